@@ -1,0 +1,72 @@
+"""What the can room works on: channels, their samples, and why a sample was refused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Reason(StrEnum):
+    """Why a frame or a value was not admitted; each is counted."""
+
+    WRONG_LENGTH = "wrong_length"
+    WRONG_SOURCE = "wrong_source"
+    BAD_CHECKSUM = "bad_checksum"
+    BAD_COUNTER = "bad_counter"
+    REMOTE_FRAME = "remote_frame"
+    TIME_BACKWARDS = "time_backwards"
+    NOT_AVAILABLE = "not_available"
+    ERROR = "error"
+    RESERVED = "reserved"
+    OUT_OF_RANGE = "out_of_range"
+    SATURATED = "saturated"
+    NOT_FINITE = "not_finite"
+    IMPLAUSIBLE = "implausible"
+    NOT_VALID = "not_valid"
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One quantity and the signal that carries it.
+
+    `value in SI = factor * physical value of the DBC + offset`; values outside
+    low..high (SI) are implausible.  `valid_signal` (same message) must hold one of
+    `valid_values` (raw codes).  `quantity` is the role, e.g. "torque"; `wheel` the
+    wheel's name or "" for the vehicle.
+    """
+
+    quantity: str
+    wheel: str
+    message: str
+    signal: str
+    factor: float
+    offset: float
+    low: float
+    high: float
+    valid_signal: str | None = None
+    valid_values: tuple[int, ...] = ()
+    timeout: float | None = None
+
+    @property
+    def name(self) -> str:
+        """"torque.FL", or "draft" for a channel of the whole vehicle."""
+        return f"{self.quantity}.{self.wheel}" if self.wheel else self.quantity
+
+
+@dataclass(slots=True)
+class Column:
+    """Admitted samples of one channel: times t [s] (N,), values (N,) in SI."""
+
+    t: NDArray[np.float64]
+    value: NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class Decoded:
+    """Columns by channel name; times of refused samples by channel name and reason."""
+
+    columns: dict[str, Column] = field(default_factory=dict)
+    refused: dict[tuple[str, Reason], NDArray[np.float64]] = field(default_factory=dict)

@@ -1,0 +1,370 @@
+"""TOML file -> typed, checked configuration.
+
+Every key, unit and default of soilbus stands here and nowhere else; an unknown key is an
+error.  Values are SI; a quantity in another unit says so in its name.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    NonNegativeFloat,
+    PositiveFloat,
+    ValidationError,
+    model_validator,
+)
+
+CONTROL_FREE_NAME = r"^[A-Za-z0-9_-]{1,16}$"
+Name = Annotated[str, Field(pattern=CONTROL_FREE_NAME)]
+SignalName = Annotated[str, Field(pattern=r"^[^.\s]+\.[^.\s]+$")]
+
+
+class ConfigError(Exception):
+    """The configuration cannot be used; `faults` holds one line for each fault."""
+
+    def __init__(self, faults: Iterable[str]) -> None:
+        self.faults = list(faults)
+        super().__init__("\n".join(self.faults))
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=False)
+
+
+class Bus(BaseModel):
+    """Handed to python-can; keys that are not ours go to the interface as they are."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+    interface: str = "socketcan"
+    channel: str = "can0"
+
+
+class Dbc(_Section):
+    """DBC files that describe the vehicle's frames, beside the configuration or ours by name."""
+
+    input: list[str] = Field(default_factory=list)
+
+
+class Vehicle(_Section):
+    """Longitudinal vehicle; lengths m, mass kg, heights above the ground."""
+
+    mass: PositiveFloat
+    wheelbase: PositiveFloat
+    cg_ahead_of_rear_axle: PositiveFloat
+    cg_height: PositiveFloat
+    hitch_height: NonNegativeFloat = 0.5
+
+    @model_validator(mode="after")
+    def _cg_between_axles(self) -> Vehicle:
+        if self.cg_ahead_of_rear_axle >= self.wheelbase:
+            raise ValueError("cg_ahead_of_rear_axle must be less than wheelbase")
+        return self
+
+
+class Signal(_Section):
+    """Where a role's value comes from: "Message.Signal", or a table with more to say.
+
+    `sign` flips a sensor mounted the other way round.  `valid` names a signal (or a
+    signal of the same message) that must hold one of `valid_values` for the value to
+    count.  `at` tells on which side of the gear a torque or speed is measured.
+    `require_counter` and `require_checksum` refuse frames without them.
+    """
+
+    signal: SignalName
+    sign: Literal[1, -1] = 1
+    at: Literal["wheel", "shaft"] | None = None
+    valid: str | None = None
+    valid_values: list[int] = Field(default_factory=lambda: [1])
+    timeout: PositiveFloat | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_text(cls, value: Any) -> Any:
+        return {"signal": value} if isinstance(value, str) else value
+
+
+class Wheel(_Section):
+    """One wheel and its sensors; radius is the rolling radius [m], width the tyre's [m].
+
+    `max_torque` [N m] is the motor's limit at the wheel where no signal tells it.
+    """
+
+    name: Name
+    axle: Literal["front", "rear"]
+    radius: PositiveFloat
+    width: PositiveFloat
+    gear_ratio: PositiveFloat = 1.0
+    max_torque: PositiveFloat | None = None
+    torque: Signal | None = None
+    speed: Signal | None = None
+    load: Signal | None = None
+    sinkage: Signal | None = None
+    torque_limit: Signal | None = None
+
+    @model_validator(mode="after")
+    def _can_be_used(self) -> Wheel:
+        if self.torque is not None and self.load is None:
+            raise ValueError(f"wheel {self.name} has a torque but no load: map `load` to its load cell")
+        if self.torque is not None and self.speed is None:
+            raise ValueError(f"wheel {self.name} has a torque but no speed: map `speed`, else it has no slip")
+        return self
+
+
+class Signals(_Section):
+    """Signals of the whole vehicle."""
+
+    ground_speed: Signal | None = None
+    draft: Signal | None = None
+    pitch: Signal | None = None
+    acceleration: Signal | None = None
+
+
+class Noise(_Section):
+    """One channel's error: sd of each sample and sd of a gain fixed over a recording.
+
+    The sd of a sample adds three parts in quadrature: `absolute` (the channel's SI
+    unit), `relative` (of the reading), `of_mean` (of the window's mean magnitude).
+    """
+
+    absolute: NonNegativeFloat = 0.0
+    relative: NonNegativeFloat = 0.0
+    of_mean: NonNegativeFloat = 0.0
+    gain: NonNegativeFloat = 0.0
+
+    @model_validator(mode="after")
+    def _not_perfect(self) -> Noise:
+        if self.absolute + self.relative + self.of_mean == 0.0:
+            raise ValueError("a sensor without any noise cannot be weighed: give absolute, relative or of_mean")
+        return self
+
+
+class NoiseOfChannels(_Section):
+    """Noise of each channel; the defaults are those of a well-instrumented tractor."""
+
+    torque: Noise = Noise(of_mean=0.02, gain=0.01)
+    load: Noise = Noise(relative=0.02, gain=0.01)
+    speed: Noise = Noise(relative=0.003, gain=0.002)
+    ground_speed: Noise = Noise(relative=0.01, gain=0.003)
+    draft: Noise = Noise(absolute=60.0, gain=0.01)
+    sinkage: Noise = Noise(absolute=0.005)
+    pitch: Noise = Noise(absolute=0.003)
+    acceleration: Noise = Noise(absolute=0.02)
+
+
+class Prior(_Section):
+    """What is known of a soil parameter beforehand; std = 0 holds it at value."""
+
+    value: NonNegativeFloat
+    std: NonNegativeFloat
+
+    @model_validator(mode="after")
+    def _free_is_positive(self) -> Prior:
+        if self.std > 0.0 and self.value == 0.0:
+            raise ValueError("value must be above 0 unless std = 0 holds it")
+        return self
+
+
+class SoilPrior(_Section):
+    """Prior of each soil parameter (SI, phi in rad), wide enough for Wong's table of soils.
+
+    A free parameter's prior is log-normal with median `value`; std/value is its
+    coefficient of variation.
+    """
+
+    k_c: Prior = Prior(value=6.0e3, std=1.2e4)
+    k_phi: Prior = Prior(value=8.0e5, std=1.4e6)
+    n: Prior = Prior(value=0.6, std=0.4)
+    phi: Prior = Prior(value=0.40, std=0.20)
+    c: Prior = Prior(value=3.0e3, std=2.0e3)
+    K: Prior = Prior(value=0.02, std=0.01)
+
+
+class Estimator(_Section):
+    """Window estimation; times s, speeds m/s, lengths m."""
+
+    window: PositiveFloat = 10.0
+    hop: PositiveFloat = 1.0
+    bin: PositiveFloat = 0.2
+    """Samples are averaged over bins of this length before the fit."""
+    min_speed: PositiveFloat = 0.2
+    """Below it slip is not judged (standstill gate)."""
+    z_ref: PositiveFloat = 0.02
+    b_ref: PositiveFloat = 0.3
+    max_bearing_std: PositiveFloat = 0.10
+    """Relative std of the bearing pressure up to which a window counts as excited."""
+    max_tan_phi_std: PositiveFloat = 0.15
+    """Relative std of tan phi up to which a window counts as excited."""
+    max_chi2: PositiveFloat = 2.0
+    """Reduced chi-square above which the model does not describe the data: never valid."""
+
+    @model_validator(mode="after")
+    def _lengths_fit(self) -> Estimator:
+        if not self.bin <= self.hop <= self.window:
+            raise ValueError("bin <= hop <= window must hold")
+        return self
+
+
+class Traversability(_Section):
+    """When soilbus says go; draft N, slopes rad."""
+
+    max_slip: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.6
+    margin: NonNegativeFloat = 0.15
+    """Share of the present demand that must be left over."""
+    go: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.95
+    """Probability from which the state is go."""
+    no_go: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.50
+    """Probability below which the state is no_go."""
+    max_age: PositiveFloat = 3.0
+    """Seconds after which a posterior no longer supports go."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Traversability:
+        if self.no_go >= self.go:
+            raise ValueError("no_go must be less than go")
+        return self
+
+
+class Effect(BaseModel):
+    """A physical effect of the catalogue with its parameters."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+    name: str
+
+
+class Model(_Section):
+    """The wheel-soil model: base choices and added effects."""
+
+    shear_law: Literal["exponential", "rational"] = "exponential"
+    effects: list[Effect] = Field(default_factory=list)
+
+
+class Output(_Section):
+    """What soilbus sends."""
+
+    dbc: str = "soilbus.dbc"
+
+
+class Config(_Section):
+    """The whole configuration."""
+
+    bus: Bus = Bus()
+    dbc: Dbc = Dbc()
+    vehicle: Vehicle | None = None
+    wheel: list[Wheel] = Field(default_factory=list, max_length=8)
+    signals: Signals = Signals()
+    noise: NoiseOfChannels = NoiseOfChannels()
+    soil: SoilPrior = SoilPrior()
+    estimator: Estimator = Estimator()
+    traversability: Traversability = Traversability()
+    model: Model = Model()
+    output: Output = Output()
+    folder: Path = Field(default=Path("."), exclude=True)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Config:
+        names = [w.name for w in self.wheel]
+        for name in {n for n in names if names.count(n) > 1}:
+            raise ValueError(f"two wheels are named {name}")
+        if len(self.wheel) > 1 and self.vehicle is None:
+            raise ValueError("several wheels need a [vehicle]")
+        return self
+
+    @property
+    def soil_prior(self) -> dict[str, Prior]:
+        """Prior by parameter name, in the order k_c, k_phi, n, phi, c, K."""
+        return {name: getattr(self.soil, name) for name in SoilPrior.model_fields}
+
+
+def load_config(path: Path | str, overrides: Iterable[str] = ()) -> Config:
+    """Read a TOML file, apply KEY=VALUE overrides (dotted paths), check everything.
+
+    Raises ConfigError with one line for each fault.
+    """
+    path = Path(path)
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError([f"{path}: {error.strerror or error}"]) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError([f"{path}: not TOML: {error}"]) from None
+    for text in overrides:
+        _override(raw, text)
+    return parse_config(raw, folder=path.parent, source=str(path))
+
+
+def parse_config(raw: Mapping[str, Any], folder: Path = Path("."), source: str = "configuration") -> Config:
+    """Check a configuration given as nested mappings; ConfigError lists every fault."""
+    if "folder" in raw:
+        raise ConfigError([f"{source}: folder: unknown key"])
+    try:
+        return Config.model_validate({**raw, "folder": folder})
+    except ValidationError as error:
+        raise ConfigError(f"{source}: {_fault(raw, e)}" for e in error.errors()) from None
+
+
+def _fault(raw: Mapping[str, Any], error: Any) -> str:
+    where = ".".join(str(part) for part in error["loc"] if part not in ("str",))
+    if error["type"] == "extra_forbidden":
+        return f"{where}: unknown key"
+    if error["type"] == "missing":
+        return f"{where}: missing"
+    message = str(error["msg"]).removeprefix("Value error, ")
+    return f"{where}: {message}" if where else message
+
+
+def _override(raw: dict[str, Any], text: str) -> None:
+    key, equals, value = text.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not all(parts):
+        raise ConfigError([f"--set {text}: expected KEY=VALUE with a dotted key"])
+    try:
+        parsed = tomllib.loads(f"x = {value}")["x"]
+    except tomllib.TOMLDecodeError:
+        parsed = value.strip()
+    here: Any = raw
+    for i, part in enumerate(parts[:-1]):
+        here = _child(here, part, ".".join(parts[: i + 1]), text)
+    if isinstance(here, list):
+        raise ConfigError([f"--set {text}: {'.'.join(parts[:-1])} is a list"])
+    here[parts[-1]] = parsed
+
+
+def _child(here: Any, part: str, path: str, text: str) -> Any:
+    """The table (or the wheel by name or number) that one step of a dotted key leads to."""
+    if isinstance(here, list):
+        for i, item in enumerate(here):
+            if part in (str(i), item.get("name") if isinstance(item, dict) else None):
+                return item
+        raise ConfigError([f"--set {text}: no {path}"])
+    child = here.setdefault(part, {})
+    if isinstance(child, str):  # "Message.Signal" grows into its table form
+        child = here[part] = {"signal": child}
+    if not isinstance(child, (dict, list)):
+        raise ConfigError([f"--set {text}: {path} is a value, not a table"])
+    return child
+
+
+def defaults_text(config: Config) -> str:
+    """Every setting with its value in force, one dotted KEY = VALUE a line."""
+    lines: list[str] = []
+
+    def walk(prefix: str, value: Any) -> None:
+        if isinstance(value, Mapping):
+            for k, v in value.items():
+                walk(f"{prefix}.{k}" if prefix else k, v)
+        else:
+            lines.append(f"{prefix} = {value}")
+
+    walk("", config.model_dump(exclude={"wheel", "signals", "folder"}))
+    return "\n".join(lines)
+
+
+__all__ = ["Config", "ConfigError", "FiniteFloat", "Signal", "Wheel", "load_config", "parse_config"]

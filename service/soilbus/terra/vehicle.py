@@ -1,0 +1,53 @@
+"""From wheels to the vehicle: slip, load transfer, draft balance.
+
+Sign conventions: forward is positive; pitch is positive nose up; draft is positive when
+it holds the vehicle back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+GRAVITY = 9.80665
+
+
+@dataclass(frozen=True, slots=True)
+class Chassis:
+    """Mass [kg] and lengths [m] of a two-axle vehicle; heights above the ground."""
+
+    mass: float
+    wheelbase: float
+    cg_ahead_of_rear_axle: float
+    cg_height: float
+    hitch_height: float
+
+
+def slip_ratio(radius: Any, wheel_speed: Any, ground_speed: Any) -> Any:
+    """1 - V/(r omega) (eq. 13 of Xi et al. 2024); nan where the wheel does not turn forward.
+
+    radius [m], wheel_speed [rad/s], ground_speed [m/s].
+    """
+    rim = np.asarray(radius * wheel_speed, float)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(rim > 0.0, 1.0 - ground_speed / rim, np.nan)
+
+
+def pull_required(chassis: Chassis, draft: Any, pitch: Any, acceleration: Any) -> Any:
+    """Drawbar pull [N] that all wheels together must give: draft, slope and inertia.
+
+    draft [N], pitch [rad], acceleration along the ground [m/s^2].
+    """
+    return draft + chassis.mass * (GRAVITY * np.sin(pitch) + acceleration)
+
+
+def axle_loads(chassis: Chassis, draft: Any, pitch: Any, acceleration: Any) -> tuple[Any, Any]:
+    """Load [N] on the front and on the rear axle, from moments about the rear contact."""
+    weight = chassis.mass * GRAVITY
+    along = weight * np.sin(pitch) + chassis.mass * acceleration
+    across = weight * np.cos(pitch)
+    moment = across * chassis.cg_ahead_of_rear_axle - along * chassis.cg_height - draft * chassis.hitch_height
+    front = moment / chassis.wheelbase
+    return front, across - front
