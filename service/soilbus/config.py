@@ -192,7 +192,7 @@ class Estimator(_Section):
 
     window: PositiveFloat = 10.0
     hop: PositiveFloat = 1.0
-    bin: PositiveFloat = 0.2
+    bin: PositiveFloat = 0.1
     """Samples are averaged over bins of this length before the fit."""
     min_speed: PositiveFloat = 0.2
     """Below it slip is not judged (standstill gate)."""

@@ -1,0 +1,382 @@
+"""Which frames count: all of a frame or nothing, each refusal with a reason and a counter.
+
+`feed` only files a frame under its message; everything else happens in `take` on whole
+columns, once a hop.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from cantools.database.can import Database, Message, Signal
+from numpy.typing import NDArray
+
+from soilbus.can.channels import Channel, Column, Decoded, Reason
+from soilbus.can.checksum import column_checksums
+from soilbus.can.decode import ColumnDecoder, SignalColumn
+from soilbus.can.j1939 import STANDARD_PGNS, SourceLock, group_mask, pgn_of, source_of
+from soilbus.can.validity import REASONS, CodeRule, in_si, judge_codes, judge_validity, rule_of
+
+CLOCK_STEP = 1.0
+"""Backward jump [s] above which the clock was set and the new time is believed."""
+MAX_LISTED_UNKNOWN = 1024
+
+COUNTER = "Counter"
+CHECKSUM = "Checksum"
+
+_EXTENDED = 1 << 31
+_NONE: NDArray[np.float64] = np.empty(0)
+
+Data = bytes | bytearray
+Frame = tuple[float, int, Data]
+Mask = NDArray[np.bool_]
+
+
+class CanMessage(Protocol):
+    """What `feed_message` reads of python-can's Message."""
+
+    timestamp: float
+    arbitration_id: int
+    is_extended_id: bool
+    is_remote_frame: bool
+    is_error_frame: bool
+    data: bytearray
+
+
+@dataclass(slots=True)
+class Counts:
+    """Frames since the start: by message name, by (message name, reason), by identifier.
+
+    Extended identifiers have bit 31 set in `unknown_ids`, which lists the first
+    MAX_LISTED_UNKNOWN identifiers; `unknown` counts all.
+    """
+
+    received: Counter[str] = field(default_factory=Counter)
+    admitted: Counter[str] = field(default_factory=Counter)
+    refused: Counter[tuple[str, Reason]] = field(default_factory=Counter)
+    unknown: int = 0
+    unknown_ids: Counter[int] = field(default_factory=Counter)
+    error_frames: int = 0
+    clock_steps: int = 0
+
+
+@dataclass(slots=True)
+class _Batch:
+    """Frames of one message: times [s] (N,), identifiers (N,), payload (N, length)."""
+
+    t: NDArray[np.float64]
+    ids: NDArray[np.int64]
+    payload: NDArray[np.uint8]
+
+    def where(self, mask: Mask) -> _Batch:
+        return _Batch(self.t[mask], self.ids[mask], self.payload[mask])
+
+
+@dataclass(slots=True)
+class _Inbox:
+    """One message: its frames not yet taken, and what must be remembered between batches."""
+
+    message: Message
+    channels: tuple[Channel, ...]
+    rules: tuple[CodeRule, ...]
+    decoder: ColumnDecoder
+    lock: SourceLock | None
+    checksum_byte: int | None
+    frames: list[Frame] = field(default_factory=list)
+    last_t: float = -math.inf
+    last_id: int = -1
+    last_counter: int = -1
+
+    def forget(self) -> None:
+        self.frames.clear()
+        self.last_t, self.last_id, self.last_counter = -math.inf, -1, -1
+        if self.lock is not None:
+            self.lock.release()
+
+
+class Admission:
+    """Collects frames and hands out admitted samples.
+
+    `channels` are what is wanted, `database` describes their messages.  `checked` names the
+    messages whose Counter and Checksum (see `can.checksum`) must be right; other makers' check
+    schemes are not ours to judge, so a message not named is not checked.
+
+    A message of a standard parameter group (`j1939.STANDARD_PGNS`) is heard from any source and
+    priority, one source at a time, unless the database has several messages of that group.
+
+    Raises ValueError when two messages share an identifier, when a checked message has no
+    Counter or no byte-aligned 8-bit Checksum, or as `ColumnDecoder` does; KeyError for a message
+    or signal that the database does not have.
+    """
+
+    def __init__(self, channels: Iterable[Channel], database: Database, checked: Collection[str] = ()) -> None:
+        self.counts = Counts()
+        self._inboxes: list[_Inbox] = []
+        self._by_key: dict[int, _Inbox] = {}
+        self._groups: dict[int, _Inbox] = {}
+        self._step_below = -math.inf
+        by_message: dict[str, list[Channel]] = {}
+        for channel in channels:
+            by_message.setdefault(channel.message, []).append(channel)
+        for name, members in by_message.items():
+            message = database.get_message_by_name(name)
+            is_open = hears_any_source(message, database)
+            inbox = _inbox(message, members, is_open, name in checked)
+            key = _key(message.frame_id, message.is_extended_frame)
+            if key in self._by_key:
+                raise ValueError(f"{name}: another mapped message has the identifier {message.frame_id:#x} too")
+            self._by_key[key] = inbox
+            if is_open:
+                self._groups[pgn_of(message.frame_id)] = inbox
+            self._inboxes.append(inbox)
+
+    def feed(self, t: float, arbitration_id: int, extended: bool, data: Data, remote: bool = False) -> None:
+        """Files one data or remote frame received at t [s]; `data` is kept, not copied."""
+        inbox = self._by_key.get(arbitration_id | _EXTENDED if extended else arbitration_id)
+        if inbox is None:
+            inbox = self._inbox_of_group(arbitration_id, extended)
+            if inbox is None:
+                return
+        if t < self._step_below:
+            self._step_clock()
+        self._step_below = t - CLOCK_STEP
+        if remote:
+            self.counts.received[inbox.message.name] += 1
+            self.counts.refused[inbox.message.name, Reason.REMOTE_FRAME] += 1
+        else:
+            inbox.frames.append((t, arbitration_id, data))
+
+    def feed_message(self, message: CanMessage) -> None:
+        """`feed` for python-can's messages; error frames are counted and dropped."""
+        if message.is_error_frame:
+            self.counts.error_frames += 1
+            return
+        self.feed(
+            message.timestamp, message.arbitration_id, message.is_extended_id, message.data, message.is_remote_frame
+        )
+
+    def take(self, until: float = math.inf) -> Decoded:
+        """Samples of all frames filed so far with t < until [s]; later frames stay.
+
+        Every channel has a column, perhaps empty; times do not decrease within it.  A refused
+        frame counts as a refused sample of each of its channels, except frames of a source that
+        is not listened to and remote frames, which are in `counts` only.
+        """
+        out = Decoded()
+        for inbox in self._inboxes:
+            self._open(inbox, _popped(inbox, until), out)
+        return out
+
+    def can_filters(self) -> list[dict[str, Any]]:
+        """Filters for python-can that pass exactly the frames of the mapped messages."""
+        filters: list[dict[str, Any]] = []
+        for inbox in self._inboxes:
+            message = inbox.message
+            mask = 0x1FFFFFFF if message.is_extended_frame else 0x7FF
+            if inbox.lock is not None:
+                mask = group_mask(message.frame_id)
+            extended = message.is_extended_frame
+            filters.append({"can_id": message.frame_id & mask, "can_mask": mask, "extended": extended})
+        return filters
+
+    def _inbox_of_group(self, arbitration_id: int, extended: bool) -> _Inbox | None:
+        """Where a frame goes whose identifier is not in the DBC: to its group, or nowhere."""
+        key = _key(arbitration_id, extended)
+        inbox = self._groups.get(pgn_of(arbitration_id)) if extended else None
+        if inbox is not None:
+            self._by_key[key] = inbox
+            return inbox
+        self.counts.unknown += 1
+        if key in self.counts.unknown_ids or len(self.counts.unknown_ids) < MAX_LISTED_UNKNOWN:
+            self.counts.unknown_ids[key] += 1
+        return None
+
+    def _step_clock(self) -> None:
+        """Believe the new time; what was filed under the old one has no place in it."""
+        self.counts.clock_steps += 1
+        for inbox in self._inboxes:
+            self.counts.received[inbox.message.name] += len(inbox.frames)
+            if inbox.frames:
+                self.counts.refused[inbox.message.name, Reason.TIME_BACKWARDS] += len(inbox.frames)
+            inbox.forget()
+
+    def _open(self, inbox: _Inbox, frames: list[Frame], out: Decoded) -> None:
+        batch = None
+        if frames:
+            self.counts.received[inbox.message.name] += len(frames)
+            batch = self._checked_batch(inbox, frames, out)
+        if batch is None:
+            for channel in inbox.channels:
+                out.columns[channel.name] = Column(_NONE, _NONE)
+            return
+        self.counts.admitted[inbox.message.name] += len(batch.t)
+        columns = inbox.decoder.columns(batch.payload)
+        for channel, rule in zip(inbox.channels, inbox.rules, strict=True):
+            _judge(channel, rule, inbox.message, batch.t, columns, out)
+
+    def _checked_batch(self, inbox: _Inbox, frames: list[Frame], out: Decoded) -> _Batch | None:
+        """The frames that pass every frame-level check; None when there are none."""
+        length = inbox.message.length
+        good = [f for f in frames if len(f[2]) == length]
+        if len(good) < len(frames):
+            bad = np.array([f[0] for f in frames if len(f[2]) != length])
+            self._refuse(inbox, bad, Reason.WRONG_LENGTH, out)
+        if inbox.lock is not None:
+            heard = _of_locked_source(inbox.lock, good)
+            self._count_wrong_source(inbox, len(good) - len(heard))
+            good = heard
+        if not good:
+            return None
+        times, ids, datas = zip(*good, strict=True)
+        payload = np.frombuffer(b"".join(datas), dtype=np.uint8).reshape(-1, length)
+        batch: _Batch | None = _Batch(np.array(times, dtype=np.float64), np.array(ids, dtype=np.int64), payload)
+        for check, reason in (
+            (_checksum_right, Reason.BAD_CHECKSUM),
+            (_time_forward, Reason.TIME_BACKWARDS),
+            (_counter_moved, Reason.BAD_COUNTER),
+        ):
+            batch = self._passed(inbox, batch, check, reason, out)
+        return batch
+
+    def _passed(
+        self,
+        inbox: _Inbox,
+        batch: _Batch | None,
+        check: Callable[[_Inbox, _Batch], Mask | None],
+        reason: Reason,
+        out: Decoded,
+    ) -> _Batch | None:
+        mask = check(inbox, batch) if batch is not None else None
+        if batch is None or mask is None or mask.all():
+            return batch
+        self._refuse(inbox, batch.t[~mask], reason, out)
+        return batch.where(mask) if mask.any() else None
+
+    def _refuse(self, inbox: _Inbox, t: NDArray[np.float64], reason: Reason, out: Decoded) -> None:
+        self.counts.refused[inbox.message.name, reason] += len(t)
+        for channel in inbox.channels:
+            out.refused[channel.name, reason] = t
+
+    def _count_wrong_source(self, inbox: _Inbox, n: int) -> None:
+        if n:
+            self.counts.refused[inbox.message.name, Reason.WRONG_SOURCE] += n
+
+
+def _key(arbitration_id: int, extended: bool) -> int:
+    return arbitration_id | _EXTENDED if extended else arbitration_id
+
+
+def hears_any_source(message: Message, database: Database) -> bool:
+    """Whether a message counts by its parameter group, whatever the source address."""
+    if not message.is_extended_frame or pgn_of(message.frame_id) not in STANDARD_PGNS:
+        return False
+    pgn = pgn_of(message.frame_id)
+    return sum(m.is_extended_frame and pgn_of(m.frame_id) == pgn for m in database.messages) == 1
+
+
+def checksum_byte_of(message: Message) -> int | None:
+    """Byte that carries a message's Checksum; None without a Counter and an aligned 8-bit Checksum."""
+    named: dict[str, Signal] = {s.name: s for s in message.signals}
+    checksum = named.get(CHECKSUM)
+    if checksum is None or COUNTER not in named or checksum.length != 8:
+        return None
+    aligned = 7 if checksum.byte_order == "big_endian" else 0
+    return checksum.start // 8 if checksum.start % 8 == aligned else None
+
+
+def _inbox(message: Message, channels: Sequence[Channel], is_open: bool, checked: bool) -> _Inbox:
+    checksum_byte = checksum_byte_of(message) if checked else None
+    if checked and checksum_byte is None:
+        raise ValueError(f"{message.name}: no {COUNTER} and byte-aligned 8-bit {CHECKSUM} to check")
+    wanted = [c.signal for c in channels] + [c.valid_signal for c in channels if c.valid_signal is not None]
+    decoder = ColumnDecoder(message, wanted + ([COUNTER] if checked else []))
+    return _Inbox(
+        message=message,
+        channels=tuple(channels),
+        rules=tuple(rule_of(message.get_signal_by_name(c.signal)) for c in channels),
+        decoder=decoder,
+        lock=SourceLock(source_of(message.frame_id)) if is_open else None,
+        checksum_byte=checksum_byte,
+    )
+
+
+def _popped(inbox: _Inbox, until: float) -> list[Frame]:
+    """Takes the frames before `until` out of the inbox."""
+    frames, inbox.frames = inbox.frames, []
+    if until == math.inf:
+        return frames
+    inbox.frames = [f for f in frames if f[0] >= until]
+    return [f for f in frames if not f[0] >= until] if inbox.frames else frames
+
+
+def _of_locked_source(lock: SourceLock, frames: list[Frame]) -> list[Frame]:
+    if {source_of(f[1]) for f in frames} == {lock.source}:
+        lock.admits(frames[-1][0], source_of(frames[-1][1]))
+        return frames
+    return [f for f in frames if lock.admits(f[0], source_of(f[1]))]
+
+
+def _checksum_right(inbox: _Inbox, batch: _Batch) -> Mask | None:
+    if inbox.checksum_byte is None:
+        return None
+    due = column_checksums(batch.ids, batch.payload, inbox.checksum_byte)
+    right: Mask = batch.payload[:, inbox.checksum_byte] == due
+    return right
+
+
+def _time_forward(inbox: _Inbox, batch: _Batch) -> Mask:
+    t = batch.t
+    if t[0] >= inbox.last_t and bool(np.all(t[1:] >= t[:-1])) and math.isfinite(t[0]) and math.isfinite(t[-1]):
+        mask = np.ones(len(t), dtype=np.bool_)
+        inbox.last_t = float(t[-1])
+        return mask
+    mask = np.zeros(len(t), dtype=np.bool_)
+    for i, now in enumerate(t.tolist()):
+        if math.isfinite(now) and now >= inbox.last_t:
+            mask[i] = True
+            inbox.last_t = now
+    return mask
+
+
+def _counter_moved(inbox: _Inbox, batch: _Batch) -> Mask | None:
+    """False where a frame repeats the counter of the one before it from the same sender."""
+    if inbox.checksum_byte is None:
+        return None
+    counter = inbox.decoder.columns(batch.payload)[COUNTER].raw
+    before = np.concatenate(([inbox.last_counter], counter[:-1]))
+    id_before = np.concatenate(([inbox.last_id], batch.ids[:-1]))
+    inbox.last_counter, inbox.last_id = int(counter[-1]), int(batch.ids[-1])
+    moved: Mask = (counter != before) | (batch.ids != id_before)
+    return moved
+
+
+def _judge(
+    channel: Channel,
+    rule: CodeRule,
+    message: Message,
+    t: NDArray[np.float64],
+    columns: dict[str, SignalColumn],
+    out: Decoded,
+) -> None:
+    """Puts one channel's samples into `out`: each one admitted, or refused for one reason."""
+    column = columns[channel.signal]
+    verdict = judge_codes(rule, column.raw, column.physical)
+    if channel.valid_signal is not None:
+        vouching = message.get_signal_by_name(channel.valid_signal)
+        other = judge_validity(channel, vouching.length, vouching.is_signed, columns[channel.valid_signal])
+        verdict = np.where(verdict == 0, other, verdict)
+    value = in_si(channel, column.physical, verdict)
+    if column.present is not None:
+        t, value, verdict = t[column.present], value[column.present], verdict[column.present]
+    if not verdict.any():
+        out.columns[channel.name] = Column(t, value)
+        return
+    admitted = verdict == 0
+    out.columns[channel.name] = Column(t[admitted], value[admitted])
+    for code in np.unique(verdict[~admitted]).tolist():
+        out.refused[channel.name, REASONS[code - 1]] = t[verdict == code]

@@ -1,0 +1,49 @@
+"""The checksum of frames that others act on: CRC-8 SAE J1850 over identifier and payload.
+
+The identifier goes in first, so that a frame relayed under a wrong identifier is refused as
+well as one with a wrong payload.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from crccheck.crc import Crc8SaeJ1850  # type: ignore[import-untyped]
+from numpy.typing import NDArray
+
+_INIT = 0xFF
+_XOR_OUT = 0xFF
+_TABLE = bytes(Crc8SaeJ1850(initvalue=0).process((byte,)).value() for byte in range(256))
+_TABLE_ARRAY: NDArray[np.uint8] = np.frombuffer(_TABLE, dtype=np.uint8)
+
+
+def crc8(data: bytes) -> int:
+    """CRC-8 SAE J1850 (polynomial 0x1D, start 0xFF, final xor 0xFF) of `data`, 0..255."""
+    crc = _INIT
+    for byte in data:
+        crc = _TABLE[crc ^ byte]
+    return crc ^ _XOR_OUT
+
+
+def frame_checksum(arbitration_id: int, data: bytes, checksum_byte_index: int) -> int:
+    """Checksum of one frame, 0..255: identifier (4 bytes, least significant first), then payload.
+
+    The byte that carries the checksum is left out.  Raises IndexError when `data` has no such
+    byte, OverflowError when the identifier does not fit 4 bytes.
+    """
+    if not 0 <= checksum_byte_index < len(data):
+        raise IndexError(f"no byte {checksum_byte_index} in {len(data)} bytes")
+    payload = bytes(data[:checksum_byte_index]) + bytes(data[checksum_byte_index + 1 :])
+    return crc8(arbitration_id.to_bytes(4, "little") + payload)
+
+
+def column_checksums(
+    arbitration_ids: NDArray[np.int64], payload: NDArray[np.uint8], checksum_byte_index: int
+) -> NDArray[np.uint8]:
+    """`frame_checksum` of many frames at once: identifiers (N,), payload (N, length) -> (N,)."""
+    crc = np.full(len(payload), _INIT, dtype=np.uint8)
+    for shift in (0, 8, 16, 24):
+        crc = _TABLE_ARRAY[crc ^ ((arbitration_ids >> shift) & 0xFF).astype(np.uint8)]
+    for column in range(payload.shape[1]):
+        if column != checksum_byte_index:
+            crc = _TABLE_ARRAY[crc ^ payload[:, column]]
+    return crc ^ np.uint8(_XOR_OUT)

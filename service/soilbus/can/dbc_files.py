@@ -1,0 +1,116 @@
+"""Finding and reading DBC files: the integrator's own beside the configuration, or ours by name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from cantools.database.can import Database, Message
+
+from soilbus.can.admission import checksum_byte_of
+from soilbus.config import Config, ConfigError
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def shipped_dbc(name: str) -> Path:
+    """Path of a DBC file that comes with soilbus: in a checkout's dbc/ or the installed package.
+
+    Raises FileNotFoundError when there is none of that name.
+    """
+    if name and Path(name).name == name:
+        for folder in (_PACKAGE / "dbc", _PACKAGE.parents[1] / "dbc"):
+            if (folder / name).is_file():
+                return folder / name
+    raise FileNotFoundError(f"soilbus ships no {name}")
+
+
+def load_databases(config: Config) -> Database:
+    """All DBC files of the configuration as one database.
+
+    Raises ConfigError with a line for each file that is missing or not a DBC, and for each
+    message that two files define differently.
+    """
+    faults: list[str] = []
+    if not config.dbc.input:
+        faults.append("dbc.input: no DBC file given")
+    messages: dict[str, tuple[str, Message]] = {}
+    for name in config.dbc.input:
+        try:
+            for message in _read(_located(config, name)).messages:
+                first, known = messages.setdefault(message.name, (name, message))
+                if not _same(known, message):
+                    faults.append(f"dbc.input: {first} and {name} define message {message.name} differently")
+        except OSError as error:
+            faults.append(f"dbc.input: {name}: {error.strerror or error}")
+        except Exception as error:  # the parser raises all kinds on a text that is no DBC
+            faults.append(f"dbc.input: {name}: not a DBC file: {_one_line(error)}")
+    if faults:
+        raise ConfigError(faults)
+    return _database(message for _, message in messages.values())
+
+
+def checked_messages(config: Config) -> frozenset[str]:
+    """Names of the messages whose Counter and Checksum follow our own convention.
+
+    Those are messages with both signals in DBC files that soilbus ships; what another maker's
+    Checksum means is not known.
+    """
+    ours = [path for name in config.dbc.input if _is_shipped(path := _located(config, name))]
+    found = (m for path in ours for m in _read(path).messages)
+    return frozenset(m.name for m in found if checksum_byte_of(m) is not None)
+
+
+def _located(config: Config, name: str) -> Path:
+    beside = config.folder / name
+    if beside.is_file():
+        return beside
+    try:
+        return shipped_dbc(name)
+    except FileNotFoundError:
+        return beside
+
+
+def _is_shipped(path: Path) -> bool:
+    try:
+        return shipped_dbc(path.name).resolve() == path.resolve()
+    except FileNotFoundError:
+        return False
+
+
+def _read(path: Path) -> Database:
+    raw = path.read_bytes()
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = raw.decode("cp1252", errors="replace")
+    # not strict: an overlap in a message that nobody maps is none of our business
+    database = Database(strict=False)
+    database.add_dbc_string(text)
+    if not database.messages:
+        raise ValueError("no message in it")
+    return database
+
+
+def _database(messages: Iterable[Message]) -> Database:
+    database = Database(strict=False)
+    for message in messages:
+        database.messages.append(message)
+    database.refresh()
+    return database
+
+
+def _same(a: Message, b: Message) -> bool:
+    return _layout(a) == _layout(b)
+
+
+def _layout(message: Message) -> tuple[object, ...]:
+    signals = sorted(
+        (s.name, s.start, s.length, s.byte_order, s.is_signed, s.conversion.is_float, s.scale, s.offset, s.unit or "")
+        for s in message.signals
+    )
+    return message.frame_id, message.is_extended_frame, message.length, tuple(signals)
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,62 @@
+"""J1939 / ISO 11783 identifiers: parameter group, source address, and which source to trust."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+GROUND_BASED_SPEED = 65097
+STANDARD_PGNS = frozenset({65093, 65094, 65096, GROUND_BASED_SPEED, 65265, 65267, 129025})
+"""Groups whose meaning the standards fix (hitch, speed, position), whoever sends them."""
+
+LOCK_RELEASE = 2.0
+"""Silence [s] of a locked source after which another may take its place."""
+
+_PDU2 = 0xF0
+_PDU1_MASK = 0x03FF0000
+_PDU2_MASK = 0x03FFFF00
+
+
+def group_mask(arbitration_id: int) -> int:
+    """Bits of a 29-bit identifier that tell its parameter group.
+
+    Below PDU format 240 (PDU1) the second byte is a destination address and no part of the
+    group; from 240 (PDU2) it is.
+    """
+    return _PDU1_MASK if (arbitration_id >> 16) & 0xFF < _PDU2 else _PDU2_MASK
+
+
+def pgn_of(arbitration_id: int) -> int:
+    """Parameter group number of a 29-bit identifier, data page bits included."""
+    return (arbitration_id & group_mask(arbitration_id)) >> 8
+
+
+def source_of(arbitration_id: int) -> int:
+    """Source address of a 29-bit identifier."""
+    return arbitration_id & 0xFF
+
+
+@dataclass(slots=True)
+class SourceLock:
+    """Keeps to one source of a parameter group.
+
+    The first source heard counts until it is silent for LOCK_RELEASE; `own`, the address that
+    the DBC names, takes over whenever it talks.
+    """
+
+    own: int
+    source: int | None = field(default=None, init=False)
+    heard: float = field(default=-math.inf, init=False)
+
+    def admits(self, t: float, source: int) -> bool:
+        """Whether a frame of `source` at t [s] counts; moves the lock where it must."""
+        if source != self.source and source != self.own and t - self.heard <= LOCK_RELEASE:
+            return False
+        self.source = source
+        self.heard = max(self.heard, t)
+        return True
+
+    def release(self) -> None:
+        """Forget the source and its time."""
+        self.source = None
+        self.heard = -math.inf

@@ -1,0 +1,192 @@
+"""Results -> frames: value codes, counter, checksum.
+
+Which value goes into which signal is the caller's business; what happens to a value that
+cannot be sent is decided here, once for all signals, from what the DBC says of them.
+"""
+
+from __future__ import annotations
+
+import math
+import numbers
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from cantools.database import Database
+from cantools.database.can import Message, Signal
+from numpy.typing import NDArray
+
+from soilbus.can.checksum import frame_checksum
+
+COUNTER, CHECKSUM = "Counter", "Checksum"
+NOT_AVAILABLE, ERROR = "not_available", "error"
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One frame, ready to send."""
+
+    arbitration_id: int
+    extended: bool
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class ValueCodes:
+    """How values of one integer signal become raw codes.
+
+    Physical value = scale * code + offset.  Valid codes are lowest..highest.  None and
+    what is not finite become `not_available`.  A value outside the range becomes `error`,
+    never the nearest valid one, since the receiver would take that for a measurement;
+    except that signals with the attribute `Saturates` (standard deviations, ages, counts:
+    "this much or more") stay at the top of their range.  `names` is the value table.
+    """
+
+    lowest: int
+    highest: int
+    not_available: int
+    error: int
+    scale: float
+    offset: float
+    saturates: bool
+    names: Mapping[str, int]
+
+    def code(self, value: Any) -> int:
+        """Raw code of one value: number, name of the value table, or None.
+
+        Raises ValueError for an unknown name, TypeError for what is no value at all.
+        """
+        if value is None:
+            return self.not_available
+        if isinstance(value, str):
+            if value not in self.names:
+                raise ValueError(f"{value!r} is not in the value table ({', '.join(self.names)})")
+            return self.names[value]
+        if not isinstance(value, numbers.Real):
+            raise TypeError(f"a {type(value).__name__} cannot be sent")
+        number = float(value)
+        if not math.isfinite(number):
+            return self.not_available
+        code = round((number - self.offset) / self.scale)
+        if self.lowest <= code <= self.highest:
+            return code
+        return self.highest if self.saturates and code > self.highest else self.error
+
+    def column(self, values: NDArray[np.float64]) -> NDArray[np.int64]:
+        """`code` of many numbers at once: shape (N,) to (N,), nan for not available."""
+        finite = np.isfinite(values)
+        codes = np.rint((np.where(finite, values, self.offset) - self.offset) / self.scale)
+        above = float(self.highest if self.saturates else self.error)
+        codes = np.where(codes > self.highest, above, np.where(codes < self.lowest, float(self.error), codes))
+        return np.where(finite, codes, float(self.not_available)).astype(np.int64)
+
+
+def value_codes(signal: Signal) -> ValueCodes:
+    """The codes of a signal of any maker's DBC.
+
+    Without names in the value table, not available is the most negative code of a signed
+    signal and all ones of an unsigned one; error is the J1939 code where the range leaves
+    it free, else not available.  Raises ValueError for float signals and for more than 32 bits.
+    """
+    if signal.is_float or signal.length > 32:
+        raise ValueError(f"{signal.name}: only integer signals up to 32 bits can be sent")
+    least = -(1 << signal.length - 1) if signal.is_signed else 0
+    greatest = least + (1 << signal.length) - 1
+    names = {str(name): int(code) for code, name in (signal.choices or {}).items()}
+    not_available = names.get(NOT_AVAILABLE, least if signal.is_signed else greatest)
+    lowest, highest = _valid_codes(signal, least, greatest)
+    if NOT_AVAILABLE not in names and signal.length >= 8:  # a range of all codes means all but this one
+        lowest, highest = lowest + (lowest == not_available), highest - (highest == not_available)
+    free = 0xFE << signal.length - 8 if signal.length >= 8 and not signal.is_signed else greatest
+    error = names.get(ERROR, free if highest < free < greatest else not_available)
+    attributes = signal.dbc.attributes if signal.dbc else {}
+    saturates = "Saturates" in attributes and bool(int(attributes["Saturates"].value))
+    return ValueCodes(
+        lowest, highest, not_available, error, float(signal.scale), float(signal.offset), saturates, names
+    )
+
+
+def _valid_codes(signal: Signal, least: int, greatest: int) -> tuple[int, int]:
+    """First and last code within the DBC's range, of those that the bits can hold."""
+    bounds = (signal.minimum, signal.maximum)
+    ends = [None if bound is None else round((bound - signal.offset) / signal.scale) for bound in bounds]
+    low, high = reversed(ends) if signal.scale < 0 else ends
+    return least if low is None else max(low, least), greatest if high is None else min(high, greatest)
+
+
+def checksum_byte(message: Message) -> int | None:
+    """Index of the byte that carries the message's Checksum; None where it has none.
+
+    Raises ValueError for a Checksum that is not one whole byte.
+    """
+    for signal in message.signals:
+        if signal.name == CHECKSUM:
+            aligned = signal.start % 8 == (7 if signal.byte_order == "big_endian" else 0)
+            if signal.length != 8 or not aligned:
+                raise ValueError(f"{message.name}: {CHECKSUM} must be one whole byte")
+            return int(signal.start) // 8
+    return None
+
+
+@dataclass(slots=True)
+class _Layout:
+    """One message, what its signals are filled with, and where its counter stands."""
+
+    message: Message
+    cycle_time: float
+    codes: dict[str, ValueCodes]
+    blank: dict[str, int]
+    counter_modulus: int
+    checksum_byte: int | None
+    sent: int = field(default=0)
+
+
+class Publisher:
+    """Frames of one DBC.  Counters start at 0 and go up by one each frame of a message."""
+
+    def __init__(self, database: Database) -> None:
+        """Raises ValueError for a message without cycle time or with a signal it cannot fill."""
+        self._layouts = {message.name: _layout(message) for message in database.messages}
+        self.schedule: Mapping[str, float] = MappingProxyType(
+            {name: layout.cycle_time for name, layout in self._layouts.items()}
+        )
+        """Cycle time [s] by message name, from the DBC's attribute GenMsgCycleTime."""
+
+    def frame(self, message: str, values: Mapping[str, Any]) -> Frame:
+        """The next frame of a message; signals without a value are sent as not available.
+
+        Values are in the DBC's units, or names of the value table.  Raises KeyError for a
+        message or signal that the DBC does not have (counter and checksum are not the
+        caller's), ValueError and TypeError as `ValueCodes.code`.
+        """
+        layout = self._layouts[message]
+        raw = layout.blank.copy()
+        for name, value in values.items():
+            try:
+                raw[name] = layout.codes[name].code(value)
+            except (ValueError, TypeError) as error:
+                raise type(error)(f"{message}.{name}: {error}") from None
+        if layout.counter_modulus:
+            raw[COUNTER] = layout.sent % layout.counter_modulus
+            layout.sent += 1
+        # Codes are within their bits already; not strict, since codes lie outside min..max.
+        data = layout.message.encode(raw, scaling=False, padding=True, strict=False)
+        frame_id, place = layout.message.frame_id, layout.checksum_byte
+        if place is not None:
+            data = data[:place] + bytes((frame_checksum(frame_id, data, place),)) + data[place + 1 :]
+        return Frame(frame_id, layout.message.is_extended_frame, data)
+
+
+def _layout(message: Message) -> _Layout:
+    if message.cycle_time is None:
+        raise ValueError(f"{message.name}: no cycle time (attribute GenMsgCycleTime)")
+    if message.is_multiplexed():
+        raise ValueError(f"{message.name}: multiplexed messages cannot be sent")
+    by_name = {signal.name: signal for signal in message.signals}
+    codes = {name: value_codes(signal) for name, signal in by_name.items() if name not in (COUNTER, CHECKSUM)}
+    blank = {name: code.not_available for name, code in codes.items()}
+    blank |= {name: 0 for name in (COUNTER, CHECKSUM) if name in by_name}
+    modulus = 1 << by_name[COUNTER].length if COUNTER in by_name else 0
+    return _Layout(message, message.cycle_time / 1000.0, codes, blank, modulus, checksum_byte(message))

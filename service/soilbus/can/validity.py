@@ -1,0 +1,166 @@
+"""Which decoded samples count, and why the others do not; never a zero for a missing value.
+
+Sources: SAE J1939-71 and ISO 11783-7 (top codes of a range: valid to 0xFA.., error 0xFE..,
+not available 0xFF..); the field's habit of keeping the most negative code of a signed signal
+for "not available".
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from cantools.database.can import Signal
+from numpy.typing import NDArray
+
+from soilbus.can.channels import Channel, Reason
+from soilbus.can.decode import SignalColumn, code_limits
+
+REASONS = tuple(Reason)
+"""A sample's verdict v: 0 admitted, else refused for REASONS[v - 1]."""
+
+Verdicts = NDArray[np.uint8]
+
+_VERDICT = {reason: np.uint8(i + 1) for i, reason in enumerate(REASONS)}
+_BANDS = {2: (2, 2, 3), 4: (14, 14, 15), 8: (0xFB, 0xFE, 0xFF)}
+_BANDS |= {bits: (0xFB << bits - 8, 0xFE << bits - 8, 0xFF << bits - 8) for bits in (16, 32)}
+
+_NO_FAULT = re.compile(r"\b(no|not|without|non) (an )?(errors?|faults?|failures?)\b|\b(error|fault) free\b")
+_NOT_AVAILABLE = re.compile(r"\b(sna|n a|na|unavailable|not ?(avail\w*|installed|present)|no (data|signal))\b")
+_ERROR = re.compile(r"\b(err|errors?|invalid|not valid|faults?|faulty|fail(ed|ure)?|defect(ive)?|malfunction)\b")
+_RESERVED = re.compile(r"\b(reserved|rsvd)\b")
+
+
+@dataclass(frozen=True, slots=True)
+class CodeRule:
+    """Codes of one signal that carry a value.
+
+    `low`..`high` are raw codes for integer signals and physical values for float signals (the
+    DBC's range, or all that the bits can hold); `bands` the first reserved, error and
+    not-available codes above `high`; `special` single codes with a meaning of their own.
+    """
+
+    low: float
+    high: float
+    is_float: bool
+    bands: tuple[int, int, int] | None
+    special: tuple[tuple[int, Reason], ...]
+
+
+def rule_of(signal: Signal) -> CodeRule:
+    """The rule that a signal's DBC entry implies."""
+    named = tuple((code, reason) for code, name in (signal.choices or {}).items() if (reason := meaning(str(name))))
+    if signal.conversion.is_float:
+        low, high = _float_range(signal)
+        return CodeRule(low, high, True, None, named)
+    first, last = code_limits(signal)
+    least, greatest = _code_range(signal, first, last)
+    special: dict[int, Reason] = {}
+    if signal.length >= 8 and signal.is_signed:
+        special = {first: Reason.NOT_AVAILABLE, last: Reason.SATURATED}
+    elif signal.length >= 8:
+        special = {last: Reason.NOT_AVAILABLE}
+    bands = None if signal.is_signed else _BANDS.get(signal.length)
+    return CodeRule(least, greatest, False, bands, tuple((special | dict(named)).items()))
+
+
+def meaning(name: str) -> Reason | None:
+    """Why a code of that name in a value table is no value; None when it is one."""
+    words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
+    text = " ".join(re.findall(r"[a-z0-9]+", words.lower()))
+    if _NOT_AVAILABLE.search(text):
+        return Reason.NOT_AVAILABLE
+    if _ERROR.search(_NO_FAULT.sub("", text)):
+        return Reason.ERROR
+    return Reason.RESERVED if _RESERVED.search(text) else None
+
+
+def judge_codes(rule: CodeRule, raw: NDArray[Any], physical: NDArray[Any]) -> Verdicts:
+    """Verdict (N,) on the signal's own codes: special codes before the range."""
+    verdict = np.zeros(len(raw), dtype=np.uint8)
+    seen = physical if rule.is_float else raw
+    outside = (seen < rule.low) | (seen > rule.high)
+    if outside.any():
+        verdict[outside] = _VERDICT[Reason.OUT_OF_RANGE]
+        if rule.bands is not None:
+            _mark_bands(verdict, raw, outside & (raw > rule.high), rule.bands)
+    if rule.is_float:
+        verdict[~np.isfinite(physical)] = _VERDICT[Reason.NOT_FINITE]
+    for code, reason in rule.special:
+        verdict[raw == code] = _VERDICT[reason]
+    return verdict
+
+
+def judge_validity(channel: Channel, length: int, signed: bool, column: SignalColumn) -> Verdicts:
+    """Verdict (N,) of the signal that vouches for another one, `length` bits long."""
+    raw = column.raw
+    verdict = np.full(len(raw), _VERDICT[Reason.NOT_VALID], dtype=np.uint8)
+    bands = None if signed else _BANDS.get(length)
+    if bands is not None:
+        verdict[raw >= bands[1]] = _VERDICT[Reason.ERROR]
+        verdict[raw >= bands[2]] = _VERDICT[Reason.NOT_AVAILABLE]
+    for code in channel.valid_values:
+        verdict[raw == code] = 0
+    if column.present is not None:
+        verdict[~column.present] = _VERDICT[Reason.NOT_VALID]
+    return verdict
+
+
+def in_si(channel: Channel, physical: NDArray[Any], verdict: Verdicts) -> NDArray[np.float64]:
+    """Values (N,) in SI; marks in `verdict` those admitted so far that are implausible."""
+    with np.errstate(over="ignore"):
+        value: NDArray[np.float64] = channel.factor * physical.astype(np.float64) + channel.offset
+    inside = (value >= channel.low) & (value <= channel.high)  # False for nan
+    if not inside.all():
+        verdict[(verdict == 0) & ~inside] = _VERDICT[Reason.IMPLAUSIBLE]
+    return value
+
+
+def _mark_bands(
+    verdict: Verdicts, raw: NDArray[Any], above: NDArray[np.bool_], bands: tuple[int, int, int]
+) -> None:
+    reasons = (Reason.RESERVED, Reason.ERROR, Reason.NOT_AVAILABLE)
+    for first, reason in zip(bands, reasons, strict=True):
+        verdict[above & (raw >= first)] = _VERDICT[reason]
+
+
+def _has_range(signal: Signal) -> bool:
+    if signal.minimum is None and signal.maximum is None:
+        return False
+    return not signal.minimum == signal.maximum == 0
+
+
+def _float_range(signal: Signal) -> tuple[float, float]:
+    """Physical limits; a float32 signal may pass a limit by its own rounding."""
+    if not _has_range(signal):
+        return -math.inf, math.inf
+    low = -math.inf if signal.minimum is None else float(signal.minimum)
+    high = math.inf if signal.maximum is None else float(signal.maximum)
+    eps = 2.0**-52 if signal.length == 64 else 2.0**-23 if signal.length == 32 else 2.0**-10
+    return low - eps * abs(low), high + eps * abs(high)
+
+
+def _code_range(signal: Signal, first: int, last: int) -> tuple[int, int]:
+    """Least and greatest raw code within the DBC's range.
+
+    Printed limits are often rounded (4095.8 for 4095.875), so a limit between two codes
+    admits the outer one.
+    """
+    if not _has_range(signal):
+        return first, last
+    scale, offset = signal.scale, signal.offset
+    low, high = signal.minimum, signal.maximum
+    if scale < 0:
+        low, high = high, low
+    least = first if low is None else _outer((low - offset) / scale, math.floor)
+    greatest = last if high is None else _outer((high - offset) / scale, math.ceil)
+    return max(least, first), min(greatest, last)
+
+
+def _outer(code: float, rounded: Callable[[float], int]) -> int:
+    nearest = round(code)
+    return nearest if abs(code - nearest) <= 1e-6 + 1e-12 * abs(code) else rounded(code)

@@ -1,0 +1,168 @@
+"""The simulated tractor: what truly happens at every instant of a scenario.
+
+Quasi-static: at 50 samples a second, ground speed and its rate of change are given, and
+slip, draft, loads, sinkages and torques are those at which the wheel-soil model balances
+exactly.  Straight ahead: turning is not modelled, a side slope only shifts load.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.config import Config, Wheel
+from soilbus.simulator.equilibrium import Equilibrium, Situation, solve
+from soilbus.simulator.scenario import SAMPLE_RATE, Scenario, Swing, realise, soil_along, soil_names
+from soilbus.terra.stress import Array
+from soilbus.terra.vehicle import Chassis, axle_loads, pull_required
+from soilbus.terra.wheel import WheelModel, sinkage
+
+
+class SimulationError(Exception):
+    """The scenario cannot be driven with this configuration; one line says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """Truth of a drive: columns (N,) by name, in SI.
+
+    t, distance, ground_speed, acceleration, pitch, draft, demand (nan where slip was
+    prescribed), soil (names); and for each wheel W slip.W, entry_angle.W, sinkage.W, load.W,
+    torque.W (at the wheel), drawbar_pull.W, speed.W [rad/s], torque_limit.W (nan: unknown).
+    The drive ends early, at `bogged_at` [s], where no slip lets the tractor go on.
+    """
+
+    columns: dict[str, NDArray[Any]]
+    bogged_at: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Motion:
+    t: Array
+    distance: Array
+    speed: Array
+    acceleration: Array
+    pitch: Array
+
+
+def drive(config: Config, scenario: Scenario, seed: int) -> Drive:
+    """Drive the configured vehicle through one realisation of the scenario.
+
+    Raises SimulationError without a vehicle, with effects, and where the tractor cannot
+    even start; KeyError for an unknown soil.
+    """
+    chassis = _chassis(config)
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(scenario.duration * SAMPLE_RATE)) / SAMPLE_RATE
+    speed = realise(scenario.speed, t, rng)
+    knots = np.array(scenario.slope, float)
+    pitch = np.interp(speed.integral, knots[:, 0], knots[:, 1])
+    motion = _Motion(t, speed.integral, speed.value, speed.rate, pitch)
+    situation = _situation(config.wheel, chassis, scenario, motion, rng)
+    result = solve(situation, WheelModel(shear_law=config.model.shear_law))
+    stuck = np.flatnonzero(~result.found)
+    end = int(stuck[0]) if len(stuck) else len(t)
+    if end < 2:
+        soil = soil_names(scenario.soils, motion.distance[:1])[0]
+        raise SimulationError(f"the tractor cannot drive on {soil}: no slip lets it move")
+    columns = _columns(config.wheel, scenario, motion, situation, result)
+    return Drive({name: column[:end] for name, column in columns.items()}, float(t[end]) if len(stuck) else None)
+
+
+def _chassis(config: Config) -> Chassis:
+    if config.vehicle is None or not config.wheel:
+        raise SimulationError("the simulator needs a [vehicle] with [[wheel]]s")
+    if {wheel.axle for wheel in config.wheel} != {"front", "rear"}:
+        raise SimulationError("the simulator needs wheels on both axles")
+    if config.model.effects:
+        raise SimulationError("model.effects: the simulator has no effects yet")
+    v = config.vehicle
+    return Chassis(v.mass, v.wheelbase, v.cg_ahead_of_rear_axle, v.cg_height, v.hitch_height)
+
+
+def _situation(
+    wheels: list[Wheel], chassis: Chassis, scenario: Scenario, motion: _Motion, rng: np.random.Generator
+) -> Situation:
+    shape = (len(wheels), len(motion.t))
+    side = realise(scenario.side_shift, motion.t, rng).value
+    share = np.stack([_load_share(wheels, i, side) for i in range(len(wheels))])
+
+    def loads(draft: float) -> Array:
+        front, rear = axle_loads(chassis, draft, motion.pitch, motion.acceleration)
+        return np.asarray(share * np.stack([front if wheel.axle == "front" else rear for wheel in wheels]))
+
+    test_draft = chassis.mass  # any draft will do, loads are linear in it
+    level = loads(0.0)
+    ahead = {"front": chassis.wheelbase - chassis.cg_ahead_of_rear_axle, "rear": -chassis.cg_ahead_of_rear_axle}
+    position = np.stack([motion.distance + ahead[wheel.axle] for wheel in wheels])
+    soil = soil_along(scenario.soils, position, scenario.transition)
+    spread = Swing(-scenario.slip_spread, scenario.slip_spread)
+    limits = [wheel.max_torque or np.inf for wheel in wheels]
+
+    def each_wheel(values: list[float]) -> Array:
+        return np.broadcast_to(np.array(values)[:, None], shape)
+
+    demand, slip_limit, least = _driver(scenario, motion.t, rng)
+    return Situation(
+        pull_required(chassis, 0.0, motion.pitch, motion.acceleration),
+        level,
+        (loads(test_draft) - level) / test_draft,
+        np.stack([realise(spread, motion.t, rng).value for _ in wheels]),
+        each_wheel([wheel.radius for wheel in wheels]),
+        each_wheel([wheel.width for wheel in wheels]),
+        np.array(soil),
+        demand,
+        slip_limit,
+        each_wheel(limits),
+        least,
+    )
+
+
+def _load_share(wheels: list[Wheel], index: int, side: Array) -> Array:
+    """Share (N,) of its axle's load on one wheel; wheels of an axle are listed left to right."""
+    mates = [i for i, wheel in enumerate(wheels) if wheel.axle == wheels[index].axle]
+    place = np.linspace(1.0, -1.0, len(mates))[mates.index(index)] if len(mates) > 1 else 0.0
+    return np.asarray((1.0 + place * side) / len(mates))
+
+
+def _driver(scenario: Scenario, t: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Demanded draft, slip limit and least draft, each (N,)."""
+    if scenario.slip is not None:
+        unbounded = np.full(len(t), np.inf)
+        return unbounded, realise(scenario.slip, t, rng).value, -unbounded
+    assert scenario.draft is not None  # Scenario sees to it
+    demand = realise(scenario.draft, t, rng).value
+    return demand, realise(scenario.lift_slip, t, rng).value, np.minimum(demand, 0.0)
+
+
+def _columns(
+    wheels: list[Wheel], scenario: Scenario, motion: _Motion, situation: Situation, result: Equilibrium
+) -> dict[str, NDArray[Any]]:
+    columns: dict[str, NDArray[Any]] = {
+        "t": motion.t,
+        "distance": motion.distance,
+        "ground_speed": motion.speed,
+        "acceleration": motion.acceleration,
+        "pitch": motion.pitch,
+        "draft": result.draft,
+        "demand": np.where(np.isfinite(situation.demand), situation.demand, np.nan),
+        "soil": np.array(soil_names(scenario.soils, motion.distance)),
+    }
+    slip = result.slip + situation.deviation
+    limit = np.where(np.isfinite(situation.torque_limit), situation.torque_limit, np.nan)
+    for i, wheel in enumerate(wheels):
+        of_wheel = {
+            "slip": slip[i],
+            "entry_angle": result.entry_angle[i],
+            "sinkage": sinkage(result.entry_angle[i], wheel.radius),
+            "load": situation.level_load[i] + situation.load_per_draft[i] * result.draft,
+            "drawbar_pull": result.forces[1, i],
+            "torque": result.forces[2, i],
+            "speed": motion.speed / (wheel.radius * (1.0 - slip[i])),
+            "torque_limit": limit[i],
+        }
+        columns |= {f"{quantity}.{wheel.name}": column for quantity, column in of_wheel.items()}
+    return columns

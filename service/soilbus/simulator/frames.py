@@ -1,0 +1,174 @@
+"""Sensor series -> CAN frames of the vehicle's own DBC, to a log or a bus."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+import can
+import numpy as np
+from cantools.database import Database
+from cantools.database.can import Message, Signal
+from numpy.typing import NDArray
+
+from soilbus.can.channels import Channel
+from soilbus.can.checksum import column_checksums
+from soilbus.can.mapping import channels_of, load_databases
+from soilbus.can.publish import COUNTER, checksum_byte, value_codes
+from soilbus.config import Config, Wheel
+from soilbus.simulator.recording import Recording
+from soilbus.simulator.sensors import channel_rng
+from soilbus.terra.stress import Array
+
+START = 1_700_000_000.0
+"""Time stamp [s] of a recording's first instant: logs hold wall clock time."""
+_JITTER = 1e-3
+_PHASE = 0.9e-3
+_PHASES = 12
+
+Payload = NDArray[np.uint8]
+
+
+def frames(
+    recording: Recording, config: Config, database: Database | None = None, start: float = START
+) -> Iterator[can.Message]:
+    """The recording's frames in the order of their time stamps.
+
+    Every message that carries a mapped channel is sent at the rate of its fastest channel,
+    each with a phase of its own and up to 1 ms of jitter; a slower channel repeats its last
+    value.  `database` defaults to the configured DBC files.  Signals that nothing is mapped
+    to are not available, save those that follow from the drive (see `_beside`).  Raises
+    ConfigError as `channels_of`, ValueError for a mapped message that cannot be encoded.
+    """
+    database = database if database is not None else load_databases(config)
+    times: list[Array] = []
+    payloads: list[Payload] = []
+    messages: list[Message] = []
+    for number, (name, channels) in enumerate(_by_message(channels_of(config, database)).items()):
+        message = database.get_message_by_name(name)
+        t, values = _sampled(recording, channels)
+        values |= _beside(recording, config.wheel, message, channels, t)
+        jitter = channel_rng(recording.seed, name).uniform(0.0, _JITTER, len(t))
+        times.append(start + t + _PHASE * (number % _PHASES) + jitter)
+        payloads.append(encoded(message, _raw_codes(message, channels, values, len(t))))
+        messages.append(message)
+    if times:
+        yield from _in_order(times, payloads, messages, str(config.bus.channel))
+
+
+def write_log(messages: Iterable[can.Message], path: Path) -> None:
+    """Write a log in the format of the file's suffix (.log, .asc, .blf, .log.gz ...).
+
+    The file appears only when it is complete.  Raises ValueError for an unknown suffix,
+    OSError where it cannot be written.
+    """
+    suffixes = "".join(path.suffixes[-2:] if path.suffix.lower() == ".gz" else path.suffixes[-1:])
+    part = path.with_name(f".soilbus-{os.getpid()}{suffixes}")
+    try:
+        with can.Logger(part) as log:
+            for message in messages:
+                log(message)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def encoded(message: Message, codes: Mapping[str, NDArray[np.int64]]) -> Payload:
+    """Payloads (N, length) from raw codes (N,) by signal name.
+
+    Bits of no signal are ones; Checksum, where the message has one, is computed last.
+    """
+    length = message.length
+    n_frames = len(next(iter(codes.values())))
+    bits = np.ones((n_frames, 8 * length), np.uint8)  # in the order of numpy's packbits
+    for signal in message.signals:
+        if signal.name in codes:
+            shifts = np.arange(signal.length)
+            bits[:, _bit_columns(signal)] = (codes[signal.name][:, None] >> shifts) & 1
+    payload = np.packbits(bits, axis=1)
+    place = checksum_byte(message)
+    if place is not None:
+        identifiers = np.full(n_frames, message.frame_id, np.int64)
+        payload[:, place] = column_checksums(identifiers, payload, place)
+    return payload
+
+
+def _bit_columns(signal: Signal) -> NDArray[np.intp]:
+    """Columns of a signal's bits, least significant first, where column 0 is bit 7 of byte 0."""
+    if signal.byte_order == "big_endian":
+        last = 8 * (signal.start // 8) + 7 - signal.start % 8 + signal.length - 1
+        return last - np.arange(signal.length)
+    position = signal.start + np.arange(signal.length)
+    return np.asarray(8 * (position // 8) + 7 - position % 8)
+
+
+def _by_message(channels: Iterable[Channel]) -> dict[str, list[Channel]]:
+    groups: dict[str, list[Channel]] = {}
+    for channel in channels:
+        groups.setdefault(channel.message, []).append(channel)
+    return groups
+
+
+def _sampled(recording: Recording, channels: list[Channel]) -> tuple[Array, dict[str, Array]]:
+    """Sample times [s] of one message and its mapped signals in the DBC's units."""
+    columns = [recording.channels[channel.name] for channel in channels]
+    t = max((column.t for column in columns), key=len)
+    values = {}
+    for channel, column in zip(channels, columns, strict=True):
+        latest = np.maximum(np.searchsorted(column.t, t + 1e-9) - 1, 0)
+        values[channel.signal] = (column.value[latest] - channel.offset) / channel.factor
+    return t, values
+
+
+def _beside(
+    recording: Recording, wheels: list[Wheel], message: Message, channels: list[Channel], t: Array
+) -> dict[str, Array]:
+    """What a real vehicle sends beside the mapped signals, where the signal's name tells it."""
+    truth, mapped = recording.truth, {channel.signal for channel in channels}
+    gears = {wheel.name: wheel.gear_ratio for wheel in wheels}
+    motor = next((c.wheel for c in channels if c.quantity == "torque"), None)
+    known = {
+        "GroundBasedMachineDistance": truth["distance"],
+        "GroundBasedMachineDirection": np.ones_like(truth["t"]),
+    }
+    if motor is not None:
+        known["ShaftSpeed"] = truth[f"speed.{motor}"] * gears[motor] * 30.0 / math.pi
+    names = {signal.name for signal in message.signals} - mapped
+    return {name: np.interp(t, truth["t"], known[name]) for name in known.keys() & names}
+
+
+def _raw_codes(
+    message: Message, channels: list[Channel], values: Mapping[str, Array], n_frames: int
+) -> dict[str, NDArray[np.int64]]:
+    codes: dict[str, NDArray[np.int64]] = {}
+    for signal in message.signals:
+        if signal.name in values:
+            codes[signal.name] = value_codes(signal).column(values[signal.name])
+    for channel in channels:
+        if channel.valid_signal is not None and channel.valid_values:
+            codes[channel.valid_signal] = np.full(n_frames, channel.valid_values[0])
+    for signal in message.signals:
+        if signal.name == COUNTER:
+            codes[COUNTER] = np.arange(n_frames) % (1 << signal.length)
+    return codes
+
+
+def _in_order(
+    times: list[Array], payloads: list[Payload], messages: list[Message], channel: str
+) -> Iterator[can.Message]:
+    stamps = np.concatenate(times)
+    owner = np.repeat(np.arange(len(times)), [len(t) for t in times])
+    row = np.concatenate([np.arange(len(t)) for t in times])
+    data = [[bytes(line) for line in payload] for payload in payloads]
+    for i in np.argsort(stamps, kind="stable"):
+        message = messages[owner[i]]
+        yield can.Message(
+            timestamp=float(stamps[i]),
+            arbitration_id=message.frame_id,
+            is_extended_id=message.is_extended_frame,
+            is_fd=message.is_fd,
+            data=data[owner[i]][row[i]],
+            channel=channel,
+        )

@@ -1,0 +1,148 @@
+"""What the simulated tractor is asked to do: soils along its way, speed, draft or slip.
+
+A scenario is plain data; the seed given to the simulation picks one realisation of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from soilbus.terra.soils import soil_named
+from soilbus.terra.stress import Array
+from soilbus.terra.wheel import Soil
+
+SAMPLE_RATE = 50.0
+"""Samples of the truth a second [Hz]."""
+_N_SINES = 4
+_REFERENCE_TIME = 60.0  # s; a shorter scenario shows a part of such a wave, not a steeper one
+
+
+@dataclass(frozen=True, slots=True)
+class Swing:
+    """A quantity that wanders between low and high as a sum of slow sines.
+
+    Slow (0.05 to 0.12 Hz by default), so that what the tractor does between two samples
+    is nothing, and many states of the wheels are seen within one estimation window.
+    """
+
+    low: float
+    high: float
+    slowest: float = 0.05
+    fastest: float = 0.12
+
+
+class Wave(NamedTuple):
+    """One realisation of a swing: value, rate of change [1/s], integral from the start [s]; each (N,)."""
+
+    value: Array
+    rate: Array
+    integral: Array
+
+
+def realise(swing: Swing, t: Array, rng: np.random.Generator) -> Wave:
+    """A random wave at the times t [s] (N,), ascending from 0; it never leaves low..high."""
+    edges = np.linspace(swing.slowest, swing.fastest, _N_SINES + 1)
+    omega = 2.0 * np.pi * rng.uniform(edges[:-1], edges[1:])
+    phase = rng.uniform(0.0, 2.0 * np.pi, _N_SINES)
+
+    def total(shape: Array) -> Array:
+        return np.asarray(shape.sum(axis=0))
+
+    def angle(at: Array) -> Array:
+        return omega[:, None] * at + phase[:, None]
+
+    reference = np.linspace(0.0, max(_REFERENCE_TIME, float(t[-1])), 4096)
+    seen = total(np.sin(angle(reference)))
+    gain = (swing.high - swing.low) / (seen.max() - seen.min())
+    base = swing.low - gain * seen.min()
+    value = np.clip(base + gain * total(np.sin(angle(t))), swing.low, swing.high)
+    rate = gain * total(omega[:, None] * np.cos(angle(t)))
+    area = total((np.cos(phase)[:, None] - np.cos(angle(t))) / omega[:, None])
+    return Wave(value, rate, base * t + gain * area)
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """Soil from a distance [m] on; a name of terra.soils, or the soil itself with a name."""
+
+    start: float
+    name: str
+    soil: Soil | None = None
+
+    def parameters(self) -> Soil:
+        """The soil; KeyError for a name that terra.soils does not know."""
+        return self.soil if self.soil is not None else soil_named(self.name)
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """One drive.
+
+    `speed` is the ground speed [m/s].  Exactly one of `draft` (what the implement asks for
+    [N]) and `slip` (common slip ratio of all wheels) is given.  With `draft`, the driver
+    lifts the implement as far as it takes to keep slip below `lift_slip`, and never pushes.
+    `slip_spread` is how far single wheels leave the common slip, `side_shift` the share of
+    an axle's load that a side slope moves to its left wheel (negative: to the right),
+    `slope` knots (distance [m], pitch [rad]) with straight lines between them,
+    `transition` the length [m] over which one soil turns into the next.
+    """
+
+    duration: float
+    soils: Sequence[Patch]
+    speed: Swing = Swing(1.0, 1.8)
+    draft: Swing | None = None
+    slip: Swing | None = None
+    lift_slip: Swing = Swing(0.45, 0.45)
+    slip_spread: float = 0.015
+    side_shift: Swing = Swing(-0.15, 0.15)
+    slope: Sequence[tuple[float, float]] = ((0.0, 0.0),)
+    transition: float = 1.0
+
+    def __post_init__(self) -> None:
+        """ValueError for a scenario that cannot be driven."""
+        starts = [patch.start for patch in self.soils]
+        if not starts or starts != sorted(set(starts)):
+            raise ValueError("soils: at least one, at ascending distances")
+        if (self.draft is None) == (self.slip is None):
+            raise ValueError("exactly one of draft and slip must be given")
+        if self.duration * SAMPLE_RATE < 2.0:
+            raise ValueError(f"duration: {self.duration} s is too short")
+        if self.speed.low <= 0.0 or self.transition <= 0.0:
+            raise ValueError("speed and transition must be above zero")
+
+
+def soil_along(patches: Sequence[Patch], position: Array, transition: float) -> Soil:
+    """Soil parameters at positions [m] of any shape: a Soil of arrays of that shape."""
+    rows = [np.array(patch.parameters()) for patch in patches]
+    values = np.multiply.outer(rows[0], np.ones_like(position))
+    for patch, before, after in zip(patches[1:], rows, rows[1:], strict=False):
+        share = np.clip((position - patch.start) / transition, 0.0, 1.0)
+        values += np.multiply.outer(after - before, share)
+    return Soil(*values)
+
+
+def soil_names(patches: Sequence[Patch], position: Array) -> list[str]:
+    """Name of the soil at each position [m] (N,)."""
+    index = np.searchsorted([patch.start for patch in patches[1:]], position, side="right")
+    return [patches[int(i)].name for i in index]
+
+
+def excited(soil: str = "loam", duration: float = 120.0) -> Scenario:
+    """One soil, slip swept from 0.05 to 0.4: the drive that tells most of the soil."""
+    return Scenario(duration, (Patch(0.0, soil),), slip=Swing(0.05, 0.40))
+
+
+def demo(duration: float = 60.0, first: str = "loam", second: str = "xi_wet_clay") -> Scenario:
+    """Half the time on the first soil, then the same work on the second.
+
+    The draft asked for is easy on loam and more than wet clay can hold: there the driver
+    lifts the implement to get through at all, at slips that a careful driver avoids.
+    """
+    speed = Swing(1.2, 1.6)
+    halfway = duration / 2.0 * (speed.low + speed.high) / 2.0
+    soils = (Patch(0.0, first), Patch(halfway, second))
+    return Scenario(duration, soils, speed, draft=Swing(2000.0, 4000.0), lift_slip=Swing(0.50, 0.65))

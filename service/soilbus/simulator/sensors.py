@@ -1,0 +1,67 @@
+"""What the sensors make of the truth: rates, noise, gain errors; quantisation is the frames' part."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+
+import numpy as np
+
+from soilbus.can.channels import Column
+from soilbus.config import Config, Noise
+from soilbus.simulator.drive import Drive
+from soilbus.simulator.scenario import SAMPLE_RATE
+from soilbus.terra.stress import Array
+
+_DIVIDERS = {"ground_speed": 2}  # radars give 25 Hz; all other sensors every sample of the truth
+_EXACT = frozenset({"torque_limit"})  # told by the motor controller, not measured
+
+
+def channel_rng(seed: int, name: str) -> np.random.Generator:
+    """Random numbers of one channel or message: the same whatever else is fitted."""
+    return np.random.default_rng([seed, zlib.crc32(name.encode())])
+
+
+def fitted(config: Config) -> Iterator[tuple[str, str]]:
+    """(quantity, wheel or "") of every channel that the configuration maps."""
+    for wheel in config.wheel:
+        for quantity in ("torque", "speed", "load", "sinkage", "torque_limit"):
+            if getattr(wheel, quantity) is not None:
+                yield quantity, wheel.name
+    for quantity in ("ground_speed", "draft", "pitch", "acceleration"):
+        if getattr(config.signals, quantity) is not None:
+            yield quantity, ""
+
+
+def measure(drive: Drive, config: Config, seed: int) -> dict[str, Column]:
+    """Noisy samples of every mapped channel, SI, by channel name (can.channels).
+
+    Each value is truth times a gain fixed for the drive, plus white noise (config [noise]).
+    """
+    columns: dict[str, Column] = {}
+    t = drive.columns["t"]
+    for quantity, wheel in fitted(config):
+        name = f"{quantity}.{wheel}" if wheel else quantity
+        every = slice(None, None, _DIVIDERS.get(quantity, 1))
+        truth = drive.columns[name]
+        if quantity not in _EXACT:
+            truth = disturbed(truth, getattr(config.noise, quantity), config.estimator.window, channel_rng(seed, name))
+        columns[name] = Column(t[every].copy(), truth[every].copy())
+    return columns
+
+
+def disturbed(truth: Array, noise: Noise, window: float, rng: np.random.Generator) -> Array:
+    """Truth (N,) at SAMPLE_RATE with gain error and noise; `of_mean` refers to the mean over `window` [s]."""
+    gain = 1.0 + noise.gain * rng.standard_normal()
+    mean = _running_mean(np.abs(truth), round(window * SAMPLE_RATE))
+    sd = np.sqrt(noise.absolute**2 + (noise.relative * truth) ** 2 + (noise.of_mean * mean) ** 2)
+    return np.asarray(gain * truth + sd * rng.standard_normal(len(truth)))
+
+
+def _running_mean(values: Array, width: int) -> Array:
+    """Mean over up to `width` samples around each one, fewer at the ends."""
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    index = np.arange(len(values))
+    first = np.maximum(index - width // 2, 0)
+    last = np.minimum(first + max(width, 1), len(values))
+    return np.asarray((total[last] - total[first]) / (last - first))

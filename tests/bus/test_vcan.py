@@ -1,0 +1,205 @@
+"""The daemon on a real bus says what `replay` of the same bus says.
+
+The field recording is played onto vcan0 in real time by canplayer, candump writes the bus
+down, cantools reads our frames there; `replay` of candump's log is the reference.
+"""
+
+from __future__ import annotations
+
+import gzip
+import itertools
+import json
+import math
+import re
+import subprocess
+import sys
+from collections import defaultdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import can
+import cantools
+import pytest
+from cantools.database.can import Database, Signal
+
+REPO = Path(__file__).resolve().parents[2]
+CONFIG = REPO / "tests/field/field.toml"
+RECORDING = REPO.parent / "shared/field/loam.log.gz"
+LIVE = Path(__file__).with_name("live.py")
+SECONDS = 25.0
+HOP = 1.0
+FIRST_WINDOW = 10.0
+
+SI = {"": 1.0, "N": 1.0, "rad": 1.0, "kPa": 1e3, "mm": 1e-3, "deg": math.pi / 180}
+SI |= {"kN/m^(n+1)": 1e3, "kN/m^(n+2)": 1e3}
+STATUS = ["invalid", "not_excited", "degraded", "valid"]
+PARAMETERS = {"k_c": "SoilCohesiveModulus", "k_phi": "SoilFrictionalModulus", "n": "SoilSinkageExponent"}
+PARAMETERS |= {"phi": "SoilFrictionAngle", "c": "SoilCohesion", "K": "SoilShearModulus"}
+# (message, signal) of a window's frames -> where `replay --json` has the value
+SAME = {
+    ("SoilStrength", "BearingPressure"): ("bearing_pressure", "value"),
+    ("SoilStrength", "BearingPressureStd"): ("bearing_pressure", "std"),
+    ("DraftCapability", "MaxDraft"): ("traversability", "max_draft", "value"),
+    ("GradeCapability", "MaxGrade"): ("traversability", "max_grade", "value"),
+    **{(message, "Value"): ("soil", name, "value") for name, message in PARAMETERS.items()},
+    **{(message, "Std"): ("soil", name, "std") for name, message in PARAMETERS.items()},
+    **{("WheelSinkage", f"SinkageWheel{i}"): ("sinkage", w) for i, w in enumerate(("FL", "FR", "RL", "RR"), 1)},
+}
+
+
+class Frame(NamedTuple):
+    t: float
+    arbitration_id: int
+    data: bytes
+    values: dict[str, Any]
+
+
+class Run(NamedTuple):
+    database: Database
+    frames: dict[str, list[Frame]]  # ours, by message name
+    windows: list[dict[str, Any]]  # what replay says
+    filters: list[tuple[int, int]]  # id and mask, with the extended flag, of the service's sockets
+    end: float
+
+
+@pytest.fixture(scope="module")
+def live(vcan_run, tool, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    tool("candump"), tool("canplayer")
+    if not RECORDING.exists():
+        pytest.skip(f"no {RECORDING}")
+    out = tmp_path_factory.mktemp("live")
+    _first(RECORDING, SECONDS, out / "played.log")
+    done = vcan_run([sys.executable, LIVE, CONFIG, out / "played.log", out], rw=[out], timeout=180.0)
+    assert done.returncode == 0, done.stdout
+    soilbus = [sys.executable, "-c", "import sys; from soilbus.cli import main; sys.exit(main())"]
+    subprocess.run(
+        [*soilbus, "replay", "--config", CONFIG, out / "bus.log", "--json", out / "replay.jsonl"], check=True
+    )
+    database = cantools.database.load_file(REPO / "dbc/soilbus.dbc")
+    frames = defaultdict(list)
+    names = {message.frame_id: message.name for message in database.messages}
+    t = 0.0
+    for frame in can.LogReader(out / "bus.log"):
+        t = frame.timestamp
+        if name := frame.is_extended_id and names.get(frame.arbitration_id):
+            values = database.decode_message(name, bytes(frame.data), decode_choices=False)
+            frames[name].append(Frame(t, frame.arbitration_id, bytes(frame.data), values))
+    windows = [json.loads(line) for line in (out / "replay.jsonl").read_text().splitlines()]
+    return Run(database, frames, windows, _filters((out / "filters").read_text()), t)
+
+
+def _first(recording: Path, seconds: float, to: Path) -> None:
+    with gzip.open(recording, "rt") as lines:
+        first = next(lines)
+        end = float(first[1 : first.index(")")]) + seconds
+        rest = itertools.takewhile(lambda line: float(line[1 : line.index(")")]) < end, lines)
+        to.write_text(first + "".join(rest))
+
+
+def _filters(lists: str) -> list[tuple[int, int]]:
+    """The kernel's receive lists of vcan0, without candump's one entry for everything."""
+    found = re.findall(r"^ +vcan0 +([0-9a-f]+) +([0-9a-f]+) ", lists, re.MULTILINE | re.IGNORECASE)
+    pairs = [(int(i, 16), int(mask, 16)) for i, mask in found]
+    pairs.remove((0, 0))
+    return pairs
+
+
+@pytest.mark.vcan
+def test_the_kernel_passes_mapped_frames_only(live: Run) -> None:
+    def passes(i: int) -> bool:
+        return any(i & mask == wanted & mask for wanted, mask in live.filters)
+
+    extended = 1 << 31
+    mapped = [0x510, 0x520, 0x530, 0x540, 0x550, *(extended | i for i in (0x18FF2210, 0x18FF2213, 0x18FE4997))]
+    assert [hex(i) for i in mapped if not passes(i)] == []
+    ours = [extended | message.frame_id for message in live.database.messages]
+    assert [hex(i) for i in (0x123, 0x7FF, extended | 0x18FF2214, extended | 0x18FEF197, *ours) if passes(i)] == []
+
+
+@pytest.mark.vcan
+def test_windows_carry_the_numbers_of_replay(live: Run) -> None:
+    ended = [(frame, _window_of(live, frame)) for frame in live.frames["SoilStrength"]]
+    assert len(ended) >= (SECONDS - FIRST_WINDOW) / HOP
+    assert sum(window["status"] == "valid" for _, window in ended) >= 10
+    ends = [window["t"] for _, window in ended]
+    assert ends == [w["t"] for w in live.windows if ends[0] <= w["t"] <= ends[-1]]  # none missing, none twice
+    wrong = []
+    for soil, window in ended:
+        assert STATUS[soil.values["Status"]] == window["status"]
+        for (message, signal), path in SAME.items():
+            frame = _sibling(live, message, soil)
+            told = _told(window, path)
+            if not _same(live.database.get_message_by_name(message).get_signal_by_name(signal), frame, told):
+                wrong.append((window["t"], message, signal, frame.values[signal], told))
+    assert wrong == []
+
+
+@pytest.mark.vcan
+def test_traversability_carries_the_verdict_of_replay(live: Run) -> None:
+    states = ["unknown", "no_go", "caution", "go"]
+    verdict = live.database.get_message_by_name("Traversability")
+    assert {c: str(t) for c, t in verdict.get_signal_by_name("State").choices.items() if c < 4} == dict(
+        enumerate(states)
+    )
+    for soil in live.frames["SoilStrength"]:
+        window = _window_of(live, soil)["traversability"]
+        frame = _sibling(live, "Traversability", soil)
+        assert states[frame.values["State"]] == window["state"]
+        assert _same(verdict.get_signal_by_name("Probability"), frame, window["probability"])
+
+
+@pytest.mark.vcan
+def test_frames_keep_their_cycle(live: Run) -> None:
+    for name in ("WheelSlip", "Traversability", "SoilbusStatus"):
+        cycle = live.database.get_message_by_name(name).cycle_time / 1000
+        frames = live.frames[name]
+        duration = live.end - frames[0].t
+        assert duration > SECONDS - 1
+        assert len(frames) == pytest.approx(duration / cycle, rel=0.05, abs=2)
+
+
+@pytest.mark.vcan
+def test_counters_and_checksums_hold(live: Run) -> None:
+    assert set(live.frames) >= {"WheelSlip", "Traversability", "SoilStrength", "SoilbusStatus", *PARAMETERS.values()}
+    for name, frames in live.frames.items():
+        counters = [frame.values["Counter"] for frame in frames]
+        assert {(b - a) % 16 for a, b in itertools.pairwise(counters)} <= {1}, name
+        for frame in frames:
+            assert frame.data[7] == _crc8(frame.arbitration_id.to_bytes(4, "little") + frame.data[:7]), name
+
+
+def _window_of(live: Run, frame: Frame) -> dict[str, Any]:
+    """The window that had just ended when the frame was sent."""
+    (window,) = [w for w in live.windows if w["t"] <= frame.t < w["t"] + HOP]
+    return window
+
+
+def _sibling(live: Run, message: str, soil: Frame) -> Frame:
+    """The first frame of that name that carries the same window number, within the same hop."""
+    same = (f for f in live.frames[message] if soil.t - HOP / 2 < f.t < soil.t + HOP)
+    return next(f for f in same if f.values["Window"] == soil.values["Window"])
+
+
+def _told(window: dict[str, Any], path: tuple[str, ...]) -> float | None:
+    here: Any = window
+    for key in path:
+        here = None if here is None else here.get(key)
+    return here
+
+
+def _same(signal: Signal, frame: Frame, told: float | None) -> bool:
+    """Equal within the signal's resolution; a value it cannot carry is one of its codes above the maximum."""
+    got, factor = frame.values[signal.name], SI[signal.unit or ""]
+    if told is None or not signal.minimum <= told / factor <= signal.maximum:
+        return got >= signal.maximum
+    return abs(got - told / factor) <= signal.scale
+
+
+def _crc8(data: bytes) -> int:
+    """SAE J1850, bit by bit."""
+    crc = 0xFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc << 1 ^ (0x1D if crc & 0x80 else 0)) & 0xFF
+    return crc ^ 0xFF

@@ -1,0 +1,348 @@
+"""Which frames count, and what each refusal is called."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+from cantools.database.can import Database
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from field_data import FIELD, field_config, field_database, frames_of, needs_field
+from soilbus.can.admission import Admission
+from soilbus.can.channels import Channel, Decoded, Reason
+from soilbus.can.checksum import frame_checksum
+from soilbus.can.j1939 import SourceLock, pgn_of
+from soilbus.can.mapping import channels_of, load_databases
+
+DBC = """
+BO_ 256 Loads: 4 X
+ SG_ Left : 0|16@1+ (1,0) [0|64255] "N" X
+ SG_ Right : 16|16@1+ (1,0) [0|64255] "N" X
+BO_ 2147483904 SameNumberExtended: 4 X
+ SG_ Value : 0|16@1+ (1,0) [0|64255] "N" X
+BO_ 257 Guarded: 4 X
+ SG_ Value : 0|16@1+ (0.5,0) [0|1000] "N" X
+ SG_ Counter : 16|4@1+ (1,0) [0|15] "" X
+ SG_ Checksum : 24|8@1+ (1,0) [0|255] "" X
+BO_ 2566801815 GroundSpeed: 8 X
+ SG_ Speed : 0|16@1+ (0.001,0) [0|64.255] "m/s" X
+BO_ 2566857232 Exact: 2 X
+ SG_ Value : 0|16@1+ (1,0) [0|64255] "N" X
+BO_ 2566857233 ExactToo: 2 X
+ SG_ Value : 0|16@1+ (1,0) [0|64255] "N" X
+BO_ 258 Muxed: 3 X
+ SG_ Page M : 0|8@1+ (1,0) [0|3] "" X
+ SG_ A m0 : 8|16@1+ (1,0) [0|64255] "N" X
+ SG_ B m1 : 8|16@1+ (1,0) [0|64255] "N" X
+"""
+
+LEFT = ("Loads", "Left")
+SPEED = 0x18FE4997
+COMMON: dict[str, Any] = {"factor": 1.0, "offset": 0.0, "low": -math.inf, "high": math.inf}
+
+
+def database() -> Database:
+    found = Database()
+    found.add_dbc_string(DBC)
+    return found
+
+
+def admission(*signals: tuple[str, str], checked: Iterable[str] = ()) -> Admission:
+    channels = [Channel(quantity=s, wheel="", message=m, signal=s, **COMMON) for m, s in signals]
+    return Admission(channels, database(), tuple(checked))
+
+
+def guarded(value: int, counter: int, identifier: int = 257) -> bytes:
+    data = bytearray(value.to_bytes(2, "little") + bytes([counter, 0]))
+    data[3] = frame_checksum(identifier, bytes(data), 3)
+    return bytes(data)
+
+
+def values(out: Decoded, name: str) -> list[tuple[float, float]]:
+    column = out.columns[name]
+    return list(zip(column.t.tolist(), column.value.tolist(), strict=True))
+
+
+def refused(out: Decoded) -> dict[tuple[str, str], list[float]]:
+    return {(name, str(reason)): t.tolist() for (name, reason), t in out.refused.items()}
+
+
+def test_samples_in_order_of_time_and_taken_once() -> None:
+    a = admission(LEFT, ("Loads", "Right"))
+    a.feed(1.0, 256, False, b"\x01\x00\x02\x00")
+    a.feed(1.5, 256, False, b"\x03\x00\xff\xff")
+    out = a.take()
+    assert values(out, "Left") == [(1.0, 1.0), (1.5, 3.0)]
+    assert values(out, "Right") == [(1.0, 2.0)]
+    assert refused(out) == {("Right", "not_available"): [1.5]}
+    assert values(a.take(), "Left") == []
+    assert (a.counts.received["Loads"], a.counts.admitted["Loads"], sum(a.counts.refused.values())) == (2, 2, 0)
+
+
+def test_take_until_leaves_the_rest() -> None:
+    a = admission(LEFT)
+    for t in (0.0, 0.5, 1.0, 1.5):
+        a.feed(t, 256, False, bytes(4))
+    assert a.take(1.0).columns["Left"].t.tolist() == [0.0, 0.5]
+    assert a.take(1.0).columns["Left"].t.tolist() == []
+    assert a.take().columns["Left"].t.tolist() == [1.0, 1.5]
+
+
+def test_standard_and_extended_identifiers_are_different_frames() -> None:
+    a = admission(LEFT, ("SameNumberExtended", "Value"))
+    a.feed(0.0, 256, False, b"\x01\x00\x00\x00")
+    a.feed(0.0, 256, True, b"\x02\x00\x00\x00")
+    out = a.take()
+    assert values(out, "Left") == [(0.0, 1.0)]
+    assert values(out, "Value") == [(0.0, 2.0)]
+
+
+@pytest.mark.parametrize("data", [b"", b"\x01\x00\x02", b"\x01\x00\x02\x00\x00"])
+def test_wrong_length_refuses_the_whole_frame(data: bytes) -> None:
+    a = admission(LEFT, ("Loads", "Right"))
+    a.feed(0.0, 256, False, bytes(4))
+    a.feed(0.1, 256, False, data)
+    a.feed(0.2, 256, False, bytes(4))
+    out = a.take()
+    assert out.columns["Left"].t.tolist() == [0.0, 0.2]
+    assert refused(out) == {("Left", "wrong_length"): [0.1], ("Right", "wrong_length"): [0.1]}
+    assert a.counts.refused == {("Loads", Reason.WRONG_LENGTH): 1}
+
+
+def test_remote_error_and_unknown_frames_are_counted_only() -> None:
+    a = admission(LEFT)
+    a.feed_message(can.Message(timestamp=0.0, arbitration_id=256, is_extended_id=False, is_remote_frame=True, dlc=4))
+    a.feed_message(can.Message(timestamp=0.0, arbitration_id=256, is_extended_id=False, is_error_frame=True))
+    a.feed_message(can.Message(timestamp=0.0, arbitration_id=256, is_extended_id=False, data=bytes(4)))
+    for i in range(2000):
+        a.feed(0.0, 1000 + i, True, b"")
+    out = a.take()
+    assert (out.columns["Left"].t.tolist(), out.refused) == ([0.0], {})
+    assert a.counts.refused == {("Loads", Reason.REMOTE_FRAME): 1}
+    assert (a.counts.error_frames, a.counts.unknown, len(a.counts.unknown_ids)) == (1, 2000, 1024)
+    assert a.counts.received["Loads"] == 2
+
+
+def test_time_may_stand_still_but_not_go_back() -> None:
+    a = admission(LEFT)
+    for t in (1.0, 1.0, 0.9, 1.1, math.nan, 1.05):
+        a.feed(t, 256, False, bytes(4))
+    out = a.take()
+    assert out.columns["Left"].t.tolist() == [1.0, 1.0, 1.1]
+    assert np.isnan(out.refused["Left", Reason.TIME_BACKWARDS]).sum() == 1
+    a.feed(1.0, 256, False, bytes(4))  # also across batches
+    assert refused(a.take()) == {("Left", "time_backwards"): [1.0]}
+
+
+def test_a_clock_set_back_starts_afresh() -> None:
+    a = admission(LEFT, ("Guarded", "Value"), checked=["Guarded"])
+    a.feed(100.0, 257, False, guarded(1, 5))
+    a.take()
+    a.feed(100.5, 256, False, bytes(4))
+    a.feed(50.0, 257, False, guarded(1, 5))
+    a.feed(50.1, 256, False, bytes(4))
+    out = a.take()
+    assert out.columns["Left"].t.tolist() == [50.1]
+    assert out.columns["Value"].t.tolist() == [50.0]
+    assert a.counts.clock_steps == 1
+    assert a.counts.refused == {("Loads", Reason.TIME_BACKWARDS): 1}
+
+
+def test_backward_jump_of_a_second_is_no_clock_step() -> None:
+    a = admission(LEFT)
+    a.feed(10.0, 256, False, bytes(4))
+    a.feed(9.0, 256, False, bytes(4))
+    assert a.take().columns["Left"].t.tolist() == [10.0]
+    assert a.counts.clock_steps == 0
+
+
+def test_checksum_and_counter() -> None:
+    a = admission(("Guarded", "Value"), checked=["Guarded"])
+    good = [guarded(10 * i, i) for i in range(4)]
+    broken = bytes([good[2][0] ^ 1]) + good[2][1:]
+    for i, data in enumerate([good[0], good[1], good[1], broken, good[2], good[0]]):
+        a.feed(float(i), 257, False, data)
+    out = a.take()
+    assert values(out, "Value") == [(0.0, 0.0), (1.0, 5.0), (4.0, 10.0), (5.0, 0.0)]
+    assert refused(out) == {("Value", "bad_counter"): [2.0], ("Value", "bad_checksum"): [3.0]}
+    a.feed(6.0, 257, False, good[0])  # stuck, seen across batches
+    assert refused(a.take()) == {("Value", "bad_counter"): [6.0]}
+
+
+@settings(derandomize=True, max_examples=60, deadline=None)
+@given(st.integers(0, 31))
+def test_any_flipped_bit_of_a_guarded_frame_is_refused(bit: int) -> None:
+    a = admission(("Guarded", "Value"), checked=["Guarded"])
+    data = bytearray(guarded(123, 4))
+    data[bit // 8] ^= 1 << bit % 8
+    a.feed(0.0, 257, False, bytes(data))
+    assert refused(a.take()) == {("Value", "bad_checksum"): [0.0]}
+
+
+def test_another_makers_checksum_is_not_judged() -> None:
+    a = admission(("Guarded", "Value"))
+    for t in (0.0, 1.0):
+        a.feed(t, 257, False, b"\x02\x00\x00\x00")
+    assert values(a.take(), "Value") == [(0.0, 1.0), (1.0, 1.0)]
+
+
+def test_checked_message_must_have_both_signals() -> None:
+    with pytest.raises(ValueError, match="Loads: no Counter"):
+        admission(LEFT, checked=["Loads"])
+
+
+@pytest.mark.parametrize("identifier", [SPEED, 0x0CFE4947, 0x1CFE49FE])
+def test_standard_group_counts_from_any_source_and_priority(identifier: int) -> None:
+    a = admission(("GroundSpeed", "Speed"))
+    a.feed(0.0, identifier, True, b"\xe8\x03" + b"\xff" * 6)
+    assert values(a.take(), "Speed") == [(0.0, 1.0)]
+
+
+@pytest.mark.parametrize("identifier", [0x18FE4897, 0x19FE4997, 0x18FF2212, 0x0CFF2210])
+def test_other_identifiers_do_not(identifier: int) -> None:
+    a = admission(("GroundSpeed", "Speed"), ("Exact", "Value"))
+    a.feed(0.0, identifier, True, bytes(8))
+    a.take()
+    assert (a.counts.unknown, a.counts.received.total()) == (1, 0)
+
+
+def feed_sources(a: Admission, frames: Iterable[tuple[float, int]]) -> list[float]:
+    for t, source in frames:
+        a.feed(t, 0x18FE4900 | source, True, source.to_bytes(2, "little") + b"\xff" * 6)
+    return [round(1000 * v) for _, v in values(a.take(), "Speed")]
+
+
+def test_one_source_at_a_time() -> None:
+    a = admission(("GroundSpeed", "Speed"))
+    assert feed_sources(a, [(0.0, 0x47), (0.1, 0x1C), (0.2, 0x47)]) == [0x47, 0x47]
+    assert feed_sources(a, [(0.3, 0x1C), (2.2, 0x1C)]) == []
+    assert feed_sources(a, [(2.3, 0x1C), (2.4, 0x47), (2.5, 0x1C)]) == [0x1C, 0x1C]
+    assert a.counts.refused == {("GroundSpeed", Reason.WRONG_SOURCE): 4}
+
+
+def test_the_dbcs_own_source_takes_over() -> None:
+    a = admission(("GroundSpeed", "Speed"))
+    assert feed_sources(a, [(0.0, 0x47), (0.1, 0x97), (0.2, 0x47), (0.3, 0x97)]) == [0x47, 0x97, 0x97]
+    assert (a.counts.received["GroundSpeed"], a.counts.admitted["GroundSpeed"]) == (4, 3)
+
+
+@settings(derandomize=True, max_examples=200, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 30), st.sampled_from([1, 2, 3])), max_size=30))
+def test_lock_never_mixes_sources_within_its_silence(steps: list[tuple[int, int]]) -> None:
+    lock, t, heard = SourceLock(own=1), 0, (None, -math.inf)
+    for step, source in steps:
+        t += step
+        if lock.admits(t / 10, source):
+            assert source in (1, heard[0]) or t / 10 - heard[1] > 2.0
+            heard = (source, t / 10)
+        else:
+            assert source != heard[0] and source != 1
+
+
+def test_groups_of_both_formats() -> None:
+    assert pgn_of(0x18FE4997) == 65097
+    assert pgn_of(0x19F80117) == 129025
+    assert pgn_of(0x18EFFF06) == pgn_of(0x18EF0006) == 0xEF00  # the second byte is a destination
+
+
+def passes(filters: list[dict[str, Any]], identifier: int, extended: bool) -> bool:
+    return any(
+        f["extended"] == extended and identifier & f["can_mask"] == f["can_id"] & f["can_mask"] for f in filters
+    )
+
+
+@settings(derandomize=True, max_examples=300, deadline=None)
+@given(st.data())
+def test_filters_pass_exactly_what_is_filed(data: st.DataObject) -> None:
+    a = admission(LEFT, ("GroundSpeed", "Speed"), ("Exact", "Value"))
+    near = [256, 257, SPEED, 0x0CFE4900, 0x18FF2210, 0x18FF2211, 0x1FFE4997]
+    bit = st.sampled_from([0, *(1 << i for i in range(29))])
+    identifier = data.draw(st.sampled_from(near)) ^ data.draw(bit)
+    extended = identifier > 0x7FF or data.draw(st.booleans())
+    a.feed(0.0, identifier, extended, bytes(8))
+    assert passes(a.can_filters(), identifier, extended) == (a.counts.unknown == 0)
+
+
+def test_multiplexed_signals_have_samples_only_where_they_are() -> None:
+    a = admission(("Muxed", "A"), ("Muxed", "B"))
+    for t, page in enumerate([0, 1, 2, 0]):
+        a.feed(float(t), 258, False, bytes([page, t, 0]))
+    out = a.take()
+    assert (values(out, "A"), values(out, "B"), out.refused) == ([(0.0, 0.0), (3.0, 3.0)], [(1.0, 1.0)], {})
+
+
+def test_two_messages_of_one_identifier_cannot_be_told_apart() -> None:
+    twins = Database(strict=False)
+    for name in ("One", "Two"):
+        twins.add_dbc_string(f'BO_ 256 {name}: 2 X\n SG_ V : 0|16@1+ (1,0) [0|1] "" X\n')
+    channels = [Channel(quantity=m, wheel="", message=m, signal="V", **COMMON) for m in ("One", "Two")]
+    with pytest.raises(ValueError, match="0x100"):
+        Admission(channels, twins)
+
+
+def play(log: str, a: Admission) -> Decoded:
+    for frame in frames_of(FIELD / log):
+        a.feed(*frame)
+    return a.take()
+
+
+@needs_field
+def test_clay_refuses_what_the_recording_marks_and_nothing_else() -> None:
+    config = field_config()
+    data = load_databases(config)
+    a = Admission(channels_of(config, data), data)
+    out = play("clay.log.gz", a)
+    lost = {(name, str(reason)): len(t) for (name, reason), t in out.refused.items()}
+    assert lost == {("draft", "not_available"): 43, ("ground_speed", "not_available"): 24}
+    assert (len(out.columns["draft"].t), len(out.columns["ground_speed"].t)) == (5946, 2964)
+    assert a.counts.unknown == 0 and not a.counts.refused
+    assert a.counts.received == a.counts.admitted
+
+
+@needs_field
+def test_hop_by_hop_gives_the_same_samples_as_at_once() -> None:
+    config = field_config()
+    data = load_databases(config)
+    at_once = play("clay.log.gz", Admission(channels_of(config, data), data))
+    a, parts, edge = Admission(channels_of(config, data), data), [], -math.inf
+    for frame in frames_of(FIELD / "clay.log.gz"):
+        edge = frame[0] + 1.0 if edge == -math.inf else edge
+        if frame[0] >= edge + 0.1:
+            parts.append(a.take(edge))
+            edge += 1.0
+        a.feed(*frame)
+    parts.append(a.take())
+    for name, column in at_once.columns.items():
+        assert np.array_equal(np.concatenate([p.columns[name].t for p in parts]), column.t)
+        assert np.array_equal(np.concatenate([p.columns[name].value for p in parts]), column.value)
+
+
+@needs_field
+def test_field_values_equal_cantools() -> None:
+    config, data = field_config(), field_database()
+    out = play("loam.log.gz", Admission(channels_of(config, data), data))
+    torque, load = out.columns["torque.RR"], out.columns["load.RR"]
+    peers = [data.decode_message(i, d) for _, i, _, d in frames_of(FIELD / "loam.log.gz") if i in (0x18FF2213, 1312)]
+    assert torque.value.tolist() == [24.0 * p["ShaftTorque"] for p in peers if "ShaftTorque" in p]
+    assert load.value.tolist() == [float(p["RR"]) for p in peers if "RR" in p]
+
+
+@needs_field
+@pytest.mark.parametrize("log", ["deere-5055e-start.log.gz", "deere-5055e-in-gear.log.gz"])
+def test_standing_deere_has_no_ground_speed(log: str) -> None:
+    """Priority 3 and source 0x47 where the DBC says 6 and 0x97: the group counts."""
+    config = field_config()
+    data = load_databases(config)
+    a = Admission([c for c in channels_of(config, data) if c.quantity == "ground_speed"], data)
+    out = play(log, a)
+    assert len(out.columns["ground_speed"].t) == 0
+    assert set(out.refused) == {("ground_speed", Reason.NOT_AVAILABLE)}
+    frames = sum(i == 0x0CFE4947 for _, i, _, _ in frames_of(FIELD / log))
+    assert len(out.refused["ground_speed", Reason.NOT_AVAILABLE]) == frames > 200
+    assert a.counts.unknown > 10000

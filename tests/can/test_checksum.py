@@ -1,0 +1,52 @@
+"""CRC-8 SAE J1850 and the checksum of a frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from crccheck.crc import Crc8SaeJ1850
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from soilbus.can.checksum import column_checksums, crc8, frame_checksum
+
+quick = settings(derandomize=True, max_examples=100, deadline=None)
+
+
+def test_published_check_value() -> None:
+    assert crc8(b"123456789") == 0x4B
+
+
+@quick
+@given(st.binary(max_size=70))
+def test_equals_crccheck(data: bytes) -> None:
+    assert crc8(data) == Crc8SaeJ1850.calc(data)
+
+
+@quick
+@given(st.integers(0, 2**29 - 1), st.binary(min_size=1, max_size=64), st.data())
+def test_covers_everything_but_its_own_byte(arbitration_id: int, data: bytes, draw: st.DataObject) -> None:
+    own = draw.draw(st.integers(0, len(data) - 1))
+    due = frame_checksum(arbitration_id, data, own)
+    bit = draw.draw(st.integers(0, 8 * len(data) - 1))
+    flipped = bytearray(data)
+    flipped[bit // 8] ^= 1 << bit % 8
+    same = frame_checksum(arbitration_id, bytes(flipped), own) == due
+    assert same == (bit // 8 == own)
+    assert frame_checksum(arbitration_id ^ 1 << draw.draw(st.integers(0, 28)), data, own) != due
+
+
+@quick
+@given(st.lists(st.integers(0, 2**29 - 1), min_size=1, max_size=5), st.integers(1, 64), st.data())
+def test_columns_equal_single_frames(ids: list[int], length: int, draw: st.DataObject) -> None:
+    rows = [draw.draw(st.binary(min_size=length, max_size=length)) for _ in ids]
+    own = draw.draw(st.integers(0, length - 1))
+    payload = np.frombuffer(b"".join(rows), dtype=np.uint8).reshape(-1, length)
+    due = [frame_checksum(i, row, own) for i, row in zip(ids, rows, strict=True)]
+    assert column_checksums(np.array(ids), payload, own).tolist() == due
+
+
+@pytest.mark.parametrize("own", [-1, 8])
+def test_byte_outside_the_frame(own: int) -> None:
+    with pytest.raises(IndexError):
+        frame_checksum(0x18FF2210, bytes(8), own)

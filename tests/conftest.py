@@ -1,0 +1,65 @@
+"""Fixtures of all tests."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+import guest
+
+Run = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+def unavailable(reason: str) -> None:
+    """Skip the test, or fail it where SOILBUS_REQUIRE_GUEST=1 says that nothing may be skipped."""
+    if os.environ.get("SOILBUS_REQUIRE_GUEST") == "1":
+        pytest.fail(f"{reason} (and SOILBUS_REQUIRE_GUEST=1)", pytrace=False)
+    pytest.skip(reason)
+
+
+@pytest.fixture(scope="session")
+def tool() -> Callable[[str], str]:
+    """Path of a program of this machine that a test cannot do without."""
+
+    def find(name: str) -> str:
+        if (path := shutil.which(name)) is None:
+            unavailable(f"no {name} on this machine")
+        return str(path)
+
+    return find
+
+
+@pytest.fixture(scope="session")
+def vcan_run() -> Iterator[Run]:
+    """Runs a command where vcan0 is up, as `guest.run` does: on this kernel if it can, else in the guest.
+
+    Units are only ever started in the guest.
+    """
+    made = _ip("link", "add", "dev", "vcan0", "type", "vcan") and _ip("link", "set", "vcan0", "up")
+
+    def run(
+        command: Sequence[str | Path], *, rw: Iterable[Path] = (), units: Iterable[Path] = (), timeout: float = 120.0
+    ) -> subprocess.CompletedProcess[str]:
+        if not units and (made or Path("/sys/class/net/vcan0").exists()):
+            return subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=timeout)
+        try:
+            return guest.run(command, rw=rw, units=units, timeout=timeout)
+        except guest.Unavailable as reason:
+            unavailable(f"no vcan in this kernel, and {reason}")
+            raise
+
+    yield run
+    if made:
+        _ip("link", "del", "vcan0")
+
+
+def _ip(*words: str) -> bool:
+    try:
+        return subprocess.run(["ip", *words], capture_output=True).returncode == 0
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,190 @@
+"""The rules that every signal of our DBC files keeps, and that other tools read them as we do."""
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cantools
+import numpy as np
+import pytest
+from cantools.database.can.c_source import camel_to_snake_case
+
+DBC = Path(__file__).resolve().parents[2] / "dbc"
+FILES = ("soilbus", "tractor")
+WHOLE_RANGE = {"Counter", "Checksum"}  # protocol, not values
+
+
+def load(name):
+    return cantools.database.load_file(DBC / f"{name}.dbc", strict=True)
+
+
+SIGNALS = [
+    pytest.param(message, signal, id=f"{name}-{message.name}-{signal.name}")
+    for name in FILES
+    for message in load(name).messages
+    for signal in message.signals
+]
+
+
+def codes_of_width(bits):
+    """Greatest value, error and not-available code by the J1939-71 rule."""
+    if bits >= 8:
+        rest = bits - 8
+        return (0xFB << rest) - 1, (0xFF << rest) - 1, (1 << bits) - 1
+    return (1 << bits) - 3, (1 << bits) - 2, (1 << bits) - 1
+
+
+def test_j1939_codes_of_common_widths():
+    assert codes_of_width(16) == (0xFAFF, 0xFEFF, 0xFFFF)
+    assert codes_of_width(8) == (0xFA, 0xFE, 0xFF)
+    assert codes_of_width(2) == (1, 2, 3)
+
+
+@pytest.mark.parametrize(("message", "signal"), SIGNALS)
+def test_top_codes_lie_outside_the_range_and_are_named(message, signal):
+    assert not signal.is_signed and not signal.is_float
+    assert signal.minimum is not None and signal.maximum is not None
+    if signal.name in WHOLE_RANGE:
+        assert (signal.minimum, signal.maximum) == (0, (1 << signal.length) - 1)
+        return
+    greatest, error, not_available = codes_of_width(signal.length)
+    assert (signal.maximum - signal.offset) / signal.scale <= greatest + 1e-6
+    assert (signal.minimum - signal.offset) / signal.scale >= -1e-6
+    assert signal.choices[error] == "error"
+    assert signal.choices[not_available] == "not_available"
+
+
+@pytest.mark.parametrize(("message", "signal"), SIGNALS)
+def test_starts_not_available_with_unit_and_comment(message, signal):
+    assert signal.raw_initial == (1 << signal.length) - 1
+    assert signal.comment and len(signal.comment) > 10
+    if signal.unit:  # a physical value says which way is positive, or that it has no sign
+        assert re.search(r"positive|negative", signal.comment), signal.comment
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_messages_are_ours_to_send(name):
+    database = load(name)
+    for message in database.messages:
+        assert message.length == 8 and message.is_extended_frame
+        assert message.comment and message.cycle_time
+        assert "VFrameFormat" in message.dbc.attributes
+        pgn = message.frame_id >> 8 & 0xFFFF
+        assert 0xFF00 <= pgn <= 0xFFFF or (name == "tractor" and pgn == 65097)
+
+
+def test_no_identifier_is_used_twice():
+    ids = [message.frame_id for name in FILES for message in load(name).messages]
+    assert len(ids) == len(set(ids))
+
+
+def test_fast_frames_are_fast_and_all_results_are_protected():
+    messages = {message.name: message for message in load("soilbus").messages}
+    fast = {name for name, message in messages.items() if message.cycle_time == 100}
+    assert fast == {"WheelSlip", "WheelSlip2", "Traversability", "TorqueDemand"}
+    assert all(message.cycle_time == 1000 for name, message in messages.items() if name not in fast)
+    for message in messages.values():
+        places = {signal.name: (signal.start, signal.length) for signal in message.signals}
+        assert (places["Counter"], places["Checksum"]) == ((52, 4), (56, 8)), message.name
+
+
+def test_cleared_or_blank_traversability_never_reads_go():
+    message = load("soilbus").get_message_by_name("Traversability")
+    assert message.decode(bytes(8))["State"] == "unknown"
+    assert message.decode(b"\xff" * 8)["State"] == "not_available"
+
+
+def test_soil_ranges_hold_every_known_soil():
+    from soilbus.terra.soils import SOILS
+
+    database = load("soilbus")
+    in_frame = {
+        "SoilCohesiveModulus": lambda s: s.k_c / 1e3,
+        "SoilFrictionalModulus": lambda s: s.k_phi / 1e3,
+        "SoilSinkageExponent": lambda s: s.n,
+        "SoilFrictionAngle": lambda s: np.degrees(s.phi),
+        "SoilCohesion": lambda s: s.c / 1e3,
+        "SoilShearModulus": lambda s: s.K * 1e3,
+    }
+    for name, value in in_frame.items():
+        signal = database.get_message_by_name(name).get_signal_by_name("Value")
+        values = [value(soil) for soil in SOILS.values()]
+        assert 2.0 * max(values) <= signal.maximum, name
+        if name != "SoilCohesiveModulus":  # which is nothing beside k_phi where it is small
+            assert signal.scale <= 0.015 * min(values), name
+
+
+def test_readme_lists_every_frame_with_its_identifier_and_its_example_is_right():
+    text = (DBC / "README.md").read_text(encoding="utf-8")
+    database = load("soilbus")
+    for message in database.messages:
+        assert f"| `{message.name}` | {message.frame_id:08X} |" in text
+    payload = bytes.fromhex(re.search(r"^payload +([0-9A-F ]+)$", text, re.M)[1])
+    covered = bytes.fromhex(re.search(r"^CRC over +(.*)$", text, re.M)[1])
+    frame_id = int(re.search(r"^id +(.*)$", text, re.M)[1], 16)
+    assert covered == frame_id.to_bytes(4, "little") + payload[:7]
+    crc = 0xFF
+    for byte in covered:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc << 1 ^ 0x1D) & 0xFF if crc & 0x80 else crc << 1
+    assert crc ^ 0xFF == payload[7]
+    decoded = database.decode_message(frame_id, payload)
+    assert decoded["State"] == "go" and decoded["LimitingCause"] == "slip" and decoded["Counter"] == 5
+    assert (decoded["Probability"], decoded["Age"], decoded["Window"]) == (pytest.approx(0.97), pytest.approx(0.4), 7)
+
+
+def c_program(name, database, readme):
+    """Reads lines `id payload`, prints every signal's value; its checksum comes from the README."""
+    cases = []
+    for message in database.messages:
+        m = f"{name}_{camel_to_snake_case(message.name)}"
+        prints = "".join(
+            f'printf(" %.17g", {m}_{s}_decode(v.{s}));' for s in (camel_to_snake_case(x.name) for x in message.signals)
+        )
+        cases.append(
+            f"case 0x{message.frame_id:x}u: {{ struct {m}_t v; if ({m}_unpack(&v, data, 8)) return 1; {prints} break; }}"
+        )
+    return f"""
+#include <stdio.h>
+#include "{name}.h"
+{readme}
+int main(void) {{
+    unsigned id, byte;
+    uint8_t data[8];
+    while (scanf("%x", &id) == 1) {{
+        for (int i = 0; i < 8; i++) {{ if (scanf("%x", &byte) != 1) return 1; data[i] = (uint8_t)byte; }}
+        printf("%u", (unsigned)soilbus_checksum(id, data));
+        switch (id) {{ {" ".join(cases)} default: return 1; }}
+        printf("\\n");
+    }}
+    return 0;
+}}
+"""
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
+@pytest.mark.parametrize("name", FILES)
+def test_generated_c_code_compiles_and_decodes_as_cantools(name, tmp_path):
+    from soilbus.can.checksum import frame_checksum
+
+    database = load(name)
+    generate = [sys.executable, "-m", "cantools", "generate_c_source", str(DBC / f"{name}.dbc")]
+    subprocess.run(generate, cwd=tmp_path, check=True, capture_output=True)
+    readme = re.search(r"```c\n(.*?)```", (DBC / "README.md").read_text(encoding="utf-8"), re.S)[1]
+    (tmp_path / "main.c").write_text(c_program(name, database, readme), encoding="utf-8")
+    gcc = ["gcc", "-std=c99", "-Wall", "-Wextra", "-Werror", f"{name}.c", "main.c", "-o", "decode"]
+    subprocess.run(gcc, cwd=tmp_path, check=True)
+
+    rng = np.random.default_rng(5)
+    cases = [(message, rng.bytes(8)) for message in database.messages for _ in range(20)]
+    lines = "".join(f"{message.frame_id:x} {data.hex(' ')}\n" for message, data in cases)
+    output = subprocess.run([tmp_path / "decode"], input=lines, text=True, capture_output=True, check=True).stdout
+    for (message, data), line in zip(cases, output.splitlines(), strict=True):
+        crc, *values = line.split()
+        assert int(crc) == frame_checksum(message.frame_id, data, 7)
+        expected = message.decode(data, decode_choices=False)
+        for signal, value in zip(message.signals, values, strict=True):
+            assert float(value) == pytest.approx(expected[signal.name], rel=1e-12, abs=1e-12), signal.name

@@ -1,0 +1,175 @@
+#!/usr/bin/env python3
+"""A guest kernel with vcan (Debian's User-Mode Linux): no KVM, an ordinary process.
+
+    guest.py setup                                       fetch the kernel, once
+    guest.py run [--rw DIR] [--unit FILE]... -- COMMAND  run COMMAND in it, vcan0 is up
+
+The guest sees this machine's files; what it writes is lost, except under --rw.
+With --unit it boots this machine's systemd as PID 1 (needs root) with these units.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import hashlib
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+PACKAGES = ("user-mode-linux", "busybox-static")
+MODULES = ("can", "can-raw", "can-bcm", "can-dev", "vcan", "overlay", "autofs4")  # in the order of loading
+ENVIRONMENT = ("PATH", "HOME", "LANG", "VIRTUAL_ENV", "PYTHONPATH", "OMP_NUM_THREADS")
+MEMORY = 1024  # MiB
+NO_STATUS = 125  # the guest ended without the command's exit status
+SYSTEMD = ("fstab=no", "systemd.gpt_auto=no", "systemd.getty_auto=no", "systemd.firstboot=off",
+           "systemd.show_status=no", "systemd.mask=systemd-binfmt.service",
+           "systemd.mask=proc-sys-fs-binfmt_misc.automount")  # fmt: skip
+# Whatever ends this process, SIGKILL too, ends the guest: the pipe to the guard closes then.
+GUARDED = 'exec 3<&0; (read _ <&3; kill -9 0) & exec "$@" </dev/null 3<&-'
+
+
+class Unavailable(Exception):
+    """This machine cannot boot the guest, in one line."""
+
+
+def cache_dir() -> Path:
+    """Where the guest lies once set up; another version of the harness has another place."""
+    parts = b"".join((HERE / name).read_bytes() for name in ("guest-init", "fpshim.c"))
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "soilbus-guest" / hashlib.sha256(parts + repr(MODULES).encode()).hexdigest()[:12]
+
+
+def prepare() -> Path:
+    """The guest's folder, set up if it is not yet; raises Unavailable."""
+    cache = cache_dir()
+    if not cache.exists():
+        cache.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=cache.parent) as tmp:
+            _build(Path(tmp))
+            (Path(tmp) / "guest").rename(cache)
+    return cache
+
+
+def _build(tmp: Path) -> None:
+    for tool in ("apt-get", "dpkg", "cc"):
+        if not shutil.which(tool):
+            raise Unavailable(f"the guest kernel cannot be set up: no {tool} here")
+    apt = ["apt-get", "-qq", "-o", "APT::Sandbox::User=root", "-o", "Acquire::http::Timeout=30"]
+    if _call([*apt, "download", *PACKAGES], tmp):
+        _call([*apt, "update"], tmp)  # its own complaints may be about other sources
+        if fault := _call([*apt, "download", *PACKAGES], tmp):
+            raise Unavailable(f"the guest kernel cannot be downloaded: {fault}")
+    for deb in tmp.glob("*.deb"):
+        subprocess.run(["dpkg", "-x", deb, tmp / "deb"], check=True)
+    root = tmp / "guest/root"
+    for folder in ("bin", "modules", "proc", "sys", "dev", "host", "layer", "new"):
+        (root / folder).mkdir(parents=True)
+    modules = {path.stem: path for path in (tmp / "deb").rglob("*.ko")}
+    for i, name in enumerate(MODULES):
+        shutil.copy(modules[name], root / f"modules/{i}-{name}.ko")
+    shutil.copy(next((tmp / "deb").rglob("bin/busybox")), root / "bin")
+    shutil.copy(tmp / "deb/usr/bin/linux.uml", tmp / "guest")
+    shutil.copy(HERE / "guest-init", root / "init")
+    (root / "init").chmod(0o755)
+    if fault := _call(["cc", "-O2", "-shared", "-fPIC", "-o", tmp / "guest/fpshim.so", HERE / "fpshim.c"], tmp):
+        raise Unavailable(f"the guest kernel's shim does not compile: {fault}")
+
+
+def _call(command: Sequence[str | Path], cwd: Path) -> str:
+    """Run it; the last line of its complaint if it failed, else nothing."""
+    try:
+        done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
+    except subprocess.TimeoutExpired:
+        return f"{command[0]} took more than 300 s"
+    return (done.stderr.strip().splitlines() or [f"{command[0]} failed"])[-1] if done.returncode else ""
+
+
+def run(
+    command: Sequence[str | Path],
+    *,
+    rw: Iterable[Path] = (),
+    units: Iterable[Path] = (),
+    timeout: float = 120.0,
+    capture: bool = True,
+) -> subprocess.CompletedProcess[str]:
+    """Run a command in the guest, in this working directory; its two outputs come as one.
+
+    The exit status is the command's, or NO_STATUS if it ended by time-out or crash.
+    Raises Unavailable if the guest cannot be set up.
+    """
+    cache = prepare()
+    with tempfile.TemporaryDirectory(prefix="guest-") as tmp:
+        job = Path(tmp)
+        words = ["env", "-i", *(f"{k}={os.environ[k]}" for k in ENVIRONMENT if k in os.environ), *map(str, command)]
+        (job / "command").write_text(f"cd {shlex.quote(os.getcwd())} && exec {shlex.join(words)}\n")
+        (job / "rw").write_text("".join(f"{Path(d).resolve()}\n" for d in rw))
+        boot = ["rootfstype=hostfs", f"rootflags={cache / 'root'}", "ro", "init=/init", "loglevel=2", "panic=-1"]
+        if units := list(units):
+            (job / "units").mkdir()
+            for unit in units:
+                shutil.copy(unit, job / "units")
+            boot += SYSTEMD
+        with (job / "console").open("wb") as console, (job / "output").open("wb") as captured:
+            output = subprocess.Popen(  # through a pipe: the kernel makes its terminals non-blocking
+                ["cat"], stdin=subprocess.PIPE, stdout=captured if capture else None
+            )
+            kernel = subprocess.Popen(
+                ["sh", "-c", GUARDED, "sh", cache / "linux.uml", f"mem={MEMORY}M", *boot, f"job={job}",
+                 f"umid={job.name}", f"uml_dir={job}/", "lsm=capability", "con=null", "con0=null,fd:2",
+                 f"con1=null,fd:{_fd(output)}"],
+                stdin=subprocess.PIPE, stdout=console, stderr=console, start_new_session=True,
+                pass_fds=[_fd(output)], env={**os.environ, "LD_PRELOAD": str(cache / "fpshim.so"), **_memory_file()},
+            )  # fmt: skip
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            kernel.wait(timeout)
+        kernel.communicate()
+        output.communicate()
+        text = (job / "output").read_text(errors="replace")
+        if (job / "status").exists():
+            return subprocess.CompletedProcess(list(command), int((job / "status").read_text()), text)
+        text += f"the guest crashed or took more than {timeout:g} s\n"
+        text += (job / "console").read_text(errors="replace")[-4000:]
+        return subprocess.CompletedProcess(list(command), NO_STATUS, text)
+
+
+def _fd(process: subprocess.Popen[bytes]) -> int:
+    assert process.stdin is not None
+    return process.stdin.fileno()
+
+
+def _memory_file() -> dict[str, str]:
+    """The guest's memory is a sparse file in /dev/shm, which is small in most containers."""
+    return {} if shutil.disk_usage("/dev/shm").free > MEMORY << 20 else {"TMPDIR": tempfile.gettempdir()}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    verbs = parser.add_subparsers(dest="verb", required=True)
+    verbs.add_parser("setup")
+    job = verbs.add_parser("run")
+    job.add_argument("--rw", action="append", default=[], type=Path)
+    job.add_argument("--unit", action="append", default=[], type=Path)
+    job.add_argument("--timeout", type=float, default=120.0)
+    job.add_argument("command", nargs="+")
+    given = parser.parse_args()
+    try:
+        if given.verb == "setup":
+            print(prepare())
+            return 0
+        done = run(given.command, rw=given.rw, units=given.unit, timeout=given.timeout, capture=False)
+        sys.stderr.write(done.stdout)
+        return done.returncode
+    except Unavailable as reason:
+        print(reason, file=sys.stderr)
+        return NO_STATUS
+
+
+if __name__ == "__main__":
+    sys.exit(main())

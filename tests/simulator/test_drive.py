@@ -1,0 +1,196 @@
+"""The truth of a drive obeys mechanics, soil and driver at every instant."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+import soilbus.simulator
+from soilbus.config import load_config
+from soilbus.simulator.drive import SimulationError, drive
+from soilbus.simulator.scenario import Patch, Scenario, Swing, demo, excited
+from soilbus.terra.soils import SOILS, soil_named
+
+TRACTOR = Path(soilbus.simulator.__file__).with_name("tractor.toml")
+GRAVITY, MASS = 9.80665, 2300.0
+WHEELS = {"FL": (0.50, 0.26), "FR": (0.50, 0.26), "RL": (0.62, 0.38), "RR": (0.62, 0.38)}
+HILLS = ((0.0, 0.0), (10.0, 0.08), (25.0, -0.05), (60.0, 0.02))
+
+
+def config(*overrides):
+    return load_config(TRACTOR, overrides)
+
+
+def on(soil, duration=20.0, **more):
+    return Scenario(duration, (Patch(0.0, soil),), **more)
+
+
+SCENARIOS = {
+    "excited": excited("loam", 20.0),
+    "demo": demo(20.0),
+    "hills": on("sandy_loam_15", draft=Swing(500.0, 9000.0), lift_slip=Swing(0.3, 0.6), slope=HILLS),
+    "skid": on("clayey_soil_38", slip=Swing(-0.1, 0.3)),
+}
+
+
+@pytest.fixture(scope="module", params=SCENARIOS)
+def columns(request):
+    return drive(config(), SCENARIOS[request.param], seed=7).columns
+
+
+def total(columns, quantity, wheels=WHEELS):
+    return sum(columns[f"{quantity}.{wheel}"] for wheel in wheels)
+
+
+def test_pull_of_the_wheels_is_draft_slope_and_inertia(columns):
+    along = MASS * (columns["acceleration"] + GRAVITY * np.sin(columns["pitch"]))
+    miss = total(columns, "drawbar_pull") - along - columns["draft"]
+    assert np.abs(miss).max() < 1e-6 * 1000.0
+
+
+def test_loads_carry_the_weight_and_balance_its_moment(columns):
+    across = MASS * GRAVITY * np.cos(columns["pitch"])
+    assert total(columns, "load") == pytest.approx(across, rel=1e-12)
+    # Moments about the rear contact line: what presses the front axle down holds the tractor level.
+    along = MASS * (columns["acceleration"] + GRAVITY * np.sin(columns["pitch"]))
+    front = total(columns, "load", ("FL", "FR"))
+    assert front * 1.95 + columns["draft"] * 0.45 + along * 0.75 == pytest.approx(across * 0.95, rel=1e-9)
+
+
+def test_slip_is_that_of_wheel_and_ground_speed(columns):
+    for wheel, (radius, _) in WHEELS.items():
+        slip = 1.0 - columns["ground_speed"] / (radius * columns[f"speed.{wheel}"])
+        assert slip == pytest.approx(columns[f"slip.{wheel}"], abs=1e-12)
+
+
+def test_distance_speed_and_acceleration_belong_together(columns):
+    t, v = columns["t"], columns["ground_speed"]
+    middle = slice(1, -1)
+    assert np.gradient(v, t)[middle] == pytest.approx(columns["acceleration"][middle], abs=1e-3)
+    assert np.gradient(columns["distance"], t)[middle] == pytest.approx(v[middle], abs=1e-3)
+    assert columns["distance"][0] == 0.0
+
+
+def forces_by_quad(soil, radius, width, entry, slip):
+    """Eqs. 20-22 of Xi et al. 2024, exponential shear law, peak at half the entry angle, no exit angle."""
+
+    def sigma(a):
+        a = a if a > entry / 2.0 else entry - a  # the rear branch mirrors the front
+        return (soil.k_c / width + soil.k_phi) * (radius * (math.cos(a) - math.cos(entry))) ** soil.n
+
+    def tau(a):
+        j = radius * (entry - a - (1.0 - slip) * (math.sin(entry) - math.sin(a)))
+        return math.copysign(-math.expm1(-abs(j) / soil.K), j) * (soil.c + sigma(a) * math.tan(soil.phi))
+
+    def integral(f):
+        return sum(quad(f, a, b, epsabs=0.0, epsrel=1e-8, limit=400)[0] for a, b in ((0, entry / 2), (entry / 2, entry)))
+
+    area = radius * width
+    return (
+        area * integral(lambda a: sigma(a) * math.cos(a) + tau(a) * math.sin(a)),
+        area * integral(lambda a: tau(a) * math.cos(a) - sigma(a) * math.sin(a)),
+        area * radius * integral(tau),
+    )
+
+
+@pytest.mark.parametrize(("name", "soil"), [("excited", "loam"), ("hills", "sandy_loam_15")])
+def test_load_pull_and_torque_are_the_integrals_over_the_rim(name, soil):
+    columns = drive(config(), SCENARIOS[name], seed=7).columns
+    for i in np.random.default_rng(1).integers(0, len(columns["t"]), 6):
+        for wheel, (radius, width) in WHEELS.items():
+            at = {q: columns[f"{q}.{wheel}"][i] for q in ("entry_angle", "slip", "load", "drawbar_pull", "torque")}
+            load, pull, torque = forces_by_quad(soil_named(soil), radius, width, at["entry_angle"], at["slip"])
+            assert load == pytest.approx(at["load"], rel=1e-6)
+            assert pull == pytest.approx(at["drawbar_pull"], abs=1e-6 * load)
+            assert torque == pytest.approx(at["torque"], rel=1e-6)
+            assert columns[f"sinkage.{wheel}"][i] == pytest.approx(radius * (1.0 - math.cos(at["entry_angle"])))
+
+
+@pytest.mark.parametrize("soil", sorted(set(SOILS) - {"sandy_loam_32_hanamoto", "snow_us", "snow_sweden", "wet_clay"}))
+def test_prescribed_slip_is_kept_on_every_soil_up_to_the_torque_limit(soil):
+    columns = drive(config(), on(soil, 10.0, slip=Swing(0.05, 0.4), slip_spread=0.0), seed=2).columns
+    assert len(columns["t"]) == 500
+    torque = np.max([columns[f"torque.{wheel}"] for wheel in WHEELS], axis=0)
+    free = torque < 2400.0 * (1.0 - 1e-9)
+    slip = columns["slip.FL"]
+    assert np.all(torque <= 2400.0 * (1.0 + 1e-9))
+    assert np.all((slip[free] >= 0.05) & (slip[free] <= 0.4)) and np.all(slip <= 0.4)
+    if free.any():
+        assert np.isnan(columns["demand"]).all()
+        assert slip[free] == pytest.approx(columns["slip.RR"][free], abs=1e-12)
+
+
+def test_driver_meets_the_demand_or_is_at_the_slip_limit():
+    scenario = on("loam", 30.0, draft=Swing(3000.0, 7000.0), lift_slip=Swing(0.3, 0.3), slip_spread=0.0)
+    columns = drive(config(), scenario, seed=4).columns
+    met = np.isclose(columns["draft"], columns["demand"], rtol=1e-9)
+    assert 0.1 < met.mean() < 0.9
+    assert np.all(columns["slip.FL"][met] <= 0.3 + 1e-9)
+    assert columns["slip.FL"][~met] == pytest.approx(0.3, abs=1e-9)
+    assert np.all(columns["draft"][~met] < columns["demand"][~met])
+
+
+def test_implement_is_up_before_the_driver_gives_in_to_slip():
+    climb = on("loam", 30.0, draft=Swing(500.0, 600.0), slope=((0.0, 0.0), (5.0, 0.28)), lift_slip=Swing(0.3, 0.3))
+    columns = drive(config(), climb, seed=1).columns
+    beyond = columns["slip.FL"] > 0.35
+    assert beyond.any()
+    assert columns["draft"][beyond] == pytest.approx(0.0, abs=1e-6)
+    assert columns["draft"].min() > -1e-6
+
+
+def test_a_weak_motor_limits_the_draft():
+    weak = drive(config("wheel.RL.max_torque=1000.0"), on("loam", draft=Swing(3000.0, 4500.0)), seed=4).columns
+    limited = weak["draft"] < weak["demand"] - 1.0
+    assert limited.any()
+    assert weak["torque.RL"][limited] == pytest.approx(1000.0, rel=1e-8)
+    assert weak["torque.RL"].max() < 1000.0 * (1 + 1e-8) < weak["torque.RR"].max()
+
+
+def test_the_demo_is_easy_on_loam_and_too_much_for_wet_clay():
+    columns = drive(config(), demo(60.0), seed=1).columns
+    loam, clay = (columns["soil"] == name for name in ("loam", "xi_wet_clay"))
+    assert 0.4 < loam.mean() < 0.6 and (loam | clay).all()
+    assert columns["draft"][loam][:-150] == pytest.approx(columns["demand"][loam][:-150], rel=1e-9)
+    assert columns["slip.FL"][loam][:-150].max() < 0.35
+    on_clay = clay & (columns["distance"] > columns["distance"][clay][0] + 3.0)
+    assert columns["demand"][on_clay].min() > 1.5 * columns["draft"][on_clay].max()
+    assert columns["slip.FL"][on_clay].min() > 0.45
+    assert np.median(columns["sinkage.FL"][on_clay]) > 2.0 * np.median(columns["sinkage.FL"][loam])
+
+
+def test_rear_wheels_reach_the_next_soil_a_wheelbase_later():
+    soils = (Patch(0.0, "loam"), Patch(15.0, "clayey_soil_38"))
+    flat = {"speed": Swing(1.5, 1.5), "side_shift": Swing(0.0, 0.0), "slip_spread": 0.0, "transition": 0.01}
+    columns = drive(config(), Scenario(20.0, soils, slip=Swing(0.2, 0.2), **flat), seed=0).columns
+    steps = [np.argmax(np.abs(np.diff(columns[f"torque.{wheel}"]))) for wheel in ("FL", "RL")]
+    assert columns["distance"][steps[0]] == pytest.approx(15.0 - 1.0, abs=0.05)
+    assert columns["distance"][steps[1]] == pytest.approx(15.0 + 0.95, abs=0.05)
+
+
+def test_same_seed_same_drive():
+    first, again, other = (drive(config(), demo(10.0), seed).columns for seed in (3, 3, 4))
+    assert all(np.array_equal(first[name], again[name], equal_nan=first[name].dtype.kind == "f") for name in first)
+    assert not np.allclose(first["torque.FL"], other["torque.FL"], rtol=1e-3)
+
+
+def test_a_tractor_that_bogs_down_ends_the_drive_there():
+    soils = (Patch(0.0, "loam"), Patch(15.0, "wet_clay"))
+    done = drive(config(), Scenario(30.0, soils, draft=Swing(1000.0, 2000.0)), seed=1)
+    assert done.bogged_at == pytest.approx(done.columns["t"][-1] + 0.02)
+    assert 13.0 < done.columns["distance"][-1] < 18.0
+    assert all(np.isfinite(done.columns[f"{q}.RL"]).all() for q in ("slip", "torque", "load", "sinkage"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "scenario", "reason"),
+    [
+        ((), on("wet_clay", draft=Swing(0.0, 100.0)), "cannot drive on wet_clay"),
+        (('model.effects=[{name="lugs"}]',), demo(5.0), "no effects"),
+    ],
+)
+def test_what_cannot_be_driven_says_so(overrides, scenario, reason):
+    with pytest.raises(SimulationError, match=reason):
+        drive(config(*overrides), scenario, seed=1)
