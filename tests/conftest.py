@@ -35,6 +35,19 @@ def tool() -> Callable[[str], str]:
 
 
 @pytest.fixture(scope="session")
+def field_recording() -> Callable[[str], Path]:
+    """Path of a recording of the field vehicle."""
+
+    def find(name: str) -> Path:
+        path = Path(__file__).resolve().parents[2] / "shared/field" / name
+        if not path.exists():
+            unavailable(f"no {path}")
+        return path
+
+    return find
+
+
+@pytest.fixture(scope="session")
 def vcan_run() -> Iterator[Run]:
     """Runs a command where vcan0 is up, as `guest.run` does: on this kernel if it can, else in the guest.
 

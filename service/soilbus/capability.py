@@ -15,30 +15,48 @@ from numpy.typing import NDArray
 
 from soilbus.estimation.window import Rig
 from soilbus.terra.stress import lumped_modulus
-from soilbus.terra.vehicle import GRAVITY, axle_loads
-from soilbus.terra.wheel import Soil, WheelModel, WheelState, entry_angle_for_load, wheel_forces_and_derivatives
+from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads
+from soilbus.terra.wheel import (
+    MAX_ENTRY_ANGLE,
+    Soil,
+    WheelModel,
+    WheelState,
+    entry_angle_for_load,
+    wheel_forces_and_derivatives,
+)
 
 Array = NDArray[np.float64]
-Against = Literal["draft", "grade"]
 
-_GRID = 14
-_MIN_SLIP = 0.02
+GRID = 14
+MIN_SLIP = 0.02
+PULL_TOLERANCE = 0.5
+MAX_ITERATIONS = 12
 
 
 @dataclass(frozen=True, slots=True)
 class PullCurve:
-    """Steady pull over slip: slip, pull [N] (S,), torque [N m] per wheel (W, S).
+    """Steady pull at some slips, each on the level (pull is draft) or up a grade without draft.
 
-    pull_by_soil (6, S) and torque_by_soil (W, 6, S) are gradients by the parameters of
-    Soil in SI.  Where the loads cannot be carried or no balance exists, pull is nan.
+    slip, on_grade, pull [N] and the summed wheel torque have shape (S,); torque [N m],
+    entry_angle [rad] have shape (W, S).  pull_by_soil (6, S) and torque_by_soil (W, 6, S)
+    are gradients by the parameters of Soil in SI.  pull is nan where no balance exists.
     """
 
     slip: Array
+    on_grade: NDArray[np.bool_]
     pull: Array
     torque: Array
-    sinkage: Array
+    entry_angle: Array
     pull_by_soil: Array
     torque_by_soil: Array
+
+    def part(self, on_grade: bool) -> PullCurve:
+        """Only the level or only the graded columns."""
+        keep = self.on_grade == on_grade
+        return PullCurve(
+            self.slip[keep], self.on_grade[keep], self.pull[keep], self.torque[:, keep], self.entry_angle[:, keep],
+            self.pull_by_soil[:, keep], self.torque_by_soil[..., keep],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,115 +69,157 @@ class Capability:
     limit: Literal["traction", "torque", "slip"]
 
 
-def pull_curve(soil: Soil, rig: Rig, model: WheelModel, slip: Array, against: Against) -> PullCurve:
-    """Pull that balances itself at each slip (S,): as draft on the level, or up a grade without draft.
+@dataclass(frozen=True, slots=True)
+class _Axles:
+    """Wheels alike in axle, radius and width are computed once."""
+
+    chassis: Chassis
+    radius: Array
+    width: Array
+    front: NDArray[np.bool_]
+    share: Array
+    count: Array
+    of_wheel: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, rig: Rig) -> _Axles:
+        if rig.chassis is None:
+            raise ValueError("a capability needs the vehicle's mass and geometry")
+        kinds = np.column_stack([rig.radius, rig.width, rig.front])
+        unique, of_wheel, count = np.unique(kinds, axis=0, return_inverse=True, return_counts=True)
+        front = unique[:, 2] > 0.5
+        share = 1.0 / np.where(front, rig.front.sum(), (~rig.front).sum())
+        return cls(
+            rig.chassis, unique[:, 0, None], unique[:, 1, None], front[:, None], share[:, None],
+            count[:, None].astype(float), of_wheel.ravel(),
+        )  # fmt: skip
+
+    def loads(self, pull: Array, on_grade: NDArray[np.bool_]) -> Array:
+        weight = self.chassis.mass * GRAVITY
+        pitch = np.arcsin(np.clip(np.where(on_grade, pull, 0.0) / weight, -0.99, 0.99))
+        front, rear = axle_loads(self.chassis, np.where(on_grade, 0.0, pull), pitch, 0.0)
+        return np.where(self.front, front, rear) * self.share
+
+
+def pull_curve(
+    soil: Soil,
+    rig: Rig,
+    model: WheelModel,
+    slip: Array,
+    on_grade: NDArray[np.bool_],
+    start: PullCurve | None = None,
+) -> PullCurve:
+    """Pull that balances itself at each slip (S,); `start` is the curve of a similar soil.
 
     Raises ValueError for a rig without a chassis.
     """
-    if rig.chassis is None:
-        raise ValueError("a capability needs the vehicle's mass and geometry")
-    W, S = len(rig.wheels), len(slip)
-    front = rig.front[:, None]
-    share = 1.0 / np.where(front, rig.front.sum(), (~rig.front).sum())
-
-    def loads(pull: Array) -> Array:
-        if against == "draft":
-            axles = axle_loads(rig.chassis, pull, 0.0, 0.0)  # type: ignore[arg-type]
-        else:
-            sine = np.clip(pull / (rig.chassis.mass * GRAVITY), -0.99, 0.99)  # type: ignore[union-attr]
-            axles = axle_loads(rig.chassis, 0.0, np.arcsin(sine), 0.0)  # type: ignore[arg-type]
-        return np.where(front, axles[0], axles[1]) * share
+    axles = _Axles.of(rig)
+    K_L = lumped_modulus(soil.k_c, soil.k_phi, axles.width)
+    shape = (len(axles.radius), len(slip))
+    tan_phi = np.tan(soil.phi)
 
     def state(angle: Array) -> WheelState:
-        wide = [np.broadcast_to(a[:, None], (W, S)).ravel() for a in (rig.radius, rig.width)]
-        K_L = lumped_modulus(soil.k_c, soil.k_phi, wide[1])
-        return WheelState(angle.ravel(), np.tile(slip, W), *wide, K_L, soil.n, np.tan(soil.phi), soil.c, soil.K)
+        slips = np.broadcast_to(slip, shape)
+        return WheelState(angle, slips, axles.radius, axles.width, K_L, soil.n, tan_phi, soil.c, soil.K)
 
-    pull = np.zeros(S)
-    step = 1.0
-    load = loads(pull)
-    angle = entry_angle_for_load(load.ravel(), state(np.full((W, S), np.nan)), model, tolerance=1e-3).reshape(W, S)
+    if start is not None and np.array_equal(start.slip, slip) and np.isfinite(start.entry_angle).all():
+        pull = np.where(np.isfinite(start.pull), start.pull, 0.0)
+        angle = start.entry_angle[[int(np.argmax(axles.of_wheel == k)) for k in range(shape[0])]]
+        load = axles.loads(pull, on_grade)
+    else:
+        pull = np.zeros(len(slip))
+        load = axles.loads(pull, on_grade)
+        guess = state(np.full(shape, np.nan))
+        angle = entry_angle_for_load(np.broadcast_to(load, shape), guess, model, tolerance=1e-2)
     with np.errstate(all="ignore"):
-        for _ in range(8):
+        for _ in range(MAX_ITERATIONS):
             forces, d = wheel_forces_and_derivatives(state(angle), model)
-            forces, d = forces.reshape(3, W, S), d.reshape(3, 7, W, S)
-            ratio = d[1, 0] / d[0, 0]
+            by_load = d[1:, 0] / d[0, 0]  # pull and torque by load, the entry angle following
+            shift = (axles.loads(pull + 1.0, on_grade) - axles.loads(pull - 1.0, on_grade)) / 2.0
             off = load - forces[0]
-            shift = (loads(pull + step) - loads(pull - step)) / (2.0 * step)
-            slope = (ratio * shift).sum(0) - 1.0
-            change = -((forces[1] + ratio * off).sum(0) - pull) / slope
+            slope = (axles.count * by_load[0] * shift).sum(0) - 1.0
+            change = -((axles.count * (forces[1] + by_load[0] * off)).sum(0) - pull) / slope
             pull = pull + change
-            load = loads(pull)
-            angle = np.clip(angle + (load - forces[0]) / d[0, 0], 0.5 * angle, np.minimum(2.0 * angle, 1.4))
-            if np.nanmax(np.abs(change), initial=0.0) < 0.5:
+            load = axles.loads(pull, on_grade)
+            new_angle = angle + (load - forces[0]) / d[0, 0]
+            angle = np.clip(new_angle, 0.5 * angle, np.minimum(2.0 * angle, MAX_ENTRY_ANGLE))
+            if not np.nanmax(np.abs(change), initial=0.0) > PULL_TOLERANCE:
                 break
-        by_soil = _by_soil(d, soil, rig.width)
-        load_by_soil, pull_by_soil, torque_by_soil = by_soil
-        total = (pull_by_soil - ratio[:, None] * load_by_soil).sum(0) / -slope
-        load_change = shift[:, None] * total - load_by_soil
-        torque_ratio = d[2, 0] / d[0, 0]
-        torque = forces[2] + torque_ratio * (load - forces[0])
-        torque_total = torque_by_soil + torque_ratio[:, None] * load_change
-        buried = ~(np.isfinite(angle).all(0) & (load > 0.0).all(0))
-        sinkage = rig.radius[:, None] * (1.0 - np.cos(angle))
-    return PullCurve(slip, np.where(buried, np.nan, pull), torque, sinkage, total, torque_total)
+        by_soil = _by_soil(d, soil, axles.width)
+        pull_by_soil = (axles.count[:, None] * (by_soil[1] - by_load[0][:, None] * by_soil[0])).sum(0) / -slope
+        load_change = shift[:, None] * pull_by_soil - by_soil[0]
+        torque = forces[2] + by_load[1] * (load - forces[0])
+        torque_by_soil = by_soil[2] + by_load[1][:, None] * load_change
+        balanced = np.isfinite(angle).all(0) & (load > 0.0).all(0) & (np.abs(change) <= PULL_TOLERANCE)
+    w = axles.of_wheel
+    return PullCurve(
+        slip, on_grade, np.where(balanced, pull, np.nan), torque[w], angle[w], pull_by_soil, torque_by_soil[w]
+    )
 
 
 def _by_soil(d: Array, soil: Soil, width: Array) -> Array:
-    """(3, W, 6, S): derivatives of load, pull and torque by the soil parameters, entry angle held."""
+    """(3, A, 6, S): derivatives of load, pull and torque by the soil parameters, entry angle held."""
     sec2 = 1.0 + np.tan(soil.phi) ** 2
-    return np.stack([d[:, 2] / width[:, None], d[:, 2], d[:, 3], d[:, 4] * sec2, d[:, 5], d[:, 6]], axis=2)
+    return np.stack([d[:, 2] / width, d[:, 2], d[:, 3], d[:, 4] * sec2, d[:, 5], d[:, 6]], axis=2)
 
 
-def largest_pull(
-    soil: Soil, rig: Rig, model: WheelModel, torque_limit: Array | None, max_slip: float, against: Against
-) -> Capability | None:
-    """Largest steady pull over slips up to max_slip and wheel torques up to torque_limit (W,) [N m].
+def slip_grid(max_slip: float) -> Array:
+    """Slips at which a pull curve is worth knowing."""
+    return np.geomspace(MIN_SLIP, max_slip, GRID)
+
+
+def largest_pull(curve: PullCurve, torque_limit: Array, soil: Soil, rig: Rig, model: WheelModel) -> Capability | None:
+    """Largest pull of a curve (all of it level, or all graded) within wheel torques up to torque_limit (W,) [N m].
 
     nan in torque_limit: that wheel's limit is not known and does not count.  None where
     the soil carries no steady state at all.
     """
-    grid = np.geomspace(_MIN_SLIP, max_slip, _GRID)
-    curve = pull_curve(soil, rig, model, grid, against)
-    limits = np.full(len(rig.wheels), np.nan) if torque_limit is None else torque_limit
-    usage = np.nanmax(np.concatenate([curve.torque / limits[:, None], np.zeros((1, len(grid)))]), axis=0)
-    usable = np.isfinite(curve.pull) & (usage <= 1.0)
+    known = np.isfinite(torque_limit)
+    usage = np.max(curve.torque[known] / torque_limit[known, None], axis=0, initial=0.0)
+    balanced = np.isfinite(curve.pull)
+    usable = balanced & (usage <= 1.0)
     if not usable.any():
-        return None if not np.isfinite(curve.pull).any() or usage[0] <= 1.0 else _torque_bound(curve)
+        return Capability(0.0, np.zeros(6), float(curve.slip[0]), "torque") if balanced.any() else None
     best = int(np.nanargmax(np.where(usable, curve.pull, -np.inf)))
     after = best + 1
-    if after < len(grid) and np.isfinite(curve.pull[after]) and curve.pull[after] > curve.pull[best]:
-        # The torque limit lies between two grid points: take the pull where it is met.
-        part = float((1.0 - usage[best]) / (usage[after] - usage[best]))
-        slip = float(grid[best] + part * (grid[after] - grid[best]))
-        at = pull_curve(soil, rig, model, np.array([slip, grid[after]]), against)
-        wheel = int(np.nanargmax(at.torque[:, 0] / limits))
-        torque_slope = (at.torque[wheel, 1] - at.torque[wheel, 0]) / (at.slip[1] - at.slip[0])
-        pull_slope = (at.pull[1] - at.pull[0]) / (at.slip[1] - at.slip[0])
-        gradient = at.pull_by_soil[:, 0] - pull_slope / torque_slope * at.torque_by_soil[wheel, :, 0]
-        return Capability(float(at.pull[0]), gradient, slip, "torque")
-    limit: Literal["traction", "slip"] = "slip" if best == len(grid) - 1 else "traction"
-    return Capability(float(curve.pull[best]), curve.pull_by_soil[:, best], float(grid[best]), limit)
+    if after < len(curve.slip) and balanced[after] and curve.pull[after] > curve.pull[best]:
+        return _at_torque_limit(curve, best, torque_limit, soil, rig, model)
+    limit: Literal["slip", "traction"] = "slip" if after == len(curve.slip) else "traction"
+    return Capability(float(curve.pull[best]), curve.pull_by_soil[:, best], float(curve.slip[best]), limit)
 
 
-def _torque_bound(curve: PullCurve) -> Capability:
-    return Capability(0.0, np.zeros(6), float(curve.slip[0]), "torque")
+def _at_torque_limit(
+    curve: PullCurve, below: int, torque_limit: Array, soil: Soil, rig: Rig, model: WheelModel
+) -> Capability:
+    """The pull where the first wheel meets its torque limit, between two points of the curve (secant)."""
+    low, high = curve.slip[below], curve.slip[below + 1]
+    usage = [np.nanmax(curve.torque[:, i] / torque_limit) for i in (below, below + 1)]
+    slip = low + (high - low) * (1.0 - usage[0]) / (usage[1] - usage[0])
+    graded = np.full(2, bool(curve.on_grade[below]))
+    for _ in range(3):
+        at = pull_curve(soil, rig, model, np.array([slip, slip * 1.001]), graded)
+        wheel = int(np.nanargmax(at.torque[:, 0] / torque_limit))
+        torque_slope, pull_slope = ((a[1] - a[0]) / (0.001 * slip) for a in (at.torque[wheel], at.pull))
+        miss = torque_limit[wheel] - at.torque[wheel, 0]
+        if abs(miss) < 1e-4 * torque_limit[wheel]:
+            break
+        slip = float(np.clip(slip + miss / torque_slope, low, high))
+    gradient = at.pull_by_soil[:, 0] - pull_slope / torque_slope * at.torque_by_soil[wheel, :, 0]
+    return Capability(float(at.pull[0] + pull_slope / torque_slope * miss), gradient, float(at.slip[0]), "torque")
 
 
-def torque_for_pull(soil: Soil, rig: Rig, model: WheelModel, pull: float, max_slip: float) -> tuple[float, float] | None:
-    """Sum of wheel torques [N m] and slip at which the wheels give this pull [N] on the level.
+def slip_for_pull(curve: PullCurve, pull: float) -> tuple[float, float] | None:
+    """Slip at which a level curve gives this pull [N], and the wheels' summed torque [N m] there.
 
-    None where no slip up to max_slip gives it.
+    None where no slip of the curve gives it.
     """
-    grid = np.geomspace(_MIN_SLIP, max_slip, _GRID)
-    curve = pull_curve(soil, rig, model, grid, "draft")
     torque = curve.torque.sum(0)
     enough = np.flatnonzero(np.isfinite(curve.pull) & (curve.pull >= pull))
     if not len(enough):
         return None
     i = int(enough[0])
-    if i == 0:
-        return float(torque[0]), float(grid[0])
+    if i == 0 or not np.isfinite(curve.pull[i - 1]):
+        return float(curve.slip[i]), float(torque[i])
     part = (pull - curve.pull[i - 1]) / (curve.pull[i] - curve.pull[i - 1])
-    slip = grid[i - 1] + part * (grid[i] - grid[i - 1])
-    return float(torque[i - 1] + part * (torque[i] - torque[i - 1])), float(slip)
+    slip = curve.slip[i - 1] + part * (curve.slip[i] - curve.slip[i - 1])
+    return float(slip), float(torque[i - 1] + part * (torque[i] - torque[i - 1]))

@@ -75,7 +75,7 @@ class Signal(_Section):
     `sign` flips a sensor mounted the other way round.  `valid` names a signal (or a
     signal of the same message) that must hold one of `valid_values` for the value to
     count.  `at` tells on which side of the gear a torque or speed is measured.
-    `require_counter` and `require_checksum` refuse frames without them.
+    `timeout` [s] is the age from which the channel counts as stale.
     """
 
     signal: SignalName
@@ -202,8 +202,8 @@ class Estimator(_Section):
     """Relative std of the bearing pressure up to which a window counts as excited."""
     max_tan_phi_std: PositiveFloat = 0.15
     """Relative std of tan phi up to which a window counts as excited."""
-    max_chi2: PositiveFloat = 2.0
-    """Reduced chi-square above which the model does not describe the data: never valid."""
+    max_chi2: PositiveFloat = 1.2
+    """Reduced chi-square, beyond its own scatter, above which the model does not describe the data."""
 
     @model_validator(mode="after")
     def _lengths_fit(self) -> Estimator:

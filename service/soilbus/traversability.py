@@ -9,7 +9,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.capability import largest_pull, torque_for_pull
+from soilbus.capability import PullCurve, largest_pull, pull_curve, slip_for_pull, slip_grid
 from soilbus.config import Traversability as Settings
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.window import Rig
@@ -69,19 +69,24 @@ def judge(
     model: WheelModel,
     torque_limit: NDArray[np.float64],
     settings: Settings,
-) -> Traversability:
-    """Traversability of the ground of one window.
+    last: PullCurve | None = None,
+) -> tuple[Traversability, PullCurve | None]:
+    """Traversability of the ground of one window, and the pull curve to start the next one from.
 
     torque_limit (W,) [N m] holds nan where a motor's limit is not known.  Only a valid
     posterior and a known demand can lead to go.
     """
     available = float(torque_limit.sum()) if np.isfinite(torque_limit).all() and len(torque_limit) else None
     if posterior is None or status is Status.INVALID or rig.chassis is None:
-        return Traversability(torque_available=available)
-    draft = largest_pull(posterior.soil, rig, model, torque_limit, settings.max_slip, "draft")
-    grade = largest_pull(posterior.soil, rig, model, torque_limit, settings.max_slip, "grade")
+        return Traversability(torque_available=available), None
+    grid = slip_grid(settings.max_slip)
+    on_grade = np.arange(2 * len(grid)) >= len(grid)
+    curve = pull_curve(posterior.soil, rig, model, np.tile(grid, 2), on_grade, last)
+    level = curve.part(on_grade=False)
+    draft = largest_pull(level, torque_limit, posterior.soil, rig, model)
+    grade = largest_pull(curve.part(on_grade=True), torque_limit, posterior.soil, rig, model)
     if draft is None:
-        return Traversability(state=State.NO_GO, probability=0.0, torque_available=available, limit="sinkage")
+        return Traversability(State.NO_GO, 0.0, torque_available=available, limit="sinkage"), None
     max_draft = Estimate(draft.pull, posterior.propagate(draft.gradient))
     weight = rig.chassis.mass * GRAVITY
     max_grade = None
@@ -90,20 +95,24 @@ def judge(
         cosine = max(math.sqrt(1.0 - sine**2), 1e-3)
         max_grade = Estimate(math.asin(sine), posterior.propagate(grade.gradient) / weight / cosine)
     if demand is None:
-        return Traversability(max_draft=max_draft, max_grade=max_grade, torque_available=available, limit=draft.limit)
+        partial = Traversability(
+            max_draft=max_draft, max_grade=max_grade, torque_available=available, limit=draft.limit
+        )
+        return partial, curve
     needed = demand.pull + settings.margin * max(demand.pull, 0.0)
     probability = _above(max_draft.value - needed, math.hypot(max_draft.std, demand.std))
-    torque = torque_for_pull(posterior.soil, rig, model, demand.pull, settings.max_slip)
-    return Traversability(
+    slip, torque = slip_for_pull(level, demand.pull) or (None, None)
+    decided = Traversability(
         state=_state(probability, status, settings),
         probability=probability,
-        torque_required=None if torque is None else torque[0],
+        torque_required=torque,
         torque_available=available,
         max_draft=max_draft,
         max_grade=max_grade,
-        slip_needed=None if torque is None else torque[1],
+        slip_needed=slip,
         limit=draft.limit,
     )
+    return decided, curve
 
 
 def _above(margin: float, std: float) -> float:

@@ -32,6 +32,10 @@ BO_ 257 Guarded: 4 X
  SG_ Checksum : 24|8@1+ (1,0) [0|255] "" X
 BO_ 2566801815 GroundSpeed: 8 X
  SG_ Speed : 0|16@1+ (0.001,0) [0|64.255] "m/s" X
+BO_ 2566801431 GuardedGroup: 3 X
+ SG_ Value : 0|8@1+ (1,0) [0|250] "m/s" X
+ SG_ Counter : 8|4@1+ (1,0) [0|15] "" X
+ SG_ Checksum : 23|8@0+ (1,0) [0|255] "" X
 BO_ 2566857232 Exact: 2 X
  SG_ Value : 0|16@1+ (1,0) [0|64255] "N" X
 BO_ 2566857233 ExactToo: 2 X
@@ -232,6 +236,27 @@ def test_the_dbcs_own_source_takes_over() -> None:
     assert (a.counts.received["GroundSpeed"], a.counts.admitted["GroundSpeed"]) == (4, 3)
 
 
+def test_each_source_counts_for_itself() -> None:
+    """The same counter value from the next source is no repeat; the identifier is in the checksum."""
+    a = admission(("GuardedGroup", "Value"), checked=["GuardedGroup"])
+    for t, identifier in ((0.0, 0x18FE4847), (5.0, 0x18FE481C)):
+        data = bytes([7, 3, frame_checksum(identifier, bytes([7, 3, 0]), 2)])
+        a.feed(t, identifier, True, data)
+    assert values(a.take(), "Value") == [(0.0, 7.0), (5.0, 7.0)]
+
+
+def test_group_that_the_dbc_gives_to_several_sources_goes_by_identifier() -> None:
+    several = database()
+    several.add_dbc_string('BO_ 2566801688 Second: 8 X\n SG_ Speed : 0|16@1+ (0.001,0) [0|64.255] "m/s" X\n')
+    several.add_dbc_string('BO_ 2566801816 Third: 8 X\n SG_ Speed : 0|16@1+ (0.001,0) [0|64.255] "m/s" X\n')
+    a = Admission([Channel("Speed", "", "GroundSpeed", "Speed", **COMMON)], several)
+    for identifier in (SPEED, SPEED + 1, 0x0CFE4997):
+        a.feed(0.0, identifier, True, bytes(8))
+    assert len(a.take().columns["Speed"].t) == 1
+    assert a.counts.unknown == 2
+    assert a.can_filters() == [{"can_id": SPEED, "can_mask": 0x1FFFFFFF, "extended": True}]
+
+
 @settings(derandomize=True, max_examples=200, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 30), st.sampled_from([1, 2, 3])), max_size=30))
 def test_lock_never_mixes_sources_within_its_silence(steps: list[tuple[int, int]]) -> None:
@@ -242,7 +267,8 @@ def test_lock_never_mixes_sources_within_its_silence(steps: list[tuple[int, int]
             assert source in (1, heard[0]) or t / 10 - heard[1] > 2.0
             heard = (source, t / 10)
         else:
-            assert source != heard[0] and source != 1
+            assert source != heard[0]
+            assert source != 1
 
 
 def test_groups_of_both_formats() -> None:
@@ -252,9 +278,7 @@ def test_groups_of_both_formats() -> None:
 
 
 def passes(filters: list[dict[str, Any]], identifier: int, extended: bool) -> bool:
-    return any(
-        f["extended"] == extended and identifier & f["can_mask"] == f["can_id"] & f["can_mask"] for f in filters
-    )
+    return any(f["extended"] == extended and identifier & f["can_mask"] == f["can_id"] & f["can_mask"] for f in filters)
 
 
 @settings(derandomize=True, max_examples=300, deadline=None)
@@ -301,7 +325,8 @@ def test_clay_refuses_what_the_recording_marks_and_nothing_else() -> None:
     lost = {(name, str(reason)): len(t) for (name, reason), t in out.refused.items()}
     assert lost == {("draft", "not_available"): 43, ("ground_speed", "not_available"): 24}
     assert (len(out.columns["draft"].t), len(out.columns["ground_speed"].t)) == (5946, 2964)
-    assert a.counts.unknown == 0 and not a.counts.refused
+    assert a.counts.unknown == 0
+    assert not a.counts.refused
     assert a.counts.received == a.counts.admitted
 
 

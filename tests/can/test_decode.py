@@ -155,8 +155,9 @@ def test_integers_beyond_64_bits() -> None:
 
 
 def test_integer_product_is_exact_before_a_fractional_offset() -> None:
+    """3 (2^53 + 1) is not three times the float next to 2^53 + 1."""
     precise = Signal("P", 0, 60, conversion=LinearConversion(scale=3, offset=0.5, is_float=False))
-    assert_equal_to_cantools(Message(1, "M", 8, [precise]), [b"\xff" * 8, b"\xfd\xff\xff\xff\xff\xff\xff\x07"])
+    assert_equal_to_cantools(Message(1, "M", 8, [precise]), [(2**53 + 1).to_bytes(8, "little"), b"\xff" * 8])
 
 
 def test_no_frames() -> None:

@@ -151,7 +151,8 @@ def test_each_fault_is_one_clear_line(tmp_path: Path, role: str, mapped: Any, li
 def test_percent_and_hertz_say_why_not(tmp_path: Path) -> None:
     lines = faults(tmp_path, signals={"pitch": "Wheel.Grade"}, **(FULL | {"speed": "Other.Pulses"}))
     assert len(lines) == 2
-    assert "sensor pulses" in lines[0] and "speed needs rad/s or m/s" in lines[0]
+    assert "sensor pulses" in lines[0]
+    assert "speed needs rad/s or m/s" in lines[0]
     assert lines[1].startswith("signals.pitch: Grade: a percentage")
 
 
@@ -173,7 +174,9 @@ def test_unreadable_files_are_told_one_by_one(tmp_path: Path) -> None:
         load_databases(config(tmp_path, "missing.dbc", "text.dbc", "empty.dbc", "."))
     lines = error.value.faults
     assert [line.split(":")[1].strip() for line in lines] == ["missing.dbc", "text.dbc", "empty.dbc", "."]
-    assert "No such file" in lines[0] and "not a DBC" in lines[1] and "not a DBC" in lines[2]
+    assert "No such file" in lines[0]
+    assert "not a DBC" in lines[1]
+    assert "not a DBC" in lines[2]
     assert not any("\n" in line for line in lines)
 
 

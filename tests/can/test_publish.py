@@ -66,10 +66,13 @@ def test_ends_of_the_range_are_values_and_beyond_is_an_error():
     def slip(x):
         return decoded(publisher.frame("WheelSlip", {"SlipWheel2": x}))["SlipWheel2"]
 
-    assert slip(1.0) == 1.0 and slip(-1.0) == -1.0
+    assert slip(1.0) == 1.0
+    assert slip(-1.0) == -1.0
     assert slip(1.0002) == 1.0  # rounds to the end
-    assert slip(1.0003) == "error" and slip(-1.0003) == "error"
-    assert slip(1e300) == "error" and slip(-1e300) == "error"
+    assert slip(1.0003) == "error"
+    assert slip(-1.0003) == "error"
+    assert slip(1e300) == "error"
+    assert slip(-1e300) == "error"
 
 
 def test_standard_deviations_stay_at_the_top_but_never_go_below():
@@ -122,19 +125,23 @@ def bitwise_crc(data):
 def test_checksum_covers_identifier_and_payload(message, values):
     names = [s.name for m, s in SENT if m is message]
     frame = Publisher(DATABASE).frame(message.name, dict(zip(names, values, strict=False)))
-    assert frame.extended and frame.arbitration_id == message.frame_id
+    assert frame.extended
+    assert frame.arbitration_id == message.frame_id
     assert frame.data[7] == bitwise_crc(frame.arbitration_id.to_bytes(4, "little") + frame.data[:7])
 
 
 def test_reserved_bits_are_ones():
     data = Publisher(DATABASE).frame("SoilbusStatus", {"State": "starting", "Window": 0}).data
-    assert data[0] == 0xF0 and data[4] == 0xFF and data[6] & 0x0F == 0x0F
+    assert data[0] == 0xF0
+    assert data[4] == 0xFF
+    assert data[6] & 0x0F == 0x0F
 
 
 def test_schedule_is_the_cycle_time_of_the_dbc():
     schedule = Publisher(DATABASE).schedule
     assert schedule == {message.name: message.cycle_time / 1000.0 for message in DATABASE.messages}
-    assert schedule["Traversability"] == 0.1 and schedule["SoilStrength"] == 1.0
+    assert schedule["Traversability"] == 0.1
+    assert schedule["SoilStrength"] == 1.0
 
 
 @pytest.mark.parametrize(
@@ -173,11 +180,13 @@ BO_ 100 M: 8 A
 def test_codes_of_a_foreign_dbc_follow_the_habits_of_the_field():
     message = cantools.database.load_string(FOREIGN, "dbc").messages[0]
     codes = {signal.name: value_codes(signal) for signal in message.signals}
-    assert codes["Plain"].code(None) == -32768 and codes["Plain"].code(-1638.35) == -32767
+    assert codes["Plain"].code(None) == -32768
+    assert codes["Plain"].code(-1638.35) == -32767
     assert (codes["Plain"].lowest, codes["Plain"].highest) == (-32767, 32767)
     assert codes["Plain"].code(2000.0) == -32768  # no error code in a signed signal
     assert (codes["Ranged"].code(None), codes["Ranged"].code(64256)) == (65535, 0xFE00)
-    assert codes["Free"].code(65534) == 65534 and codes["Free"].code(65535) == 65535  # [0|0] is no range
+    assert codes["Free"].code(65534) == 65534
+    assert codes["Free"].code(65535) == 65535
     assert (codes["Falling"].code(100), codes["Falling"].code(-50), codes["Falling"].code(None)) == (0, 150, 255)
 
 

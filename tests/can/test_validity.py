@@ -63,6 +63,7 @@ def reasons(verdict: Any) -> list[Reason | None]:
         (signal(16, is_signed=True, minimum=-9, maximum=9), {-32768: NA, -10: OUT, 10: OUT, 32767: Reason.SATURATED}),
         # 4095.8 is 4095.875 as printed: no code is lost to rounding
         (signal(16, is_signed=True, scale=0.125, minimum=-4096, maximum=4095.8), {32766: None, -32767: None}),
+        (signal(16, scale=0.125, minimum=0, maximum=100.1), {801: None, 802: OUT}),
         (signal(16, scale=-0.5, offset=10, minimum=-10, maximum=10), {0: None, 40: None, 41: OUT, 0xFFFF: NA}),
         (signal(8, minimum=0, maximum=0), {0: None, 254: None, 255: NA}),
         (signal(8, choices={7: "SNA", 8: "Error", 9: "Ok"}), {6: None, 7: NA, 8: ERROR, 9: None}),

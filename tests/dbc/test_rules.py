@@ -44,8 +44,10 @@ def test_j1939_codes_of_common_widths():
 
 @pytest.mark.parametrize(("message", "signal"), SIGNALS)
 def test_top_codes_lie_outside_the_range_and_are_named(message, signal):
-    assert not signal.is_signed and not signal.is_float
-    assert signal.minimum is not None and signal.maximum is not None
+    assert not signal.is_signed
+    assert not signal.is_float
+    assert signal.minimum is not None
+    assert signal.maximum is not None
     if signal.name in WHOLE_RANGE:
         assert (signal.minimum, signal.maximum) == (0, (1 << signal.length) - 1)
         return
@@ -59,7 +61,8 @@ def test_top_codes_lie_outside_the_range_and_are_named(message, signal):
 @pytest.mark.parametrize(("message", "signal"), SIGNALS)
 def test_starts_not_available_with_unit_and_comment(message, signal):
     assert signal.raw_initial == (1 << signal.length) - 1
-    assert signal.comment and len(signal.comment) > 10
+    assert signal.comment
+    assert len(signal.comment) > 10
     if signal.unit:  # a physical value says which way is positive, or that it has no sign
         assert re.search(r"positive|negative", signal.comment), signal.comment
 
@@ -68,8 +71,10 @@ def test_starts_not_available_with_unit_and_comment(message, signal):
 def test_messages_are_ours_to_send(name):
     database = load(name)
     for message in database.messages:
-        assert message.length == 8 and message.is_extended_frame
-        assert message.comment and message.cycle_time
+        assert message.length == 8
+        assert message.is_extended_frame
+        assert message.comment
+        assert message.cycle_time
         assert "VFrameFormat" in message.dbc.attributes
         pgn = message.frame_id >> 8 & 0xFFFF
         assert 0xFF00 <= pgn <= 0xFFFF or (name == "tractor" and pgn == 65097)
@@ -132,7 +137,9 @@ def test_readme_lists_every_frame_with_its_identifier_and_its_example_is_right()
             crc = (crc << 1 ^ 0x1D) & 0xFF if crc & 0x80 else crc << 1
     assert crc ^ 0xFF == payload[7]
     decoded = database.decode_message(frame_id, payload)
-    assert decoded["State"] == "go" and decoded["LimitingCause"] == "slip" and decoded["Counter"] == 5
+    assert decoded["State"] == "go"
+    assert decoded["LimitingCause"] == "slip"
+    assert decoded["Counter"] == 5
     assert (decoded["Probability"], decoded["Age"], decoded["Window"]) == (pytest.approx(0.97), pytest.approx(0.4), 7)
 
 
@@ -144,9 +151,8 @@ def c_program(name, database, readme):
         prints = "".join(
             f'printf(" %.17g", {m}_{s}_decode(v.{s}));' for s in (camel_to_snake_case(x.name) for x in message.signals)
         )
-        cases.append(
-            f"case 0x{message.frame_id:x}u: {{ struct {m}_t v; if ({m}_unpack(&v, data, 8)) return 1; {prints} break; }}"
-        )
+        unpack = f"struct {m}_t v; if ({m}_unpack(&v, data, 8)) return 1;"
+        cases.append(f"case 0x{message.frame_id:x}u: {{ {unpack} {prints} break; }}")
     return f"""
 #include <stdio.h>
 #include "{name}.h"

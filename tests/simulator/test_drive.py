@@ -85,7 +85,9 @@ def forces_by_quad(soil, radius, width, entry, slip):
         return math.copysign(-math.expm1(-abs(j) / soil.K), j) * (soil.c + sigma(a) * math.tan(soil.phi))
 
     def integral(f):
-        return sum(quad(f, a, b, epsabs=0.0, epsrel=1e-8, limit=400)[0] for a, b in ((0, entry / 2), (entry / 2, entry)))
+        return sum(
+            quad(f, a, b, epsabs=0.0, epsrel=1e-8, limit=400)[0] for a, b in ((0, entry / 2), (entry / 2, entry))
+        )
 
     area = radius * width
     return (
@@ -116,7 +118,8 @@ def test_prescribed_slip_is_kept_on_every_soil_up_to_the_torque_limit(soil):
     free = torque < 2400.0 * (1.0 - 1e-9)
     slip = columns["slip.FL"]
     assert np.all(torque <= 2400.0 * (1.0 + 1e-9))
-    assert np.all((slip[free] >= 0.05) & (slip[free] <= 0.4)) and np.all(slip <= 0.4)
+    assert np.all((slip[free] >= 0.05) & (slip[free] <= 0.4))
+    assert np.all(slip <= 0.4)
     if free.any():
         assert np.isnan(columns["demand"]).all()
         assert slip[free] == pytest.approx(columns["slip.RR"][free], abs=1e-12)
@@ -152,7 +155,8 @@ def test_a_weak_motor_limits_the_draft():
 def test_the_demo_is_easy_on_loam_and_too_much_for_wet_clay():
     columns = drive(config(), demo(60.0), seed=1).columns
     loam, clay = (columns["soil"] == name for name in ("loam", "xi_wet_clay"))
-    assert 0.4 < loam.mean() < 0.6 and (loam | clay).all()
+    assert 0.4 < loam.mean() < 0.6
+    assert (loam | clay).all()
     assert columns["draft"][loam][:-150] == pytest.approx(columns["demand"][loam][:-150], rel=1e-9)
     assert columns["slip.FL"][loam][:-150].max() < 0.35
     on_clay = clay & (columns["distance"] > columns["distance"][clay][0] + 3.0)

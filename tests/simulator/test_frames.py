@@ -53,12 +53,15 @@ def test_each_message_keeps_its_cycle_time_with_little_jitter(messages):
     groups = by_name(messages)
     assert set(groups) == {message.name for message in DATABASE.messages}
     stamps = [message.timestamp for message in messages]
-    assert stamps == sorted(stamps) and START <= stamps[0] < START + 0.002
+    assert stamps == sorted(stamps)
+    assert START <= stamps[0] < START + 0.002
     phases = []
     for name, group in groups.items():
         cycle = DATABASE.get_message_by_name(name).cycle_time / 1000.0
         late = np.array([m.timestamp for m in group]) - START - cycle * np.arange(len(group))
-        assert 0.0 <= late.min() and np.ptp(late) < 1.01e-3 and late.max() < 0.02
+        assert late.min() >= 0.0
+        assert np.ptp(late) < 1.01e-3
+        assert late.max() < 0.02
         assert np.ptp(late) > 0.8e-3
         phases.append(late.min())
     assert len({round(phase, 4) for phase in phases}) == len(phases)
@@ -77,13 +80,13 @@ def test_what_a_vehicle_sends_beside_the_mapped_signals(recording, messages):
     ground = [DATABASE.decode_message(m.arbitration_id, m.data) for m in groups["GroundBasedSpeedAndDistance"]]
     distance = [x["GroundBasedMachineDistance"] for x in ground]
     assert distance == pytest.approx(recording.truth["distance"][::2], abs=5.1e-4)
-    assert {x["GroundBasedMachineDirection"] for x in ground} == {"forward"}
+    assert {str(x["GroundBasedMachineDirection"]) for x in ground} == {"forward"}
     motor = [DATABASE.decode_message(m.arbitration_id, m.data) for m in groups["MotorRL"]]
     rpm = recording.truth["speed.RL"] * 24.0 * 60.0 / (2.0 * np.pi)
     assert [x["ShaftSpeed"] for x in motor] == pytest.approx(rpm, abs=0.0626)
-    assert {x["State"] for x in motor} == {"not_available"}
+    assert {str(x["State"]) for x in motor} == {"not_available"}
     assert {x["TorqueLimit"] for x in motor} == {100.0}
-    assert {DATABASE.decode_message(m.arbitration_id, m.data)["Valid"] for m in groups["DrawbarPin"]} == {"valid"}
+    assert {m.data[2] & 3 for m in groups["DrawbarPin"]} == {1}
 
 
 def test_what_is_not_known_is_not_available():
@@ -92,7 +95,8 @@ def test_what_is_not_known_is_not_available():
     unlimited = parse_config(raw)
     short = simulate(unlimited, excited("loam", 1.0), seed=1)
     group = by_name(frames(short, unlimited))["MotorFL"]
-    assert {DATABASE.decode_message(m.arbitration_id, m.data)["TorqueLimit"] for m in group} == {"not_available"}
+    limits = {str(DATABASE.decode_message(m.arbitration_id, m.data)["TorqueLimit"]) for m in group}
+    assert limits == {"not_available"}
 
 
 @pytest.mark.parametrize("suffix", [".log", ".log.gz", ".asc", ".blf"])
@@ -117,7 +121,7 @@ def test_a_log_that_fails_midway_leaves_nothing(messages, tmp_path):
 
     with pytest.raises(RuntimeError):
         write_log(breaking(), tmp_path / "drive.log")
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match="xyz"):
         write_log(iter(messages[:10]), tmp_path / "drive.xyz")
     assert list(tmp_path.iterdir()) == []
 

@@ -14,21 +14,22 @@ from soilbus.terra.soils import soil_named
 def test_waves_stay_in_range_with_exact_rate_and_integral(seed, low, span, duration):
     t = np.linspace(0.0, duration, 5001)
     wave = realise(Swing(low, low + span), t, np.random.default_rng(seed))
-    slack = 1e-5 * span + 1e-12
-    assert wave.value.min() >= low - slack and wave.value.max() <= low + span + slack
+    assert wave.value.min() >= low
+    assert wave.value.max() <= low + span
     step = t[1]
     area = np.concatenate([[0.0], np.cumsum((wave.value[1:] + wave.value[:-1]) / 2.0) * step])
-    assert wave.integral == pytest.approx(area, abs=1e-3 * (abs(low) + span) + 1e-12)
-    assert np.gradient(wave.value, t)[1:-1] == pytest.approx(wave.rate[1:-1], abs=2e-2 * span + 1e-12)
+    assert np.abs(wave.integral - area).max() <= 1e-3 * (abs(low) + span)
+    assert np.abs(np.gradient(wave.value, t) - wave.rate)[1:-1].max() <= 1e-3 * span + 1e-9
 
 
 def test_a_long_wave_sweeps_its_whole_range_slowly():
     t = np.linspace(0.0, 120.0, 6001)
     wave = realise(Swing(0.05, 0.4), t, np.random.default_rng(0))
-    assert wave.value.min() < 0.052 and wave.value.max() > 0.398
-    spectrum = np.abs(np.fft.rfft(wave.value - wave.value.mean())) ** 2
+    assert wave.value.min() < 0.052
+    assert wave.value.max() > 0.398
+    spectrum = np.abs(np.fft.rfft((wave.value - wave.value.mean()) * np.hanning(len(t)))) ** 2
     frequency = np.fft.rfftfreq(len(t), t[1])
-    assert spectrum[frequency > 0.15].sum() < 0.01 * spectrum.sum()
+    assert spectrum[frequency > 0.15].sum() < 1e-4 * spectrum.sum()
 
 
 def test_soil_changes_over_the_transition():
@@ -43,21 +44,21 @@ def test_soil_changes_over_the_transition():
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    ("wrong", "fault"),
     [
-        {"soils": ()},
-        {"soils": (Patch(5.0, "loam"), Patch(0.0, "loam"))},
-        {"draft": None},
-        {"slip": Swing(0.1, 0.2)},
-        {"duration": 0.01},
-        {"speed": Swing(0.0, 1.0)},
-        {"transition": 0.0},
+        ({"soils": ()}, "soils"),
+        ({"soils": (Patch(5.0, "loam"), Patch(0.0, "loam"))}, "ascending"),
+        ({"draft": None}, "exactly one of draft and slip"),
+        ({"slip": Swing(0.1, 0.2)}, "exactly one of draft and slip"),
+        ({"duration": 0.01}, "too short"),
+        ({"speed": Swing(0.0, 1.0)}, "above zero"),
+        ({"transition": 0.0}, "above zero"),
     ],
 )
-def test_impossible_scenarios_are_refused(wrong):
+def test_impossible_scenarios_are_refused(wrong, fault):
     good = {"duration": 10.0, "soils": (Patch(0.0, "loam"),), "draft": Swing(0.0, 1.0)}
     Scenario(**good)
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match=fault):
         Scenario(**good | wrong)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import soilbus.simulator
-from soilbus.config import Noise, load_config
+from soilbus.config import Noise, load_config, parse_config
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.scenario import excited
 from soilbus.simulator.sensors import disturbed
@@ -26,7 +26,8 @@ def test_every_mapped_channel_has_a_column_at_its_rate(recording):
     assert set(recording.channels) == wheels | {"ground_speed", "draft", "pitch", "acceleration"}
     for name, column in recording.channels.items():
         period = 0.04 if name == "ground_speed" else 0.02
-        assert np.diff(column.t) == pytest.approx(period) and len(column.t) == len(column.value) == round(120 / period)
+        assert np.diff(column.t) == pytest.approx(period)
+        assert len(column.t) == len(column.value) == round(120 / period)
 
 
 @pytest.mark.parametrize(
@@ -77,8 +78,6 @@ def test_a_channel_does_not_change_when_another_is_not_fitted(recording):
     raw = CONFIG.model_dump(exclude={"folder"}, exclude_none=True)
     for wheel in raw["wheel"]:
         del wheel["sinkage"]
-    from soilbus.config import parse_config
-
     without = simulate(parse_config(raw), excited("loam", 120.0), seed=11)
     assert not any(name.startswith("sinkage") for name in without.channels)
     for name, column in without.channels.items():

@@ -17,7 +17,7 @@ from cantools.database.can import Database, Message, Signal
 from numpy.typing import NDArray
 
 from soilbus.can.channels import Channel, Column, Decoded, Reason
-from soilbus.can.checksum import column_checksums
+from soilbus.can.checksum import CHECKSUM, COUNTER, column_checksums
 from soilbus.can.decode import ColumnDecoder, SignalColumn
 from soilbus.can.j1939 import STANDARD_PGNS, SourceLock, group_mask, pgn_of, source_of
 from soilbus.can.validity import REASONS, CodeRule, in_si, judge_codes, judge_validity, rule_of
@@ -25,9 +25,6 @@ from soilbus.can.validity import REASONS, CodeRule, in_si, judge_codes, judge_va
 CLOCK_STEP = 1.0
 """Backward jump [s] above which the clock was set and the new time is believed."""
 MAX_LISTED_UNKNOWN = 1024
-
-COUNTER = "Counter"
-CHECKSUM = "Checksum"
 
 _EXTENDED = 1 << 31
 _NONE: NDArray[np.float64] = np.empty(0)

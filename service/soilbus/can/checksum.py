@@ -10,6 +10,10 @@ import numpy as np
 from crccheck.crc import Crc8SaeJ1850  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
+COUNTER = "Counter"
+CHECKSUM = "Checksum"
+"""Names of the signals that make a frame checkable."""
+
 _INIT = 0xFF
 _XOR_OUT = 0xFF
 _TABLE = bytes(Crc8SaeJ1850(initvalue=0).process((byte,)).value() for byte in range(256))

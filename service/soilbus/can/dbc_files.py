@@ -61,6 +61,25 @@ def checked_messages(config: Config) -> frozenset[str]:
     return frozenset(m.name for m in found if checksum_byte_of(m) is not None)
 
 
+def output_database(config: Config) -> Database:
+    """The DBC of the frames that soilbus sends.
+
+    Raises ConfigError where it is missing, not a DBC, or lacks a message of ours.
+    """
+    name = config.output.dbc
+    try:
+        database = _read(_located(config, name))
+        ours = {m.name for m in _read(shipped_dbc("soilbus.dbc")).messages}
+    except OSError as error:
+        raise ConfigError([f"output.dbc: {name}: {error.strerror or error}"]) from None
+    except Exception as error:
+        raise ConfigError([f"output.dbc: {name}: not a DBC file: {_one_line(error)}"]) from None
+    missing = sorted(ours - {m.name for m in database.messages})
+    if missing:
+        raise ConfigError([f"output.dbc: {name}: no message {', '.join(missing)}"])
+    return database
+
+
 def _located(config: Config, name: str) -> Path:
     beside = config.folder / name
     if beside.is_file():

@@ -199,7 +199,7 @@ def plausible(config: Config, quantity: str, wheel: Wheel | None) -> tuple[float
         case "speed":
             return -MAX_SPEED / radius, MAX_SPEED / radius
         case "load":
-            return 0.0, 5.0 * weight
+            return -0.02 * weight, 5.0 * weight  # a lifted wheel reads about zero
         case "sinkage":
             return -0.1 * radius, radius
         case "ground_speed":

@@ -18,9 +18,8 @@ from cantools.database import Database
 from cantools.database.can import Message, Signal
 from numpy.typing import NDArray
 
-from soilbus.can.checksum import frame_checksum
+from soilbus.can.checksum import CHECKSUM, COUNTER, frame_checksum
 
-COUNTER, CHECKSUM = "Counter", "Checksum"
 NOT_AVAILABLE, ERROR = "not_available", "error"
 
 

@@ -41,7 +41,7 @@ class CodeRule:
 
     `low`..`high` are raw codes for integer signals and physical values for float signals (the
     DBC's range, or all that the bits can hold); `bands` the first reserved, error and
-    not-available codes above `high`; `special` single codes with a meaning of their own.
+    not-available codes, where the range leaves them out; `special` single codes with a meaning of their own.
     """
 
     low: float
@@ -87,7 +87,7 @@ def judge_codes(rule: CodeRule, raw: NDArray[Any], physical: NDArray[Any]) -> Ve
     if outside.any():
         verdict[outside] = _VERDICT[Reason.OUT_OF_RANGE]
         if rule.bands is not None:
-            _mark_bands(verdict, raw, outside & (raw > rule.high), rule.bands)
+            _mark_bands(verdict, raw, outside, rule.bands)
     if rule.is_float:
         verdict[~np.isfinite(physical)] = _VERDICT[Reason.NOT_FINITE]
     for code, reason in rule.special:
@@ -120,12 +120,10 @@ def in_si(channel: Channel, physical: NDArray[Any], verdict: Verdicts) -> NDArra
     return value
 
 
-def _mark_bands(
-    verdict: Verdicts, raw: NDArray[Any], above: NDArray[np.bool_], bands: tuple[int, int, int]
-) -> None:
+def _mark_bands(verdict: Verdicts, raw: NDArray[Any], outside: NDArray[np.bool_], bands: tuple[int, int, int]) -> None:
     reasons = (Reason.RESERVED, Reason.ERROR, Reason.NOT_AVAILABLE)
     for first, reason in zip(bands, reasons, strict=True):
-        verdict[above & (raw >= first)] = _VERDICT[reason]
+        verdict[outside & (raw >= first)] = _VERDICT[reason]
 
 
 def _has_range(signal: Signal) -> bool:

@@ -136,7 +136,7 @@ def excited(soil: str = "loam", duration: float = 120.0) -> Scenario:
     return Scenario(duration, (Patch(0.0, soil),), slip=Swing(0.05, 0.40))
 
 
-def demo(duration: float = 60.0, first: str = "loam", second: str = "xi_wet_clay") -> Scenario:
+def demo(duration: float = 60.0, first: str = "loam", second: str = "wet_clay") -> Scenario:
     """Half the time on the first soil, then the same work on the second.
 
     The draft asked for is easy on loam and more than wet clay can hold: there the driver

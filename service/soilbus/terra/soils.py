@@ -44,10 +44,8 @@ SOILS |= {
     # Table 2 of Xi et al. 2024.
     "xi_wet_clay": _soil(0.85, 43.68, 499.3, 7.58, 14.0, 0.025),
     "xi_sandy_loam": _soil(0.70, 5.3, 1515.0, 1.7, 29.0, 0.025),
-    # The two soils of the demo.
-    "loam": _soil(0.70, 5.3, 1515.0, 1.7, 29.0, 0.025),
-    "wet_clay": _soil(0.50, 4.0, 130.0, 4.0, 8.0, 0.020),
 }
+SOILS |= {"loam": SOILS["xi_sandy_loam"], "wet_clay": SOILS["xi_wet_clay"]}  # the demo's two
 
 
 def soil_named(name: str) -> Soil:

@@ -85,12 +85,15 @@ def state_on(soil: Soil, entry_angle: Any, slip: Any, radius: Any, width: Any) -
 
 
 def wheel_forces(state: WheelState, model: WheelModel) -> Array:
-    """Load W [N], drawbar pull DP [N] and torque T [N m]: array (3, N) (eqs. 20-22)."""
+    """Load W [N], drawbar pull DP [N] and torque T [N m]: array (3, ...) (eqs. 20-22).
+
+    The dots stand for the shape that the fields of `state` broadcast to.
+    """
     return _in_chunks(state, model, derivatives=False)[0]
 
 
 def wheel_forces_and_derivatives(state: WheelState, model: WheelModel) -> tuple[Array, Array]:
-    """Forces (3, N) and their exact derivatives (3, 7, N) by INPUTS, radius and width held.
+    """Forces (3, ...) and their exact derivatives (3, 7, ...) by INPUTS, radius and width held.
 
     Rows as FORCES, columns as INPUTS; units are those of force per unit of input.
     """
@@ -103,7 +106,7 @@ def sinkage(entry_angle: Any, radius: Any) -> Any:
 
 
 def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolerance: float = 1e-12) -> Array:
-    """Entry angle [rad], shape (N,), at which the soil carries the load [N].
+    """Entry angle [rad], in the broadcast shape, at which the soil carries the load [N].
 
     Newton on logarithms, where the curve is nearly straight, inside a bracket that
     bisection shrinks whenever Newton leaves it.  state.entry_angle is the first guess
@@ -111,6 +114,8 @@ def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolera
     (wheel buried), or that is not a positive number, gives nan.
     """
     load, *fields = (np.atleast_1d(np.asarray(a, float)) for a in np.broadcast_arrays(load, *state))
+    shape = load.shape
+    load, *fields = (a.ravel() for a in (load, *fields))
     guess, rest = fields[0], fields[1:]
     low = np.full(load.shape, np.log(MIN_ENTRY_ANGLE))
     high = np.full(load.shape, np.log(MAX_ENTRY_ANGLE))
@@ -138,7 +143,7 @@ def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolera
         todo = todo[~done]
     angle = np.exp(at)
     angle[~usable | (at > np.log(MAX_ENTRY_ANGLE) - 1e-9)] = np.nan
-    return angle
+    return angle.reshape(shape)
 
 
 def _first_guess(load: Array, slip: Array, r: Array, b: Array, K_L: Array, n: Array, t: Array, c: Array, K: Array) -> Array:
@@ -156,11 +161,10 @@ def _in_chunks(
 ) -> tuple[Array, Array]:
     shape = np.broadcast_shapes(*(np.shape(a) for a in state))
     n_samples = int(np.prod(shape, dtype=int))
-    per_sample = ("entry_angle", "slip")
     rows = WheelState(*(
-        np.broadcast_to(np.asarray(a, float), shape).reshape(n_samples)
-        if np.ndim(a) or name in per_sample else float(a)
-        for name, a in zip(WheelState._fields, state, strict=True)
+        (a if np.shape(a) == shape else np.broadcast_to(a, shape)).reshape(n_samples)
+        if np.ndim(a) or i < 2 else float(a)  # entry angle and slip always by sample
+        for i, a in enumerate(state)
     ))  # fmt: skip
     forces = np.empty((3, n_samples))
     n_inputs = 1 if only_entry_angle else len(INPUTS)
@@ -171,7 +175,8 @@ def _in_chunks(
         forces[:, index], d = _integrate(part, model, skid, derivatives, only_entry_angle)
         if derivatives:
             jacobian[:, :, index] = d
-    return forces, jacobian
+    shape = shape or (1,)
+    return forces.reshape(3, *shape), jacobian.reshape(3, n_inputs, *shape) if derivatives else jacobian
 
 
 def _groups(slip: Array, n_samples: int) -> list[Any]:

@@ -1,0 +1,243 @@
+"""The command line: parse, call one function of a room, print.
+
+Exit codes: 0 done; 1 the work could not be done; 2 wrong usage or configuration.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import signal
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+from soilbus.allocator import keep_freed_memory
+from soilbus.config import Config, ConfigError, load_config
+
+DONE, FAILED, WRONG_USAGE = 0, 1, 2
+
+
+class WorkError(Exception):
+    """The work could not be done; the text is one line for the user."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns its exit code."""
+    args = _parser().parse_args(arguments)
+    logging.basicConfig(level=logging.INFO, format="soilbus: %(message)s", stream=sys.stderr)
+    logging.getLogger("can").setLevel(logging.ERROR)
+    keep_freed_memory()
+    try:
+        args.work(args)
+        sys.stdout.flush()
+    except ConfigError as error:
+        for fault in error.faults:
+            print(f"soilbus: {fault}", file=sys.stderr)
+        return WRONG_USAGE
+    except WorkError as error:
+        print(f"soilbus: {error}", file=sys.stderr)
+        return FAILED
+    except BrokenPipeError:  # the reader of our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except KeyboardInterrupt:
+        return FAILED
+    return DONE
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="soilbus", description="Tells a tractor what soil it is driving on.")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def command(name: str, work: Any, text: str, config: str = "required") -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=text, description=text)
+        sub.set_defaults(work=work)
+        if config:
+            sub.add_argument("--config", metavar="FILE", required=config == "required", help="TOML configuration")
+            sub.add_argument(
+                "--set", action="append", default=[], metavar="KEY=VALUE", help="override a value (dotted TOML path)"
+            )
+        return sub
+
+    sub = command("demo", _demo, "simulated tractor, service and dashboard; needs no hardware, ends by itself", "")
+    sub.add_argument("--duration", type=float, default=48.0, metavar="S", help="simulated seconds (default 48)")
+
+    sub = command("run", _run, "the service on a live bus")
+    sub.add_argument("--wait", action="store_true", help="wait for an interface that is not there yet")
+
+    command("check", _check, "check configuration and DBCs, list every mapped signal")
+
+    sub = command("replay", _replay, "the service's own pipeline over recorded logs")
+    sub.add_argument("logs", nargs="+", type=Path, metavar="LOG")
+    sub.add_argument("--json", type=Path, metavar="OUT", help="one JSON object a line per window; - for stdout")
+    sub.add_argument("--report", type=Path, metavar="OUT.html", help="self-contained HTML with plots (extra: plots)")
+    sub.add_argument("--partial", action="store_true", help="keep the windows before the point where a log is cut off")
+
+    sub = command("simulate", _simulate, "simulated tractor, to a bus in real time or to a log", "optional")
+    sub.add_argument("--soil", action="append", default=[], metavar="NAME", help="soil; repeat it for a sequence")
+    sub.add_argument("--duration", type=float, default=120.0, metavar="S")
+    sub.add_argument("--seed", type=int, default=1)
+    target = sub.add_mutually_exclusive_group(required=True)
+    target.add_argument("--bus", action="store_true", help="send to the configured bus in real time")
+    target.add_argument("--log", type=Path, metavar="OUT", help="write a log (.log .log.gz .asc .blf)")
+
+    sub = command("watch", _watch, "live terminal dashboard that reads only our frames", "optional")
+    sub.add_argument("--seconds", type=float, metavar="S", help="stop after this time")
+
+    sub = command("bench", _bench, "every performance figure beside its peer, in one run", "")
+    sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
+    return parser
+
+
+def _configured(args: argparse.Namespace) -> Config:
+    return load_config(args.config, args.set)
+
+
+def _configured_or_demo(args: argparse.Namespace) -> Config:
+    from soilbus.simulator.reference import reference_configuration
+
+    return _configured(args) if args.config else reference_configuration(args.set)
+
+
+def _demo(args: argparse.Namespace) -> None:
+    from soilbus.demo import run_demo
+
+    run_demo(args.duration)
+
+
+def _run(args: argparse.Namespace) -> None:
+    from soilbus.can.bus import BusError
+    from soilbus.daemon.start import start_service
+
+    config = _configured(args)
+    wait = args.wait or "NOTIFY_SOCKET" in os.environ
+    try:
+        service = start_service(config, wait)
+    except BusError as error:
+        raise WorkError(str(error)) from None
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: service.stop())
+    service.run()
+
+
+def _check(args: argparse.Namespace) -> None:
+    from soilbus.report.configuration import configuration_report
+
+    print(configuration_report(_configured(args)), end="")
+
+
+def _replay(args: argparse.Namespace) -> None:
+    from soilbus.can.dbc_files import load_databases
+    from soilbus.daemon.outputs import json_line
+    from soilbus.daemon.pipeline import Pipeline, WindowResult
+    from soilbus.daemon.replay import LogError, check_heard, replay
+    from soilbus.report.progress import progress
+    from soilbus.report.windows import html_report, summary
+
+    config = _configured(args)
+    pipeline = Pipeline(config, load_databases(config))
+    if args.report is not None:
+        _need("matplotlib", "plots", "--report")
+    results: list[WindowResult] = []
+    cut_off: LogError | None = None
+    with progress("replay") as step:
+        try:
+            for result in replay(pipeline, args.logs, step):
+                results.append(result)
+            check_heard(pipeline, args.logs)
+        except LogError as error:
+            if not (args.partial and results):
+                hint = "" if not results else f"; --partial keeps the {len(results)} windows before"
+                raise WorkError(f"{error}{hint}") from None
+            cut_off = error
+    if cut_off is not None:
+        print(f"soilbus: {cut_off}; {len(results)} windows before that are kept", file=sys.stderr)
+    if args.json is not None:
+        with _whole_file(args.json) as out:
+            for result in results:
+                out.write(json_line(result, config) + "\n")
+    if args.report is not None:
+        with _whole_file(args.report) as out:
+            out.write(html_report(results, pipeline, config, args.logs))
+    if args.json is None or str(args.json) != "-":
+        print(summary(results, pipeline), end="")
+
+
+def _simulate(args: argparse.Namespace) -> None:
+    from soilbus.can.bus import BusError
+    from soilbus.simulator.drive import SimulationError
+    from soilbus.simulator.play import play, scenario_over
+    from soilbus.simulator.recording import simulate
+
+    config = _configured_or_demo(args)
+    try:
+        recording = simulate(config, scenario_over(args.soil or ["loam"], args.duration), args.seed)
+        play(recording, config, args.log)
+    except (SimulationError, KeyError, ValueError, BusError) as error:
+        raise WorkError(str(error.args[0])) from None
+    except OSError as error:
+        raise WorkError(f"{args.log or 'bus'}: {error.strerror or error}") from None
+    if recording.bogged_at is not None:
+        print(f"soilbus: the tractor is stuck after {recording.bogged_at:.1f} s", file=sys.stderr)
+
+
+def _watch(args: argparse.Namespace) -> None:
+    from soilbus.can.bus import BusError
+    from soilbus.report.dashboard import watch
+
+    config = _configured_or_demo(args)
+    try:
+        watch(config, args.seconds)
+    except BusError as error:
+        raise WorkError(str(error)) from None
+
+
+def _bench(args: argparse.Namespace) -> None:
+    import json
+
+    from soilbus.bench import run_bench
+
+    figures = run_bench()
+    if args.json is not None:
+        with _whole_file(args.json) as out:
+            out.write(json.dumps(figures, indent=1) + "\n")
+
+
+def _need(module: str, extra: str, what: str) -> None:
+    from importlib.util import find_spec
+
+    if find_spec(module) is None:
+        raise WorkError(f"{what} needs the extra soilbus[{extra}]")
+
+
+@contextmanager
+def _whole_file(path: Path) -> Iterator[IO[str]]:
+    """A text file that appears under its name only when it is complete; "-" is stdout."""
+    if str(path) == "-":
+        yield sys.stdout
+        return
+    try:
+        with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=f".{path.name}.", delete=False) as out:
+            try:
+                yield out
+            except BaseException:
+                os.unlink(out.name)
+                raise
+        os.chmod(out.name, 0o666 & ~_umask())
+        os.replace(out.name, path)
+    except OSError as error:
+        raise WorkError(f"{path}: {error.strerror or error}") from None
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,100 @@
+"""One window's result as a JSON line and as values of our frames."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from soilbus.config import Config
+from soilbus.daemon.pipeline import WindowResult
+from soilbus.estimation.posterior import Estimate
+
+WINDOW_MODULUS = 251
+"""The frames' 8-bit window number counts 0..250."""
+
+PARAMETER_FRAMES = {
+    # JSON name: (message, SI value of one unit of the DBC)
+    "k_c": ("SoilCohesiveModulus", 1e3),
+    "k_phi": ("SoilFrictionalModulus", 1e3),
+    "n": ("SoilSinkageExponent", 1.0),
+    "phi": ("SoilFrictionAngle", math.pi / 180.0),
+    "c": ("SoilCohesion", 1e3),
+    "K": ("SoilShearModulus", 1e-3),
+}
+
+
+def json_line(result: WindowResult, config: Config) -> str:
+    """The result as one JSON object (keys: DESIGN.md), SI throughout, null for the unknown."""
+    way = result.traversability
+    bearing = {"z_ref": config.estimator.z_ref, "b_ref": config.estimator.b_ref, **_value_std(result.bearing)}
+    posterior = result.posterior
+    return json.dumps(
+        {
+            "t": round(result.t, 6),
+            "window": result.index,
+            "status": str(result.status),
+            "reason": result.reason,
+            "soil": None if posterior is None else {k: _value_std(e) for k, e in posterior.parameters().items()},
+            "bearing_pressure": bearing,
+            "slip": result.slip,
+            "sinkage": result.sinkage,
+            "traversability": {
+                "state": str(way.state),
+                "probability": way.probability,
+                "torque_required": way.torque_required,
+                "torque_available": way.torque_available,
+                "max_draft": _value_std(way.max_draft),
+                "max_grade": _value_std(way.max_grade),
+                "limit": way.limit,
+            },
+            "chi2": result.chi2,
+            "samples": result.samples,
+            "rejected": result.rejected,
+        },
+        allow_nan=False,
+    )
+
+
+def _value_std(estimate: Estimate | None) -> dict[str, float | None]:
+    return {"value": None, "std": None} if estimate is None else {"value": estimate.value, "std": estimate.std}
+
+
+def hop_frames(result: WindowResult) -> Iterator[tuple[str, dict[str, Any]]]:
+    """(message, values in the DBC's units) of the frames that go out once each window."""
+    common = {"Window": result.index % WINDOW_MODULUS, "Status": str(result.status)}
+    bearing, way = result.bearing, result.traversability
+    yield (
+        "SoilStrength",
+        common
+        | {"Chi2": result.chi2}
+        | _pair("BearingPressure", "BearingPressureStd", bearing, 1e3),
+    )
+    parameters = {} if result.posterior is None else result.posterior.parameters()
+    for name, (message, unit) in PARAMETER_FRAMES.items():
+        yield message, common | _pair("Value", "Std", parameters.get(name), unit)
+    yield "DraftCapability", common | _pair("MaxDraft", "MaxDraftStd", way.max_draft, 1.0)
+    yield "GradeCapability", common | _pair("MaxGrade", "MaxGradeStd", way.max_grade, 1.0)
+    for message, values in _by_wheel("WheelSinkage", "SinkageWheel", result.sinkage, 1e-3):
+        yield message, common | values
+
+
+def _pair(value: str, std: str, estimate: Estimate | None, unit: float) -> dict[str, float | None]:
+    if estimate is None:
+        return {value: None, std: None}
+    return {value: estimate.value / unit, std: estimate.std / unit}
+
+
+def slip_frames(slip: Mapping[str, float | None]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """(message, values) of the wheel slips, wheels in the order of the configuration."""
+    return _by_wheel("WheelSlip", "SlipWheel", slip, 1.0)
+
+
+def _by_wheel(
+    message: str, signal: str, values: Mapping[str, float | None], unit: float
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    numbered = [(i, None if v is None else v / unit) for i, v in enumerate(values.values(), start=1)]
+    yield message, {f"{signal}{i}": v for i, v in numbered if i <= 4}
+    if len(numbered) > 4:
+        yield message + "2", {f"{signal}{i}": v for i, v in numbered if i > 4}

@@ -1,0 +1,96 @@
+"""Recorded logs through the daemon's own pipeline, as fast as it can."""
+
+from __future__ import annotations
+
+import gzip
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import can
+
+from soilbus.daemon.pipeline import Pipeline, WindowResult
+
+
+class LogError(Exception):
+    """A log cannot be read, or not to its end; the text says where and why."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayCounts:
+    """Frames of all logs: read, of mapped messages, time spanned [s]."""
+
+    frames: int
+    mapped: int
+    span: float
+
+
+def read_log(path: Path) -> Iterator[can.Message]:
+    """Messages of one log in any format that python-can reads (and MF4 with the extra `mf4`).
+
+    Raises LogError for a file that is missing, of an unknown format, or damaged.
+    """
+    n = 0
+    try:
+        with _reader(path) as reader:
+            for message in reader:
+                n += 1
+                yield message
+    except FileNotFoundError:
+        raise LogError(f"{path}: no such file") from None
+    except (EOFError, zlib.error, ValueError, IndexError, KeyError, TypeError, UnicodeDecodeError, OSError) as error:
+        what = "not a CAN log that can be read" if n == 0 else f"cut off or damaged after {n} frames"
+        raise LogError(f"{path}: {what} ({_one_line(error)})") from None
+    except NotImplementedError:
+        raise LogError(f"{path}: this format needs soilbus[mf4]") from None
+    if n == 0:
+        raise LogError(f"{path}: no frame in it")
+
+
+def _reader(path: Path) -> Any:
+    """python-can's reader; it cannot tell the format of a name such as a.b.log.gz, so that is done here."""
+    if path.suffixes[-2:] == [".log", ".gz"]:
+        return can.CanutilsLogReader(gzip.open(path, "rt"))
+    return can.LogReader(path)
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:100] or type(error).__name__
+
+
+def replay(
+    pipeline: Pipeline, logs: Sequence[Path], progress: Callable[[int, float], None] | None = None
+) -> Iterator[WindowResult]:
+    """Results of every window of the logs, one after the other; LogError as read_log().
+
+    `progress` is called now and then with the number of frames read and the time in the
+    recording [s].
+    """
+    feed = pipeline.admission.feed
+    last = 0.0
+    n = 0
+    for path in logs:
+        due = -1.0
+        for message in read_log(path):
+            n += 1
+            if message.is_error_frame:
+                pipeline.admission.counts.error_frames += 1
+                continue
+            last = message.timestamp
+            if last >= due or last < due - 2.0:
+                yield from pipeline.advance(last)
+                due = min(pipeline.next_end, last + 1.0)
+                if progress is not None:
+                    progress(n, last)
+            feed(last, message.arbitration_id, message.is_extended_id, message.data, message.is_remote_frame)
+    yield from pipeline.finish(last)
+
+
+def check_heard(pipeline: Pipeline, logs: Iterable[Path]) -> None:
+    """Raises LogError where not one frame of a mapped message was in the logs."""
+    counts = pipeline.admission.counts
+    if not sum(counts.received.values()):
+        names = ", ".join(str(p) for p in logs)
+        raise LogError(f"{names}: none of its {counts.unknown} frames is in the DBC: a log of another bus?")

@@ -1,0 +1,244 @@
+"""The daemon's loop: receive, admit, estimate, publish; nothing else."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from enum import StrEnum
+from importlib.metadata import PackageNotFoundError, version
+
+from soilbus.can.bus import LiveBus
+from soilbus.can.publish import Publisher
+from soilbus.config import Config
+from soilbus.daemon.notify import Notifier
+from soilbus.daemon.outputs import WINDOW_MODULUS, hop_frames, slip_frames
+from soilbus.daemon.pipeline import Pipeline, WindowResult
+from soilbus.traversability import State as Way
+from soilbus.traversability import Status
+
+log = logging.getLogger(__name__)
+
+TICK = 0.1
+SILENCE = 1.0
+"""Seconds without any frame after which the bus counts as silent."""
+GRACE = 0.2
+"""A window that no later frame has closed is closed this long after its end [s]."""
+MAX_DRAIN = 4000
+"""Frames taken in one go before the loop looks at its clock again."""
+
+
+class ServiceState(StrEnum):
+    """What the service is doing; on the bus and in systemd's STATUS line."""
+
+    STARTING = "starting"
+    WAITING = "waiting"
+    LISTENING = "listening"
+    ESTIMATING = "estimating"
+    VALID = "valid"
+    DEGRADED = "degraded"
+    FAULT = "fault"
+
+
+class Service:
+    """One vehicle on one bus.
+
+    `clock` is monotonic [s]; frame stamps only space the samples.  `step` makes one
+    round and returns; `run` repeats it until `stop`.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        pipeline: Pipeline,
+        bus: LiveBus,
+        publisher: Publisher,
+        notifier: Notifier,
+        clock: Callable[[], float] = time.monotonic,
+        on_window: Callable[[WindowResult], None] | None = None,
+    ) -> None:
+        self.config, self.pipeline, self.bus, self.publisher = config, pipeline, bus, publisher
+        self.notifier, self.clock, self.on_window = notifier, clock, on_window
+        self.result: WindowResult | None = None
+        self.deadline_misses = 0
+        self._stopping = False
+        self._started = clock()
+        self._last_frame = -1e9  # monotonic arrival time
+        self._last_stamp = 0.0  # the bus's own time
+        self._next_tick = self._started
+        self._due = dict.fromkeys(("SoilbusStatus", "SoilbusIdentity"), self._started)
+        self._next_watchdog = self._started
+        self._state: tuple[ServiceState, str] = (ServiceState.STARTING, "none")
+
+    def stop(self) -> None:
+        """Let `run` return after the present round; safe to call from a signal handler."""
+        self._stopping = True
+
+    def run(self) -> None:
+        """Work until `stop`, then tell everybody that nothing follows."""
+        self.notifier.ready("starting")
+        while not self._stopping:
+            self.step()
+        self.notifier.stopping()
+        self.result = None
+        self._publish_ten_hertz(self.clock())
+        self.bus.close()
+
+    def step(self) -> None:
+        """Receive until the next tick, then estimate and publish what is due."""
+        self._receive()
+        now = self.clock()
+        if self.bus.is_open:
+            self._close_windows(now)
+        if now >= self._next_tick:
+            if now - self._next_tick > TICK:
+                self.deadline_misses += 1
+            self._next_tick = max(self._next_tick + TICK, now - TICK)
+            self._tick(now)
+
+    def _receive(self) -> None:
+        feed = self.pipeline.admission.feed
+        for _ in range(MAX_DRAIN):
+            message = self.bus.receive(max(0.0, self._next_tick - self.clock()))
+            if message is None:
+                return
+            self._last_stamp = message.timestamp
+            feed(
+                message.timestamp,
+                message.arbitration_id,
+                message.is_extended_id,
+                message.data,
+                message.is_remote_frame,
+            )
+            self._last_frame = self.clock()
+            if message.timestamp >= self.pipeline.next_end or self._last_frame >= self._next_tick:
+                return
+
+    def bus_time(self, now: float) -> float:
+        """The bus's own time at the monotonic time `now` [s]."""
+        return self._last_stamp + max(0.0, now - self._last_frame) if self._last_frame > 0.0 else 0.0
+
+    def _close_windows(self, now: float) -> None:
+        for result in self.pipeline.advance(max(self._last_stamp, self.bus_time(now) - GRACE)):
+            self.result = result
+            for message, values in hop_frames(result):
+                self.bus.send(self.publisher.frame(message, values))
+            if self.on_window is not None:
+                self.on_window(result)
+
+    def _tick(self, now: float) -> None:
+        if self.bus.is_open:
+            self.pipeline.ingest()
+        self._state = self._present_state(now)
+        self._publish_ten_hertz(now)
+        for message, due in self._due.items():
+            if now >= due:
+                self._due[message] = max(due + self.publisher.schedule[message], now)
+                self._publish_slow(message, now)
+        interval = self.notifier.watchdog_interval
+        if interval is not None and now >= self._next_watchdog:
+            self._next_watchdog = now + interval / 2.0
+            self.notifier.watchdog()
+
+    def _present_state(self, now: float) -> tuple[ServiceState, str]:
+        if not self.bus.is_open:
+            return ServiceState.WAITING, "bus_down"
+        if now - self._last_frame > SILENCE:
+            return ServiceState.LISTENING, "no_frames"
+        stale = self.pipeline.stale(self.bus_time(now))
+        if stale:
+            never = [name for name in stale if name not in self.pipeline.last_seen]
+            reason = "input_missing " + " ".join(never) if never else "input_stale " + " ".join(stale)
+            return ServiceState.DEGRADED, reason
+        if self.result is None:
+            return ServiceState.ESTIMATING, "none"
+        if self.result.status is Status.VALID:
+            return ServiceState.VALID, "none"
+        if self.result.status is Status.NOT_EXCITED:
+            return ServiceState.LISTENING, self.result.reason
+        return ServiceState.DEGRADED, self.result.reason
+
+    def present_way(self, now: float) -> Way:
+        """go, caution or no_go only while the bus is up, no needed input is stale and the posterior is young."""
+        if self.result is None or self._present_state(now)[1].split()[0] in (
+            "bus_down", "no_frames", "input_missing", "input_stale",
+        ):  # fmt: skip
+            return Way.UNKNOWN
+        if self._age(now) > self.config.traversability.max_age:
+            return Way.UNKNOWN
+        return self.result.traversability.state
+
+    def _age(self, now: float) -> float:
+        return self.bus_time(now) - self.result.t if self.result is not None else 1e9
+
+    def _publish_ten_hertz(self, now: float) -> None:
+        way = self.present_way(now)
+        known = way is not Way.UNKNOWN and self.result is not None
+        decided = self.result.traversability if known and self.result is not None else None
+        window = self.result.index % WINDOW_MODULUS if self.result is not None else None
+        slip = self.pipeline.latest_slip(self.bus_time(now)) if self.bus.is_open else {}
+        for message, values in slip_frames(slip):
+            self.bus.send(self.publisher.frame(message, values))
+        limit = decided.limit if decided is not None else None
+        self.bus.send(
+            self.publisher.frame(
+                "Traversability",
+                {
+                    "State": str(way),
+                    "LimitingCause": limit,
+                    "Probability": None if decided is None else decided.probability,
+                    "Age": None if self.result is None else max(self._age(now), 0.0),
+                    "Window": window,
+                },
+            )
+        )
+        self.bus.send(
+            self.publisher.frame(
+                "TorqueDemand",
+                {
+                    "TorqueRequired": None if decided is None else decided.torque_required,
+                    "TorqueAvailable": None if decided is None else decided.torque_available,
+                    "Window": window,
+                },
+            )
+        )
+
+    def _publish_slow(self, message: str, now: float) -> None:
+        state, reason = self._state
+        if message == "SoilbusIdentity":
+            major, minor, patch = software_version()
+            values = {
+                "VersionMajor": major, "VersionMinor": minor, "VersionPatch": patch, "Uptime": now - self._started,
+            }  # fmt: skip
+            self.bus.send(self.publisher.frame(message, values))
+            return
+        counts = self.pipeline.admission.counts
+        received = sum(counts.received.values())
+        self.bus.send(
+            self.publisher.frame(
+                message,
+                {
+                    "State": str(state),
+                    "Reason": reason.split()[0],
+                    "RejectedShare": 100.0 * sum(counts.refused.values()) / received if received else None,
+                    "DeadlineMisses": self.deadline_misses,
+                    "Window": self.result.index % WINDOW_MODULUS if self.result is not None else None,
+                },
+            )
+        )
+        text = f"{state}" if reason == "none" else f"{state}: {reason}"
+        if self.result is not None and self.result.bearing is not None:
+            bearing = self.result.bearing
+            text += f", bearing pressure {bearing.value / 1e3:.1f} +- {bearing.std / 1e3:.1f} kPa"
+            text += f", {self.present_way(now)}"
+        self.notifier.status(text)
+
+
+def software_version() -> tuple[int, int, int]:
+    """Version of the installed package; zeros in a checkout that is not installed."""
+    try:
+        parts = [int(p) for p in version("soilbus").split(".")[:3] if p.isdigit()]
+    except PackageNotFoundError:
+        parts = []
+    major, minor, patch = (parts + [0, 0, 0])[:3]
+    return major, minor, patch

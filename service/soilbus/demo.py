@@ -1,0 +1,119 @@
+"""`soilbus demo`: a simulated tractor, the service and a dashboard, without hardware.
+
+Three parties on one bus: the tractor's ECUs (simulator) send, the service estimates, the
+dashboard reads only the service's frames.  On vcan where the kernel has it, else on
+python-can's in-process virtual bus.  Time is compressed: the tractor's seconds pass
+faster, so the service's times are shortened by the same factor.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+
+from soilbus.can.bus import BusError, open_bus
+from soilbus.can.dbc_files import output_database
+from soilbus.config import Config
+from soilbus.daemon.pipeline import WindowResult
+from soilbus.daemon.start import start_service
+from soilbus.report.dashboard import Dashboard, show
+from soilbus.report.table import table
+from soilbus.simulator.frames import frames
+from soilbus.simulator.play import send_in_time
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import demo as demo_scenario
+
+SPEED_UP = 9.0
+SEED = 1
+SHOWN_EVERY = 4.0
+
+
+def run_demo(duration: float) -> None:
+    """Drive `duration` simulated seconds from loam onto wet clay and show what the service says."""
+    console = Console()
+    real = reference_configuration()
+    recording = simulate(real, demo_scenario(duration), SEED)
+    messages = list(frames(recording, real))
+    results: list[WindowResult] = []
+    with _bus_settings() as overrides:
+        where = "vcan" if any("socketcan" in o for o in overrides) else "the in-process virtual bus"
+        console.print(f"Simulated tractor on {where}: loam, then wet clay; {SPEED_UP:.0f} times as fast as real time.")
+        config = reference_configuration(overrides + _compressed(real))
+        with open_bus(config.bus.model_dump()) as tractor, open_bus(config.bus.model_dump()) as ear:
+            service = start_service(config, wait=False, on_window=results.append)
+            sender = threading.Thread(target=send_in_time, args=(messages, tractor.send, SPEED_UP), daemon=True)
+            worker = threading.Thread(target=service.run, daemon=True)
+            worker.start()
+            sender.start()
+            show(Dashboard(output_database(config)), ear, console, done=lambda: not sender.is_alive())
+            service.stop()
+            worker.join(timeout=2.0)
+    console.print(_story(results), highlight=False)
+
+
+def _compressed(config: Config) -> list[str]:
+    """Overrides that shorten the service's times as the tractor's time is shortened."""
+    times = {
+        "estimator.window": config.estimator.window,
+        "estimator.hop": 2.0 * config.estimator.hop,
+        "estimator.bin": config.estimator.bin,
+    }
+    return [f"{key}={value / SPEED_UP}" for key, value in times.items()]
+
+
+@contextmanager
+def _bus_settings() -> Iterator[list[str]]:
+    """Overrides for a vcan of our own if we may make one, else for the virtual bus."""
+    name = "soilbusdemo"
+    made = _ip("link", "add", "dev", name, "type", "vcan") and _ip("link", "set", name, "up")
+    try:
+        overrides = ["bus.interface=socketcan", f"bus.channel={name}"]
+        if made and _works(overrides):
+            yield overrides
+        else:
+            yield ["bus.interface=virtual", f"bus.channel={name}"]
+    finally:
+        if made:
+            _ip("link", "del", name)
+
+
+def _works(overrides: list[str]) -> bool:
+    try:
+        open_bus(reference_configuration(overrides).bus.model_dump()).shutdown()
+    except BusError:
+        return False
+    return True
+
+
+def _ip(*words: str) -> bool:
+    try:
+        return subprocess.run(["ip", *words], capture_output=True, check=False).returncode == 0
+    except OSError:
+        return False
+
+
+def _story(results: list[WindowResult]) -> str:
+    """The windows some seconds apart, as a table."""
+    rows, due = [], 0.0
+    start = results[0].t if results else 0.0
+    for r in results:
+        t = (r.t - start) * SPEED_UP
+        if t + 1e-6 < due:
+            continue
+        due = t + SHOWN_EVERY
+        draft = r.traversability.max_draft
+        rows.append(
+            (
+                f"{t + 10.0:.0f}",
+                str(r.status),
+                "-" if r.bearing is None else f"{r.bearing.value / 1e3:.1f} ± {r.bearing.std / 1e3:.1f}",
+                "-" if draft is None else f"{draft.value:.0f} ± {draft.std:.0f}",
+                str(r.traversability.state).upper().replace("_", "-"),
+            )
+        )
+    return table(("tractor's s", "window", "bearing pressure, kPa", "max. draft, N", "decision"), rows)

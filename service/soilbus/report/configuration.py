@@ -1,0 +1,68 @@
+"""What `soilbus check` prints: mapped signals, what they can tell, settings in force."""
+
+from __future__ import annotations
+
+from cantools.database.can import Database
+
+from soilbus.assembly import model_of, rig_of
+from soilbus.can.channels import Channel
+from soilbus.can.dbc_files import load_databases, output_database
+from soilbus.can.mapping import channels_of, without_unit
+from soilbus.config import Config, defaults_text
+from soilbus.report.table import table
+
+
+def configuration_report(config: Config) -> str:
+    """The whole report as text; ConfigError lists every fault."""
+    database = load_databases(config)
+    channels = channels_of(config, database)
+    model_of(config)
+    output_database(config)
+    assumed = {c.name for c in without_unit(channels, database)}
+    rows = [_row(channel, database, channel.name in assumed) for channel in channels]
+    head = ("role", "signal", "unit", "factor to SI", "plausible", "every", "status")
+    parts = [table(head, rows)]
+    parts += [f"{name:<8} {verdict}\n" for name, verdict in identifiable(config)]
+    parts.append("\nSettings in force (defaults included):\n" + defaults_text(config) + "\n")
+    return "\n".join(parts[:1]) + "\nWhat these sensors can tell of the soil:\n" + "".join(parts[1:])
+
+
+def _row(channel: Channel, database: Database, unit_assumed: bool) -> tuple[str, ...]:
+    message = database.get_message_by_name(channel.message)
+    signal = message.get_signal_by_name(channel.signal)
+    status = "SI assumed: the DBC tells no unit" if unit_assumed else "ok"
+    if channel.valid_signal:
+        status += f", valid while {channel.valid_signal} is {'/'.join(map(str, channel.valid_values))}"
+    every = f"{message.cycle_time} ms" if message.cycle_time else "not told"
+    return (
+        channel.name,
+        f"{channel.message}.{channel.signal}",
+        signal.unit or "-",
+        f"{channel.factor:g}",
+        f"{channel.low:.4g} .. {channel.high:.4g}",
+        every,
+        status,
+    )
+
+
+def identifiable(config: Config) -> list[tuple[str, str]]:
+    """(parameter, verdict) for each soil parameter: told by which sensors, or why not."""
+    rig = rig_of(config)
+    held = {name for name, prior in config.soil_prior.items() if prior.std == 0.0}
+    if not rig.wheels or config.signals.ground_speed is None:
+        verdicts = dict.fromkeys(config.soil_prior, "no: needs torque, speed and load of a wheel and a ground speed")
+    else:
+        draft = config.signals.draft is not None
+        widths = len({float(b) for b in rig.width}) > 1
+        sinkage = any(w.sinkage for w in config.wheel if w.name in rig.wheels)
+        both = "yes: torque and draft over varied load and slip"
+        alone = "weakly: torque alone; a draft signal would tell more"
+        verdicts = {
+            "k_c": "weakly: two tyre widths" if widths else "no: needs two tyre widths (prior kept)",
+            "k_phi": (both if draft else alone) + (", and sinkage" if sinkage else ""),
+            "n": (both if draft else alone) + (", and sinkage" if sinkage else ""),
+            "phi": both if draft else alone,
+            "c": "partly: torque over varied load; the prior counts",
+            "K": "yes: torque over varied slip",
+        }
+    return [(name, "held by the configuration" if name in held else text) for name, text in verdicts.items()]

@@ -1,0 +1,29 @@
+"""A progress bar on a terminal, nothing in a pipe."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def progress(title: str) -> Iterator[Callable[[int, float], None] | None]:
+    """Yields a function to call with frames read and time in the recording [s]; None in a pipe."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title)
+        start: list[float] = []
+
+        def step(frames: int, t: float) -> None:
+            if not start:
+                start.append(t)
+            bar.update(task, description=f"{title}: {frames} frames, {t - start[0]:.0f} s of recording")
+
+        yield step

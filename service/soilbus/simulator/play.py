@@ -1,0 +1,56 @@
+"""A recording onto a bus in real time, or into a log."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+import can
+
+from soilbus.can.bus import open_bus
+from soilbus.config import Config
+from soilbus.simulator.frames import frames, write_log
+from soilbus.simulator.recording import Recording
+from soilbus.simulator.scenario import Patch, Scenario, Swing
+
+_MEAN_SPEED = 1.4
+
+
+def scenario_over(soils: Sequence[str], duration: float) -> Scenario:
+    """The soils one after the other in equal parts of the time, with all the excitation they bear."""
+    length = duration * _MEAN_SPEED / len(soils)
+    patches = tuple(Patch(i * length, name) for i, name in enumerate(soils))
+    return Scenario(duration, patches, slip=Swing(0.05, 0.40))
+
+
+def play(recording: Recording, config: Config, log: Path | None) -> None:
+    """Write the recording's frames to a log, or send them to the configured bus in real time.
+
+    Raises BusError, OSError, and ValueError for a log format that is not known.
+    """
+    messages = frames(recording, config)
+    if log is not None:
+        write_log(messages, log)
+        return
+    with open_bus(config.bus.model_dump()) as bus:
+        send_in_time(messages, bus.send)
+
+
+def send_in_time(
+    messages: Iterable[can.Message],
+    send: Callable[[can.Message], None],
+    speed: float = 1.0,
+    clock: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+) -> None:
+    """Send messages spaced as their time stamps are, `speed` times as fast."""
+    first: float | None = None
+    begin = clock()
+    for message in messages:
+        if first is None:
+            first = message.timestamp
+        ahead = (message.timestamp - first) / speed - (clock() - begin)
+        if ahead > 0.0005:
+            sleep(ahead)
+        send(message)

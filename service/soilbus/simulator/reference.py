@@ -1,0 +1,15 @@
+"""Our reference tractor, for the demo and wherever no configuration is given."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from soilbus.config import Config, load_config
+
+TRACTOR = Path(__file__).with_name("tractor.toml")
+
+
+def reference_configuration(overrides: Iterable[str] = ()) -> Config:
+    """Configuration of the reference tractor; ConfigError for a wrong override."""
+    return load_config(TRACTOR, overrides)
