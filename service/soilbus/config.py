@@ -192,6 +192,8 @@ class Estimator(_Section):
 
     window: PositiveFloat = 10.0
     hop: PositiveFloat = 1.0
+    change_window: PositiveFloat = 2.0
+    """Where a known soil ends, this much newest data is asked whether it is a new one."""
     bin: PositiveFloat = 0.1
     """Samples are averaged over bins of this length before the fit."""
     min_speed: PositiveFloat = 0.2
@@ -202,13 +204,15 @@ class Estimator(_Section):
     """Relative std of the bearing pressure up to which a window counts as excited."""
     max_tan_phi_std: PositiveFloat = 0.15
     """Relative std of tan phi up to which a window counts as excited."""
-    max_chi2: PositiveFloat = 1.2
+    max_chi2: PositiveFloat = 1.1
     """Reduced chi-square, beyond its own scatter, above which the model does not describe the data."""
 
     @model_validator(mode="after")
     def _lengths_fit(self) -> Estimator:
         if not self.bin <= self.hop <= self.window:
             raise ValueError("bin <= hop <= window must hold")
+        if not self.bin < self.change_window <= self.window:
+            raise ValueError("bin < change_window <= window must hold")
         return self
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import socket
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +18,8 @@ log = logging.getLogger(__name__)
 FIRST_BACK_OFF = 0.1
 LONGEST_BACK_OFF = 1.0
 """Reopening is tried at least this often [s], so that a bus that is back is found in time."""
+
+RECEIVE_BUFFER = 4 * 2**20
 
 _KERNEL_WITHOUT_CAN = {errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT, errno.ESOCKTNOSUPPORT}
 
@@ -46,7 +49,9 @@ def open_bus(settings: Mapping[str, Any], filters: Sequence[dict[str, Any]] | No
     """
     name = f"{settings.get('interface')}:{settings.get('channel')}"
     try:
-        return can.Bus(**dict(settings), can_filters=list(filters) if filters is not None else None)
+        bus = can.Bus(**dict(settings), can_filters=list(filters) if filters is not None else None)
+        _enlarge_buffer(bus)
+        return bus
     except can.CanInterfaceNotImplementedError as error:
         raise BusError(f"bus {name}: {_one_line(error)}", may_come=False) from None
     except (OSError, can.CanError) as error:
@@ -56,6 +61,12 @@ def open_bus(settings: Mapping[str, Any], filters: Sequence[dict[str, Any]] | No
         raise BusError(f"bus {name}: {_one_line(error)}", may_come=True) from None
     except (ValueError, TypeError, AttributeError) as error:
         raise BusError(f"bus {name}: {_one_line(error)}", may_come=False) from None
+
+
+def _enlarge_buffer(bus: can.BusABC) -> None:
+    """As much receive buffer as the kernel lets us have (net.core.rmem_max)."""
+    if isinstance(getattr(bus, "socket", None), socket.socket):
+        bus.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)  # type: ignore[attr-defined]
 
 
 def _one_line(error: Exception) -> str:

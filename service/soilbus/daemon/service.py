@@ -1,10 +1,12 @@
-"""The daemon's loop: receive, admit, estimate, publish; nothing else."""
+"""The daemon's loop: receive, admit, publish, with the estimate beside it."""
 
 from __future__ import annotations
 
 import logging
 import time
+from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Executor, Future
 from enum import StrEnum
 from importlib.metadata import PackageNotFoundError, version
 
@@ -26,6 +28,12 @@ GRACE = 0.2
 """A window that no later frame has closed is closed this long after its end [s]."""
 MAX_DRAIN = 4000
 """Frames taken in one go before the loop looks at its clock again."""
+POLL = 0.02
+"""Longest wait for a frame [s] before the loop looks whether the worker is done."""
+MAX_PENDING = 3
+"""Windows that may wait for the worker."""
+LONGEST_SOLVE = 20.0
+"""A window that takes longer [s] is a worker that hangs: the watchdog is fed no more."""
 
 
 class ServiceState(StrEnum):
@@ -43,8 +51,10 @@ class ServiceState(StrEnum):
 class Service:
     """One vehicle on one bus.
 
-    `clock` is monotonic [s]; frame stamps only space the samples.  `step` makes one
-    round and returns; `run` repeats it until `stop`.
+    The loop receives and publishes; `workers` (one thread) estimates beside it, so that a
+    hard window neither delays a frame nor loses one.  `clock` is monotonic [s]; frame
+    stamps only space the samples.  `step` makes one round and returns; `run` repeats it
+    until `stop`.
     """
 
     def __init__(
@@ -54,15 +64,20 @@ class Service:
         bus: LiveBus,
         publisher: Publisher,
         notifier: Notifier,
+        workers: Executor,
         clock: Callable[[], float] = time.monotonic,
         on_window: Callable[[WindowResult], None] | None = None,
     ) -> None:
-        self.config, self.pipeline, self.bus, self.publisher = config, pipeline, bus, publisher
+        self.config, self.bus, self.publisher = config, bus, publisher
+        self.intake, self._solve = pipeline.intake, pipeline.estimator.solve
         self.notifier, self.clock, self.on_window = notifier, clock, on_window
         self.result: WindowResult | None = None
         self.deadline_misses = 0
+        self._workers = workers
+        self._pending: deque[Future[WindowResult]] = deque()
         self._stopping = False
         self._started = clock()
+        self._solved_at = self._started
         self._last_frame = -1e9  # monotonic arrival time
         self._last_stamp = 0.0  # the bus's own time
         self._next_tick = self._started
@@ -82,14 +97,16 @@ class Service:
         self.notifier.stopping()
         self.result = None
         self._publish_ten_hertz(self.clock())
+        self._workers.shutdown(wait=False, cancel_futures=True)
         self.bus.close()
 
     def step(self) -> None:
-        """Receive until the next tick, then estimate and publish what is due."""
+        """Receive until the next tick, then hand out, collect and publish what is due."""
         self._receive()
         now = self.clock()
         if self.bus.is_open:
-            self._close_windows(now)
+            self._hand_out(now)
+        self._collect(now)
         if now >= self._next_tick:
             if now - self._next_tick > TICK:
                 self.deadline_misses += 1
@@ -97,9 +114,9 @@ class Service:
             self._tick(now)
 
     def _receive(self) -> None:
-        feed = self.pipeline.admission.feed
+        feed = self.intake.admission.feed
         for _ in range(MAX_DRAIN):
-            message = self.bus.receive(max(0.0, self._next_tick - self.clock()))
+            message = self.bus.receive(max(0.0, min(self._next_tick - self.clock(), POLL)))
             if message is None:
                 return
             self._last_stamp = message.timestamp
@@ -111,24 +128,39 @@ class Service:
                 message.is_remote_frame,
             )
             self._last_frame = self.clock()
-            if message.timestamp >= self.pipeline.next_end or self._last_frame >= self._next_tick:
+            if message.timestamp >= self.intake.next_end or self._last_frame >= self._next_tick or self._result_waits():
                 return
+
+    def _result_waits(self) -> bool:
+        return bool(self._pending) and self._pending[0].done()
 
     def bus_time(self, now: float) -> float:
         """The bus's own time at the monotonic time `now` [s]."""
         return self._last_stamp + max(0.0, now - self._last_frame) if self._last_frame > 0.0 else 0.0
 
-    def _close_windows(self, now: float) -> None:
-        for result in self.pipeline.advance(max(self._last_stamp, self.bus_time(now) - GRACE)):
-            self.result = result
-            for message, values in hop_frames(result):
+    def _hand_out(self, now: float) -> None:
+        """Give the windows that have ended to the worker; what it cannot keep up with is dropped."""
+        for task in self.intake.due(max(self._last_stamp, self.bus_time(now) - GRACE)):
+            if not self._pending:
+                self._solved_at = now
+            self._pending.append(self._workers.submit(self._solve, task))
+            while len(self._pending) > MAX_PENDING and self._pending[1].cancel():
+                del self._pending[1]
+                self.deadline_misses += 1
+
+    def _collect(self, now: float) -> None:
+        """Publish the windows that are solved, in their order; raises what the worker raised."""
+        while self._result_waits():
+            self.result = self._pending.popleft().result()
+            self._solved_at = now
+            for message, values in hop_frames(self.result):
                 self.bus.send(self.publisher.frame(message, values))
             if self.on_window is not None:
-                self.on_window(result)
+                self.on_window(self.result)
 
     def _tick(self, now: float) -> None:
         if self.bus.is_open:
-            self.pipeline.ingest()
+            self.intake.ingest()
         self._state = self._present_state(now)
         self._publish_ten_hertz(now)
         for message, due in self._due.items():
@@ -136,7 +168,8 @@ class Service:
                 self._due[message] = max(due + self.publisher.schedule[message], now)
                 self._publish_slow(message, now)
         interval = self.notifier.watchdog_interval
-        if interval is not None and now >= self._next_watchdog:
+        worker_hangs = bool(self._pending) and now - self._solved_at > LONGEST_SOLVE
+        if interval is not None and now >= self._next_watchdog and not worker_hangs:
             self._next_watchdog = now + interval / 2.0
             self.notifier.watchdog()
 
@@ -145,9 +178,9 @@ class Service:
             return ServiceState.WAITING, "bus_down"
         if now - self._last_frame > SILENCE:
             return ServiceState.LISTENING, "no_frames"
-        stale = self.pipeline.stale(self.bus_time(now))
+        stale = self.intake.stale(self.bus_time(now))
         if stale:
-            never = [name for name in stale if name not in self.pipeline.last_seen]
+            never = [name for name in stale if name not in self.intake.last_seen]
             reason = "input_missing " + " ".join(never) if never else "input_stale " + " ".join(stale)
             return ServiceState.DEGRADED, reason
         if self.result is None:
@@ -176,7 +209,7 @@ class Service:
         known = way is not Way.UNKNOWN and self.result is not None
         decided = self.result.traversability if known and self.result is not None else None
         window = self.result.index % WINDOW_MODULUS if self.result is not None else None
-        slip = self.pipeline.latest_slip(self.bus_time(now)) if self.bus.is_open else {}
+        slip = self.intake.latest_slip(self.bus_time(now)) if self.bus.is_open else {}
         for message, values in slip_frames(slip):
             self.bus.send(self.publisher.frame(message, values))
         limit = decided.limit if decided is not None else None
@@ -212,7 +245,7 @@ class Service:
             }  # fmt: skip
             self.bus.send(self.publisher.frame(message, values))
             return
-        counts = self.pipeline.admission.counts
+        counts = self.intake.admission.counts
         received = sum(counts.received.values())
         self.bus.send(
             self.publisher.frame(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 from soilbus.can.bus import BusError, LiveBus, open_bus
 from soilbus.can.dbc_files import load_databases, output_database
@@ -12,6 +14,8 @@ from soilbus.config import Config
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.pipeline import Pipeline, WindowResult
 from soilbus.daemon.service import Service
+
+SWITCH_INTERVAL = 0.0005
 
 
 def start_service(config: Config, wait: bool, on_window: Callable[[WindowResult], None] | None = None) -> Service:
@@ -30,4 +34,7 @@ def start_service(config: Config, wait: bool, on_window: Callable[[WindowResult]
     except BusError as error:
         if not (wait and error.may_come):
             raise
-    return Service(config, pipeline, bus, publisher, Notifier.from_environment(), on_window=on_window)
+    # The loop must get its turn between the estimator's steps, or the socket overflows.
+    sys.setswitchinterval(SWITCH_INTERVAL)
+    workers = ThreadPoolExecutor(max_workers=1, thread_name_prefix="estimate")
+    return Service(config, pipeline, bus, publisher, Notifier.from_environment(), workers, on_window=on_window)

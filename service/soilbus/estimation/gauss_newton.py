@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.estimation.coordinates import Coordinates
 from soilbus.estimation.posterior import Posterior, SoilPrior
 from soilbus.estimation.residuals import Latents, Linearised, WindowProblem
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
-MAX_ITERATIONS = 25
+MAX_ITERATIONS = 20
 MAX_RESUMED = 8
 CONVERGED = 1e-2
 """Squared length of a step in posterior standard deviations that ends the fit; the step is
@@ -23,9 +25,17 @@ SETTLING = 1.0
 """The same, below which the latents and gains join in."""
 ENOUGH = 0.02
 """Relative fall of the cost below which the approach has done its part."""
-MAX_LOG_STEP = 0.7
-LOG_BOUND = 4.0
-"""Prior standard deviations to which a free parameter is confined."""
+WORSE = 1e-3
+"""Relative rise of the cost that a step may bring: the weights move with the soil a little."""
+THINNED = 24
+"""Instants of a window that the search for good starts looks at."""
+MAX_APPROACH = 10
+MAX_SETTLED = 2
+MAX_HOPELESS = 5
+HOPELESS = 60.0
+"""Cost for each thinned instant beyond which the window cannot be one soil."""
+LONG_LOG_STEP = 0.1
+"""Step of a log parameter from which the entry angles are solved again, not extrapolated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,9 +74,24 @@ def fit_window(problem: WindowProblem, prior: SoilPrior, last: Fit | None = None
         fit = resume(problem, prior, last)
         if fit is not None and fit.converged:
             return fit
-    fits = [f for f in (descend(problem, prior, soil) for soil in starting_soils(prior)) if f is not None]
-    done = [f for f in fits if f.converged] or fits
-    return min(done, key=lambda f: f.cost) if done else None
+    best: Fit | None = None
+    coordinates = _coordinates(problem, prior)
+    with np.errstate(all="ignore"):
+        for end in _promising(problem.thinned(THINNED), coordinates)[:MAX_SETTLED]:
+            most = MAX_ITERATIONS if end.cost < HOPELESS * THINNED else MAX_HOPELESS
+            fit = _settle(problem, coordinates, replace(end, latents=problem.start(end.as_soil())), most)
+            if fit is not None and (best is None or (fit.converged, -fit.cost) > (best.converged, -best.cost)):
+                best = fit
+            if best is not None and best.converged:
+                return best
+    return best
+
+
+def _promising(thin: WindowProblem, coordinates: Coordinates) -> list[_Place]:
+    """Where descents on a few instants of the window end, the best first."""
+    starts = [np.asarray(soil) for soil in starting_soils(coordinates.prior)]
+    ends = [end for start in starts if (end := _approach(thin, coordinates, start, MAX_APPROACH)) is not None]
+    return sorted(ends, key=lambda end: end.cost)
 
 
 def starting_soils(prior: SoilPrior) -> list[Soil]:
@@ -88,77 +113,106 @@ def descend(problem: WindowProblem, prior: SoilPrior, start: Soil) -> Fit | None
     latents and gains would take up whatever a wrong soil leaves.  Near it everything is
     relinearised together.
     """
-    free = prior.free
+    coordinates = _coordinates(problem, prior)
     soil = np.where(prior.log_std > 0.0, np.asarray(start, float), prior.median)
     with np.errstate(all="ignore"):
-        rough = _approach(problem, prior, free, soil)
-        return None if rough is None else _settle(problem, prior, free, *rough)
+        near = _approach(problem, coordinates, soil, MAX_ITERATIONS)
+        return None if near is None else _settle(problem, coordinates, near, MAX_ITERATIONS)
 
 
 def resume(problem: WindowProblem, prior: SoilPrior, last: Fit) -> Fit | None:
     """Descent from the optimum of a neighbouring window."""
     soil = np.where(prior.log_std > 0.0, np.asarray(last.posterior.soil), prior.median)
     with np.errstate(all="ignore"):
-        return _settle(problem, prior, prior.free, soil, problem.start_on(last.angle_curve), 0, MAX_RESUMED)
+        near = _Place(soil, problem.start_on(last.angle_curve), last.gains, np.inf, 0)
+        return _settle(problem, _coordinates(problem, prior), near, MAX_RESUMED)
 
 
-def _approach(problem: WindowProblem, prior: SoilPrior, free: Array, soil: Array) -> tuple[Array, Latents, int] | None:
+def _coordinates(problem: WindowProblem, prior: SoilPrior) -> Coordinates:
+    return Coordinates(prior, float(problem.rig.width.mean()))
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """A soil with its latents, what it costs, and how many evaluations led there."""
+
+    soil: Array
+    latents: Latents
+    gains: Array
+    cost: float
+    trials: int
+
+    def as_soil(self) -> Soil:
+        return Soil(*self.soil.tolist())
+
+
+def _approach(problem: WindowProblem, coordinates: Coordinates, soil: Array, most: int) -> _Place | None:
     """Levenberg-damped steps of the soil alone, until they are short."""
     no_gains = np.zeros(len(problem.gain_std))
-    none = np.zeros(0, dtype=int)
+    none = np.zeros(0, dtype=np.intp)
     latents = problem.start(Soil(*soil.tolist()))
-    point = _normal_equations(problem, prior, free, none, soil, no_gains, latents)
+    point = _normal_equations(problem, coordinates, none, soil, no_gains, latents)
     damping, trials = 1e-3, 1
     while point is not None:
         step = _solve(point.information, point.gradient, damping)
         if step is None:
             return None
-        if float(step @ point.information @ step) < SETTLING or trials >= MAX_ITERATIONS:
-            return soil, latents, trials
-        new_soil = _moved(prior, free, soil, step)
+        done = float(step @ point.information @ step) < SETTLING or trials >= most or damping > 1e6
+        if done:
+            return _Place(soil, latents, no_gains, point.cost, trials)
+        new_soil = coordinates.moved(soil, step)
         new_latents = problem.start(Soil(*new_soil.tolist()), latents.entry_angle)
-        new = _normal_equations(problem, prior, free, none, new_soil, no_gains, new_latents)
+        new = _normal_equations(problem, coordinates, none, new_soil, no_gains, new_latents)
         trials += 1
-        gain = -np.inf if new is None else point.cost - new.cost
-        if new is not None and gain > 0.0:
-            soil, latents, point, damping = new_soil, new_latents, new, damping * 0.1
-        if gain <= 0.0:
+        if new is None or new.cost >= point.cost:
             damping *= 10.0
-        if (0.0 <= gain < ENOUGH * point.cost) or damping > 1e6:
-            return soil, latents, trials
+            continue
+        enough = point.cost - new.cost < ENOUGH * point.cost
+        soil, latents, point, damping = new_soil, new_latents, new, damping * 0.1
+        if enough:
+            return _Place(soil, latents, no_gains, point.cost, trials)
     return None
 
 
-def _settle(
-    problem: WindowProblem,
-    prior: SoilPrior,
-    free: Array,
-    soil: Array,
-    latents: Latents,
-    trials: int,
-    most: int = MAX_ITERATIONS,
-) -> Fit | None:
-    """Full steps of soil, gains and latents together from a point near the optimum."""
-    gains = np.zeros(len(problem.gain_std))
+def _settle(problem: WindowProblem, coordinates: Coordinates, near: _Place, most: int) -> Fit | None:
+    """Steps of soil, gains and latents together from a place near the optimum.
+
+    A step that makes things worse is taken back and tried again damped.
+    """
+    free = coordinates.free
     active = np.flatnonzero(problem.gain_std > 0.0)
+    soil, latents, gains = near.soil, near.latents, near.gains
+    best: tuple[Array, Latents, Array, _Point] | None = None
+    damping, length = 0.0, np.inf
     for iteration in range(1, most + 1):
-        point = _normal_equations(problem, prior, free, active, soil, gains, latents)
-        step = None if point is None else _solve(point.information, point.gradient, 0.0)
-        if point is None or step is None:
+        point = _normal_equations(problem, coordinates, active, soil, gains, latents)
+        if best is not None and (point is None or point.cost > best[3].cost * (1.0 + WORSE) + 1.0):
+            soil, latents, gains, point = best
+            damping = max(4.0 * damping, 0.03)
+        else:
+            damping = damping / 4.0 if damping > 1e-3 else 0.0
+        full = None if point is None else _solve(point.information, point.gradient, 0.0)
+        if point is None or full is None:
             return None
-        length = float(step @ point.information @ step)
-        new_soil = _moved(prior, free, soil, step[: len(free)])
+        best = (soil, latents, gains, point)
+        length = float(full @ point.information @ full)
+        step = full if length < CONVERGED or damping == 0.0 else _solve(point.information, point.gradient, damping)
+        if step is None:
+            return None
+        new_soil = coordinates.moved(soil, step[: len(free)])
         gain_step = np.zeros(len(gains))
         gain_step[active] = step[len(free) :]
         latents = problem.updated(point.at, latents, new_soil - soil, gain_step)
+        if np.max(np.abs(np.log(new_soil[free] / soil[free])), initial=0.0) > LONG_LOG_STEP:
+            latents = problem.carried(latents, Soil(*new_soil.tolist()))
         soil, gains = new_soil, gains + gain_step
         if length < CONVERGED:
             break
     covariance = _inverse(point.information)
     if covariance is None:
         return None
-    log_covariance = np.zeros((6, 6))
-    log_covariance[np.ix_(free, free)] = covariance[: len(free), : len(free)]
+    directions = coordinates.log_directions(soil)
+    log_covariance = directions @ covariance[: len(free), : len(free)] @ directions.T
     return Fit(
         posterior=Posterior(Soil(*soil.tolist()), log_covariance),
         gains=gains,
@@ -166,7 +220,7 @@ def _settle(
         angle_curve=problem.angle_curve(latents),
         cost=point.cost - length,
         rows=point.at.known,
-        iterations=trials + iteration,
+        iterations=near.trials + iteration,
         converged=length < CONVERGED,
     )
 
@@ -182,34 +236,31 @@ class _Point:
 
 
 def _normal_equations(
-    problem: WindowProblem, prior: SoilPrior, free: Array, active: Array, soil: Array, gains: Array, latents: Latents
+    problem: WindowProblem, coordinates: Coordinates, active: Indices, soil: Array, gains: Array, latents: Latents
 ) -> _Point | None:
-    """By log soil (free) and gains (active); None where the model is not finite."""
+    """By soil coordinates and active gains; None where the model is not finite."""
     try:
         at = problem.linearise(Soil(*soil.tolist()), gains, latents)
     except np.linalg.LinAlgError:
         return None
-    columns = np.concatenate([1 + free, 7 + active])
-    scale = np.concatenate([soil[free], np.ones(len(active))])
-    weighed = at.weighed[:, columns] * scale
-    pull = np.concatenate(
-        [np.log(soil[free] / prior.median[free]) / prior.log_std[free], gains[active] / problem.gain_std[active]]
-    )
-    precision = np.concatenate([1.0 / prior.log_std[free], 1.0 / problem.gain_std[active]])
-    cost = at.chi2 + float(pull @ pull)
+    prior, free = coordinates.prior, coordinates.free
+    directions = coordinates.log_directions(soil)
+    by_soil = soil[:, None] * directions
+    rows = np.concatenate([at.rows[:, 1:7] @ by_soil, at.rows[:, 7 + active]], axis=1)
+    weighed = np.concatenate([at.weighed[:, 1:7] @ by_soil, at.weighed[:, 7 + active]], axis=1)
+    soil_pull = np.log(soil[free] / prior.median[free]) / prior.log_std[free]
+    by_pull = directions[free] / prior.log_std[free, None]
+    gain_pull = gains[active] / problem.gain_std[active]
+    cost = at.chi2 + float(soil_pull @ soil_pull) + float(gain_pull @ gain_pull)
     if not np.isfinite(cost):
         return None
-    information = (at.rows[:, columns] * scale).T @ weighed + np.diag(precision**2)
-    return _Point(information, weighed.T @ at.rows[:, 0] + precision * pull, cost, at)
-
-
-def _moved(prior: SoilPrior, free: Array, soil: Array, log_step: Array) -> Array:
-    """The soil after a step of its free logarithms, shortened and kept near the prior."""
-    log_step = log_step * min(1.0, MAX_LOG_STEP / max(float(np.max(np.abs(log_step), initial=0.0)), 1e-12))
-    centre, bound = np.log(prior.median[free]), LOG_BOUND * prior.log_std[free]
-    new = soil.copy()
-    new[free] = np.exp(np.clip(np.log(soil[free]) + log_step, centre - bound, centre + bound))
-    return new
+    information, gradient = rows.T @ weighed, weighed.T @ at.rows[:, 0]
+    n = len(free)
+    information[:n, :n] += by_pull.T @ by_pull
+    gradient[:n] += by_pull.T @ soil_pull
+    information[n:, n:] += np.diag(1.0 / problem.gain_std[active] ** 2)
+    gradient[n:] += gain_pull / problem.gain_std[active]
+    return _Point(information, gradient, cost, at)
 
 
 def _solve(information: Array, gradient: Array, damping: float) -> Array | None:

@@ -79,6 +79,7 @@ class WindowProblem:
 
     def __init__(self, window: Window, rig: Rig, model: WheelModel, min_speed: float) -> None:
         self.rig, self.model = rig, model
+        self._window, self._min_speed = window, min_speed
         n_wheels = len(rig.wheels)
         moving = window.ground_speed > min_speed
         rim = rig.radius * window.speed
@@ -87,6 +88,7 @@ class WindowProblem:
             usable = moving[:, None] & (window.load > 0.0) & (rim > 0.0) & (slip < MAX_SLIP) & (slip > MIN_SLIP)
         kept = np.flatnonzero(usable.any(axis=1))
         self.standstill = int(np.count_nonzero(~moving & np.isfinite(window.ground_speed)))
+        self._kept = kept
         self.t = window.t[kept]
         self.usable = usable = usable[kept]
         self.n, self.n_wheels = len(kept), n_wheels
@@ -149,14 +151,26 @@ class WindowProblem:
         """Number of residuals that count."""
         return int(self.has_torque.sum() + self.has_balance.sum() + self.has_sinkage.sum())
 
+    def thinned(self, most: int) -> WindowProblem:
+        """The same window with at most so many of its usable instants, evenly spread."""
+        if self.n <= most:
+            return self
+        keep = self._kept[np.linspace(0, self.n - 1, most).round().astype(int)]
+        return WindowProblem(self._window.rows(keep), self.rig, self.model, self._min_speed)
+
     def start(self, soil: Soil, guess: Array | None = None) -> Latents:
         """Latents at the measured values, entry angles solved for this soil from a guess (N, W)."""
-        shape = (self.n, self.n_wheels)
-        slip = 1.0 - self.ground_speed[:, None] / (self.rig.radius * self.speed)
-        state = self._state(soil, np.full(shape, np.nan) if guess is None else guess, slip)
-        angle = entry_angle_for_load(self.load.ravel(), state, self.model, tolerance=START_TOLERANCE).reshape(shape)
+        angle = np.full((self.n, self.n_wheels), np.nan) if guess is None else guess
+        return self.carried(Latents(self.load.copy(), self.speed.copy(), self.ground_speed.copy(), angle), soil)
+
+    def carried(self, latents: Latents, soil: Soil) -> Latents:
+        """The same latents with the entry angles at which this soil carries their loads."""
+        slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
+        state = self._state(soil, latents.entry_angle, slip)
+        angle = entry_angle_for_load(latents.load.ravel(), state, self.model, tolerance=START_TOLERANCE)
+        angle = angle.reshape(self.n, self.n_wheels)
         angle = np.where(np.isfinite(angle), angle, MAX_ENTRY_ANGLE * 0.98)
-        return Latents(self.load.copy(), self.speed.copy(), self.ground_speed.copy(), angle)
+        return Latents(latents.load, latents.speed, latents.ground_speed, angle)
 
     def angle_curve(self, latents: Latents) -> Array:
         """How the entry angles depend on load and slip here: coefficients (W, 4) for `start_on`.

@@ -74,6 +74,16 @@ class Window:
     variance: Mapping[str, Array]
     samples: int
 
+    def rows(self, keep: NDArray[np.intp]) -> Window:
+        """The window with only these bins."""
+        values = {q: getattr(self, q)[keep] for q in (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)}
+        variance = {q: v[keep] for q, v in self.variance.items()}
+        return Window(t=self.t[keep], variance=variance, samples=self.samples, **values)
+
+    def since(self, t: float) -> Window:
+        """The window from t [s] on."""
+        return self.rows(np.flatnonzero(self.t >= t))
+
 
 class BinStore:
     """Sums and counts of samples by bin and channel, over a sliding span of time.

@@ -32,7 +32,7 @@ def summary(results: Sequence[WindowResult], pipeline: Pipeline) -> str:
         lines.append(f"bearing pressure {bearing / 1e3:.1f} +- {std / 1e3:.1f} kPa (medians of the valid windows)")
     states = Counter(str(r.traversability.state) for r in results)
     lines.append("traversability " + (", ".join(f"{s} {n}" for s, n in states.most_common()) or "unknown"))
-    refused = pipeline.refusals.total
+    refused = pipeline.intake.refusals.total
     lines.append("refused samples " + (", ".join(f"{reason} {n}" for reason, n in refused.most_common()) or "none"))
     return "\n".join(lines) + "\n"
 

@@ -1,0 +1,181 @@
+"""Windows of measured data in, results out: soil, capability, decision."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.capability import PullCurve
+from soilbus.config import Config
+from soilbus.daemon.intake import WindowTask, column_means
+from soilbus.estimation.gauss_newton import Fit, fit_window, resume
+from soilbus.estimation.posterior import Estimate, Posterior
+from soilbus.estimation.residuals import WindowProblem
+from soilbus.estimation.window import Window
+from soilbus.terra.vehicle import GRAVITY
+from soilbus.terra.wheel import sinkage as sinkage_of
+from soilbus.traversability import Demand, Status, Traversability, judge
+
+MIN_ROWS = 60
+
+
+@dataclass(frozen=True, slots=True)
+class WindowResult:
+    """What one window says; t is its end [s], index counts windows since the start.
+
+    slip and sinkage [m] are means over the window by wheel name, None where unknown.
+    rejected counts refused samples of the window by reason.  posterior is None where
+    status is invalid.
+    """
+
+    t: float
+    index: int
+    status: Status
+    reason: str
+    posterior: Posterior | None
+    bearing: Estimate | None
+    slip: dict[str, float | None]
+    sinkage: dict[str, float | None]
+    traversability: Traversability
+    chi2: float | None
+    samples: int
+    rejected: dict[str, int]
+    iterations: int = 0
+
+
+class WindowEstimator:
+    """Solves one window after the other; the last fit only tells where to start.
+
+    Each window is estimated from its own data and the configured prior.  Where a known
+    soil ends, only the data since then count until a whole window of the new soil is in.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.rig, self.prior, self.model = rig_of(config), prior_of(config), model_of(config)
+        self._settings = config.estimator
+        self._forget()
+
+    def _forget(self) -> None:
+        self._fit: Fit | None = None
+        self._pull_curve: PullCurve | None = None
+        self._soil_since = -math.inf
+        self._known_until = -math.inf  # end of the last valid window that was whole
+
+    def solve(self, task: WindowTask) -> WindowResult:
+        """Estimate and decision of one window."""
+        if task.fresh:
+            self._forget()
+        problem, fit = self._estimate(task)
+        self._fit = fit if fit is not None and fit.converged else None
+        status, reason = self._status(task, problem, fit)
+        if status is Status.VALID and task.start >= self._soil_since:
+            self._known_until = task.end
+        posterior = None if fit is None or status is Status.INVALID else self._honest(fit)
+        way, self._pull_curve = judge(
+            posterior, status, self._demand(task.window), self.rig, self.model, task.torque_limit,
+            self.config.traversability, self._pull_curve,
+        )  # fmt: skip
+        return WindowResult(
+            t=task.end,
+            index=task.index,
+            status=status,
+            reason=reason,
+            posterior=posterior,
+            bearing=None if posterior is None else self._bearing(posterior),
+            slip=task.slip,
+            sinkage=self._sinkage(problem, fit if posterior is not None else None),
+            traversability=way,
+            chi2=None if fit is None else fit.chi2,
+            samples=task.window.samples,
+            rejected=task.rejected,
+            iterations=0 if fit is None else fit.iterations,
+        )
+
+    def _estimate(self, task: WindowTask) -> tuple[WindowProblem, Fit | None]:
+        problem = self._problem(task.window, max(task.start, self._soil_since))
+        if problem.n_rows < MIN_ROWS:
+            return problem, None
+        fit = fit_window(problem, self.prior) if self._fit is None else resume(problem, self.prior, self._fit)
+        if not self._mismatch(fit):
+            return problem, fit
+        self._soil_since = -math.inf
+        if task.end - self._known_until <= self._settings.window:
+            # The soil was known until just now: does the newest data agree with itself?
+            since = task.end - self._settings.change_window
+            newest = self._problem(task.window, since)
+            if newest.n_rows >= MIN_ROWS:
+                new_fit = fit_window(newest, self.prior)
+                if not self._mismatch(new_fit):
+                    self._soil_since = since
+                    return newest, new_fit
+        elif self._fit is not None and (fit is None or not fit.converged):
+            fit = fit_window(problem, self.prior)
+        return problem, fit
+
+    def _problem(self, window: Window, since: float) -> WindowProblem:
+        part = window if not len(window.t) or since <= window.t[0] else window.since(since)
+        return WindowProblem(part, self.rig, self.model, self._settings.min_speed)
+
+    def _mismatch(self, fit: Fit | None) -> bool:
+        return fit is None or not fit.converged or fit.chi2 > self._chi2_limit(fit)
+
+    def _chi2_limit(self, fit: Fit) -> float:
+        """Reduced chi-square that noise alone reaches hardly ever with this many residuals."""
+        return self._settings.max_chi2 + 3.5 * math.sqrt(2.0 / max(fit.rows, 1))
+
+    def _honest(self, fit: Fit) -> Posterior:
+        """Posterior with its covariance widened where the residuals are larger than the noise."""
+        if fit.chi2 <= self._chi2_limit(fit):
+            return fit.posterior
+        return Posterior(fit.posterior.soil, fit.posterior.log_covariance * fit.chi2)
+
+    def _bearing(self, posterior: Posterior) -> Estimate:
+        return posterior.bearing_pressure(self._settings.z_ref, self._settings.b_ref)
+
+    def _sinkage(self, problem: WindowProblem, fit: Fit | None) -> dict[str, float | None]:
+        if fit is None:
+            return dict.fromkeys(self.rig.wheels)
+        z = np.where(problem.usable, sinkage_of(fit.latents.entry_angle, self.rig.radius), np.nan)
+        return dict(zip(self.rig.wheels, column_means(z), strict=True))
+
+    def _demand(self, window: Window) -> Demand | None:
+        """Draft and slope, over the last hop or the whole window, whichever asks for more.
+
+        A driver who has just lifted the implement because it was too much still wants it
+        down.  None where the draft of the last hop is not known.
+        """
+        if self.rig.chassis is None or not len(window.t):
+            return None
+        slope = np.where(np.isfinite(window.pitch), np.sin(window.pitch), 0.0)
+        pull = window.draft + self.rig.chassis.mass * GRAVITY * slope
+        recent = pull[window.t > window.t[-1] - self._settings.hop]
+        recent, pull = recent[np.isfinite(recent)], pull[np.isfinite(pull)]
+        if not len(recent):
+            return None
+        part = recent if recent.mean() >= pull.mean() else pull
+        return Demand(float(part.mean()), float(part.std() / math.sqrt(len(part))))
+
+    def _status(self, task: WindowTask, problem: WindowProblem, fit: Fit | None) -> tuple[Status, str]:
+        if task.missing:
+            return Status.INVALID, "input_missing " + " ".join(task.missing)
+        if problem.n_rows < MIN_ROWS:
+            standing = problem.standstill > 0.5 * max(len(task.window.t), 1)
+            return (Status.NOT_EXCITED, "standstill") if standing else (Status.INVALID, "input_stale")
+        if fit is None:
+            return Status.INVALID, "no_convergence"
+        if fit.chi2 > self._chi2_limit(fit):
+            return (Status.DEGRADED if fit.converged else Status.INVALID), "model_mismatch"
+        if not fit.converged:
+            return Status.INVALID, "no_convergence"
+        if task.poor:
+            return Status.DEGRADED, "input_stale " + " ".join(task.poor)
+        bearing, tan_phi = self._bearing(fit.posterior), fit.posterior.tan_phi()
+        if bearing.std > self._settings.max_bearing_std * bearing.value:
+            return Status.NOT_EXCITED, "not_excited load_range"
+        if tan_phi.std > self._settings.max_tan_phi_std * tan_phi.value:
+            return Status.NOT_EXCITED, "not_excited slip_range"
+        return Status.VALID, "none"

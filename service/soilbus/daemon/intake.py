@@ -1,0 +1,215 @@
+"""Frames in, windows of measured data out.
+
+Time is what the frames' stamps say.  Windows are counted from the first admitted sample,
+so the same frames always give the same windows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+from cantools.database.can import Database
+from numpy.typing import NDArray
+
+from soilbus.assembly import rig_of
+from soilbus.can.admission import Admission
+from soilbus.can.channels import Channel, Decoded
+from soilbus.can.dbc_files import checked_messages
+from soilbus.can.mapping import channels_of
+from soilbus.config import Config
+from soilbus.estimation.window import BinStore, Window
+from soilbus.terra.vehicle import slip_ratio
+
+Array = NDArray[np.float64]
+
+DEFAULT_TIMEOUT = 1.0
+COVERAGE_BLOCK = 0.5
+MIN_COVERAGE = 0.95
+LONGEST_GAP = 60.0
+"""Silence [s] after which windows are counted anew instead of being reported one by one."""
+SLIP_SPAN = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class WindowTask:
+    """One window's data and what is known of its inputs; everything an estimate needs.
+
+    index counts windows since the start; start and end [s]; missing are needed channels never seen, poor those that are stale
+    at the end or covered the window badly; torque_limit (W,) [N m], nan where unknown;
+    fresh: nothing of the window before may be carried over.
+    """
+
+    index: int
+    start: float
+    end: float
+    window: Window
+    slip: dict[str, float | None]
+    missing: tuple[str, ...]
+    poor: tuple[str, ...]
+    torque_limit: Array
+    rejected: dict[str, int]
+    fresh: bool
+
+
+@dataclass(slots=True)
+class Refusals:
+    """Refused samples by reason, kept as long as a window may ask for them."""
+
+    entries: list[tuple[str, Array]] = field(default_factory=list)
+    total: Counter[str] = field(default_factory=Counter)
+
+    def add(self, decoded: Decoded) -> None:
+        """Take note of what one batch of frames refused."""
+        for (_, reason), times in decoded.refused.items():
+            self.entries.append((str(reason), times))
+            self.total[str(reason)] += len(times)
+
+    def within(self, start: float, end: float) -> dict[str, int]:
+        """Counts by reason from start to end [s]; what is older is forgotten."""
+        self.entries = [(r, t) for r, t in self.entries if t[-1] >= start]
+        counts: Counter[str] = Counter()
+        for reason, t in self.entries:
+            counts[reason] += int(np.count_nonzero((t >= start) & (t < end)))
+        return {r: n for r, n in sorted(counts.items()) if n}
+
+
+class Intake:
+    """Admission, bins and freshness of one vehicle's channels.
+
+    Raises ConfigError where configuration and database do not fit.
+    """
+
+    def __init__(self, config: Config, database: Database) -> None:
+        self.channels = channels_of(config, database)
+        self.admission = Admission(self.channels, database, checked_messages(config))
+        self.rig = rig_of(config)
+        self.refusals = Refusals()
+        self.needed = tuple(c for c in self.channels if self._is_needed(c))
+        self._settings = config.estimator
+        self._binned = frozenset(self.rig.channels)
+        limits = {w.name: w.max_torque for w in config.wheel}
+        self._max_torque = np.array([limits[name] or math.nan for name in self.rig.wheels])
+        self._limit = np.full(len(self.rig.wheels), math.nan)
+        self._limit_t = np.full(len(self.rig.wheels), -math.inf)
+        self._index = 0
+        self._restart()
+
+    def _is_needed(self, channel: Channel) -> bool:
+        if channel.wheel:
+            return channel.wheel in self.rig.wheels and channel.quantity in ("torque", "speed", "load")
+        return True
+
+    def _restart(self) -> None:
+        self._bins: BinStore | None = None
+        self._fresh = True
+        self.next_end = math.inf
+        self.last_seen: dict[str, float] = {}
+        self._clock_steps = self.admission.counts.clock_steps
+
+    def ingest(self, until: float = math.inf) -> None:
+        """Decode the frames filed so far that are older than `until` [s] and put them into bins."""
+        decoded = self.admission.take(until)
+        if self.admission.counts.clock_steps != self._clock_steps:
+            self._restart()
+        self.refusals.add(decoded)
+        for name, column in decoded.columns.items():
+            if not len(column.t):
+                continue
+            self.last_seen[name] = float(column.t[-1])
+            if name.startswith("torque_limit."):
+                self._note_limit(name.removeprefix("torque_limit."), column.t, column.value)
+            elif name in self._binned:
+                self._store(float(column.t[0])).add(name, column.t, column.value)
+
+    def _note_limit(self, wheel: str, t: Array, value: Array) -> None:
+        if wheel in self.rig.wheels:
+            i = self.rig.wheels.index(wheel)
+            self._limit[i], self._limit_t[i] = value[-1], t[-1]
+
+    def _store(self, t: float) -> BinStore:
+        if self._bins is None:
+            self._bins = BinStore(self.rig, self._settings.bin, t)
+            self.next_end = t + self._settings.window
+        return self._bins
+
+    def due(self, now: float) -> list[WindowTask]:
+        """Every window that ended at or before `now` [s] and was not handed out yet."""
+        if self._bins is None:
+            self.ingest(now)
+        tasks: list[WindowTask] = []
+        while self.next_end <= now:
+            self.ingest(self.next_end)
+            if self.next_end > now or self._bins is None:  # the clock was set meanwhile
+                break
+            if self.last_seen and self.next_end - max(self.last_seen.values()) > LONGEST_GAP:
+                self._restart()
+                break
+            tasks.append(self._task(self._bins, self.next_end))
+            self.next_end += self._settings.hop
+        return tasks
+
+    def _task(self, bins: BinStore, end: float) -> WindowTask:
+        start = end - self._settings.window
+        window = bins.window(start, end)
+        missing = tuple(c.name for c in self.needed if c.name not in self.last_seen)
+        badly_covered = [c.name for c in self.needed if _coverage(window, self.rig.wheels, c) < MIN_COVERAGE]
+        poor = tuple(dict.fromkeys(self.stale(end) + badly_covered))
+        fresh_limit = end - self._limit_t < DEFAULT_TIMEOUT
+        task = WindowTask(
+            index=self._index,
+            start=start,
+            end=end,
+            window=window,
+            slip=self._slip(window),
+            missing=missing if self.rig.wheels else (*missing, "wheels"),
+            poor=poor,
+            torque_limit=np.where(fresh_limit, self._limit, self._max_torque),
+            rejected=self.refusals.within(start, end),
+            fresh=self._fresh,
+        )
+        self._fresh = False
+        self._index += 1
+        bins.drop_before(start + self._settings.hop)
+        return task
+
+    def stale(self, now: float) -> list[str]:
+        """Needed channels without an admitted sample within their time-out before `now` [s]."""
+        return [
+            c.name
+            for c in self.needed
+            if now - self.last_seen.get(c.name, -math.inf) > (c.timeout or DEFAULT_TIMEOUT)
+        ]
+
+    def latest_slip(self, now: float) -> dict[str, float | None]:
+        """Slip ratio by wheel over the last moments before `now` [s]; None where unknown."""
+        if self._bins is None:
+            return dict.fromkeys(self.rig.wheels)
+        last = math.floor((now - self._bins.origin) / self._settings.bin) * self._settings.bin + self._bins.origin
+        return self._slip(self._bins.window(last - SLIP_SPAN, last))
+
+    def _slip(self, window: Window) -> dict[str, float | None]:
+        ground = window.ground_speed[:, None]
+        slip = slip_ratio(self.rig.radius, window.speed, ground)
+        slip = np.where((ground > self._settings.min_speed) & (slip > -1.0), slip, np.nan)
+        return dict(zip(self.rig.wheels, column_means(slip), strict=True))
+
+
+def column_means(rows: Array) -> list[float | None]:
+    """Mean of each column of (N, W) over its finite entries; None for a column without any."""
+    known = np.isfinite(rows)
+    count = known.sum(0)
+    total = np.where(known, rows, 0.0).sum(0)
+    return [float(s / n) if n else None for s, n in zip(total, count, strict=True)]
+
+
+def _coverage(window: Window, wheels: tuple[str, ...], channel: Channel) -> float:
+    """Share of the window's half seconds in which the channel has a sample."""
+    values = getattr(window, channel.quantity)
+    known = np.isfinite(values if not channel.wheel else values[:, wheels.index(channel.wheel)])
+    if len(known) < 2:
+        return 0.0
+    block = ((window.t - window.t[0]) / COVERAGE_BLOCK + 1e-6).astype(int)
+    return float((np.bincount(block, weights=known) > 0).mean())

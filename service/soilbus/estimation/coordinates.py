@@ -1,0 +1,69 @@
+"""Coordinates in which a window's cost is closest to a parabola.
+
+Logarithms of the free parameters, but for k_phi the logarithm of the bearing pressure at
+a typical depth and tyre width: a window determines that well and k_c, k_phi and n apart
+badly, so in plain logarithms the optimum lies in a long curved valley.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+
+Array = NDArray[np.float64]
+
+TYPICAL_DEPTH = 0.03
+MAX_STEP = 0.7
+"""Longest step of a coordinate."""
+BOUND = 4.0
+"""Prior standard deviations of the logarithm to which a free parameter is confined."""
+
+_K_C, _K_PHI, _N = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n"))
+
+
+@dataclass(frozen=True, slots=True)
+class Coordinates:
+    """The free parameters' coordinates (F,) for a prior and a mean tyre width [m]."""
+
+    prior: SoilPrior
+    width: float
+
+    @property
+    def free(self) -> NDArray[np.intp]:
+        """Indices of the free parameters, one coordinate each."""
+        return self.prior.free
+
+    def log_directions(self, soil: Array) -> Array:
+        """Derivatives (6, F) of the parameters' logarithms by the coordinates."""
+        free = self.free
+        directions = np.zeros((len(soil), len(free)))
+        directions[free, np.arange(len(free))] = 1.0
+        if _K_PHI in free:
+            k_phi = soil[_K_PHI]
+            K_L = k_phi + soil[_K_C] / self.width
+            column = {int(parameter): i for i, parameter in enumerate(free)}
+            directions[_K_PHI, column[_K_PHI]] = K_L / k_phi
+            if _K_C in column:
+                directions[_K_PHI, column[_K_C]] = -soil[_K_C] / self.width / k_phi
+            if _N in column:
+                directions[_K_PHI, column[_N]] = -K_L / k_phi * soil[_N] * np.log(TYPICAL_DEPTH)
+        return directions
+
+    def moved(self, soil: Array, step: Array) -> Array:
+        """The soil (6,) after a step (F,) of the coordinates, shortened and kept near the prior."""
+        free = self.free
+        step = step * min(1.0, MAX_STEP / max(float(np.max(np.abs(step), initial=0.0)), 1e-12))
+        new = soil.copy()
+        new[free] = soil[free] * np.exp(step)
+        if _K_PHI in free:
+            log_strength = np.log(soil[_K_PHI] + soil[_K_C] / self.width) + soil[_N] * np.log(TYPICAL_DEPTH)
+            log_strength += step[int(np.flatnonzero(free == _K_PHI)[0])]
+            K_L = np.exp(log_strength - new[_N] * np.log(TYPICAL_DEPTH))
+            new[_K_PHI] = max(K_L - new[_K_C] / self.width, 0.01 * K_L)
+        centre, bound = self.prior.median[free], np.exp(BOUND * self.prior.log_std[free])
+        new[free] = np.clip(new[free], centre / bound, centre * bound)
+        return new
