@@ -10,13 +10,12 @@ import numpy as np
 from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.capability import PullCurve
 from soilbus.config import Config
-from soilbus.daemon.intake import WindowTask, column_means
-from soilbus.estimation.gauss_newton import Fit, fit_window, resume
+from soilbus.daemon.intake import WindowTask
+from soilbus.estimation.gauss_newton import Fit, fit_window
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import Window
 from soilbus.terra.vehicle import GRAVITY
-from soilbus.terra.wheel import sinkage as sinkage_of
 from soilbus.traversability import Demand, Status, Traversability, judge
 
 MIN_ROWS = 60
@@ -69,9 +68,9 @@ class WindowEstimator:
         """Estimate and decision of one window."""
         if task.fresh:
             self._forget()
-        problem, fit = self._estimate(task)
+        standstill, fit = self._estimate(task)
         self._fit = fit if fit is not None and fit.converged else None
-        status, reason = self._status(task, problem, fit)
+        status, reason = self._status(task, standstill, fit)
         if status is Status.VALID and task.start >= self._soil_since:
             self._known_until = task.end
         posterior = None if fit is None or status is Status.INVALID else self._honest(fit)
@@ -87,7 +86,7 @@ class WindowEstimator:
             posterior=posterior,
             bearing=None if posterior is None else self._bearing(posterior),
             slip=task.slip,
-            sinkage=self._sinkage(problem, fit if posterior is not None else None),
+            sinkage=self._sinkage(fit if posterior is not None else None),
             traversability=way,
             chi2=None if fit is None else fit.chi2,
             samples=task.window.samples,
@@ -95,29 +94,23 @@ class WindowEstimator:
             iterations=0 if fit is None else fit.iterations,
         )
 
-    def _estimate(self, task: WindowTask) -> tuple[WindowProblem, Fit | None]:
-        problem = self._problem(task.window, max(task.start, self._soil_since))
-        if problem.n_rows < MIN_ROWS:
-            return problem, None
-        fit = fit_window(problem, self.prior) if self._fit is None else resume(problem, self.prior, self._fit)
-        if not self._mismatch(fit):
-            return problem, fit
-        self._soil_since = -math.inf
-        if task.end - self._known_until <= self._settings.window:
-            # The soil was known until just now: does the newest data agree with itself?
-            since = task.end - self._settings.change_window
-            newest = self._problem(task.window, since)
-            if newest.n_rows >= MIN_ROWS:
-                new_fit = fit_window(newest, self.prior)
-                if not self._mismatch(new_fit):
-                    self._soil_since = since
-                    return newest, new_fit
-        elif self._fit is not None and (fit is None or not fit.converged):
-            fit = fit_window(problem, self.prior)
-        return problem, fit
+    def _estimate(self, task: WindowTask) -> tuple[int, Fit | None]:
+        """Standstill instants and the fit of a window."""
+        problem = self._problem(task.window, self._soil_since)
+        fit = fit_window(problem, self.prior, self._fit) if problem.n_rows >= MIN_ROWS else None
+        if fit is not None and self._mismatch(fit):
+            self._soil_since = -math.inf
+            if task.end - self._known_until <= self._settings.window:
+                # The soil was known until just now: does the newest data agree with itself?
+                since = task.end - self._settings.change_window
+                newest = self._problem(task.window, since)
+                changed = fit_window(newest, self.prior) if newest.n_rows >= MIN_ROWS else None
+                if changed is not None and not self._mismatch(changed):
+                    self._soil_since, fit = since, changed
+        return problem.standstill, fit
 
     def _problem(self, window: Window, since: float) -> WindowProblem:
-        part = window if not len(window.t) or since <= window.t[0] else window.since(since)
+        part = window if not len(window.t) or since <= window.t[0] else window.rows(np.flatnonzero(window.t >= since))
         return WindowProblem(part, self.rig, self.model, self._settings.min_speed)
 
     def _mismatch(self, fit: Fit | None) -> bool:
@@ -136,11 +129,9 @@ class WindowEstimator:
     def _bearing(self, posterior: Posterior) -> Estimate:
         return posterior.bearing_pressure(self._settings.z_ref, self._settings.b_ref)
 
-    def _sinkage(self, problem: WindowProblem, fit: Fit | None) -> dict[str, float | None]:
-        if fit is None:
-            return dict.fromkeys(self.rig.wheels)
-        z = np.where(problem.usable, sinkage_of(fit.latents.entry_angle, self.rig.radius), np.nan)
-        return dict(zip(self.rig.wheels, column_means(z), strict=True))
+    def _sinkage(self, fit: Fit | None) -> dict[str, float | None]:
+        known = [None] * len(self.rig.wheels) if fit is None else [float(z) for z in fit.sinkage]
+        return {w: z if z is not None and math.isfinite(z) else None for w, z in zip(self.rig.wheels, known, strict=True)}
 
     def _demand(self, window: Window) -> Demand | None:
         """Draft and slope, over the last hop or the whole window, whichever asks for more.
@@ -159,14 +150,13 @@ class WindowEstimator:
         part = recent if recent.mean() >= pull.mean() else pull
         return Demand(float(part.mean()), float(part.std() / math.sqrt(len(part))))
 
-    def _status(self, task: WindowTask, problem: WindowProblem, fit: Fit | None) -> tuple[Status, str]:
+    def _status(self, task: WindowTask, standstill: int, fit: Fit | None) -> tuple[Status, str]:
         if task.missing:
             return Status.INVALID, "input_missing " + " ".join(task.missing)
-        if problem.n_rows < MIN_ROWS:
-            standing = problem.standstill > 0.5 * max(len(task.window.t), 1)
-            return (Status.NOT_EXCITED, "standstill") if standing else (Status.INVALID, "input_stale")
         if fit is None:
-            return Status.INVALID, "no_convergence"
+            if standstill > 0:
+                return Status.NOT_EXCITED, "standstill"
+            return Status.INVALID, "input_stale " + " ".join(task.poor) if task.poor else "no_convergence"
         if fit.chi2 > self._chi2_limit(fit):
             return (Status.DEGRADED if fit.converged else Status.INVALID), "model_mismatch"
         if not fit.converged:

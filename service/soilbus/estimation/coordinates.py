@@ -53,17 +53,37 @@ class Coordinates:
                 directions[_K_PHI, column[_N]] = -K_L / k_phi * soil[_N] * np.log(TYPICAL_DEPTH)
         return directions
 
-    def moved(self, soil: Array, step: Array) -> Array:
-        """The soil (6,) after a step (F,) of the coordinates, shortened and kept near the prior."""
+    def position(self, soil: Array) -> Array:
+        """Coordinates (F,) of a soil (6,)."""
+        logs = np.log(soil[self.free])
+        if _K_PHI in self.free:
+            K_L = soil[_K_PHI] + soil[_K_C] / self.width
+            logs[self._strength] = np.log(K_L) + soil[_N] * np.log(TYPICAL_DEPTH)
+        return logs
+
+    def soil_at(self, position: Array) -> Array:
+        """The soil (6,) with these coordinates (F,), kept near the prior."""
         free = self.free
-        step = step * min(1.0, MAX_STEP / max(float(np.max(np.abs(step), initial=0.0)), 1e-12))
-        new = soil.copy()
-        new[free] = soil[free] * np.exp(step)
+        soil = self.prior.median.copy()
+        soil[free] = np.exp(position)
         if _K_PHI in free:
-            log_strength = np.log(soil[_K_PHI] + soil[_K_C] / self.width) + soil[_N] * np.log(TYPICAL_DEPTH)
-            log_strength += step[int(np.flatnonzero(free == _K_PHI)[0])]
-            K_L = np.exp(log_strength - new[_N] * np.log(TYPICAL_DEPTH))
-            new[_K_PHI] = max(K_L - new[_K_C] / self.width, 0.01 * K_L)
+            K_L = np.exp(position[self._strength] - soil[_N] * np.log(TYPICAL_DEPTH))
+            soil[_K_PHI] = max(K_L - soil[_K_C] / self.width, 0.01 * K_L)
         centre, bound = self.prior.median[free], np.exp(BOUND * self.prior.log_std[free])
-        new[free] = np.clip(new[free], centre / bound, centre * bound)
-        return new
+        soil[free] = np.clip(soil[free], centre / bound, centre * bound)
+        return soil
+
+    @property
+    def _strength(self) -> int:
+        return int(np.flatnonzero(self.free == _K_PHI)[0])
+
+    def prior_pull(self, soil: Array) -> tuple[Array, Array]:
+        """How far the free parameters are from the prior, in its standard deviations (F,), and its derivatives (F, F)."""
+        free, log_std = self.free, self.prior.log_std[self.free]
+        pull = np.log(soil[free] / self.prior.median[free]) / log_std
+        return pull, self.log_directions(soil)[free] / log_std[:, None]
+
+    def moved(self, soil: Array, step: Array) -> Array:
+        """The soil (6,) after a step (F,) of the coordinates, shortened where it is long."""
+        step = step * min(1.0, MAX_STEP / max(float(np.max(np.abs(step), initial=0.0)), 1e-12))
+        return self.soil_at(self.position(soil) + step)

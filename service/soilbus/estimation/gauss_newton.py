@@ -32,8 +32,8 @@ THINNED = 24
 MAX_APPROACH = 10
 MAX_SETTLED = 2
 MAX_HOPELESS = 5
-HOPELESS = 60.0
-"""Cost for each thinned instant beyond which the window cannot be one soil."""
+HOPELESS = 30.0
+"""Cost for each residual beyond which the window cannot be one soil: no use to search on."""
 LONG_LOG_STEP = 0.1
 """Step of a log parameter from which the entry angles are solved again, not extrapolated."""
 
@@ -44,13 +44,13 @@ class Fit:
 
     cost is -2 log posterior up to a constant: chi-square of the residuals, of the soil's
     prior and of the gains.  chi2 is cost per residual (reduced: each parameter has its
-    prior as one more residual).  angle_curve (W, 4) is for
-    resume().  gains are relative errors by problem.gain_names.
+    prior as one more residual).  sinkage (W,) is the mean over the
+    window [m], nan where unknown; angle_curve (W, 4) is for resume().  gains are relative errors by problem.gain_names.
     """
 
     posterior: Posterior
     gains: Array
-    latents: Latents
+    sinkage: Array
     angle_curve: Array
     cost: float
     rows: int
@@ -72,7 +72,7 @@ def fit_window(problem: WindowProblem, prior: SoilPrior, last: Fit | None = None
     """
     if last is not None:
         fit = resume(problem, prior, last)
-        if fit is not None and fit.converged:
+        if fit is not None and (fit.converged or fit.chi2 > HOPELESS):
             return fit
     best: Fit | None = None
     coordinates = _coordinates(problem, prior)
@@ -208,15 +208,16 @@ def _settle(problem: WindowProblem, coordinates: Coordinates, near: _Place, most
         soil, gains = new_soil, gains + gain_step
         if length < CONVERGED:
             break
-    covariance = _inverse(point.information)
-    if covariance is None:
+    inverse = solved(point.information, point.gradient)
+    if inverse is None:
         return None
+    covariance = inverse[1]
     directions = coordinates.log_directions(soil)
     log_covariance = directions @ covariance[: len(free), : len(free)] @ directions.T
     return Fit(
         posterior=Posterior(Soil(*soil.tolist()), log_covariance),
         gains=gains,
-        latents=latents,
+        sinkage=problem.mean_sinkage(latents),
         angle_curve=problem.angle_curve(latents),
         cost=point.cost - length,
         rows=point.at.known,
@@ -243,19 +244,16 @@ def _normal_equations(
         at = problem.linearise(Soil(*soil.tolist()), gains, latents)
     except np.linalg.LinAlgError:
         return None
-    prior, free = coordinates.prior, coordinates.free
-    directions = coordinates.log_directions(soil)
-    by_soil = soil[:, None] * directions
+    by_soil = soil[:, None] * coordinates.log_directions(soil)
     rows = np.concatenate([at.rows[:, 1:7] @ by_soil, at.rows[:, 7 + active]], axis=1)
     weighed = np.concatenate([at.weighed[:, 1:7] @ by_soil, at.weighed[:, 7 + active]], axis=1)
-    soil_pull = np.log(soil[free] / prior.median[free]) / prior.log_std[free]
-    by_pull = directions[free] / prior.log_std[free, None]
+    soil_pull, by_pull = coordinates.prior_pull(soil)
     gain_pull = gains[active] / problem.gain_std[active]
     cost = at.chi2 + float(soil_pull @ soil_pull) + float(gain_pull @ gain_pull)
     if not np.isfinite(cost):
         return None
     information, gradient = rows.T @ weighed, weighed.T @ at.rows[:, 0]
-    n = len(free)
+    n = len(coordinates.free)
     information[:n, :n] += by_pull.T @ by_pull
     gradient[:n] += by_pull.T @ soil_pull
     information[n:, n:] += np.diag(1.0 / problem.gain_std[active] ** 2)
@@ -264,16 +262,16 @@ def _normal_equations(
 
 
 def _solve(information: Array, gradient: Array, damping: float) -> Array | None:
-    damped = information + damping * np.diag(np.diag(information))
-    inverse = _inverse(damped)
-    return None if inverse is None else -inverse @ gradient
+    step = solved(information + damping * np.diag(np.diag(information)), gradient)
+    return None if step is None else -step[0]
 
 
-def _inverse(information: Array) -> Array | None:
+def solved(information: Array, gradient: Array) -> tuple[Array, Array] | None:
+    """information^-1 gradient and information^-1, (F,) and (F, F); None where it is singular."""
     scale = 1.0 / np.sqrt(np.diag(information))
     try:
         inverse = np.linalg.inv(information * np.outer(scale, scale))
     except np.linalg.LinAlgError:
         return None
-    return inverse * np.outer(scale, scale) if np.isfinite(inverse).all() else None
-
+    inverse = inverse * np.outer(scale, scale)
+    return (inverse @ gradient, inverse) if np.isfinite(inverse).all() else None

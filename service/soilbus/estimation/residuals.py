@@ -172,6 +172,16 @@ class WindowProblem:
         angle = np.where(np.isfinite(angle), angle, MAX_ENTRY_ANGLE * 0.98)
         return Latents(latents.load, latents.speed, latents.ground_speed, angle)
 
+    def sinkages(self, latents: Latents) -> Array:
+        """Sinkage [m] of each wheel at each instant (N, W), nan where the wheel is not usable."""
+        return np.where(self.usable, sinkage(latents.entry_angle, self.rig.radius), np.nan)
+
+    def mean_sinkage(self, latents: Latents) -> Array:
+        """Mean sinkage [m] of each wheel (W,), nan for a wheel that is never usable."""
+        known = self.usable.sum(0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray(np.where(self.usable, self.sinkages(latents), 0.0).sum(0) / known)
+
     def angle_curve(self, latents: Latents) -> Array:
         """How the entry angles depend on load and slip here: coefficients (W, 4) for `start_on`.
 

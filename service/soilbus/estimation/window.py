@@ -80,10 +80,6 @@ class Window:
         variance = {q: v[keep] for q, v in self.variance.items()}
         return Window(t=self.t[keep], variance=variance, samples=self.samples, **values)
 
-    def since(self, t: float) -> Window:
-        """The window from t [s] on."""
-        return self.rows(np.flatnonzero(self.t >= t))
-
 
 class BinStore:
     """Sums and counts of samples by bin and channel, over a sliding span of time.

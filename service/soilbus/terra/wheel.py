@@ -113,7 +113,7 @@ def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolera
     where it is finite and positive.  A load that no angle up to MAX_ENTRY_ANGLE carries
     (wheel buried), or that is not a positive number, gives nan.
     """
-    load, *fields = (np.atleast_1d(np.asarray(a, float)) for a in np.broadcast_arrays(load, *state))
+    load, *fields = (np.asarray(a, float) for a in np.broadcast_arrays(load, *state))
     shape = load.shape
     load, *fields = (a.ravel() for a in (load, *fields))
     guess, rest = fields[0], fields[1:]
@@ -162,7 +162,7 @@ def _in_chunks(
     shape = np.broadcast_shapes(*(np.shape(a) for a in state))
     n_samples = int(np.prod(shape, dtype=int))
     rows = WheelState(*(
-        (a if np.shape(a) == shape else np.broadcast_to(a, shape)).reshape(n_samples)
+        np.broadcast_to(a, shape).reshape(n_samples)
         if np.ndim(a) or i < 2 else float(a)  # entry angle and slip always by sample
         for i, a in enumerate(state)
     ))  # fmt: skip
@@ -175,7 +175,6 @@ def _in_chunks(
         forces[:, index], d = _integrate(part, model, skid, derivatives, only_entry_angle)
         if derivatives:
             jacobian[:, :, index] = d
-    shape = shape or (1,)
     return forces.reshape(3, *shape), jacobian.reshape(3, n_inputs, *shape) if derivatives else jacobian
 
 

@@ -1,0 +1,208 @@
+"""One wheel's forces against adaptive integration of the paper's equations, and its derivatives."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.optimize import brentq
+
+from soilbus.terra.soils import SOILS
+from soilbus.terra.wheel import (
+    EXACT_NODES,
+    FAST_NODES,
+    INPUTS,
+    MAX_ENTRY_ANGLE,
+    Soil,
+    WheelModel,
+    WheelState,
+    entry_angle_for_load,
+    sinkage,
+    state_on,
+    wheel_forces,
+    wheel_forces_and_derivatives,
+)
+
+R, B = 0.5, 0.3
+
+
+def adaptive_forces(state: WheelState, model: WheelModel) -> np.ndarray:
+    """W, DP and T of one wheel by scipy.integrate.quad, equation by equation (numbers of Xi et al. 2024)."""
+    theta1, slip, r, b, K_L, n, tan_phi, c, K = (float(v) for v in state)
+    theta_m = (model.peak_c1 + model.peak_c2 * slip) * theta1  # eq. 4
+    theta2 = model.exit_ratio * theta1
+
+    def sigma(theta: float) -> float:
+        """Eqs. 7 and 8, with the bracket that eq. 8 has lost (notes.md)."""
+        front = theta if theta >= theta_m else theta1 - (theta - theta2) / (theta_m - theta2) * (theta1 - theta_m)
+        # cos(front) - cos(theta1), without cancellation
+        z = 2.0 * r * math.sin((theta1 + front) / 2.0) * math.sin((theta1 - front) / 2.0)
+        return K_L * max(z, 0.0) ** n
+
+    def displacement(theta: float) -> float:
+        """Eqs. 15 and 16: the integral of the rim's slip velocity."""
+        return r * ((theta1 - theta) - (1.0 - slip) * (math.sin(theta1) - math.sin(theta)))
+
+    def tau(theta: float) -> float:
+        """Eqs. 11 and 12; in skid the shear acts the other way."""
+        x = displacement(theta) / K
+        share = 1.0 - math.exp(-abs(x)) if model.shear_law == "exponential" else abs(x) / (abs(x) + 1.0)
+        return math.copysign((c + sigma(theta) * tan_phi) * share, x)
+
+    splits = {theta2, theta_m, theta1}
+    grid = np.linspace(theta2, theta1, 400)[:-1]
+    values = [displacement(theta) for theta in grid]
+    for i in range(len(grid) - 1):
+        if values[i] * values[i + 1] < 0.0:
+            splits.add(brentq(displacement, grid[i], grid[i + 1], xtol=1e-15))
+
+    def integral(f) -> float:  # type: ignore[no-untyped-def]
+        total, points = 0.0, sorted(splits)
+        for low, high in zip(points, points[1:], strict=False):
+            half = (high - low) / 2.0  # each end gets sixth-power nodes: sigma may start as z**0.1 there
+            for end, way in ((low, half), (high, -half)):
+                g = lambda u, end=end, way=way: f(end + way * u**6) * 6.0 * u**5 * half  # noqa: E731
+                total += quad(g, 0.0, 1.0, epsabs=0.0, epsrel=1e-11, limit=200)[0]
+        return total
+
+    W = r * b * integral(lambda t: sigma(t) * math.cos(t) + tau(t) * math.sin(t))  # eq. 20
+    DP = r * b * integral(lambda t: tau(t) * math.cos(t) - sigma(t) * math.sin(t))  # eq. 21
+    T = r * r * b * integral(tau)  # eq. 22
+    return np.array([W, DP, T])
+
+
+def wheels(seed: int, size: int, slip: tuple[float, float] = (0.0, 0.95), c: float = 70e3) -> WheelState:
+    """Random wheels over the ranges that EXACT_NODES promises for."""
+    rng = np.random.default_rng(seed)
+    return WheelState(
+        entry_angle=rng.uniform(0.05, 0.8, size),
+        slip=rng.uniform(*slip, size),
+        radius=rng.choice([0.3, 0.5, 0.62, 0.9], size),
+        width=rng.uniform(0.15, 0.6, size),
+        K_L=10.0 ** rng.uniform(4.6, 6.7, size),
+        n=rng.uniform(0.1, 1.6, size),
+        tan_phi=np.tan(rng.uniform(0.1, 0.65, size)),
+        c=rng.uniform(0.0, c, size),
+        K=rng.uniform(0.005, 0.025, size),
+    )
+
+
+def one(state: WheelState, i: int) -> WheelState:
+    return WheelState(*(np.broadcast_to(a, np.shape(state.slip))[i] for a in state))
+
+
+MODELS = {
+    "exponential": WheelModel(),
+    "rational": WheelModel(shear_law="rational"),
+    "peak shift": WheelModel(peak_c1=0.35, peak_c2=0.3),
+    "rut recovery": WheelModel(exit_ratio=-0.4),
+    "everything": WheelModel("rational", 0.25, 0.35, -0.25),
+}
+
+
+def corners(slips: tuple[float, ...]) -> WheelState:
+    """Every corner of n, K, entry angle and slip."""
+    grid = np.meshgrid([0.1, 1.6], [0.005, 0.025], [0.05, 0.8], slips, indexing="ij")
+    n, K, angle, slip = (g.ravel() for g in grid)
+    return WheelState(angle, slip, R, B, 6e5, n, math.tan(0.4), 5e3, K)
+
+
+SITUATIONS = {
+    "drive": wheels(1, 24),
+    "skid": wheels(2, 16, slip=(-0.3, 0.0)),
+    "no slip": wheels(3, 4, slip=(0.0, 0.0)),
+}
+CORNERS = {"drive": corners((0.0, 0.3, 0.95)), "skid": corners((-0.3, -0.02))}
+
+
+def error(state: WheelState, model: WheelModel, nodes: int) -> np.ndarray:
+    """Worst error (3,) of W, DP and T: W and T of drive to their own size, the rest to W (and W r).
+
+    In skid T passes through zero, as DP does wherever motion resistance eats the thrust.
+    """
+    ours = wheel_forces(state, WheelModel(model.shear_law, model.peak_c1, model.peak_c2, model.exit_ratio, nodes))
+    worst = np.zeros(3)
+    for i in range(len(state.slip)):
+        part = one(state, i)
+        true = adaptive_forces(part, model)
+        size = np.array([true[0], true[0], true[0] * part.radius if part.slip < 0.0 else true[2]])
+        worst = np.maximum(worst, np.abs(ours[:, i] - true) / size)
+    return worst
+
+
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
+@pytest.mark.parametrize("state", SITUATIONS.values(), ids=SITUATIONS)
+def test_forces_equal_adaptive_integration(state, model):
+    assert np.all(error(state, model, EXACT_NODES) < 1e-6)
+
+
+@pytest.mark.parametrize("law", ["exponential", "rational"])
+@pytest.mark.parametrize("state", CORNERS.values(), ids=CORNERS)
+def test_forces_equal_adaptive_integration_in_every_corner(state, law):
+    model = WheelModel(shear_law=law)
+    exact, fast = error(state, model, EXACT_NODES), error(state, model, FAST_NODES)
+    print(exact, fast)
+    assert np.all(exact < 1e-6)
+    assert np.all(fast < 5e-5)
+
+
+def test_the_papers_wet_clay_at_five_centimetres():
+    # shared/paper/notes.md: r = 0.5 m, b = 0.3 m, slip 0.2, c1 = 0.5
+    angle = math.acos(1.0 - 0.05 / R)
+    state = state_on(SOILS["xi_wet_clay"], angle, 0.2, R, B)
+    assert sinkage(angle, R) == pytest.approx(0.05, rel=1e-12)
+    _, DP, T = wheel_forces(state, WheelModel())
+    assert (round(DP), round(T)) == (192, 278)
+    _, DP, T = wheel_forces(state, WheelModel(shear_law="rational"))
+    assert (round(DP), round(T)) == (77, 219)
+
+
+def central(state: WheelState, model: WheelModel, name: str, step: float) -> np.ndarray:
+    """(3, N) central differences by one input, the step relative to its value."""
+    at = np.asarray(getattr(state, name))
+    h = step * np.abs(at)
+    up, down = (wheel_forces(state._replace(**{name: at + s * h}), model) for s in (1.0, -1.0))
+    return (up - down) / (2.0 * h)
+
+
+def relative(difference: np.ndarray, state: WheelState, model: WheelModel, name: str) -> np.ndarray:
+    """Derivatives (3, N) as relative change of W (W r for T) by relative change of the input."""
+    W = wheel_forces(state, model)[0]
+    size = np.stack([W, W, W * state.radius])
+    return difference * getattr(state, name) / size
+
+
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
+@pytest.mark.parametrize("name", INPUTS)
+def test_derivatives_equal_central_differences_with_second_order(name, model):
+    state = wheels(4, 300, slip=(0.03, 0.92))
+    _, jacobian = wheel_forces_and_derivatives(state, model)
+    ours = jacobian[:, INPUTS.index(name)]
+
+    def miss(step: float) -> float:
+        difference = relative(central(state, model, name, step) - ours, state, model, name)
+        return float(np.sqrt(np.mean(difference**2)))
+
+    if name in ("K_L", "tan_phi", "c"):  # the forces are linear in these: no truncation error at any step
+        assert miss(1e-1) < 1e-11
+        return
+    errors = [miss(h) for h in (1e-2, 1e-3, 1e-4)]
+    orders = -np.diff(np.log10(errors))
+    assert orders == pytest.approx([2.0, 2.0], abs=0.05)
+    assert errors[-1] < 1e-6
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_derivatives_of_a_skidding_wheel(name):
+    # Here the panels' split moves with slip and entry angle; the derivatives do not count that motion.
+    state = wheels(5, 300, slip=(-0.3, -0.01))
+    for law in ("exponential", "rational"):
+        model = WheelModel(shear_law=law)
+        _, jacobian = wheel_forces_and_derivatives(state, model)
+        miss = central(state, model, name, 1e-4) - jacobian[:, INPUTS.index(name)]
+        print(name, law, np.abs(relative(miss, state, model, name)).max(1))
+        assert np.abs(relative(miss, state, model, name)).max() < 1e-5
