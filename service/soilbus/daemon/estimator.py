@@ -11,7 +11,7 @@ from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.capability import PullCurve
 from soilbus.config import Config
 from soilbus.daemon.intake import WindowTask
-from soilbus.estimation.gauss_newton import Fit, fit_window
+from soilbus.estimation.gauss_newton import Fit, fit_window, resume
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import Window
@@ -97,16 +97,22 @@ class WindowEstimator:
     def _estimate(self, task: WindowTask) -> tuple[int, Fit | None]:
         """Standstill instants and the fit of a window."""
         problem = self._problem(task.window, self._soil_since)
-        fit = fit_window(problem, self.prior, self._fit) if problem.n_rows >= MIN_ROWS else None
-        if fit is not None and self._mismatch(fit):
-            self._soil_since = -math.inf
-            if task.end - self._known_until <= self._settings.window:
-                # The soil was known until just now: does the newest data agree with itself?
-                since = task.end - self._settings.change_window
-                newest = self._problem(task.window, since)
-                changed = fit_window(newest, self.prior) if newest.n_rows >= MIN_ROWS else None
-                if changed is not None and not self._mismatch(changed):
-                    self._soil_since, fit = since, changed
+        if problem.n_rows < MIN_ROWS:
+            return problem.standstill, None
+        fit = resume(problem, self.prior, self._fit) if self._fit is not None else None
+        if fit is not None and not self._mismatch(fit):
+            return problem.standstill, fit
+        if task.end - self._known_until > self._settings.window:
+            if fit is None or not fit.converged:
+                fit = fit_window(problem, self.prior)
+            return problem.standstill, fit
+        # The soil was known until just now: does the newest data agree with itself?
+        self._soil_since = -math.inf
+        since = task.end - self._settings.change_window
+        newest = self._problem(task.window, since)
+        changed = fit_window(newest, self.prior) if newest.n_rows >= MIN_ROWS else None
+        if changed is not None and not self._mismatch(changed):
+            self._soil_since, fit = since, changed
         return problem.standstill, fit
 
     def _problem(self, window: Window, since: float) -> WindowProblem:
@@ -154,6 +160,8 @@ class WindowEstimator:
         if task.missing:
             return Status.INVALID, "input_missing " + " ".join(task.missing)
         if fit is None:
+            if task.end - self._known_until <= self._settings.window and not task.poor and not standstill:
+                return Status.INVALID, "model_mismatch"
             if standstill > 0:
                 return Status.NOT_EXCITED, "standstill"
             return Status.INVALID, "input_stale " + " ".join(task.poor) if task.poor else "no_convergence"

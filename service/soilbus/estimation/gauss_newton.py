@@ -32,8 +32,8 @@ THINNED = 24
 MAX_APPROACH = 10
 MAX_SETTLED = 2
 MAX_HOPELESS = 5
-HOPELESS = 30.0
-"""Cost for each residual beyond which the window cannot be one soil: no use to search on."""
+HOPELESS = 60.0
+"""Cost for each thinned instant beyond which the window cannot be one soil."""
 LONG_LOG_STEP = 0.1
 """Step of a log parameter from which the entry angles are solved again, not extrapolated."""
 
@@ -63,17 +63,11 @@ class Fit:
         return self.cost / max(self.rows, 1)
 
 
-def fit_window(problem: WindowProblem, prior: SoilPrior, last: Fit | None = None) -> Fit | None:
-    """Posterior of a window.
+def fit_window(problem: WindowProblem, prior: SoilPrior) -> Fit | None:
+    """Posterior of a window of which nothing is known: descents from several soils, of which the best counts.
 
-    With the fit of the window before, one descent from there; without, or where that
-    fails, descents from several known soils, of which the best counts.  None if no
-    descent ends at a finite optimum.
+    None if no descent ends at a finite optimum.
     """
-    if last is not None:
-        fit = resume(problem, prior, last)
-        if fit is not None and (fit.converged or fit.chi2 > HOPELESS):
-            return fit
     best: Fit | None = None
     coordinates = _coordinates(problem, prior)
     with np.errstate(all="ignore"):
