@@ -186,6 +186,18 @@ class SoilPrior(_Section):
     c: Prior = Prior(value=3.0e3, std=2.0e3)
     K: Prior = Prior(value=0.02, std=0.01)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _complete(cls, value: Any) -> Any:
+        """What one key of a parameter leaves open keeps its default."""
+        if not isinstance(value, Mapping):
+            return value
+        defaults = {name: field.default for name, field in cls.model_fields.items()}
+        return {
+            name: {**defaults[name].model_dump(), **prior} if name in defaults and isinstance(prior, Mapping) else prior
+            for name, prior in value.items()
+        }
+
 
 class Estimator(_Section):
     """Window estimation; times s, speeds m/s, lengths m."""

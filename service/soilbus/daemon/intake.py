@@ -1,7 +1,7 @@
 """Frames in, windows of measured data out.
 
-Time is what the frames' stamps say.  Windows are counted from the first admitted sample,
-so the same frames always give the same windows.
+Time is what the frames' stamps say.  Windows are counted from the first sample of a
+mapped channel, so the same frames always give the same windows.
 """
 
 from __future__ import annotations
@@ -115,6 +115,9 @@ class Intake:
         if self.admission.counts.clock_steps != self._clock_steps:
             self._restart()
         self.refusals.add(decoded)
+        if self._bins is None and (heard := _first_time(decoded)) is not None:
+            self._bins = BinStore(self.rig, self._settings.bin, heard)
+            self.next_end = heard + self._settings.window
         for name, column in decoded.columns.items():
             if not len(column.t):
                 continue
@@ -122,18 +125,12 @@ class Intake:
             if name.startswith("torque_limit."):
                 self._note_limit(name.removeprefix("torque_limit."), column.t, column.value)
             elif name in self._binned:
-                self._store(float(column.t[0])).add(name, column.t, column.value)
+                self._bins.add(name, column.t, column.value)  # type: ignore[union-attr]
 
     def _note_limit(self, wheel: str, t: Array, value: Array) -> None:
         if wheel in self.rig.wheels:
             i = self.rig.wheels.index(wheel)
             self._limit[i], self._limit_t[i] = value[-1], t[-1]
-
-    def _store(self, t: float) -> BinStore:
-        if self._bins is None:
-            self._bins = BinStore(self.rig, self._settings.bin, t)
-            self.next_end = t + self._settings.window
-        return self._bins
 
     def due(self, now: float) -> list[WindowTask]:
         """Every window that ended at or before `now` [s] and was not handed out yet."""
@@ -195,6 +192,12 @@ class Intake:
         slip = slip_ratio(self.rig.radius, window.speed, ground)
         slip = np.where((ground > self._settings.min_speed) & (slip > -1.0), slip, np.nan)
         return dict(zip(self.rig.wheels, column_means(slip), strict=True))
+
+
+def _first_time(decoded: Decoded) -> float | None:
+    """Time of the earliest sample, admitted or refused; None where there is none."""
+    times = [c.t[0] for c in decoded.columns.values() if len(c.t)] + [t[0] for t in decoded.refused.values()]
+    return float(min(times)) if times else None
 
 
 def column_means(rows: Array) -> list[float | None]:

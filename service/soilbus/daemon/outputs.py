@@ -9,6 +9,7 @@ from typing import Any
 
 from soilbus.config import Config
 from soilbus.daemon.pipeline import WindowResult
+from soilbus.daemon.states import state_after
 from soilbus.estimation.posterior import Estimate
 
 WINDOW_MODULUS = 251
@@ -35,6 +36,7 @@ def json_line(result: WindowResult, config: Config) -> str:
             "t": round(result.t, 6),
             "window": result.index,
             "status": str(result.status),
+            "state": str(state_after(result)),
             "reason": result.reason,
             "soil": None if posterior is None else {k: _value_std(e) for k, e in posterior.parameters().items()},
             "bearing_pressure": bearing,

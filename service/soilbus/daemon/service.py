@@ -7,7 +7,6 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
-from enum import StrEnum
 from importlib.metadata import PackageNotFoundError, version
 
 from soilbus.can.bus import LiveBus
@@ -16,8 +15,8 @@ from soilbus.config import Config
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.outputs import WINDOW_MODULUS, hop_frames, slip_frames
 from soilbus.daemon.pipeline import Pipeline, WindowResult
+from soilbus.daemon.states import ServiceState, state_after
 from soilbus.traversability import State as Way
-from soilbus.traversability import Status
 
 log = logging.getLogger(__name__)
 
@@ -34,18 +33,6 @@ MAX_PENDING = 3
 """Windows that may wait for the worker."""
 LONGEST_SOLVE = 20.0
 """A window that takes longer [s] is a worker that hangs: the watchdog is fed no more."""
-
-
-class ServiceState(StrEnum):
-    """What the service is doing; on the bus and in systemd's STATUS line."""
-
-    STARTING = "starting"
-    WAITING = "waiting"
-    LISTENING = "listening"
-    ESTIMATING = "estimating"
-    VALID = "valid"
-    DEGRADED = "degraded"
-    FAULT = "fault"
 
 
 class Service:
@@ -185,11 +172,7 @@ class Service:
             return ServiceState.DEGRADED, reason
         if self.result is None:
             return ServiceState.ESTIMATING, "none"
-        if self.result.status is Status.VALID:
-            return ServiceState.VALID, "none"
-        if self.result.status is Status.NOT_EXCITED:
-            return ServiceState.LISTENING, self.result.reason
-        return ServiceState.DEGRADED, self.result.reason
+        return state_after(self.result), self.result.reason
 
     def present_way(self, now: float) -> Way:
         """go, caution or no_go only while the bus is up, no needed input is stale and the posterior is young."""

@@ -17,8 +17,9 @@ import numpy as np
 from soilbus.terra.stress import SHEAR_LAWS, Array, lumped_modulus
 
 EXACT_NODES = 12
-"""Gauss-Legendre nodes a branch: relative error below 2e-6 for n in 0.1..1.6, K from
-5 mm, entry angles up to 0.8 rad and slip up to 0.95 (tests/terra/test_wheel.py)."""
+"""Gauss-Legendre nodes a branch: errors below 1e-6 of W (of T: W r) for n in 0.1..1.6, K
+from 5 mm, entry angles up to 0.8 rad, slip -0.3 to 0.95; 2e-6 for rational shear in skid
+(tests/terra/test_wheel.py)."""
 FAST_NODES = 8
 """Enough for fits: below 5e-5 in the same ranges, far below any sensor's noise."""
 
@@ -190,19 +191,19 @@ def _groups(slip: Array, n_samples: int) -> list[Any]:
 
 
 @cache
-def _gauss(nodes: int) -> tuple[Array, Array, Array, Array]:
-    """Gauss points and weights on 0..1, plain and clustered towards 0; columns."""
+def _gauss(nodes: int, power: int) -> tuple[Array, Array]:
+    """Gauss points on 0..1 clustered towards 0 by a power, and their weights; columns."""
     u, w = np.polynomial.legendre.leggauss(nodes)
     u, w = (u[:, None] + 1.0) / 2.0, w[:, None] / 2.0
-    power = 3 if nodes >= EXACT_NODES else 2
-    return u, w, u**power, w * power * u ** (power - 1)
+    return u**power, w * power * u ** (power - 1)
 
 
 def _nodes(state: WheelState, rho: Any, model: WheelModel, skid: bool) -> tuple[Array, Array]:
-    """Nodes x and weights on 0..1, (M, 1); in skid (2 M, N), split where shear changes sign."""
-    u, w, x, xw = _gauss(model.nodes)
+    """Nodes x and weights on 0..1, (M, 1); in skid (2 M + 4, N), split where shear changes sign."""
     if not skid:
-        return x, xw
+        return _gauss(model.nodes, 3 if model.nodes >= EXACT_NODES else 2)
+    x, xw = _gauss(model.nodes + 2, 3)  # shear is steep where it changes sign
+    u, w = _gauss(model.nodes + 2, 2)  # the branch may start just before the split
     turn = _turning_angle(state, model.exit_ratio)
     theta = state.entry_angle
     front = (theta - turn) / (theta * (1.0 - rho))

@@ -1,0 +1,75 @@
+"""Loads and pull of the vehicle against forces and moments written out point by point."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads, pull_required, slip_ratio
+
+TRACTOR = Chassis(mass=2300.0, wheelbase=1.95, cg_ahead_of_rear_axle=0.95, cg_height=0.75, hitch_height=0.45)
+SIDES = {"draft": st.floats(-3e3, 12e3), "pitch": st.floats(-0.4, 0.4), "acceleration": st.floats(-2.0, 2.0)}
+
+
+def test_standing_tractor():
+    front, rear = axle_loads(TRACTOR, 0.0, 0.0, 0.0)
+    assert front == pytest.approx(2300.0 * 9.80665 * 0.95 / 1.95, rel=1e-12)
+    assert rear == pytest.approx(2300.0 * 9.80665 * 1.00 / 1.95, rel=1e-12)
+
+
+@settings(derandomize=True, deadline=None)
+@given(**SIDES)
+def test_loads_balance_forces_and_moments_about_any_point(draft, pitch, acceleration):
+    front, rear = axle_loads(TRACTOR, draft, pitch, acceleration)
+    # Every force as (x, z, F_x, F_z) in the vehicle's axes, x ahead of the rear contact; d'Alembert's
+    # force m a points backwards; the thrust of all wheels acts at the ground.
+    m, g = TRACTOR.mass, 9.80665
+    thrust = pull_required(TRACTOR, draft, pitch, acceleration)
+    forces = np.array(
+        [
+            (0.95, 0.75, -m * g * math.sin(pitch), -m * g * math.cos(pitch)),
+            (0.95, 0.75, -m * acceleration, 0.0),
+            (0.0, 0.45, -draft, 0.0),
+            (1.95, 0.0, 0.0, front),
+            (0.0, 0.0, thrust, rear),
+        ]
+    )
+    x, z, along, across = forces.T
+    assert along.sum() == pytest.approx(0.0, abs=1e-7)
+    assert across.sum() == pytest.approx(0.0, abs=1e-7)
+    for px, pz in ((0.0, 0.0), (1.95, 0.0), (0.7, 1.3)):
+        assert np.sum((x - px) * across - (z - pz) * along) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_signs_of_load_transfer():
+    front, rear = axle_loads(TRACTOR, 0.0, 0.0, 0.0)
+    for more in ({"draft": 5e3}, {"pitch": 0.2}, {"acceleration": 1.0}):
+        f, r = axle_loads(TRACTOR, **({"draft": 0.0, "pitch": 0.0, "acceleration": 0.0} | more))
+        assert f < front, more  # all of these take load off the front
+        assert r > rear or "pitch" in more
+    assert pull_required(TRACTOR, 1000.0, 0.0, 0.0) == 1000.0
+    assert pull_required(TRACTOR, 0.0, math.pi / 2.0, 0.0) == pytest.approx(2300.0 * GRAVITY)
+    assert pull_required(TRACTOR, 0.0, 0.0, 0.5) == pytest.approx(1150.0)
+
+
+def test_arrays_go_through():
+    draft = np.array([0.0, 3e3, 9e3])
+    front, rear = axle_loads(TRACTOR, draft, 0.05, 0.1)
+    assert front + rear == pytest.approx(np.full(3, TRACTOR.mass * GRAVITY * math.cos(0.05)), rel=1e-12)
+    assert np.diff(front) == pytest.approx(-np.diff(draft) * 0.45 / 1.95, rel=1e-12)
+
+
+def test_slip_ratio():
+    assert slip_ratio(0.5, 4.0, 1.5) == pytest.approx(0.25, rel=1e-12)
+    assert slip_ratio(0.5, 2.0, 1.2) == pytest.approx(-0.2, rel=1e-12)
+    assert slip_ratio(0.5, 2.0, 0.0) == 1.0
+
+
+def test_slip_is_unknown_where_the_wheel_does_not_turn_forward_or_a_reading_is_missing():
+    speed = np.array([0.0, -0.0, -3.0, np.nan, 3.0])
+    ground = np.array([0.0, 1.0, 1.0, 1.0, np.nan])
+    assert np.isnan(slip_ratio(0.5, speed, ground)).all()
