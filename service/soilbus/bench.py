@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from cantools.database.can import Database
 
-from soilbus.can.decode import ColumnDecoder
 from soilbus.can.dbc_files import load_databases
+from soilbus.can.decode import ColumnDecoder
 from soilbus.can.mapping import channels_of
 from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.replay import read_log, replay

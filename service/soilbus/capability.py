@@ -98,7 +98,7 @@ class _Axles:
         weight = self.chassis.mass * GRAVITY
         pitch = np.arcsin(np.clip(np.where(on_grade, pull, 0.0) / weight, -0.99, 0.99))
         front, rear = axle_loads(self.chassis, np.where(on_grade, 0.0, pull), pitch, 0.0)
-        return np.where(self.front, front, rear) * self.share
+        return np.asarray(np.where(self.front, front, rear) * self.share)
 
 
 def pull_curve(

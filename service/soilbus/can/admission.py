@@ -20,6 +20,7 @@ from soilbus.can.channels import Channel, Column, Decoded, Reason
 from soilbus.can.checksum import CHECKSUM, COUNTER, column_checksums
 from soilbus.can.decode import ColumnDecoder, SignalColumn
 from soilbus.can.j1939 import STANDARD_PGNS, SourceLock, group_mask, pgn_of, source_of
+from soilbus.can.plain import PlainPlan, plain_plan
 from soilbus.can.validity import REASONS, CodeRule, in_si, judge_codes, judge_validity, rule_of
 
 CLOCK_STEP = 1.0
@@ -82,6 +83,7 @@ class _Inbox:
     channels: tuple[Channel, ...]
     rules: tuple[CodeRule, ...]
     decoder: ColumnDecoder
+    plain: PlainPlan | None
     lock: SourceLock | None
     checksum_byte: int | None
     frames: list[Frame] = field(default_factory=list)
@@ -212,15 +214,23 @@ class Admission:
                 out.columns[channel.name] = Column(_NONE, _NONE)
             return
         self.counts.admitted[inbox.message.name] += len(batch.t)
-        columns = inbox.decoder.columns(batch.payload)
+        blocks = inbox.decoder.blocks(batch.payload)
+        plain = inbox.plain.samples(blocks) if inbox.plain is not None else None
+        if plain is not None:
+            for channel in inbox.channels:
+                out.columns[channel.name] = Column(batch.t, plain[channel.name])
+            return
+        columns = inbox.decoder.columns_of(blocks)
         for channel, rule in zip(inbox.channels, inbox.rules, strict=True):
             _judge(channel, rule, inbox.message, batch.t, columns, out)
 
     def _checked_batch(self, inbox: _Inbox, frames: list[Frame], out: Decoded) -> _Batch | None:
         """The frames that pass every frame-level check; None when there are none."""
         length = inbox.message.length
-        good = [f for f in frames if len(f[2]) == length]
-        if len(good) < len(frames):
+        times, ids, datas = zip(*frames, strict=True)
+        good = frames
+        if set(map(len, datas)) != {length}:
+            good = [f for f in frames if len(f[2]) == length]
             bad = np.array([f[0] for f in frames if len(f[2]) != length])
             self._refuse(inbox, bad, Reason.WRONG_LENGTH, out)
         if inbox.lock is not None:
@@ -229,7 +239,8 @@ class Admission:
             good = heard
         if not good:
             return None
-        times, ids, datas = zip(*good, strict=True)
+        if good is not frames:
+            times, ids, datas = zip(*good, strict=True)
         payload = np.frombuffer(b"".join(datas), dtype=np.uint8).reshape(-1, length)
         batch: _Batch | None = _Batch(np.array(times, dtype=np.float64), np.array(ids, dtype=np.int64), payload)
         for check, reason in (
@@ -292,11 +303,13 @@ def _inbox(message: Message, channels: Sequence[Channel], is_open: bool, checked
         raise ValueError(f"{message.name}: no {COUNTER} and byte-aligned 8-bit {CHECKSUM} to check")
     wanted = [c.signal for c in channels] + [c.valid_signal for c in channels if c.valid_signal is not None]
     decoder = ColumnDecoder(message, wanted + ([COUNTER] if checked else []))
+    rules = tuple(rule_of(message.get_signal_by_name(c.signal)) for c in channels)
     return _Inbox(
         message=message,
         channels=tuple(channels),
-        rules=tuple(rule_of(message.get_signal_by_name(c.signal)) for c in channels),
+        rules=rules,
         decoder=decoder,
+        plain=plain_plan(message, channels, rules, decoder),
         lock=SourceLock(source_of(message.frame_id)) if is_open else None,
         checksum_byte=checksum_byte,
     )
@@ -312,7 +325,7 @@ def _popped(inbox: _Inbox, until: float) -> list[Frame]:
 
 
 def _of_locked_source(lock: SourceLock, frames: list[Frame]) -> list[Frame]:
-    if {source_of(f[1]) for f in frames} == {lock.source}:
+    if {source_of(i) for i in {f[1] for f in frames}} == {lock.source}:
         lock.admits(frames[-1][0], source_of(frames[-1][1]))
         return frames
     return [f for f in frames if lock.admits(f[0], source_of(f[1]))]
@@ -326,12 +339,12 @@ def _checksum_right(inbox: _Inbox, batch: _Batch) -> Mask | None:
     return right
 
 
-def _time_forward(inbox: _Inbox, batch: _Batch) -> Mask:
+def _time_forward(inbox: _Inbox, batch: _Batch) -> Mask | None:
     t = batch.t
-    if t[0] >= inbox.last_t and bool(np.all(t[1:] >= t[:-1])) and math.isfinite(t[0]) and math.isfinite(t[-1]):
-        mask = np.ones(len(t), dtype=np.bool_)
-        inbox.last_t = float(t[-1])
-        return mask
+    first, last = float(t[0]), float(t[-1])
+    if first >= inbox.last_t and (t[1:] >= t[:-1]).all() and math.isfinite(first) and math.isfinite(last):
+        inbox.last_t = last
+        return None
     mask = np.zeros(len(t), dtype=np.bool_)
     for i, now in enumerate(t.tolist()):
         if math.isfinite(now) and now >= inbox.last_t:

@@ -28,6 +28,8 @@ from soilbus.can.bits import Place, place_of, top_aligned
 
 Kind = Literal["identity", "integer", "linear", "row"]
 Payload = NDArray[np.uint8]
+Block = tuple[NDArray[Any], NDArray[Any]]
+"""Codes and physical values (rows, N) of signals that were cut out together."""
 
 _FLOATS = {16: np.float16, 32: np.float32, 64: np.float64}
 _FLOAT_BITS = {16: np.uint16, 32: np.uint32, 64: np.uint64}
@@ -88,6 +90,7 @@ class ColumnDecoder:
         wanted = _with_multiplexers(message, self.signals)
         self._multiplexed = tuple(s for s in wanted.values() if s.multiplexer_signal is not None)
         self._groups = _groups(message.length, list(wanted.values()))
+        self.rows = tuple(group.rows for group in self._groups)
 
     def columns(self, payload: Payload) -> dict[str, SignalColumn]:
         """Raw codes, physical values and presence by signal name; payload (N, message length).
@@ -95,14 +98,21 @@ class ColumnDecoder:
         Signals that the wanted ones hang on are among them.  Raises ValueError when the payload
         has another shape or is not bytes.
         """
+        return self.columns_of(self.blocks(payload))
+
+    def blocks(self, payload: Payload) -> list[Block]:
+        """Everything decoded, block by block; `rows` names each block's rows.  Errors as `columns`."""
         if payload.ndim != 2 or payload.shape[1] != self._length or payload.dtype != np.uint8:
             expected = f"uint8 (N, {self._length})"
             raise ValueError(f"{self.message.name}: payload is {payload.dtype} {payload.shape}, not {expected}")
+        codes = [_codes(group, payload) for group in self._groups]
+        return [(c, _scaled(group, c)) for group, c in zip(self._groups, codes, strict=True)]
+
+    def columns_of(self, blocks: Sequence[Block]) -> dict[str, SignalColumn]:
+        """The columns that `blocks` holds; see `columns`."""
         columns: dict[str, SignalColumn] = {}
-        for group in self._groups:
-            codes = _codes(group, payload)
-            values = _scaled(group, codes)
-            for name, row in group.rows:
+        for rows, (codes, values) in zip(self.rows, blocks, strict=True):
+            for name, row in rows:
                 columns[name] = SignalColumn(codes[row], values[row], None)
         for signal in self._multiplexed:
             columns[signal.name] = columns[signal.name]._replace(present=_presence(signal, columns))

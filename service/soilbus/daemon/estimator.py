@@ -136,8 +136,10 @@ class WindowEstimator:
         return posterior.bearing_pressure(self._settings.z_ref, self._settings.b_ref)
 
     def _sinkage(self, fit: Fit | None) -> dict[str, float | None]:
-        known = [None] * len(self.rig.wheels) if fit is None else [float(z) for z in fit.sinkage]
-        return {w: z if z is not None and math.isfinite(z) else None for w, z in zip(self.rig.wheels, known, strict=True)}
+        if fit is None:
+            return dict.fromkeys(self.rig.wheels)
+        known = zip(self.rig.wheels, fit.sinkage.tolist(), strict=True)
+        return {wheel: z if math.isfinite(z) else None for wheel, z in known}
 
     def _demand(self, window: Window) -> Demand | None:
         """Draft and slope, over the last hop or the whole window, whichever asks for more.

@@ -20,7 +20,7 @@ from soilbus.can.channels import Channel, Decoded
 from soilbus.can.dbc_files import checked_messages
 from soilbus.can.mapping import channels_of
 from soilbus.config import Config
-from soilbus.estimation.window import BinStore, Window
+from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, BinStore, Window
 from soilbus.terra.vehicle import slip_ratio
 
 Array = NDArray[np.float64]
@@ -37,9 +37,10 @@ SLIP_SPAN = 0.3
 class WindowTask:
     """One window's data and what is known of its inputs; everything an estimate needs.
 
-    index counts windows since the start; start and end [s]; missing are needed channels never seen, poor those that are stale
-    at the end or covered the window badly; torque_limit (W,) [N m], nan where unknown;
-    fresh: nothing of the window before may be carried over.
+    index counts windows since the start; start and end [s]; missing are needed channels
+    never seen, poor those that are stale at the end or covered the window badly;
+    torque_limit (W,) [N m], nan where unknown; fresh: nothing of the window before may be
+    carried over.
     """
 
     index: int
@@ -115,17 +116,16 @@ class Intake:
         if self.admission.counts.clock_steps != self._clock_steps:
             self._restart()
         self.refusals.add(decoded)
-        if self._bins is None and (heard := _first_time(decoded)) is not None:
-            self._bins = BinStore(self.rig, self._settings.bin, heard)
-            self.next_end = heard + self._settings.window
-        for name, column in decoded.columns.items():
-            if not len(column.t):
-                continue
-            self.last_seen[name] = float(column.t[-1])
+        if self._bins is None and (first := _first_time(decoded)) is not None:
+            self._bins = BinStore(self.rig, self._settings.bin, first)
+            self.next_end = first + self._settings.window
+        heard = {name: (c.t, c.value) for name, c in decoded.columns.items() if len(c.t)}
+        self.last_seen |= {name: float(t[-1]) for name, (t, _) in heard.items()}
+        for name, (t, value) in heard.items():
             if name.startswith("torque_limit."):
-                self._note_limit(name.removeprefix("torque_limit."), column.t, column.value)
-            elif name in self._binned:
-                self._bins.add(name, column.t, column.value)  # type: ignore[union-attr]
+                self._note_limit(name.removeprefix("torque_limit."), t, value)
+        if self._bins is not None:
+            self._bins.add({name: samples for name, samples in heard.items() if name in self._binned})
 
     def _note_limit(self, wheel: str, t: Array, value: Array) -> None:
         if wheel in self.rig.wheels:
@@ -152,7 +152,8 @@ class Intake:
         start = end - self._settings.window
         window = bins.window(start, end)
         missing = tuple(c.name for c in self.needed if c.name not in self.last_seen)
-        badly_covered = [c.name for c in self.needed if _coverage(window, self.rig.wheels, c) < MIN_COVERAGE]
+        covered = dict(zip(self.rig.channels, coverage(window).tolist(), strict=True))
+        badly_covered = [c.name for c in self.needed if covered[c.name] < MIN_COVERAGE]
         poor = tuple(dict.fromkeys(self.stale(end) + badly_covered))
         fresh_limit = end - self._limit_t < DEFAULT_TIMEOUT
         task = WindowTask(
@@ -208,11 +209,13 @@ def column_means(rows: Array) -> list[float | None]:
     return [float(s / n) if n else None for s, n in zip(total, count, strict=True)]
 
 
-def _coverage(window: Window, wheels: tuple[str, ...], channel: Channel) -> float:
-    """Share of the window's half seconds in which the channel has a sample."""
-    values = getattr(window, channel.quantity)
-    known = np.isfinite(values if not channel.wheel else values[:, wheels.index(channel.wheel)])
+def coverage(window: Window) -> Array:
+    """Share of the window's half seconds in which each of the rig's channels has a sample, (channels,)."""
+    quantities = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
+    known = np.isfinite(np.column_stack([getattr(window, q) for q in quantities]))
     if len(known) < 2:
-        return 0.0
+        return np.zeros(known.shape[1])
     block = ((window.t - window.t[0]) / COVERAGE_BLOCK + 1e-6).astype(int)
-    return float((np.bincount(block, weights=known) > 0).mean())
+    begins = np.flatnonzero(np.diff(block, prepend=-1))
+    share: Array = np.logical_or.reduceat(known, begins).sum(0) / (block[-1] + 1)
+    return share

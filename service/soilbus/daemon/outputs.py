@@ -69,9 +69,7 @@ def hop_frames(result: WindowResult) -> Iterator[tuple[str, dict[str, Any]]]:
     bearing, way = result.bearing, result.traversability
     yield (
         "SoilStrength",
-        common
-        | {"Chi2": result.chi2}
-        | _pair("BearingPressure", "BearingPressureStd", bearing, 1e3),
+        common | {"Chi2": result.chi2} | _pair("BearingPressure", "BearingPressureStd", bearing, 1e3),
     )
     parameters = {} if result.posterior is None else result.posterior.parameters()
     for name, (message, unit) in PARAMETER_FRAMES.items():

@@ -7,11 +7,15 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import can
 
+from soilbus.can.candump import Frame, candump_frames, frame_of
 from soilbus.daemon.pipeline import Pipeline, WindowResult
+
+
+_T = TypeVar("_T")
 
 
 class LogError(Exception):
@@ -32,12 +36,28 @@ def read_log(path: Path) -> Iterator[can.Message]:
 
     Raises LogError for a file that is missing, of an unknown format, or damaged.
     """
+    return _read(path, iter)
+
+
+def read_frames(path: Path) -> Iterator[Frame]:
+    """The frames of read_log()'s messages, several times as fast for a candump log."""
+    return _read(path, _frames)
+
+
+def _frames(reader: Any) -> Iterator[Frame]:
+    if isinstance(reader, can.CanutilsLogReader):
+        return candump_frames(reader.file)
+    return map(frame_of, reader)
+
+
+def _read(path: Path, items: Callable[[Any], Iterator[_T]]) -> Iterator[_T]:
+    """What `items` makes of python-can's reader of a log; LogError as read_log()."""
     n = 0
     try:
         with _reader(path) as reader:
-            for message in reader:
+            for item in items(reader):
                 n += 1
-                yield message
+                yield item
     except FileNotFoundError:
         raise LogError(f"{path}: no such file") from None
     except (EOFError, zlib.error, ValueError, IndexError, KeyError, TypeError, UnicodeDecodeError, OSError) as error:
@@ -73,18 +93,18 @@ def replay(
     n = 0
     for path in logs:
         due = -1.0
-        for message in read_log(path):
+        for t, identifier, extended, data, remote, error in read_frames(path):
             n += 1
-            if message.is_error_frame:
+            if error:
                 pipeline.admission.counts.error_frames += 1
                 continue
-            last = message.timestamp
+            last = t
             if last >= due or last < due - 2.0:
                 yield from pipeline.advance(last)
                 due = min(pipeline.next_end, last + 1.0)
                 if progress is not None:
                     progress(n, last)
-            feed(last, message.arbitration_id, message.is_extended_id, message.data, message.is_remote_frame)
+            feed(t, identifier, extended, data, remote)
     yield from pipeline.finish(last)
 
 

@@ -78,7 +78,7 @@ class Coordinates:
         return int(np.flatnonzero(self.free == _K_PHI)[0])
 
     def prior_pull(self, soil: Array) -> tuple[Array, Array]:
-        """How far the free parameters are from the prior, in its standard deviations (F,), and its derivatives (F, F)."""
+        """Distance of the free parameters from the prior in its standard deviations (F,), and its slopes (F, F)."""
         free, log_std = self.free, self.prior.log_std[self.free]
         pull = np.log(soil[free] / self.prior.median[free]) / log_std
         return pull, self.log_directions(soil)[free] / log_std[:, None]

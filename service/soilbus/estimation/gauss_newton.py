@@ -45,7 +45,8 @@ class Fit:
     cost is -2 log posterior up to a constant: chi-square of the residuals, of the soil's
     prior and of the gains.  chi2 is cost per residual (reduced: each parameter has its
     prior as one more residual).  sinkage (W,) is the mean over the
-    window [m], nan where unknown; angle_curve (W, 4) is for resume().  gains are relative errors by problem.gain_names.
+    window [m], nan where unknown; angle_curve (W, 4) is for resume().  gains are relative
+    errors by problem.gain_names.
     """
 
     posterior: Posterior
@@ -178,7 +179,9 @@ def _settle(problem: WindowProblem, coordinates: Coordinates, near: _Place, most
     soil, latents, gains = near.soil, near.latents, near.gains
     best: tuple[Array, Latents, Array, _Point] | None = None
     damping, length = 0.0, np.inf
-    for iteration in range(1, most + 1):
+    iterations = near.trials
+    for _ in range(most):
+        iterations += 1
         point = _normal_equations(problem, coordinates, active, soil, gains, latents)
         if best is not None and (point is None or point.cost > best[3].cost * (1.0 + WORSE) + 1.0):
             soil, latents, gains, point = best
@@ -202,10 +205,10 @@ def _settle(problem: WindowProblem, coordinates: Coordinates, near: _Place, most
         soil, gains = new_soil, gains + gain_step
         if length < CONVERGED:
             break
-    inverse = solved(point.information, point.gradient)
-    if inverse is None:
+    inverse = None if best is None else solved(best[3].information, best[3].gradient)
+    if best is None or inverse is None:
         return None
-    covariance = inverse[1]
+    point, covariance = best[3], inverse[1]
     directions = coordinates.log_directions(soil)
     log_covariance = directions @ covariance[: len(free), : len(free)] @ directions.T
     return Fit(
@@ -215,7 +218,7 @@ def _settle(problem: WindowProblem, coordinates: Coordinates, near: _Place, most
         angle_curve=problem.angle_curve(latents),
         cost=point.cost - length,
         rows=point.at.known,
-        iterations=near.trials + iteration,
+        iterations=iterations,
         converged=length < CONVERGED,
     )
 

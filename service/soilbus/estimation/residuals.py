@@ -129,9 +129,7 @@ class WindowProblem:
             if has_acceleration.any():
                 known = known & has_acceleration
             else:
-                acceleration, acceleration_var = differentiated_speed(
-                    self.t, self.ground_speed, self.ground_speed_var
-                )
+                acceleration, acceleration_var = differentiated_speed(self.t, self.ground_speed, self.ground_speed_var)
             demand += mass * (GRAVITY * np.sin(pitch) + acceleration)
             variance += mass**2 * ((GRAVITY * np.cos(pitch)) ** 2 * pitch_var + acceleration_var)
         self.demand, self.demand_var = demand, variance
@@ -238,9 +236,13 @@ class WindowProblem:
         gain = dict(zip(self.gain_names, gains.tolist(), strict=True))
         g_torque, g_load, g_speed = (np.array([gain[f"{q}.{w}"] for w in self.rig.wheels]) for q in GAIN_QUANTITIES[:3])
         corrected = np.concatenate(
-            [self.load * (1 - g_load), self.speed * (1 - g_speed), (self.ground_speed * (1 - gain["ground_speed"]))[:, None]],
+            [
+                self.load * (1 - g_load),
+                self.speed * (1 - g_speed),
+                (self.ground_speed * (1 - gain["ground_speed"]))[:, None],
+            ],
             axis=1,
-        )  # fmt: skip
+        )
         now = np.concatenate([latents.load, latents.speed, latents.ground_speed[:, None]], axis=1)
 
         m = W + 1 + (W if self.with_sinkage else 0)

@@ -93,23 +93,30 @@ class BinStore:
         self.bin_length = bin_length
         self.origin = origin
         self._index = {name: i for i, name in enumerate(rig.channels)}
+        self._noise = _NoiseTable.of(rig)
         self._first = 0
         self._totals = np.zeros((3, 0, len(self._index)))  # count, sum of values, sum of times
 
-    def add(self, channel: str, t: Array, value: Array) -> None:
-        """Add samples (t [s], value in SI; both (N,)) of a channel; those before the span are dropped."""
-        since = t - self.origin
+    def add(self, samples: Mapping[str, tuple[Array, Array]]) -> None:
+        """Add samples (t [s], value in SI; both (N,)) by channel; those before the span are dropped."""
+        if not samples:
+            return
+        rows = [self._index[name] for name in samples]
+        column = np.repeat(rows, [len(t) for t, _ in samples.values()])
+        since = np.concatenate([t for t, _ in samples.values()]) - self.origin
+        value = np.concatenate([v for _, v in samples.values()])
         bins = np.floor(since / self.bin_length + 1e-9).astype(int) - self._first
         keep = bins >= 0
         if not keep.all():
-            bins, value, since = bins[keep], value[keep], since[keep]
+            bins, column, since, value = bins[keep], column[keep], since[keep], value[keep]
         if not len(bins):
             return
-        self._grow(int(bins.max()) + 1)
-        low = int(bins.min())
-        place = bins - low
-        sums = [np.bincount(place), np.bincount(place, weights=value), np.bincount(place, weights=since)]
-        self._totals[:, low : low + len(sums[0]), self._index[channel]] += sums
+        low, end = int(bins.min()), int(bins.max()) + 1
+        self._grow(end)
+        shape = end - low, len(self._index)
+        place = (bins - low) * shape[1] + column
+        for total, weights in zip(self._totals, (None, value, since), strict=True):
+            total[low:end] += np.bincount(place, weights, shape[0] * shape[1]).reshape(shape)
 
     def _grow(self, length: int) -> None:
         short = length - self._totals.shape[1]
@@ -133,9 +140,9 @@ class BinStore:
         count, total, time = self._totals[:, low:high]
         with np.errstate(invalid="ignore", divide="ignore"):
             mean, since = total / count, time / count
-        centre = (self._first + low + np.arange(len(mean)) + 0.5) * self.bin_length
+        centre: Array = (self._first + low + np.arange(len(mean), dtype=np.float64) + 0.5) * self.bin_length
         mean = _at_centres(mean, since, centre)
-        return make_window(self.rig, self.origin + centre, mean, count)
+        return _make_window(self._noise, self.origin + centre, mean, count)
 
 
 def _at_centres(mean: Array, since: Array, centre: Array) -> Array:
@@ -157,34 +164,50 @@ def _at_centres(mean: Array, since: Array, centre: Array) -> Array:
     return mean + np.where(np.isfinite(slope), slope, 0.0) * (centre[:, None] - since)
 
 
-def make_window(rig: Rig, t: Array, mean: Array, count: Array) -> Window:
+class _NoiseTable(NamedTuple):
+    """A rig's noise, column by column of its channels: variance, relative and of_mean (channels,)."""
+
+    n_wheels: int
+    variance: Array
+    relative: Array
+    of_mean: Array
+
+    @classmethod
+    def of(cls, rig: Rig) -> _NoiseTable:
+        noise = [rig.noise[name.partition(".")[0]] for name in rig.channels]
+        return cls(
+            len(rig.wheels),
+            np.array([n.absolute**2 for n in noise]),
+            np.array([n.relative for n in noise]),
+            np.array([n.of_mean for n in noise]),
+        )
+
+
+def _make_window(noise: _NoiseTable, t: Array, mean: Array, count: Array) -> Window:
     """A window from bin means and sample counts, both (N, channels) in the order of rig.channels."""
-    n_wheels = len(rig.wheels)
-    values: dict[str, Array] = {}
-    variance: dict[str, Array] = {}
-    column = 0
-    for quantity in WHEEL_QUANTITIES + VEHICLE_QUANTITIES:
-        wide = n_wheels if quantity in WHEEL_QUANTITIES else 1
-        part, n = mean[:, column : column + wide], count[:, column : column + wide]
-        column += wide
-        variance[quantity] = _variance_of_mean(part, n, rig.noise[quantity])
-        values[quantity] = part
-        if quantity in VEHICLE_QUANTITIES:
-            values[quantity], variance[quantity] = part[:, 0], variance[quantity][:, 0]
-    return Window(t=t, variance=variance, samples=int(count.sum()), **values)
+    variance = _variance_of_means(mean, count, noise)
+    values, variances = _by_quantity(mean, noise.n_wheels), _by_quantity(variance, noise.n_wheels)
+    return Window(t=t, variance=variances, samples=int(count.sum()), **values)
 
 
-def _variance_of_mean(mean: Array, count: Array, noise: SensorNoise) -> Array:
-    variance = np.full(mean.shape, noise.absolute**2)
-    if noise.relative:
-        variance += (noise.relative * mean) ** 2
-    if noise.of_mean:
+def _by_quantity(table: Array, n_wheels: int) -> dict[str, Array]:
+    """The columns (N, channels) of each quantity: (N, W) of the wheels', (N,) of the vehicle's."""
+    wheels = {q: table[:, i * n_wheels : (i + 1) * n_wheels] for i, q in enumerate(WHEEL_QUANTITIES)}
+    first = len(WHEEL_QUANTITIES) * n_wheels
+    return wheels | {q: table[:, first + i] for i, q in enumerate(VEHICLE_QUANTITIES)}
+
+
+def _variance_of_means(mean: Array, count: Array, noise: _NoiseTable) -> Array:
+    """Variances (N, channels) of bin means; not finite where a bin is empty."""
+    of_sample = noise.variance + np.where(noise.relative != 0.0, (noise.relative * mean) ** 2, 0.0)
+    if noise.of_mean.any():
         size = np.abs(mean)
         known = np.isfinite(size)
         level = np.where(known, size, 0.0).sum(0) / np.maximum(known.sum(0), 1)
-        variance += (noise.of_mean * level) ** 2
+        of_sample += (noise.of_mean * level) ** 2
     with np.errstate(divide="ignore"):
-        return variance / count
+        variance: Array = of_sample / count
+    return variance
 
 
 def window_of_samples(rig: Rig, t: Array, samples: Mapping[str, Array], names: Sequence[str] = ()) -> Window:
@@ -193,4 +216,4 @@ def window_of_samples(rig: Rig, t: Array, samples: Mapping[str, Array], names: S
     for i, name in enumerate(rig.channels):
         if name in samples and (not names or name in names):
             mean[:, i] = samples[name]
-    return make_window(rig, np.asarray(t, float), mean, np.isfinite(mean).astype(float))
+    return _make_window(_NoiseTable.of(rig), np.asarray(t, float), mean, np.isfinite(mean).astype(float))

@@ -14,7 +14,6 @@ import numpy as np
 
 from soilbus.config import Config
 from soilbus.daemon.pipeline import Pipeline, WindowResult
-from soilbus.report.table import table
 from soilbus.traversability import Status
 
 
@@ -72,7 +71,8 @@ def _plots(results: Sequence[WindowResult]) -> str:
     start = results[0].t if results else 0.0
     known = [r for r in results if r.bearing is not None and r.posterior is not None]
     t = [r.t - start for r in known]
-    _band(axes[0], t, [(r.bearing.value / 1e3, r.bearing.std / 1e3) for r in known if r.bearing], "bearing pressure, kPa")
+    bearing = [(r.bearing.value / 1e3, r.bearing.std / 1e3) for r in known if r.bearing]
+    _band(axes[0], t, bearing, "bearing pressure, kPa")
     phi = [r.posterior.parameters()["phi"] for r in known if r.posterior]
     _band(axes[1], t, [(float(np.degrees(e.value)), float(np.degrees(e.std))) for e in phi], "friction angle, °")
     pulls = [(r.t - start, r.traversability.max_draft) for r in known if r.traversability.max_draft]

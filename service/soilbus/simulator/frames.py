@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from soilbus.can.channels import Channel
 from soilbus.can.checksum import column_checksums
 from soilbus.can.mapping import channels_of, load_databases
-from soilbus.can.publish import COUNTER, checksum_byte, value_codes
+from soilbus.can.checksum import COUNTER
+from soilbus.can.publish import checksum_byte, value_codes
 from soilbus.config import Config, Wheel
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.sensors import channel_rng

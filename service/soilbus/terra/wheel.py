@@ -123,7 +123,7 @@ def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolera
     usable = np.isfinite(load) & (load > 0.0)
     target = np.log(np.where(usable, load, 1.0))
     with np.errstate(all="ignore"):
-        at = np.where((guess > 0.0) & np.isfinite(guess), np.log(np.abs(guess)), _first_guess(load, *rest))
+        at = np.where((guess > 0.0) & np.isfinite(guess), np.log(np.abs(guess)), _first_guess(load, *rest[1:5]))
     at = np.clip(np.where(np.isfinite(at), at, np.log(0.3)), low, high)
     todo = np.flatnonzero(usable)
     for _ in range(80):
@@ -147,9 +147,10 @@ def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolera
     return angle.reshape(shape)
 
 
-def _first_guess(load: Array, slip: Array, r: Array, b: Array, K_L: Array, n: Array, t: Array, c: Array, K: Array) -> Array:
+def _first_guess(load: Array, radius: Array, width: Array, K_L: Array, n: Array) -> Array:
     """log entry angle from the small-angle load K_L b r^(n+1) theta^(2n+1) / (n + 1.5)."""
-    return np.log(load * (n + 1.5) / (0.6 * b * K_L * r ** (n + 1.0))) / (2.0 * n + 1.0)
+    scale = 0.6 * width * K_L * radius ** (n + 1.0)
+    return np.asarray(np.log(load * (n + 1.5) / scale) / (2.0 * n + 1.0))
 
 
 def _load_and_slope(state: WheelState, model: WheelModel) -> tuple[Array, Array]:
@@ -229,7 +230,7 @@ def _turning_angle(state: WheelState, exit_ratio: float) -> Array:
         middle = (low + high) / 2.0
         negative = displacement(middle) < 0.0
         low, high = np.where(negative, middle, low), np.where(negative, high, middle)
-    return (low + high) / 2.0
+    return np.asarray((low + high) / 2.0)
 
 
 def _integrate(
@@ -312,4 +313,5 @@ def _stack(front: Any, rear: Any) -> Array:
 
 def _contract(fields: Array, rows: Array) -> Array:
     """Sums over the nodes of fields (..., nodes, N) times rows (..., nodes, N): (fields, rows, N)."""
-    return np.einsum("...mn,rmn->...rn", fields, rows) if rows.ndim == 3 else np.einsum("mn,mn->n", fields, rows)
+    subscripts = "...mn,rmn->...rn" if rows.ndim == 3 else "mn,mn->n"
+    return np.asarray(np.einsum(subscripts, fields, rows))

@@ -1,0 +1,194 @@
+"""The loop with a clock and a bus in hand: what it sends, when, and that it fails safe."""
+
+from __future__ import annotations
+
+import errno
+import itertools
+
+import can
+import pytest
+
+from fakes import FakeClock, InlineExecutor, ScriptedBus
+from soilbus.can.bus import BusError, LiveBus
+from soilbus.can.dbc_files import load_databases, output_database
+from soilbus.can.publish import Publisher
+from soilbus.daemon.notify import Notifier
+from soilbus.daemon.pipeline import Pipeline
+from soilbus.daemon.service import Service
+from soilbus.simulator.frames import frames
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import excited
+
+DURATION = 16.0
+
+
+@pytest.fixture(scope="module")
+def recording() -> list[can.Message]:
+    config = reference_configuration()
+    return list(frames(simulate(config, excited("loam", DURATION), seed=3), config))
+
+
+class Bench:
+    """A service on a scripted bus."""
+
+    def __init__(self, messages=(), config=None) -> None:
+        self.config = config or reference_configuration()
+        self.clock = FakeClock()
+        self.wire = ScriptedBus(self.clock, messages)
+        self.away = False
+        database = output_database(self.config)
+        self.database = database
+        self.bus = LiveBus(self._open, self.clock, self.clock.sleep)
+        pipeline = Pipeline(self.config, load_databases(self.config))
+        self.results = []
+        self.service = Service(
+            self.config, pipeline, self.bus, Publisher(database), Notifier(), InlineExecutor(), self.clock,
+            self.results.append,
+        )  # fmt: skip
+
+    def _open(self):
+        if self.away:
+            raise BusError("bus can0: no such device", may_come=True)
+        self.wire.closed = False
+        return self.wire
+
+    def run(self, seconds: float) -> None:
+        end = self.clock.now + seconds
+        while self.clock.now < end:
+            self.service.step()
+
+    def sent(self, name: str, since: float = 0.0) -> list[dict]:
+        wanted = self.database.get_message_by_name(name).frame_id
+        return [
+            {"at": t, **self.database.decode_message(name, bytes(m.data))}
+            for t, m in self.wire.sent
+            if m.arbitration_id == wanted and t >= since
+        ]
+
+
+def test_frames_go_out_at_their_cycle_times(recording):
+    bench = Bench(recording)
+    bench.run(DURATION)
+    for name, cycle in {"WheelSlip": 0.1, "Traversability": 0.1, "TorqueDemand": 0.1, "SoilbusStatus": 1.0}.items():
+        times = [f["at"] for f in bench.sent(name)]
+        gaps = [b - a for a, b in itertools.pairwise(times)]
+        assert len(times) >= DURATION / cycle - 2, name
+        assert max(gaps) < 1.5 * cycle, name
+        assert sum(gaps) / len(gaps) == pytest.approx(cycle, rel=0.05), name
+    assert len(bench.results) == len(bench.sent("SoilStrength")) >= 6
+
+
+def test_a_good_drive_passes_the_states_in_order_and_ends_in_go(recording):
+    bench = Bench(recording)
+    bench.run(DURATION)
+    states = [str(f["State"]) for f in bench.sent("SoilbusStatus")]
+    order = list(dict.fromkeys(states))
+    assert order[-1] == "valid"
+    assert order[: order.index("valid")] in (["degraded", "estimating"], ["estimating"], ["listening", "estimating"])
+    ways = {str(f["State"]) for f in bench.sent("Traversability", since=bench.clock.now - 2.0)}
+    assert ways == {"go"}
+    before_first = [f for f in bench.sent("Traversability") if f["at"] < bench.sent("SoilStrength")[0]["at"]]
+    assert {str(f["State"]) for f in before_first} == {"unknown"}
+
+
+def test_values_on_the_bus_are_those_of_the_result(recording):
+    bench = Bench(recording)
+    bench.run(DURATION)
+    for result, frame in zip(bench.results, bench.sent("SoilStrength"), strict=True):
+        assert frame["Window"] == result.index % 251
+        assert frame["BearingPressure"] == pytest.approx(result.bearing.value / 1e3, abs=0.026)
+        assert str(frame["Status"]) == str(result.status)
+
+
+@pytest.mark.parametrize("lost", ["WheelLoads", "GroundBasedSpeedAndDistance", "MotorRL", "Drawbar"])
+def test_losing_a_needed_stream_ends_go_within_its_timeout(recording, lost):
+    config = reference_configuration()
+    database = load_databases(config)
+    names = {m.name for m in database.messages}
+    full = next(n for n in names if n.startswith(lost))
+    frame_id = database.get_message_by_name(full).frame_id
+    cut = recording[0].timestamp + 13.0
+    kept = [m for m in recording if m.arbitration_id != frame_id or m.timestamp < cut]
+    bench = Bench(kept)
+    bench.run(DURATION)
+    start = bench.clock.now - DURATION
+    late = [f for f in bench.sent("Traversability") if f["at"] > start + 13.0 + 1.0 + 0.25]
+    assert late
+    assert {str(f["State"]) for f in late} == {"unknown"}
+    assert str(bench.sent("SoilbusStatus")[-1]["State"]) == "degraded"
+
+
+def test_silence_ends_go_and_is_no_reason_to_stop(recording):
+    bench = Bench(recording)
+    bench.run(DURATION + 6.0)
+    last = bench.sent("Traversability", since=bench.clock.now - 3.0)
+    assert {str(f["State"]) for f in last} == {"unknown"}
+    status = bench.sent("SoilbusStatus")[-1]
+    assert (str(status["State"]), str(status["Reason"])) == ("listening", "no_frames")
+    assert {str(f["SlipWheel1"]) for f in bench.sent("WheelSlip", since=bench.clock.now - 3.0)} == {"not_available"}
+
+
+def test_a_bus_that_goes_and_comes_back(recording):
+    bench = Bench(recording)
+    bench.run(5.0)
+    bench.away = True
+    bench.wire.fail_receive.append(can.CanOperationError("Network is down", errno.ENETDOWN))
+    bench.run(3.0)
+    assert not bench.bus.is_open
+    assert bench.wire.closed
+    quiet_since = bench.clock.now - 2.0
+    assert bench.sent("WheelSlip", since=quiet_since) == []
+    bench.away = False
+    came_back = bench.clock.now
+    bench.run(2.0)
+    assert bench.bus.is_open
+    first = bench.sent("Traversability", since=came_back)[0]
+    assert first["at"] - came_back < 2.0
+    assert str(first["State"]) == "unknown"
+
+
+def test_a_full_send_queue_drops_frames_and_counts_them(recording):
+    bench = Bench(recording)
+    bench.run(1.0)
+    bench.wire.fail_send += [can.CanOperationError("No buffer space", errno.ENOBUFS)] * 3
+    bench.run(1.0)
+    assert bench.bus.counts.dropped == 3
+    assert bench.bus.is_open
+    assert bench.sent("WheelSlip", since=bench.clock.now - 0.5)
+
+
+def test_counters_never_repeat_and_checksums_are_right(recording):
+    from soilbus.can.checksum import frame_checksum
+
+    bench = Bench(recording)
+    bench.run(8.0)
+    last: dict[int, int] = {}
+    for _, message in bench.wire.sent:
+        counter = message.data[6] >> 4
+        if message.arbitration_id in last:
+            assert counter == (last[message.arbitration_id] + 1) % 16
+        last[message.arbitration_id] = counter
+        assert message.data[7] == frame_checksum(message.arbitration_id, bytes(message.data), 7)
+
+
+def test_stop_says_unknown_last(recording):
+    bench = Bench(recording)
+    bench.run(DURATION)
+    bench.service.stop()
+    bench.service.run()
+    assert str(bench.sent("Traversability")[-1]["State"]) == "unknown"
+    assert bench.wire.closed
+
+
+def test_the_output_dbc_decides_the_identifiers(recording, tmp_path):
+    text = output_database(reference_configuration()).as_dbc_string()
+    moved = text.replace(str(0x80000000 | 0x18FF629A), str(0x80000000 | 0x18FF909A))
+    (tmp_path / "moved.dbc").write_text(moved)
+    ours = output_database(reference_configuration()).get_message_by_name("WheelSlip").frame_id
+    assert ours == 0x18FF629A
+    config = reference_configuration([f'output.dbc="{tmp_path / "moved.dbc"}"'])
+    bench = Bench(recording, config)
+    bench.run(1.0)
+    assert 0x18FF909A in {m.arbitration_id for _, m in bench.wire.sent}
+    assert ours not in {m.arbitration_id for _, m in bench.wire.sent}

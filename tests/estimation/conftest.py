@@ -1,0 +1,60 @@
+"""A simulated drive as the estimator sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.config import Config
+from soilbus.estimation.posterior import SoilPrior
+from soilbus.estimation.residuals import WindowProblem
+from soilbus.estimation.window import BinStore, Rig, Window
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.terra.wheel import Soil
+
+SPREAD = float(np.sqrt(np.log1p(0.25**2)))
+"""Sd of the logarithm of a parameter known to 25 %."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One window of an excited drive on a soil, with what the driver was told of c and K."""
+
+    soil: Soil
+    config: Config
+    rig: Rig
+    window: Window
+
+    @property
+    def prior(self) -> SoilPrior:
+        return prior_of(self.config)
+
+    def problem(self, window: Window | None = None, rig: Rig | None = None) -> WindowProblem:
+        return WindowProblem(window or self.window, rig or self.rig, model_of(self.config), 0.2)
+
+
+def case(soil: Soil, seed: int, overrides: Iterable[str] = (), without: Iterable[str] = ()) -> Case:
+    """10 s with slip swept from 0.05 to 0.4; c and K are known to 25 %, so their priors miss by as much."""
+    miss = np.exp(SPREAD * np.random.default_rng([seed, 77]).standard_normal(2))
+    told = {"c": soil.c * miss[0], "K": soil.K * miss[1]}
+    settings = [f"soil.{name}.{key}={v * f}" for name, v in told.items() for key, f in (("value", 1.0), ("std", 0.25))]
+    config = reference_configuration([*settings, *overrides])
+    scenario = Scenario(10.0, (Patch(0.0, "this", soil),), slip=Swing(0.05, 0.40))
+    rig = rig_of(config)
+    store = BinStore(rig, config.estimator.bin, 0.0)
+    for name, column in simulate(config, scenario, seed).channels.items():
+        if name in rig.channels and name.partition(".")[0] not in without:
+            store.add(name, column.t, column.value)
+    return Case(soil, config, rig, store.window(0.0, 10.0))
+
+
+@pytest.fixture(scope="session")
+def simulated():
+    """`case`, for tests that need their own."""
+    return case

@@ -1,0 +1,70 @@
+"""The terminal dashboard believes only fresh frames with a right checksum."""
+
+from __future__ import annotations
+
+import io
+
+import can
+import pytest
+from rich.console import Console
+
+from fakes import FakeClock
+from soilbus.can.dbc_files import output_database
+from soilbus.can.publish import Publisher
+from soilbus.report.dashboard import Dashboard
+from soilbus.simulator.reference import reference_configuration
+
+
+@pytest.fixture
+def setup():
+    database = output_database(reference_configuration())
+    clock = FakeClock()
+    return Publisher(database), Dashboard(database, clock), clock
+
+
+def message(frame) -> can.Message:
+    return can.Message(arbitration_id=frame.arbitration_id, is_extended_id=frame.extended, data=frame.data)
+
+
+def shown(dashboard) -> str:
+    console = Console(width=90, record=True, file=io.StringIO())
+    console.print(dashboard.render())
+    return console.export_text()
+
+
+def test_what_was_sent_is_shown(setup):
+    publisher, dashboard, _ = setup
+    dashboard.receive(message(publisher.frame("Traversability", {"State": "no_go", "Probability": 0.25})))
+    dashboard.receive(message(publisher.frame("SoilStrength", {"BearingPressure": 99.1, "BearingPressureStd": 0.4})))
+    dashboard.receive(message(publisher.frame("WheelSlip", {"SlipWheel2": -0.125})))
+    text = shown(dashboard)
+    assert "NO-GO" in text
+    assert "p = 0.25" in text
+    assert "99.1 ± 0.4" in text
+    assert "-0.12" in text
+
+
+def test_a_stale_go_is_no_go_any_more(setup):
+    publisher, dashboard, clock = setup
+    dashboard.receive(message(publisher.frame("Traversability", {"State": "go", "Probability": 0.99})))
+    assert dashboard.value("Traversability", "State") == "go"
+    clock.now += 1.0
+    assert dashboard.value("Traversability", "State") is None
+    assert " UNKNOWN " in shown(dashboard)
+
+
+def test_a_frame_with_one_bit_wrong_is_not_believed(setup):
+    publisher, dashboard, _ = setup
+    good = message(publisher.frame("Traversability", {"State": "no_go"}))
+    for bit in range(64):
+        bad = bytearray(good.data)
+        bad[bit // 8] ^= 1 << bit % 8
+        dashboard.receive(can.Message(arbitration_id=good.arbitration_id, is_extended_id=True, data=bad))
+    assert dashboard.bad_frames == 64
+    assert dashboard.value("Traversability", "State") is None
+
+
+def test_not_available_is_shown_as_nothing(setup):
+    publisher, dashboard, _ = setup
+    dashboard.receive(message(publisher.frame("WheelSlip", {})))
+    assert dashboard.value("WheelSlip", "SlipWheel1") is None

@@ -1,0 +1,239 @@
+"""Commands as a user types them: exit codes, one line for each fault, nothing half-written."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import shutil
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from soilbus.cli import main
+from soilbus.config import ConfigError, load_config
+
+FIELD = Path(__file__).resolve().parent / "field/field.toml"
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("log") / "drive.log"
+    assert main(["simulate", "--soil", "loam", "--duration", "14", "--seed", "5", "--log", str(path)]) == 0
+    return path
+
+
+@pytest.fixture
+def tractor(tmp_path) -> Path:
+    import soilbus.simulator.reference as reference
+
+    return Path(shutil.copy(reference.TRACTOR, tmp_path / "tractor.toml"))
+
+
+def lines(capsys) -> tuple[list[str], list[str]]:
+    out, err = capsys.readouterr()
+    return out.splitlines(), err.splitlines()
+
+
+def test_replay_of_a_simulated_drive_finds_the_soil(log, tractor, tmp_path, capsys):
+    out = tmp_path / "out.jsonl"
+    assert main(["replay", "--config", str(tractor), str(log), "--json", str(out)]) == 0
+    windows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert len(windows) == 4
+    assert [w["status"] for w in windows] == ["valid"] * 4
+    truth = (5300.0 / 0.3 + 1.515e6) * 0.02**0.7
+    bearing = windows[-1]["bearing_pressure"]
+    assert abs(bearing["value"] - truth) < 4.0 * bearing["std"]
+    assert "4 windows" in lines(capsys)[0][0]
+
+
+def test_json_to_stdout_is_nothing_but_json(log, tractor, capsys):
+    capsys.readouterr()
+    assert main(["replay", "--config", str(tractor), str(log), "--json", "-"]) == 0
+    out, err = lines(capsys)
+    assert len(out) == 4
+    assert all(json.loads(line)["samples"] > 0 for line in out)
+    assert err == []
+
+
+@pytest.mark.parametrize("suffix", [".log.gz", ".asc", ".blf", ".csv"])
+def test_other_formats_give_the_same_windows(log, tractor, tmp_path, suffix):
+    other = tmp_path / f"a.b{suffix}"
+    if suffix == ".log.gz":
+        other.write_bytes(gzip.compress(log.read_bytes()))
+    else:
+        with can.Logger(other) as writer:
+            for message in can.LogReader(log):
+                writer(message)
+    for path, name in ((log, "a"), (other, "b")):
+        assert main(["replay", "--config", str(tractor), str(path), "--json", str(tmp_path / name)]) == 0
+    a, b = ([json.loads(x) for x in (tmp_path / n).read_text().splitlines()] for n in "ab")
+    assert [w["status"] for w in a] == [w["status"] for w in b]
+    values = np.array([[w["bearing_pressure"]["value"] for w in ws] for ws in (a, b)])
+    assert values[1] == pytest.approx(values[0], rel=1e-3)  # .asc keeps times to 0.1 ms only
+
+
+def broken(kind: str, log: Path, to: Path) -> Path:
+    data = log.read_bytes()
+    if kind == "midway.log":
+        (to / kind).write_bytes(data[: len(data) * 9 // 10 + 7])
+    elif kind == "midway.log.gz":
+        (to / kind).write_bytes(gzip.compress(data)[: len(data) // 8])
+    elif kind == "random.blf":
+        (to / kind).write_bytes(np.random.default_rng(1).bytes(4000))
+    elif kind == "words.log":
+        (to / kind).write_text("the quick brown fox\n")
+    elif kind == "empty.log":
+        (to / kind).write_text("")
+    elif kind == "other_bus.log":
+        (to / kind).write_text("".join(f"(1700000000.{i:06d}) can0 7{i % 256:02X}#00\n" for i in range(500)))
+    return to / kind
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["midway.log", "midway.log.gz", "random.blf", "words.log", "empty.log", "other_bus.log", "missing.log", "what.xyz"],
+)
+def test_a_bad_log_is_one_line_and_leaves_no_file(kind, log, tractor, tmp_path, capsys):
+    out = tmp_path / "out.jsonl"
+    path = broken(kind, log, tmp_path)
+    capsys.readouterr()
+    assert main(["replay", "--config", str(tractor), str(path), "--json", str(out)]) == 1
+    printed, err = lines(capsys)
+    assert len(err) == 1
+    assert str(path) in err[0]
+    assert "Traceback" not in err[0]
+    assert printed == []
+    assert [p.name for p in tmp_path.iterdir() if "jsonl" in p.name] == []
+
+
+def test_partial_keeps_the_windows_before_the_cut(log, tractor, tmp_path, capsys):
+    path = broken("midway.log", log, tmp_path)
+    out = tmp_path / "out.jsonl"
+    assert main(["replay", "--config", str(tractor), str(path), "--partial", "--json", str(out)]) == 0
+    assert len(out.read_text().splitlines()) >= 2
+    assert "cut off" in lines(capsys)[1][0]
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("estimator.windw=3", ["estimator.windw: unknown key"]),
+        ("wheel.FL.torque=McuFL.Shafttorque", ["wheel.FL.torque", "did you mean ShaftTorque?"]),
+        ("wheel.FL.torque=McuXX.ShaftTorque", ["wheel.FL.torque", "no message McuXX"]),
+        ("wheel.FL.load=McuFL.ShaftTorque", ["wheel.FL.load", "torque"]),
+        ("wheel.FL.load.signal=AxleLoads.FR", ["AxleLoads.FR is already mapped"]),
+        ('dbc.input=["nowhere.dbc"]', ["nowhere.dbc", "No such file"]),
+        ('dbc.input=["field.toml"]', ["field.toml", "not a DBC"]),
+        ("soil.n.std=-1", ["soil.n.std"]),
+        ("vehicle.cg_ahead_of_rear_axle=3", ["less than wheelbase"]),
+        ("wheel.QQ.radius=1", ["wheel.QQ"]),
+        ("estimator.hop=20", ["bin <= hop <= window"]),
+        ("nonsense", ["KEY=VALUE"]),
+        ('output.dbc="field.dbc"', ["output.dbc", "no message"]),
+        ('model.effects=[{name="magic"}]', ["magic"]),
+    ],
+)
+def test_a_mistake_in_the_configuration_is_one_clear_line_and_exit_code_2(override, says, capsys):
+    assert main(["check", "--config", str(FIELD), "--set", override]) == 2
+    printed, err = lines(capsys)
+    assert printed == []
+    assert all(line.startswith("soilbus: ") for line in err)
+    assert any(all(part in line for part in says) for line in err), err
+
+
+@pytest.mark.parametrize("key", ["load", "speed"])
+def test_a_wheel_without_load_or_speed_is_a_fault(key, tmp_path, capsys):
+    text = FIELD.read_text()
+    cut = next(line for line in text.splitlines() if line.startswith(f'{key} = "') and "FL" in line)
+    shutil.copy(FIELD.with_name("field.dbc"), tmp_path)
+    (tmp_path / "c.toml").write_text(text.replace(cut + "\n", ""))
+    assert main(["check", "--config", str(tmp_path / "c.toml")]) == 2
+    err = lines(capsys)[1]
+    assert len(err) == 1
+    assert f"wheel FL has a torque but no {key}" in err[0]
+
+
+@pytest.mark.parametrize(
+    "text", ["[vehicle\n", "\xff\xfe", "[vehicle]\nmass = 1\n[vehicle]\nmass = 2\n", 'wheel = "x"\n', "soil = 3\n"]
+)
+def test_any_text_as_configuration_gives_faults_not_tracebacks(text, tmp_path, capsys):
+    (tmp_path / "c.toml").write_bytes(text.encode("latin-1"))
+    assert main(["check", "--config", str(tmp_path / "c.toml")]) == 2
+    assert len(lines(capsys)[1]) >= 1
+
+
+def test_several_faults_are_all_listed(capsys):
+    sets = ["--set", "soil.q.std=1", "--set", "estimator.hop=-1", "--set", "vehicle.mass=0"]
+    assert main(["check", "--config", str(FIELD), *sets]) == 2
+    err = "\n".join(lines(capsys)[1])
+    assert all(part in err for part in ("soil.q", "estimator.hop", "vehicle.mass"))
+
+
+def test_check_lists_every_mapped_signal_with_unit_rate_and_what_can_be_told(tractor, capsys):
+    assert main(["check", "--config", str(tractor)]) == 0
+    out = "\n".join(lines(capsys)[0])
+    for part in ("torque.FL", "MotorFL.ShaftTorque", "N.m", "20 ms", "k_phi", "two tyre widths", "estimator.hop = 1.0"):
+        assert part in out, part
+
+
+def test_an_override_of_one_prior_key_keeps_the_other():
+    config = load_config(FIELD, ["soil.n.std=0", "soil.c.value=5000"])
+    assert (config.soil.n.value, config.soil.n.std) == (0.6, 0.0)
+    assert (config.soil.c.value, config.soil.c.std) == (5000.0, 500.0)
+
+
+def test_the_folder_is_no_key_of_the_file(tmp_path):
+    (tmp_path / "c.toml").write_text('folder = "/"\n')
+    with pytest.raises(ConfigError, match="folder"):
+        load_config(tmp_path / "c.toml")
+
+
+@pytest.mark.parametrize("interface", ["nosuch", "socketcan"])
+def test_a_bus_that_does_not_exist_is_one_line(interface, tractor, capsys):
+    settings = ["--set", f"bus.interface={interface}", "--set", "bus.channel=nope7"]
+    assert main(["run", "--config", str(tractor), *settings]) == 1
+    err = lines(capsys)[1]
+    assert len(err) == 1
+    assert "nope7" in err[0]
+
+
+def test_simulate_refuses_an_unknown_soil_and_an_unwritable_place(tmp_path, capsys):
+    assert main(["simulate", "--soil", "cheese", "--log", str(tmp_path / "x.log")]) == 1
+    assert main(["simulate", "--duration", "1", "--log", str(tmp_path / "no/such/x.log")]) == 1
+    assert main(["simulate", "--duration", "1", "--log", str(tmp_path / "x.odt")]) == 1
+    err = lines(capsys)[1]
+    assert len(err) == 3
+    assert "cheese" in err[0]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_usage_errors_exit_with_2(capsys):
+    for words in ([], ["fly"], ["replay"], ["simulate"]):
+        with pytest.raises(SystemExit) as stop:
+            main(words)
+        assert stop.value.code == 2
+
+
+def test_report_is_one_page_with_its_picture_inside(log, tractor, tmp_path, capsys):
+    pytest.importorskip("matplotlib", reason="the extra `plots` is not installed")
+    out = tmp_path / "report.html"
+    assert main(["replay", "--config", str(tractor), str(log), "--report", str(out)]) == 0
+    page = out.read_text()
+    assert "data:image/png;base64," in page
+    assert "http" not in page
+    assert page.count("<tr>") == 1 + 4
+
+
+def test_deere_logs_never_claim_to_know(field_recording, tmp_path):
+    out = tmp_path / "out.jsonl"
+    for name in ("start", "in-gear"):
+        log = field_recording(f"deere-5055e-{name}.log.gz")
+        assert main(["replay", "--config", str(FIELD.with_name("deere.toml")), str(log), "--json", str(out)]) == 0
+        windows = [json.loads(line) for line in out.read_text().splitlines()]
+        assert len(windows) > 20
+        assert {w["state"] for w in windows} <= {"listening", "degraded"}
+        assert {w["traversability"]["state"] for w in windows} == {"unknown"}
+        assert windows[0]["rejected"]["not_available"] > 0
+        assert all(value is None for w in windows for value in w["slip"].values())
