@@ -20,7 +20,7 @@ from soilbus.can.dbc_files import output_database
 from soilbus.config import Config
 from soilbus.daemon.pipeline import WindowResult
 from soilbus.daemon.start import start_service
-from soilbus.report.dashboard import Dashboard, show
+from soilbus.report.dashboard import Dashboard, filters_of, show
 from soilbus.report.table import table
 from soilbus.simulator.frames import frames
 from soilbus.simulator.play import send_in_time
@@ -44,16 +44,18 @@ def run_demo(duration: float) -> None:
         where = "vcan" if any("socketcan" in o for o in overrides) else "the in-process virtual bus"
         console.print(f"Simulated tractor on {where}: loam, then wet clay; {SPEED_UP:.0f} times as fast as real time.")
         config = reference_configuration(overrides + _compressed(real))
-        with open_bus(config.bus.model_dump()) as tractor, open_bus(config.bus.model_dump()) as ear:
+        ours = output_database(config)
+        bus = config.bus.model_dump()
+        with open_bus(bus, []) as tractor, open_bus(bus, filters_of(ours)) as ear:
             service = start_service(config, wait=False, on_window=results.append)
             sender = threading.Thread(target=send_in_time, args=(messages, tractor.send, SPEED_UP), daemon=True)
             worker = threading.Thread(target=service.run, daemon=True)
             worker.start()
             sender.start()
-            show(Dashboard(output_database(config)), ear, console, done=lambda: not sender.is_alive())
+            show(Dashboard(ours), ear, console, done=lambda: not sender.is_alive())
             service.stop()
             worker.join(timeout=2.0)
-    console.print(_story(results), highlight=False)
+    console.print("\n" + _story(results), highlight=False, end="")
 
 
 def _compressed(config: Config) -> list[str]:

@@ -47,10 +47,10 @@ def case(soil: Soil, seed: int, overrides: Iterable[str] = (), without: Iterable
     config = reference_configuration([*settings, *overrides])
     scenario = Scenario(10.0, (Patch(0.0, "this", soil),), slip=Swing(0.05, 0.40))
     rig = rig_of(config)
+    channels = simulate(config, scenario, seed).channels
+    wanted = [name for name in rig.channels if name in channels and name.partition(".")[0] not in without]
     store = BinStore(rig, config.estimator.bin, 0.0)
-    for name, column in simulate(config, scenario, seed).channels.items():
-        if name in rig.channels and name.partition(".")[0] not in without:
-            store.add(name, column.t, column.value)
+    store.add({name: (channels[name].t, channels[name].value) for name in wanted})
     return Case(soil, config, rig, store.window(0.0, 10.0))
 
 

@@ -205,7 +205,7 @@ def _variance_of_means(mean: Array, count: Array, noise: _NoiseTable) -> Array:
         known = np.isfinite(size)
         level = np.where(known, size, 0.0).sum(0) / np.maximum(known.sum(0), 1)
         of_sample += (noise.of_mean * level) ** 2
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         variance: Array = of_sample / count
     return variance
 

@@ -114,11 +114,13 @@ class Dashboard:
 def watch(config: Config, seconds: float | None = None) -> None:
     """Show the dashboard of the configured bus until interrupted, or for some seconds; raises BusError."""
     database = output_database(config)
-    filters = [
-        {"can_id": m.frame_id, "can_mask": 0x1FFFFFFF, "extended": m.is_extended_frame} for m in database.messages
-    ]
-    with open_bus(config.bus.model_dump(), filters) as bus:
+    with open_bus(config.bus.model_dump(), filters_of(database)) as bus:
         show(Dashboard(database), bus, Console(), until=None if seconds is None else time.monotonic() + seconds)
+
+
+def filters_of(database: Database) -> list[dict[str, Any]]:
+    """Filters for python-can that pass the messages of a database only."""
+    return [{"can_id": m.frame_id, "can_mask": 0x1FFFFFFF, "extended": m.is_extended_frame} for m in database.messages]
 
 
 def show(

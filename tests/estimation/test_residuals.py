@@ -1,0 +1,205 @@
+"""The eliminated latents against explicit minimisation, and the residuals' covariance against Monte Carlo."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from soilbus.estimation.residuals import GAIN_QUANTITIES, Latents, WindowProblem, differentiated_speed
+from soilbus.estimation.window import Rig, Window, window_of_samples
+from soilbus.terra.soils import SOILS
+from soilbus.terra.vehicle import GRAVITY
+from soilbus.terra.wheel import Soil, WheelModel, entry_angle_for_load, sinkage, state_on, wheel_forces
+
+MODEL = WheelModel()
+PARAMETERS = Soil._fields
+
+
+def explicit(rig: Rig, soil: Soil, load, speed, ground_speed):
+    """Pull (summed), torques and sinkages of one instant or of N (last axis the wheels)."""
+    slip = 1.0 - np.asarray(ground_speed)[..., None] / (rig.radius * speed)
+    state = state_on(soil, np.full(np.shape(load), 0.2), slip, rig.radius, rig.width)
+    angle = entry_angle_for_load(load, state, MODEL)
+    _, pull, torque = wheel_forces(state._replace(entry_angle=angle), MODEL)
+    return pull.sum(-1), torque, sinkage(angle, rig.radius)
+
+
+def cost_of_instant(window: Window, rig: Rig, i: int, soil: Soil, gains: dict[str, float]) -> float:
+    """Least sum of squares over loads, speeds and ground speed, by scipy: readings = truth (1 + gain) + noise.
+
+    To first order in the gains, as the estimator has it: reading (1 - gain) = truth + noise.
+    """
+    W = len(rig.wheels)
+
+    def corrected(quantity: str) -> np.ndarray:
+        g = np.array([gains.get(f"{quantity}.{w}", 0.0) for w in rig.wheels])
+        return getattr(window, quantity)[i] * (1.0 - g)
+
+    sd = {q: np.sqrt(v[i]) for q, v in window.variance.items()}
+    seen = np.concatenate([corrected("load"), corrected("speed")])
+    ground = window.ground_speed[i] * (1.0 - gains.get("ground_speed", 0.0))
+    chassis = rig.chassis
+    slope = GRAVITY * np.sin(window.pitch[i]) + window.acceleration[i]
+    demand = window.draft[i] * (1.0 - gains.get("draft", 0.0)) + chassis.mass * slope
+    slope_sd = np.hypot(GRAVITY * np.cos(window.pitch[i]) * sd["pitch"], sd["acceleration"])
+    demand_sd = np.hypot(sd["draft"], chassis.mass * slope_sd)
+    size = np.concatenate([sd["load"], sd["speed"], [sd["ground_speed"]]])
+    start = np.concatenate([seen, [ground]])
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        latent = start + x * size
+        pull, torque, z = explicit(rig, soil, latent[:W], latent[W : 2 * W], latent[2 * W])
+        rows = [x, (corrected("torque") - torque) / sd["torque"], [(demand - pull) / demand_sd]]
+        rows.append((window.sinkage[i] - z) / sd["sinkage"])
+        parts = np.concatenate(rows)
+        return parts[np.isfinite(parts)]
+
+    return 2.0 * least_squares(residuals, np.zeros(2 * W + 1), x_scale=1.0, xtol=1e-14, ftol=1e-14, gtol=1e-12).cost
+
+
+def converged(problem: WindowProblem, soil: Soil, gains: np.ndarray):
+    """The linearisation at the best latents for a held soil and gains."""
+    latents = problem.start(soil)
+    none = np.zeros(6), np.zeros(len(gains))
+    for _ in range(8):
+        at = problem.linearise(soil, gains, latents)
+        latents = problem.updated(at, latents, *none)
+    return problem.linearise(soil, gains, latents)
+
+
+@pytest.fixture(scope="module")
+def few(simulated):
+    """A handful of instants, one without a torque, one without sinkages; a wrong soil and gains."""
+    case = simulated(SOILS["clayey_soil_38"], 11)
+    window = case.window.rows(np.array([2, 30, 55, 80]))
+    window.torque[1, 0] = np.nan
+    window.sinkage[2] = np.nan
+    rng = np.random.default_rng(3)
+    problem = WindowProblem(window, case.rig, MODEL, 0.2)
+    soil = Soil(*(np.asarray(case.soil) * np.exp(rng.normal(0.0, 0.03, 6))))
+    gains = problem.gain_std * rng.standard_normal(len(problem.gain_std))
+    return window, case.rig, problem, soil, gains
+
+
+def total_cost(few, soil, gains) -> float:
+    window, rig, problem, _, _ = few
+    named = dict(zip(problem.gain_names, gains, strict=True))
+    return sum(cost_of_instant(window, rig, i, soil, named) for i in range(len(window.t)))
+
+
+def test_chi_square_is_the_least_sum_of_squares_over_the_latents(few):
+    _, _, problem, soil, gains = few
+    assert converged(problem, soil, gains).chi2 == pytest.approx(total_cost(few, soil, gains), rel=1e-6)
+    assert problem.n_rows == 4 * 9 - 1 - 4
+
+
+def test_gradients_are_those_of_the_least_sum_of_squares(few):
+    # By the envelope theorem the derivative of the least cost is 2 J' S^-1 r at the best latents.
+    _, _, problem, soil, gains = few
+    at = converged(problem, soil, gains)
+    gradient = 2.0 * at.weighed.T @ at.rows[:, 0]
+    assert gradient[0] == pytest.approx(2.0 * at.chi2)
+    for k, name in enumerate(PARAMETERS):
+        h = 2e-4 * soil[k]
+        up, down = (total_cost(few, soil._replace(**{name: soil[k] + s * h}), gains) for s in (1, -1))
+        assert gradient[1 + k] * soil[k] == pytest.approx((up - down) / (2 * h) * soil[k], rel=1e-4, abs=1e-4), name
+    for k, name in enumerate(problem.gain_names):
+        h = 1e-4 * np.eye(len(gains))[k]
+        numeric = (total_cost(few, soil, gains + h) - total_cost(few, soil, gains - h)) / 2e-4
+        scale = problem.gain_std[k]
+        assert gradient[7 + k] * scale == pytest.approx(numeric * scale, rel=2e-3, abs=2e-4), name
+
+
+def test_missing_rows_are_zero_and_everything_is_finite(few):
+    _, _, problem, soil, gains = few
+    at = converged(problem, soil, gains)
+    assert np.isfinite(at.rows).all()
+    assert np.isfinite(at.weighed).all()
+    m = 9  # torques, balance, sinkages
+    rows = at.rows.reshape(4, m, -1)
+    assert not rows[1, 0].any()
+    assert not rows[2, 5:].any()
+    assert np.abs(rows).sum(axis=2)[0].all()
+    assert at.known == problem.n_rows
+
+
+def test_covariance_of_residuals_equals_monte_carlo(simulated):
+    # One true state, seen 4000 times through the sensors' noise.
+    case = simulated(SOILS["loam"], 5)
+    rig, soil, n = case.rig, case.soil, 4000
+    load, speed = np.array([5200.0, 4800.0, 6000.0, 5500.0]), np.array([4.0, 4.1, 3.2, 3.25])
+    pull, torque, z = explicit(rig, soil, load, speed, np.float64(1.5))
+    rng = np.random.default_rng(4)
+    truth = {"torque": torque, "load": load, "speed": speed, "sinkage": z}
+    columns = {f"{q}.{w}": v[i] for q, v in truth.items() for i, w in enumerate(rig.wheels)}
+    columns |= {"ground_speed": 1.5, "pitch": 0.03, "acceleration": 0.1}
+    columns["draft"] = pull - rig.chassis.mass * (GRAVITY * np.sin(0.03) + 0.1)
+    noisy = {}
+    for name, value in columns.items():
+        noise = rig.noise[name.partition(".")[0]]
+        sd = np.sqrt(noise.absolute**2 + ((noise.relative**2 + noise.of_mean**2) * value**2))
+        noisy[name] = value + sd * rng.standard_normal(n)
+    problem = WindowProblem(window_of_samples(rig, np.arange(n, dtype=float), noisy), rig, MODEL, 0.2)
+    none = np.zeros(len(problem.gain_std))
+    latents = Latents(*(np.broadcast_to(a, (n, *np.shape(a))).copy() for a in (load, speed)), np.full(n, 1.5), None)
+    latents.entry_angle = np.full((n, 4), np.nan)
+    at = problem.linearise(soil, none, problem.carried(latents, soil))
+    rows, weighed = (a.reshape(n, 9, -1) for a in (at.rows, at.weighed))
+    # Residuals by hand, with the measured loads and speeds, not linearised at all.
+    got = [np.stack([noisy[f"{q}.{w}"] for w in rig.wheels], axis=1) for q in ("load", "speed", "torque", "sinkage")]
+    pull, torque, z = explicit(rig, soil, got[0], got[1], noisy["ground_speed"])
+    slope = GRAVITY * np.sin(noisy["pitch"]) + noisy["acceleration"]
+    by_hand = np.column_stack([got[2] - torque, noisy["draft"] + rig.chassis.mass * slope - pull, got[3] - z])
+    inverse = weighed[0] @ np.linalg.pinv(rows[0])  # S^-1 of one instant
+    assert inverse == pytest.approx(inverse.T, rel=1e-6, abs=1e-9 * np.abs(inverse).max())
+    half = np.linalg.cholesky((inverse + inverse.T) / 2.0)
+    for residuals in (rows[:, :, 0], by_hand):
+        white = residuals @ half
+        assert np.cov(white.T) == pytest.approx(np.eye(9), abs=0.1)  # sampling sd 0.016 (0.022 on the diagonal)
+    assert at.chi2 / at.known == pytest.approx(1.0, abs=0.03)
+
+
+def test_masks(simulated):
+    case = simulated(SOILS["loam"], 5)
+    window = case.window
+    window = window.rows(np.arange(len(window.t)))
+    window.ground_speed[:10] = 0.05  # standing
+    window.ground_speed[10:15] = np.nan
+    window.speed[20:25, 0] = -1.0  # a wheel turning backwards
+    window.load[30:33, 1] = 0.0  # in the air
+    window.load[40, 2] = np.nan
+    window.draft[50:60] = np.nan
+    problem = case.problem(window)
+    assert problem.standstill == 10
+    assert problem.n == 85
+    usable = problem.usable
+    assert (~usable).sum(axis=0).tolist() == [5, 3, 1, 0]
+    assert problem.has_balance.sum() == 85 - 5 - 3 - 1 - 10
+    assert problem.n_rows == problem.has_balance.sum() + 2 * (4 * 85 - 9)
+    assert np.isfinite(problem.linearise(case.soil, np.zeros(len(problem.gain_std)), problem.start(case.soil)).chi2)
+
+
+def test_gains_are_named_in_the_order_of_their_columns(few):
+    _, rig, problem, _, _ = few
+    assert problem.gain_names == [
+        *(f"{q}.{w}" for q in GAIN_QUANTITIES[:3] for w in rig.wheels),
+        "ground_speed",
+        "draft",
+    ]
+    assert problem.gain_std == pytest.approx([0.005] * 8 + [0.0015] * 4 + [0.002, 0.005])
+
+
+def test_acceleration_from_speed_and_its_variance():
+    t = np.arange(0.0, 10.0, 0.1)
+    a, variance = differentiated_speed(t, 1.0 + 0.3 * t, np.full(100, 1e-4))
+    assert a == pytest.approx(np.full(100, 0.3), abs=1e-12)
+    assert variance[50] == pytest.approx(1e-4 / (0.01 * 28), rel=1e-9)  # sum of squares of -3..3
+    rng = np.random.default_rng(0)
+    speed = 1.0 + 0.3 * np.sin(0.5 * t) + 0.01 * rng.standard_normal((400, 100))
+    miss = np.stack([differentiated_speed(t, row, np.full(100, 1e-4))[0] - 0.15 * np.cos(0.5 * t) for row in speed])
+    assert miss[:, 10:90].std() == pytest.approx(np.sqrt(1e-4 / 0.28), rel=0.05)
+    # A jerk is not a precise acceleration.
+    step = np.where(t < 5.0, 1.0, 2.0)
+    assert differentiated_speed(t, step, np.full(100, 1e-4))[1][50] > 10.0 * variance[50]
+    assert (differentiated_speed(t[:2], step[:2], np.full(2, 1e-4))[1] >= 1.0).all()
