@@ -2,12 +2,13 @@
 
 All wheels turn at the same slip.  Loads follow the pull (load transfer) and the entry
 angles follow the loads; both are solved together by Newton.  Gradients by the soil
-parameters are exact at the solution, so a posterior propagates through them.
+parameters come with its last step, so a posterior propagates through them.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -29,7 +30,10 @@ Array = NDArray[np.float64]
 
 GRID = 14
 MIN_SLIP = 0.02
-PULL_TOLERANCE = 0.5
+PULL_TOLERANCE = 1e-3
+"""Newton step of the pull, over the weight, that is the last: it leaves some 1e-6 of the weight."""
+SMALL_PULL = 1e-2
+"""Difference of pull [N] from which the load transfer's slope is taken."""
 MAX_ITERATIONS = 12
 
 
@@ -85,14 +89,13 @@ class _Axles:
     def of(cls, rig: Rig) -> _Axles:
         if rig.chassis is None:
             raise ValueError("a capability needs the vehicle's mass and geometry")
-        kinds = np.column_stack([rig.radius, rig.width, rig.front])
-        unique, of_wheel, count = np.unique(kinds, axis=0, return_inverse=True, return_counts=True)
-        front = unique[:, 2] > 0.5
+        kinds = list(zip(rig.radius.tolist(), rig.width.tolist(), rig.front.tolist(), strict=True))
+        unlike = list(dict.fromkeys(kinds))
+        radius, width, front = (np.array(column)[:, None] for column in zip(*unlike, strict=True))
+        count = np.array([[float(kinds.count(kind))] for kind in unlike])
         share = 1.0 / np.where(front, rig.front.sum(), (~rig.front).sum())
-        return cls(
-            rig.chassis, unique[:, 0, None], unique[:, 1, None], front[:, None], share[:, None],
-            count[:, None].astype(float), of_wheel.ravel(),
-        )  # fmt: skip
+        of_wheel = np.array([unlike.index(kind) for kind in kinds])
+        return cls(rig.chassis, radius, width, front, share, count, of_wheel)
 
     def loads(self, pull: Array, on_grade: NDArray[np.bool_]) -> Array:
         weight = self.chassis.mass * GRAVITY
@@ -115,12 +118,12 @@ def pull_curve(
     """
     axles = _Axles.of(rig)
     K_L = lumped_modulus(soil.k_c, soil.k_phi, axles.width)
-    shape = (len(axles.radius), len(slip))
+    slips, radius, width, K_L = (a.copy() for a in np.broadcast_arrays(slip, axles.radius, axles.width, K_L))
+    shape, tolerance = slips.shape, PULL_TOLERANCE * axles.chassis.mass * GRAVITY
     tan_phi = np.tan(soil.phi)
 
     def state(angle: Array) -> WheelState:
-        slips = np.broadcast_to(slip, shape)
-        return WheelState(angle, slips, axles.radius, axles.width, K_L, soil.n, tan_phi, soil.c, soil.K)
+        return WheelState(angle, slips, radius, width, K_L, soil.n, tan_phi, soil.c, soil.K)
 
     if start is not None and np.array_equal(start.slip, slip) and np.isfinite(start.entry_angle).all():
         pull = np.where(np.isfinite(start.pull), start.pull, 0.0)
@@ -135,7 +138,7 @@ def pull_curve(
         for _ in range(MAX_ITERATIONS):
             forces, d = wheel_forces_and_derivatives(state(angle), model)
             by_load = d[1:, 0] / d[0, 0]  # pull and torque by load, the entry angle following
-            shift = (axles.loads(pull + 1.0, on_grade) - axles.loads(pull - 1.0, on_grade)) / 2.0
+            shift = (axles.loads(pull + SMALL_PULL, on_grade) - axles.loads(pull, on_grade)) / SMALL_PULL
             off = load - forces[0]
             slope = (axles.count * by_load[0] * shift).sum(0) - 1.0
             change = -((axles.count * (forces[1] + by_load[0] * off)).sum(0) - pull) / slope
@@ -143,14 +146,14 @@ def pull_curve(
             load = axles.loads(pull, on_grade)
             new_angle = angle + (load - forces[0]) / d[0, 0]
             angle = np.clip(new_angle, 0.5 * angle, np.minimum(2.0 * angle, MAX_ENTRY_ANGLE))
-            if not np.nanmax(np.abs(change), initial=0.0) > PULL_TOLERANCE:
+            if not np.nanmax(np.abs(change), initial=0.0) > tolerance:
                 break
         by_soil = _by_soil(d, soil, axles.width)
         pull_by_soil = (axles.count[:, None] * (by_soil[1] - by_load[0][:, None] * by_soil[0])).sum(0) / -slope
         load_change = shift[:, None] * pull_by_soil - by_soil[0]
         torque = forces[2] + by_load[1] * (load - forces[0])
         torque_by_soil = by_soil[2] + by_load[1][:, None] * load_change
-        balanced = np.isfinite(angle).all(0) & (load > 0.0).all(0) & (np.abs(change) <= PULL_TOLERANCE)
+        balanced = np.isfinite(angle).all(0) & (load > 0.0).all(0) & (np.abs(change) <= tolerance)
     w = axles.of_wheel
     return PullCurve(
         slip, on_grade, np.where(balanced, pull, np.nan), torque[w], angle[w], pull_by_soil, torque_by_soil[w]
@@ -163,6 +166,7 @@ def _by_soil(d: Array, soil: Soil, width: Array) -> Array:
     return np.stack([d[:, 2] / width, d[:, 2], d[:, 3], d[:, 4] * sec2, d[:, 5], d[:, 6]], axis=2)
 
 
+@cache
 def slip_grid(max_slip: float) -> Array:
     """Slips at which a pull curve is worth knowing."""
     return np.geomspace(MIN_SLIP, max_slip, GRID)
@@ -180,7 +184,7 @@ def largest_pull(curve: PullCurve, torque_limit: Array, soil: Soil, rig: Rig, mo
     usable = balanced & (usage <= 1.0)
     if not usable.any():
         return Capability(0.0, np.zeros(6), float(curve.slip[0]), "torque") if balanced.any() else None
-    best = int(np.nanargmax(np.where(usable, curve.pull, -np.inf)))
+    best = int(np.argmax(np.where(usable, curve.pull, -np.inf)))
     after = best + 1
     if after < len(curve.slip) and balanced[after] and curve.pull[after] > curve.pull[best]:
         return _at_torque_limit(curve, best, torque_limit, soil, rig, model)

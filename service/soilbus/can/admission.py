@@ -217,8 +217,7 @@ class Admission:
         blocks = inbox.decoder.blocks(batch.payload)
         plain = inbox.plain.samples(blocks) if inbox.plain is not None else None
         if plain is not None:
-            for channel in inbox.channels:
-                out.columns[channel.name] = Column(batch.t, plain[channel.name])
+            out.columns.update((name, Column(batch.t, value)) for name, value in plain.items())
             return
         columns = inbox.decoder.columns_of(blocks)
         for channel, rule in zip(inbox.channels, inbox.rules, strict=True):
@@ -342,7 +341,8 @@ def _checksum_right(inbox: _Inbox, batch: _Batch) -> Mask | None:
 def _time_forward(inbox: _Inbox, batch: _Batch) -> Mask | None:
     t = batch.t
     first, last = float(t[0]), float(t[-1])
-    if first >= inbox.last_t and (t[1:] >= t[:-1]).all() and math.isfinite(first) and math.isfinite(last):
+    rises = np.count_nonzero(t[1:] >= t[:-1]) == len(t) - 1  # never of a nan
+    if rises and first >= inbox.last_t and math.isfinite(first) and math.isfinite(last):
         inbox.last_t = last
         return None
     mask = np.zeros(len(t), dtype=np.bool_)

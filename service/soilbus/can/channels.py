@@ -52,7 +52,7 @@ class Channel:
 
     @property
     def name(self) -> str:
-        """"torque.FL", or "draft" for a channel of the whole vehicle."""
+        """Such as "torque.FL", or "draft" for a channel of the whole vehicle."""
         return f"{self.quantity}.{self.wheel}" if self.wheel else self.quantity
 
 

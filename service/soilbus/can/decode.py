@@ -223,8 +223,8 @@ def _group(length: int, members: list[Signal]) -> _Group:
         kind=kind,
         left=_stacked([_place(s, length)[1] for s in members], np.uint64),
         right=_stacked([64 - s.length for s in members], np.int64 if signed else np.uint64),
-        scale=_shared(scale),
-        offset=_shared(offset),
+        scale=shared(scale),
+        offset=shared(offset),
         # adding zero matters only for minus zero, which a positive scale cannot give
         adds_offset=any(c.offset != 0 or c.scale <= 0 for c in conversions),
     )
@@ -243,7 +243,7 @@ def _lane(signal: Signal, length: int) -> np.dtype[Any] | None:
     return np.dtype(f"{'>' if big_endian else '<'}{'i' if signal.is_signed else 'u'}{size}")
 
 
-def _shared(column: NDArray[Any]) -> Any:
+def shared(column: NDArray[Any]) -> Any:
     """The number that all rows share, else the column itself."""
     return column[0, 0] if (column == column[0, 0]).all() else column
 

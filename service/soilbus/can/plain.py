@@ -12,6 +12,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from cantools.database.can import Message, Signal
 from numpy.typing import NDArray
 
 from soilbus.can.channels import Channel
-from soilbus.can.decode import Block, ColumnDecoder, code_limits
+from soilbus.can.decode import Block, ColumnDecoder, code_limits, shared
 from soilbus.can.validity import CodeRule
 
 MAX_BITS = 53
@@ -33,15 +34,15 @@ class _BlockPlan:
     """One block: admitted codes of its rows, and the channels taken from it.
 
     Row i admits low[i] .. low[i] + span[i], both (rows, 1); `pick` are the channels' rows,
-    factor and offset (channels, 1) bring them to SI.
+    factor and offset bring them to SI: (channels, 1), or plain numbers where all share them.
     """
 
     low: NDArray[np.int64]
     span: NDArray[np.uint64]
     names: tuple[str, ...]
-    pick: NDArray[np.intp]
-    factor: NDArray[np.float64]
-    offset: NDArray[np.float64]
+    pick: slice | NDArray[np.intp]
+    factor: Any
+    offset: Any
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +58,7 @@ class PlainPlan:
         """
         for plan, (codes, _) in zip(self.blocks, blocks, strict=True):
             # what is below wraps round to the largest numbers: one comparison for both ends
-            if not ((codes - plan.low).view(np.uint64) <= plan.span).all():
+            if np.count_nonzero((codes - plan.low).view(np.uint64) > plan.span):
                 return None
         samples: dict[str, NDArray[np.float64]] = {}
         for plan, (_, physical) in zip(self.blocks, blocks, strict=True):
@@ -102,14 +103,22 @@ def _block_plan(
     ranges = {row_of[name]: codes for name, codes in admitted.items() if name in row_of}
     bounds = [ranges.get(row, _ANY) for row in range(height)]
     members = [c for c in channels if c.signal in row_of]
+    pick = [row_of[c.signal] for c in members]
     return _BlockPlan(
         low=_column([low for low, _ in bounds], np.int64),
         span=_column([high - low for low, high in bounds], np.uint64),
         names=tuple(c.name for c in members),
-        pick=np.array([row_of[c.signal] for c in members], np.intp),
-        factor=_column([c.factor for c in members], np.float64),
-        offset=_column([c.offset for c in members], np.float64),
+        pick=_as_slice(pick),
+        factor=shared(_column([c.factor for c in members], np.float64)) if members else 1.0,
+        offset=shared(_column([c.offset for c in members], np.float64)) if members else 0.0,
     )
+
+
+def _as_slice(rows: Sequence[int]) -> slice | NDArray[np.intp]:
+    """The rows as a slice where they follow one another, which spares a copy."""
+    if rows and list(rows) == list(range(rows[0], rows[0] + len(rows))):
+        return slice(rows[0], rows[0] + len(rows))
+    return np.array(rows, np.intp)
 
 
 def _column(values: Sequence[Any], dtype: Any) -> NDArray[Any]:
@@ -126,10 +135,11 @@ def _admitted_codes(signal: Signal, channel: Channel, rule: CodeRule) -> tuple[i
     first, last = max(first, math.ceil(rule.low)), min(last, math.floor(rule.high))
     cuts = sorted({code for code, _ in rule.special if first <= code <= last})
     ends = [first - 1, *cuts, last + 1]
-    first, last = max(((a + 1, b - 1) for a, b in zip(ends[:-1], ends[1:], strict=True)), key=lambda r: r[1] - r[0])
+    first, last = max(((a + 1, b - 1) for a, b in pairwise(ends)), key=lambda r: r[1] - r[0])
 
     def value(code: int) -> float:
-        return channel.factor * float(signal.conversion.raw_to_scaled(code, False)) + channel.offset
+        physical: Any = signal.conversion.raw_to_scaled(code, False)
+        return channel.factor * float(physical) + channel.offset
 
     if first > last:
         return first, last

@@ -176,9 +176,7 @@ class Intake:
     def stale(self, now: float) -> list[str]:
         """Needed channels without an admitted sample within their time-out before `now` [s]."""
         return [
-            c.name
-            for c in self.needed
-            if now - self.last_seen.get(c.name, -math.inf) > (c.timeout or DEFAULT_TIMEOUT)
+            c.name for c in self.needed if now - self.last_seen.get(c.name, -math.inf) > (c.timeout or DEFAULT_TIMEOUT)
         ]
 
     def latest_slip(self, now: float) -> dict[str, float | None]:
@@ -216,6 +214,6 @@ def coverage(window: Window) -> Array:
     if len(known) < 2:
         return np.zeros(known.shape[1])
     block = ((window.t - window.t[0]) / COVERAGE_BLOCK + 1e-6).astype(int)
-    begins = np.flatnonzero(np.diff(block, prepend=-1))
+    begins = [0, *(np.flatnonzero(block[1:] != block[:-1]) + 1)]
     share: Array = np.logical_or.reduceat(known, begins).sum(0) / (block[-1] + 1)
     return share

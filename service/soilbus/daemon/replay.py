@@ -14,7 +14,6 @@ import can
 from soilbus.can.candump import Frame, candump_frames, frame_of
 from soilbus.daemon.pipeline import Pipeline, WindowResult
 
-
 _T = TypeVar("_T")
 
 

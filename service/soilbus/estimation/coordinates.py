@@ -8,6 +8,7 @@ badly, so in plain logarithms the optimum lies in a long curved valley.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,14 +26,14 @@ BOUND = 4.0
 _K_C, _K_PHI, _N = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n"))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Coordinates:
     """The free parameters' coordinates (F,) for a prior and a mean tyre width [m]."""
 
     prior: SoilPrior
     width: float
 
-    @property
+    @cached_property
     def free(self) -> NDArray[np.intp]:
         """Indices of the free parameters, one coordinate each."""
         return self.prior.free
@@ -42,10 +43,10 @@ class Coordinates:
         free = self.free
         directions = np.zeros((len(soil), len(free)))
         directions[free, np.arange(len(free))] = 1.0
-        if _K_PHI in free:
+        column = self._column
+        if _K_PHI in column:
             k_phi = soil[_K_PHI]
             K_L = k_phi + soil[_K_C] / self.width
-            column = {int(parameter): i for i, parameter in enumerate(free)}
             directions[_K_PHI, column[_K_PHI]] = K_L / k_phi
             if _K_C in column:
                 directions[_K_PHI, column[_K_C]] = -soil[_K_C] / self.width / k_phi
@@ -56,9 +57,9 @@ class Coordinates:
     def position(self, soil: Array) -> Array:
         """Coordinates (F,) of a soil (6,)."""
         logs = np.log(soil[self.free])
-        if _K_PHI in self.free:
+        if _K_PHI in self._column:
             K_L = soil[_K_PHI] + soil[_K_C] / self.width
-            logs[self._strength] = np.log(K_L) + soil[_N] * np.log(TYPICAL_DEPTH)
+            logs[self._column[_K_PHI]] = np.log(K_L) + soil[_N] * np.log(TYPICAL_DEPTH)
         return logs
 
     def soil_at(self, position: Array) -> Array:
@@ -66,16 +67,22 @@ class Coordinates:
         free = self.free
         soil = self.prior.median.copy()
         soil[free] = np.exp(position)
-        if _K_PHI in free:
-            K_L = np.exp(position[self._strength] - soil[_N] * np.log(TYPICAL_DEPTH))
+        if _K_PHI in self._column:
+            K_L = np.exp(position[self._column[_K_PHI]] - soil[_N] * np.log(TYPICAL_DEPTH))
             soil[_K_PHI] = max(K_L - soil[_K_C] / self.width, 0.01 * K_L)
-        centre, bound = self.prior.median[free], np.exp(BOUND * self.prior.log_std[free])
-        soil[free] = np.clip(soil[free], centre / bound, centre * bound)
+        low, high = self._bounds
+        soil[free] = np.minimum(np.maximum(soil[free], low), high)
         return soil
 
-    @property
-    def _strength(self) -> int:
-        return int(np.flatnonzero(self.free == _K_PHI)[0])
+    @cached_property
+    def _column(self) -> dict[int, int]:
+        """Place among the coordinates of each free parameter."""
+        return {parameter: i for i, parameter in enumerate(self.free.tolist())}
+
+    @cached_property
+    def _bounds(self) -> tuple[Array, Array]:
+        centre, bound = self.prior.median[self.free], np.exp(BOUND * self.prior.log_std[self.free])
+        return centre / bound, centre * bound
 
     def prior_pull(self, soil: Array) -> tuple[Array, Array]:
         """Distance of the free parameters from the prior in its standard deviations (F,), and its slopes (F, F)."""

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 MAX_ITERATIONS = 20
-MAX_RESUMED = 8
+MAX_RESUMED = 10
 CONVERGED = 1e-2
 """Squared length of a step in posterior standard deviations that ends the fit; the step is
 still taken, and what it leaves is smaller by another such factor."""
@@ -34,8 +34,14 @@ MAX_SETTLED = 2
 MAX_HOPELESS = 5
 HOPELESS = 60.0
 """Cost for each thinned instant beyond which the window cannot be one soil."""
-LONG_LOG_STEP = 0.1
-"""Step of a log parameter from which the entry angles are solved again, not extrapolated."""
+MAX_REFUSED = 5
+"""Steps taken back after which a fit has failed: what is left is noise of the linear model."""
+PLAUSIBLE = 3.0
+"""Cost per residual, gains held, up to which an optimum of the search may be the soil's."""
+SAME_END = 0.02
+"""Relative difference in cost of two descents that are taken to have met at one optimum."""
+LONG_TURN = 0.2
+"""Relative change of an entry angle from which the angles are solved again, not extrapolated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,14 +51,16 @@ class Fit:
     cost is -2 log posterior up to a constant: chi-square of the residuals, of the soil's
     prior and of the gains.  chi2 is cost per residual (reduced: each parameter has its
     prior as one more residual).  sinkage (W,) is the mean over the
-    window [m], nan where unknown; angle_curve (W, 4) is for resume().  gains are relative
-    errors by problem.gain_names.
+    window [m], nan where unknown; gains are relative errors by problem.gain_names.
+    angle_curve (W, 4), and the latents at the instants t (N,), are for resume().
     """
 
     posterior: Posterior
     gains: Array
     sinkage: Array
     angle_curve: Array
+    t: Array
+    latents: Latents
     cost: float
     rows: int
     iterations: int
@@ -83,10 +91,22 @@ def fit_window(problem: WindowProblem, prior: SoilPrior) -> Fit | None:
 
 
 def _promising(thin: WindowProblem, coordinates: Coordinates) -> list[_Place]:
-    """Where descents on a few instants of the window end, the best first."""
-    starts = [np.asarray(soil) for soil in starting_soils(coordinates.prior)]
-    ends = [end for start in starts if (end := _approach(thin, coordinates, start, MAX_APPROACH)) is not None]
-    return sorted(ends, key=lambda end: end.cost)
+    """Optima on a few instants of the window, the best first.
+
+    Descents from unlike soils that meet at a plausible cost are proof enough; otherwise
+    every start is tried.
+    """
+    ends: list[_Place] = []
+    for start in starting_soils(coordinates.prior):
+        end = _approach(thin, coordinates, np.asarray(start), MAX_APPROACH)
+        if end is None:
+            continue
+        met = any(abs(end.cost - other.cost) < SAME_END * other.cost for other in ends)
+        ends.append(end)
+        if met and end.cost < PLAUSIBLE * thin.n_rows:
+            break
+    ends.sort(key=lambda end: end.cost)
+    return [end for i, end in enumerate(ends) if i == 0 or end.cost > ends[i - 1].cost * (1.0 + SAME_END)]
 
 
 def starting_soils(prior: SoilPrior) -> list[Soil]:
@@ -119,7 +139,7 @@ def resume(problem: WindowProblem, prior: SoilPrior, last: Fit) -> Fit | None:
     """Descent from the optimum of a neighbouring window."""
     soil = np.where(prior.log_std > 0.0, np.asarray(last.posterior.soil), prior.median)
     with np.errstate(all="ignore"):
-        near = _Place(soil, problem.start_on(last.angle_curve), last.gains, np.inf, 0)
+        near = _Place(soil, problem.start_on(last.angle_curve, last.t, last.latents), last.gains, np.inf, 0)
         return _settle(problem, _coordinates(problem, prior), near, MAX_RESUMED)
 
 
@@ -172,35 +192,38 @@ def _approach(problem: WindowProblem, coordinates: Coordinates, soil: Array, mos
 def _settle(problem: WindowProblem, coordinates: Coordinates, near: _Place, most: int) -> Fit | None:
     """Steps of soil, gains and latents together from a place near the optimum.
 
-    A step that makes things worse is taken back and tried again damped.
+    A step that makes things worse is taken back and tried again shorter: damping would
+    hold back just the weak directions, along which the steps overshoot.
     """
     free = coordinates.free
     active = np.flatnonzero(problem.gain_std > 0.0)
     soil, latents, gains = near.soil, near.latents, near.gains
     best: tuple[Array, Latents, Array, _Point] | None = None
-    damping, length = 0.0, np.inf
+    share, length, refused = 1.0, np.inf, 0
     iterations = near.trials
     for _ in range(most):
         iterations += 1
         point = _normal_equations(problem, coordinates, active, soil, gains, latents)
         if best is not None and (point is None or point.cost > best[3].cost * (1.0 + WORSE) + 1.0):
             soil, latents, gains, point = best
-            damping = max(4.0 * damping, 0.03)
+            share *= 0.4
+            refused += 1
+            if refused > MAX_REFUSED:
+                break
         else:
-            damping = damping / 4.0 if damping > 1e-3 else 0.0
+            share = min(2.0 * share, 1.0)
         full = None if point is None else _solve(point.information, point.gradient, 0.0)
         if point is None or full is None:
             return None
         best = (soil, latents, gains, point)
         length = float(full @ point.information @ full)
-        step = full if length < CONVERGED or damping == 0.0 else _solve(point.information, point.gradient, damping)
-        if step is None:
-            return None
+        step = full if length < CONVERGED else share * full
         new_soil = coordinates.moved(soil, step[: len(free)])
         gain_step = np.zeros(len(gains))
         gain_step[active] = step[len(free) :]
+        angles = latents.entry_angle
         latents = problem.updated(point.at, latents, new_soil - soil, gain_step)
-        if np.max(np.abs(np.log(new_soil[free] / soil[free])), initial=0.0) > LONG_LOG_STEP:
+        if np.max(np.abs(latents.entry_angle / angles - 1.0), initial=0.0) > LONG_TURN:
             latents = problem.carried(latents, Soil(*new_soil.tolist()))
         soil, gains = new_soil, gains + gain_step
         if length < CONVERGED:
@@ -216,6 +239,8 @@ def _settle(problem: WindowProblem, coordinates: Coordinates, near: _Place, most
         gains=gains,
         sinkage=problem.mean_sinkage(latents),
         angle_curve=problem.angle_curve(latents),
+        t=problem.t,
+        latents=latents,
         cost=point.cost - length,
         rows=point.at.known,
         iterations=iterations,
@@ -241,20 +266,22 @@ def _normal_equations(
         at = problem.linearise(Soil(*soil.tolist()), gains, latents)
     except np.linalg.LinAlgError:
         return None
-    by_soil = soil[:, None] * coordinates.log_directions(soil)
-    rows = np.concatenate([at.rows[:, 1:7] @ by_soil, at.rows[:, 7 + active]], axis=1)
-    weighed = np.concatenate([at.weighed[:, 1:7] @ by_soil, at.weighed[:, 7 + active]], axis=1)
     soil_pull, by_pull = coordinates.prior_pull(soil)
     gain_pull = gains[active] / problem.gain_std[active]
     cost = at.chi2 + float(soil_pull @ soil_pull) + float(gain_pull @ gain_pull)
     if not np.isfinite(cost):
         return None
-    information, gradient = rows.T @ weighed, weighed.T @ at.rows[:, 0]
-    n = len(coordinates.free)
-    information[:n, :n] += by_pull.T @ by_pull
-    gradient[:n] += by_pull.T @ soil_pull
-    information[n:, n:] += np.diag(1.0 / problem.gain_std[active] ** 2)
-    gradient[n:] += gain_pull / problem.gain_std[active]
+    free = len(coordinates.free)
+    directions = np.zeros((len(at.normal), 1 + free + len(active)))  # of the residual, coordinates and gains
+    directions[0, 0] = 1.0
+    directions[1:7, 1 : 1 + free] = soil[:, None] * coordinates.log_directions(soil)
+    directions[7 + active, 1 + free + np.arange(len(active))] = 1.0
+    normal = directions.T @ at.normal @ directions
+    information, gradient = normal[1:, 1:], normal[1:, 0]
+    information[:free, :free] += by_pull.T @ by_pull
+    gradient[:free] += by_pull.T @ soil_pull
+    information[free:, free:] += np.diag(1.0 / problem.gain_std[active] ** 2)
+    gradient[free:] += gain_pull / problem.gain_std[active]
     return _Point(information, gradient, cost, at)
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.estimation.weights import diagonals, inverse_covariance
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.stress import lumped_modulus
 from soilbus.terra.vehicle import GRAVITY
@@ -35,6 +36,8 @@ MAX_SLIP = 0.98
 MIN_SLIP = -1.0
 START_TOLERANCE = 0.02
 """Relative error of load left in the first entry angles; each linearisation mends it further."""
+SAME_INSTANT = 1e-3
+"""Times [s] closer than this are those of one bin."""
 GAIN_QUANTITIES = ("torque", "load", "speed", "ground_speed", "draft")
 
 
@@ -54,24 +57,25 @@ class Linearised:
 
     The columns of `rows` and `weighed` (R, 1 + 6 + G) are the residual and its derivatives
     by the soil parameters (SI) and the gains; `weighed` is `rows` times the inverse
-    covariance of its instant, so that rows' weighed are the normal equations.  Rows of
-    missing data are zero; `known` counts the others.
+    covariance of its instant, so that `normal`, rows' weighed, holds chi-square and the
+    normal equations.  Rows of missing data are zero; `known` counts the others.
     """
 
     rows: Array
     weighed: Array
+    normal: Array
     known: int
-    latent_gain: Array  # (N, 2 W + 1, m): covariance of latents times A'
+    by_latents: Array  # (N, m, 2 W + 1)
     corrected: Array  # (N, 2 W + 1) measured latents less their gain errors
+    off: Array  # (N, W) latent load less the model's
     load_slope: Array  # (N, W) dW/d entry angle
     load_by_slip: Array
-    load_by_soil: Array  # (N, W, 6)
-    model_load: Array
+    load_by_soil: Array  # (6, N, W)
 
     @property
     def chi2(self) -> float:
         """Sum of squares of the whitened residuals."""
-        return float(self.rows[:, 0] @ self.weighed[:, 0])
+        return float(self.normal[0, 0])
 
 
 class WindowProblem:
@@ -114,6 +118,16 @@ class WindowProblem:
         self._balance(take, usable)
         self.gain_names, self.gain_std = self._gains()
         self.slip = slip[kept]
+        self._measured = np.concatenate([self.load, self.speed, self.ground_speed[:, None]], axis=1)
+        self._measured_var = np.concatenate([self.load_var, self.speed_var, self.ground_speed_var[:, None]], axis=1)
+        known_rows = [self.has_torque, self.has_balance[:, None], self.has_sinkage]
+        row_var = [self.torque_var, self.demand_var[:, None], self.sinkage_var]
+        n_kinds = 3 if self.with_sinkage else 2
+        known = np.concatenate(known_rows[:n_kinds], axis=1)
+        self._row_var = np.where(known, np.concatenate(row_var[:n_kinds], axis=1), 1.0)
+        self._n_known = int(known.sum())
+        self._radius, self._width = (np.tile(a, self.n) for a in (rig.radius, rig.width))
+        self._missing = None if known.all() else ~known
 
     def _balance(self, take, usable: NDArray[np.bool_]) -> None:  # type: ignore[no-untyped-def]
         """The pull that draft, slope and inertia ask of the wheels, and its variance."""
@@ -147,7 +161,7 @@ class WindowProblem:
     @property
     def n_rows(self) -> int:
         """Number of residuals that count."""
-        return int(self.has_torque.sum() + self.has_balance.sum() + self.has_sinkage.sum())
+        return self._n_known
 
     def thinned(self, most: int) -> WindowProblem:
         """The same window with at most so many of its usable instants, evenly spread."""
@@ -190,8 +204,22 @@ class WindowProblem:
         gram = regressors.transpose(0, 2, 1) @ regressors + 1e-9 * np.eye(4)
         return np.asarray(np.linalg.solve(gram, regressors.transpose(0, 2, 1) @ target)[:, :, 0])
 
-    def start_on(self, curve: Array) -> Latents:
-        """Latents at the measured values with entry angles from a neighbouring window's curve."""
+    def start_on(self, curve: Array, t: Array, latents: Latents) -> Latents:
+        """Latents from a neighbouring window, whose instants were t (M,).
+
+        At instants that both share these are its latents; elsewhere the measured values
+        with entry angles from its curve.
+        """
+        start = self._measured_on(curve)
+        place = np.minimum(np.searchsorted(t, self.t - SAME_INSTANT), max(len(t) - 1, 0))
+        mine = np.flatnonzero(np.abs(t[place] - self.t) < SAME_INSTANT) if len(t) else place[:0]
+        theirs = place[mine]
+        start.load[mine], start.speed[mine] = latents.load[theirs], latents.speed[theirs]
+        start.ground_speed[mine] = latents.ground_speed[theirs]
+        start.entry_angle[mine] = latents.entry_angle[theirs]
+        return start
+
+    def _measured_on(self, curve: Array) -> Latents:
         log_angle = self._curve_regressors(self.load, self.speed, self.ground_speed) @ curve[:, :, None]
         angle = np.exp(np.clip(log_angle[:, :, 0].T, np.log(MIN_ENTRY_ANGLE), np.log(MAX_ENTRY_ANGLE)))
         return Latents(self.load.copy(), self.speed.copy(), self.ground_speed.copy(), angle)
@@ -201,125 +229,109 @@ class WindowProblem:
         return np.stack([np.ones_like(load), np.log(load), slip, slip**2], axis=-1).transpose(1, 0, 2)
 
     def _state(self, soil: Soil, angle: Array, slip: Array) -> WheelState:
-        tile = np.broadcast_to
-        shape = angle.shape
-        K_L = lumped_modulus(soil.k_c, soil.k_phi, self.rig.width)
+        K_L = lumped_modulus(soil.k_c, soil.k_phi, self._width)
         return WheelState(
-            angle.ravel(), slip.ravel(), tile(self.rig.radius, shape).ravel(), tile(self.rig.width, shape).ravel(),
-            tile(K_L, shape).ravel(), soil.n, np.tan(soil.phi), soil.c, soil.K,
-        )  # fmt: skip
+            angle.ravel(), slip.ravel(), self._radius, self._width, K_L, soil.n, np.tan(soil.phi), soil.c, soil.K
+        )
 
     def linearise(self, soil: Soil, gains: Array, latents: Latents) -> Linearised:
         """Whitened residuals and derivatives at a soil, gains (G,) and latents."""
         N, W = self.n, self.n_wheels
         r = self.rig.radius
         rim = r * latents.speed
-        slip = 1.0 - latents.ground_speed[:, None] / rim
-        state = self._state(soil, latents.entry_angle, slip)
+        carried = latents.ground_speed[:, None] / rim  # 1 - slip
+        state = self._state(soil, latents.entry_angle, 1.0 - carried)
         forces, d = wheel_forces_and_derivatives(state, self.model)
         forces, d = forces.reshape(3, N, W), d.reshape(3, 7, N, W)
 
         # Eliminate the entry angle: it follows the load.
         slope = d[0, 0]
         off = latents.load - forces[0]
-        z = sinkage(latents.entry_angle, r)
-        z_angle = r * np.sin(latents.entry_angle)
-        ratio = np.stack([d[1, 0], d[2, 0], z_angle]) / slope  # (DP, T, z) by load
-        value = np.stack([forces[1], forces[2], z]) + ratio * off
-        load_by_soil = self._by_soil(d[0], soil)
-        by_slip = np.stack([d[1, 1], d[2, 1], np.zeros((N, W))]) - ratio * d[0, 1]
-        by_soil = np.stack([self._by_soil(d[1], soil), self._by_soil(d[2], soil), np.zeros((N, W, 6))])
-        by_soil -= ratio[..., None] * load_by_soil
-        by_speed = by_slip * (latents.ground_speed[:, None] / (rim * latents.speed))
-        by_ground = by_slip * (-1.0 / rim)
+        load_by = self._by_slip_and_soil(d[0], soil)
+        by = np.zeros((3, 7, N, W))  # of (DP, T, z), by slip and soil
+        by[0], by[1] = self._by_slip_and_soil(d[1], soil), self._by_slip_and_soil(d[2], soil)
+        ratio = np.empty((3, N, W))  # by load
+        np.divide(d[1:, 0], slope, out=ratio[:2])
+        np.divide(r * np.sin(latents.entry_angle), slope, out=ratio[2])
+        by -= ratio[:, None] * load_by
+        value = ratio * off
+        value[:2] += forces[1:]
+        value[2] += sinkage(latents.entry_angle, r)
 
-        gain = dict(zip(self.gain_names, gains.tolist(), strict=True))
-        g_torque, g_load, g_speed = (np.array([gain[f"{q}.{w}"] for w in self.rig.wheels]) for q in GAIN_QUANTITIES[:3])
-        corrected = np.concatenate(
-            [
-                self.load * (1 - g_load),
-                self.speed * (1 - g_speed),
-                (self.ground_speed * (1 - gain["ground_speed"]))[:, None],
-            ],
-            axis=1,
-        )
-        now = np.concatenate([latents.load, latents.speed, latents.ground_speed[:, None]], axis=1)
-
-        m = W + 1 + (W if self.with_sinkage else 0)
-        residual = np.zeros((N, m))
-        A = np.zeros((N, m, 2 * W + 1))
-        J = np.zeros((N, m, 6))
-        R = np.zeros((N, m))
-        i = np.arange(W)
-        residual[:, :W] = self.torque * (1 - g_torque) - value[1]
-        A[:, i, i], A[:, i, W + i], A[:, :W, 2 * W] = -ratio[1], -by_speed[1], -by_ground[1]
-        J[:, :W] = -by_soil[1]
-        R[:, :W] = self.torque_var
-        residual[:, W] = self.demand - gain["draft"] * self.draft - value[0].sum(1)
-        A[:, W, :W], A[:, W, W : 2 * W], A[:, W, 2 * W] = -ratio[0], -by_speed[0], -by_ground[0].sum(1)
-        J[:, W] = -by_soil[0].sum(1)
-        R[:, W] = self.demand_var
-        known = np.concatenate([self.has_torque, self.has_balance[:, None]], axis=1)
+        A = self._by_latents(ratio, by[:, 0], carried / latents.speed, -1.0 / rim)
+        g_torque, g_latents, g_draft = gains[:W], gains[W:-1], gains[-1]
+        corrected = self._measured * (1.0 - g_latents)
+        rows = np.zeros((*A.shape[:2], 7 + len(gains)))
+        residual, by_soil = rows[:, :, 0], rows[:, :, 1:7]
+        residual[:, :W] = self.torque * (1.0 - g_torque) - value[1]
+        residual[:, W] = self.demand - g_draft * self.draft - value[0].sum(1)
+        by_soil[:, :W] = -by[1, 1:].transpose(1, 2, 0)
+        by_soil[:, W] = -by[0, 1:].sum(2).T
         if self.with_sinkage:
-            s = slice(W + 1, m)
-            residual[:, s] = self.sinkage - value[2]
-            A[:, W + 1 + i, i], A[:, W + 1 + i, W + i], A[:, s, 2 * W] = -ratio[2], -by_speed[2], -by_ground[2]
-            J[:, s] = -by_soil[2]
-            R[:, s] = self.sinkage_var
-            known = np.concatenate([known, self.has_sinkage], axis=1)
-
-        residual += np.einsum("nij,nj->ni", A, corrected - now)
-        G = self._by_gain(A)
-        latent_var = np.concatenate([self.load_var, self.speed_var, self.ground_speed_var[:, None]], axis=1)
-        for array in (residual, A, J, G, R):
-            array[~known] = 0.0
-        AV = A * latent_var[:, None, :]
-        S = AV @ A.transpose(0, 2, 1)
-        S[:, np.arange(m), np.arange(m)] += np.where(known, R, 1.0)
-        rows = np.concatenate([residual[:, :, None], J, G], axis=2)
-        weighed = np.linalg.solve(S, rows)
+            residual[:, W + 1 :] = self.sinkage - value[2]
+            by_soil[:, W + 1 :] = -by[2, 1:].transpose(1, 2, 0)
+        now = np.concatenate([latents.load, latents.speed, latents.ground_speed[:, None]], axis=1)
+        residual += (A @ (corrected - now)[:, :, None])[:, :, 0]
+        self._write_by_gain(A, rows[:, :, 7:])
+        if self._missing is not None:
+            A[self._missing] = 0.0
+            rows[self._missing] = 0.0
+        weighed = inverse_covariance(A, self._measured_var, self._row_var, W) @ rows
+        flat, weighed = rows.reshape(-1, rows.shape[2]), weighed.reshape(-1, rows.shape[2])
         return Linearised(
-            rows=rows.reshape(N * m, -1), weighed=weighed.reshape(N * m, -1), known=int(known.sum()),
-            latent_gain=AV.transpose(0, 2, 1), corrected=corrected, load_slope=slope, load_by_slip=d[0, 1],
-            load_by_soil=load_by_soil, model_load=forces[0],
-        )  # fmt: skip
+            rows=flat,
+            weighed=weighed,
+            normal=flat.T @ weighed,
+            known=self._n_known,
+            by_latents=A,
+            corrected=corrected,
+            off=off,
+            load_slope=slope,
+            load_by_slip=load_by[0],
+            load_by_soil=load_by[1:],
+        )
 
-    def _by_soil(self, d: Array, soil: Soil) -> Array:
-        """Derivatives (N, W, 6) by k_c, k_phi, n, phi, c, K of one force from those by INPUTS (7, N, W)."""
-        sec2 = 1.0 + np.tan(soil.phi) ** 2
-        return np.stack([d[2] / self.rig.width, d[2], d[3], d[4] * sec2, d[5], d[6]], axis=-1)
+    def _by_slip_and_soil(self, d: Array, soil: Soil) -> Array:
+        """Derivatives (7, N, W) by slip, k_c, k_phi, n, phi, c, K of one force from those by INPUTS."""
+        out = np.empty(d.shape)
+        out[0] = d[1]
+        np.divide(d[2], self.rig.width, out=out[1])
+        out[2:] = d[2:]
+        out[4] *= 1.0 + np.tan(soil.phi) ** 2
+        return out
 
-    def _by_gain(self, A: Array) -> Array:
+    def _by_latents(self, by_load: Array, by_slip: Array, slip_by_speed: Array, slip_by_ground: Array) -> Array:
+        """Derivatives A (N, m, 2 W + 1) of the residuals from those of DP, T and z (3, N, W)."""
+        N, W = self.n, self.n_wheels
+        by_speed, by_ground = by_slip * slip_by_speed, by_slip * slip_by_ground
+        A = np.zeros((N, self._row_var.shape[1], 2 * W + 1))
+        A[:, W, :W], A[:, W, W : 2 * W], A[:, W, 2 * W] = by_load[0], by_speed[0], by_ground[0].sum(1)
+        for kind, first in ((1, 0), (2, W + 1)) if self.with_sinkage else ((1, 0),):
+            wheel_rows = A[:, first : first + W]
+            diagonals(wheel_rows[:, :, :W])[:] = by_load[kind]
+            diagonals(wheel_rows[:, :, W : 2 * W])[:] = by_speed[kind]
+            wheel_rows[:, :, 2 * W] = by_ground[kind]
+        return np.negative(A, out=A)
+
+    def _write_by_gain(self, A: Array, out: Array) -> None:
         """Derivatives (N, m, G): a torque or draft gain scales the reading, a latent's gain acts through A."""
-        N, m, _ = A.shape
         W = self.n_wheels
-        G = np.zeros((N, m, 3 * W + 2))
-        i = np.arange(W)
-        G[:, i, i] = -self.torque
-        G[:, :, W : 2 * W] = -A[:, :, :W] * self.load[:, None, :]
-        G[:, :, 2 * W : 3 * W] = -A[:, :, W : 2 * W] * self.speed[:, None, :]
-        G[:, :, 3 * W] = -A[:, :, 2 * W] * self.ground_speed[:, None]
-        G[:, W, 3 * W + 1] = -self.draft
-        return G
+        diagonals(out[:, :W, :W])[:] = -self.torque
+        np.multiply(A, -self._measured[:, None, :], out=out[:, :, W:-1])
+        out[:, W, -1] = -self.draft
 
     def updated(self, at: Linearised, latents: Latents, soil_step: Array, gain_step: Array) -> Latents:
         """Latents after a step (6,) of the soil and (G,) of the gains, by the linear model."""
         N, W = self.n, self.n_wheels
-        left = at.weighed @ np.concatenate([[1.0], soil_step, gain_step])
-        new = at.corrected - (at.latent_gain @ left.reshape(N, -1, 1))[:, :, 0]
-        scale = np.concatenate([self.load, self.speed, self.ground_speed[:, None]], axis=1)
-        new = new - scale * self._latent_gain_steps(gain_step)
+        left = (at.weighed @ np.concatenate([[1.0], soil_step, gain_step])).reshape(N, 1, at.by_latents.shape[1])
+        new = at.corrected - self._measured_var * (left @ at.by_latents)[:, 0] - self._measured * gain_step[W:-1]
         load, speed, ground = new[:, :W], new[:, W : 2 * W], new[:, 2 * W]
-        old_slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
-        slip = 1.0 - ground[:, None] / (self.rig.radius * speed)
-        change = load - at.model_load - at.load_by_slip * (slip - old_slip) - at.load_by_soil @ soil_step
+        slip_change = (latents.ground_speed[:, None] / latents.speed - ground[:, None] / speed) / self.rig.radius
+        change = load - latents.load + at.off - at.load_by_slip * slip_change
+        change -= (soil_step @ at.load_by_soil.reshape(6, -1)).reshape(N, W)
         low, high = latents.entry_angle * 0.6, np.minimum(latents.entry_angle * 1.6, MAX_ENTRY_ANGLE)
         angle = np.clip(latents.entry_angle + change / at.load_slope, low, high)
         return Latents(load, speed, ground, angle)
-
-    def _latent_gain_steps(self, gain_step: Array) -> Array:
-        W = self.n_wheels
-        return np.concatenate([gain_step[W : 3 * W], gain_step[3 * W : 3 * W + 1]])
 
 
 def differentiated_speed(t: Array, speed: Array, variance: Array, half_width: int = 3) -> tuple[Array, Array]:

@@ -156,7 +156,7 @@ def _at_centres(mean: Array, since: Array, centre: Array) -> Array:
         return mean
     slope = np.full(mean.shape, np.nan)
     with np.errstate(invalid="ignore", divide="ignore"):
-        step = np.diff(mean, axis=0) / np.diff(since, axis=0)
+        step = (mean[1:] - mean[:-1]) / (since[1:] - since[:-1])
         slope[1:-1] = (mean[2:] - mean[:-2]) / (since[2:] - since[:-2])
     slope[0], slope[-1] = step[0], step[-1]
     slope[1:-1] = np.where(np.isfinite(slope[1:-1]), slope[1:-1], step[:-1])

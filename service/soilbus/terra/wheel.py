@@ -1,19 +1,28 @@
 """One rigid wheel on soil: load, drawbar pull and torque with their derivatives.
 
 Equations 20-22 of Xi et al. 2024 (Wong & Reece 1967), integrated by Gauss-Legendre
-quadrature.  Both stress branches share one coordinate x: 0 where the branch starts to
-carry (entry or exit angle), 1 at the angle of greatest stress.  Nodes lie at a power of
-the Gauss points, which tames the x**n singularity of the normal stress for any n > 0.
+quadrature at the nodes of terra.rim.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from soilbus.terra.rim import (
+    Quadrature,
+    Rim,
+    fixed_shares,
+    gauss,
+    on_branches,
+    rim_at,
+    rim_of_fixed_shares,
+    split_nodes,
+)
 from soilbus.terra.stress import SHEAR_LAWS, Array, lumped_modulus
 
 EXACT_NODES = 12
@@ -44,6 +53,11 @@ class WheelModel:
     peak_c2: float = 0.0
     exit_ratio: float = 0.0
     nodes: int = EXACT_NODES
+
+    @property
+    def quadrature(self) -> Quadrature:
+        """Nodes for a wheel without slip."""
+        return Quadrature(self.nodes, 3 if self.nodes >= EXACT_NODES else 2, self.peak_c1, self.exit_ratio)
 
 
 class WheelState(NamedTuple):
@@ -90,7 +104,7 @@ def wheel_forces(state: WheelState, model: WheelModel) -> Array:
 
     The dots stand for the shape that the fields of `state` broadcast to.
     """
-    return _in_chunks(state, model, derivatives=False)[0]
+    return _in_chunks(_forces, 3, state, model)
 
 
 def wheel_forces_and_derivatives(state: WheelState, model: WheelModel) -> tuple[Array, Array]:
@@ -98,7 +112,8 @@ def wheel_forces_and_derivatives(state: WheelState, model: WheelModel) -> tuple[
 
     Rows as FORCES, columns as INPUTS; units are those of force per unit of input.
     """
-    return _in_chunks(state, model, derivatives=True)
+    both = _in_chunks(_forces_and_jacobian, 3 + 3 * len(INPUTS), state, model)
+    return both[:3], both[3:].reshape(3, len(INPUTS), *both.shape[1:])
 
 
 def sinkage(entry_angle: Any, radius: Any) -> Any:
@@ -130,7 +145,7 @@ def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolera
         if not len(todo):
             break
         part = WheelState(np.exp(at[todo]), *(f[todo] for f in rest))
-        W, slope = _load_and_slope(part, model)
+        W, slope = _in_chunks(_load_and_slope, 2, part, model)
         miss = np.where(W > 0.0, np.log(np.maximum(W, 1e-300)), -690.0) - target[todo]
         above = miss > 0.0
         high[todo] = np.where(above, at[todo], high[todo])
@@ -153,165 +168,182 @@ def _first_guess(load: Array, radius: Array, width: Array, K_L: Array, n: Array)
     return np.asarray(np.log(load * (n + 1.5) / scale) / (2.0 * n + 1.0))
 
 
-def _load_and_slope(state: WheelState, model: WheelModel) -> tuple[Array, Array]:
-    forces, jacobian = _in_chunks(state, model, derivatives=True, only_entry_angle=True)
-    return forces[0], jacobian[0, 0]
-
-
 def _in_chunks(
-    state: WheelState, model: WheelModel, *, derivatives: bool, only_entry_angle: bool = False
-) -> tuple[Array, Array]:
-    shape = np.broadcast_shapes(*(np.shape(a) for a in state))
-    n_samples = int(np.prod(shape, dtype=int))
+    integrate: Callable[[WheelState, WheelModel, bool], Array], n_rows: int, state: WheelState, model: WheelModel
+) -> Array:
+    """(n_rows, ...) of an integrator of samples, which gets the state as rows (N,) or floats."""
+    shape = np.broadcast(*state).shape
+    n_samples = math.prod(shape)
     rows = WheelState(*(
-        np.broadcast_to(a, shape).reshape(n_samples)
+        (np.asarray(a) if np.shape(a) == shape else np.broadcast_to(a, shape)).reshape(n_samples)
         if np.ndim(a) or i < 2 else float(a)  # entry angle and slip always by sample
         for i, a in enumerate(state)
     ))  # fmt: skip
-    forces = np.empty((3, n_samples))
-    n_inputs = 1 if only_entry_angle else len(INPUTS)
-    jacobian = np.empty((3, n_inputs, n_samples if derivatives else 0))
-    for index in _groups(rows.slip, n_samples):
-        part = WheelState(*(a[index] if np.ndim(a) else a for a in rows))
-        skid = bool(np.min(part.slip, initial=0.0) < 0.0)
-        forces[:, index], d = _integrate(part, model, skid, derivatives, only_entry_angle)
-        if derivatives:
-            jacobian[:, :, index] = d
-    return forces.reshape(3, *shape), jacobian.reshape(3, n_inputs, *shape) if derivatives else jacobian
+    skid = rows.slip < 0.0
+    if n_samples <= _CHUNK and not skid.any():
+        return integrate(rows, model, False).reshape(n_rows, *shape)
+    out = np.empty((n_rows, n_samples))
+    for skidding in (False, True):  # skidding wheels need split panels
+        members = np.flatnonzero(skid == skidding)
+        for i in range(0, len(members), _CHUNK):
+            index = members[i : i + _CHUNK]
+            part = WheelState(*(a[index] if np.ndim(a) else a for a in rows))
+            out[:, index] = integrate(part, model, skidding)
+    return out.reshape(n_rows, *shape)
 
 
-def _groups(slip: Array, n_samples: int) -> list[Any]:
-    """Index chunks, driven wheels apart from skidding ones, which need split panels."""
-    skid = slip < 0.0
-    if not skid.any():
-        return [slice(i, i + _CHUNK) for i in range(0, n_samples, _CHUNK)]
-    groups = []
-    for members in (np.flatnonzero(~skid), np.flatnonzero(skid)):
-        groups += [members[i : i + _CHUNK] for i in range(0, len(members), _CHUNK)]
-    return groups
+class _Stress(NamedTuple):
+    """Stresses at the nodes (2, M, N), front and rear branch, weighted for the integral.
 
-
-@cache
-def _gauss(nodes: int, power: int) -> tuple[Array, Array]:
-    """Gauss points on 0..1 clustered towards 0 by a power, and their weights; columns."""
-    u, w = np.polynomial.legendre.leggauss(nodes)
-    u, w = (u[:, None] + 1.0) / 2.0, w[:, None] / 2.0
-    return u**power, w * power * u ** (power - 1)
-
-
-def _nodes(state: WheelState, rho: Any, model: WheelModel, skid: bool) -> tuple[Array, Array]:
-    """Nodes x and weights on 0..1, (M, 1); in skid (2 M + 4, N), split where shear changes sign."""
-    if not skid:
-        return _gauss(model.nodes, 3 if model.nodes >= EXACT_NODES else 2)
-    x, xw = _gauss(model.nodes + 2, 3)  # shear is steep where it changes sign
-    u, w = _gauss(model.nodes + 2, 2)  # the branch may start just before the split
-    turn = _turning_angle(state, model.exit_ratio)
-    theta = state.entry_angle
-    front = (theta - turn) / (theta * (1.0 - rho))
-    rear = (turn - model.exit_ratio * theta) / (theta * (rho - model.exit_ratio))
-    split = np.clip(np.where(turn > rho * theta, front, rear), 0.0, 1.0)
-    split = np.where(np.isfinite(turn), split, 1.0)
-    x = np.concatenate([split * x, split + (1.0 - split) * u])
-    return x, np.concatenate([split * xw, (1.0 - split) * w])
-
-
-def _turning_angle(state: WheelState, exit_ratio: float) -> Array:
-    """Angle where the shear displacement of a skidding wheel is back at zero; nan if nowhere."""
-    entry, carry = state.entry_angle, 1.0 - state.slip
-
-    def displacement(angle: Array) -> Array:
-        return np.asarray(entry - angle - carry * (np.sin(entry) - np.sin(angle)))
-
-    # The displacement peaks where carry cos(angle) = 1 and is zero once behind that.
-    high = np.where(carry * np.cos(entry) < 1.0, np.arccos(np.minimum(1.0 / carry, 1.0)), np.nan)
-    low = exit_ratio * entry
-    high = np.where(displacement(low) < 0.0, high, np.nan)
-    for _ in range(50):
-        middle = (low + high) / 2.0
-        negative = displacement(middle) < 0.0
-        low, high = np.where(negative, middle, low), np.where(negative, high, middle)
-    return np.asarray((low + high) / 2.0)
-
-
-def _integrate(
-    state: WheelState, model: WheelModel, skid: bool, derivatives: bool, only_entry_angle: bool
-) -> tuple[Array, Array]:
-    """Forces (3, N) and derivatives (3, inputs, N) of a state of rows (N,) or floats.
-
-    Arrays inside are (nodes, N): the nodes of the front branch, then those of the rear.
+    A field of normal stress P with one of shear stress Q adds P cos + Q sin to the load,
+    Q cos - P sin to the drawbar pull and Q to the torque.  normal is the normal stress;
+    the shear stress is tan_phi rubbed + c stuck; mobilising is its derivative by the
+    displacement j_K over K.
     """
-    theta1, slip, r, b, K_L, n, tan_phi, c, K = state
-    rho = model.peak_c1 + model.peak_c2 * slip if model.peak_c2 else model.peak_c1
-    eps = model.exit_ratio
-    x, w = _nodes(state, rho, model, skid)
-    m = len(x)
 
-    share = _stack(1.0 - (1.0 - rho) * x, eps + (rho - eps) * x)
-    weight = _stack((1.0 - rho) * w, (rho - eps) * w)
-    theta = theta1 * share
-    sin = np.sin(theta)
-    cos = np.sqrt(1.0 - sin * sin)
-    sin1, cos1 = np.sin(theta1), np.cos(theta1)
-    depth = np.maximum(cos[:m] - cos1, 1e-300)
-    log_z = np.log(r * depth)
-    sigma = K_L * np.exp(n * log_z)  # the rear takes the front's stress (eqs. 5-9)
-    sw = _stack(sigma, sigma) * weight
-    travel = sin1 - sin
-    j_K = (r / K) * ((theta1 - theta) - (1.0 - slip) * travel)
+    rim: Rim
+    share: Array
+    weight: Array
+    log_z: Array  # (M, N)
+    normal: Array
+    rubbed: Array
+    stuck: Array
+    shear_share: Array
+    shear_slope: Array
+    j_K: Array
+
+
+def _stress(state: WheelState, model: WheelModel, skid: bool) -> _Stress:
+    theta, slip, r, _, K_L, n, _, _, K = state
+    q = model.quadrature
+    if skid or model.peak_c2:
+        peak = np.asarray(model.peak_c1 + model.peak_c2 * slip)
+        x, w = split_nodes(theta, slip, peak, q) if skid else gauss(q.nodes, q.power)
+        share, weight = on_branches(x, w, peak, q.exit)
+        rim = rim_at(theta, share, r / K)
+    else:
+        share, weight = fixed_shares(q)
+        rim = rim_of_fixed_shares(theta, q, r / K)
+    log_z = np.log(r * rim.depth)
+    sigma = np.exp(n * log_z + np.log(K_L))  # the rear takes the front's stress (eqs. 5-9)
+    normal = sigma * weight
+    j_K = slip * rim.travel
+    j_K += rim.creep
     g, dg = SHEAR_LAWS[model.shear_law](j_K)
-    tg = tan_phi * g
-    tau = tg * sw + (c * g) * weight
+    return _Stress(rim, share, weight, log_z, normal, normal * g, weight * g, g, dg, j_K)
 
-    area = r * b * theta1
-    unit = np.stack([area, area, r * area])
-    ones = np.ones_like(sin)
-    # Rows of W, DP and T as a normal and as a shear stress enter them.
-    enters = np.stack([_contract(sw, cos), -_contract(sw, sin), 0.0 * area])
-    rim = np.stack([sin, cos, ones])
-    integral = enters + _contract(tau, rim)
-    forces = unit * integral
-    if not derivatives:
-        return forces, np.empty((3, 0, 0))
 
-    mobilising = (c * weight + tan_phi * sw) * dg
-    deepening = (sin1 - sin[:m] * share[:m]) / depth
-    entry_normal = n * sw * _stack(deepening, deepening)
-    entry_shear = mobilising * ((r / K) * ((1.0 - share) - (1.0 - slip) * (cos1 - cos * share)))
-    turned = np.stack([tau * cos - sw * sin, -tau * sin - sw * cos])
+def _shear(at: _Stress, state: WheelState) -> tuple[Array, Array]:
+    """Shear stress and its derivative by j/K."""
+    tau = state.tan_phi * at.rubbed + state.c * at.stuck
+    mobilising = state.tan_phi * at.normal
+    mobilising += state.c * at.weight
+    mobilising *= at.shear_slope
+    return tau, mobilising
 
-    def by_turning(turn: Array) -> Array:
-        """Change when the nodes move by an angle, the stresses held."""
-        return np.concatenate([_contract(np.broadcast_to(turn, sin.shape), turned), 0.0 * area[None, :]])
 
-    shared = np.stack([cos, -sin, 0.0 * sin]) + tg * rim  # a normal stress with the shear it mobilises
-    if only_entry_angle:
-        entry = _contract(entry_normal, shared) + _contract(entry_shear, rim) + by_turning(share) + integral / theta1
-        return forces, (unit * entry)[:, None, :]
+def _entering(at: _Stress, state: WheelState, tau: Array, mobilising: Array) -> tuple[Array, Array]:
+    """Fields by the entry angle: stresses grow, and the nodes turn with it.  The torque wants Q + share normal."""
+    normal = at.normal * (state.n * at.rim.deepening)
+    rate = state.slip * at.rim.travel_rate
+    rate += at.rim.creep_rate
+    rate *= mobilising
+    shear = at.shear_share * normal
+    shear *= state.tan_phi
+    shear += rate
+    shear -= at.share * at.normal
+    normal += at.share * tau
+    return normal, shear
 
-    normal = [entry_normal, sw, sw * _stack(log_z, log_z)]
-    shear = [entry_shear, mobilising * travel, sw * g, weight * g, mobilising * j_K]
-    entry, by_K_L, by_n = _contract(np.stack(normal), shared)
-    entry_by_shear, by_slip, by_phi, by_c, by_K = _contract(np.stack(shear), rim)
-    by_slip = by_slip * (r / K)
+
+def _unit(state: WheelState) -> Array:
+    """What turns an integral over shares of the entry angle into W, DP and T (3, N)."""
+    area = state.radius * state.width * state.entry_angle
+    return np.asarray(np.stack([area, area, state.radius * area]))
+
+
+def _dot(field: Array, rows: Array) -> Array:
+    return np.asarray(np.einsum("bmn,bmn->n", field, rows))
+
+
+def _load_and_slope(state: WheelState, model: WheelModel, skid: bool) -> Array:
+    """Load and its derivative by the entry angle (2, N)."""
+    at = _stress(state, model, skid)
+    tau, mobilising = _shear(at, state)
+    normal, shear = _entering(at, state, tau, mobilising)
+    sin, cos = at.rim.sin, at.rim.cos
+    load = _dot(at.normal, cos) + _dot(tau, sin)
+    slope = _dot(normal, cos) + _dot(shear, sin) + load / state.entry_angle
+    return np.asarray(np.stack([load, slope]) * (state.radius * state.width * state.entry_angle))
+
+
+def _forces(state: WheelState, model: WheelModel, skid: bool) -> Array:
+    """W, DP and T (3, N)."""
+    at = _stress(state, model, skid)
+    return _unit(state) * _whole(_integrals(np.stack([at.normal, at.rubbed, at.stuck]), 1, at.rim), state)
+
+
+def _integrals(fields: Array, n_normal: int, rim: Rim) -> Array:
+    """What fields (F, 2, M, N), the first few of normal stress and the rest of shear, add to W, DP and T (3, F, N)."""
+    along, across = (np.einsum("fbmn,bmn->fn", fields, rows) for rows in (rim.cos, rim.sin))
+    out = np.empty((3, *along.shape))
+    normal, shear = slice(n_normal), slice(n_normal, None)
+    out[0, normal], out[0, shear] = along[normal], across[shear]
+    out[1, normal], out[1, shear] = -across[normal], along[shear]
+    out[2, normal] = 0.0
+    fields[shear].sum(axis=(1, 2), out=out[2, shear])
+    return out
+
+
+def _whole(parts: Array, state: WheelState) -> Array:
+    """Integrals (3, N) of the stresses from those of the normal, the rubbed and the stuck part."""
+    return np.asarray(parts[:, 0] + (state.tan_phi * parts[:, 1] + state.c * parts[:, 2]))
+
+
+def _forces_and_jacobian(state: WheelState, model: WheelModel, skid: bool) -> Array:
+    """W, DP and T and their derivatives by INPUTS (3 + 21, N)."""
+    at = _stress(state, model, skid)
+    tau, mobilising = _shear(at, state)
+    changes = np.empty((6, *at.normal.shape))
+    np.multiply(at.normal, at.log_z, out=changes[0])
+    changes[1], changes[2] = _entering(at, state, tau, mobilising)
+    np.multiply(at.rubbed, at.log_z, out=changes[3])
+    np.multiply(mobilising, at.rim.travel, out=changes[4])
+    np.multiply(mobilising, at.j_K, out=changes[5])
+    parts = _integrals(np.stack([at.normal, at.rubbed, at.stuck]), 1, at.rim)
+    by_normal, by_rubbed, by_stuck = parts.swapaxes(0, 1)
+    deeper, pressed, turned, rubbed_deeper, by_slip, by_K = _integrals(changes, 2, at.rim).swapaxes(0, 1)
+    turned[2] += _dot(at.normal, np.broadcast_to(at.share, at.normal.shape))
     if model.peak_c2:
-        shift = theta1 * _stack(x, x)
-        lift = -sin[:m] * shift[:m] / depth
-        spread = _stack(0.0 * x - 1.0 / (1.0 - rho), 0.0 * x + 1.0 / (rho - eps))
-        by_slip = by_slip + model.peak_c2 * (
-            _contract(n * sw * _stack(lift, lift) + sw * spread, shared)
-            + _contract(mobilising * ((r / K) * ((1.0 - slip) * cos - 1.0) * shift) + c * g * weight * spread, rim)
-            + by_turning(shift)
-        )
-    entry = entry + entry_by_shear + by_turning(share) + integral / theta1
-    jacobian = np.stack([entry, by_slip, by_K_L / K_L, by_n, by_phi, by_c, by_K / -K], axis=1)
-    return forces, unit[:, None, :] * jacobian
+        by_slip = by_slip + model.peak_c2 * _by_peak(at, state, model, tau, mobilising)
+    whole, unit = _whole(parts, state), _unit(state)
+    columns = (
+        pressed + turned + whole / state.entry_angle,
+        by_slip,
+        (by_normal + state.tan_phi * by_rubbed) / state.K_L,
+        deeper + state.tan_phi * rubbed_deeper,
+        by_rubbed,
+        by_stuck,
+        by_K / -state.K,
+    )
+    out = np.empty((3 + 3 * len(INPUTS), len(state.entry_angle)))
+    np.multiply(unit, whole, out=out[:3])
+    jacobian = out[3:].reshape(3, len(INPUTS), -1)
+    for column, derivative in enumerate(columns):
+        np.multiply(unit, derivative, out=jacobian[:, column])
+    return out
 
 
-def _stack(front: Any, rear: Any) -> Array:
-    return np.concatenate([front, rear])
-
-
-def _contract(fields: Array, rows: Array) -> Array:
-    """Sums over the nodes of fields (..., nodes, N) times rows (..., nodes, N): (fields, rows, N)."""
-    subscripts = "...mn,rmn->...rn" if rows.ndim == 3 else "mn,mn->n"
-    return np.asarray(np.einsum(subscripts, fields, rows))
+def _by_peak(at: _Stress, state: WheelState, model: WheelModel, tau: Array, mobilising: Array) -> Array:
+    """Derivatives (3, N) of the integrals by the ratio of the angle of greatest stress to the entry angle."""
+    rim, peak = at.rim, model.peak_c1 + model.peak_c2 * state.slip
+    turn = state.entry_angle * (1.0 - at.share[0]) / (1.0 - peak)
+    spread = np.stack([-1.0 / (1.0 - peak), 1.0 / (peak - model.exit_ratio)])[:, None]
+    growth = spread - state.n * rim.sin[0] * turn / rim.depth
+    glide = state.radius / state.K * ((1.0 - state.slip) * rim.cos - 1.0)
+    shear = state.tan_phi * at.rubbed * growth + mobilising * glide * turn + state.c * at.stuck * spread
+    normal = at.normal * growth + turn * tau
+    around = shear.sum((0, 1))
+    shear = shear - turn * at.normal
+    load = _dot(normal, rim.cos) + _dot(shear, rim.sin)
+    return np.stack([load, _dot(shear, rim.cos) - _dot(normal, rim.sin), around])

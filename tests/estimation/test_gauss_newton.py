@@ -1,0 +1,316 @@
+"""The window estimator on simulated drives: honest, robust, and the same from wherever it starts."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from soilbus.estimation.coordinates import BOUND, Coordinates
+from soilbus.estimation.gauss_newton import descend, fit_window, resume, solved, starting_soils
+from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+from soilbus.estimation.window import Rig, Window
+from soilbus.terra.soils import SOILS
+from soilbus.terra.wheel import Soil
+
+QUANTITIES = ("torque", "load", "speed", "sinkage", "ground_speed", "draft", "pitch", "acceleration")
+
+
+def deviations(fit, soil):
+    """Estimate less truth in the estimate's own standard deviations, parameter by parameter (free ones)."""
+    std = np.sqrt(np.diag(fit.posterior.log_covariance))
+    free = std > 0.0
+    return np.log(np.asarray(fit.posterior.soil)[free] / np.asarray(soil)[free]) / std[free]
+
+
+def changed(window: Window, **changes) -> Window:
+    """A copy of the window whose columns the changes (functions working in place) have been at."""
+    window = window.rows(np.arange(len(window.t)))
+    for quantity, change in changes.items():
+        change(getattr(window, quantity))
+    return window
+
+
+def set_nan(*index):
+    def change(column):
+        column[index if len(index) > 1 else index[0]] = np.nan
+
+    return change
+
+
+EVERYTHING = set_nan(Ellipsis)
+
+
+@pytest.fixture(scope="module")
+def wet_clay(simulated):
+    return simulated(SOILS["wet_clay"], 50)
+
+
+@pytest.fixture(scope="module")
+def wet_clay_fit(wet_clay):
+    return fit_window(wet_clay.problem(), wet_clay.prior)
+
+
+def test_errors_are_as_large_as_the_posterior_says(simulated):
+    # 48 drives with their own noise, gains and wrong ideas of c and K.
+    z, chi2, spread = [], [], []
+    for k, name in enumerate(("loam", "clayey_soil_38", "wet_clay")):
+        for seed in range(16):
+            case = simulated(SOILS[name], 1000 * k + seed)
+            fit = fit_window(case.problem(), case.prior)
+            assert fit.converged
+            bearing, tan_phi = fit.posterior.bearing_pressure(0.02, 0.3), fit.posterior.tan_phi()
+            n = fit.posterior.parameters()["n"]
+            truth = (case.soil.bearing_pressure(0.02, 0.3), np.tan(case.soil.phi), case.soil.n)
+            z.append([(e.value - t) / e.std for e, t in zip((bearing, tan_phi, n), truth, strict=True)])
+            chi2.append(fit.chi2)
+            spread.append((bearing.std / bearing.value, tan_phi.std / tan_phi.value))
+    rms = np.sqrt(np.mean(np.square(z), axis=0))
+    assert np.all((rms > 0.8) & (rms < 1.25)), rms
+    assert np.abs(np.mean(z, axis=0)).max() < 0.4  # 2.8 standard errors
+    assert np.mean(chi2) == pytest.approx(1.0, abs=0.05)
+    assert np.median(spread, axis=0).max() < 0.03  # and they are small
+
+
+def test_the_same_optimum_from_all_starts(wet_clay, wet_clay_fit):
+    problem, prior = wet_clay.problem(), wet_clay.prior
+    for start in starting_soils(prior):
+        fit = descend(problem, prior, start)
+        assert fit.converged
+        assert fit.cost == pytest.approx(wet_clay_fit.cost, abs=0.01)
+        assert np.abs(deviations(fit, wet_clay_fit.posterior.soil)).max() < 0.05
+        assert fit.posterior.log_covariance == pytest.approx(wet_clay_fit.posterior.log_covariance, rel=0.01, abs=1e-6)
+
+
+def test_resuming_from_any_neighbour_ends_where_a_fresh_fit_does(wet_clay, wet_clay_fit, simulated):
+    problem, prior = wet_clay.problem(), wet_clay.prior
+    again = resume(problem, prior, wet_clay_fit)
+    assert again.converged
+    assert again.iterations <= 3
+    assert np.abs(deviations(again, wet_clay_fit.posterior.soil)).max() < 0.05
+    other = simulated(SOILS["wet_clay"], 51)
+    neighbour = fit_window(other.problem(), prior)
+    fit = resume(problem, prior, neighbour)
+    assert fit.converged
+    assert np.abs(deviations(fit, wet_clay_fit.posterior.soil)).max() < 0.05
+
+
+def test_the_prior_counts_as_one_measurement_more(wet_clay, wet_clay_fit):
+    # Near the optimum all is linear: a tighter prior moves estimate and covariance as Bayes' rule for
+    # Gaussians does.
+    prior, posterior = wet_clay.prior, wet_clay_fit.posterior
+    k = PARAMETERS.index("phi")
+    tight = prior.log_std.copy()
+    tight[k] = np.sqrt(posterior.log_covariance[k, k])
+    target = posterior.soil.phi * np.exp(0.5 * tight[k])
+    median = prior.median.copy()
+    median[k] = target
+    fit = fit_window(wet_clay.problem(), SoilPrior(median, tight))
+    before = (np.log(prior.median[k]), 1.0 / prior.log_std[k] ** 2)
+    precision = 1.0 / posterior.log_covariance[k, k] - before[1] + 1.0 / tight[k] ** 2
+    pulled = (1.0 / posterior.log_covariance[k, k]) * np.log(posterior.soil.phi) - before[0] * before[1]
+    expected = (pulled + np.log(target) / tight[k] ** 2) / precision
+    assert fit.posterior.log_covariance[k, k] == pytest.approx(1.0 / precision, rel=0.02)
+    assert np.log(fit.posterior.soil.phi) == pytest.approx(expected, abs=0.05 * tight[k])
+
+
+def test_what_a_window_cannot_tell_stays_at_the_prior(simulated):
+    # One wheel's torque at one operating point, alone, tells one combination of the parameters.
+    case = simulated(SOILS["loam"], 60)
+    same = np.full(60, 30)
+    window = case.window.rows(same)
+    window = changed(window, sinkage=EVERYTHING, draft=EVERYTHING, torque=set_nan(slice(None), slice(1, None)))
+    fit = fit_window(case.problem(window), case.prior)
+    std = np.sqrt(np.diag(fit.posterior.log_covariance))
+    assert np.all(std <= case.prior.log_std * (1.0 + 1e-9))
+    scaled = fit.posterior.log_covariance / np.outer(case.prior.log_std, case.prior.log_std)
+    told, *rest = np.linalg.eigvalsh(scaled)
+    assert told < 0.1
+    assert min(rest) > 0.99
+    away = np.log(np.asarray(fit.posterior.soil) / case.prior.median) / case.prior.log_std
+    assert np.abs(away).max() < 2.0
+
+
+def test_held_parameters_are_held_exactly(wet_clay):
+    values = dict(zip(PARAMETERS, wet_clay.soil, strict=True))
+    held = {name: (v, 0.0 if name in ("c", "K", "k_c") else v) for name, v in values.items()}
+    fit = fit_window(wet_clay.problem(), SoilPrior.from_value_std(held))
+    soil = fit.posterior.soil
+    assert (soil.c, soil.K, soil.k_c) == (values["c"], values["K"], values["k_c"])
+    covariance = fit.posterior.log_covariance
+    for name in ("c", "K", "k_c"):
+        assert not covariance[PARAMETERS.index(name)].any()
+        assert not covariance[:, PARAMETERS.index(name)].any()
+    assert np.abs(deviations(fit, wet_clay.soil)).max() < 3.0
+    everything = fit_window(wet_clay.problem(), SoilPrior.from_value_std({n: (v, 0.0) for n, v in values.items()}))
+    assert everything.posterior.soil == wet_clay.soil
+    assert everything.converged
+
+
+def test_a_cohesionless_soil_with_c_held_at_zero(simulated):
+    sand = SOILS["dry_sand"]._replace(c=0.0, k_c=2e3)
+    case = simulated(sand, 70, ["soil.c.value=0", "soil.c.std=0"])
+    fit = fit_window(case.problem(), case.prior)
+    assert fit.converged
+    assert fit.posterior.soil.c == 0.0
+    assert fit.chi2 == pytest.approx(1.0, abs=0.15)
+    assert np.abs(deviations(fit, sand)).max() < 3.0
+
+
+MISSING = {
+    "torque of one wheel": {"torque": set_nan(slice(None), 0)},
+    "draft": {"draft": EVERYTHING},
+    "sinkage": {"sinkage": EVERYTHING},
+    "pitch and acceleration": {"pitch": EVERYTHING, "acceleration": EVERYTHING},
+    "load of one wheel": {"load": set_nan(slice(None), 3)},
+    "two seconds of everything": dict.fromkeys(QUANTITIES, set_nan(slice(40, 60))),
+    "a third of the ground speeds": {"ground_speed": set_nan(slice(None, None, 3))},
+}
+
+
+@pytest.mark.parametrize("what", MISSING)
+def test_what_is_missing_makes_wider_not_wrong(what, wet_clay, wet_clay_fit):
+    problem = wet_clay.problem(changed(wet_clay.window, **MISSING[what]))
+    fit = fit_window(problem, wet_clay.prior)
+    assert fit.converged
+    assert fit.chi2 == pytest.approx(1.0, abs=0.15)
+    assert np.abs(deviations(fit, wet_clay.soil)).max() < 3.5
+    bearing, full = (f.posterior.bearing_pressure(0.02, 0.3) for f in (fit, wet_clay_fit))
+    assert bearing.std > 0.98 * full.std
+    assert bearing.std < 0.15 * bearing.value
+
+
+def test_scattered_nan_bins(wet_clay, wet_clay_fit):
+    rng = np.random.default_rng(2)
+    holes = {}
+    for quantity in QUANTITIES:
+        mask = rng.random(getattr(wet_clay.window, quantity).shape) < 0.1
+        holes[quantity] = lambda column, mask=mask: np.putmask(column, mask, np.nan)
+    fit = fit_window(wet_clay.problem(changed(wet_clay.window, **holes)), wet_clay.prior)
+    assert fit.converged
+    assert fit.rows < wet_clay_fit.rows
+    assert np.abs(deviations(fit, wet_clay.soil)).max() < 3.5
+
+
+def hit(value, *index):
+    def change(column):
+        column[index if len(index) > 1 else index[0]] = value
+
+    return change
+
+
+NONSENSE = {
+    "all missing": dict.fromkeys(QUANTITIES, EVERYTHING),
+    "no torque, draft or sinkage": {"torque": EVERYTHING, "draft": EVERYTHING, "sinkage": EVERYTHING},
+    "huge torque": {"torque": hit(1e300, 5, 1)},
+    "huge load": {"load": hit(1e300, 5, 1)},
+    "infinite draft": {"draft": hit(np.inf, 7)},
+    "infinite speed": {"speed": hit(np.inf, 7, 2)},
+    "loads of a feather": {"load": hit(1e-9, Ellipsis)},
+    "negative torques": {"torque": lambda column: np.negative(column, out=column)},
+    "huge ground speed": {"ground_speed": hit(1e200, 3)},
+    "loads of a ship": {"load": lambda column: np.multiply(column, 1e4, out=column)},
+    "zero torque": {"torque": hit(0.0, Ellipsis)},
+}
+
+
+@pytest.mark.parametrize("what", NONSENSE)
+def test_nonsense_raises_nothing_and_is_never_a_good_fit(what, wet_clay):
+    problem = wet_clay.problem(changed(wet_clay.window, **NONSENSE[what]))
+    fit = fit_window(problem, wet_clay.prior)
+    if fit is None:
+        return
+    assert np.isfinite(np.asarray(fit.posterior.soil)).all()
+    assert np.isfinite(fit.posterior.log_covariance).all()
+    good = fit.converged and fit.chi2 < 1.1 + 3.5 * np.sqrt(2.0 / max(fit.rows, 1))
+    if what in ("all missing", "no torque, draft or sinkage"):
+        assert fit.rows == 0
+        assert np.abs(np.log(np.asarray(fit.posterior.soil) / wet_clay.prior.median)).max() < 1e-6
+    elif what in ("infinite draft", "infinite speed", "huge ground speed"):
+        assert fit.rows < wet_clay.problem().n_rows  # such a reading is not used at all
+    else:
+        assert not good
+
+
+def test_a_soil_far_outside_the_model_is_no_good_fit(wet_clay):
+    def shuffle(column):
+        np.random.default_rng(0).shuffle(column)
+
+    fit = fit_window(wet_clay.problem(changed(wet_clay.window, torque=shuffle)), wet_clay.prior)
+    assert fit is None or not fit.converged or fit.chi2 > 2.0
+
+
+def test_order_of_wheels_does_not_matter(wet_clay, wet_clay_fit):
+    order = [2, 0, 3, 1]
+    rig = wet_clay.rig
+    mixed = Rig(
+        tuple(rig.wheels[i] for i in order), rig.radius[order], rig.width[order], rig.front[order],
+        rig.chassis, rig.noise,
+    )  # fmt: skip
+    wheel = {q: getattr(wet_clay.window, q)[:, order] for q in ("torque", "load", "speed", "sinkage")}
+    variance = {q: v[:, order] if v.ndim == 2 else v for q, v in wet_clay.window.variance.items()}
+    window = dataclasses.replace(wet_clay.window, variance=variance, **wheel)
+    fit = fit_window(wet_clay.problem(window, mixed), wet_clay.prior)
+    assert np.abs(deviations(fit, wet_clay_fit.posterior.soil)).max() < 1e-3
+    assert fit.cost == pytest.approx(wet_clay_fit.cost, rel=1e-6)
+    assert fit.sinkage == pytest.approx(wet_clay_fit.sinkage[order], rel=1e-4)
+
+
+def test_gains_take_up_a_wrong_gain(wet_clay, wet_clay_fit):
+    def off(column):
+        column[:, 2] *= 1.02  # four times the load cell's gain error
+
+    fit = fit_window(wet_clay.problem(changed(wet_clay.window, load=off)), wet_clay.prior)
+    names = wet_clay.problem().gain_names
+    change = fit.gains - wet_clay_fit.gains
+    assert names[int(np.argmax(change))] == "load.RL"
+    assert 0.005 < change.max() < 0.02
+
+
+def test_mean_sinkage_is_the_simulated_one(wet_clay, wet_clay_fit):
+    measured = np.nanmean(wet_clay.window.sinkage, axis=0)  # 4 mm of noise, 500 samples
+    assert wet_clay_fit.sinkage == pytest.approx(measured, abs=6e-4)
+
+
+def test_coordinates_and_back(wet_clay):
+    rng = np.random.default_rng(1)
+    coordinates = Coordinates(wet_clay.prior, 0.32)
+    soil = np.asarray(wet_clay.soil)
+    for _ in range(20):
+        soil = np.asarray(wet_clay.soil) * np.exp(rng.normal(0.0, 0.3, 6))
+        assert coordinates.soil_at(coordinates.position(soil)) == pytest.approx(soil, rel=1e-12)
+    directions = coordinates.log_directions(soil)
+    for k in range(6):
+        h = 1e-6 * np.eye(6)[k]
+        up, down = (coordinates.soil_at(coordinates.position(soil) + s * h) for s in (1, -1))
+        assert np.log(up / down) / 2e-6 == pytest.approx(directions[:, k], abs=1e-8)
+    far = coordinates.moved(soil, np.full(6, 1e6))
+    for _ in range(50):
+        far = coordinates.moved(far, np.full(6, 1e6))
+    away = np.abs(np.log(far / wet_clay.prior.median)) / wet_clay.prior.log_std
+    assert away.max() < BOUND * (1.0 + 1e-9)
+
+
+def test_starts_stay_near_the_prior_and_hold_what_is_held():
+    prior = SoilPrior.from_value_std(dict(zip(PARAMETERS, [(v, 0.3 * v) for v in SOILS["loam"]], strict=True)))
+    prior.log_std[4] = 0.0
+    for soil in starting_soils(prior):
+        assert soil.c == SOILS["loam"].c
+        free = prior.free
+        away = np.log(np.asarray(soil)[free] / prior.median[free]) / prior.log_std[free]
+        assert np.abs(away).max() < 2.0 + 1e-9
+    assert starting_soils(prior)[0] == pytest.approx(Soil(*prior.median))
+
+
+def test_solved():
+    root = np.random.default_rng(0).normal(size=(5, 5)) * np.geomspace(1e-6, 1e6, 5)
+    information = root.T @ root
+    gradient = information @ np.arange(5.0)
+    step, inverse = solved(information, gradient)
+    scale = np.sqrt(np.diag(information))  # spread over twelve decades
+    assert step * scale == pytest.approx(np.arange(5.0) * scale, rel=1e-8, abs=1e-6)
+    assert inverse * np.outer(scale, scale) == pytest.approx(np.linalg.inv(information / np.outer(scale, scale)))
+    with np.errstate(all="ignore"):
+        assert solved(np.zeros((2, 2)), np.zeros(2)) is None
+        assert solved(np.full((2, 2), np.nan), np.zeros(2)) is None

@@ -1,0 +1,84 @@
+"""Prior moments and propagation of uncertainty against Monte Carlo of the log-normal."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
+from soilbus.terra.soils import SOILS
+from soilbus.terra.wheel import Soil
+
+LOAM = SOILS["loam"]
+VALUES = dict(zip(PARAMETERS, LOAM, strict=True))
+
+
+def correlated(size: float, seed: int = 0) -> np.ndarray:
+    """A covariance of logarithms with strong correlations and sd of about `size`."""
+    root = np.random.default_rng(seed).normal(0.0, size / np.sqrt(6.0), (6, 6))
+    return root @ root.T
+
+
+def draws(posterior: Posterior, n: int) -> np.ndarray:
+    logs = np.random.default_rng(1).multivariate_normal(np.log(posterior.soil), posterior.log_covariance, n)
+    return np.exp(logs)
+
+
+@settings(derandomize=True, deadline=None, max_examples=25)
+@given(value=st.floats(1e-3, 1e6), share=st.floats(0.01, 1.0))
+def test_prior_is_log_normal_with_that_median_and_coefficient_of_variation(value, share):
+    prior = SoilPrior.from_value_std(dict.fromkeys(PARAMETERS, (value, share * value)))
+    assert prior.median == pytest.approx(np.full(6, value))
+    n = 200_000
+    sample = np.exp(np.log(value) + prior.log_std[0] * np.random.default_rng(2).standard_normal(n))
+    assert np.median(sample) == pytest.approx(value, rel=0.01)
+    assert sample.std() / sample.mean() == pytest.approx(share, rel=0.05)
+    assert prior.free.tolist() == list(range(6))
+
+
+def test_a_parameter_without_std_is_held():
+    given_ = {name: (v, 0.0 if name in ("c", "K") else 0.3 * v) for name, v in VALUES.items()} | {"c": (0.0, 0.0)}
+    prior = SoilPrior.from_value_std(given_)
+    assert prior.free.tolist() == [0, 1, 2, 3]
+    assert prior.log_std[4:].tolist() == [0.0, 0.0]
+    assert prior.median[4] == 0.0
+
+
+def test_parameters_come_with_their_std():
+    posterior = Posterior(LOAM, np.diag([0.1, 0.2, 0.05, 0.02, 0.0, 0.3]) ** 2)
+    estimates = posterior.parameters()
+    assert list(estimates) == list(PARAMETERS)
+    assert estimates["k_phi"].value == LOAM.k_phi
+    assert estimates["k_phi"].std == pytest.approx(0.2 * LOAM.k_phi)
+    assert estimates["c"].std == 0.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_bearing_pressure_and_tan_phi_against_monte_carlo(seed):
+    soil = list(SOILS.values())[seed * 5]
+    posterior = Posterior(soil, correlated(0.03, seed))
+    sample = Soil(*draws(posterior, 200_000).T)
+    pressure = (sample.k_c / 0.3 + sample.k_phi) * 0.02**sample.n
+    bearing = posterior.bearing_pressure(0.02, 0.3)
+    assert bearing.value == pytest.approx((soil.k_c / 0.3 + soil.k_phi) * 0.02**soil.n, rel=1e-12)
+    assert bearing.std == pytest.approx(pressure.std(), rel=0.03)
+    assert posterior.tan_phi().value == pytest.approx(np.tan(soil.phi), rel=1e-12)
+    assert posterior.tan_phi().std == pytest.approx(np.tan(sample.phi).std(), rel=0.03)
+
+
+def test_any_scalar_is_propagated_by_its_gradient():
+    posterior = Posterior(LOAM, correlated(0.02, 7))
+    weights = np.array([1e-3, 2e-6, 3.0, -4.0, 1e-3, 50.0])
+    sample = draws(posterior, 200_000) @ weights
+    assert posterior.propagate(weights) == pytest.approx(sample.std(), rel=0.02)
+    assert posterior.propagate(np.zeros(6)) == 0.0
+    certain = Posterior(LOAM._replace(c=0.0), np.zeros((6, 6)))
+    assert certain.propagate(weights) == 0.0
+    assert certain.bearing_pressure(0.02, 0.3).std == 0.0
+
+
+def test_a_round_off_negative_variance_is_no_nan():
+    covariance = np.diag([1e-4, -1e-20, 0.0, 0.0, 0.0, 0.0])
+    assert Posterior(LOAM, covariance).propagate(np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])) == 0.0
