@@ -88,7 +88,7 @@ def test_limits_come_from_the_vehicle(tmp_path: Path) -> None:
     assert limits == {
         "torque.W": (-weight, weight),
         "speed.W": (-50.0, 50.0),
-        "load.W": (0.0, 5.0 * weight),
+        "load.W": (-0.02 * weight, 5.0 * weight),
         "sinkage.W": (-0.05, 0.5),
         "acceleration": (-20.0, 20.0),
     }

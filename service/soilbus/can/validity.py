@@ -151,6 +151,8 @@ def _code_range(signal: Signal, first: int, last: int) -> tuple[int, int]:
     if not _has_range(signal):
         return first, last
     scale, offset = signal.scale, signal.offset
+    if scale == 0:  # every code means the same value
+        return first, last
     low, high = signal.minimum, signal.maximum
     if scale < 0:
         low, high = high, low

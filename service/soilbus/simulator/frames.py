@@ -14,9 +14,8 @@ from cantools.database.can import Message, Signal
 from numpy.typing import NDArray
 
 from soilbus.can.channels import Channel
-from soilbus.can.checksum import column_checksums
+from soilbus.can.checksum import COUNTER, column_checksums
 from soilbus.can.mapping import channels_of, load_databases
-from soilbus.can.checksum import COUNTER
 from soilbus.can.publish import checksum_byte, value_codes
 from soilbus.config import Config, Wheel
 from soilbus.simulator.recording import Recording
