@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -11,15 +10,9 @@ from pathlib import Path
 import pytest
 
 import guest
+from availability import unavailable
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
-
-
-def unavailable(reason: str) -> None:
-    """Skip the test, or fail it where SOILBUS_REQUIRE_GUEST=1 says that nothing may be skipped."""
-    if os.environ.get("SOILBUS_REQUIRE_GUEST") == "1":
-        pytest.fail(f"{reason} (and SOILBUS_REQUIRE_GUEST=1)", pytrace=False)
-    pytest.skip(reason)
 
 
 @pytest.fixture(scope="session")

@@ -62,16 +62,17 @@ def test_pull_curve_equals_brute_force(name):
     for graded, curve in enumerate(both(SOILS[name])):
         for i in (0, 5, 9, 13):
             pull, axles = brute(SOILS[name], curve.slip[i], bool(graded))
-            assert curve.pull[i] == pytest.approx(pull, abs=1e-4 * WEIGHT)
-            assert curve.torque[:, i] == pytest.approx(axles[2, [0, 0, 1, 1]], rel=2e-3)
-            assert curve.entry_angle[:, i] == pytest.approx(axles[3, [0, 0, 1, 1]], rel=2e-3)
+            assert curve.pull[i] == pytest.approx(pull, abs=1e-6 * WEIGHT)
+            assert curve.torque[:, i] == pytest.approx(axles[2, [0, 0, 1, 1]], rel=1e-5)
+            assert curve.entry_angle[:, i] == pytest.approx(axles[3, [0, 0, 1, 1]], rel=1e-5)
 
 
-def test_grade_without_draft_and_draft_on_the_level_differ_by_load_transfer():
-    level, graded = both(SOILS["loam"])
-    # The slope presses less on the ground and lifts the front at the height of the centre of gravity.
-    assert np.all(graded.pull < level.pull)
-    assert np.all(graded.pull > 0.9 * level.pull)
+def test_a_draft_at_the_height_of_the_centre_of_gravity_is_like_a_grade():
+    high = dataclasses.replace(RIG, chassis=dataclasses.replace(RIG.chassis, hitch_height=0.75))
+    level, graded = (pull_curve(SOILS["loam"], high, MODEL, GRID, np.full(14, g)).pull for g in (False, True))
+    second_order = (level / WEIGHT) ** 2 / 2.0  # the slope presses a little less on the ground
+    assert np.all(np.abs(graded - level) < 2.0 * second_order * WEIGHT)
+    assert np.abs(level - both(SOILS["loam"])[0].pull).max() > 20.0  # at its own height it is not
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -83,12 +84,9 @@ def test_gradients_of_a_curve_equal_finite_differences(name):
         for k, parameter in enumerate(Soil._fields):
             h = 1e-3 * soil[k]
             up, down = (both(soil._replace(**{parameter: soil[k] + s * h}), slip)[graded] for s in (1, -1))
-            scale = 2e-3
-            assert here.pull_by_soil[k] * soil[k] == pytest.approx(
-                (up.pull - down.pull) / scale, abs=2e-3 * WEIGHT / 10
-            )
-            by_torque = (up.torque - down.torque) / scale
-            assert here.torque_by_soil[:, k] * soil[k] == pytest.approx(by_torque, abs=2e-3 * here.torque.max())
+            by_pull, by_torque = (up.pull - down.pull) / 2e-3, (up.torque - down.torque) / 2e-3
+            assert here.pull_by_soil[k] * soil[k] == pytest.approx(by_pull, abs=5e-3 * np.abs(by_pull).max())
+            assert here.torque_by_soil[:, k] * soil[k] == pytest.approx(by_torque, abs=5e-3 * np.abs(by_torque).max())
 
 
 def test_a_warm_start_changes_nothing():
@@ -99,10 +97,10 @@ def test_a_warm_start_changes_nothing():
         near = soil._replace(k_phi=1.2 * soil.k_phi, n=0.95 * soil.n, c=0.8 * soil.c)
         start = pull_curve(near, RIG, MODEL, np.tile(GRID, 2), on_grade)
         warm = pull_curve(soil, RIG, MODEL, np.tile(GRID, 2), on_grade, start)
-        assert warm.pull == pytest.approx(cold.pull, abs=1e-4 * WEIGHT)
-        assert warm.pull_by_soil == pytest.approx(
-            cold.pull_by_soil, rel=1e-2, abs=1e-6 * np.abs(cold.pull_by_soil).max()
-        )
+        assert warm.pull == pytest.approx(cold.pull, abs=1e-6 * WEIGHT)
+        assert warm.torque == pytest.approx(cold.torque, rel=1e-5)
+        by_cold, by_warm = (c.pull_by_soil * np.array(soil)[:, None] for c in (cold, warm))
+        assert by_warm == pytest.approx(by_cold, abs=5e-3 * np.abs(by_cold).max())
 
 
 def total_gradient(soil: Soil, limit: np.ndarray) -> np.ndarray:
@@ -141,22 +139,27 @@ def test_unlimited_pull_is_the_best_over_slip(name):
         assert found.limit == ("slip" if np.argmax(fine.pull) == 199 else "traction")
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ["loam", "wet_clay", "sandy_loam_22"])
 @pytest.mark.parametrize("graded", [False, True])
 def test_torque_limit_is_met_exactly(name, graded):
     soil = SOILS[name]
     curve = both(soil)[graded]
-    for limit in (np.full(4, 0.7 * curve.torque.max()), np.array([np.nan, 0.6, 0.9, np.nan]) * curve.torque.max()):
+    low, high = curve.torque[:, 0], curve.torque[:, -1]
+    for share in (np.full(4, 0.7), np.array([np.nan, 0.6, 0.9, np.nan])):
+        # A front wheel may need less torque the more the draft lifts it: its limit must not bind at the start.
+        limit = np.where(np.isnan(share), np.nan, np.fmax(low + share * (high - low), 1.001 * low))
         found = largest_pull(curve, limit, soil, RIG, MODEL)
         assert found.limit == "torque"
         known = np.isfinite(limit)
 
-        def usage(slip, limit=limit, known=known):
+        def usage(slip: float, limit: np.ndarray = limit, known: np.ndarray = known) -> float:
             return (brute(soil, slip, graded)[1][2, [0, 0, 1, 1]] / limit)[known].max() - 1.0
 
         slip = brentq(usage, 0.02, 0.6, xtol=1e-7)
-        assert found.slip == pytest.approx(slip, rel=2e-3)
-        assert found.pull == pytest.approx(brute(soil, slip, graded)[0], abs=2e-4 * WEIGHT)
+        _, axles = brute(soil, found.slip, graded)
+        assert (axles[2, [0, 0, 1, 1]] / limit)[known].max() < 1.0 + 2e-4
+        assert found.slip == pytest.approx(slip, rel=1e-2)  # torque hardly changes with slip
+        assert found.pull == pytest.approx(brute(soil, slip, graded)[0], abs=1e-5 * WEIGHT)
 
 
 def test_more_torque_never_pulls_less():

@@ -16,7 +16,7 @@ from soilbus.can.dbc_files import load_databases
 from soilbus.can.decode import ColumnDecoder
 from soilbus.can.mapping import channels_of
 from soilbus.daemon.pipeline import Pipeline
-from soilbus.daemon.replay import read_log, replay
+from soilbus.daemon.replay import estimator_beside, read_log, replay
 from soilbus.report.table import table
 from soilbus.simulator.frames import frames, write_log
 from soilbus.simulator.recording import simulate
@@ -96,8 +96,9 @@ def _replay(log: Path) -> dict[str, Any]:
     config = reference_configuration()
 
     def whole() -> None:
-        for _ in replay(Pipeline(config, load_databases(config)), [log]):
-            pass
+        with estimator_beside(config) as workers:
+            for _ in replay(Pipeline(config, load_databases(config)), [log], workers=workers):
+                pass
 
     def only_read() -> None:
         for _ in read_log(log):

@@ -179,17 +179,33 @@ def largest_pull(curve: PullCurve, torque_limit: Array, soil: Soil, rig: Rig, mo
     the soil carries no steady state at all.
     """
     known = np.isfinite(torque_limit)
+    torque_limit = np.where(known, np.maximum(torque_limit, 1e-9), np.nan)
     usage = np.max(curve.torque[known] / torque_limit[known, None], axis=0, initial=0.0)
     balanced = np.isfinite(curve.pull)
     usable = balanced & (usage <= 1.0)
+    if not balanced.any():
+        return None
     if not usable.any():
-        return Capability(0.0, np.zeros(6), float(curve.slip[0]), "torque") if balanced.any() else None
+        return _short_of_torque(
+            curve, int(np.argmin(np.where(balanced, usage, np.inf))), float(usage[balanced].min()), rig
+        )
     best = int(np.argmax(np.where(usable, curve.pull, -np.inf)))
     after = best + 1
     if after < len(curve.slip) and balanced[after] and curve.pull[after] > curve.pull[best]:
         return _at_torque_limit(curve, best, torque_limit, soil, rig, model)
     limit: Literal["slip", "traction"] = "slip" if after == len(curve.slip) else "traction"
     return Capability(float(curve.pull[best]), curve.pull_by_soil[:, best], float(curve.slip[best]), limit)
+
+
+def _short_of_torque(curve: PullCurve, at: int, usage: float, rig: Rig) -> Capability:
+    """The pull left where even the least slip of the curve asks for `usage` times the torque there is.
+
+    Thrust is torque over radius and what resists stays, so the pull may well be negative:
+    then only a push or a slope moves the vehicle.
+    """
+    missing = (1.0 - 1.0 / usage) * np.sum(curve.torque[:, at] / rig.radius)
+    gradient = curve.pull_by_soil[:, at] - np.sum(curve.torque_by_soil[:, :, at] / rig.radius[:, None], axis=0)
+    return Capability(float(curve.pull[at] - missing), gradient, float(curve.slip[at]), "torque")
 
 
 def _at_torque_limit(

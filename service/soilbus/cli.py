@@ -134,7 +134,7 @@ def _replay(args: argparse.Namespace) -> None:
     from soilbus.can.dbc_files import load_databases
     from soilbus.daemon.outputs import json_line
     from soilbus.daemon.pipeline import Pipeline, WindowResult
-    from soilbus.daemon.replay import LogError, check_heard, replay
+    from soilbus.daemon.replay import LogError, check_heard, estimator_beside, replay
     from soilbus.report.progress import progress
     from soilbus.report.windows import html_report, summary
 
@@ -144,9 +144,9 @@ def _replay(args: argparse.Namespace) -> None:
         _need("matplotlib", "plots", "--report")
     results: list[WindowResult] = []
     cut_off: LogError | None = None
-    with progress("replay") as step:
+    with estimator_beside(config) as workers, progress("replay") as step:
         try:
-            for result in replay(pipeline, args.logs, step):
+            for result in replay(pipeline, args.logs, step, workers):
                 results.append(result)
             check_heard(pipeline, args.logs)
         except LogError as error:

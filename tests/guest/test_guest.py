@@ -4,9 +4,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import unavailable
 
 import guest
+from availability import unavailable
 
 ONE_FRAME = """
 import os, socket, struct

@@ -148,6 +148,12 @@ class Intake:
             self.next_end += self._settings.hop
         return tasks
 
+    def finish(self, now: float) -> list[WindowTask]:
+        """Windows still open at the end of a recording that lasts until `now` [s]."""
+        tasks = self.due(now)
+        self.ingest(math.inf)
+        return tasks + self.due(now)
+
     def _task(self, bins: BinStore, end: float) -> WindowTask:
         start = end - self._settings.window
         window = bins.window(start, end)

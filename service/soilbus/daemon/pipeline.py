@@ -5,8 +5,6 @@ No bus and no clock in here.
 
 from __future__ import annotations
 
-import math
-
 from cantools.database.can import Database
 
 from soilbus.config import Config
@@ -41,9 +39,7 @@ class Pipeline:
 
     def finish(self, now: float) -> list[WindowResult]:
         """Windows still open at the end of a recording that lasts until `now` [s]."""
-        results = self.advance(now)
-        self.intake.ingest(math.inf)
-        return results + self.advance(now)
+        return [self.estimator.solve(task) for task in self.intake.finish(now)]
 
 
 __all__ = ["Pipeline", "WindowResult"]

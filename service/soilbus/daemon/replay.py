@@ -3,30 +3,31 @@
 from __future__ import annotations
 
 import gzip
+import os
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_all_start_methods, get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
 import can
 
 from soilbus.can.candump import Frame, candump_frames, frame_of
-from soilbus.daemon.pipeline import Pipeline, WindowResult
+from soilbus.config import Config
+from soilbus.daemon.estimator import WindowEstimator, WindowResult
+from soilbus.daemon.intake import Intake, WindowTask
+from soilbus.daemon.pipeline import Pipeline
 
 _T = TypeVar("_T")
+
+MAX_AHEAD = 30
+"""Windows that may wait for the estimator."""
 
 
 class LogError(Exception):
     """A log cannot be read, or not to its end; the text says where and why."""
-
-
-@dataclass(frozen=True, slots=True)
-class ReplayCounts:
-    """Frames of all logs: read, of mapped messages, time spanned [s]."""
-
-    frames: int
-    mapped: int
-    span: float
 
 
 def read_log(path: Path) -> Iterator[can.Message]:
@@ -79,14 +80,38 @@ def _one_line(error: Exception) -> str:
 
 
 def replay(
-    pipeline: Pipeline, logs: Sequence[Path], progress: Callable[[int, float], None] | None = None
+    pipeline: Pipeline,
+    logs: Sequence[Path],
+    progress: Callable[[int, float], None] | None = None,
+    workers: Executor | None = None,
 ) -> Iterator[WindowResult]:
     """Results of every window of the logs, one after the other; LogError as read_log().
 
     `progress` is called now and then with the number of frames read and the time in the
-    recording [s].
+    recording [s].  With `workers` (of `estimator_beside`) reading and estimating go on at
+    the same time; the results are the same.
     """
-    feed = pipeline.admission.feed
+    tasks = _tasks(pipeline.intake, logs, progress)
+    if workers is None:
+        yield from map(pipeline.estimator.solve, tasks)
+        return
+    pending: deque[Future[WindowResult]] = deque()
+    cut_off: LogError | None = None
+    try:
+        for task in tasks:
+            pending.append(workers.submit(_solve, task))
+            while pending and (pending[0].done() or len(pending) > MAX_AHEAD):
+                yield pending.popleft().result()
+    except LogError as error:
+        cut_off = error
+    for future in pending:
+        yield future.result()
+    if cut_off is not None:
+        raise cut_off
+
+
+def _tasks(intake: Intake, logs: Sequence[Path], progress: Callable[[int, float], None] | None) -> Iterator[WindowTask]:
+    feed = intake.admission.feed
     last = 0.0
     n = 0
     for path in logs:
@@ -94,16 +119,45 @@ def replay(
         for t, identifier, extended, data, remote, error in read_frames(path):
             n += 1
             if error:
-                pipeline.admission.counts.error_frames += 1
+                intake.admission.counts.error_frames += 1
                 continue
             last = t
             if last >= due or last < due - 2.0:
-                yield from pipeline.advance(last)
-                due = min(pipeline.next_end, last + 1.0)
+                yield from intake.due(last)
+                due = min(intake.next_end, last + 1.0)
                 if progress is not None:
                     progress(n, last)
             feed(t, identifier, extended, data, remote)
-    yield from pipeline.finish(last)
+    yield from intake.finish(last)
+
+
+@contextmanager
+def estimator_beside(config: Config) -> Iterator[Executor | None]:
+    """A process that estimates while this one reads; None on a machine with one core."""
+    if (os.cpu_count() or 1) < 2 or "fork" not in get_all_start_methods():
+        yield None
+        return
+    with ProcessPoolExecutor(1, get_context("fork"), initializer=_begin, initargs=(config,)) as workers:
+        workers.submit(_begun).result()  # forked now, before there are threads
+        yield workers
+
+
+_estimator: WindowEstimator | None = None
+
+
+def _begin(config: Config) -> None:
+    global _estimator
+    _estimator = WindowEstimator(config)
+
+
+def _begun() -> bool:
+    return _estimator is not None
+
+
+def _solve(task: WindowTask) -> WindowResult:
+    if _estimator is None:
+        raise RuntimeError("estimator_beside() was not entered")
+    return _estimator.solve(task)
 
 
 def check_heard(pipeline: Pipeline, logs: Iterable[Path]) -> None:

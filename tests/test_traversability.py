@@ -1,0 +1,212 @@
+"""The decision: probability against Monte Carlo, and go only when everything speaks for it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from soilbus.assembly import rig_of
+from soilbus.capability import largest_pull, pull_curve, slip_grid
+from soilbus.config import Traversability as Settings
+from soilbus.estimation.posterior import Posterior
+from soilbus.simulator.reference import reference_configuration
+from soilbus.terra.soils import SOILS
+from soilbus.terra.wheel import FAST_NODES, Soil, WheelModel
+from soilbus.traversability import Demand, State, Status, judge
+
+RIG = rig_of(reference_configuration())
+MODEL = WheelModel(nodes=FAST_NODES)
+DEFAULTS = Settings()
+STRONG = np.full(4, 3000.0)
+BAD_STATUS = [s for s in Status if s is not Status.VALID]
+
+
+def posterior_of(soil: Soil, size: float = 0.05, seed: int = 0) -> Posterior:
+    root = np.random.default_rng(seed).normal(0.0, size / math.sqrt(6.0), (6, 6))
+    return Posterior(soil, root @ root.T)
+
+
+LOAM = posterior_of(SOILS["loam"])
+
+
+def decide(posterior=LOAM, status=Status.VALID, demand=Demand(2000.0, 20.0), limit=STRONG, config=DEFAULTS, rig=RIG):
+    return judge(posterior, status, demand, rig, MODEL, limit, config)[0]
+
+
+def test_an_easy_draft_on_loam_is_a_go():
+    way = decide()
+    assert way.state is State.GO
+    assert way.probability > 0.999
+    assert way.torque_available == 12_000.0
+    assert 0.0 < way.torque_required < way.torque_available
+    assert 0.05 < way.slip_needed < 0.3
+    assert way.max_draft.value > 5000.0
+    assert 0.15 < way.max_grade.value < 0.35
+
+
+def test_max_draft_and_max_grade_are_those_of_the_curve():
+    way = decide()
+    grid = slip_grid(DEFAULTS.max_slip)
+    for graded, estimate in ((False, way.max_draft), (True, way.max_grade)):
+        curve = pull_curve(LOAM.soil, RIG, MODEL, grid, np.full(len(grid), graded))
+        best = largest_pull(curve, STRONG, LOAM.soil, RIG, MODEL).pull
+        value = math.asin(best / (2300.0 * 9.80665)) if graded else best
+        assert estimate.value == pytest.approx(value, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", ["loam", "wet_clay", "clayey_soil_38"])
+@pytest.mark.parametrize("limit", [np.full(4, np.nan), np.full(4, 700.0)])
+def test_spread_of_the_capability_equals_monte_carlo(name, limit):
+    posterior = posterior_of(SOILS[name], 0.03, 3)
+    way = decide(posterior, limit=limit)
+    grid = slip_grid(DEFAULTS.max_slip)
+    drafts, grades = [], []
+    logs = np.random.default_rng(1).multivariate_normal(np.log(posterior.soil), posterior.log_covariance, 250)
+    for soil in (Soil(*row) for row in np.exp(logs)):
+        level, graded = (pull_curve(soil, RIG, MODEL, grid, np.full(len(grid), g)) for g in (False, True))
+        drafts.append(largest_pull(level, limit, soil, RIG, MODEL).pull)
+        grades.append(math.asin(largest_pull(graded, limit, soil, RIG, MODEL).pull / (2300.0 * 9.80665)))
+    for estimate, sample in ((way.max_draft, drafts), (way.max_grade, grades)):
+        assert estimate.std == pytest.approx(np.std(sample), rel=0.2)  # sampling: 4.5 %
+        assert estimate.value == pytest.approx(np.mean(sample), abs=0.4 * estimate.std)
+
+
+@pytest.mark.parametrize("status", Status)
+def test_probability_falls_with_demand_and_state_follows(status):
+    ways = [decide(status=status, demand=Demand(pull, 50.0)) for pull in np.linspace(-2000.0, 9000.0, 23)]
+    if status is Status.INVALID:
+        assert all(w.state is State.UNKNOWN and w.probability is None for w in ways)
+        return
+    probability = [w.probability for w in ways]
+    assert np.all(np.diff(probability) <= 0.0)
+    assert probability[0] > 0.999
+    assert probability[-1] < 0.001
+    for way in ways:
+        if way.probability < DEFAULTS.no_go:
+            assert way.state is State.NO_GO
+        elif way.probability >= DEFAULTS.go and status is Status.VALID:
+            assert way.state is State.GO
+        else:
+            assert way.state is State.CAUTION
+
+
+def test_probability_is_that_of_the_gaussian_margin():
+    free = decide(demand=Demand(0.0, 0.0))
+    for z in (-2.0, -0.5, 0.0, 1.0, 2.5):
+        std = math.hypot(free.max_draft.std, 300.0)
+        pull = (free.max_draft.value - z * std) / (1.0 + DEFAULTS.margin)
+        expected = 0.5 * (1.0 + math.erf(z / math.sqrt(2.0)))
+        assert decide(demand=Demand(pull, 300.0)).probability == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_margin_counts_for_pulling_only():
+    careful = Settings(margin=0.5)
+    assert (
+        decide(demand=Demand(5000.0, 100.0), config=careful).probability
+        < decide(demand=Demand(5000.0, 100.0)).probability
+    )
+    pushed = Demand(-3000.0, 100.0)
+    assert decide(demand=pushed, config=careful).probability == decide(demand=pushed).probability
+
+
+def test_weak_motors_limit():
+    weak = decide(limit=np.full(4, 500.0))
+    assert weak.limit == "torque"
+    assert weak.max_draft.value < decide().max_draft.value
+    assert decide().limit in ("slip", "traction")
+    assert decide(limit=np.full(4, 500.0), demand=Demand(4000.0, 50.0)).state is State.NO_GO
+    none = decide(limit=np.zeros(4))
+    assert none.state is not State.GO
+    assert none.torque_available == 0.0
+    unknown = decide(limit=np.array([500.0, np.nan, 500.0, 500.0]))
+    assert unknown.torque_available is None
+    assert unknown.limit == "torque"
+
+
+@pytest.mark.parametrize("status", Status)
+def test_nothing_is_known_without_a_posterior(status):
+    way = decide(posterior=None, status=status)
+    assert way.state is State.UNKNOWN
+    assert (way.probability, way.max_draft, way.max_grade, way.slip_needed) == (None,) * 4
+    assert way.torque_available == 12_000.0
+
+
+@pytest.mark.parametrize("status", Status)
+def test_nothing_is_decided_without_a_demand_or_a_vehicle(status):
+    way = decide(status=status, demand=None)
+    assert way.state is State.UNKNOWN
+    assert way.probability is None
+    assert (way.max_draft is None) == (status is Status.INVALID)
+    assert decide(status=status, rig=dataclasses.replace(RIG, chassis=None)).state is State.UNKNOWN
+
+
+def test_no_go_where_nothing_balances():
+    slush = posterior_of(SOILS["heavy_clay_40"]._replace(k_c=10.0, k_phi=500.0, c=50.0, phi=0.02))
+    way, curve = judge(slush, Status.VALID, Demand(0.0, 1.0), RIG, MODEL, STRONG, DEFAULTS)
+    assert (way.state, way.probability, way.limit) == (State.NO_GO, 0.0, "sinkage")
+    assert curve is None
+
+
+def test_a_demand_that_no_slip_gives_has_no_slip():
+    way = decide(demand=Demand(20_000.0, 10.0))
+    assert way.state is State.NO_GO
+    assert way.slip_needed is None
+    assert way.torque_required is None
+
+
+def test_a_warm_start_decides_the_same():
+    for name in ("loam", "wet_clay", "clayey_soil_38"):
+        posterior = posterior_of(SOILS[name])
+        cold, curve = judge(posterior, Status.VALID, Demand(1500.0, 50.0), RIG, MODEL, STRONG, DEFAULTS)
+        near = posterior_of(posterior.soil._replace(k_phi=1.1 * posterior.soil.k_phi))
+        _, other = judge(near, Status.VALID, Demand(1500.0, 50.0), RIG, MODEL, STRONG, DEFAULTS)
+        for start in (curve, other):
+            warm, _ = judge(posterior, Status.VALID, Demand(1500.0, 50.0), RIG, MODEL, STRONG, DEFAULTS, start)
+            assert warm.state is cold.state
+            assert warm.probability == pytest.approx(cold.probability, abs=1e-3)
+            assert warm.max_draft.value == pytest.approx(cold.max_draft.value, rel=1e-4)
+            assert warm.max_draft.std == pytest.approx(cold.max_draft.std, rel=1e-2)
+
+
+TORQUES = st.lists(
+    st.one_of(st.floats(0.0, 5e3), st.sampled_from([math.nan, math.inf, 0.0])), min_size=4, max_size=4
+).map(np.array)
+
+
+@settings(derandomize=True, deadline=None, max_examples=200)
+@given(
+    soil=st.sampled_from(list(SOILS.values())),
+    size=st.floats(0.0, 1.0),
+    status=st.sampled_from(Status),
+    demand=st.none() | st.builds(Demand, st.floats(-3e3, 2e4), st.floats(0.0, 5e3)),
+    limit=TORQUES,
+    go=st.floats(0.6, 0.99),
+    margin=st.floats(0.0, 1.0),
+)
+def test_go_only_when_everything_speaks_for_it(soil, size, status, demand, limit, go, margin):
+    config = Settings(go=go, no_go=0.5, margin=margin)
+    with np.errstate(all="ignore"):
+        way = decide(posterior_of(soil, size), status, demand, limit, config)
+    if way.state is State.GO:
+        assert status is Status.VALID
+        assert demand is not None
+        assert way.probability >= go
+        # Even one sigma of demand and capability apart from the best estimate, and with the margin.
+        assert way.max_draft.value >= demand.pull + margin * max(demand.pull, 0.0)
+        assert way.slip_needed is not None or demand.pull <= 0.0
+    for value in (way.probability, way.torque_required, way.torque_available, way.slip_needed):
+        assert value is None or not math.isnan(value)
+    for estimate in (way.max_draft, way.max_grade):
+        assert estimate is None or (math.isfinite(estimate.value) and math.isfinite(estimate.std))
+    assert way.probability is None or 0.0 <= way.probability <= 1.0
+    assert (way.state is State.UNKNOWN) == (way.probability is None)
+
+
+@pytest.mark.parametrize("status", BAD_STATUS)
+def test_a_status_that_is_not_valid_is_never_a_go(status):
+    assert decide(status=status, demand=Demand(0.0, 1.0)).state in (State.CAUTION, State.UNKNOWN)
