@@ -29,7 +29,7 @@ def wheel(soil: Soil, load: float, slip: float, radius: float, width: float) -> 
     def excess(angle: float) -> float:
         return wheel_forces(state_on(soil, angle, slip, radius, width), MODEL)[0] - load
 
-    angle = brentq(excess, 1e-4, 1.39, xtol=1e-14, rtol=1e-13)
+    angle = brentq(excess, 1e-4, 1.39, xtol=1e-10)
     return np.append(wheel_forces(state_on(soil, angle, slip, radius, width), MODEL), angle)
 
 
@@ -46,7 +46,7 @@ def brute(soil: Soil, slip: float, graded: bool) -> tuple[float, np.ndarray]:
         rear = across - front
         return np.stack([wheel(soil, front / 2, slip, 0.50, 0.26), wheel(soil, rear / 2, slip, 0.62, 0.38)], axis=1)
 
-    pull = brentq(lambda p: 2.0 * axles(p)[1].sum() - p, -0.4 * WEIGHT, 0.6 * WEIGHT, xtol=1e-7)
+    pull = brentq(lambda p: 2.0 * axles(p)[1].sum() - p, -0.75 * WEIGHT, 0.6 * WEIGHT, xtol=1e-3)
     return pull, axles(pull)
 
 
@@ -155,7 +155,7 @@ def test_torque_limit_is_met_exactly(name, graded):
         def usage(slip: float, limit: np.ndarray = limit, known: np.ndarray = known) -> float:
             return (brute(soil, slip, graded)[1][2, [0, 0, 1, 1]] / limit)[known].max() - 1.0
 
-        slip = brentq(usage, 0.02, 0.6, xtol=1e-7)
+        slip = brentq(usage, 0.02, 0.6, xtol=1e-5)
         _, axles = brute(soil, found.slip, graded)
         assert (axles[2, [0, 0, 1, 1]] / limit)[known].max() < 1.0 + 2e-4
         assert found.slip == pytest.approx(slip, rel=1e-2)  # torque hardly changes with slip
@@ -166,18 +166,33 @@ def test_more_torque_never_pulls_less():
     soil = SOILS["loam"]
     level = both(soil)[0]
     top = level.torque.max()
-    pulls = [largest_pull(level, np.full(4, t), soil, RIG, MODEL).pull for t in np.linspace(0.3, 1.2, 37) * top]
+    pulls = [largest_pull(level, np.full(4, t), soil, RIG, MODEL).pull for t in np.linspace(0.3, 1.2, 19) * top]
     assert np.all(np.diff(pulls) > -1e-4 * WEIGHT)
     assert pulls[-1] == largest_pull(level, NO_LIMIT, soil, RIG, MODEL).pull
 
 
-def test_no_torque_no_pull():
-    soil = SOILS["loam"]
+@pytest.mark.parametrize(("name", "share"), [("loam", 0.0), ("wet_clay", 0.9), ("dry_sand", 0.5)])
+def test_motors_too_weak_to_turn_the_wheels_without_a_push(name, share):
+    # The motors give less than the least slip of the curve asks for: only wheels that skid need so little.
+    soil = SOILS[name]
     level = both(soil)[0]
-    found = largest_pull(level, np.full(4, 1e-3), soil, RIG, MODEL)
-    assert (found.pull, found.limit) == (0.0, "torque")
-    with np.errstate(all="ignore"):
-        assert largest_pull(level, np.zeros(4), soil, RIG, MODEL).pull == 0.0
+    limit = share * level.torque[:, 0].min()
+    found = largest_pull(level, np.full(4, limit), soil, RIG, MODEL)
+    slip = brentq(lambda s: brute(soil, s, False)[1][2].max() - limit, -0.3, 0.02, xtol=1e-5)
+    assert found.limit == "torque"
+    assert found.slip == pytest.approx(slip, abs=1e-3)
+    assert found.pull == pytest.approx(brute(soil, slip, False)[0], abs=1e-4 * WEIGHT)
+    assert found.pull < -1000.0
+    expected = total_gradient(soil, np.full(4, limit))
+    assert found.gradient * np.asarray(soil) == pytest.approx(expected, abs=0.02 * np.abs(expected).max())
+
+
+def test_motors_too_weak_even_for_skid_push_back():
+    soil = SOILS["sandy_loam_22"]
+    level = both(soil)[0]
+    found = largest_pull(level, np.full(4, 1.0), soil, RIG, MODEL)
+    assert found.pull < level.pull.min() - 1000.0
+    assert found.limit == "torque"
 
 
 def test_buried_wheels_have_no_capability():
@@ -191,10 +206,10 @@ def test_buried_wheels_have_no_capability():
 def test_slip_for_a_pull_lies_on_the_curve():
     soil = SOILS["loam"]
     level = both(soil)[0]
-    for part in (0.3, 0.6, 0.9, 0.99):
+    for part in (0.3, 0.9):
         wanted = part * level.pull.max()
         slip, torque = slip_for_pull(level, wanted)
-        exact = brentq(lambda s, wanted=wanted: brute(soil, s, False)[0] - wanted, 0.02, 0.6, xtol=1e-6)
+        exact = brentq(lambda s, wanted=wanted: brute(soil, s, False)[0] - wanted, 0.02, 0.6, xtol=1e-5)
         assert slip == pytest.approx(exact, rel=0.05)
         assert torque == pytest.approx(2.0 * brute(soil, exact, False)[1][2].sum(), rel=0.01)
     assert slip_for_pull(level, 1.01 * level.pull.max()) is None

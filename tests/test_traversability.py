@@ -32,9 +32,10 @@ def posterior_of(soil: Soil, size: float = 0.05, seed: int = 0) -> Posterior:
 
 
 LOAM = posterior_of(SOILS["loam"])
+EASY = Demand(2000.0, 20.0)
 
 
-def decide(posterior=LOAM, status=Status.VALID, demand=Demand(2000.0, 20.0), limit=STRONG, config=DEFAULTS, rig=RIG):
+def decide(posterior=LOAM, status=Status.VALID, demand=EASY, limit=STRONG, config=DEFAULTS, rig=RIG):
     return judge(posterior, status, demand, rig, MODEL, limit, config)[0]
 
 
@@ -59,20 +60,22 @@ def test_max_draft_and_max_grade_are_those_of_the_curve():
         assert estimate.value == pytest.approx(value, rel=1e-4)
 
 
-@pytest.mark.parametrize("name", ["loam", "wet_clay", "clayey_soil_38"])
-@pytest.mark.parametrize("limit", [np.full(4, np.nan), np.full(4, 700.0)])
+@pytest.mark.parametrize(
+    ("name", "limit"), [("loam", np.nan), ("loam", 700.0), ("wet_clay", np.nan), ("clayey_soil_38", 700.0)]
+)
 def test_spread_of_the_capability_equals_monte_carlo(name, limit):
     posterior = posterior_of(SOILS[name], 0.03, 3)
+    limit = np.full(4, limit)
     way = decide(posterior, limit=limit)
     grid = slip_grid(DEFAULTS.max_slip)
     drafts, grades = [], []
-    logs = np.random.default_rng(1).multivariate_normal(np.log(posterior.soil), posterior.log_covariance, 250)
+    logs = np.random.default_rng(1).multivariate_normal(np.log(posterior.soil), posterior.log_covariance, 120)
     for soil in (Soil(*row) for row in np.exp(logs)):
         level, graded = (pull_curve(soil, RIG, MODEL, grid, np.full(len(grid), g)) for g in (False, True))
         drafts.append(largest_pull(level, limit, soil, RIG, MODEL).pull)
         grades.append(math.asin(largest_pull(graded, limit, soil, RIG, MODEL).pull / (2300.0 * 9.80665)))
     for estimate, sample in ((way.max_draft, drafts), (way.max_grade, grades)):
-        assert estimate.std == pytest.approx(np.std(sample), rel=0.2)  # sampling: 4.5 %
+        assert estimate.std == pytest.approx(np.std(sample), rel=0.2)  # sampling: 6.5 %
         assert estimate.value == pytest.approx(np.mean(sample), abs=0.4 * estimate.std)
 
 
@@ -120,9 +123,10 @@ def test_weak_motors_limit():
     assert weak.max_draft.value < decide().max_draft.value
     assert decide().limit in ("slip", "traction")
     assert decide(limit=np.full(4, 500.0), demand=Demand(4000.0, 50.0)).state is State.NO_GO
-    none = decide(limit=np.zeros(4))
-    assert none.state is not State.GO
-    assert none.torque_available == 0.0
+    for pull in (0.0, -1000.0):  # without torque the soil holds the tractor, also on a gentle slope down
+        none = decide(limit=np.zeros(4), demand=Demand(pull, 100.0))
+        assert none.state is State.NO_GO
+        assert none.torque_available == 0.0
     unknown = decide(limit=np.array([500.0, np.nan, 500.0, 500.0]))
     assert unknown.torque_available is None
     assert unknown.limit == "torque"
@@ -178,7 +182,7 @@ TORQUES = st.lists(
 ).map(np.array)
 
 
-@settings(derandomize=True, deadline=None, max_examples=200)
+@settings(derandomize=True, deadline=None, max_examples=100)
 @given(
     soil=st.sampled_from(list(SOILS.values())),
     size=st.floats(0.0, 1.0),
@@ -190,8 +194,7 @@ TORQUES = st.lists(
 )
 def test_go_only_when_everything_speaks_for_it(soil, size, status, demand, limit, go, margin):
     config = Settings(go=go, no_go=0.5, margin=margin)
-    with np.errstate(all="ignore"):
-        way = decide(posterior_of(soil, size), status, demand, limit, config)
+    way = decide(posterior_of(soil, size), status, demand, limit, config)
     if way.state is State.GO:
         assert status is Status.VALID
         assert demand is not None

@@ -7,6 +7,7 @@ parameters come with its last step, so a posterior propagates through them.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal
@@ -30,6 +31,12 @@ Array = NDArray[np.float64]
 
 GRID = 14
 MIN_SLIP = 0.02
+MAX_SKID = 0.3
+SKID_GRID = 9
+SLIP_STEP = 1e-4
+"""For the change of pull and torque with slip."""
+TORQUE_TOLERANCE = 1e-4
+"""Of the largest torque of the curve; what is left is mended linearly."""
 PULL_TOLERANCE = 1e-3
 """Newton step of the pull, over the weight, that is the last: it leaves some 1e-6 of the weight."""
 SMALL_PULL = 1e-2
@@ -175,20 +182,25 @@ def slip_grid(max_slip: float) -> Array:
 def largest_pull(curve: PullCurve, torque_limit: Array, soil: Soil, rig: Rig, model: WheelModel) -> Capability | None:
     """Largest pull of a curve (all of it level, or all graded) within wheel torques up to torque_limit (W,) [N m].
 
-    nan in torque_limit: that wheel's limit is not known and does not count.  None where
+    nan in torque_limit: that wheel's limit is not known and does not count.  Where even
+    the least slip of the curve asks for more torque than there is, the pull is that of
+    wheels that skid: below zero, as only a push or a slope moves the vehicle.  None where
     the soil carries no steady state at all.
     """
     known = np.isfinite(torque_limit)
-    torque_limit = np.where(known, np.maximum(torque_limit, 1e-9), np.nan)
-    usage = np.max(curve.torque[known] / torque_limit[known, None], axis=0, initial=0.0)
     balanced = np.isfinite(curve.pull)
-    usable = balanced & (usage <= 1.0)
+    usable = balanced & (curve.torque[known] <= torque_limit[known, None]).all(0)
     if not balanced.any():
         return None
     if not usable.any():
-        return _short_of_torque(
-            curve, int(np.argmin(np.where(balanced, usage, np.inf))), float(usage[balanced].min()), rig
-        )
+        if curve.slip[0] < 0.0:
+            least = int(np.argmin(np.where(balanced, curve.pull, np.inf)))
+            return Capability(
+                float(curve.pull[least]), curve.pull_by_soil[:, least], float(curve.slip[least]), "torque"
+            )
+        skid = np.linspace(-MAX_SKID, curve.slip[0], SKID_GRID)
+        towed = pull_curve(soil, rig, model, skid, np.full(SKID_GRID, bool(curve.on_grade[0])))
+        return largest_pull(towed, torque_limit, soil, rig, model)
     best = int(np.argmax(np.where(usable, curve.pull, -np.inf)))
     after = best + 1
     if after < len(curve.slip) and balanced[after] and curve.pull[after] > curve.pull[best]:
@@ -197,33 +209,27 @@ def largest_pull(curve: PullCurve, torque_limit: Array, soil: Soil, rig: Rig, mo
     return Capability(float(curve.pull[best]), curve.pull_by_soil[:, best], float(curve.slip[best]), limit)
 
 
-def _short_of_torque(curve: PullCurve, at: int, usage: float, rig: Rig) -> Capability:
-    """The pull left where even the least slip of the curve asks for `usage` times the torque there is.
-
-    Thrust is torque over radius and what resists stays, so the pull may well be negative:
-    then only a push or a slope moves the vehicle.
-    """
-    missing = (1.0 - 1.0 / usage) * np.sum(curve.torque[:, at] / rig.radius)
-    gradient = curve.pull_by_soil[:, at] - np.sum(curve.torque_by_soil[:, :, at] / rig.radius[:, None], axis=0)
-    return Capability(float(curve.pull[at] - missing), gradient, float(curve.slip[at]), "torque")
-
-
 def _at_torque_limit(
     curve: PullCurve, below: int, torque_limit: Array, soil: Soil, rig: Rig, model: WheelModel
 ) -> Capability:
-    """The pull where the first wheel meets its torque limit, between two points of the curve (secant)."""
+    """The pull where the first wheel meets its torque limit, between two points of the curve.
+
+    Newton on the wheel that is most above its limit, inside a bracket.
+    """
     low, high = curve.slip[below], curve.slip[below + 1]
-    usage = [np.nanmax(curve.torque[:, i] / torque_limit) for i in (below, below + 1)]
-    slip = low + (high - low) * (1.0 - usage[0]) / (usage[1] - usage[0])
+    over = [float(np.nanmax(curve.torque[:, i] - torque_limit)) for i in (below, below + 1)]
+    slip = float(low - (high - low) * over[0] / (over[1] - over[0]))
     graded = np.full(2, bool(curve.on_grade[below]))
-    for _ in range(3):
-        at = pull_curve(soil, rig, model, np.array([slip, slip * 1.001]), graded)
-        wheel = int(np.nanargmax(at.torque[:, 0] / torque_limit))
-        torque_slope, pull_slope = ((a[1] - a[0]) / (0.001 * slip) for a in (at.torque[wheel], at.pull))
+    for _ in range(MAX_ITERATIONS):
+        at = pull_curve(soil, rig, model, np.array([slip, slip + SLIP_STEP]), graded)
+        wheel = int(np.nanargmax(at.torque[:, 0] - torque_limit))
+        torque_slope, pull_slope = ((a[1] - a[0]) / SLIP_STEP for a in (at.torque[wheel], at.pull))
         miss = torque_limit[wheel] - at.torque[wheel, 0]
-        if abs(miss) < 1e-4 * torque_limit[wheel]:
+        if abs(miss) < TORQUE_TOLERANCE * curve.torque[wheel].max():
             break
-        slip = float(np.clip(slip + miss / torque_slope, low, high))
+        low, high = (slip, high) if miss > 0.0 else (low, slip)
+        step = slip + float(miss / torque_slope) if torque_slope > 0.0 else math.inf
+        slip = step if low < step < high else (low + high) / 2.0
     gradient = at.pull_by_soil[:, 0] - pull_slope / torque_slope * at.torque_by_soil[wheel, :, 0]
     return Capability(float(at.pull[0] + pull_slope / torque_slope * miss), gradient, float(at.slip[0]), "torque")
 

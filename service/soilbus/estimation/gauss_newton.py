@@ -21,6 +21,8 @@ MAX_RESUMED = 10
 CONVERGED = 1e-2
 """Squared length of a step in posterior standard deviations that ends the fit; the step is
 still taken, and what it leaves is smaller by another such factor."""
+LEFT_OVER = 2e-3
+"""The same for what a full step leaves behind, foreseen from how fast the steps shrink."""
 SETTLING = 1.0
 """The same, below which the latents and gains join in."""
 ENOUGH = 0.02
@@ -199,14 +201,15 @@ def _settle(problem: WindowProblem, coordinates: Coordinates, near: _Place, most
     active = np.flatnonzero(problem.gain_std > 0.0)
     soil, latents, gains = near.soil, near.latents, near.gains
     best: tuple[Array, Latents, Array, _Point] | None = None
-    share, length, refused = 1.0, np.inf, 0
-    iterations = near.trials
+    share, length, before, refused = 1.0, np.inf, 0.0, 0
+    iterations, converged = near.trials, False
     for _ in range(most):
         iterations += 1
         point = _normal_equations(problem, coordinates, active, soil, gains, latents)
         if best is not None and (point is None or point.cost > best[3].cost * (1.0 + WORSE) + 1.0):
             soil, latents, gains, point = best
             share *= 0.4
+            before = 0.0  # nothing can be foreseen after a refused step
             refused += 1
             if refused > MAX_REFUSED:
                 break
@@ -226,7 +229,9 @@ def _settle(problem: WindowProblem, coordinates: Coordinates, near: _Place, most
         if np.max(np.abs(latents.entry_angle / angles - 1.0), initial=0.0) > LONG_TURN:
             latents = problem.carried(latents, Soil(*new_soil.tolist()))
         soil, gains = new_soil, gains + gain_step
-        if length < CONVERGED:
+        converged = length < CONVERGED or (share == 1.0 and length * length < LEFT_OVER * before)
+        before = length if share == 1.0 else 0.0
+        if converged:
             break
     inverse = None if best is None else solved(best[3].information, best[3].gradient)
     if best is None or inverse is None:
@@ -244,7 +249,7 @@ def _settle(problem: WindowProblem, coordinates: Coordinates, near: _Place, most
         cost=point.cost - length,
         rows=point.at.known,
         iterations=iterations,
-        converged=length < CONVERGED,
+        converged=converged,
     )
 
 
