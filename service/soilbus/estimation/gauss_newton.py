@@ -18,11 +18,11 @@ Indices = NDArray[np.intp]
 
 MAX_ITERATIONS = 20
 MAX_RESUMED = 10
-CONVERGED = 1e-2
-"""Squared length of a step in posterior standard deviations that ends the fit; the step is
-still taken, and what it leaves is smaller by another such factor."""
-LEFT_OVER = 2e-3
-"""The same for what a full step leaves behind, foreseen from how fast the steps shrink."""
+CONVERGED = 1e-6
+"""Squared length of a step in posterior standard deviations that ends the fit."""
+LEFT_OVER = 1e-5
+"""The same for what a full step leaves behind, foreseen from how fast the steps shrink: small
+enough that live and replayed windows agree to the resolution of our frames."""
 SETTLING = 1.0
 """The same, below which the latents and gains join in."""
 ENOUGH = 0.02
@@ -220,7 +220,7 @@ def _settle(problem: WindowProblem, coordinates: Coordinates, near: _Place, most
             return None
         best = (soil, latents, gains, point)
         length = float(full @ point.information @ full)
-        step = full if length < CONVERGED else share * full
+        step = share * full
         new_soil = coordinates.moved(soil, step[: len(free)])
         gain_step = np.zeros(len(gains))
         gain_step[active] = step[len(free) :]
