@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,8 +17,13 @@ from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import Window
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.traversability import Demand, Status, Traversability, judge
+from soilbus.traversability import State as Way
 
 MIN_ROWS = 60
+MIN_NEW_SOIL = 0.5
+"""Share of a window that a new soil must fill before its estimate is valid: shorter ones fit anything."""
+STUCK_RIM_SPEED = 2.5
+"""Least rim speed of a vehicle that is stuck, in units of the least speed at which slip is judged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +79,15 @@ class WindowEstimator:
         if status is Status.VALID and task.start >= self._soil_since:
             self._known_until = task.end
         posterior = None if fit is None or status is Status.INVALID else self._honest(fit)
+        stuck = self._stuck(task.window)
+        if stuck and status is Status.VALID:
+            status, reason = Status.NOT_EXCITED, "standstill"
         way, self._pull_curve = judge(
             posterior, status, self._demand(task.window), self.rig, self.model, task.torque_limit,
             self.config.traversability, self._pull_curve,
         )  # fmt: skip
+        if stuck:
+            way = replace(way, state=Way.NO_GO, probability=0.0, limit="slip")
         return WindowResult(
             t=task.end,
             index=task.index,
@@ -100,6 +110,8 @@ class WindowEstimator:
         if problem.n_rows < MIN_ROWS:
             return problem.standstill, None
         fit = resume(problem, self.prior, self._fit) if self._fit is not None else None
+        if fit is not None and not fit.converged and fit.chi2 <= self._chi2_limit(fit):
+            fit = fit_window(problem, self.prior)
         if fit is not None and not self._mismatch(fit):
             return problem.standstill, fit
         if task.end - self._known_until > self._settings.window:
@@ -158,6 +170,15 @@ class WindowEstimator:
         part = recent if recent.mean() >= pull.mean() else pull
         return Demand(float(part.mean()), float(part.std() / math.sqrt(len(part))))
 
+    def _stuck(self, window: Window) -> bool:
+        """Whether the wheels turned but the vehicle stood during most of the last hop."""
+        recent = window.t > window.t[-1] - self._settings.hop if len(window.t) else window.t > 0.0
+        ground = window.ground_speed[recent]
+        rim = (self.rig.radius * window.speed[recent]).min(axis=1, initial=np.inf)
+        known = np.isfinite(ground) & np.isfinite(rim)
+        standing = known & (ground < self._settings.min_speed) & (rim > STUCK_RIM_SPEED * self._settings.min_speed)
+        return bool(standing.sum() > 0.5 * max(int(known.sum()), 1))
+
     def _status(self, task: WindowTask, standstill: int, fit: Fit | None) -> tuple[Status, str]:
         if task.missing:
             return Status.INVALID, "input_missing " + " ".join(task.missing)
@@ -174,6 +195,8 @@ class WindowEstimator:
         if task.poor:
             return Status.DEGRADED, "input_stale " + " ".join(task.poor)
         bearing, tan_phi = self._bearing(fit.posterior), fit.posterior.tan_phi()
+        if self._soil_since > task.end - MIN_NEW_SOIL * self._settings.window:
+            return Status.NOT_EXCITED, "not_excited new_soil"
         if bearing.std > self._settings.max_bearing_std * bearing.value:
             return Status.NOT_EXCITED, "not_excited load_range"
         if tan_phi.std > self._settings.max_tan_phi_std * tan_phi.value:

@@ -31,6 +31,9 @@ MIN_COVERAGE = 0.95
 LONGEST_GAP = 60.0
 """Silence [s] after which windows are counted anew instead of being reported one by one."""
 SLIP_SPAN = 0.3
+EDGE_LEAD = 0.005
+"""Bins begin this long before the first sample [s]: else each frame of its message would fall on
+an edge, and a microsecond would decide on which side."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,8 +120,9 @@ class Intake:
             self._restart()
         self.refusals.add(decoded)
         if self._bins is None and (first := _first_time(decoded)) is not None:
-            self._bins = BinStore(self.rig, self._settings.bin, first)
-            self.next_end = first + self._settings.window
+            origin = first - EDGE_LEAD
+            self._bins = BinStore(self.rig, self._settings.bin, origin)
+            self.next_end = origin + self._settings.window
         heard = {name: (c.t, c.value) for name, c in decoded.columns.items() if len(c.t)}
         self.last_seen |= {name: float(t[-1]) for name, (t, _) in heard.items()}
         for name, (t, value) in heard.items():
