@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.assembly import chassis_of
 from soilbus.config import Config, Wheel
 from soilbus.simulator.equilibrium import Equilibrium, Situation, solve
 from soilbus.simulator.scenario import SAMPLE_RATE, Scenario, Swing, realise, soil_along, soil_names
@@ -73,14 +74,14 @@ def drive(config: Config, scenario: Scenario, seed: int) -> Drive:
 
 
 def _chassis(config: Config) -> Chassis:
-    if config.vehicle is None or not config.wheel:
+    chassis = chassis_of(config)
+    if chassis is None or not config.wheel:
         raise SimulationError("the simulator needs a [vehicle] with [[wheel]]s")
     if {wheel.axle for wheel in config.wheel} != {"front", "rear"}:
         raise SimulationError("the simulator needs wheels on both axles")
     if config.model.effects:
         raise SimulationError("model.effects: the simulator has no effects yet")
-    v = config.vehicle
-    return Chassis(v.mass, v.wheelbase, v.cg_ahead_of_rear_axle, v.cg_height, v.hitch_height)
+    return chassis
 
 
 def _situation(
