@@ -64,7 +64,7 @@ def _parser() -> argparse.ArgumentParser:
         return sub
 
     sub = command("demo", _demo, "simulated tractor, service and dashboard; needs no hardware, ends by itself", "")
-    sub.add_argument("--duration", type=float, default=48.0, metavar="S", help="simulated seconds (default 48)")
+    sub.add_argument("--duration", type=float, default=42.0, metavar="S", help="simulated seconds (default 42)")
 
     sub = command("run", _run, "the service on a live bus")
     sub.add_argument("--wait", action="store_true", help="wait for an interface that is not there yet")
