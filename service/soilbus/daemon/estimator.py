@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.capability import PullCurve
@@ -50,6 +51,21 @@ class WindowResult:
     iterations: int = 0
 
 
+@dataclass(frozen=True, slots=True)
+class Undecided:
+    """A window's estimate with what the decision needs besides; its traversability is still unknown.
+
+    demand is None where the draft is not known; torque_limit (W,) [N m]; stuck: the wheels
+    turn on the spot; fresh: nothing of the window before may be carried over.
+    """
+
+    result: WindowResult
+    demand: Demand | None
+    torque_limit: NDArray[np.float64]
+    stuck: bool
+    fresh: bool
+
+
 class WindowEstimator:
     """Solves one window after the other; the last fit only tells where to start.
 
@@ -61,19 +77,23 @@ class WindowEstimator:
         self.config = config
         self.rig, self.prior, self.model = rig_of(config), prior_of(config), model_of(config)
         self._settings = config.estimator
+        self._pull_curve: PullCurve | None = None
         self._forget()
 
     def _forget(self) -> None:
         self._fit: Fit | None = None
-        self._pull_curve: PullCurve | None = None
         self._soil_since = -math.inf
         self._known_until = -math.inf  # end of the last valid window that was whole
 
     def solve(self, task: WindowTask) -> WindowResult:
         """Estimate and decision of one window."""
+        return self.decide(self.estimate(task))
+
+    def estimate(self, task: WindowTask) -> Undecided:
+        """Soil and status of one window."""
         if task.fresh:
             self._forget()
-        standstill, fit = self._estimate(task)
+        standstill, fit = self._fitted(task)
         self._fit = fit if fit is not None and fit.converged else None
         status, reason = self._status(task, standstill, fit)
         if status is Status.VALID and task.start >= self._soil_since:
@@ -82,13 +102,7 @@ class WindowEstimator:
         stuck = self._stuck(task.window)
         if stuck and status is Status.VALID:
             status, reason = Status.NOT_EXCITED, "standstill"
-        way, self._pull_curve = judge(
-            posterior, status, self._demand(task.window), self.rig, self.model, task.torque_limit,
-            self.config.traversability, self._pull_curve,
-        )  # fmt: skip
-        if stuck:
-            way = replace(way, state=Way.NO_GO, probability=0.0, limit="slip")
-        return WindowResult(
+        result = WindowResult(
             t=task.end,
             index=task.index,
             status=status,
@@ -97,14 +111,25 @@ class WindowEstimator:
             bearing=None if posterior is None else self._bearing(posterior),
             slip=task.slip,
             sinkage=self._sinkage(fit if posterior is not None else None),
-            traversability=way,
+            traversability=Traversability(),
             chi2=None if fit is None else fit.chi2,
             samples=task.window.samples,
             rejected=task.rejected,
             iterations=0 if fit is None else fit.iterations,
         )
+        return Undecided(result, self._demand(task.window), task.torque_limit, stuck, task.fresh)
 
-    def _estimate(self, task: WindowTask) -> tuple[int, Fit | None]:
+    def decide(self, window: Undecided) -> WindowResult:
+        """The result with its traversability; windows in their order, here or in another process."""
+        way, self._pull_curve = judge(
+            window.result.posterior, window.result.status, window.demand, self.rig, self.model, window.torque_limit,
+            self.config.traversability, None if window.fresh else self._pull_curve,
+        )  # fmt: skip
+        if window.stuck:
+            way = replace(way, state=Way.NO_GO, probability=0.0, limit="slip")
+        return replace(window.result, traversability=way)
+
+    def _fitted(self, task: WindowTask) -> tuple[int, Fit | None]:
         """Standstill instants and the fit of a window."""
         problem = self._problem(task.window, self._soil_since)
         if problem.n_rows < MIN_ROWS:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import os
+import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
@@ -16,12 +17,13 @@ import can
 
 from soilbus.can.candump import Frame, candump_frames, frame_of
 from soilbus.config import Config
-from soilbus.daemon.estimator import WindowEstimator, WindowResult
+from soilbus.daemon.estimator import Undecided, WindowEstimator, WindowResult
 from soilbus.daemon.intake import Intake, WindowTask
 from soilbus.daemon.pipeline import Pipeline
 
 _T = TypeVar("_T")
 
+SWITCH_INTERVAL = 0.0002
 MAX_AHEAD = 30
 """Windows that may wait for the estimator."""
 
@@ -95,17 +97,18 @@ def replay(
     if workers is None:
         yield from map(pipeline.estimator.solve, tasks)
         return
-    pending: deque[Future[WindowResult]] = deque()
+    decide = pipeline.estimator.decide
+    pending: deque[Future[Undecided]] = deque()
     cut_off: LogError | None = None
     try:
         for task in tasks:
-            pending.append(workers.submit(_solve, task))
+            pending.append(workers.submit(_estimate, task))
             while pending and (pending[0].done() or len(pending) > MAX_AHEAD):
-                yield pending.popleft().result()
+                yield decide(pending.popleft().result())
     except LogError as error:
         cut_off = error
     for future in pending:
-        yield future.result()
+        yield decide(future.result())
     if cut_off is not None:
         raise cut_off
 
@@ -133,13 +136,18 @@ def _tasks(intake: Intake, logs: Sequence[Path], progress: Callable[[int, float]
 
 @contextmanager
 def estimator_beside(config: Config) -> Iterator[Executor | None]:
-    """A process that estimates while this one reads; None on a machine with one core."""
+    """A process that estimates while this one reads and decides; None on a machine with one core."""
     if (os.cpu_count() or 1) < 2 or "fork" not in get_all_start_methods():
         yield None
         return
     with ProcessPoolExecutor(1, get_context("fork"), initializer=_begin, initargs=(config,)) as workers:
         workers.submit(_begun).result()  # forked now, before there are threads
-        yield workers
+        usual = sys.getswitchinterval()
+        sys.setswitchinterval(SWITCH_INTERVAL)  # the pool's thread must get its turn to hand on tasks
+        try:
+            yield workers
+        finally:
+            sys.setswitchinterval(usual)
 
 
 _estimator: WindowEstimator | None = None
@@ -154,10 +162,10 @@ def _begun() -> bool:
     return _estimator is not None
 
 
-def _solve(task: WindowTask) -> WindowResult:
+def _estimate(task: WindowTask) -> Undecided:
     if _estimator is None:
         raise RuntimeError("estimator_beside() was not entered")
-    return _estimator.solve(task)
+    return _estimator.estimate(task)
 
 
 def check_heard(pipeline: Pipeline, logs: Iterable[Path]) -> None:
