@@ -15,7 +15,6 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
-    FiniteFloat,
     NonNegativeFloat,
     PositiveFloat,
     ValidationError,
@@ -381,6 +380,3 @@ def defaults_text(config: Config) -> str:
 
     walk("", config.model_dump(exclude={"wheel", "signals", "folder"}))
     return "\n".join(lines)
-
-
-__all__ = ["Config", "ConfigError", "FiniteFloat", "Signal", "Wheel", "load_config", "parse_config"]

@@ -157,7 +157,7 @@ class Service:
         interval = self.notifier.watchdog_interval
         worker_hangs = bool(self._pending) and now - self._solved_at > LONGEST_SOLVE
         if interval is not None and now >= self._next_watchdog and not worker_hangs:
-            self._next_watchdog = now + interval / 2.0
+            self._next_watchdog = now + interval
             self.notifier.watchdog()
 
     def _present_state(self, now: float) -> tuple[ServiceState, str]:
