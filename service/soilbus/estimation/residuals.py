@@ -10,6 +10,7 @@ sect. 4.8).  The entry angle of each wheel follows from its load.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +32,8 @@ from soilbus.terra.wheel import (
 )
 
 Array = NDArray[np.float64]
+Reading = tuple[Array, Array, NDArray[np.bool_]]
+"""Values, variances of them, and which of them are known; zero where not."""
 
 MAX_SLIP = 0.98
 MIN_SLIP = -1.0
@@ -97,7 +100,7 @@ class WindowProblem:
         self.usable = usable = usable[kept]
         self.n, self.n_wheels = len(kept), n_wheels
 
-        def take(quantity: str) -> tuple[Array, Array, NDArray[np.bool_]]:
+        def take(quantity: str) -> Reading:
             value = getattr(window, quantity)[kept]
             variance = window.variance[quantity][kept]
             known = np.isfinite(value) & np.isfinite(variance)
@@ -129,7 +132,7 @@ class WindowProblem:
         self._radius, self._width = (np.tile(a, self.n) for a in (rig.radius, rig.width))
         self._missing = None if known.all() else ~known
 
-    def _balance(self, take, usable: NDArray[np.bool_]) -> None:  # type: ignore[no-untyped-def]
+    def _balance(self, take: Callable[[str], Reading], usable: NDArray[np.bool_]) -> None:
         """The pull that draft, slope and inertia ask of the wheels, and its variance."""
         self.draft, variance, known = take("draft")
         demand = self.draft.copy()
