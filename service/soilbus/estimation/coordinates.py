@@ -54,6 +54,18 @@ class Coordinates:
                 directions[_K_PHI, column[_N]] = -K_L / k_phi * soil[_N] * np.log(TYPICAL_DEPTH)
         return directions
 
+    def bend(self, gradient: Array) -> Array:
+        """Curvature (F, F) that the coordinates themselves add to chi-square, by its gradient (F,).
+
+        The model is all but linear in k_c, and so curved in its logarithm; of that, what
+        shortens steps.
+        """
+        curvature = np.zeros((len(gradient), len(gradient)))
+        if _K_C in self._column:
+            i = self._column[_K_C]
+            curvature[i, i] = max(gradient[i], 0.0)
+        return curvature
+
     def position(self, soil: Array) -> Array:
         """Coordinates (F,) of a soil (6,)."""
         logs = np.log(soil[self.free])
@@ -83,12 +95,6 @@ class Coordinates:
     def _bounds(self) -> tuple[Array, Array]:
         centre, bound = self.prior.median[self.free], np.exp(BOUND * self.prior.log_std[self.free])
         return centre / bound, centre * bound
-
-    def prior_pull(self, soil: Array) -> tuple[Array, Array]:
-        """Distance of the free parameters from the prior in its standard deviations (F,), and its slopes (F, F)."""
-        free, log_std = self.free, self.prior.log_std[self.free]
-        pull = np.log(soil[free] / self.prior.median[free]) / log_std
-        return pull, self.log_directions(soil)[free] / log_std[:, None]
 
     def moved(self, soil: Array, step: Array) -> Array:
         """The soil (6,) after a step (F,) of the coordinates, shortened where it is long."""

@@ -53,6 +53,15 @@ class Latents:
     ground_speed: Array
     entry_angle: Array
 
+    def followed_by(self, shared: int, new: Latents) -> Latents:
+        """The last `shared` instants of these and then others."""
+        return Latents(
+            np.concatenate([self.load[-shared:], new.load]),
+            np.concatenate([self.speed[-shared:], new.speed]),
+            np.concatenate([self.ground_speed[-shared:], new.ground_speed]),
+            np.concatenate([self.entry_angle[-shared:], new.entry_angle]),
+        )
+
 
 @dataclass(slots=True)
 class Linearised:
@@ -61,13 +70,12 @@ class Linearised:
     The columns of `rows` and `weighed` (R, 1 + 6 + G) are the residual and its derivatives
     by the soil parameters (SI) and the gains; `weighed` is `rows` times the inverse
     covariance of its instant, so that `normal`, rows' weighed, holds chi-square and the
-    normal equations.  Rows of missing data are zero; `known` counts the others.
+    normal equations.  Rows of missing data are zero.
     """
 
     rows: Array
     weighed: Array
     normal: Array
-    known: int
     by_latents: Array  # (N, m, 2 W + 1)
     corrected: Array  # (N, 2 W + 1) measured latents less their gain errors
     off: Array  # (N, W) latent load less the model's
@@ -79,6 +87,34 @@ class Linearised:
     def chi2(self) -> float:
         """Sum of squares of the whitened residuals."""
         return float(self.normal[0, 0])
+
+    def followed_by(self, shared: int, new: Linearised) -> Linearised:
+        """The last `shared` instants of this and then those of another, linearised at the same soil and gains."""
+        first = len(self.off) - shared
+        row = first * self.by_latents.shape[1]
+        rows, weighed = (np.concatenate([a[row:], b]) for a, b in ((self.rows, new.rows), (self.weighed, new.weighed)))
+        return Linearised(
+            rows=rows,
+            weighed=weighed,
+            normal=rows.T @ weighed,
+            by_latents=np.concatenate([self.by_latents[first:], new.by_latents]),
+            corrected=np.concatenate([self.corrected[first:], new.corrected]),
+            off=np.concatenate([self.off[first:], new.off]),
+            load_slope=np.concatenate([self.load_slope[first:], new.load_slope]),
+            load_by_slip=np.concatenate([self.load_by_slip[first:], new.load_by_slip]),
+            load_by_soil=np.concatenate([self.load_by_soil[:, first:], new.load_by_soil], axis=1),
+        )
+
+
+@dataclass(slots=True)
+class Optimum:
+    """Where a fit ended: soil (6,) in SI, gains (G,), latents of the instants t (N,), and the model there."""
+
+    t: Array
+    soil: Array
+    gains: Array
+    latents: Latents
+    at: Linearised
 
 
 class WindowProblem:
@@ -162,6 +198,11 @@ class WindowProblem:
         return names, np.array(std)
 
     @property
+    def _n_residuals(self) -> int:
+        """Residuals of an instant."""
+        return int(self._row_var.shape[1])
+
+    @property
     def n_rows(self) -> int:
         """Number of residuals that count."""
         return self._n_known
@@ -170,8 +211,10 @@ class WindowProblem:
         """The same window with at most so many of its usable instants, evenly spread."""
         if self.n <= most:
             return self
-        keep = self._kept[np.linspace(0, self.n - 1, most).round().astype(int)]
-        return WindowProblem(self._window.rows(keep), self.rig, self.model, self._min_speed)
+        return self._part(np.linspace(0, self.n - 1, most).round().astype(int))
+
+    def _part(self, instants: NDArray[np.intp]) -> WindowProblem:
+        return WindowProblem(self._window.rows(self._kept[instants]), self.rig, self.model, self._min_speed)
 
     def start(self, soil: Soil, guess: Array | None = None) -> Latents:
         """Latents at the measured values, entry angles solved for this soil from a guess (N, W)."""
@@ -197,8 +240,29 @@ class WindowProblem:
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(np.where(self.usable, self.sinkages(latents), 0.0).sum(0) / known)
 
-    def angle_curve(self, latents: Latents) -> Array:
-        """How the entry angles depend on load and slip here: coefficients (W, 4) for `start_on`.
+    def after(self, before: Optimum) -> tuple[Latents, Linearised]:
+        """Latents and model of this window at the optimum of one that ends a little earlier.
+
+        Instants that both share are taken over; the others are linearised at the measured
+        values, with entry angles as loads and slips had them in the other window.
+        """
+        shared = self._shared(before.t)
+        new = self._part(np.arange(shared, self.n)) if shared else self
+        if not self._n_residuals == new._n_residuals == before.at.by_latents.shape[1]:
+            new, shared = self, 0
+        start = new._measured_on(self._angle_curve(before.latents))
+        at = new.linearise(Soil(*before.soil.tolist()), before.gains, start)
+        if not shared:
+            return start, at
+        return before.latents.followed_by(shared, start), before.at.followed_by(shared, at)
+
+    def _shared(self, t: Array) -> int:
+        """How many of the first instants are the last of those at t (M,)."""
+        n = len(t) - int(np.searchsorted(t, self.t[0] - SAME_INSTANT))
+        return n if 0 < n < self.n and np.abs(self.t[:n] - t[-n:]).max() < SAME_INSTANT else 0
+
+    def _angle_curve(self, latents: Latents) -> Array:
+        """How entry angles depend on load and slip: coefficients (W, 4).
 
         log entry angle = a + b log load + c slip + d slip^2, fitted wheel by wheel.
         """
@@ -206,21 +270,6 @@ class WindowProblem:
         target = np.log(latents.entry_angle).T[:, :, None]
         gram = regressors.transpose(0, 2, 1) @ regressors + 1e-9 * np.eye(4)
         return np.asarray(np.linalg.solve(gram, regressors.transpose(0, 2, 1) @ target)[:, :, 0])
-
-    def start_on(self, curve: Array, t: Array, latents: Latents) -> Latents:
-        """Latents from a neighbouring window, whose instants were t (M,).
-
-        At instants that both share these are its latents; elsewhere the measured values
-        with entry angles from its curve.
-        """
-        start = self._measured_on(curve)
-        place = np.minimum(np.searchsorted(t, self.t - SAME_INSTANT), max(len(t) - 1, 0))
-        mine = np.flatnonzero(np.abs(t[place] - self.t) < SAME_INSTANT) if len(t) else place[:0]
-        theirs = place[mine]
-        start.load[mine], start.speed[mine] = latents.load[theirs], latents.speed[theirs]
-        start.ground_speed[mine] = latents.ground_speed[theirs]
-        start.entry_angle[mine] = latents.entry_angle[theirs]
-        return start
 
     def _measured_on(self, curve: Array) -> Latents:
         log_angle = self._curve_regressors(self.load, self.speed, self.ground_speed) @ curve[:, :, None]
@@ -285,7 +334,6 @@ class WindowProblem:
             rows=flat,
             weighed=weighed,
             normal=flat.T @ weighed,
-            known=self._n_known,
             by_latents=A,
             corrected=corrected,
             off=off,
@@ -307,7 +355,7 @@ class WindowProblem:
         """Derivatives A (N, m, 2 W + 1) of the residuals from those of DP, T and z (3, N, W)."""
         N, W = self.n, self.n_wheels
         by_speed, by_ground = by_slip * slip_by_speed, by_slip * slip_by_ground
-        A = np.zeros((N, self._row_var.shape[1], 2 * W + 1))
+        A = np.zeros((N, self._n_residuals, 2 * W + 1))
         A[:, W, :W], A[:, W, W : 2 * W], A[:, W, 2 * W] = by_load[0], by_speed[0], by_ground[0].sum(1)
         for kind, first in ((1, 0), (2, W + 1)) if self.with_sinkage else ((1, 0),):
             wheel_rows = A[:, first : first + W]

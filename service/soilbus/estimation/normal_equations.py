@@ -1,0 +1,148 @@
+"""One Gauss-Newton step on a window: normal equations of the residuals and of what was known before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.estimation.belief import Belief
+from soilbus.estimation.coordinates import Coordinates
+from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+from soilbus.estimation.residuals import Latents, Linearised, WindowProblem
+from soilbus.terra.wheel import Soil
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+LONG_TURN = 0.2
+"""Relative change of an entry angle from which the angles are solved again, not extrapolated."""
+_SOIL = len(PARAMETERS)
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A soil (6,) in SI with gains (G,) and latents, what it costs, and how many evaluations led there."""
+
+    soil: Array
+    gains: Array
+    latents: Latents
+    cost: float
+    trials: int
+
+    def as_soil(self) -> Soil:
+        """The soil by name."""
+        return Soil(*self.soil.tolist())
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """Normal equations by the free coordinates (F) and active gains (A) at one place.
+
+    information (F + A, F + A) is Gauss-Newton's; bend, which comes on top for a step, is
+    the curvature of the coordinates.  cost is -2 log posterior up to a constant.
+    """
+
+    information: Array
+    bend: Array
+    gradient: Array
+    cost: float
+    at: Linearised
+
+    def step(self, damping: float = 0.0) -> Array | None:
+        """Step (F + A,) to the minimum, held back in proportion to the diagonal; None where there is none."""
+        curved = self.information + self.bend
+        solution = solved(curved + damping * np.diag(np.diag(curved)), self.gradient)
+        return None if solution is None else -solution[0]
+
+    def length(self, step: Array) -> float:
+        """Squared length of a step in standard deviations."""
+        return float(step @ self.information @ step)
+
+
+class Fitting:
+    """A window's residuals together with what was known before: free coordinates (F), active gains (A)."""
+
+    def __init__(self, problem: WindowProblem, prior: SoilPrior, before: Belief, with_gains: bool = True) -> None:
+        self.problem, self.before = problem, before
+        self.coordinates = Coordinates(prior, float(problem.rig.width.mean()))
+        known = np.diag(before.covariance)[_SOIL:] > 0.0 if with_gains else np.zeros(len(before.gains), bool)
+        self.active = np.flatnonzero(known)
+        self.free = self.coordinates.free
+        kept = np.concatenate([self.free, _SOIL + self.active])
+        inverse = solved(before.covariance[np.ix_(kept, kept)], np.zeros(len(kept)))
+        if inverse is None:
+            raise ValueError("what was known before has no proper covariance")
+        self._mean = np.concatenate([np.log(before.soil[self.free]), before.gains[self.active]])
+        self._precision = inverse[1]
+
+    def start(self, soil: Array, guess: Array | None = None) -> Place:
+        """A soil with gains as believed and latents as measured; entry angles solved from a guess (N, W)."""
+        return Place(soil, self.before.gains, self.problem.start(Soil(*soil.tolist()), guess), np.inf, 0)
+
+    def point(self, place: Place) -> Point | None:
+        """The normal equations at a place; None where the model is not finite."""
+        return self.with_before(place, self.problem.linearise(place.as_soil(), place.gains, place.latents))
+
+    def with_before(self, place: Place, at: Linearised) -> Point | None:
+        """Those of residuals linearised already."""
+        free, active = len(self.free), self.active
+        off = np.concatenate([np.log(place.soil[self.free]), place.gains[active]]) - self._mean
+        by = self._log_directions(place.soil)
+        directions = np.zeros((len(at.normal), 1 + free + len(active)))  # of the residual, coordinates and gains
+        directions[0, 0] = 1.0
+        directions[1:7, 1 : 1 + free] = place.soil[:, None] * by
+        directions[7 + active, 1 + free + np.arange(len(active))] = 1.0
+        normal = directions.T @ at.normal @ directions
+        bend = np.zeros((free + len(active), free + len(active)))
+        bend[:free, :free] = self.coordinates.bend(normal[1 : 1 + free, 0])
+        by_known = np.eye(free + len(active))
+        by_known[:free, :free] = by[self.free]
+        pull = self._precision @ off
+        cost = at.chi2 + float(off @ pull)
+        if not np.isfinite(cost):
+            return None
+        return Point(
+            information=normal[1:, 1:] + by_known.T @ self._precision @ by_known,
+            bend=bend,
+            gradient=normal[1:, 0] + by_known.T @ pull,
+            cost=cost,
+            at=at,
+        )
+
+    def moved(self, place: Place, point: Point, step: Array) -> Place:
+        """The place after a step (F + A,), with the latents that the linear model foresees."""
+        free = len(self.free)
+        soil = self.coordinates.moved(place.soil, step[:free])
+        gain_step = np.zeros(len(place.gains))
+        gain_step[self.active] = step[free:]
+        latents = self.problem.updated(point.at, place.latents, soil - place.soil, gain_step)
+        if np.max(np.abs(latents.entry_angle / place.latents.entry_angle - 1.0), initial=0.0) > LONG_TURN:
+            latents = self.problem.carried(latents, Soil(*soil.tolist()))
+        return Place(soil, place.gains + gain_step, latents, point.cost, place.trials)
+
+    def belief(self, place: Place, point: Point) -> Belief | None:
+        """What is known at the optimum; None where the information is singular."""
+        inverse = solved(point.information, point.gradient)
+        if inverse is None:
+            return None
+        free, n_gains = len(self.free), len(place.gains)
+        spread = np.zeros((_SOIL + n_gains, free + len(self.active)))
+        spread[:_SOIL, :free] = self._log_directions(place.soil)
+        spread[_SOIL + self.active, free + np.arange(len(self.active))] = 1.0
+        return Belief(place.soil, place.gains, spread @ inverse[1] @ spread.T)
+
+    def _log_directions(self, soil: Array) -> Array:
+        return self.coordinates.log_directions(soil)
+
+
+def solved(information: Array, gradient: Array) -> tuple[Array, Array] | None:
+    """information^-1 gradient and information^-1, (F,) and (F, F); None where it is singular."""
+    scale = 1.0 / np.sqrt(np.diag(information))
+    try:
+        inverse = np.linalg.inv(information * np.outer(scale, scale))
+    except np.linalg.LinAlgError:
+        return None
+    inverse = inverse * np.outer(scale, scale)
+    return (inverse @ gradient, inverse) if np.isfinite(inverse).all() else None
