@@ -20,7 +20,7 @@ MAX_ITERATIONS = 20
 MAX_RESUMED = 10
 CONVERGED = 1e-6
 """Squared length of a step in posterior standard deviations that ends the fit."""
-LEFT_OVER, LEFT_OVER_RESUMED = 1e-5, 1e-3
+LEFT_OVER, LEFT_OVER_RESUMED = 1e-7, 1e-3
 """The same for what a full step leaves behind, foreseen from how fast the steps shrink."""
 SETTLING = 1.0
 """The same, below which the latents and gains join in."""
