@@ -203,8 +203,8 @@ class Estimator(_Section):
 
     window: PositiveFloat = 10.0
     hop: PositiveFloat = 1.0
-    change_window: PositiveFloat = 2.0
-    """Where a known soil ends, this much newest data is asked whether it is a new one."""
+    soil_drift: NonNegativeFloat = 0.03
+    """How far the soil may wander in the time of one window, as sd of a relative change."""
     bin: PositiveFloat = 0.1
     """Samples are averaged over bins of this length before the fit."""
     min_speed: PositiveFloat = 0.2
@@ -222,8 +222,6 @@ class Estimator(_Section):
     def _lengths_fit(self) -> Estimator:
         if not self.bin <= self.hop <= self.window:
             raise ValueError("bin <= hop <= window must hold")
-        if not self.bin < self.change_window <= self.window:
-            raise ValueError("bin < change_window <= window must hold")
         return self
 
 

@@ -76,7 +76,6 @@ def _compressed(config: Config) -> list[str]:
     times = {
         "estimator.window": config.estimator.window,
         "estimator.hop": 2.0 * config.estimator.hop,
-        "estimator.change_window": 2.0 * config.estimator.change_window,
         "estimator.bin": config.estimator.bin,
     }
     return [f"{key}={value / SPEED_UP}" for key, value in times.items()]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from soilbus.estimation.coordinates import BOUND, Coordinates
-from soilbus.estimation.gauss_newton import descend, fit_window, resume, starting_soils
+from soilbus.estimation.gauss_newton import descend, fit_window, foreseen, resume, starting_soils
 from soilbus.estimation.normal_equations import solved
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.window import Rig, Window
@@ -86,13 +86,13 @@ def test_the_same_optimum_from_all_starts(wet_clay, wet_clay_fit):
 
 def test_resuming_from_any_neighbour_ends_where_a_fresh_fit_does(wet_clay, wet_clay_fit, simulated):
     problem, prior = wet_clay.problem(), wet_clay.prior
-    again = resume(problem, prior, wet_clay_fit)
+    again = resume(foreseen(problem, prior, wet_clay_fit))
     assert again.converged
     assert again.iterations <= 3
     assert np.abs(deviations(again, wet_clay_fit.posterior.soil)).max() < 0.05
     other = simulated(SOILS["wet_clay"], 51)
     neighbour = fit_window(other.problem(), prior)
-    fit = resume(problem, prior, neighbour)
+    fit = resume(foreseen(problem, prior, neighbour))
     assert fit.converged
     assert np.abs(deviations(fit, wet_clay_fit.posterior.soil)).max() < 0.05
 

@@ -26,22 +26,21 @@ def explicit(rig: Rig, soil: Soil, load, speed, ground_speed):
 
 
 def cost_of_instant(window: Window, rig: Rig, i: int, soil: Soil, gains: dict[str, float]) -> float:
-    """Least sum of squares over loads, speeds and ground speed, by scipy: readings = truth (1 + gain) + noise.
-
-    To first order in the gains, as the estimator has it: reading (1 - gain) = truth + noise.
-    """
+    """Least sum of squares over loads, speeds and ground speed, by scipy: reading = truth (1 + gain) + noise."""
     W = len(rig.wheels)
+    gain = {q: np.array([gains.get(f"{q}.{w}", 0.0) for w in rig.wheels]) for q in ("torque", "load", "speed")}
+    gain |= {q: gains.get(q, 0.0) for q in ("ground_speed", "draft")}
+    sd = {q: np.sqrt(v[i]) for q, v in window.variance.items()}
+    sd |= {q: sd[q] / (1.0 + g) for q, g in gain.items()}  # of the reading, scaled back to the truth
 
     def corrected(quantity: str) -> np.ndarray:
-        g = np.array([gains.get(f"{quantity}.{w}", 0.0) for w in rig.wheels])
-        return getattr(window, quantity)[i] * (1.0 - g)
+        return getattr(window, quantity)[i] / (1.0 + gain[quantity])
 
-    sd = {q: np.sqrt(v[i]) for q, v in window.variance.items()}
     seen = np.concatenate([corrected("load"), corrected("speed")])
-    ground = window.ground_speed[i] * (1.0 - gains.get("ground_speed", 0.0))
+    ground = corrected("ground_speed")
     chassis = rig.chassis
     slope = GRAVITY * np.sin(window.pitch[i]) + window.acceleration[i]
-    demand = window.draft[i] * (1.0 - gains.get("draft", 0.0)) + chassis.mass * slope
+    demand = corrected("draft") + chassis.mass * slope
     slope_sd = np.hypot(GRAVITY * np.cos(window.pitch[i]) * sd["pitch"], sd["acceleration"])
     demand_sd = np.hypot(sd["draft"], chassis.mass * slope_sd)
     size = np.concatenate([sd["load"], sd["speed"], [sd["ground_speed"]]])

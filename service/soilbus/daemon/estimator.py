@@ -12,17 +12,16 @@ from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.capability import PullCurve
 from soilbus.config import Config
 from soilbus.daemon.intake import WindowTask
-from soilbus.estimation.gauss_newton import Fit, fit_window, resume
+from soilbus.estimation.gauss_newton import Fit
 from soilbus.estimation.posterior import Estimate, Posterior
-from soilbus.estimation.residuals import WindowProblem
+from soilbus.estimation.tracker import Ground, Settings, Tracked, Tracker
 from soilbus.estimation.window import Window
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.traversability import Demand, Status, Traversability, judge
 from soilbus.traversability import State as Way
 
-MIN_ROWS = 60
-MIN_NEW_SOIL = 0.5
-"""Share of a window that a new soil must fill before its estimate is valid: shorter ones fit anything."""
+MIN_NEW_SOIL = 0.2
+"""Share of a window that a new soil must fill before its estimate is valid."""
 STUCK_RIM_SPEED = 2.5
 """Least rim speed of a vehicle that is stuck, in units of the least speed at which slip is judged."""
 
@@ -67,23 +66,18 @@ class Undecided:
 
 
 class WindowEstimator:
-    """Solves one window after the other; the last fit only tells where to start.
-
-    Each window is estimated from its own data and the configured prior.  Where a known
-    soil ends, only the data since then count until a whole window of the new soil is in.
-    """
+    """Solves one window after the other: the tracker's soil, its status, the decision."""
 
     def __init__(self, config: Config) -> None:
         self.config = config
         self.rig, self.prior, self.model = rig_of(config), prior_of(config), model_of(config)
         self._settings = config.estimator
         self._pull_curve: PullCurve | None = None
-        self._forget()
-
-    def _forget(self) -> None:
-        self._fit: Fit | None = None
-        self._soil_since = -math.inf
-        self._known_until = -math.inf  # end of the last valid window that was whole
+        settings = config.estimator
+        self._tracker = Tracker(
+            self.rig, self.prior, self.model,
+            Settings(settings.window, settings.min_speed, settings.max_chi2, settings.soil_drift),
+        )  # fmt: skip
 
     def solve(self, task: WindowTask) -> WindowResult:
         """Estimate and decision of one window."""
@@ -92,13 +86,11 @@ class WindowEstimator:
     def estimate(self, task: WindowTask) -> Undecided:
         """Soil and status of one window."""
         if task.fresh:
-            self._forget()
-        standstill, fit = self._fitted(task)
-        self._fit = fit if fit is not None and fit.converged else None
-        status, reason = self._status(task, standstill, fit)
-        if status is Status.VALID and task.start >= self._soil_since:
-            self._known_until = task.end
-        posterior = None if fit is None or status is Status.INVALID else self._honest(fit)
+            self._tracker.forget()
+        tracked = self._tracker.estimate(task.window, task.end)
+        fit = tracked.fit
+        status, reason = self._status(task, tracked)
+        posterior = None if fit is None or status is Status.INVALID else self._honest(tracked, fit)
         stuck = self._stuck(task.window)
         if stuck and status is Status.VALID:
             status, reason = Status.NOT_EXCITED, "standstill"
@@ -129,45 +121,11 @@ class WindowEstimator:
             way = replace(way, state=Way.NO_GO, probability=0.0, limit="slip")
         return replace(window.result, traversability=way)
 
-    def _fitted(self, task: WindowTask) -> tuple[int, Fit | None]:
-        """Standstill instants and the fit of a window."""
-        problem = self._problem(task.window, self._soil_since)
-        if problem.n_rows < MIN_ROWS:
-            return problem.standstill, None
-        fit = resume(problem, self.prior, self._fit) if self._fit is not None else None
-        if fit is not None and not fit.converged and fit.chi2 <= self._chi2_limit(fit):
-            fit = fit_window(problem, self.prior)
-        if fit is not None and not self._mismatch(fit):
-            return problem.standstill, fit
-        if task.end - self._known_until > self._settings.window:
-            if fit is None or not fit.converged:
-                fit = fit_window(problem, self.prior)
-            return problem.standstill, fit
-        # The soil was known until just now: does the newest data agree with itself?
-        self._soil_since = -math.inf
-        since = task.end - self._settings.change_window
-        newest = self._problem(task.window, since)
-        changed = fit_window(newest, self.prior) if newest.n_rows >= MIN_ROWS else None
-        if changed is not None and not self._mismatch(changed):
-            self._soil_since, fit = since, changed
-        return problem.standstill, fit
-
-    def _problem(self, window: Window, since: float) -> WindowProblem:
-        part = window if not len(window.t) or since <= window.t[0] else window.rows(np.flatnonzero(window.t >= since))
-        return WindowProblem(part, self.rig, self.model, self._settings.min_speed)
-
-    def _mismatch(self, fit: Fit | None) -> bool:
-        return fit is None or not fit.converged or fit.chi2 > self._chi2_limit(fit)
-
-    def _chi2_limit(self, fit: Fit) -> float:
-        """Reduced chi-square that noise alone reaches hardly ever with this many residuals."""
-        return self._settings.max_chi2 + 3.5 * math.sqrt(2.0 / max(fit.rows, 1))
-
-    def _honest(self, fit: Fit) -> Posterior:
+    def _honest(self, tracked: Tracked, fit: Fit) -> Posterior:
         """Posterior with its covariance widened where the residuals are larger than the noise."""
-        if fit.chi2 <= self._chi2_limit(fit):
+        if not tracked.mismatch:
             return fit.posterior
-        return Posterior(fit.posterior.soil, fit.posterior.log_covariance * fit.chi2)
+        return Posterior(fit.posterior.soil, fit.posterior.log_covariance * max(fit.chi2, 1.0))
 
     def _bearing(self, posterior: Posterior) -> Estimate:
         return posterior.bearing_pressure(self._settings.z_ref, self._settings.b_ref)
@@ -204,24 +162,22 @@ class WindowEstimator:
         standing = known & (ground < self._settings.min_speed) & (rim > STUCK_RIM_SPEED * self._settings.min_speed)
         return bool(standing.sum() > 0.5 * max(int(known.sum()), 1))
 
-    def _status(self, task: WindowTask, standstill: int, fit: Fit | None) -> tuple[Status, str]:
+    def _status(self, task: WindowTask, tracked: Tracked) -> tuple[Status, str]:
+        fit = tracked.fit
         if task.missing:
             return Status.INVALID, "input_missing " + " ".join(task.missing)
         if fit is None:
-            if task.end - self._known_until <= self._settings.window and not task.poor and not standstill:
-                return Status.INVALID, "model_mismatch"
-            if standstill > 0:
+            if tracked.standstill > 0:
                 return Status.NOT_EXCITED, "standstill"
             return Status.INVALID, "input_stale " + " ".join(task.poor) if task.poor else "no_convergence"
-        if fit.chi2 > self._chi2_limit(fit):
-            return (Status.DEGRADED if fit.converged else Status.INVALID), "model_mismatch"
-        if not fit.converged:
-            return Status.INVALID, "no_convergence"
+        if tracked.mismatch:
+            status = Status.DEGRADED if fit.converged else Status.INVALID
+            return status, "model_mismatch" if fit.chi2 > self._tracker.chi2_limit(fit) else "no_convergence"
         if task.poor:
             return Status.DEGRADED, "input_stale " + " ".join(task.poor)
-        bearing, tan_phi = self._bearing(fit.posterior), fit.posterior.tan_phi()
-        if self._soil_since > task.end - MIN_NEW_SOIL * self._settings.window:
+        if tracked.ground is Ground.CHANGING or tracked.since > task.end - MIN_NEW_SOIL * self._settings.window:
             return Status.NOT_EXCITED, "not_excited new_soil"
+        bearing, tan_phi = self._bearing(fit.posterior), fit.posterior.tan_phi()
         if bearing.std > self._settings.max_bearing_std * bearing.value:
             return Status.NOT_EXCITED, "not_excited load_range"
         if tan_phi.std > self._settings.max_tan_phi_std * tan_phi.value:

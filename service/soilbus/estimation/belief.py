@@ -17,11 +17,12 @@ _SOIL = len(PARAMETERS)
 
 @dataclass(frozen=True, slots=True)
 class Belief:
-    """Most likely soil (6,) in SI and gain errors (G,); covariance (6 + G, 6 + G) of the soil's logarithms and the gains.
+    """Most likely soil (6,) in SI and gain errors (G,), with their covariance (6 + G, 6 + G).
 
-    What is held has no variance.  A window tells combinations of soil and gains, so what
-    it leaves behind is kept jointly: gains do not change from window to window, and
-    forgetting them would count the same ignorance as news each time.
+    The covariance is that of the soil parameters' logarithms and the gains; what is held
+    has none.  A window tells combinations of soil and gains, so what it leaves behind is
+    kept jointly: gains do not change from window to window, and forgetting them would
+    count the same ignorance as news each time.
     """
 
     soil: Array
@@ -39,9 +40,12 @@ class Belief:
         """What is known of the soil alone."""
         return Posterior(Soil(*self.soil.tolist()), self.covariance[:_SOIL, :_SOIL])
 
-    def widened(self, variance: Array) -> Belief:
-        """With more variance, a covariance (6 + G, 6 + G) that is added; what is held stays held."""
-        return replace(self, covariance=self.covariance + variance)
+    def drifted(self, soil: Array, gains: Array) -> Belief:
+        """Later: the soil's logarithms may have changed with covariance (6, 6), the gains with variance (G,)."""
+        covariance = self.covariance.copy()
+        covariance[:_SOIL, :_SOIL] += soil
+        covariance[range(_SOIL, len(covariance)), range(_SOIL, len(covariance))] += gains
+        return replace(self, covariance=covariance)
 
     def of_another_soil(self, prior: SoilPrior) -> Belief:
         """What is left on another soil, of which only the prior is known: the gains."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.normal_equations import Fitting, Place, Point
 from soilbus.estimation.posterior import Posterior, SoilPrior
-from soilbus.estimation.residuals import Optimum, WindowProblem
+from soilbus.estimation.residuals import Linearised, Optimum, WindowProblem
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
 
@@ -48,16 +48,18 @@ class Fit:
     """Outcome of one fit.
 
     cost is -2 log posterior up to a constant: chi-square of the residuals and of what was
-    known before.  chi2 is cost per residual (reduced: each parameter has its prior as one
-    more residual).  sinkage (W,) is the mean over the window [m], nan where unknown;
-    belief holds soil and gains (relative errors, by problem.gain_names) for the windows
-    to come, optimum is for resume().
+    known before; evidence is -2 log of the data's likelihood, up to the same.  chi2 is
+    cost per residual (reduced: each parameter has its prior as one more residual).
+    sinkage (W,) is the mean over the window [m], nan where unknown; belief holds soil and
+    gains (relative errors, by problem.gain_names) for the windows to come, optimum is for
+    resume().
     """
 
     belief: Belief
     sinkage: Array
     optimum: Optimum
     cost: float
+    evidence: float
     rows: int
     iterations: int
     converged: bool
@@ -143,17 +145,29 @@ def descend(problem: WindowProblem, prior: SoilPrior, start: Soil, before: Belie
         return None if near is None else _settle(Fitting(problem, prior, before), near, MAX_ITERATIONS)
 
 
-def resume(problem: WindowProblem, prior: SoilPrior, last: Fit, before: Belief | None = None) -> Fit | None:
-    """Descent from the optimum of a window just before.
+@dataclass(frozen=True, slots=True)
+class Foreseen:
+    """A window as the one just before lets expect it: linearised at that one's optimum."""
 
-    What both windows share was linearised there already: the first step costs little.
-    """
+    fitting: Fitting
+    place: Place
+    at: Linearised
+
+
+def foreseen(problem: WindowProblem, prior: SoilPrior, last: Fit, before: Belief | None = None) -> Foreseen:
+    """A window at the optimum of the one just before, where what both share is linearised already."""
     fitting = Fitting(problem, prior, Belief.of(prior, problem.gain_std) if before is None else before)
-    start = last.optimum
     with np.errstate(all="ignore"):
-        latents, at = problem.after(start)
-        near = Place(np.where(prior.log_std > 0.0, start.soil, prior.median), start.gains, latents, np.inf, 1)
-        point = fitting.with_before(near, at)
+        latents, at = problem.after(last.optimum)
+    soil = np.where(prior.log_std > 0.0, last.optimum.soil, prior.median)
+    return Foreseen(fitting, Place(soil, last.optimum.gains, latents, np.inf, 1), at)
+
+
+def resume(ahead: Foreseen) -> Fit | None:
+    """Descent from the optimum of the window just before; the first step costs nothing more."""
+    fitting, near = ahead.fitting, ahead.place
+    with np.errstate(all="ignore"):
+        point = fitting.with_before(near, ahead.at)
         step = None if point is None else point.step()
         if point is not None and step is not None:
             near = fitting.moved(near, point, step)
@@ -227,6 +241,7 @@ def _settle(fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OV
         sinkage=fitting.problem.mean_sinkage(near.latents),
         optimum=Optimum(fitting.problem.t, last.soil, last.gains, last.latents, point.at),
         cost=point.cost - length,
+        evidence=point.evidence - length,
         rows=fitting.problem.n_rows,
         iterations=iterations,
         converged=converged,

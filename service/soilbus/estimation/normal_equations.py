@@ -40,11 +40,13 @@ class Place:
 class Point:
     """Normal equations by the free coordinates (F) and active gains (A) at one place.
 
-    information (F + A, F + A) is Gauss-Newton's; bend, which comes on top for a step, is
-    the curvature of the coordinates.  cost is -2 log posterior up to a constant.
+    information (F + A, F + A) is Gauss-Newton's, of which `known` is what was known
+    before; bend, which comes on top for a step, is the curvature of the coordinates.
+    cost is -2 log posterior up to a constant.
     """
 
     information: Array
+    known: Array
     bend: Array
     gradient: Array
     cost: float
@@ -55,6 +57,11 @@ class Point:
         curved = self.information + self.bend
         solution = solved(curved + damping * np.diag(np.diag(curved)), self.gradient)
         return None if solution is None else -solution[0]
+
+    @property
+    def evidence(self) -> float:
+        """-2 log of the data's likelihood whatever the soil may be (Laplace), up to the same constant."""
+        return self.cost + float(np.linalg.slogdet(self.information)[1] - np.linalg.slogdet(self.known)[1])
 
     def length(self, step: Array) -> float:
         """Squared length of a step in standard deviations."""
@@ -77,6 +84,10 @@ class Fitting:
         self._mean = np.concatenate([np.log(before.soil[self.free]), before.gains[self.active]])
         self._precision = inverse[1]
 
+    def given(self, before: Belief) -> Fitting:
+        """The same with something else known before."""
+        return Fitting(self.problem, self.coordinates.prior, before)
+
     def start(self, soil: Array, guess: Array | None = None) -> Place:
         """A soil with gains as believed and latents as measured; entry angles solved from a guess (N, W)."""
         return Place(soil, self.before.gains, self.problem.start(Soil(*soil.tolist()), guess), np.inf, 0)
@@ -87,29 +98,45 @@ class Fitting:
 
     def with_before(self, place: Place, at: Linearised) -> Point | None:
         """Those of residuals linearised already."""
-        free, active = len(self.free), self.active
-        off = np.concatenate([np.log(place.soil[self.free]), place.gains[active]]) - self._mean
-        by = self._log_directions(place.soil)
-        directions = np.zeros((len(at.normal), 1 + free + len(active)))  # of the residual, coordinates and gains
-        directions[0, 0] = 1.0
-        directions[1:7, 1 : 1 + free] = place.soil[:, None] * by
-        directions[7 + active, 1 + free + np.arange(len(active))] = 1.0
-        normal = directions.T @ at.normal @ directions
-        bend = np.zeros((free + len(active), free + len(active)))
-        bend[:free, :free] = self.coordinates.bend(normal[1 : 1 + free, 0])
-        by_known = np.eye(free + len(active))
-        by_known[:free, :free] = by[self.free]
+        free = len(self.free)
+        off = np.concatenate([np.log(place.soil[self.free]), place.gains[self.active]]) - self._mean
+        directions = self.directions(place)
+        gradient = directions.T @ at.normal[:, 0]
+        by_known = self._by_known(place)
+        known = self.precision(place)
+        bend = np.zeros(known.shape)
+        bend[:free, :free] = self.coordinates.bend(gradient[:free])
         pull = self._precision @ off
         cost = at.chi2 + float(off @ pull)
         if not np.isfinite(cost):
             return None
         return Point(
-            information=normal[1:, 1:] + by_known.T @ self._precision @ by_known,
+            information=directions.T @ at.normal @ directions + known,
+            known=known,
             bend=bend,
-            gradient=normal[1:, 0] + by_known.T @ pull,
+            gradient=gradient + by_known.T @ pull,
             cost=cost,
             at=at,
         )
+
+    def directions(self, place: Place) -> Array:
+        """What a column of Linearised.rows (1 + 6 + G) has of each coordinate and active gain (F + A)."""
+        free = len(self.free)
+        directions = np.zeros((7 + len(place.gains), free + len(self.active)))
+        directions[1:7, :free] = place.soil[:, None] * self._log_directions(place.soil)
+        directions[7 + self.active, free + np.arange(len(self.active))] = 1.0
+        return directions
+
+    def precision(self, place: Place) -> Array:
+        """Information (F + A, F + A) of what was known before, by the coordinates at a place."""
+        by_known = self._by_known(place)
+        return np.asarray(by_known.T @ self._precision @ by_known)
+
+    def _by_known(self, place: Place) -> Array:
+        free = len(self.free)
+        by_known = np.eye(free + len(self.active))
+        by_known[:free, :free] = self._log_directions(place.soil)[self.free]
+        return by_known
 
     def moved(self, place: Place, point: Point, step: Array) -> Place:
         """The place after a step (F + A,), with the latents that the linear model foresees."""

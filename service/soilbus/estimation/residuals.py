@@ -78,6 +78,8 @@ class Linearised:
     normal: Array
     by_latents: Array  # (N, m, 2 W + 1)
     corrected: Array  # (N, 2 W + 1) measured latents less their gain errors
+    variance: Array  # of these
+    by_gain: Array  # and minus their derivatives by the gain errors
     off: Array  # (N, W) latent load less the model's
     load_slope: Array  # (N, W) dW/d entry angle
     load_by_slip: Array
@@ -99,6 +101,8 @@ class Linearised:
             normal=rows.T @ weighed,
             by_latents=np.concatenate([self.by_latents[first:], new.by_latents]),
             corrected=np.concatenate([self.corrected[first:], new.corrected]),
+            variance=np.concatenate([self.variance[first:], new.variance]),
+            by_gain=np.concatenate([self.by_gain[first:], new.by_gain]),
             off=np.concatenate([self.off[first:], new.off]),
             load_slope=np.concatenate([self.load_slope[first:], new.load_slope]),
             load_by_slip=np.concatenate([self.load_by_slip[first:], new.load_by_slip]),
@@ -170,9 +174,8 @@ class WindowProblem:
 
     def _balance(self, take: Callable[[str], Reading], usable: NDArray[np.bool_]) -> None:
         """The pull that draft, slope and inertia ask of the wheels, and its variance."""
-        self.draft, variance, known = take("draft")
-        demand = self.draft.copy()
-        variance = variance.copy()
+        self.draft, draft_var, known = take("draft")
+        demand, variance = self.draft.copy(), draft_var.copy()
         if self.rig.chassis is not None:
             mass = self.rig.chassis.mass
             pitch, pitch_var, has_pitch = take("pitch")
@@ -186,6 +189,7 @@ class WindowProblem:
             demand += mass * (GRAVITY * np.sin(pitch) + acceleration)
             variance += mass**2 * ((GRAVITY * np.cos(pitch)) ** 2 * pitch_var + acceleration_var)
         self.demand, self.demand_var = demand, variance
+        self.draft_var = np.where(known & usable.all(axis=1), draft_var, 0.0)
         self.has_balance = known & usable.all(axis=1)
 
     def _gains(self) -> tuple[list[str], Array]:
@@ -311,12 +315,20 @@ class WindowProblem:
         value[2] += sinkage(latents.entry_angle, r)
 
         A = self._by_latents(ratio, by[:, 0], carried / latents.speed, -1.0 / rim)
-        g_torque, g_latents, g_draft = gains[:W], gains[W:-1], gains[-1]
-        corrected = self._measured * (1.0 - g_latents)
+        # A sensor reads (1 + gain) times the truth, plus noise: readings are scaled back, and their
+        # noise with them, else a gain that makes everything smaller would seem to fit better.
+        scale = 1.0 / (1.0 + gains)
+        of_torque, of_latents, of_draft = scale[:W], scale[W:-1], scale[-1]
+        corrected, variance = self._measured * of_latents, self._measured_var * of_latents**2
         rows = np.zeros((*A.shape[:2], 7 + len(gains)))
         residual, by_soil = rows[:, :, 0], rows[:, :, 1:7]
-        residual[:, :W] = self.torque * (1.0 - g_torque) - value[1]
-        residual[:, W] = self.demand - g_draft * self.draft - value[0].sum(1)
+        draft, draft_var = self.draft * of_draft, self.draft_var * of_draft**2
+        row_var = self._row_var.copy()
+        row_var[:, :W] *= of_torque**2
+        row_var[:, W] += draft_var - self.draft_var
+        residual[:, :W] = self.torque * of_torque - value[1]
+        residual[:, W] = self.demand - self.draft + draft - value[0].sum(1)
+        likely_draft = draft - residual[:, W] * draft_var / row_var[:, W]
         by_soil[:, :W] = -by[1, 1:].transpose(1, 2, 0)
         by_soil[:, W] = -by[0, 1:].sum(2).T
         if self.with_sinkage:
@@ -324,11 +336,14 @@ class WindowProblem:
             by_soil[:, W + 1 :] = -by[2, 1:].transpose(1, 2, 0)
         now = np.concatenate([latents.load, latents.speed, latents.ground_speed[:, None]], axis=1)
         residual += (A @ (corrected - now)[:, :, None])[:, :, 0]
-        self._write_by_gain(A, rows[:, :, 7:])
+        by_gain = now * of_latents
+        diagonals(rows[:, :W, 7 : 7 + W])[:] = -of_torque * value[1]
+        np.multiply(A, -by_gain[:, None, :], out=rows[:, :, 7 + W : -1])
+        rows[:, W, -1] = -of_draft * likely_draft
         if self._missing is not None:
             A[self._missing] = 0.0
             rows[self._missing] = 0.0
-        weighed = inverse_covariance(A, self._measured_var, self._row_var, W) @ rows
+        weighed = inverse_covariance(A, variance, row_var, W) @ rows
         flat, weighed = rows.reshape(-1, rows.shape[2]), weighed.reshape(-1, rows.shape[2])
         return Linearised(
             rows=flat,
@@ -336,6 +351,8 @@ class WindowProblem:
             normal=flat.T @ weighed,
             by_latents=A,
             corrected=corrected,
+            variance=variance,
+            by_gain=by_gain,
             off=off,
             load_slope=slope,
             load_by_slip=load_by[0],
@@ -364,18 +381,11 @@ class WindowProblem:
             wheel_rows[:, :, 2 * W] = by_ground[kind]
         return np.negative(A, out=A)
 
-    def _write_by_gain(self, A: Array, out: Array) -> None:
-        """Derivatives (N, m, G): a torque or draft gain scales the reading, a latent's gain acts through A."""
-        W = self.n_wheels
-        diagonals(out[:, :W, :W])[:] = -self.torque
-        np.multiply(A, -self._measured[:, None, :], out=out[:, :, W:-1])
-        out[:, W, -1] = -self.draft
-
     def updated(self, at: Linearised, latents: Latents, soil_step: Array, gain_step: Array) -> Latents:
         """Latents after a step (6,) of the soil and (G,) of the gains, by the linear model."""
         N, W = self.n, self.n_wheels
         left = (at.weighed @ np.concatenate([[1.0], soil_step, gain_step])).reshape(N, 1, at.by_latents.shape[1])
-        new = at.corrected - self._measured_var * (left @ at.by_latents)[:, 0] - self._measured * gain_step[W:-1]
+        new = at.corrected - at.variance * (left @ at.by_latents)[:, 0] - at.by_gain * gain_step[W:-1]
         load, speed, ground = new[:, :W], new[:, W : 2 * W], new[:, 2 * W]
         slip_change = (latents.ground_speed[:, None] / latents.speed - ground[:, None] / speed) / self.rig.radius
         change = load - latents.load + at.off - at.load_by_slip * slip_change
