@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import argparse
 import logging
+import math
 import os
 import signal
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -87,6 +88,13 @@ def _parser() -> argparse.ArgumentParser:
 
     sub = command("watch", _watch, "live terminal dashboard that reads only our frames", "optional")
     sub.add_argument("--seconds", type=float, metavar="S", help="stop after this time")
+
+    sub = command("paper", _paper, "the tables of Xi et al. 2024 beside ours, and what holds of its method", "")
+    sub.add_argument(
+        "--sinkage", type=_between(0.005, 0.2), default=0.05, metavar="M",
+        help="of the simulated wheels, 0.005 to 0.2 m; the paper does not print its own (default 0.05)",
+    )  # fmt: skip
+    sub.add_argument("--seed", type=_natural, default=1, help="of the noise (default 1)")
 
     sub = command("bench", _bench, "every performance figure beside its peer, in one run", "")
     sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
@@ -194,6 +202,34 @@ def _watch(args: argparse.Namespace) -> None:
         watch(config, args.seconds)
     except BusError as error:
         raise WorkError(str(error)) from None
+
+
+def _between(low: float, high: float) -> Callable[[str], float]:
+    """Parser of a number in a range, for argparse."""
+
+    def number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"{text} is not a number from {low:g} to {high:g}")
+        return value
+
+    return number
+
+
+def _natural(text: str) -> int:
+    """Parser of a whole number that is not negative, for argparse."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text} is not a whole number from 0 up")
+    return int(text)
+
+
+def _paper(args: argparse.Namespace) -> None:
+    from soilbus.report.paper import paper_report
+
+    print(paper_report(args.sinkage, args.seed), end="")
 
 
 def _bench(args: argparse.Namespace) -> None:

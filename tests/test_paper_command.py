@@ -1,0 +1,112 @@
+"""`soilbus paper` as a reader sees it, and the bench of the paper's solve."""
+
+from __future__ import annotations
+
+import io
+import re
+import sys
+from contextlib import redirect_stdout
+
+import pytest
+
+from soilbus import bench_paper
+from soilbus.cli import main
+from soilbus.estimation.paper_tables import RUNS
+
+
+@pytest.fixture(scope="module")
+def output() -> str:
+    out = io.StringIO()
+    with redirect_stdout(out):
+        assert main(["paper"]) == 0
+    return out.getvalue()
+
+
+def section(output: str, title: str) -> list[str]:
+    """Lines under a ruled title."""
+    lines = output.splitlines()
+    (at,) = (i for i, line in enumerate(lines[:-1]) if line.startswith(title) and set(lines[i + 1]) == {"="})
+    body = lines[at + 2 :]
+    end = next((i for i, line in enumerate(body) if set(line) == {"="}), len(body) + 1)
+    return body[: end - 1]
+
+
+@pytest.mark.parametrize("number", [3, 4, 6, 7])
+def test_every_printed_figure_stands_beside_ours(output, number):
+    rows = [re.split(r"  +", line.strip()) for line in section(output, f"Table {number}:")[2:] if line]
+    expected = [
+        [name, run.on, f"{run.start[i]:g}", f"{run.result[i]:g}", f"{run.errors[i]:g}", f"{run.seconds:g}"]
+        for i, name in enumerate(("phi [deg]", "K_L", "n"))
+        for run in RUNS
+        if run.table == number
+    ]
+    assert [[*row[:5], row[9]] for row in rows] == expected
+    for row in rows:
+        assert float(row[7]) < 1e-7  # our error in per cent
+        assert 4 <= int(row[8]) <= 8
+        assert float(row[10]) < 0.1 * float(row[9])
+
+
+def test_sections_and_their_numbers(output):
+    assert all(len(line) <= 130 for line in output.splitlines())
+    assert "Traceback" not in output
+    assert "nan" not in output
+    holds = re.sub(r"\s+", " ", " ".join(section(output, "What holds")))
+    assert "8 of the 8" in holds
+    assert "K_L = 108 instead of 645" in holds
+    assert "at least 559 %" in holds
+    other = "\n".join(section(output, "Other data"))
+    assert re.search(r"A4 as printed, in the solver only +none +none +none", other)
+    assert re.search(r"exact integrals, rational shear +13\.980, 108\.40, 0\.3645", other)
+    torques = "\n".join(section(output, "Figure 13"))
+    assert re.search(r"sinkage 0\.05 m +219 +934 +278 +1182", torques)
+    noise = "\n".join(section(output, "Noise"))
+    assert noise.count("100 instants: RMS error") == noise.count("one instant: bound") == 4
+    widths = "\n".join(section(output, "k_c and k_phi"))
+    assert re.search(r"paper's Table 6 +635\.52 +596\.18 +35\.41 +19 +517\.5 +3\.6", widths)
+
+
+def test_every_correction_shows_its_effect(output):
+    text = "\n".join(section(output, "Corrected in the paper"))
+    flat = re.sub(r"\s+", " ", text)
+    for number in (
+        "DP = -22.3 N instead of +79.6 N (integrals: +77.4 N)",  # eq. 27
+        "T = 340 N m instead of",  # eq. 14
+        "0.67 against 0.87 of the strength",  # fig. 2
+        "T = 219 N m against W = 1633 N, DP = +192 N, T = 278 N m",
+        "j/(j+K) <= 0.67",  # section 2.4
+        "635.522 against 644.9 is 1.45 %",
+        "k_c = 35.41 instead of 43.68",
+        "phi = 14.000, K_L = 596.37, n = 0.8500",  # table 7
+    ):
+        assert number in flat
+    assert text.count("effect:") == text.count("printed:") == text.count("must be:") == 12
+
+
+@pytest.mark.parametrize("wrong", [["--sinkage", "1"], ["--sinkage", "deep"], ["--sinkage", "nan"], ["--seed", "-1"]])
+def test_wrong_usage_is_one_line(wrong, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["paper", *wrong])
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.splitlines()[-1].startswith(f"soilbus paper: error: argument {wrong[0]}: {wrong[1]}")
+
+
+def test_bench_solves_the_same_problem_as_its_peer(monkeypatch):
+    monkeypatch.setattr(bench_paper, "ROUNDS", 1)
+    monkeypatch.setattr(bench_paper, "SOLVES", 20)
+    figure = bench_paper.paper_solve()
+    assert set(figure) == {"value", "target", "peer", "what"}
+    assert figure["target"] == 300
+    assert figure["value"] > 30.0  # one noisy round; the bench itself is where 300 is asked for
+
+
+def test_bench_refuses_to_compare_unlike_solutions(monkeypatch):
+    monkeypatch.setattr(bench_paper, "AGREEMENT", 1e-12)
+    with pytest.raises(AssertionError, match="apart"):
+        bench_paper.paper_solve()
+
+
+def test_bench_without_scipy_says_what_it_needs(monkeypatch):
+    monkeypatch.setitem(sys.modules, "scipy.optimize", None)
+    with pytest.raises(ModuleNotFoundError, match=r"needs the extra soilbus\[peers\]"):
+        bench_paper.paper_solve()
