@@ -1,0 +1,133 @@
+"""Noisy windows of the full simulator, what the methods are told beside them, and the form of their answers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from functools import cache, cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.assembly import model_of, rig_of
+from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
+from soilbus.estimation.residuals import Linearised, WindowProblem
+from soilbus.estimation.weights import diagonals
+from soilbus.estimation.window import BinStore, Rig
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.terra.wheel import Soil, WheelModel
+
+Array = NDArray[np.float64]
+Answer = dict[str, Estimate]
+"""Estimates by name: parameters of Soil, and "bearing"; std is nan where the method has none."""
+Method = Callable[["Case"], Answer | None]
+"""A window's answer; None where the method itself says that it failed."""
+
+Z_REF, B_REF = 0.02, 0.3
+"""Depth and width [m] of the bearing pressure that is compared."""
+TOLD = 0.25
+"""Variation of what is told of a parameter: sd over value."""
+SPREAD = float(np.sqrt(np.log1p(TOLD**2)))
+LENGTH = 10.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """A window, and for each parameter a value that is told: exact, or off by a quarter (one sd).
+
+    `exact` names the parameters that are told exactly; `soil` is the truth, for scoring only.
+    """
+
+    soil: Soil
+    told: Soil
+    exact: frozenset[str]
+    problem: WindowProblem
+
+    @property
+    def known(self) -> Soil:
+        """What a method that holds parameters fixed takes for them."""
+        return Soil(*(getattr(self.soil if name in self.exact else self.told, name) for name in PARAMETERS))
+
+    @cached_property
+    def prior(self) -> SoilPrior:
+        """The configuration's prior, but c and K as told; what is told exactly is held."""
+        values = configured_prior() | {
+            name: (getattr(self.told, name), TOLD * getattr(self.told, name)) for name in ("c", "K")
+        }
+        return SoilPrior.from_value_std(values | {name: (getattr(self.soil, name), 0.0) for name in self.exact})
+
+    def knowing(self, exact: Collection[str]) -> Case:
+        """The same window with other parameters told exactly."""
+        return Case(self.soil, self.told, frozenset(exact), self.problem)
+
+
+@cache
+def configured_prior() -> dict[str, tuple[float, float]]:
+    """Value and std of each soil parameter that our reference configuration has as prior."""
+    return {name: (p.value, p.std) for name, p in reference_configuration().soil_prior.items()}
+
+
+@cache
+def reference_rig() -> Rig:
+    """Our reference tractor, with a sinkage sensor at each wheel."""
+    return rig_of(reference_configuration())
+
+
+@cache
+def fit_model() -> WheelModel:
+    """The wheel model that all methods but the linear one integrate."""
+    return model_of(reference_configuration())
+
+
+def told_about(soil: Soil, rng: np.random.Generator) -> Soil:
+    """The soil as somebody would tell it who knows each parameter to a quarter."""
+    return Soil(*(np.asarray(soil) * np.exp(SPREAD * rng.standard_normal(6))).tolist())
+
+
+def simulated_case(soil: Soil, seed: int, noise_free: bool = False) -> Case:
+    """10 s of the full simulator, slip swept between 0.05 and 0.4, bins of 0.1 s."""
+    quiet = [f"noise.{q}.{kind}=1e-9" for q in _NOISY for kind in _NOISY[q]] if noise_free else []
+    scenario = Scenario(LENGTH, (Patch(0.0, "this", soil),), slip=Swing(0.05, 0.40))
+    recording = simulate(reference_configuration(quiet), scenario, seed)
+    rig, estimator = reference_rig(), reference_configuration().estimator
+    store = BinStore(rig, estimator.bin, 0.0)
+    store.add({name: (c.t, c.value) for name, c in recording.channels.items() if name in rig.channels})
+    problem = WindowProblem(store.window(0.0, LENGTH), rig, fit_model(), estimator.min_speed)
+    return Case(soil, told_about(soil, np.random.default_rng([seed, 77])), frozenset(), problem)
+
+
+_NOISY = {
+    "torque": ("of_mean", "gain"), "load": ("relative", "gain"), "speed": ("relative", "gain"),
+    "ground_speed": ("relative", "gain"), "draft": ("absolute", "gain"), "sinkage": ("absolute",),
+    "pitch": ("absolute",), "acceleration": ("absolute",),
+}  # fmt: skip
+
+
+def entry_angles(problem: WindowProblem) -> Array:
+    """Entry angles [rad] (N, W) that the sinkage sensors tell (eq. 1)."""
+    return np.arccos(1.0 - np.maximum(problem.sinkage, 1e-4) / problem.rig.radius)
+
+
+def at_measured(problem: WindowProblem, soil: Soil) -> Linearised:
+    """Our residuals at a soil, with loads and speeds at their measured values."""
+    return problem.linearise(soil, np.zeros(len(problem.gain_std)), problem.start(soil))
+
+
+def reading_covariance(problem: WindowProblem, at: Linearised) -> Array:
+    """Covariance (N, m, m) of an instant's torques, draft balance and sinkages against the model.
+
+    The noise of loads and speeds travels through the linearised model: the noise model of
+    soilbus.estimation, without the gain errors, written out.
+    """
+    latent = np.concatenate([problem.load_var, problem.speed_var, problem.ground_speed_var[:, None]], axis=1)
+    covariance = np.einsum("nik,nk,njk->nij", at.by_latents, latent, at.by_latents)
+    own = np.concatenate([problem.torque_var, problem.demand_var[:, None], problem.sinkage_var], axis=1)
+    diagonals(covariance)[:] += own
+    return covariance
+
+
+def bearing_pressure(K_L: float, n: float, std: float = np.nan) -> Estimate:
+    """Bearing pressure [Pa] at Z_REF from the lumped modulus at B_REF."""
+    return Estimate(float(K_L * Z_REF**n), std)
