@@ -171,7 +171,8 @@ def resume(ahead: Foreseen) -> Fit | None:
         step = None if point is None else point.step()
         if point is not None and step is not None:
             near = fitting.moved(near, point, step)
-        return _settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED)
+        first = 0.0 if point is None or step is None else point.length(step)
+        return _settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED, first)
 
 
 def _approach(fitting: Fitting, soil: Array, most: int) -> Place | None:
@@ -199,14 +200,17 @@ def _approach(fitting: Fitting, soil: Array, most: int) -> Place | None:
     return None
 
 
-def _settle(fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OVER) -> Fit | None:
+def _settle(
+    fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OVER, before: float = 0.0
+) -> Fit | None:
     """Steps of soil, gains and latents together from a place near the optimum.
 
+    `before` is the squared length of the step that led there, if it was one of these.
     A step that makes things worse is taken back and tried again shorter: damping would
     hold back just the weak directions, along which the steps overshoot.
     """
     best: tuple[Place, Point] | None = None
-    share, length, before, refused = 1.0, np.inf, 0.0, 0
+    share, length, refused = 1.0, np.inf, 0
     iterations, converged = near.trials, False
     for _ in range(most):
         iterations += 1

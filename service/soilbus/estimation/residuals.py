@@ -11,6 +11,7 @@ sect. 4.8).  The entry angle of each wheel follows from its load.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,12 +122,19 @@ class Optimum:
     at: Linearised
 
 
+_BY_INSTANT = (
+    "t", "usable", "torque", "torque_var", "has_torque", "sinkage", "sinkage_var", "has_sinkage", "load", "load_var",
+    "speed", "speed_var", "ground_speed", "ground_speed_var", "slip", "draft", "draft_var", "demand", "demand_var",
+    "has_balance", "_measured", "_measured_var", "_row_var", "_known",
+)  # fmt: skip
+"""Attributes of a window's problem with a row for each instant."""
+
+
 class WindowProblem:
     """One window's data with masks, ready to be linearised at any soil."""
 
     def __init__(self, window: Window, rig: Rig, model: WheelModel, min_speed: float) -> None:
         self.rig, self.model = rig, model
-        self._window, self._min_speed = window, min_speed
         n_wheels = len(rig.wheels)
         moving = window.ground_speed > min_speed
         rim = rig.radius * window.speed
@@ -135,10 +143,9 @@ class WindowProblem:
             usable = moving[:, None] & (window.load > 0.0) & (rim > 0.0) & (slip < MAX_SLIP) & (slip > MIN_SLIP)
         kept = np.flatnonzero(usable.any(axis=1))
         self.standstill = int(np.count_nonzero(~moving & np.isfinite(window.ground_speed)))
-        self._kept = kept
         self.t = window.t[kept]
         self.usable = usable = usable[kept]
-        self.n, self.n_wheels = len(kept), n_wheels
+        self.n_wheels = n_wheels
 
         def take(quantity: str) -> Reading:
             value = getattr(window, quantity)[kept]
@@ -168,9 +175,15 @@ class WindowProblem:
         n_kinds = 3 if self.with_sinkage else 2
         known = np.concatenate(known_rows[:n_kinds], axis=1)
         self._row_var = np.where(known, np.concatenate(row_var[:n_kinds], axis=1), 1.0)
-        self._n_known = int(known.sum())
-        self._radius, self._width = (np.tile(a, self.n) for a in (rig.radius, rig.width))
-        self._missing = None if known.all() else ~known
+        self._known = known
+        self._count()
+
+    def _count(self) -> None:
+        """What follows from the number of instants and the masks."""
+        self.n = len(self.t)
+        self._n_known = int(self._known.sum())
+        self._missing = None if self._n_known == self._known.size else ~self._known
+        self._radius, self._width = (np.tile(a, self.n) for a in (self.rig.radius, self.rig.width))
 
     def _balance(self, take: Callable[[str], Reading], usable: NDArray[np.bool_]) -> None:
         """The pull that draft, slope and inertia ask of the wheels, and its variance."""
@@ -217,8 +230,13 @@ class WindowProblem:
             return self
         return self._part(np.linspace(0, self.n - 1, most).round().astype(int))
 
-    def _part(self, instants: NDArray[np.intp]) -> WindowProblem:
-        return WindowProblem(self._window.rows(self._kept[instants]), self.rig, self.model, self._min_speed)
+    def _part(self, instants: slice | NDArray[np.intp]) -> WindowProblem:
+        """The same with only these instants."""
+        part = copy(self)
+        for name in _BY_INSTANT:
+            setattr(part, name, getattr(self, name)[instants])
+        part._count()
+        return part
 
     def start(self, soil: Soil, guess: Array | None = None) -> Latents:
         """Latents at the measured values, entry angles solved for this soil from a guess (N, W)."""
@@ -251,9 +269,9 @@ class WindowProblem:
         values, with entry angles as loads and slips had them in the other window.
         """
         shared = self._shared(before.t)
-        new = self._part(np.arange(shared, self.n)) if shared else self
-        if not self._n_residuals == new._n_residuals == before.at.by_latents.shape[1]:
-            new, shared = self, 0
+        if before.at.by_latents.shape[1] != self._n_residuals:
+            shared = 0
+        new = self._part(slice(shared, None))
         start = new._measured_on(self._angle_curve(before.latents))
         at = new.linearise(Soil(*before.soil.tolist()), before.gains, start)
         if not shared:
