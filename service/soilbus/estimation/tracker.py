@@ -34,6 +34,8 @@ ALARM = 12.0
 """Log likelihood ratio from which another soil is looked for."""
 CHANGED = 20.0
 """Fall of -2 log evidence from which it is believed."""
+TRUST, TRUST_AGAIN = 3.5, 1.0
+"""Standard deviations of chi-square that a window may have above the allowed: always, and after a mismatch."""
 LOOK_BACK = 0.3
 """Share of a window, up to its end, within which a change is looked for."""
 LEARNED = 0.5
@@ -102,6 +104,7 @@ class Tracker:
     def forget(self) -> None:
         """Begin anew."""
         self._here = self.prior  # of the present soil
+        self._distrusted = False
         self._fit: Fit | None = None
         self._good_until = -math.inf
         self._crossing: Crossing | None = None
@@ -155,12 +158,15 @@ class Tracker:
 
     def chi2_limit(self, fit: Fit) -> float:
         """Reduced chi-square that noise alone reaches hardly ever with this many residuals."""
-        return self.settings.max_chi2 + 3.5 * math.sqrt(2.0 / max(fit.rows, 1))
+        deviations = TRUST_AGAIN if self._distrusted else TRUST
+        return self.settings.max_chi2 + deviations * math.sqrt(2.0 / max(fit.rows, 1))
 
     def _remembered(self, tracked: Tracked, end: float) -> Tracked:
         """The same, taken note of; a failed or bad fit leaves what is known alone."""
         fit = tracked.fit
         self._fit = fit if fit is not None and fit.converged else None
+        if fit is not None:
+            self._distrusted = tracked.mismatch
         if fit is not None and not tracked.mismatch:
             self._good_until = end
             if end - tracked.since >= LEARNED * self.settings.window and tracked.ground is not Ground.CHANGING:
