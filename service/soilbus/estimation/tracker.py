@@ -34,7 +34,7 @@ ALARM = 12.0
 """Log likelihood ratio from which another soil is looked for."""
 CHANGED = 20.0
 """Fall of -2 log evidence from which it is believed."""
-TRUST, TRUST_AGAIN = 3.5, 1.0
+TRUST, TRUST_AGAIN = 3.5, 0.0
 """Standard deviations of chi-square that a window may have above the allowed: always, and after a mismatch."""
 LOOK_BACK = 0.3
 """Share of a window, up to its end, within which a change is looked for."""
