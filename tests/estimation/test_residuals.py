@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from soilbus.estimation.residuals import GAIN_QUANTITIES, Latents, WindowProblem, differentiated_speed
+from soilbus.estimation.linearised import Latents
+from soilbus.estimation.readings import GAIN_QUANTITIES, differentiated_speed
+from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import Rig, Window, window_of_samples
 from soilbus.terra.soils import SOILS
 from soilbus.terra.vehicle import GRAVITY

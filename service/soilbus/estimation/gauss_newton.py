@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
+from soilbus.estimation.linearised import Linearised, Optimum
 from soilbus.estimation.normal_equations import Fitting, Place, Point
 from soilbus.estimation.posterior import Posterior, SoilPrior
-from soilbus.estimation.residuals import Linearised, Optimum, WindowProblem
+from soilbus.estimation.residuals import WindowProblem
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
 
@@ -200,9 +201,7 @@ def _approach(fitting: Fitting, soil: Array, most: int) -> Place | None:
     return None
 
 
-def _settle(
-    fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OVER, before: float = 0.0
-) -> Fit | None:
+def _settle(fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OVER, before: float = 0.0) -> Fit | None:
     """Steps of soil, gains and latents together from a place near the optimum.
 
     `before` is the squared length of the step that led there, if it was one of these.

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.coordinates import Coordinates
+from soilbus.estimation.linearised import Latents, Linearised
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-from soilbus.estimation.residuals import Latents, Linearised, WindowProblem
+from soilbus.estimation.residuals import WindowProblem
 from soilbus.terra.wheel import Soil
 
 Array = NDArray[np.float64]

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.estimation.linearised import Linearised
 from soilbus.estimation.normal_equations import Fitting, Place
-from soilbus.estimation.residuals import Linearised
 from soilbus.estimation.window import Window
 
 Array = NDArray[np.float64]

@@ -1,0 +1,157 @@
+"""A window's data as the model wants it: what is usable, in which instants, with which variance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.estimation.window import Rig, Window
+from soilbus.terra.vehicle import GRAVITY
+
+Array = NDArray[np.float64]
+Reading = tuple[Array, Array, NDArray[np.bool_]]
+"""Values, variances of them, and which of them are known; zero where not."""
+
+MAX_SLIP = 0.98
+MIN_SLIP = -1.0
+GAIN_QUANTITIES = ("torque", "load", "speed", "ground_speed", "draft")
+
+_BY_INSTANT = (
+    "t", "usable", "torque", "torque_var", "has_torque", "sinkage", "sinkage_var", "has_sinkage", "load", "load_var",
+    "speed", "speed_var", "ground_speed", "ground_speed_var", "slip", "draft", "draft_var", "demand", "demand_var",
+    "has_balance", "_measured", "_measured_var", "_row_var", "_known",
+)  # fmt: skip
+"""Attributes of a window's problem with a row for each instant."""
+
+
+class Readings:
+    """The usable instants (N) of a window: arrays (N, W) of the wheels and (N,) of the vehicle, in SI.
+
+    Each has its variance and a mask of what is known; both are zero where it is not.
+    `standstill` counts instants left out.
+    """
+
+    def __init__(self, window: Window, rig: Rig, min_speed: float) -> None:
+        self.rig = rig
+        n_wheels = len(rig.wheels)
+        moving = window.ground_speed > min_speed
+        rim = rig.radius * window.speed
+        with np.errstate(invalid="ignore", divide="ignore"):
+            slip = 1.0 - window.ground_speed[:, None] / rim
+            usable = moving[:, None] & (window.load > 0.0) & (rim > 0.0) & (slip < MAX_SLIP) & (slip > MIN_SLIP)
+        kept = np.flatnonzero(usable.any(axis=1))
+        self.standstill = int(np.count_nonzero(~moving & np.isfinite(window.ground_speed)))
+        self.t = window.t[kept]
+        self.usable = usable = usable[kept]
+        self.n_wheels = n_wheels
+
+        def take(quantity: str) -> Reading:
+            value = getattr(window, quantity)[kept]
+            variance = window.variance[quantity][kept]
+            known = np.isfinite(value) & np.isfinite(variance)
+            return np.where(known, value, 0.0), np.where(known, variance, 0.0), known
+
+        self.torque, self.torque_var, known = take("torque")
+        self.has_torque = known & usable
+        self.sinkage, self.sinkage_var, known = take("sinkage")
+        self.has_sinkage = known & usable
+        self.with_sinkage = bool(self.has_sinkage.any())
+        load, load_var, _ = take("load")
+        speed, speed_var, _ = take("speed")
+        self.ground_speed, self.ground_speed_var, _ = take("ground_speed")
+        # Unusable wheel-instants get a harmless stand-in; none of their rows counts.
+        self.load = np.where(usable, load, 1e3)
+        self.speed = np.where(usable, speed, self.ground_speed[:, None] / (0.8 * rig.radius))
+        self.load_var, self.speed_var = np.where(usable, load_var, 0.0), np.where(usable, speed_var, 0.0)
+        self._balance(take, usable)
+        self.gain_names, self.gain_std = self._gains()
+        self.slip = slip[kept]
+        self._measured = np.concatenate([self.load, self.speed, self.ground_speed[:, None]], axis=1)
+        self._measured_var = np.concatenate([self.load_var, self.speed_var, self.ground_speed_var[:, None]], axis=1)
+        known_rows = [self.has_torque, self.has_balance[:, None], self.has_sinkage]
+        row_var = [self.torque_var, self.demand_var[:, None], self.sinkage_var]
+        n_kinds = 3 if self.with_sinkage else 2
+        known = np.concatenate(known_rows[:n_kinds], axis=1)
+        self._row_var = np.where(known, np.concatenate(row_var[:n_kinds], axis=1), 1.0)
+        self._known = known
+        self._count()
+
+    def _count(self) -> None:
+        """What follows from the number of instants and the masks."""
+        self.n = len(self.t)
+        self._n_known = int(self._known.sum())
+        self._missing = None if self._n_known == self._known.size else ~self._known
+        self._radius, self._width = (np.tile(a, self.n) for a in (self.rig.radius, self.rig.width))
+
+    def _balance(self, take: Callable[[str], Reading], usable: NDArray[np.bool_]) -> None:
+        """The pull that draft, slope and inertia ask of the wheels, and its variance."""
+        self.draft, draft_var, known = take("draft")
+        demand, variance = self.draft.copy(), draft_var.copy()
+        if self.rig.chassis is not None:
+            mass = self.rig.chassis.mass
+            pitch, pitch_var, has_pitch = take("pitch")
+            if has_pitch.any():
+                known = known & has_pitch
+            acceleration, acceleration_var, has_acceleration = take("acceleration")
+            if has_acceleration.any():
+                known = known & has_acceleration
+            else:
+                acceleration, acceleration_var = differentiated_speed(self.t, self.ground_speed, self.ground_speed_var)
+            demand += mass * (GRAVITY * np.sin(pitch) + acceleration)
+            variance += mass**2 * ((GRAVITY * np.cos(pitch)) ** 2 * pitch_var + acceleration_var)
+        self.demand, self.demand_var = demand, variance
+        self.draft_var = np.where(known & usable.all(axis=1), draft_var, 0.0)
+        self.has_balance = known & usable.all(axis=1)
+
+    def _gains(self) -> tuple[list[str], Array]:
+        names, std = [], []
+        for quantity in GAIN_QUANTITIES:
+            per_wheel = quantity in ("torque", "load", "speed")
+            for name in [f"{quantity}.{w}" for w in self.rig.wheels] if per_wheel else [quantity]:
+                names.append(name)
+                std.append(self.rig.noise[quantity].gain)
+        return names, np.array(std)
+
+    @property
+    def _n_residuals(self) -> int:
+        """Residuals of an instant."""
+        return int(self._row_var.shape[1])
+
+    @property
+    def n_rows(self) -> int:
+        """Number of residuals that count."""
+        return self._n_known
+
+    def _part(self, instants: slice | NDArray[np.intp]) -> Self:
+        """The same with only these instants."""
+        part = copy(self)
+        for name in _BY_INSTANT:
+            setattr(part, name, getattr(self, name)[instants])
+        part._count()
+        return part
+
+
+def differentiated_speed(t: Array, speed: Array, variance: Array, half_width: int = 3) -> tuple[Array, Array]:
+    """Acceleration [m/s^2] and its variance from ground speed by local straight lines.
+
+    t [s], speed [m/s] and variance of speed, all (N,).  The misfit of the line adds to
+    the variance, so that harsh driving is not mistaken for a precise reading.
+    """
+    n = len(t)
+    a, var = np.zeros(n), np.full(n, np.inf)
+    if n < 3:
+        return a, np.full(n, 1.0)
+    for i in range(n):
+        part = slice(max(i - half_width, 0), min(i + half_width + 1, n))
+        x = t[part] - t[part].mean()
+        sxx = float(x @ x)
+        y = speed[part] - speed[part].mean()
+        a[i] = (x @ y) / sxx
+        misfit = y - a[i] * x
+        spread = max(float(variance[part].mean()), float(misfit @ misfit) / max(len(x) - 2, 1))
+        var[i] = spread / sxx
+    return a, var
