@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.window import Rig, Window
+from soilbus.estimation.window import Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
 
 Array = NDArray[np.float64]
@@ -32,19 +32,22 @@ class Readings:
     """The usable instants (N) of a window: arrays (N, W) of the wheels and (N,) of the vehicle, in SI.
 
     Each has its variance and a mask of what is known; both are zero where it is not.
-    `standstill` counts instants left out.
+    `standstill` and `turning` count instants left out; reversing counts as driving forward.
     """
 
-    def __init__(self, window: Window, rig: Rig, min_speed: float) -> None:
+    def __init__(self, window: Window, rig: Rig, min_speed: float, max_turn: float) -> None:
         self.rig = rig
+        window = forward(window)
         n_wheels = len(rig.wheels)
-        moving = window.ground_speed > min_speed
+        moving, in_turn = window.ground_speed > min_speed, turning(window, rig, max_turn)
+        straight = moving & ~in_turn
         rim = rig.radius * window.speed
         with np.errstate(invalid="ignore", divide="ignore"):
             slip = 1.0 - window.ground_speed[:, None] / rim
-            usable = moving[:, None] & (window.load > 0.0) & (rim > 0.0) & (slip < MAX_SLIP) & (slip > MIN_SLIP)
+            usable = straight[:, None] & (window.load > 0.0) & (rim > 0.0) & (slip < MAX_SLIP) & (slip > MIN_SLIP)
         kept = np.flatnonzero(usable.any(axis=1))
         self.standstill = int(np.count_nonzero(~moving & np.isfinite(window.ground_speed)))
+        self.turning = int(np.count_nonzero(moving & in_turn))
         self.t = window.t[kept]
         self.usable = usable = usable[kept]
         self.n_wheels = n_wheels

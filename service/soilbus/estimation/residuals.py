@@ -35,6 +35,8 @@ Array = NDArray[np.float64]
 
 START_TOLERANCE = 0.02
 """Relative error of load left in the first entry angles; each linearisation mends it further."""
+MAX_TURN = 0.15
+"""Relative difference of an axle's rim speeds from which slip is not judged, where nobody says otherwise."""
 SAME_INSTANT = 1e-3
 """Times [s] closer than this are those of one bin."""
 
@@ -58,8 +60,10 @@ class _Wheels(NamedTuple):
 class WindowProblem(Readings):
     """One window's data and the model that is to explain it, ready to be linearised at any soil."""
 
-    def __init__(self, window: Window, rig: Rig, model: WheelModel, min_speed: float) -> None:
-        super().__init__(window, rig, min_speed)
+    def __init__(
+        self, window: Window, rig: Rig, model: WheelModel, min_speed: float, max_turn: float = MAX_TURN
+    ) -> None:
+        super().__init__(window, rig, min_speed, max_turn)
         self.model = model
 
     def thinned(self, most: int) -> WindowProblem:

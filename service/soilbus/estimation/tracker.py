@@ -70,6 +70,7 @@ class Settings:
 
     window: float
     min_speed: float
+    max_turn: float
     max_chi2: float
     drift: float
 
@@ -78,7 +79,7 @@ class Settings:
 class Tracked:
     """A window's fit (None without), whether the model fails to describe its data, and of which ground they are.
 
-    since [s] is where the data that count begin; standstill counts instants.
+    since [s] is where the data that count begin; standstill and turning count instants left out.
     """
 
     fit: Fit | None
@@ -86,6 +87,7 @@ class Tracked:
     ground: Ground
     since: float
     standstill: int = 0
+    turning: int = 0
 
 
 def elsewhere(prior: SoilPrior) -> SoilPrior:
@@ -116,10 +118,11 @@ class Tracker:
         new = self._crossing is not None and start < self._crossing.end
         window = self._of_this_soil(window)
         problem = self._problem(window)
-        standstill, since = problem.standstill, self._crossing.end if new and self._crossing else start
+        since = self._crossing.end if new and self._crossing else start
+        left_out = problem.standstill, problem.turning
         if problem.n_rows < MIN_ROWS:
             self._fit = None
-            return Tracked(None, False, Ground.SAME, since, standstill)
+            return Tracked(None, False, Ground.SAME, since, *left_out)
         before = self._known_at(since, problem)
         last = self._fit
         if last is None:
@@ -134,11 +137,11 @@ class Tracker:
                 if doubt.ratio > ALARM or self.mismatch(fit):
                     changed = self._two_soils(window, float(problem.t[doubt.instant]), before, last)
                     if changed is not None:
-                        return self._remembered(replace(changed, standstill=standstill), end)
+                        return self._remembered(replace(changed, standstill=left_out[0], turning=left_out[1]), end)
             if self.mismatch(fit):
                 fit = self._afresh(problem, before)
         ground = Ground.NEW if new else Ground.SAME
-        return self._remembered(Tracked(fit, self.mismatch(fit), ground, since, standstill), end)
+        return self._remembered(Tracked(fit, self.mismatch(fit), ground, since, *left_out), end)
 
     def _afresh(self, problem: WindowProblem, before: Belief) -> Fit | None:
         """A fit that starts anywhere; what was known of the soil counts only where it agrees with the data."""
@@ -220,4 +223,4 @@ class Tracker:
         return window.rows(np.flatnonzero(window.t >= self._crossing.end))
 
     def _problem(self, window: Window) -> WindowProblem:
-        return WindowProblem(window, self.rig, self.model, self.settings.min_speed)
+        return WindowProblem(window, self.rig, self.model, self.settings.min_speed, self.settings.max_turn)

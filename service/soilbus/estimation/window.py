@@ -8,18 +8,27 @@ bin without an admitted sample holds nan: missing is never zero.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.estimation.screening import SIDE, Samples, joined, judge
 from soilbus.terra.vehicle import Chassis
 
 Array = NDArray[np.float64]
 
 WHEEL_QUANTITIES = ("torque", "load", "speed", "sinkage")
 VEHICLE_QUANTITIES = ("ground_speed", "draft", "pitch", "acceleration")
+LEAST_LEVEL = {
+    "torque": 50.0, "load": 500.0, "speed": 0.4, "sinkage": 0.01,
+    "ground_speed": 0.2, "draft": 500.0, "pitch": 0.01, "acceleration": 0.1,
+}  # fmt: skip
+"""Magnitudes (SI) below which a relative noise shrinks no further when samples are screened: a
+sensor at rest still has its resolution and its zero."""
+GLIMPSE_BACK = 1.0
+"""Samples of so many seconds before a glimpse help to judge those in it."""
 
 
 class SensorNoise(NamedTuple):
@@ -81,11 +90,65 @@ class Window:
         return Window(t=self.t[keep], variance=variance, samples=self.samples, **values)
 
 
+def forward(window: Window) -> Window:
+    """The window with every instant of reversing turned into the same drive forward.
+
+    A smooth wheel is its own mirror image: backwards, all that points along the ground
+    changes its sign and nothing else does.  So wheel speed, torque, draft, pitch and
+    acceleration are negated and the ground speed becomes its magnitude (a radar's has no
+    sign anyway), while loads and sinkages stay.  The load transfer is in the measured
+    loads, which stay with their wheels.  Not mirrored is what tells front from rear: which
+    axle runs in the other's ruts, and lugs with a direction.
+
+    A vehicle reverses where more of its wheels turn backward than forward; the speed of a
+    wheel against most of the others is nan, and that of every wheel where neither side is
+    in the majority.
+    """
+    if not (window.speed < 0.0).any():
+        return window
+    with np.errstate(invalid="ignore"):
+        turns = np.sign(window.speed)
+    majority = np.sign(np.nansum(turns, axis=1))
+    way = np.where(majority < 0.0, -1.0, 1.0)
+    torn = (majority == 0.0) & (np.abs(turns) > 0.0).any(axis=1)
+    speed = way[:, None] * window.speed
+    return replace(
+        window,
+        speed=np.where((speed < 0.0) | torn[:, None], np.nan, speed),
+        torque=way[:, None] * window.torque,
+        ground_speed=np.where(way < 0.0, np.abs(window.ground_speed), window.ground_speed),
+        draft=way * window.draft,
+        pitch=way * window.pitch,
+        acceleration=way * window.acceleration,
+    )
+
+
+def turning(window: Window, rig: Rig, max_turn: float) -> NDArray[np.bool_]:
+    """At which instants (N,) of a forward window the vehicle turns too sharply for one ground speed.
+
+    There the rim speeds of the two wheels of every axle differ by more than max_turn of
+    their mean.  On a turn of radius R with track B they differ by B/R, and each wheel's
+    slip, told from the speed of the vehicle's middle, is wrong by B/(2 R) (1 - slip).  One
+    axle alone may differ as much by slip: with different loads on a side slope.  An axle
+    with an unknown speed, or not with two wheels, does not count; without any no instant
+    is in a turn.
+    """
+    rim = rig.radius * window.speed
+    least = np.full(len(window.t), np.inf)
+    for members in (np.flatnonzero(rig.front), np.flatnonzero(~rig.front)):
+        if len(members) == 2:
+            left, right = rim[:, members].T
+            with np.errstate(invalid="ignore", divide="ignore"):
+                least = np.fmin(least, 2.0 * np.abs(left - right) / (left + right))
+    return np.asarray(np.isfinite(least) & (least > max_turn))
+
+
 class BinStore:
     """Sums and counts of samples by bin and channel, over a sliding span of time.
 
     Bins are counted from `origin`; each sample is added once, however many windows it
-    ends up in.
+    ends up in.  Wild samples (see `screening`) are left out; one that looks wild among the
+    last four of its channel is judged anew when more is known.
     """
 
     def __init__(self, rig: Rig, bin_length: float, origin: float) -> None:
@@ -96,33 +159,48 @@ class BinStore:
         self._noise = _NoiseTable.of(rig)
         self._first = 0
         self._totals = np.zeros((3, 0, len(self._index)))  # count, sum of values, sum of times
+        self._recent: list[Samples] = []
+        self._wild: list[Array] = []
 
     def add(self, samples: Mapping[str, tuple[Array, Array]]) -> None:
         """Add samples (t [s], value in SI; both (N,)) by channel; those before the span are dropped."""
         if not samples:
             return
-        rows = [self._index[name] for name in samples]
+        rows = np.array([self._index[name] for name in samples], np.int16)
         column = np.repeat(rows, [len(t) for t, _ in samples.values()])
         since = np.concatenate([t for t, _ in samples.values()]) - self.origin
         value = np.concatenate([v for _, v in samples.values()])
-        bins = np.floor(since / self.bin_length + 1e-9).astype(int) - self._first
-        keep = bins >= 0
-        if not keep.all():
-            bins, column, since, value = bins[keep], column[keep], since[keep], value[keep]
-        if not len(bins):
-            return
-        low, end = int(bins.min()), int(bins.max()) + 1
-        self._grow(end)
-        shape = end - low, len(self._index)
-        place = (bins - low) * shape[1] + column
-        for total, weights in zip(self._totals, (None, value, since), strict=True):
-            total[low:end] += np.bincount(place, weights, shape[0] * shape[1]).reshape(shape)
+        self._recent.append(Samples(column, since, value, np.zeros(len(value), bool)))
 
-    def _grow(self, length: int) -> None:
-        short = length - self._totals.shape[1]
-        if short > 0:
-            pad = np.zeros((3, max(short, 64), len(self._index)))
-            self._totals = np.concatenate([self._totals, pad], axis=1)
+    def window(self, start: float, end: float) -> Window:
+        """The bins from start to end [s], both rounded to whole bins."""
+        low, high = self._span(start, end)
+        samples, wild, later = judge(self._taken(high), self._noise.sd)
+        new = ~samples.settled
+        self._totals = self._with(self._totals, samples.pick(new & ~wild), high)
+        again = new & wild & (later < SIDE)
+        if wild.any():
+            self._wild.append(samples.t[new & wild & ~again] + self.origin)
+        settled = samples._replace(settled=~again)
+        self._recent.append(settled.pick(later < 2 * SIDE))
+        return self._made(self._totals, low, high)
+
+    def glimpse(self, start: float, end: float) -> Window:
+        """As `window`, but nothing is decided: later windows are the same as without it."""
+        low, high = self._span(start, end)
+        recent = list(self._recent)
+        samples = self._taken(high)
+        self._recent = recent
+        near = self._bins(samples) >= low - round(GLIMPSE_BACK / self.bin_length)
+        samples, wild, _ = judge(samples.pick(near), self._noise.sd)
+        totals = self._with(self._totals.copy(), samples.pick(~(samples.settled | wild)), high)
+        return self._made(totals, low, high)
+
+    def new_wild(self) -> Array:
+        """Times [s] of the samples found wild for good since the last call, ascending."""
+        found = np.sort(np.concatenate([np.zeros(0), *self._wild]))
+        self._wild.clear()
+        return found
 
     def drop_before(self, t: float) -> None:
         """Forget the bins that end before t."""
@@ -131,29 +209,59 @@ class BinStore:
             self._totals = self._totals[:, gone:]
             self._first += gone
 
-    def window(self, start: float, end: float) -> Window:
-        """The bins from start to end [s], both rounded to whole bins."""
-        low = round((start - self.origin) / self.bin_length) - self._first
-        high = round((end - self.origin) / self.bin_length) - self._first
-        self._grow(high)
-        low = max(low, 0)
-        count, total, time = self._totals[:, low:high]
+    def _span(self, start: float, end: float) -> tuple[int, int]:
+        """Numbers of the bins that begin nearest to start and end [s], counted from the first one kept."""
+        low, high = (round((t - self.origin) / self.bin_length) - self._first for t in (start, end))
+        return max(low, 0), max(high, 0)
+
+    def _bins(self, samples: Samples) -> NDArray[np.intp]:
+        return np.floor(samples.t / self.bin_length + 1e-9).astype(np.intp) - self._first
+
+    def _taken(self, high: int) -> Samples:
+        """Takes the recent samples before bin `high` out of the store; those before the span are dropped."""
+        recent = joined(self._recent)
+        bins = self._bins(recent)
+        self._recent = []
+        if len(bins) and not (bins.min() >= 0 and bins.max() < high):
+            self._recent = [recent.pick(bins >= high)]
+            recent = recent.pick((bins >= 0) & (bins < high))
+        return recent
+
+    def _with(self, totals: Array, samples: Samples, high: int) -> Array:
+        """Totals with these samples added, at least up to the bin `high`; the array is changed if it is long enough."""
+        short = high - totals.shape[1]
+        if short > 0:
+            totals = np.concatenate([totals, np.zeros((3, max(short, 64), totals.shape[2]))], axis=1)
+        if not len(samples.t):
+            return totals
+        bins = self._bins(samples)
+        low = int(bins.min())
+        shape = high - low, totals.shape[2]
+        place = (bins - low) * shape[1] + samples.column
+        for total, weights in zip(totals, (None, samples.value, samples.t), strict=True):
+            total[low:high] += np.bincount(place, weights, shape[0] * shape[1]).reshape(shape)
+        return totals
+
+    def _made(self, totals: Array, low: int, high: int) -> Window:
+        count, total, time = totals[:, low:high]
         with np.errstate(invalid="ignore", divide="ignore"):
             mean, since = total / count, time / count
         centre: Array = (self._first + low + np.arange(len(mean), dtype=np.float64) + 0.5) * self.bin_length
-        mean = _at_centres(mean, since, centre)
-        return _make_window(self._noise, self.origin + centre, mean, count)
+        mean, worth = _at_centres(mean, since, centre)
+        return _make_window(self._noise, self.origin + centre, mean, count * worth, count)
 
 
-def _at_centres(mean: Array, since: Array, centre: Array) -> Array:
+def _at_centres(mean: Array, since: Array, centre: Array) -> tuple[Array, Array]:
     """Bin means moved to the bins' centres along the slope between neighbouring bins.
 
     mean and since (mean sample time) are (N, channels), centre is (N,).  Messages of
     different phase have different mean times in a bin; a few ms matter where slip
-    changes within a second.
+    changes within a second.  Second, what share of its samples a moved mean is worth:
+    moved by a share d of the bin, it has 1 + d^2 / 2 times the variance, that of a slope
+    between two neighbours as noisy as itself.
     """
     if len(mean) < 3:
-        return mean
+        return mean, np.ones(mean.shape)
     slope = np.full(mean.shape, np.nan)
     with np.errstate(invalid="ignore", divide="ignore"):
         step = (mean[1:] - mean[:-1]) / (since[1:] - since[:-1])
@@ -161,16 +269,20 @@ def _at_centres(mean: Array, since: Array, centre: Array) -> Array:
     slope[0], slope[-1] = step[0], step[-1]
     slope[1:-1] = np.where(np.isfinite(slope[1:-1]), slope[1:-1], step[:-1])
     slope[1:-1] = np.where(np.isfinite(slope[1:-1]), slope[1:-1], step[1:])
-    return mean + np.where(np.isfinite(slope), slope, 0.0) * (centre[:, None] - since)
+    away = np.where(np.isfinite(slope), centre[:, None] - since, 0.0)
+    return mean + np.where(np.isfinite(slope), slope, 0.0) * away, 1.0 / (
+        1.0 + (away / (centre[1] - centre[0])) ** 2 / 2.0
+    )
 
 
 class _NoiseTable(NamedTuple):
-    """A rig's noise, column by column of its channels: variance, relative and of_mean (channels,)."""
+    """A rig's noise, column by column of its channels: variance, relative, of_mean, least level (channels,)."""
 
     n_wheels: int
     variance: Array
     relative: Array
     of_mean: Array
+    least: Array
 
     @classmethod
     def of(cls, rig: Rig) -> _NoiseTable:
@@ -180,12 +292,26 @@ class _NoiseTable(NamedTuple):
             np.array([n.absolute**2 for n in noise]),
             np.array([n.relative for n in noise]),
             np.array([n.of_mean for n in noise]),
+            np.array([LEAST_LEVEL[name.partition(".")[0]] for name in rig.channels]),
         )
 
+    def sd(self, count: NDArray[np.intp], size: Array, level: Array) -> Array:
+        """Sd (N,) of samples of magnitudes `size` (N,), channel after channel.
 
-def _make_window(noise: _NoiseTable, t: Array, mean: Array, count: Array) -> Window:
-    """A window from bin means and sample counts, both (N, channels) in the order of rig.channels."""
-    variance = _variance_of_means(mean, count, noise)
+        count (C,) of them are of each of the first channels, whose mean magnitudes are level (C,).
+        """
+        least = self.least[: len(count)]
+        fixed = self.variance[: len(count)] + (self.of_mean[: len(count)] * np.maximum(level, least)) ** 2
+        sd = np.maximum(size, np.repeat(least, count))
+        sd *= np.repeat(self.relative[: len(count)], count)
+        np.multiply(sd, sd, out=sd)
+        sd += np.repeat(fixed, count)
+        return np.sqrt(sd, out=sd)
+
+
+def _make_window(noise: _NoiseTable, t: Array, mean: Array, worth: Array, count: Array) -> Window:
+    """A window from bin means, the samples they are worth and those in them, (N, channels) as rig.channels."""
+    variance = _variance_of_means(mean, np.where(count > 0.0, worth, 0.0), noise)
     values, variances = _by_quantity(mean, noise.n_wheels), _by_quantity(variance, noise.n_wheels)
     return Window(t=t, variance=variances, samples=int(count.sum()), **values)
 
@@ -216,4 +342,5 @@ def window_of_samples(rig: Rig, t: Array, samples: Mapping[str, Array], names: S
     for i, name in enumerate(rig.channels):
         if name in samples and (not names or name in names):
             mean[:, i] = samples[name]
-    return _make_window(_NoiseTable.of(rig), np.asarray(t, float), mean, np.isfinite(mean).astype(float))
+    one = np.isfinite(mean).astype(float)
+    return _make_window(_NoiseTable.of(rig), np.asarray(t, float), mean, one, one)

@@ -1,0 +1,157 @@
+"""Single wild samples: readings that fit neither their noise nor the readings around them.
+
+Each sample is compared with a robust straight line through the four before and the four
+after it (a Hampel identifier with the trend taken out; cf. Davies & Gather, J. Am. Stat.
+Assoc. 88, 1993, 782-792).  Steps, bends and vibration widen the limit, so that only one or
+two samples standing out by themselves are called wild: longer runs, frozen or offset
+sensors are the model's to notice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Sd = Callable[[NDArray[np.intp], Array, Array], Array]
+"""Sd (N,) of samples, channel after channel, from each channel's number of them (C,), their expected
+magnitudes (N,) and the channels' mean magnitudes (C,)."""
+
+WILD = "wild"
+"""Reason under which wild samples are counted."""
+SIDE = 4
+"""Samples on each side that a sample is compared with."""
+SPAN = 2 * SIDE + 1
+FAR = 6.5
+"""Distance from the line, in standard deviations of the sensor, from which a sample may be wild."""
+ROOM = 3.0
+"""Distances of the quartiles around a sample that it may always lie off: in steps and bumps real signals do."""
+LIVELY = 1.5
+"""A channel that scatters so many times as much as its sensor (it vibrates, or its noise is set too low) is
+judged by its own scatter."""
+VERY_FAR = 8.0
+"""Distance from the line, in standard deviations of that scatter, from which a sample of such a channel is wild."""
+BEND = 1.65
+"""Median second difference of normal samples, in their standard deviation."""
+
+
+class Samples(NamedTuple):
+    """Samples of many channels: column of the channel, time [s], value in SI, whether they are settled; each (N,)."""
+
+    column: NDArray[np.int16]
+    t: Array
+    value: Array
+    settled: Mask
+
+    def pick(self, which: Mask | NDArray[np.intp]) -> Samples:
+        """Those of a mask (N,) or of indices."""
+        return Samples(self.column[which], self.t[which], self.value[which], self.settled[which])
+
+    def in_order(self) -> Samples:
+        """The same, channel after channel, each in the order of time (and of value at the same time)."""
+        ordered = self.pick(np.argsort(self.column, kind="stable"))
+        same = ordered.column[1:] == ordered.column[:-1]
+        if (same & ~(ordered.t[1:] > ordered.t[:-1])).any():
+            ordered = self.pick(np.lexsort((self.value, self.t, self.column)))
+        return ordered
+
+
+def joined(parts: Sequence[Samples]) -> Samples:
+    """All samples of the parts."""
+    columns, t, value, settled = zip(*(parts or (NO_SAMPLES,)), strict=True)
+    return Samples(np.concatenate(columns), np.concatenate(t), np.concatenate(value), np.concatenate(settled))
+
+
+NO_SAMPLES = Samples(np.zeros(0, np.int16), np.zeros(0), np.zeros(0), np.zeros(0, bool))
+
+
+class Judged(NamedTuple):
+    """Samples in order, which are wild, and how many of its channel follow each one; each (N,)."""
+
+    samples: Samples
+    wild: Mask
+    later: NDArray[np.intp]
+
+
+def judge(samples: Samples, sd: Sd) -> Judged:
+    """Find the wild ones among samples in any order.
+
+    A channel with fewer than nine samples is not judged; the first and last four of the
+    others are judged by the line nearest to them.
+    """
+    samples = samples.in_order()
+    column, t, value, _ = samples
+    n = len(t)
+    count = np.bincount(column)
+    end = np.cumsum(count)
+    here = np.arange(n)
+    later = np.repeat(end, count)
+    later -= here + 1
+    wild = np.zeros(n, bool)
+    if n < SPAN:
+        return Judged(samples, wild, later)
+    line = np.maximum(here - SIDE, np.repeat(end - count, count))
+    np.minimum(line, np.repeat(np.maximum(end - SPAN, 0), count), out=line)
+    slope, level, when = _lines(t, value).take(line, axis=1)
+    expected = level + slope * (t - when)
+    off = np.abs(value - expected)
+    size = np.abs(expected)
+    noise = sd(count, size, np.bincount(column, size) / np.maximum(count, 1))
+    far = np.flatnonzero(off > FAR * noise)
+    far = far[count[column[far]] >= SPAN]
+    if len(far):
+        limit = ROOM * _spread(t, value, line[far], slope[far])
+        lively = _liveliness(value, noise, end - count, end, column[far])
+        np.maximum(limit, np.where(lively > LIVELY, VERY_FAR * lively, 0.0) * noise[far], out=limit)
+        wild[far] = off[far] > limit
+    return Judged(samples, wild, later)
+
+
+def _lines(t: Array, value: Array) -> Array:
+    """Robust lines through four samples before and four after each one: slopes, levels and their times (3, N - 8).
+
+    They join the medians of both fours (Brown & Mood, 1951).
+    """
+    four = np.empty((2, len(t) - SIDE + 1))
+    _median_of_four(value[:-3], value[1:-2], value[2:-1], value[3:], four[0])
+    np.add(t[1:-2], t[2:-1], out=four[1])
+    four[1] *= 0.5
+    before, after = four[:, : -SIDE - 1], four[:, SIDE + 1 :]
+    lines = np.zeros((3, before.shape[1]))
+    np.add(before, after, out=lines[1:])
+    lines[1:] *= 0.5
+    rise, run = after - before
+    np.divide(rise, run, out=lines[0], where=run > 0.0)  # not so where the nine are of two channels
+    return lines
+
+
+def _median_of_four(a: Array, b: Array, c: Array, d: Array, out: Array) -> None:
+    low = np.maximum(np.minimum(a, b), np.minimum(c, d))
+    high = np.minimum(np.maximum(a, b), np.maximum(c, d))
+    np.add(low, high, out=out)
+    out *= 0.5
+
+
+def _spread(t: Array, value: Array, first: NDArray[np.intp], slope: Array) -> Array:
+    """Distance of the quartiles of nine samples, from `first` on, less their slope; each (M,)."""
+    nine = first[:, None] + np.arange(SPAN)
+    level = np.sort(value[nine] - slope[:, None] * (t[nine] - t[first, None]), axis=1)
+    return np.asarray(level[:, SIDE + 2] - level[:, SIDE - 2])
+
+
+def _liveliness(
+    value: Array, noise: Array, begin: NDArray[np.intp], end: NDArray[np.intp], column: NDArray[np.int16]
+) -> Array:
+    """How many sd of the noise the second differences of these columns (M,) show.
+
+    value[begin:end], of (C,), are the samples of one column.
+    """
+    lively = np.zeros(len(begin))
+    for c in np.unique(column):
+        bend = np.diff(value[begin[c] : end[c]], 2) / noise[begin[c] + 1 : end[c] - 1]
+        lively[c] = np.median(np.abs(bend)) / BEND
+    return lively[column]

@@ -1,0 +1,57 @@
+"""Windows at constant speed, and with braking (negative slip): right within what they say of themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.gauss_newton import fit_window
+from soilbus.estimation.residuals import WindowProblem
+from soilbus.estimation.window import BinStore
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.terra.soils import SOILS
+
+STEADY = Swing(1.4, 1.4)
+DRIVES = {
+    "driving and braking": {"slip": Swing(-0.2, 0.3)},
+    "braking alone": {"slip": Swing(-0.2, -0.02)},
+    "harsh": {"slip": Swing(-0.2, 0.3), "speed": Swing(0.8, 2.5, 0.2, 0.5)},  # to 2 m/s^2
+    "constant speed": {"slip": Swing(0.05, 0.4), "speed": STEADY},
+    "constant speed and slip": {"slip": Swing(0.15, 0.15), "speed": STEADY},
+}
+SPREAD = float(np.sqrt(np.log1p(0.25**2)))
+
+
+@pytest.mark.parametrize("what", DRIVES)
+def test_errors_are_as_large_as_the_posterior_says(what):
+    away, chi2, braking = [], [], []
+    for k, name in enumerate(("loam", "clayey_soil_38", "wet_clay")):
+        for seed in range(3):
+            soil = SOILS[name]
+            miss = np.exp(SPREAD * np.random.default_rng([seed, 77]).standard_normal(2))
+            told = {"c": soil.c * miss[0], "K": soil.K * miss[1]}
+            config = reference_configuration(
+                f"soil.{n}.{key}={v * f}" for n, v in told.items() for key, f in (("value", 1.0), ("std", 0.25))
+            )
+            rig = rig_of(config)
+            heard = simulate(config, Scenario(10.0, (Patch(0.0, "this", soil),), **DRIVES[what]), 1000 * k + seed)
+            store = BinStore(rig, 0.1, 0.0)
+            store.add({n: (heard.channels[n].t, heard.channels[n].value) for n in rig.channels if n in heard.channels})
+            problem = WindowProblem(store.window(0.0, 10.0), rig, model_of(config), 0.2)
+            fit = fit_window(problem, prior_of(config))
+            assert fit.converged
+            bearing, tan_phi = fit.posterior.bearing_pressure(0.02, 0.3), fit.posterior.tan_phi()
+            n = fit.posterior.parameters()["n"]
+            truth = soil.bearing_pressure(0.02, 0.3), np.tan(soil.phi), soil.n
+            away.append([(e.value - x) / e.std for e, x in zip((bearing, tan_phi, n), truth, strict=True)])
+            chi2.append(fit.chi2)
+            braking.append(np.mean(problem.slip < 0.0))
+    # The rms of 9 normal numbers is between 0.5 and 1.6 in 98.1 % of all cases.
+    rms = np.sqrt(np.mean(np.square(away), axis=0))
+    assert np.all((rms > 0.5) & (rms < 1.6)), rms
+    assert np.mean(chi2) == pytest.approx(1.0, abs=0.05)
+    low, high = {"driving and braking": (0.2, 0.5), "braking alone": (0.99, 1.0), "harsh": (0.2, 0.5)}.get(what, (0, 0))
+    assert low <= np.mean(braking) <= high

@@ -1,0 +1,173 @@
+"""Reversing is driving forward seen in a mirror; turns are recognised by their rim speeds."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from soilbus.assembly import model_of
+from soilbus.estimation.gauss_newton import fit_window
+from soilbus.estimation.residuals import WindowProblem
+from soilbus.estimation.window import Rig, SensorNoise, Window, forward, turning
+from soilbus.terra.soils import SOILS
+
+ALONG = ("speed", "torque", "ground_speed", "draft", "pitch", "acceleration")
+ACROSS = ("load", "sinkage")
+MAX_TURN = 0.15
+
+
+def backwards(window: Window, part=slice(None), signed_ground: bool = True) -> Window:
+    """The window as its sensors would read, were the same drive done in reverse during a part of it."""
+    mirrored = {name: getattr(window, name).copy() for name in ALONG}
+    for name in ALONG:
+        if name != "ground_speed" or signed_ground:
+            mirrored[name][part] *= -1.0
+    return dataclasses.replace(window, **mirrored)
+
+
+def equal(a: Window, b: Window) -> bool:
+    return all(np.array_equal(getattr(a, q), getattr(b, q), equal_nan=True) for q in ALONG + ACROSS) and all(
+        np.array_equal(v, b.variance[q], equal_nan=True) for q, v in a.variance.items()
+    )
+
+
+@pytest.fixture(scope="module")
+def loam(simulated):
+    case = simulated(SOILS["loam"], 21)
+    case.window.pitch[:] += 0.05  # uphill, so that its sign matters
+    case.window.draft[:] -= case.rig.chassis.mass * 9.80665 * np.sin(0.05)
+    return case
+
+
+@pytest.mark.parametrize("signed_ground", [True, False], ids=["signed", "radar"])
+@pytest.mark.parametrize("part", [slice(None), slice(30, 70)], ids=["all", "part"])
+def test_a_drive_in_reverse_gives_the_very_same_estimate(part, signed_ground, loam):
+    reverse = backwards(loam.window, part, signed_ground)
+    assert equal(forward(reverse), loam.window)
+    ahead, back = (fit_window(loam.problem(w), loam.prior) for w in (loam.window, forward(reverse)))
+    assert back.posterior.soil == ahead.posterior.soil
+    assert np.array_equal(back.posterior.log_covariance, ahead.posterior.log_covariance)
+    assert back.chi2 == ahead.chi2 < 1.2
+
+
+def test_forward_driving_is_left_alone(loam):
+    assert forward(loam.window) is loam.window
+    assert equal(forward(forward(backwards(loam.window))), loam.window)
+
+
+def test_slopes_and_draft_point_the_other_way_in_reverse(loam):
+    # Backing down a slope with the implement pushing is, in the mirror, driving down it nose first.
+    reverse = backwards(loam.window)
+    wrong = dataclasses.replace(forward(reverse), pitch=reverse.pitch)
+    fit = fit_window(loam.problem(wrong), loam.prior)
+    assert fit is None or fit.chi2 > 2.0
+
+
+def few(speeds, **columns) -> Window:
+    """Instants with these wheel speeds (N, 4); everything else is 1."""
+    speed = np.array(speeds, float)
+    n = len(speed)
+    values = {q: np.ones((n, 4)) for q in ("torque", "load", "sinkage")}
+    values |= {q: np.ones(n) for q in ("ground_speed", "draft", "pitch", "acceleration")}
+    values |= {q: np.array(v, float) for q, v in columns.items()}
+    variance = {q: np.ones_like(v) for q, v in values.items()} | {"speed": np.ones_like(speed)}
+    return Window(t=np.arange(n) * 0.1, speed=speed, variance=variance, samples=9 * n, **values)
+
+
+def test_wheels_against_the_majority_are_unknown():
+    nan = np.nan
+    window = few([
+        [1, 2, 3, 4], [-1, -2, -3, -4], [-1, nan, nan, -4], [nan] * 4, [0, 0, 0, 0], [0, -1, -1, 0],
+        [1, 2, 3, -4], [-1, -2, 3, -4], [1, -2, 3, -4], [1, -2, nan, 0], [0, 0, 0, -1],
+    ])  # fmt: skip
+    mirrored = forward(window)
+    expected = [
+        [1, 2, 3, 4], [1, 2, 3, 4], [1, nan, nan, 4], [nan] * 4, [0, 0, 0, 0], [0, 1, 1, 0],
+        [1, 2, 3, nan], [1, 2, nan, 4], [nan] * 4, [nan] * 4, [0, 0, 0, 1],
+    ]  # fmt: skip
+    assert np.array_equal(mirrored.speed, np.array(expected, float), equal_nan=True)
+    way = np.array([1, -1, -1, 1, 1, -1, 1, -1, 1, 1, -1.0])
+    for name in ("torque", "draft", "pitch", "acceleration"):
+        value = getattr(mirrored, name)
+        assert np.array_equal(value, way if value.ndim == 1 else np.repeat(way[:, None], 4, axis=1)), name
+    assert (mirrored.load == 1.0).all()
+    assert (mirrored.sinkage == 1.0).all()
+    assert (mirrored.ground_speed == 1.0).all()
+
+
+def test_ground_speed_keeps_its_sign_where_the_wheels_drive_forward():
+    # Rolling back downhill while the wheels spin forward is no slip of this model; the standstill gate has it.
+    mirrored = forward(few([[1, 1, 1, 1], [-1, -1, -1, -1]], ground_speed=[-0.5, -0.5]))
+    assert mirrored.ground_speed.tolist() == [-0.5, 0.5]
+
+
+# --- turns ---
+
+
+def rig(front, radius=None) -> Rig:
+    n = len(front)
+    noise = {q: SensorNoise(absolute=1.0) for q in ALONG + ACROSS}
+    radii = np.array(radius or [0.5] * n)
+    return Rig(tuple("ABCDEF"[:n]), radii, np.full(n, 0.3), np.array(front), None, noise)
+
+
+TRACTOR = rig([True, True, False, False], [0.5, 0.5, 0.62, 0.62])
+
+
+def on_a_curve(radius_of_turn: float, track: float = 1.5, slip: float = 0.2) -> Window:
+    """One instant of a left turn at 1.4 m/s, every wheel with the same slip."""
+    side = np.array([-1.0, 1.0, -1.0, 1.0])
+    path = 1.4 * (1.0 + side * track / (2.0 * radius_of_turn))
+    return few([path / (TRACTOR.radius * (1.0 - slip))], ground_speed=[1.4])
+
+
+@pytest.mark.parametrize("slip", [0.05, 0.5])
+@pytest.mark.parametrize("to", [1.0, -1.0], ids=["left", "right"])
+def test_sharp_turns_are_turns_and_curves_are_not(slip, to):
+    # 15 % of the mean at a track of 1.5 m: a radius of 10 m, whatever the slip.
+    for radius, expected in ((3.0, True), (9.8, True), (10.2, False), (30.0, False), (1e9, False)):
+        assert turning(on_a_curve(to * radius, slip=slip), TRACTOR, MAX_TURN).tolist() == [expected]
+
+
+def test_every_axle_must_turn():
+    straight = few([[2.0, 2.4, 2.0, 2.0], [2.0, 2.4, 2.0, 2.4], [2.0, 2.0, 2.0, 2.4]])
+    assert turning(straight, TRACTOR, MAX_TURN).tolist() == [False, True, False]
+
+
+def test_an_unknown_axle_does_not_count():
+    nan = np.nan
+    window = few([[2.0, 2.4, nan, 2.4], [nan, 2.4, 2.0, nan], [nan] * 4, [2.0, nan, 2.0, 2.0], [0.0] * 4])
+    assert turning(window, TRACTOR, MAX_TURN).tolist() == [True, False, False, False, False]
+
+
+@pytest.mark.parametrize("front", [[True], [False], [True, False], [True] * 4, [True, False, False, False]])
+def test_without_an_axle_of_two_wheels_nothing_turns(front):
+    speed = np.array([[1.0, 3.0, 5.0, 7.0], [1.0, 1.0, 1.0, 1.0]])[:, : len(front)]
+    window = dataclasses.replace(few(np.ones((2, 4))), speed=speed)
+    assert turning(window, rig(front), MAX_TURN).tolist() == [False, False]
+    beside = rig([*front[:1], not front[0], not front[0]])  # one wheel here, two there: those count
+    window = dataclasses.replace(window, speed=np.array([[1.0, 3.0, 5.0], [1.0, 1.0, 1.0]]))
+    assert turning(window, beside, MAX_TURN).tolist() == [True, False]
+
+
+def test_slip_and_side_slopes_of_straight_driving_are_no_turns(simulated):
+    for name in ("loam", "clayey_soil_38", "wet_clay"):
+        case = simulated(SOILS[name], 22)
+        assert not turning(case.window, case.rig, MAX_TURN).any()
+
+
+def test_a_sharp_turn_does_harm_and_is_left_out(simulated):
+    off = []
+    side = np.array([1.0, -1.0, 1.0, -1.0])
+    for seed in range(4):
+        case = simulated(SOILS["loam"], seed)
+        bent = dataclasses.replace(case.window, speed=case.window.speed * (1.0 + 0.1 * side))  # 7.5 m: a headland
+        assert turning(bent, case.rig, MAX_TURN).mean() > 0.95
+        model = model_of(case.config)
+        gated = WindowProblem(bent, case.rig, model, 0.2, MAX_TURN)
+        assert gated.turning == turning(bent, case.rig, MAX_TURN).sum() == len(bent.t) - gated.n
+        tan_phi = fit_window(WindowProblem(bent, case.rig, model, 0.2, np.inf), case.prior).posterior.tan_phi()
+        off.append((tan_phi.value - np.tan(case.soil.phi)) / tan_phi.std)
+    assert np.sqrt(np.mean(np.square(off))) > 5.0
