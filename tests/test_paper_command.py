@@ -1,15 +1,13 @@
-"""`soilbus paper` as a reader sees it, and the bench of the paper's solve."""
+"""`soilbus paper` as a reader sees it."""
 
 from __future__ import annotations
 
 import io
 import re
-import sys
 from contextlib import redirect_stdout
 
 import pytest
 
-from soilbus import bench_paper
 from soilbus.cli import main
 from soilbus.estimation.paper_tables import RUNS
 
@@ -89,24 +87,3 @@ def test_wrong_usage_is_one_line(wrong, capsys):
         main(["paper", *wrong])
     assert stop.value.code == 2
     assert capsys.readouterr().err.splitlines()[-1].startswith(f"soilbus paper: error: argument {wrong[0]}: {wrong[1]}")
-
-
-def test_bench_solves_the_same_problem_as_its_peer(monkeypatch):
-    monkeypatch.setattr(bench_paper, "ROUNDS", 1)
-    monkeypatch.setattr(bench_paper, "SOLVES", 20)
-    figure = bench_paper.paper_solve()
-    assert set(figure) == {"value", "target", "peer", "what"}
-    assert figure["target"] == 300
-    assert figure["value"] > 30.0  # one noisy round; the bench itself is where 300 is asked for
-
-
-def test_bench_refuses_to_compare_unlike_solutions(monkeypatch):
-    monkeypatch.setattr(bench_paper, "AGREEMENT", 1e-12)
-    with pytest.raises(AssertionError, match="apart"):
-        bench_paper.paper_solve()
-
-
-def test_bench_without_scipy_says_what_it_needs(monkeypatch):
-    monkeypatch.setitem(sys.modules, "scipy.optimize", None)
-    with pytest.raises(ModuleNotFoundError, match=r"needs the extra soilbus\[peers\]"):
-        bench_paper.paper_solve()
