@@ -1,0 +1,111 @@
+"""The tracker on simulated drives: over a border, on one soil for minutes, with failures on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.config import Config
+from soilbus.estimation.tracker import Ground, Settings, Tracked, Tracker
+from soilbus.estimation.window import BinStore, Window
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.terra.soils import SOILS
+
+Z_REF, B_REF = 0.02, 0.3
+SPEED = 1.5
+CROSSED = 20.0
+
+
+def tracker_of(config: Config) -> Tracker:
+    s = config.estimator
+    return Tracker(
+        rig_of(config), prior_of(config), model_of(config),
+        Settings(s.window, s.min_speed, s.max_turn, s.max_chi2, s.soil_drift),
+    )  # fmt: skip
+
+
+def windows(config: Config, scenario: Scenario, seed: int) -> Iterator[tuple[Window, float]]:
+    rig, recording = rig_of(config), simulate(config, scenario, seed)
+    store = BinStore(rig, config.estimator.bin, 0.0)
+    store.add({n: (c.t, c.value) for n, c in recording.channels.items() if n in rig.channels})
+    for end in np.arange(config.estimator.window, scenario.duration + 0.05, config.estimator.hop).tolist():
+        yield store.window(end - config.estimator.window, end), end
+
+
+def off(tracked: Tracked, soil: str) -> float:
+    """Error of the bearing pressure in its standard deviations."""
+    bearing = tracked.fit.posterior.bearing_pressure(Z_REF, B_REF)
+    return (bearing.value - SOILS[soil].bearing_pressure(Z_REF, B_REF)) / bearing.std
+
+
+@pytest.mark.parametrize(("first", "second"), [("loam", "wet_clay"), ("wet_clay", "loam")])
+def test_a_new_soil_is_known_two_seconds_after_its_border(first, second):
+    border = (Patch(0.0, first), Patch(CROSSED * SPEED, second))
+    scenario = Scenario(26.0, border, speed=Swing(SPEED, SPEED + 1e-6), slip=Swing(0.05, 0.40))
+    config = reference_configuration()
+    for seed in range(3):
+        tracker = tracker_of(config)
+        results = {round(end): tracker.estimate(w, end) for w, end in windows(config, scenario, seed)}
+        assert all(r.ground is Ground.SAME and abs(off(r, first)) < 3.5 for end, r in results.items() if end < CROSSED)
+        after = [r for end, r in results.items() if end >= CROSSED + 2.0]
+        assert len(after) == 5
+        for r in after:
+            assert r.ground is Ground.NEW
+            assert not r.mismatch
+            assert abs(off(r, second)) < 3.0
+
+
+def test_one_soil_for_minutes_stays_one_soil_and_the_errors_as_said():
+    config = reference_configuration()
+    scenario = Scenario(200.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))
+    tracker = tracker_of(config)
+    results = [tracker.estimate(w, end) for w, end in windows(config, scenario, 1)]
+    assert {r.ground for r in results} == {Ground.SAME}
+    assert not any(r.mismatch for r in results)
+    errors = np.array([off(r, "loam") for r in results])
+    # Gains are fixed over the drive and windows overlap: this is not many independent errors.
+    assert np.sqrt(np.mean(errors**2)) < 1.6
+    assert np.abs(errors).max() < 3.5
+    # What windows before told is worth something: the last estimates are surer than the first.
+    std = [r.fit.posterior.bearing_pressure(Z_REF, B_REF).std for r in results]
+    assert np.median(std[-20:]) < 0.9 * np.median(std[:5])
+
+
+def test_a_window_that_fails_leaves_what_is_known_alone():
+    config = reference_configuration()
+    scenario = Scenario(16.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))
+    drive = list(windows(config, scenario, 3))
+    undisturbed, disturbed = tracker_of(config), tracker_of(config)
+    nonsense = np.random.default_rng(0)
+    for i, (window, end) in enumerate(drive):
+        undisturbed.estimate(window, end)
+        if i == 3:
+            wild = window.torque * nonsense.choice([-3.0, 3.0], window.torque.shape)
+            bad = disturbed.estimate(replace(window, torque=wild), end)
+            assert bad.mismatch
+            assert all(at != end for at, _ in disturbed._beliefs)
+        else:
+            last = disturbed.estimate(window, end)
+    expected = undisturbed.estimate(*drive[-1])
+    assert not last.mismatch
+    assert off(last, "loam") == pytest.approx(off(expected, "loam"), abs=0.3)
+    empty = replace(drive[-1][0], ground_speed=np.full(len(drive[-1][0].t), np.nan))
+    assert disturbed.estimate(empty, drive[-1][1]).fit is None
+
+
+def test_a_wheel_that_dies_drops_out():
+    config = reference_configuration()
+    scenario = Scenario(24.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))
+    tracker = tracker_of(config)
+    for window, end in windows(config, scenario, 4):
+        dead = window.t > 14.0
+        torque = np.where(dead[:, None] & (np.arange(4) == 2), np.nan, window.torque)
+        result = tracker.estimate(replace(window, torque=torque), end)
+        assert not result.mismatch
+        assert abs(off(result, "loam")) < 3.5
