@@ -72,13 +72,20 @@ def _every_second(messages: Iterable[can.Message]) -> list[can.Message]:
 
 
 def _compressed(config: Config) -> list[str]:
-    """Overrides that shorten the service's times as the tractor's time is shortened."""
-    times = {
+    """Overrides that shorten the service's times as the tractor's time is shortened.
+
+    And the vehicle's lengths with them: it drives past a border in so much less time, and
+    loads only know their ratios.
+    """
+    sizes = {
         "estimator.window": config.estimator.window,
         "estimator.hop": 2.0 * config.estimator.hop,
         "estimator.bin": config.estimator.bin,
     }
-    return [f"{key}={value / SPEED_UP}" for key, value in times.items()]
+    if config.vehicle is not None:
+        lengths = config.vehicle.model_dump(exclude={"mass"})
+        sizes |= {f"vehicle.{name}": length for name, length in lengths.items()}
+    return [f"{key}={size / SPEED_UP}" for key, size in sizes.items()]
 
 
 @contextmanager

@@ -36,8 +36,10 @@ CHANGED = 20.0
 """Fall of -2 log evidence from which it is believed."""
 TRUST, TRUST_AGAIN = 3.5, 0.0
 """Standard deviations of chi-square that a window may have above the allowed: always, and after a mismatch."""
-LOOK_BACK = 0.3
-"""Share of a window, up to its end, within which a change is looked for."""
+LOOK_BACK = 0.2
+"""Share of a window before the end of the last fit's data from which on a change is looked for."""
+GRACE = 0.3
+"""Share of a window that a new soil must fill before the next change is looked for."""
 LEARNED = 0.5
 """Share of a window that its data must fill for later windows to build on it: the posterior of less is not Gaussian."""
 BORDER = 0.5
@@ -103,6 +105,11 @@ class Tracker:
         self.rig, self.prior, self.model, self.settings = rig, prior, model, settings
         self.forget()
 
+    @property
+    def here(self) -> SoilPrior:
+        """Prior of the present soil: the configured one, or a wider one after the soil has changed."""
+        return self._here
+
     def forget(self) -> None:
         """Begin anew."""
         self._here = self.prior  # of the present soil
@@ -130,9 +137,10 @@ class Tracker:
         else:
             ahead = foreseen(problem, self._here, last, before)
             fit = resume(ahead)
-            if self._good_until > end - self.settings.window and end - since > LOOK_BACK * self.settings.window:
+            if self._good_until > end - self.settings.window and end - since > GRACE * self.settings.window:
                 known = ahead.fitting.given(last.belief)
-                first = int(np.searchsorted(problem.t, end - LOOK_BACK * self.settings.window))
+                sure = float(last.optimum.t[-1]) - LOOK_BACK * self.settings.window
+                first = int(np.searchsorted(problem.t, sure))
                 doubt = suspicion(known, ahead.place, ahead.at, first, ALARM)
                 if doubt.ratio > ALARM or self.mismatch(fit):
                     changed = self._two_soils(window, float(problem.t[doubt.instant]), before, last)
