@@ -6,8 +6,9 @@ logarithm of the parameter; a held parameter has no variance.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +49,29 @@ class Estimate:
     std: float
 
 
+class Scalar(NamedTuple):
+    """A quantity that follows from the soil: its value and its gradient (6,) by the parameters, all in SI."""
+
+    value: float
+    gradient: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Derived:
+    """Quantities by name: values (Q,) and covariance (Q, Q), in SI."""
+
+    names: tuple[str, ...]
+    values: Array
+    covariance: Array
+
+    def __getitem__(self, name: str) -> Estimate:
+        """One of them alone; KeyError if it is not there."""
+        if name not in self.names:
+            raise KeyError(name)
+        i = self.names.index(name)
+        return Estimate(float(self.values[i]), _root(float(self.covariance[i, i])))
+
+
 @dataclass(frozen=True, slots=True)
 class Posterior:
     """Soil at the mode and covariance (6, 6) of the parameters' logarithms (held ones: 0)."""
@@ -63,16 +87,50 @@ class Posterior:
     def propagate(self, gradient: Array) -> float:
         """Std of a scalar with this gradient (6,) by the parameters in SI."""
         g = gradient * np.asarray(self.soil)
-        return float(np.sqrt(max(g @ self.log_covariance @ g, 0.0)))
+        return _root(float(g @ self.log_covariance @ g))
 
     def bearing_pressure(self, z_ref: float, b_ref: float) -> Estimate:
         """Pressure [Pa] under a plate of width b_ref [m] at depth z_ref [m] (Bekker)."""
-        value = self.soil.bearing_pressure(z_ref, b_ref)
-        K_L = lumped_modulus(self.soil.k_c, self.soil.k_phi, b_ref)
-        gradient = value * np.array([1 / b_ref / K_L, 1 / K_L, np.log(z_ref), 0.0, 0.0, 0.0])
-        return Estimate(value, self.propagate(gradient))
+        return self._estimate(bearing_pressure(self.soil, z_ref, b_ref))
 
     def tan_phi(self) -> Estimate:
         """Tangent of the internal friction angle."""
-        tan = float(np.tan(self.soil.phi))
-        return Estimate(tan, self.propagate(np.array([0.0, 0.0, 0.0, 1.0 + tan**2, 0.0, 0.0])))
+        return self._estimate(tan_phi(self.soil))
+
+    def derived(self, z_ref: float, b_ref: float, widths: Iterable[float] = ()) -> Derived:
+        """What a window tells best, jointly: bearing_pressure (z_ref, b_ref [m]), tan_phi and K_L of tyres.
+
+        K_L of a tyre of width b [m] is called K_L(b), as in K_L(0.26).
+        """
+        scalars = {"bearing_pressure": bearing_pressure(self.soil, z_ref, b_ref), "tan_phi": tan_phi(self.soil)}
+        scalars |= {f"K_L({width:g})": tyre_modulus(self.soil, width) for width in widths}
+        gradients = np.array([scalar.gradient for scalar in scalars.values()]) * np.asarray(self.soil)
+        values = np.array([scalar.value for scalar in scalars.values()])
+        return Derived(tuple(scalars), values, gradients @ self.log_covariance @ gradients.T)
+
+    def _estimate(self, scalar: Scalar) -> Estimate:
+        return Estimate(scalar.value, self.propagate(scalar.gradient))
+
+
+def bearing_pressure(soil: Soil, z_ref: float, b_ref: float) -> Scalar:
+    """Pressure [Pa] under a plate of width b_ref [m] at depth z_ref [m] (eq. 3 of Xi et al. 2024)."""
+    value = soil.bearing_pressure(z_ref, b_ref)
+    by_modulus = z_ref**soil.n
+    return Scalar(value, np.array([by_modulus / b_ref, by_modulus, value * np.log(z_ref), 0.0, 0.0, 0.0]))
+
+
+def tan_phi(soil: Soil) -> Scalar:
+    """Tangent of the internal friction angle."""
+    tan = float(np.tan(soil.phi))
+    return Scalar(tan, np.array([0.0, 0.0, 0.0, 1.0 + tan**2, 0.0, 0.0]))
+
+
+def tyre_modulus(soil: Soil, width: float) -> Scalar:
+    """Lumped modulus K_L [N/m^(n+2)] under a tyre of this width [m] (eq. 35 of Xi et al. 2024)."""
+    value = float(lumped_modulus(soil.k_c, soil.k_phi, width))
+    return Scalar(value, np.array([1.0 / width, 1.0, 0.0, 0.0, 0.0, 0.0]))
+
+
+def _root(variance: float) -> float:
+    """Square root of a variance that rounding may have taken below zero."""
+    return float(np.sqrt(max(variance, 0.0)))

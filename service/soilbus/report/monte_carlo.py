@@ -1,0 +1,79 @@
+"""Table of the Monte Carlo figures beside their targets."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+
+from soilbus.report.table import table
+from soilbus.simulator.monte_carlo import DURATIONS, SOILS, Cell
+
+MAX_RMS = 1.15
+COVERAGE = (0.93, 0.97)
+MAX_CHI2_OFF = 0.03
+
+
+def with_progress(cells: Iterable[Cell]) -> Iterator[Cell]:
+    """The same cells, with a progress bar on a terminal."""
+    if not sys.stderr.isatty():
+        yield from cells
+        return
+    from rich.console import Console
+    from rich.progress import track
+
+    n_cells = 2 * len(SOILS) * len(DURATIONS)
+    yield from track(cells, "montecarlo", n_cells, console=Console(stderr=True), transient=True)
+
+
+def monte_carlo_report(cells: Sequence[Cell]) -> str:
+    """One line a cell: RMS error over the bound and coverage of each quantity, with marks where targets are missed."""
+    names = list(dict.fromkeys(name for cell in cells for name in cell.quantities))
+    head = ("soil", "window", "sinkage", *names, "chi2", "failed", "open", "fit")
+    return table(head, [_row(cell, names) for cell in cells]) + "\n" + "\n".join(_notes(cells)) + "\n"
+
+
+def _row(cell: Cell, names: Sequence[str]) -> tuple[str, ...]:
+    n = cell.windows - cell.failed - cell.not_converged
+    figures = dict(zip(cell.quantities, zip(cell.rms.tolist(), cell.coverage.tolist(), strict=True), strict=True))
+    of_quantities = [_figure(*figures[name], n) if name in figures else "held" for name in names]
+    chi2 = f"{cell.chi2:.3f}{_mark(abs(cell.chi2 - 1.0) - MAX_CHI2_OFF, 0.0)}"
+    fitted = "measured" if cell.sinkage else "none"
+    counts = (str(cell.failed), str(cell.not_converged))
+    return (cell.soil, f"{cell.duration:g} s", fitted, *of_quantities, chi2, *counts, f"{1e3 * cell.seconds:.0f} ms")
+
+
+def _figure(rms: float, coverage: float, n: int) -> str:
+    """Such as "1.02 95.0" of n windows."""
+    low, high = COVERAGE
+    too_large = _mark(rms - MAX_RMS, _rms_scatter(n))
+    astray = _mark(max(low - coverage, coverage - high), _coverage_scatter(n))
+    return f"{rms:.2f}{too_large} {100.0 * coverage:.1f}{astray}"
+
+
+def _mark(excess: float, scatter: float) -> str:
+    """How far a target is missed: ~ where chance may have done it, * where it can hardly have."""
+    if excess <= 0.0:
+        return ""
+    return "~" if excess < 2.0 * scatter else "*"
+
+
+def _rms_scatter(n: int) -> float:
+    """Standard deviation of the root mean square of n standard normal errors."""
+    return math.sqrt(0.5 / max(n, 1))
+
+
+def _coverage_scatter(n: int) -> float:
+    """Standard deviation of the share of n 95 % intervals that hold the truth."""
+    return math.sqrt(0.95 * 0.05 / max(n, 1))
+
+
+def _notes(cells: Sequence[Cell]) -> Iterator[str]:
+    n = min(cell.windows for cell in cells)
+    low, high = (100.0 * share for share in COVERAGE)
+    yield "Each quantity: RMS error over the Cramér-Rao bound, and share of 95 % intervals that hold the truth [%]."
+    yield f"Targets: at most {MAX_RMS}; {low:.0f} to {high:.0f} %; chi2 1 +- {MAX_CHI2_OFF}."
+    scatter = f"{_rms_scatter(n):.3f} and the other by {100.0 * _coverage_scatter(n):.1f} points"
+    yield f"{n} windows scatter the one by {scatter}"
+    yield "by chance: ~ marks a target missed by less than twice that, * one missed by more."
+    yield "failed: no optimum; open: not converged; both are left out.  fit: median processor time, from cold."
