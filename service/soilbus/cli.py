@@ -13,7 +13,7 @@ import signal
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import IO, Any
 
@@ -76,12 +76,18 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("logs", nargs="+", type=Path, metavar="LOG")
     sub.add_argument("--json", type=Path, metavar="OUT", help="one JSON object a line per window; - for stdout")
     sub.add_argument("--report", type=Path, metavar="OUT.html", help="self-contained HTML with plots (extra: plots)")
+    sub.add_argument("--map", type=Path, metavar="OUT.geojson", help="a point for each window; needs a mapped position")
     sub.add_argument("--partial", action="store_true", help="keep the windows before the point where a log is cut off")
 
     sub = command("simulate", _simulate, "simulated tractor, to a bus in real time or to a log", "optional")
     sub.add_argument("--soil", action="append", default=[], metavar="NAME", help="soil; repeat it for a sequence")
     sub.add_argument("--duration", type=float, default=120.0, metavar="S")
-    sub.add_argument("--seed", type=int, default=1)
+    sub.add_argument("--seed", type=_natural, default=1)
+    sub.add_argument("--start", nargs=2, type=float, metavar=("LAT", "LON"), help="where it starts [deg]")
+    sub.add_argument("--heading", type=float, default=0.0, metavar="DEG", help="clockwise from north (default 0)")
+    sub.add_argument(
+        "--rows", nargs=2, type=float, metavar=("LENGTH", "SPACING"), help="up and down a field [m], not straight on"
+    )
     target = sub.add_mutually_exclusive_group(required=True)
     target.add_argument("--bus", action="store_true", help="send to the configured bus in real time")
     target.add_argument("--log", type=Path, metavar="OUT", help="write a log (.log .log.gz .asc .blf)")
@@ -95,6 +101,11 @@ def _parser() -> argparse.ArgumentParser:
         help="of the simulated wheels, 0.005 to 0.2 m; the paper does not print its own (default 0.05)",
     )  # fmt: skip
     sub.add_argument("--seed", type=_natural, default=1, help="of the noise (default 1)")
+
+    sub = command("montecarlo", _montecarlo, "errors of simulated windows beside the Cramér-Rao bound", "optional")
+    sub.add_argument("--windows", type=_counted, default=200, metavar="N", help="of each kind (default 200)")
+    sub.add_argument("--seed", type=_natural, default=1, help="of drives, noise and priors (default 1)")
+    sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
 
     sub = command("bench", _bench, "every performance figure beside its peer, in one run", "")
     sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
@@ -144,10 +155,13 @@ def _replay(args: argparse.Namespace) -> None:
     from soilbus.daemon.pipeline import Pipeline, WindowResult
     from soilbus.daemon.replay import LogError, check_heard, estimator_beside, replay
     from soilbus.report.progress import progress
+    from soilbus.report.soil_map import check_position_is_mapped, soil_map
     from soilbus.report.windows import html_report, summary
 
     config = _configured(args)
     pipeline = Pipeline(config, load_databases(config))
+    if args.map is not None:
+        check_position_is_mapped(config)
     if args.report is not None:
         _need("matplotlib", "plots", "--report")
     results: list[WindowResult] = []
@@ -171,19 +185,27 @@ def _replay(args: argparse.Namespace) -> None:
     if args.report is not None:
         with _whole_file(args.report) as out:
             out.write(html_report(results, pipeline, config, args.logs))
-    if args.json is None or str(args.json) != "-":
+    if args.map is not None:
+        text, left_out = soil_map(results)
+        with _whole_file(args.map) as out:
+            out.write(text)
+        if left_out:
+            print(f"soilbus: {left_out} of {len(results)} windows have no position: not on the map", file=sys.stderr)
+    if "-" not in (str(args.json), str(args.map)):
         print(summary(results, pipeline), end="")
 
 
 def _simulate(args: argparse.Namespace) -> None:
     from soilbus.can.bus import BusError
+    from soilbus.simulator.course import course
     from soilbus.simulator.drive import SimulationError
     from soilbus.simulator.play import play, scenario_over
     from soilbus.simulator.recording import simulate
 
     config = _configured_or_demo(args)
     try:
-        recording = simulate(config, scenario_over(args.soil or ["loam"], args.duration), args.seed)
+        way = course(args.start, args.heading, args.rows)
+        recording = simulate(config, scenario_over(args.soil or ["loam"], args.duration, way), args.seed)
         play(recording, config, args.log)
     except (SimulationError, KeyError, ValueError, BusError) as error:
         raise WorkError(str(error.args[0])) from None
@@ -232,15 +254,50 @@ def _paper(args: argparse.Namespace) -> None:
     print(paper_report(args.sinkage, args.seed), end="")
 
 
+def _counted(text: str) -> int:
+    """Parser of a whole number above zero, for argparse."""
+    number = _natural(text)
+    if number == 0:
+        raise argparse.ArgumentTypeError("0 is not enough")
+    return number
+
+
+def _montecarlo(args: argparse.Namespace) -> None:
+    import json
+
+    from soilbus.report.monte_carlo import monte_carlo_report, with_progress
+    from soilbus.simulator.drive import SimulationError
+    from soilbus.simulator.monte_carlo import ROUGHLY_KNOWN, as_json, monte_carlo, processes
+    from soilbus.simulator.reference import reference_configuration
+
+    config = _configured(args) if args.config else reference_configuration([*ROUGHLY_KNOWN, *args.set])
+    try:
+        with processes(os.cpu_count() or 1) as each:
+            cells = list(with_progress(monte_carlo(config, args.windows, args.seed, each=each)))
+    except SimulationError as error:
+        raise WorkError(str(error)) from None
+    if args.json is not None:
+        with _whole_file(args.json) as out:
+            out.write(json.dumps([as_json(cell) for cell in cells], indent=1) + "\n")
+    if str(args.json) != "-":
+        print(monte_carlo_report(cells), end="")
+
+
 def _bench(args: argparse.Namespace) -> None:
     import json
 
-    from soilbus.bench import run_bench
+    _need("scipy", "peers", "bench")
+    from soilbus.bench import bench_report, run_bench
 
-    figures = run_bench()
-    if args.json is not None:
-        with _whole_file(args.json) as out:
-            out.write(json.dumps(figures, indent=1) + "\n")
+    with nullcontext() if args.json is None else _whole_file(args.json) as out:  # first, for it takes a minute
+        try:
+            results = run_bench()
+        except (AssertionError, ModuleNotFoundError) as error:
+            raise WorkError(f"bench: {error}") from None
+        if out is not None:
+            out.write(json.dumps(results, indent=1) + "\n")
+    if str(args.json) != "-":
+        print(bench_report(results), end="")
 
 
 def _need(module: str, extra: str, what: str) -> None:

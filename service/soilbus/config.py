@@ -124,6 +124,16 @@ class Signals(_Section):
     draft: Signal | None = None
     pitch: Signal | None = None
     acceleration: Signal | None = None
+    latitude: Signal | None = None
+    """WGS84, positive north; only for the map."""
+    longitude: Signal | None = None
+    """WGS84, positive east."""
+
+    @model_validator(mode="after")
+    def _whole_position(self) -> Signals:
+        if (self.latitude is None) != (self.longitude is None):
+            raise ValueError("a position needs both latitude and longitude")
+        return self
 
 
 class Noise(_Section):
@@ -209,6 +219,8 @@ class Estimator(_Section):
     """Samples are averaged over bins of this length before the fit."""
     min_speed: PositiveFloat = 0.2
     """Below it slip is not judged (standstill gate)."""
+    max_turn: PositiveFloat = 0.15
+    """Relative difference of rim speeds of both axles' wheels above which slip is not judged (turn gate)."""
     z_ref: PositiveFloat = 0.02
     b_ref: PositiveFloat = 0.3
     max_bearing_std: PositiveFloat = 0.10

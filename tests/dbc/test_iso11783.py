@@ -18,6 +18,8 @@ DBC = Path(__file__).resolve().parents[2] / "dbc/iso11783.dbc"
         ("RearHitchStatus", 65093, "RearDraft", "FFFFFF007DFFFFFF", 0.0),
         ("FrontHitchStatus", 65094, "FrontDraft", "FFFFFF647EFFFFFF", 3560.0),
         ("CruiseControlVehicleSpeed", 65265, "WheelBasedVehicleSpeed", "FF0001FFFFFFFFFF", 1.0),
+        ("VehiclePosition", 65267, "Latitude", "B2A86B9CFFFFFFFF", 52.4301234),
+        ("VehiclePosition", 65267, "Longitude", "FFFFFFFF412AFC7B", -1.9876543),
     ],
 )
 def test_values(message, pgn, signal, data, value):

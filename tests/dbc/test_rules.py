@@ -77,7 +77,7 @@ def test_messages_are_ours_to_send(name):
         assert message.cycle_time
         assert "VFrameFormat" in message.dbc.attributes
         pgn = message.frame_id >> 8 & 0xFFFF
-        assert 0xFF00 <= pgn <= 0xFFFF or (name == "tractor" and pgn == 65097)
+        assert 0xFF00 <= pgn <= 0xFFFF or (name == "tractor" and pgn in (65097, 65267))
 
 
 def test_no_identifier_is_used_twice():

@@ -82,3 +82,22 @@ def test_any_scalar_is_propagated_by_its_gradient():
 def test_a_round_off_negative_variance_is_no_nan():
     covariance = np.diag([1e-4, -1e-20, 0.0, 0.0, 0.0, 0.0])
     assert Posterior(LOAM, covariance).propagate(np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])) == 0.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_derived_quantities_jointly_against_monte_carlo(seed):
+    soil = SOILS[("loam", "wet_clay", "lete_sand")[seed]]
+    posterior = Posterior(soil, correlated(0.03, seed))
+    derived = posterior.derived(0.02, 0.3, [0.26, 0.38, 0.26])
+    assert derived.names == ("bearing_pressure", "tan_phi", "K_L(0.26)", "K_L(0.38)")
+    sample = Soil(*draws(posterior, 200_000).T)
+    K_L = [sample.k_c / width + sample.k_phi for width in (0.26, 0.38, 0.3)]
+    drawn = np.array([K_L[2] * 0.02**sample.n, np.tan(sample.phi), *K_L[:2]])
+    std = np.sqrt(np.diag(derived.covariance))
+    assert std == pytest.approx(drawn.std(axis=1), rel=0.03)
+    assert derived.covariance / np.outer(std, std) == pytest.approx(np.corrcoef(drawn), abs=0.03)
+    assert derived.values[2] == pytest.approx(soil.k_c / 0.26 + soil.k_phi, rel=1e-12)
+    assert derived["bearing_pressure"] == posterior.bearing_pressure(0.02, 0.3)
+    assert derived["tan_phi"] == posterior.tan_phi()
+    with pytest.raises(KeyError):
+        derived["K_L(0.3)"]

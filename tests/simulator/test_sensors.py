@@ -23,9 +23,10 @@ def recording():
 def test_every_mapped_channel_has_a_column_at_its_rate(recording):
     quantities = ("torque", "speed", "load", "sinkage", "torque_limit")
     wheels = {f"{quantity}.{wheel}" for quantity in quantities for wheel in ("FL", "FR", "RL", "RR")}
-    assert set(recording.channels) == wheels | {"ground_speed", "draft", "pitch", "acceleration"}
+    slower = {"ground_speed": 0.04, "latitude": 0.1, "longitude": 0.1}
+    assert set(recording.channels) == wheels | {"draft", "pitch", "acceleration"} | set(slower)
     for name, column in recording.channels.items():
-        period = 0.04 if name == "ground_speed" else 0.02
+        period = slower.get(name, 0.02)
         assert np.diff(column.t) == pytest.approx(period)
         assert len(column.t) == len(column.value) == round(120 / period)
 
@@ -51,6 +52,15 @@ def test_noise_is_as_configured(recording, name, sd):
     assert error.std() == pytest.approx(1.0, abs=0.05)
     assert abs(error.mean()) < 4.0 / np.sqrt(len(error))
     assert abs(np.corrcoef(error[1:], error[:-1])[0, 1]) < 4.0 / np.sqrt(len(error))
+
+
+def test_fixes_are_off_by_two_centimetres_north_and_east(recording):
+    metres_per_rad = 6371e3
+    for name, scale in (("latitude", 1.0), ("longitude", np.cos(recording.truth["latitude"][0]))):
+        column = recording.channels[name]
+        off = (column.value - np.interp(column.t, recording.truth["t"], recording.truth[name])) * metres_per_rad * scale
+        assert off.std() == pytest.approx(0.02, rel=0.07)
+        assert abs(off.mean()) < 4.0 * 0.02 / np.sqrt(len(off))
 
 
 def test_gain_errors_are_fixed_for_a_drive_and_spread_as_configured():

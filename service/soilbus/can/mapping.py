@@ -17,9 +17,12 @@ from soilbus.config import Config, ConfigError, Wheel
 from soilbus.config import Signal as Mapped
 
 WHEEL_ROLES = ("torque", "speed", "load", "sinkage", "torque_limit")
-VEHICLE_ROLES = ("ground_speed", "draft", "pitch", "acceleration")
+POSITION_ROLES = ("latitude", "longitude")
+VEHICLE_ROLES = ("ground_speed", "draft", "pitch", "acceleration", *POSITION_ROLES)
 
 MAX_SPEED = 25.0  # m/s, faster than any field tractor
+LEAST_GAP, GAP_CYCLES = 2.0, 1.5
+"""A position is stale after so many seconds, and where the DBC says that it is sent seldom, after so many cycles."""
 _HEAVY = 5.0e4  # kg, stands for the mass when there is no [vehicle]
 
 _DIMENSIONS: dict[str, tuple[str, ...]] = {
@@ -32,6 +35,8 @@ _DIMENSIONS: dict[str, tuple[str, ...]] = {
     "draft": ("force",),
     "pitch": ("angle",),
     "acceleration": ("acceleration",),
+    "latitude": ("angle",),
+    "longitude": ("angle",),
 }
 _SHAFT_BY_DEFAULT = frozenset({"torque", "torque_limit"})
 _HAS_SIDE = frozenset({"torque", "torque_limit", "speed"})
@@ -107,8 +112,15 @@ def _channel(config: Config, database: Database, role: _Role) -> Channel:
         high=high,
         valid_signal=valid_signal,
         valid_values=tuple(role.mapped.valid_values) if valid_signal else (),
-        timeout=role.mapped.timeout,
+        timeout=role.mapped.timeout or _usual_timeout(role, message),
     )
+
+
+def _usual_timeout(role: _Role, message: Message) -> float | None:
+    """Age [s] from which a channel is stale if the configuration does not say; None: as any other."""
+    if role.quantity not in POSITION_ROLES:
+        return None
+    return max(LEAST_GAP, GAP_CYCLES * (message.cycle_time or 0) / 1e3)
 
 
 def _find(database: Database, path: str) -> tuple[Message, Signal]:
@@ -183,6 +195,8 @@ def _unit(quantity: str, signal: Signal) -> tuple[str, float]:
     except ValueError as error:
         raise _Fault(f"{signal.name}: {error} ({quantity} needs {wanted})") from None
     if unit is None:
+        if quantity in POSITION_ROLES:
+            raise _Fault(f"{signal.name} has no unit: write deg or rad in the DBC")
         return fitting[0], 1.0
     if unit.dimension not in fitting:
         raise _Fault(f"{signal.name} is in {signal.unit}, a {unit.dimension}; {quantity} needs {wanted}")
@@ -203,13 +217,17 @@ def plausible(config: Config, quantity: str, wheel: Wheel | None) -> tuple[float
         case "sinkage":
             return -0.1 * radius, radius
         case "ground_speed":
-            return 0.0, MAX_SPEED
+            return -MAX_SPEED, MAX_SPEED
         case "draft":
             return -2.0 * weight, 2.0 * weight
         case "pitch":
             return -1.0, 1.0
         case "acceleration":
             return -20.0, 20.0
+        case "latitude":
+            return -math.pi / 2.0, math.pi / 2.0
+        case "longitude":
+            return -math.pi - 1e-9, math.pi + 1e-9  # 180 degrees, however it is rounded
     return -math.inf, math.inf
 
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from soilbus.can.checksum import CHECKSUM, COUNTER, frame_checksum
 
 NOT_AVAILABLE, ERROR = "not_available", "error"
+_BEYOND = 2.0**40  # any code; a value divided by its scale may be infinite
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +69,7 @@ class ValueCodes:
         number = float(value)
         if not math.isfinite(number):
             return self.not_available
-        code = round((number - self.offset) / self.scale)
+        code = round(min(max((number - self.offset) / self.scale, -_BEYOND), _BEYOND))
         if self.lowest <= code <= self.highest:
             return code
         return self.highest if self.saturates and code > self.highest else self.error

@@ -12,8 +12,10 @@ from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.capability import PullCurve
 from soilbus.config import Config
 from soilbus.daemon.intake import WindowTask
+from soilbus.daemon.positions import Position
 from soilbus.estimation.gauss_newton import Fit
 from soilbus.estimation.posterior import Estimate, Posterior
+from soilbus.estimation.soil_class import SoilClasses, guessed
 from soilbus.estimation.tracker import Ground, Settings, Tracked, Tracker
 from soilbus.estimation.window import Window
 from soilbus.terra.vehicle import GRAVITY
@@ -32,7 +34,9 @@ class WindowResult:
 
     slip and sinkage [m] are means over the window by wheel name, None where unknown.
     rejected counts refused samples of the window by reason.  posterior is None where
-    status is invalid.
+    status is invalid.  soil_class is the probability of each known soil and of `unknown`,
+    the largest first.  position is in the middle of the data that count: of the window, or
+    of its part on a new soil.
     """
 
     t: float
@@ -48,6 +52,8 @@ class WindowResult:
     samples: int
     rejected: dict[str, int]
     iterations: int = 0
+    soil_class: dict[str, float] | None = None
+    position: Position | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,10 +79,12 @@ class WindowEstimator:
         self.rig, self.prior, self.model = rig_of(config), prior_of(config), model_of(config)
         self._settings = config.estimator
         self._pull_curve: PullCurve | None = None
+        self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
+        self._guess = guessed(self.prior, prior_of(Config()))
         settings = config.estimator
         self._tracker = Tracker(
             self.rig, self.prior, self.model,
-            Settings(settings.window, settings.min_speed, settings.max_chi2, settings.soil_drift),
+            Settings(settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift),
         )  # fmt: skip
 
     def solve(self, task: WindowTask) -> WindowResult:
@@ -108,6 +116,8 @@ class WindowEstimator:
             samples=task.window.samples,
             rejected=task.rejected,
             iterations=0 if fit is None else fit.iterations,
+            soil_class=self._soil_class(posterior),
+            position=task.track.at((tracked.since + task.end) / 2.0),
         )
         return Undecided(result, self._demand(task.window), task.torque_limit, stuck, task.fresh)
 
@@ -129,6 +139,12 @@ class WindowEstimator:
 
     def _bearing(self, posterior: Posterior) -> Estimate:
         return posterior.bearing_pressure(self._settings.z_ref, self._settings.b_ref)
+
+    def _soil_class(self, posterior: Posterior | None) -> dict[str, float] | None:
+        if posterior is None or self._classes is None:
+            return None
+        here = self._tracker.here
+        return self._classes.probabilities(posterior, self._guess if here is self.prior else here)
 
     def _sinkage(self, fit: Fit | None) -> dict[str, float | None]:
         if fit is None:
@@ -167,8 +183,8 @@ class WindowEstimator:
         if task.missing:
             return Status.INVALID, "input_missing " + " ".join(task.missing)
         if fit is None:
-            if tracked.standstill > 0:
-                return Status.NOT_EXCITED, "standstill"
+            if tracked.standstill + tracked.turning > 0:
+                return Status.NOT_EXCITED, "standstill" if tracked.standstill >= tracked.turning else "turning"
             return Status.INVALID, "input_stale " + " ".join(task.poor) if task.poor else "no_convergence"
         if tracked.mismatch:
             status = Status.DEGRADED if fit.converged else Status.INVALID

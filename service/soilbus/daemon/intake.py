@@ -18,9 +18,11 @@ from soilbus.assembly import rig_of
 from soilbus.can.admission import Admission
 from soilbus.can.channels import Channel, Decoded
 from soilbus.can.dbc_files import checked_messages
-from soilbus.can.mapping import channels_of
+from soilbus.can.mapping import POSITION_ROLES, channels_of
 from soilbus.config import Config
-from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, BinStore, Window
+from soilbus.daemon.positions import PositionTrack
+from soilbus.estimation.screening import WILD
+from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, BinStore, Window, forward
 from soilbus.terra.vehicle import slip_ratio
 
 Array = NDArray[np.float64]
@@ -42,8 +44,8 @@ class WindowTask:
 
     index counts windows since the start; start and end [s]; missing are needed channels
     never seen, poor those that are stale at the end or covered the window badly;
-    torque_limit (W,) [N m], nan where unknown; fresh: nothing of the window before may be
-    carried over.
+    torque_limit (W,) [N m], nan where unknown; track knows the positions from the window's
+    middle on; fresh: nothing of the window before may be carried over.
     """
 
     index: int
@@ -54,6 +56,7 @@ class WindowTask:
     missing: tuple[str, ...]
     poor: tuple[str, ...]
     torque_limit: Array
+    track: PositionTrack
     rejected: dict[str, int]
     fresh: bool
 
@@ -68,8 +71,13 @@ class Refusals:
     def add(self, decoded: Decoded) -> None:
         """Take note of what one batch of frames refused."""
         for (_, reason), times in decoded.refused.items():
-            self.entries.append((str(reason), times))
-            self.total[str(reason)] += len(times)
+            self.note(str(reason), times)
+
+    def note(self, reason: str, times: Array) -> None:
+        """Take note of samples refused for one reason at these times [s], ascending."""
+        if len(times):
+            self.entries.append((reason, times))
+            self.total[reason] += len(times)
 
     def within(self, start: float, end: float) -> dict[str, int]:
         """Counts by reason from start to end [s]; what is older is forgotten."""
@@ -92,6 +100,9 @@ class Intake:
         self.rig = rig_of(config)
         self.refusals = Refusals()
         self.needed = tuple(c for c in self.channels if self._is_needed(c))
+        self._positions = PositionTrack(
+            {c.name: c.timeout or DEFAULT_TIMEOUT for c in self.channels if c.quantity in POSITION_ROLES}
+        )
         self._settings = config.estimator
         self._binned = frozenset(self.rig.channels)
         limits = {w.name: w.max_torque for w in config.wheel}
@@ -104,11 +115,12 @@ class Intake:
     def _is_needed(self, channel: Channel) -> bool:
         if channel.wheel:
             return channel.wheel in self.rig.wheels and channel.quantity in ("torque", "speed", "load")
-        return True
+        return channel.quantity not in POSITION_ROLES
 
     def _restart(self) -> None:
         self._bins: BinStore | None = None
         self._fresh = True
+        self._positions.forget()
         self.next_end = math.inf
         self.last_seen: dict[str, float] = {}
         self._clock_steps = self.admission.counts.clock_steps
@@ -128,6 +140,7 @@ class Intake:
         for name, (t, value) in heard.items():
             if name.startswith("torque_limit."):
                 self._note_limit(name.removeprefix("torque_limit."), t, value)
+        self._positions.add(heard)
         if self._bins is not None:
             self._bins.add({name: samples for name, samples in heard.items() if name in self._binned})
 
@@ -160,7 +173,8 @@ class Intake:
 
     def _task(self, bins: BinStore, end: float) -> WindowTask:
         start = end - self._settings.window
-        window = bins.window(start, end)
+        window = forward(bins.window(start, end))
+        self.refusals.note(WILD, bins.new_wild())
         missing = tuple(c.name for c in self.needed if c.name not in self.last_seen)
         covered = dict(zip(self.rig.channels, coverage(window).tolist(), strict=True))
         badly_covered = [c.name for c in self.needed if covered[c.name] < MIN_COVERAGE]
@@ -175,12 +189,14 @@ class Intake:
             missing=missing if self.rig.wheels else (*missing, "wheels"),
             poor=poor,
             torque_limit=np.where(fresh_limit, self._limit, self._max_torque),
+            track=self._positions.copy(),
             rejected=self.refusals.within(start, end),
             fresh=self._fresh,
         )
         self._fresh = False
         self._index += 1
         bins.drop_before(start + self._settings.hop)
+        self._positions.drop_before((start + end) / 2.0 + self._settings.hop)
         return task
 
     def stale(self, now: float) -> list[str]:
@@ -194,9 +210,10 @@ class Intake:
         if self._bins is None:
             return dict.fromkeys(self.rig.wheels)
         last = math.floor((now - self._bins.origin) / self._settings.bin) * self._settings.bin + self._bins.origin
-        return self._slip(self._bins.window(last - SLIP_SPAN, last))
+        return self._slip(self._bins.glimpse(last - SLIP_SPAN, last))
 
     def _slip(self, window: Window) -> dict[str, float | None]:
+        window = forward(window)
         ground = window.ground_speed[:, None]
         slip = slip_ratio(self.rig.radius, window.speed, ground)
         slip = np.where((ground > self._settings.min_speed) & (slip > -1.0), slip, np.nan)

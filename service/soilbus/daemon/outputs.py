@@ -11,9 +11,13 @@ from soilbus.config import Config
 from soilbus.daemon.pipeline import WindowResult
 from soilbus.daemon.states import state_after
 from soilbus.estimation.posterior import Estimate
+from soilbus.estimation.soil_class import UNKNOWN
 
 WINDOW_MODULUS = 251
 """The frames' 8-bit window number counts 0..250."""
+
+MOST_CLASSES = 3
+"""Known soils that a window names."""
 
 PARAMETER_FRAMES = {
     # JSON name: (message, SI value of one unit of the DBC)
@@ -40,6 +44,7 @@ def json_line(result: WindowResult, config: Config) -> str:
             "reason": result.reason,
             "soil": None if posterior is None else {k: _value_std(e) for k, e in posterior.parameters().items()},
             "bearing_pressure": bearing,
+            "soil_class": None if result.soil_class is None else likeliest(result.soil_class),
             "slip": result.slip,
             "sinkage": result.sinkage,
             "traversability": {
@@ -57,6 +62,12 @@ def json_line(result: WindowResult, config: Config) -> str:
         },
         allow_nan=False,
     )
+
+
+def likeliest(soil_class: Mapping[str, float]) -> dict[str, float]:
+    """The few most likely known soils and `unknown`, likeliest first."""
+    known = [name for name in soil_class if name != UNKNOWN][:MOST_CLASSES]
+    return {name: p for name, p in soil_class.items() if name in known or name == UNKNOWN}
 
 
 def _value_std(estimate: Estimate | None) -> dict[str, float | None]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,12 +13,13 @@ from soilbus.estimation.linearised import Linearised, Optimum
 from soilbus.estimation.normal_equations import Fitting, Place, Point
 from soilbus.estimation.posterior import Posterior, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
-from soilbus.terra.soils import SOILS
+from soilbus.estimation.soil_class import foretelling
+from soilbus.terra.soils import KINDS, SOILS
 from soilbus.terra.wheel import Soil
 
 Array = NDArray[np.float64]
 
-MAX_ITERATIONS = 20
+MAX_ITERATIONS = 30
 MAX_RESUMED = 10
 CONVERGED = 1e-6
 """Squared length of a step in posterior standard deviations that ends the fit."""
@@ -31,6 +33,8 @@ WORSE = 20.0
 """Rise of the cost that a step may bring: where the cost bends, steps that overshoot come back by themselves."""
 THINNED = 24
 """Instants of a window that the search for good starts looks at."""
+MAX_KINDS = 2
+"""Known soils that the search starts from where the first starts did not agree."""
 MAX_APPROACH = 10
 MAX_SETTLED = 2
 MAX_HOPELESS = 5
@@ -108,7 +112,7 @@ def _promising(thin: Fitting, prior: SoilPrior) -> list[Place]:
     every start is tried.
     """
     ends: list[Place] = []
-    for start in starting_soils(prior, thin.before):
+    for start in starting_soils(thin.problem, prior, thin.before):
         end = _approach(thin, np.asarray(start), MAX_APPROACH)
         if end is None:
             continue
@@ -120,16 +124,17 @@ def _promising(thin: Fitting, prior: SoilPrior) -> list[Place]:
     return [end for i, end in enumerate(ends) if i == 0 or end.cost > ends[i - 1].cost * (1.0 + SAME_END)]
 
 
-def starting_soils(prior: SoilPrior, before: Belief | None = None) -> list[Soil]:
-    """What is believed (else the prior median) and a few unlike known soils, held parameters at their values."""
-    held = prior.log_std == 0.0
-    soils = [Soil(*(prior.median if before is None else before.soil).tolist())]
-    for name in ("loam", "clayey_soil_38", "dry_sand", "heavy_clay_40", "wet_clay"):
-        mixed = np.where(held, prior.median, np.asarray(SOILS[name]))
-        low = prior.median * np.exp(-2.0 * prior.log_std)
-        high = prior.median * np.exp(2.0 * prior.log_std)
-        soils.append(Soil(*np.clip(mixed, low, high).tolist()))
-    return soils
+def starting_soils(problem: WindowProblem, prior: SoilPrior, before: Belief | None = None) -> Iterator[Soil]:
+    """What is believed (else the prior median), loam, and the known soils that foretell the window best."""
+    yield Soil(*(prior.median if before is None else before.soil).tolist())
+    yield near(prior, SOILS["loam"])
+    yield from foretelling(problem, [near(prior, SOILS[kind]) for kind in KINDS])[:MAX_KINDS]
+
+
+def near(prior: SoilPrior, soil: Soil) -> Soil:
+    """The soil with held parameters at their values and the others within two standard deviations of the prior."""
+    reach = np.exp(2.0 * prior.log_std)
+    return Soil(*np.clip(soil, prior.median / reach, prior.median * reach).tolist())
 
 
 def descend(problem: WindowProblem, prior: SoilPrior, start: Soil, before: Belief | None = None) -> Fit | None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from soilbus.assembly import chassis_of
 from soilbus.config import Config, Wheel
+from soilbus.simulator.course import positions
 from soilbus.simulator.equilibrium import Equilibrium, Situation, solve
 from soilbus.simulator.scenario import SAMPLE_RATE, Scenario, Swing, realise, soil_along, soil_names
 from soilbus.terra.stress import Array
@@ -30,8 +31,8 @@ class SimulationError(Exception):
 class Drive:
     """Truth of a drive: columns (N,) by name, in SI.
 
-    t, distance, ground_speed, acceleration, pitch, draft, demand (nan where slip was
-    prescribed), soil (names); and for each wheel W slip.W, entry_angle.W, sinkage.W, load.W,
+    t, distance, ground_speed, acceleration, pitch, latitude, longitude [rad], draft, demand (nan
+    where slip was prescribed), soil (names); and for each wheel W slip.W, entry_angle.W, sinkage.W, load.W,
     torque.W (at the wheel), drawbar_pull.W, speed.W [rad/s], torque_limit.W (nan: unknown).
     The drive ends early, at `bogged_at` [s], where no slip lets the tractor go on.
     """
@@ -142,12 +143,15 @@ def _driver(scenario: Scenario, t: Array, rng: np.random.Generator) -> tuple[Arr
 def _columns(
     wheels: list[Wheel], scenario: Scenario, motion: _Motion, situation: Situation, result: Equilibrium
 ) -> dict[str, NDArray[Any]]:
+    latitude, longitude = positions(scenario.course, motion.distance)
     columns: dict[str, NDArray[Any]] = {
         "t": motion.t,
         "distance": motion.distance,
         "ground_speed": motion.speed,
         "acceleration": motion.acceleration,
         "pitch": motion.pitch,
+        "latitude": latitude,
+        "longitude": longitude,
         "draft": result.draft,
         "demand": np.where(np.isfinite(situation.demand), situation.demand, np.nan),
         "soil": np.array(soil_names(scenario.soils, motion.distance)),

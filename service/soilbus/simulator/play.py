@@ -10,6 +10,7 @@ import can
 
 from soilbus.can.bus import open_bus
 from soilbus.config import Config
+from soilbus.simulator.course import NORTHWARD, Course
 from soilbus.simulator.frames import frames, write_log
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -17,11 +18,11 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 _MEAN_SPEED = 1.4
 
 
-def scenario_over(soils: Sequence[str], duration: float) -> Scenario:
+def scenario_over(soils: Sequence[str], duration: float, course: Course = NORTHWARD) -> Scenario:
     """The soils one after the other in equal parts of the time, with all the excitation they bear."""
     length = duration * _MEAN_SPEED / len(soils)
     patches = tuple(Patch(i * length, name) for i, name in enumerate(soils))
-    return Scenario(duration, patches, slip=Swing(0.05, 0.40))
+    return Scenario(duration, patches, slip=Swing(0.05, 0.40), course=course)
 
 
 def play(recording: Recording, config: Config, log: Path | None) -> None:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from soilbus.simulator.course import NORTHWARD, Course
 from soilbus.terra.soils import soil_named
 from soilbus.terra.stress import Array
 from soilbus.terra.wheel import Soil
@@ -88,7 +89,8 @@ class Scenario:
     `slip_spread` is how far single wheels leave the common slip, `side_shift` the share of
     an axle's load that a side slope moves to its left wheel (negative: to the right),
     `slope` knots (distance [m], pitch [rad]) with straight lines between them,
-    `transition` the length [m] over which one soil turns into the next.
+    `transition` the length [m] over which one soil turns into the next, `course` where on
+    the earth all this happens.
     """
 
     duration: float
@@ -101,6 +103,7 @@ class Scenario:
     side_shift: Swing = Swing(-0.15, 0.15)
     slope: Sequence[tuple[float, float]] = ((0.0, 0.0),)
     transition: float = 1.0
+    course: Course = NORTHWARD
 
     def __post_init__(self) -> None:
         """ValueError for a scenario that cannot be driven."""

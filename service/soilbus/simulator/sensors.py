@@ -11,9 +11,13 @@ from soilbus.can.channels import Column
 from soilbus.config import Config, Noise
 from soilbus.simulator.drive import Drive
 from soilbus.simulator.scenario import SAMPLE_RATE
+from soilbus.terra.earth import SEMI_MAJOR_AXIS, wrapped
 from soilbus.terra.stress import Array
 
-_DIVIDERS = {"ground_speed": 2}  # radars give 25 Hz; all other sensors every sample of the truth
+_DIVIDERS = {"ground_speed": 2, "latitude": 5, "longitude": 5}
+"""Radars give 25 Hz, receivers of positions 10 Hz; all other sensors every sample of the truth."""
+POSITION_NOISE = 0.02
+"""Sd of a fix, north and east [m]: a receiver with real-time corrections."""
 _EXACT = frozenset({"torque_limit"})  # told by the motor controller, not measured
 
 
@@ -28,7 +32,7 @@ def fitted(config: Config) -> Iterator[tuple[str, str]]:
         for quantity in ("torque", "speed", "load", "sinkage", "torque_limit"):
             if getattr(wheel, quantity) is not None:
                 yield quantity, wheel.name
-    for quantity in ("ground_speed", "draft", "pitch", "acceleration"):
+    for quantity in ("ground_speed", "draft", "pitch", "acceleration", "latitude", "longitude"):
         if getattr(config.signals, quantity) is not None:
             yield quantity, ""
 
@@ -36,16 +40,20 @@ def fitted(config: Config) -> Iterator[tuple[str, str]]:
 def measure(drive: Drive, config: Config, seed: int) -> dict[str, Column]:
     """Noisy samples of every mapped channel, SI, by channel name (can.channels).
 
-    Each value is truth times a gain fixed for the drive, plus white noise (config [noise]).
+    Each value is truth times a gain fixed for the drive, plus white noise (config [noise]);
+    positions are off by POSITION_NOISE.
     """
     columns: dict[str, Column] = {}
     t = drive.columns["t"]
     for quantity, wheel in fitted(config):
         name = f"{quantity}.{wheel}" if wheel else quantity
         every = slice(None, None, _DIVIDERS.get(quantity, 1))
-        truth = drive.columns[name]
-        if quantity not in _EXACT:
-            truth = disturbed(truth, getattr(config.noise, quantity), config.estimator.window, channel_rng(seed, name))
+        truth, rng = drive.columns[name], channel_rng(seed, name)
+        if quantity in ("latitude", "longitude"):
+            parallel = 1.0 if quantity == "latitude" else np.cos(drive.columns["latitude"])
+            truth = wrapped(truth + POSITION_NOISE / (SEMI_MAJOR_AXIS * parallel) * rng.standard_normal(len(t)))
+        elif quantity not in _EXACT:
+            truth = disturbed(truth, getattr(config.noise, quantity), config.estimator.window, rng)
         columns[name] = Column(t[every].copy(), truth[every].copy())
     return columns
 

@@ -47,6 +47,9 @@ SOILS |= {
 }
 SOILS |= {"loam": SOILS["xi_sandy_loam"], "wet_clay": SOILS["xi_wet_clay"]}  # the demo's two
 
+KINDS = (*_WONG, "xi_wet_clay")
+"""Names of the soils that differ; Xi's sandy loam is Wong's with 15 % of moisture."""
+
 
 def soil_named(name: str) -> Soil:
     """The soil of that name; KeyError with the known names otherwise."""

@@ -1,0 +1,86 @@
+"""Where the vehicle was: fixes of a satellite receiver -> its position at any time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.terra.earth import wrapped
+
+Array = NDArray[np.float64]
+
+SMOOTHING = 1.0
+"""Fixes up to so many seconds before and after share in a position: receivers are noisy."""
+NO_FIX = 1e-9
+"""Angle [rad] below which a coordinate is zero: what receivers send before they have a fix."""
+
+
+class Position(NamedTuple):
+    """WGS84 [rad]; positive north and east."""
+
+    latitude: float
+    longitude: float
+
+
+class PositionTrack:
+    """The fixes of the last while; `timeout` [s] by channel name, empty where no position is mapped.
+
+    Latitude and longitude may come in different frames.  Longitudes are compared across the
+    antimeridian.
+    """
+
+    def __init__(self, timeout: Mapping[str, float]) -> None:
+        self._timeout = dict(timeout)
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew."""
+        self._fixes: dict[str, tuple[Array, Array]] = dict.fromkeys(self._timeout, (np.zeros(0), np.zeros(0)))
+
+    def copy(self) -> PositionTrack:
+        """The same fixes, for keeps."""
+        track = PositionTrack(self._timeout)
+        track._fixes = dict(self._fixes)
+        return track
+
+    def add(self, samples: Mapping[str, tuple[Array, Array]]) -> None:
+        """Take in times [s] and values [rad], both (N,), by channel name; other channels are passed over."""
+        for name in self._timeout.keys() & samples.keys():
+            t, value = samples[name]
+            fixed = np.abs(value) > NO_FIX
+            old_t, old_value = self._fixes[name]
+            self._fixes[name] = np.append(old_t, t[fixed]), np.append(old_value, value[fixed])
+
+    def at(self, t: float) -> Position | None:
+        """The position at t [s]; None where no fixes before and after it are within the timeout of each other."""
+        if not self._timeout:
+            return None
+        latitude, longitude = (self._coordinate(name, t) for name in Position._fields)
+        if latitude is None or longitude is None:
+            return None
+        return Position(latitude, float(wrapped(longitude)))
+
+    def drop_before(self, t: float) -> None:
+        """Forget the fixes that no position at or after t [s] needs."""
+        for name, (times, value) in self._fixes.items():
+            first = int(np.searchsorted(times, t - self._timeout[name]))
+            self._fixes[name] = times[first:], value[first:]
+
+    def _coordinate(self, name: str, t: float) -> float | None:
+        """On the straight line in time that fits the fixes about t [s] best."""
+        times, value = self._fixes[name]
+        after = int(np.searchsorted(times, t))
+        if not 0 < after < len(times) or times[after] - times[after - 1] > self._timeout[name]:
+            return None
+        near = min(SMOOTHING, self._timeout[name])
+        low = min(int(np.searchsorted(times, t - near)), after - 1)
+        high = max(int(np.searchsorted(times, t + near, "right")), after + 1)
+        reference = float(value[after])
+        since, off = times[low:high] - t, wrapped(value[low:high] - reference)
+        mean = float(since.mean())
+        spread = float(((since - mean) ** 2).sum())
+        slope = float((since - mean) @ off) / spread if spread > 0.0 else 0.0
+        return reference + float(off.mean()) - slope * mean

@@ -1,0 +1,87 @@
+"""Soil along the way as GeoJSON (RFC 7946): one point for each window, in the middle of its data.
+
+Coordinates are WGS84 in degrees, longitude first.  Every property has its unit in its
+name; what is not known is null, never a nan.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from datetime import UTC, datetime
+from typing import Any
+
+from soilbus.config import Config, ConfigError
+from soilbus.daemon.estimator import WindowResult
+from soilbus.estimation.posterior import Estimate
+
+DECIMALS = 7
+"""Of a degree: a centimetre."""
+
+
+def check_position_is_mapped(config: Config) -> None:
+    """Raises ConfigError where a map could only be empty."""
+    if config.signals.latitude is None:
+        raise ConfigError(["--map needs a position: map signals.latitude and signals.longitude"])
+
+
+def soil_map(results: Iterable[WindowResult]) -> tuple[str, int]:
+    """A FeatureCollection as text, a feature a line, and how many windows have no position and are left out."""
+    features: list[str] = []
+    left_out = 0
+    for result in results:
+        if result.position is None:
+            left_out += 1
+        else:
+            features.append(json.dumps(_feature(result), allow_nan=False))
+    body = ",\n".join(features)
+    return f'{{"type": "FeatureCollection", "features": [\n{body}\n]}}\n', left_out
+
+
+def _feature(result: WindowResult) -> dict[str, Any]:
+    assert result.position is not None
+    latitude, longitude = (round(math.degrees(angle), DECIMALS) for angle in result.position)
+    return {
+        "type": "Feature",
+        "id": result.index,
+        "geometry": {"type": "Point", "coordinates": [longitude, latitude]},
+        "properties": _properties(result),
+    }
+
+
+def _properties(result: WindowResult) -> dict[str, Any]:
+    way, parameters = result.traversability, {} if result.posterior is None else result.posterior.parameters()
+    likeliest = max(result.soil_class.items(), key=lambda item: item[1]) if result.soil_class else (None, None)
+    return {
+        "window": result.index,
+        "t": round(result.t, 6),
+        "time": _time(result.t),
+        "status": str(result.status),
+        "reason": result.reason,
+        **_value_std("bearing_pressure", "kpa", result.bearing, 1e3),
+        **_value_std("phi", "deg", parameters.get("phi"), math.pi / 180.0),
+        "soil_class": likeliest[0],
+        "soil_class_probability": _finite(likeliest[1]),
+        "state": str(way.state),
+        "probability": _finite(way.probability),
+        **_value_std("max_draft", "n", way.max_draft, 1.0),
+        "limit": way.limit,
+    }
+
+
+def _time(t: float) -> str | None:
+    """ISO 8601; None for a time stamp [s] that is no date."""
+    try:
+        return datetime.fromtimestamp(t, UTC).isoformat(timespec="milliseconds")
+    except (ValueError, OverflowError, OSError):
+        return None
+
+
+def _value_std(name: str, unit: str, estimate: Estimate | None, factor: float) -> dict[str, float | None]:
+    value, std = (None, None) if estimate is None else (estimate.value / factor, estimate.std / factor)
+    return {f"{name}_{unit}": _finite(value), f"{name}_std_{unit}": _finite(std)}
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None

@@ -1,0 +1,70 @@
+"""Where on the earth the simulated tractor drives: along one straight line, or up and down field rows.
+
+Only the receiver of positions knows of it.  The wheels do not feel the turns at the
+headland, and soils follow one another along the way driven, not across the field.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from soilbus.terra.earth import moved
+from soilbus.terra.stress import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """Start and heading (clockwise from north) [rad]; rows `row` [m] long, each `spacing` [m] right of the one before.
+
+    A row ends in a half circle into the next one.
+    """
+
+    latitude: float = math.radians(52.43)
+    longitude: float = math.radians(12.53)
+    heading: float = 0.0
+    row: float = math.inf
+    spacing: float = 3.0
+
+    def __post_init__(self) -> None:
+        """ValueError for a course that cannot be driven."""
+        if not (abs(self.latitude) <= math.radians(80.0) and abs(self.longitude) <= math.pi):
+            raise ValueError("start: latitude must be within 80 degrees, longitude within 180")
+        if not math.isfinite(self.heading):
+            raise ValueError("heading: must be a number")
+        if not (self.row > 0.0 and 0.0 < self.spacing < math.inf):
+            raise ValueError("rows: length and spacing must be above zero")
+
+
+def course(start: Sequence[float] | None = None, heading: float = 0.0, rows: Sequence[float] | None = None) -> Course:
+    """A course from degrees: start (latitude, longitude), heading, rows (length, spacing) [m]; ValueError as Course."""
+    from_start = {} if start is None else dict(zip(("latitude", "longitude"), map(math.radians, start), strict=True))
+    in_rows = {} if rows is None else dict(zip(("row", "spacing"), rows, strict=True))
+    return Course(**from_start, heading=math.radians(heading), **in_rows)
+
+
+NORTHWARD = Course()
+"""A straight line north through Brandenburg."""
+
+
+def positions(course: Course, distance: Array) -> tuple[Array, Array]:
+    """Latitudes and longitudes [rad] (N,) after driving these distances [m] (N,)."""
+    ahead, right = _in_field(course, distance)
+    sine, cosine = math.sin(course.heading), math.cos(course.heading)
+    north, east = cosine * ahead - sine * right, sine * ahead + cosine * right
+    return moved(course.latitude, course.longitude, north, east)
+
+
+def _in_field(course: Course, distance: Array) -> tuple[Array, Array]:
+    """Metres along the first row and to its right."""
+    if math.isinf(course.row):
+        return distance, np.zeros_like(distance)
+    radius = course.spacing / 2.0
+    number, since = np.divmod(distance, course.row + math.pi * radius)
+    angle = np.maximum(since - course.row, 0.0) / radius
+    along = np.minimum(since, course.row) + radius * np.sin(angle)
+    ahead = np.where(number % 2 == 0, along, course.row - along)
+    return ahead, number * course.spacing + radius * (1.0 - np.cos(angle))

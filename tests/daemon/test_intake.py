@@ -1,0 +1,121 @@
+"""Wild samples and reversing, from frames to windows."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from soilbus.can.candump import Frame
+from soilbus.can.dbc_files import load_databases
+from soilbus.config import load_config
+from soilbus.daemon.intake import Intake
+from soilbus.daemon.replay import read_frames
+from soilbus.simulator.frames import frames
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import excited
+
+FIELD_TOML = Path(__file__).resolve().parents[1] / "field/field.toml"
+START = 1_700_000_000.0
+SPEEDS = 0x510
+QUANTITIES = ("torque", "load", "speed", "sinkage", "ground_speed", "draft", "pitch", "acceleration")
+
+
+@pytest.fixture(scope="module")
+def loam(field_recording) -> list[Frame]:
+    out = []
+    for frame in read_frames(field_recording("loam.log.gz")):
+        if frame[0] >= START + 14.5:
+            break
+        out.append(frame)
+    return out
+
+
+def spoilt(recorded: list[Frame], share: float = 0.01):
+    """The frames with 1 % of the front left wheel's speeds a tenth too high, and the times of those."""
+    rng = np.random.default_rng(1)
+    out, times = [], []
+    for t, identifier, extended, data, *rest in recorded:
+        # not where a window's last samples are: one there is counted by the next window
+        if identifier == SPEEDS and rng.random() < share and 0.02 < (t - START) % 1.0 < 0.88:
+            data = round(1.1 * int.from_bytes(data[:2], "little")).to_bytes(2, "little") + data[2:]
+            times.append(t)
+        out.append((t, identifier, extended, data, *rest))
+    return out, np.array(times)
+
+
+def windows(recorded: list[Frame], every: int = 200, glimpse: bool = False):
+    """The tasks of the frames, the clock looked at every so many of them, and the intake."""
+    config = load_config(FIELD_TOML)
+    intake = Intake(config, load_databases(config))
+    tasks = []
+    for i, (t, identifier, extended, data, *_) in enumerate(recorded):
+        if i % every == 0:
+            tasks += intake.due(t)
+            if glimpse:  # as the live service does at every tick
+                intake.ingest()
+                slip = intake.latest_slip(t)
+                assert all(s is None or -0.1 < s < 0.7 for s in slip.values())
+        intake.admission.feed(t, identifier, extended, data)
+    return tasks + intake.finish(recorded[-1][0]), intake
+
+
+def test_wild_samples_are_left_out_and_counted(loam):
+    frames_, times = spoilt(loam)
+    assert len(times) > 3
+    clean, _ = windows(loam)
+    tasks, intake = windows(frames_)
+    assert len(tasks) == len(clean) == 5
+    assert intake.refusals.total["wild"] == np.count_nonzero(times < tasks[-1].end)
+    for task, other in zip(tasks, clean, strict=True):
+        n = np.count_nonzero((times >= task.start) & (times < task.end))
+        assert n > 0
+        assert task.rejected == {"wild": n}
+        assert other.rejected == {}
+        assert task.window.samples == other.window.samples - n
+        assert task.window.speed[:, 0] == pytest.approx(other.window.speed[:, 0], rel=5e-3)  # 5 sd of a bin's mean
+        for name in QUANTITIES:
+            a, b = getattr(task.window, name), getattr(other.window, name)
+            assert name == "speed" or np.array_equal(a, b, equal_nan=True)
+
+
+@pytest.mark.parametrize(("every", "glimpse"), [(1, False), (40, True), (100_000, False)])
+def test_live_and_replay_give_the_same_windows(every, glimpse, loam):
+    frames_, _ = spoilt(loam, 0.03)
+    expected, _ = windows(frames_)
+    got, intake = windows(frames_, every, glimpse)
+    assert len(got) == len(expected)
+    for a, b in zip(got, expected, strict=True):
+        assert (a.rejected, a.slip, a.window.samples) == (b.rejected, b.slip, b.window.samples)
+        assert all(np.array_equal(getattr(a.window, q), getattr(b.window, q), equal_nan=True) for q in QUANTITIES)
+    assert intake.refusals.total["wild"] > 10
+
+
+def test_slip_in_reverse_is_that_of_the_same_drive_forward():
+    config = reference_configuration()
+    recording = simulate(config, excited("loam", 11.5), seed=3)
+    reversed_ = {
+        name: dataclasses.replace(c, value=-c.value)
+        if name.partition(".")[0] in ("speed", "torque", "draft", "pitch", "acceleration")
+        else c
+        for name, c in recording.channels.items()
+    }
+    slips = []
+    for channels in (recording.channels, reversed_):
+        database = load_databases(config)
+        intake = Intake(config, database)
+        tasks = []
+        for m in frames(dataclasses.replace(recording, channels=channels), config, database):
+            tasks += intake.due(m.timestamp)
+            intake.admission.feed_message(m)
+            last = m.timestamp
+        slips += [[*tasks[0].slip.values(), *intake.latest_slip(last).values()]]
+        intake.ingest()
+        slips[-1] += intake.latest_slip(last).values()
+    ahead, back = slips
+    assert all(0.0 < s < 0.5 for s in ahead[:4] + ahead[8:])
+    assert back[:4] == pytest.approx(ahead[:4], abs=1e-3)  # codes are rounded
+    assert back[8:] == pytest.approx(ahead[8:], abs=1e-3)

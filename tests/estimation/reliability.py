@@ -1,0 +1,120 @@
+"""Simulated windows of soils drawn from the classes and from none of them: do reported probabilities come true?
+
+`PYTHONPATH=service python tests/estimation/reliability.py 300 [--seconds 10] [--slip 0.4]` prints the table.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.config import Config
+from soilbus.estimation.coordinates import TYPICAL_DEPTH
+from soilbus.estimation.gauss_newton import fit_window
+from soilbus.estimation.residuals import WindowProblem
+from soilbus.estimation.soil_class import PRIOR_UNKNOWN, UNKNOWN, SoilClasses
+from soilbus.estimation.tracker import TRUST
+from soilbus.estimation.window import BinStore
+from soilbus.simulator.drive import SimulationError
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.terra.wheel import Soil
+
+WIDE_COHESION = ("soil.c.value=5000", "soil.c.std=8000")
+"""The table has cohesions up to 69 kPa, 23 times the default prior's median."""
+EDGES = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 1.0)
+
+
+class Said(NamedTuple):
+    """Probabilities of a window, and the class that its soil was drawn from."""
+
+    probability: dict[str, float]
+    truth: str
+
+
+def drawn(classes: SoilClasses, rng: np.random.Generator) -> tuple[str, Soil | None]:
+    """A class, as likely as it is beforehand, and a soil of it; None where it is no soil at all."""
+    known = len(classes.names) - 1
+    i = known if rng.random() < PRIOR_UNKNOWN else int(rng.integers(known))
+    log_k_c, log_p, *logs = classes.centre[i] + classes.spread[i] * rng.standard_normal(6)
+    k_c, (n, phi, c, K) = math.exp(log_k_c), np.exp(logs).tolist()
+    k_phi = math.exp(log_p) / TYPICAL_DEPTH**n - k_c / classes.width
+    soil = Soil(k_c, k_phi, n, phi, c, K)
+    return classes.names[i], soil if k_phi > 0.0 and phi < 1.2 else None
+
+
+def windows(count: int, seed: int, seconds: float, slip: float = 0.4) -> Iterator[Said]:
+    """What is said of so many drawn soils; those that no tractor can drive on are left out."""
+    config = reference_configuration(WIDE_COHESION)
+    classes, prior = SoilClasses.of_table(float(rig_of(config).width.mean())), prior_of(config)
+    for i in range(count):
+        truth, soil = drawn(classes, np.random.default_rng([seed, i]))
+        problem = None if soil is None else driven(config, soil, [seed, i], seconds, slip)
+        fit = None if problem is None else fit_window(problem, prior)
+        if fit is None or not fit.converged or fit.chi2 > 1.1 + TRUST * math.sqrt(2.0 / fit.rows):
+            continue  # the service reports such a window as degraded or invalid
+        yield Said(classes.probabilities(fit.posterior, prior), truth)
+
+
+def driven(config: Config, soil: Soil, seed: list[int], seconds: float, slip: float = 0.4) -> WindowProblem | None:
+    """One window on a soil; None where the tractor cannot drive on it."""
+    scenario = Scenario(seconds, (Patch(0.0, "this", soil),), slip=Swing(0.05, slip))
+    try:
+        recording = simulate(config, scenario, int(np.random.SeedSequence(seed).generate_state(1)[0]))
+    except SimulationError:
+        return None
+    if recording.bogged_at is not None:
+        return None
+    rig, channels = rig_of(config), recording.channels
+    store = BinStore(rig, config.estimator.bin, 0.0)
+    store.add({name: (channels[name].t, channels[name].value) for name in rig.channels if name in channels})
+    return WindowProblem(store.window(0.0, seconds), rig, model_of(config), config.estimator.min_speed)
+
+
+def shortfall(said: list[Said]) -> float:
+    """By how many standard deviations the Brier score is above what the probabilities promise."""
+    got = promised = variance = 0.0
+    for probability, truth in said:
+        p = np.array([*probability.values()])
+        got += probability[truth]
+        promised += p @ p
+        variance += p @ p**2 - (p @ p) ** 2
+    return (promised - got) / math.sqrt(variance)
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("count", type=int)
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--slip", type=float, default=0.4)
+    parser.add_argument("--seed", type=int, default=1)
+    args = parser.parse_args()
+    said = list(windows(args.count, args.seed, args.seconds, args.slip))
+    first = [(max(p.values()), next(iter(p)) == truth) for p, truth in said]
+    unknown = [(p[UNKNOWN], truth == UNKNOWN) for p, truth in said]
+    every = [(value, name == truth) for p, truth in said for name, value in p.items()]
+    print(f"{len(said)} of {args.count} windows; the first named is right in {np.mean([r for _, r in first]):.1%}")
+    brier = np.mean([1.0 + sum(q**2 for q in p.values()) - 2.0 * p[truth] for p, truth in said])
+    print(
+        f"Brier score {brier:.3f}; above what the probabilities promise by {shortfall(said):+.1f} standard deviations"
+    )
+    for title, pairs in (("first named", first), ("unknown", unknown), ("every class", every)):
+        print(f"\n{title:<12}  windows  said   true   by chance +-")
+        for low, high in pairwise(EDGES):
+            part = np.array([pair for pair in pairs if low <= pair[0] < high or pair[0] == high == 1.0], float)
+            if len(part):
+                (p, true), n = part.T, len(part)
+                chance = math.sqrt((p * (1.0 - p)).sum()) / n
+                print(f"{low:.2f} - {high:.2f}  {n:7d}  {p.mean():.3f}  {true.mean():.3f}  {chance:.3f}")
+
+
+if __name__ == "__main__":
+    main()
