@@ -169,7 +169,7 @@ def test_stubble_is_known_to_be_misunderstood(whole):
 
 
 KEYS = {"t", "status", "soil", "bearing_pressure", "slip", "sinkage", "traversability", "chi2", "samples", "rejected"}
-MORE = {"window", "reason", "state"}
+MORE = {"window", "reason", "state", "soil_class"}
 DECISION = {"state", "probability", "torque_required", "torque_available", "max_draft", "max_grade", "limit"}
 
 
@@ -191,6 +191,8 @@ def test_json_lines_have_the_keys_of_the_design(name, whole):
         assert one["soil"] is None or {k: set(v) for k, v in one["soil"].items()} == {
             k: {"value", "std"} for k in ("k_c", "k_phi", "n", "phi", "c", "K")
         }
+        assert (one["soil_class"] is None) == (one["soil"] is None)
+        assert one["soil_class"] is None or (len(one["soil_class"]) == 4 and "unknown" in one["soil_class"])
         assert set(one["slip"]) == set(one["sinkage"]) == {"FL", "FR", "RL", "RR"}
         assert one["status"] in ("valid", "degraded", "not_excited", "invalid")
         assert one["traversability"]["state"] in ("go", "caution", "no_go", "unknown")

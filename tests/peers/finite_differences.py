@@ -55,7 +55,7 @@ def fit(case: Case) -> Posterior | None:
         if turn:
             latents = problem.carried(problem.updated(at, latents, np.zeros(6), np.zeros(len(gains))), soil)
             at = problem.linearise(soil, gains, latents)
-        residuals = _whitened(problem, at, latents)
+        residuals = _whitened(problem, at, latents, gains)
         try:
             found = least_squares(
                 lambda x, residuals=residuals: np.concatenate([residuals(*parted(x)), x]), x, bounds=(-reach, reach)
@@ -72,14 +72,16 @@ def fit(case: Case) -> Posterior | None:
     return Posterior(soil, log_covariance)
 
 
-def _whitened(problem: WindowProblem, at: Linearised, latents: Latents) -> Callable[[Soil, Array], Array]:
+def _whitened(
+    problem: WindowProblem, at: Linearised, latents: Latents, frozen: Array
+) -> Callable[[Soil, Array], Array]:
     """Readings less model of torques, draft balance and sinkages, whitened, by soil and gains (G,)."""
     rig, W = problem.rig, problem.n_wheels
     whiten = np.linalg.inv(np.linalg.cholesky(reading_covariance(problem, at)))
     now = np.concatenate([latents.load, latents.speed, latents.ground_speed[:, None]], axis=1)
     measured = np.concatenate([problem.load, problem.speed, problem.ground_speed[:, None]], axis=1)
     slip = 1.0 - latents.ground_speed[:, None] / (rig.radius * latents.speed)
-    angle = latents.entry_angle
+    angle, scale = latents.entry_angle, 1.0 / (1.0 + frozen)
 
     def residuals(soil: Soil, gains: Array) -> Array:
         nonlocal angle  # the last one's is the best first guess
@@ -87,10 +89,12 @@ def _whitened(problem: WindowProblem, at: Linearised, latents: Latents) -> Calla
         state = WheelState(angle, slip, rig.radius, rig.width, K_L, soil.n, np.tan(soil.phi), soil.c, soil.K)
         angle = entry_angle_for_load(latents.load, state, fit_model())
         _, pull, torque = wheel_forces(state._replace(entry_angle=angle), fit_model())
-        balance = problem.demand - gains[-1] * problem.draft - pull.sum(1)
-        misfit = [problem.torque * (1.0 - gains[:W]) - torque, balance[:, None]]
+        # A reading less what the sensor makes of the truth, in units of the truth at the frozen gains.
+        draft = pull.sum(1) - (problem.demand - problem.draft)
+        misfit = [(problem.torque - (1.0 + gains[:W]) * torque) * scale[:W]]
+        misfit.append(((problem.draft - (1.0 + gains[-1]) * draft) * scale[-1])[:, None])
         misfit.append(problem.sinkage - sinkage(angle, rig.radius))
-        linear = at.by_latents @ (measured * (1.0 - gains[W:-1]) - now)[:, :, None]
+        linear = at.by_latents @ ((measured - (1.0 + gains[W:-1]) * now) * scale[W:-1])[:, :, None]
         return (whiten @ (np.concatenate(misfit, axis=1)[:, :, None] + linear)).ravel()
 
     return residuals
