@@ -45,7 +45,11 @@ class WheelModel:
     """The choices that make a wheel-soil model.
 
     The angle of greatest stress is (peak_c1 + peak_c2 slip) times the entry angle (eq. 4),
-    the exit angle exit_ratio times it (0: the rut does not recover).
+    the exit angle exit_ratio times it (0: the rut does not recover; behind the axle it is
+    negative).  exponential_share of the shear strength is mobilised by the exponential law
+    whatever shear_law says.  From the depth pan_depth [m] on the pressure grows by
+    pan_stiffness times what the soil alone would add (0: no hard pan).  one_off: a model
+    whose shape no other call will share, so that nothing of it is kept.
     """
 
     shear_law: str = "exponential"
@@ -53,6 +57,10 @@ class WheelModel:
     peak_c2: float = 0.0
     exit_ratio: float = 0.0
     nodes: int = EXACT_NODES
+    exponential_share: float = 0.0
+    pan_depth: float = 0.0
+    pan_stiffness: float = 0.0
+    one_off: bool = False
 
     @property
     def quadrature(self) -> Quadrature:
@@ -216,7 +224,7 @@ class _Stress(NamedTuple):
 def _stress(state: WheelState, model: WheelModel, skid: bool) -> _Stress:
     theta, slip, r, _, K_L, n, _, _, K = state
     q = model.quadrature
-    if skid or model.peak_c2:
+    if skid or model.peak_c2 or model.one_off:
         peak = np.asarray(model.peak_c1 + model.peak_c2 * slip)
         x, w = split_nodes(theta, slip, peak, q) if skid else gauss(q.nodes, q.power)
         share, weight = on_branches(x, w, peak, q.exit)
@@ -226,11 +234,28 @@ def _stress(state: WheelState, model: WheelModel, skid: bool) -> _Stress:
         rim = rim_of_fixed_shares(theta, q, r / K)
     log_z = np.log(r * rim.depth)
     sigma = np.exp(n * log_z + np.log(K_L))  # the rear takes the front's stress (eqs. 5-9)
+    if model.pan_stiffness:
+        sigma = sigma + _pan_pressure(r * rim.depth, K_L, n, model)
     normal = sigma * weight
     j_K = slip * rim.travel
     j_K += rim.creep
-    g, dg = SHEAR_LAWS[model.shear_law](j_K)
+    g, dg = _mobilised(j_K, model)
     return _Stress(rim, share, weight, log_z, normal, normal * g, weight * g, g, dg, j_K)
+
+
+def _mobilised(j_K: Array, model: WheelModel) -> tuple[Any, Any]:
+    """Mobilised share of the shear strength and its derivative by j/K."""
+    share, slope = SHEAR_LAWS[model.shear_law](j_K)
+    if not model.exponential_share:
+        return share, slope
+    w, (other, other_slope) = model.exponential_share, SHEAR_LAWS["exponential"](j_K)
+    return (1.0 - w) * share + w * other, (1.0 - w) * slope + w * other_slope
+
+
+def _pan_pressure(depth: Array, K_L: Any, n: Any, model: WheelModel) -> Array:
+    """Pressure [Pa] that a hard pan adds at a depth [m]; zero above it."""
+    own = K_L * np.maximum(depth, model.pan_depth) ** n - K_L * model.pan_depth**n
+    return np.asarray(model.pan_stiffness * own)
 
 
 def _shear(at: _Stress, state: WheelState) -> tuple[Array, Array]:

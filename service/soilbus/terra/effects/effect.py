@@ -1,0 +1,111 @@
+"""What an effect is: a small change of the wheel-soil model, of a force, or of what a sensor tells.
+
+An effect has parameters, each with a value at which the effect is absent and a prior
+range, and up to five hooks, all pure functions.  `wheel` and `forces` are elementwise, for
+arrays of any shape that broadcast with those of Surroundings; the others work on instants
+(N,) and wheels (N, W).  Effects are off by default and may be combined in any order of the
+catalogue: first every `wheel`, then the integrals, then every `forces`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from soilbus.terra.stress import Array
+from soilbus.terra.wheel import WheelModel, WheelState, wheel_forces
+
+Values = Mapping[str, Any]
+"""Parameters of an effect by name: floats, or one for each wheel (W,)."""
+
+
+class Surroundings(NamedTuple):
+    """What effects may depend on besides the wheel state; (N, W), (N, 1) or (W,), broadcasting with it.
+
+    t [s] and distance [m] since the start of the record; load of the wheel [N];
+    ground_speed [m/s]; wheel_speed [rad/s]; rear tells which wheels run in the rut of
+    another; draft [N] and acceleration [m/s^2] of the vehicle, mass [kg] of it; duration
+    [s] of the record.  Slips are those of the nominal radius, 1 - V/(r omega).
+    """
+
+    t: Any
+    distance: Any
+    load: Any
+    ground_speed: Any
+    wheel_speed: Any
+    rear: Any
+    draft: Any
+    acceleration: Any
+    mass: float
+    duration: float
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One parameter of an effect: absent at `neutral`, prior sd `std` about it, confined to low..high; SI unit."""
+
+    name: str
+    unit: str
+    neutral: float
+    std: float
+    low: float
+    high: float
+
+
+WheelHook = Callable[[WheelState, WheelModel, Surroundings, Values], tuple[WheelState, WheelModel]]
+ForcesHook = Callable[[Array, WheelState, Surroundings, Values], Array]
+TorqueHook = Callable[[Array, Surroundings, Values], Array]
+DraftHook = Callable[[Array, Surroundings, Values], Array]
+ErrorHook = Callable[[Surroundings, Values], Array]
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One physical or sensor effect.
+
+    `physics` is the sentence a report prints, `source` where its equation comes from,
+    `tells` the manoeuvre or sensor that shows it apart from others.  The first of the
+    parameters is the one that `simulate --effect NAME=VALUE` sets.  With `each_wheel` every
+    wheel has parameters of its own.
+
+    wheel: state and model before the stresses are integrated.  forces: load, drawbar pull
+    and torque (3, ...) between wheel and ground, after it.  torque: what the sensors tell
+    (N, W) of the torques at the wheels.  draft: error [N] (N,) of the load cell at the
+    hitch, reading less truth, of true drafts (N,).  load: errors [N] (N, W) of the wheel
+    load cells.  resistance: force [N] (N,) that holds the vehicle back and is in no reading.
+    base_law: the shear law of models to which the effect can be added, None for any.
+    """
+
+    name: str
+    physics: str
+    source: str
+    tells: str
+    parameters: tuple[Parameter, ...]
+    each_wheel: bool = False
+    wheel: WheelHook | None = None
+    forces: ForcesHook | None = None
+    torque: TorqueHook | None = None
+    draft: DraftHook | None = None
+    load: ErrorHook | None = None
+    resistance: ErrorHook | None = None
+    base_law: str | None = None
+
+
+class Active(NamedTuple):
+    """An effect with values of all its parameters."""
+
+    effect: Effect
+    values: Values
+
+
+def forces_with(active: Sequence[Active], state: WheelState, model: WheelModel, around: Surroundings) -> Array:
+    """Load W [N], drawbar pull DP [N] and torque T [N m] of wheels with these effects: array (3, ...)."""
+    for effect, values in active:
+        if effect.wheel is not None:
+            state, model = effect.wheel(state, model, around, values)
+    forces = wheel_forces(state, model)
+    for effect, values in active:
+        if effect.forces is not None:
+            forces = effect.forces(forces, state, around, values)
+    return forces
