@@ -151,6 +151,14 @@ def descend(problem: WindowProblem, prior: SoilPrior, start: Soil, before: Belie
         return None if near is None else _settle(Fitting(problem, prior, before), near, MAX_ITERATIONS)
 
 
+def continued(problem: WindowProblem, prior: SoilPrior, before: Belief, soil: Array, gains: Array) -> Fit | None:
+    """Descent of everything together from a soil (6,) and gains (G,) near the optimum; None as descend()."""
+    fitting = Fitting(problem, prior, before)
+    with np.errstate(all="ignore"):
+        latents = problem.carried(problem.start(Soil(*soil.tolist())), Soil(*soil.tolist()), gains)
+        return _settle(fitting, Place(soil, gains, latents, np.inf, 0), MAX_ITERATIONS)
+
+
 @dataclass(frozen=True, slots=True)
 class Foreseen:
     """A window as the one just before lets expect it: linearised at that one's optimum."""

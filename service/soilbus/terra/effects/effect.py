@@ -75,6 +75,7 @@ class Effect:
     hitch, reading less truth, of true drafts (N,).  load: errors [N] (N, W) of the wheel
     load cells.  resistance: force [N] (N,) that holds the vehicle back and is in no reading.
     base_law: the shear law of models to which the effect can be added, None for any.
+    of_record: the parameters are those of one recording, not of the vehicle.
     """
 
     name: str
@@ -90,6 +91,7 @@ class Effect:
     load: ErrorHook | None = None
     resistance: ErrorHook | None = None
     base_law: str | None = None
+    of_record: bool = False
 
 
 class Active(NamedTuple):

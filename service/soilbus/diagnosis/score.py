@@ -1,0 +1,123 @@
+"""Score test: what each effect could explain, foreseen from one linearisation at the fitted model.
+
+The residuals' gradient by an effect's parameters, and their information less what soil,
+gains and effects already in the model can imitate, foretell how far the penalised cost
+would fall if the effect were added (Rao's score test, Bayesian with the prior's precision).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.diagnosis.completion import Completion, Start
+from soilbus.diagnosis.records import Record
+from soilbus.estimation.belief import Belief
+from soilbus.estimation.completed import Free, parameters_of
+from soilbus.estimation.normal_equations import Fitting, Place, solved
+from soilbus.estimation.posterior import SoilPrior
+from soilbus.terra.effects.effect import Effect
+
+Array = NDArray[np.float64]
+
+MAX_PULL = 2.0
+"""Prior standard deviations to which a foreseen parameter is confined: linear is not for ever."""
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """What an effect is foreseen to do: fall of the penalised cost, change of -2 log evidence, start of its fit."""
+
+    effect: Effect
+    fall: float
+    evidence: float
+    starts: tuple[Start, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Normal:
+    """Normal equations of one recording: those of the present model solved for, the effects' left over.
+
+    by_effects (P,) is the gradient, left (P, P) the information without the prior's,
+    answer (F + A, P) how the present parameters follow the effects'.
+    """
+
+    fitting: Fitting
+    place: Place
+    by_effects: Array
+    left: Array
+    answer: Array
+
+
+def scores(
+    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect]
+) -> list[Score]:
+    """The candidates in the order of what they are foreseen to explain, the best first."""
+    n_wheels = len(records[0].learned.rig.wheels)
+    free = [f for effect in candidates for f in parameters_of(effect, n_wheels)]
+    normals = [_normal(r, prior, present, i, candidates, free) for i, r in enumerate(records)]
+    found = []
+    for effect in candidates:
+        columns = np.array([i for i, f in enumerate(free) if f.effect == effect.name])
+        found.append(_score(effect, columns, normals, present))
+    return sorted(found, key=lambda score: score.evidence)
+
+
+def _normal(
+    record: Record, prior: SoilPrior, present: Completion, i: int, candidates: Sequence[Effect], free: Sequence[Free]
+) -> _Normal:
+    problem = record.learned.completed((*present.effects, *candidates), (*present.free, *free))
+    fit, before, P = present.fits[i], present.before[i], len(free)
+    covariance = np.zeros((len(before.covariance) + P,) * 2)
+    covariance[:-P, :-P], covariance[-P:, -P:] = before.covariance, np.eye(P)
+    extended = Belief(before.soil, np.concatenate([before.gains, np.zeros(P)]), covariance)
+    gains = np.concatenate([fit.optimum.gains, np.zeros(P)])
+    place = Place(fit.optimum.soil, gains, fit.optimum.latents, np.inf, 0)
+    fitting = Fitting(problem, prior, extended)
+    with np.errstate(all="ignore"):
+        point = fitting.point(place)
+    if point is None:
+        raise np.linalg.LinAlgError("the model is not finite where it was fitted")
+    base, new = slice(None, -P), slice(-P, None)
+    information = point.information
+    inverse = solved(information[base, base], np.zeros(len(information) - P))
+    if inverse is None:
+        raise np.linalg.LinAlgError("the present model's information is singular")
+    answer = inverse[1] @ information[base, new]
+    left = information[new, new] - np.eye(P) - information[new, base] @ answer
+    by_effects = point.gradient[new] - answer.T @ point.gradient[base]
+    return _Normal(fitting, place, by_effects, left, answer)
+
+
+def _score(effect: Effect, columns: NDArray[np.intp], normals: Sequence[_Normal], present: Completion) -> Score:
+    """One effect's score over all recordings; with parameters of its own in each where it is of the recording."""
+    block = np.ix_(columns, columns)
+    if effect.of_record:
+        parts = [(n.left[block], n.by_effects[columns]) for n in normals]
+    else:
+        parts = [(sum(n.left[block] for n in normals), sum(n.by_effects[columns] for n in normals))]
+    fall, logdet, pulls = 0.0, 0.0, []
+    for left, gradient in parts:
+        information = left + np.eye(len(columns))
+        pull = -np.linalg.solve(information, gradient)
+        fall += float(-gradient @ pull)
+        logdet += float(np.linalg.slogdet(information)[1])
+        pulls.append(pull)
+    if not effect.of_record:
+        pulls *= len(normals)
+    starts = tuple(_start(n, columns, pull, present) for n, pull in zip(normals, pulls, strict=True))
+    return Score(effect, fall, logdet - fall, starts)
+
+
+def _start(normal: _Normal, columns: NDArray[np.intp], pull: Array, present: Completion) -> Start:
+    pull = pull * min(1.0, MAX_PULL / max(float(np.abs(pull).max(initial=0.0)), 1e-12))
+    step = -normal.answer[:, columns] @ pull
+    fitting, place = normal.fitting, normal.place
+    n_free, n_known = len(fitting.free), len(place.gains) - len(normal.left)
+    soil = fitting.coordinates.moved(place.soil, step[:n_free])
+    gains = place.gains[:n_known].copy()
+    gains[fitting.active[fitting.active < n_known]] += step[n_free:]
+    return Start(soil, np.concatenate([gains, pull]))

@@ -1,0 +1,230 @@
+"""A window's residuals under a wheel-soil model that effects complete.
+
+The parameters of the effects take their place beside the gain errors of the sensors: each
+as (parameter - value) / std, zero with variance one before any data.  Derivatives are
+differences here: an effect is any small function, and a dozen evaluations of the forces are
+cheaper than a derivative by hand for every pair of effects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.estimation.linearised import Latents
+from soilbus.estimation.residuals import MAX_TURN, Response, WindowProblem
+from soilbus.estimation.window import Rig, Window
+from soilbus.terra.effects.effect import Active, Effect, Parameter, Surroundings, forces_with
+from soilbus.terra.stress import lumped_modulus
+from soilbus.terra.wheel import MAX_ENTRY_ANGLE, MIN_ENTRY_ANGLE, Soil, WheelModel, WheelState, sinkage
+
+Array = NDArray[np.float64]
+
+STEP = 1e-6
+"""Relative step of the differences; in standard deviations of a parameter, STEP_OF_EFFECT."""
+STEP_OF_EFFECT = 1e-4
+LOAD_ROUNDS = 6
+DRAFT_ROUNDS = 3
+"""Fixed-point rounds from a reading of the hitch to the draft: its error is a few per cent of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Free:
+    """One parameter of an effect, of one wheel (its number) or of all (None): value and std of the prior."""
+
+    effect: str
+    parameter: Parameter
+    wheel: int | None
+    value: float
+    std: float
+
+    @property
+    def name(self) -> str:
+        """effect.parameter, with the wheel's number where it has one."""
+        return f"{self.effect}.{self.parameter.name}" + ("" if self.wheel is None else f".{self.wheel}")
+
+    def at(self, pull: float) -> float:
+        """The parameter's value so many prior std from its prior value, kept inside its range."""
+        return min(max(self.value + self.std * pull, self.parameter.low), self.parameter.high)
+
+
+def parameters_of(effect: Effect, n_wheels: int) -> list[Free]:
+    """The parameters of an effect as before any data: absent, with the catalogue's prior."""
+    wheels: Sequence[int | None] = range(n_wheels) if effect.each_wheel else (None,)
+    return [Free(effect.name, p, w, p.neutral, p.std) for p in effect.parameters for w in wheels]
+
+
+class _Outcome(NamedTuple):
+    """Load that the soil carries beyond what it must, drawbar pull, torque reading, sinkage (4, N, W); pull (N,)."""
+
+    wheels: Array
+    pull: Array
+
+
+class CompletedProblem(WindowProblem):
+    """One window's data and the model with effects; `free` are the effects' parameters (P)."""
+
+    def __init__(
+        self,
+        window: Window,
+        rig: Rig,
+        model: WheelModel,
+        min_speed: float,
+        max_turn: float = MAX_TURN,
+        effects: Sequence[Effect] = (),
+        free: Sequence[Free] = (),
+    ) -> None:
+        super().__init__(window, rig, model, min_speed, max_turn)
+        self._complete(effects, free)
+
+    def completed(self, effects: Sequence[Effect], free: Sequence[Free]) -> Self:
+        """The same data under a model with these effects, and no others, with these parameters."""
+        other = copy(self)
+        other._complete(effects, free)
+        return other
+
+    def _complete(self, effects: Sequence[Effect], free: Sequence[Free]) -> None:
+        self.effects, self.free = tuple(effects), tuple(free)
+        std = [float(f.std > 0.0) for f in self.free]
+        self.gain_names = [*self.gain_names[: self.n_sensors], *(f.name for f in self.free)]
+        self.gain_std = np.concatenate([self.gain_std[: self.n_sensors], std])
+
+    def active(self, pulls: Array) -> list[Active]:
+        """The effects with their values where the parameters are so many std (P,) from their prior values."""
+        values: dict[str, dict[str, Any]] = {e.name: {} for e in self.effects}
+        for f, u in zip(self.free, pulls.tolist(), strict=True):
+            of_effect = values[f.effect]
+            if f.wheel is None:
+                of_effect[f.parameter.name] = f.at(u)
+            else:
+                of_effect.setdefault(f.parameter.name, np.zeros(self.n_wheels))[f.wheel] = f.at(u)
+        return [Active(e, values[e.name]) for e in self.effects]
+
+    def carried(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
+        """As WindowProblem; without gains the effects' parameters are at their prior values."""
+        base = super().carried(latents, soil, gains)
+        if not self.effects:
+            return base
+        active = self.active(np.zeros(len(self.free)) if gains is None else gains[self.n_sensors :])
+        angle = base.entry_angle
+        for _ in range(LOAD_ROUNDS):
+            excess = self._outcome(soil, active, base, angle).wheels[0]
+            more = self._outcome(soil, active, base, angle * (1.0 + STEP)).wheels[0]
+            slope = (more - excess) / STEP
+            with np.errstate(all="ignore"):
+                step = np.where(slope > 0.0, -excess / slope, 0.0)
+            angle = np.clip(angle * np.exp(np.clip(step, -0.5, 0.5)), MIN_ENTRY_ANGLE, MAX_ENTRY_ANGLE * 0.98)
+            if np.abs(step).max(initial=0.0) < 1e-3:
+                break
+        return Latents(base.load, base.speed, base.ground_speed, angle)
+
+    def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
+        if not self.effects:
+            return super()._response(soil, gains, latents)
+        pulls = gains[self.n_sensors :]
+        active, angle = self.active(pulls), latents.entry_angle
+        at = self._outcome(soil, active, latents, angle)
+
+        def by(changed: _Outcome, step: Any) -> _Outcome:
+            return _Outcome((changed.wheels - at.wheels) / step, (changed.pull - at.pull) / _of_instant(step))
+
+        turn = STEP * angle
+        by_angle = by(self._outcome(soil, active, latents, angle + turn), turn).wheels
+        by_latents = []
+        for name in ("load", "speed", "ground_speed"):
+            value = getattr(latents, name)
+            step = STEP * np.abs(value)
+            changed = self._outcome(soil, active, _with(latents, name, value + step), angle)
+            by_latents.append(by(changed, step if step.ndim == 2 else step[:, None]).wheels)
+        by_soil = self._by_soil(soil, active, latents, at)
+        by_effects = np.zeros((4, len(self.free), self.n, self.n_wheels))
+        pull_by_effects = np.zeros((len(self.free), self.n))
+        for i in np.flatnonzero(self.gain_std[self.n_sensors :] > 0.0):
+            shifted = pulls.copy()
+            shifted[i] += STEP_OF_EFFECT
+            d = by(self._outcome(soil, self.active(shifted), latents, angle), STEP_OF_EFFECT)
+            by_effects[:, i], pull_by_effects[i] = d
+        slope, off = by_angle[0], -at.wheels[0]
+        along = by_angle[1:] / slope  # what a load more turns into, by way of the entry angle
+
+        def held(d: Array) -> Array:
+            """Derivatives (3, ..., N, W) with the entry angle following the load."""
+            return np.asarray(d[1:] - (along[:, None] if d.ndim == 4 else along) * d[0])
+
+        value = at.wheels[1:] + along * off
+        return Response(
+            value=value,
+            by_load=held(by_latents[0]),
+            by_speed=held(by_latents[1]),
+            by_ground=held(by_latents[2]),
+            by_soil=held(by_soil),
+            load_by_slip=by_latents[1][0] * self.rig.radius * latents.speed**2 / latents.ground_speed[:, None],
+            load_by_soil=by_soil[0],
+            load_slope=slope,
+            off=off,
+            by_effects=held(by_effects),
+            pull=at.pull,
+            pull_by_effects=pull_by_effects,
+        )
+
+    def _by_soil(self, soil: Soil, active: Sequence[Active], latents: Latents, at: _Outcome) -> Array:
+        """Derivatives (4, 6, N, W) by k_c, k_phi, n, phi, c, K at held entry angles."""
+        out = np.empty((4, 6, self.n, self.n_wheels))
+        for i, name in enumerate(Soil._fields[1:], 1):
+            step = STEP * max(abs(getattr(soil, name)), 1e-9)
+            changed = soil._replace(**{name: getattr(soil, name) + step})
+            out[:, i] = (self._outcome(changed, active, latents, latents.entry_angle).wheels - at.wheels) / step
+        np.divide(out[:, 1], self.rig.width, out=out[:, 0])  # both act through K_L = k_c/b + k_phi
+        return out
+
+    def _outcome(self, soil: Soil, active: Sequence[Active], latents: Latents, angle: Array) -> _Outcome:
+        around = self._surroundings(latents)
+        slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
+        K_L = lumped_modulus(soil.k_c, soil.k_phi, self.rig.width)
+        state = WheelState(
+            angle, slip, self.rig.radius, self.rig.width, K_L, soil.n, float(np.tan(soil.phi)), soil.c, soil.K
+        )
+        load, pull, torque = forces_with(active, state, self.model, around)
+        error, missing, draft = np.zeros_like(load), np.zeros(self.n), self.draft
+        for effect, values in active:
+            if effect.torque is not None:
+                torque = effect.torque(torque, around, values)
+            if effect.load is not None:
+                error = error + effect.load(around, values)
+            if effect.resistance is not None:
+                missing = missing + effect.resistance(around, values)
+        for _ in range(DRAFT_ROUNDS if any(e.draft is not None for e, _ in active) else 0):
+            draft = self.draft - sum(e.draft(draft, around, v) for e, v in active if e.draft is not None)
+        depth = sinkage(angle, self.rig.radius)
+        excess = load - (latents.load - error)
+        return _Outcome(np.stack([excess, pull, torque, np.broadcast_to(depth, load.shape)]), missing + draft - self.draft)
+
+    def _surroundings(self, latents: Latents) -> Surroundings:
+        chassis = self.rig.chassis
+        return Surroundings(
+            t=self.since[:, None],
+            distance=self.distance[:, None],
+            load=latents.load,
+            ground_speed=latents.ground_speed[:, None],
+            wheel_speed=latents.speed,
+            rear=~self.rig.front,
+            draft=self.draft[:, None],
+            acceleration=self.acceleration[:, None],
+            mass=0.0 if chassis is None else chassis.mass,
+            duration=self.duration,
+        )
+
+
+def _of_instant(step: Any) -> Any:
+    """A step by instant (N,) of one by instant and wheel."""
+    return step[:, 0] if np.ndim(step) == 2 else step
+
+
+def _with(latents: Latents, name: str, value: Array) -> Latents:
+    parts = {n: getattr(latents, n) for n in ("load", "speed", "ground_speed", "entry_angle")}
+    return Latents(**(parts | {name: value}))
