@@ -20,7 +20,7 @@ from soilbus.estimation.completed import CompletedProblem, Free, parameters_of
 from soilbus.estimation.gauss_newton import Fit, continued, fit_window
 from soilbus.estimation.linearised import Latents, Linearised
 from soilbus.estimation.normal_equations import Fitting, Place
-from soilbus.estimation.posterior import Estimate, PARAMETERS, SoilPrior
+from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.wheel import Soil
 
