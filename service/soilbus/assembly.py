@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
 import numpy as np
 
 from soilbus.config import Config, ConfigError
+from soilbus.config import Effect as EffectSetting
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.window import Rig, SensorNoise
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.effects.effect import Active, Effect, Parameter
 from soilbus.terra.vehicle import Chassis
 from soilbus.terra.wheel import FAST_NODES, WheelModel
 
@@ -40,3 +47,125 @@ def model_of(config: Config) -> WheelModel:
     if unknown:
         raise ConfigError([f"model.effects: no effect is named {name}" for name in unknown])
     return WheelModel(shear_law=config.model.shear_law, nodes=FAST_NODES)
+
+
+def effects_of(config: Config, wheels: Sequence[str] | None = None) -> tuple[Active, ...]:
+    """The effects of model.effects with their values, in the order of the catalogue.
+
+    A parameter is a number or, as `diagnose --model-out` writes it, {value = x, std = y};
+    without any it stays neutral.  One that every wheel has for itself may also be a table of
+    these by wheel, {FL = x, RR = {value = y, std = z}}; wheels not in it stay neutral.  It
+    becomes an array (W,) of `wheels`, by default all wheels of the configuration.
+
+    ConfigError with a line for each effect and parameter that the catalogue lacks, value out of
+    range or no number, effect given twice, or shear law that the effect cannot be added to.
+    """
+    of_all = [wheel.name for wheel in config.wheel]
+    faults: list[str] = []
+    found: dict[str, Active] = {}
+    for setting in config.model.effects:
+        try:
+            if setting.name in found:
+                raise ConfigError([f"two effects are named {setting.name}"])
+            found[setting.name] = _active(setting, config.model.shear_law, of_all)
+        except ConfigError as error:
+            faults += error.faults
+    if faults:
+        raise ConfigError(f"model.effects: {fault}" for fault in faults)
+    place = [of_all.index(name) for name in (of_all if wheels is None else wheels)]
+    return tuple(
+        Active(effect, {name: value[place] if np.ndim(value) else value for name, value in values.items()})
+        for effect, values in (found[name] for name in CATALOGUE if name in found)
+    )
+
+
+def with_effects(config: Config, texts: Iterable[str]) -> Config:
+    """The configuration with effects added, or with other values of those it has.
+
+    Each text is NAME=VALUE for the first parameter of an effect, NAME.PARAMETER=VALUE for
+    another one, or NAME.PARAMETER.WHEEL=VALUE for that of one wheel.  ConfigError for a text
+    of another form, an unknown effect, and as `effects_of`.
+    """
+    effects_of(config)
+    settings: dict[str, dict[str, Any]] = {e.name: dict(e.model_extra or {}) for e in config.model.effects}
+    for text in texts:
+        try:
+            _set_effect(settings, text, [wheel.name for wheel in config.wheel])
+        except ConfigError as error:
+            raise ConfigError(f"--effect {text}: {fault}" for fault in error.faults) from None
+    effects = [EffectSetting(name=name, **values) for name, values in settings.items()]
+    changed = config.model_copy(update={"model": config.model.model_copy(update={"effects": effects})})
+    effects_of(changed)
+    return changed
+
+
+def _set_effect(settings: dict[str, dict[str, Any]], text: str, wheels: Sequence[str]) -> None:
+    key, equals, value = text.partition("=")
+    name, *path = key.strip().split(".")
+    if not equals or len(path) > 2 or not all([name, *path]):
+        raise ConfigError(["expected NAME=VALUE, NAME.PARAMETER=VALUE or NAME.PARAMETER.WHEEL=VALUE"])
+    effect, number = _effect(name), _number(value)
+    setting = settings.setdefault(name, {})
+    parameter, *wheel = path or [effect.parameters[0].name]
+    if not wheel:
+        setting[parameter] = number
+        return
+    before = setting.get(parameter, {})
+    setting[parameter] = {**(before if _by_wheel(before) else dict.fromkeys(wheels, before)), wheel[0]: number}
+
+
+def _active(setting: EffectSetting, shear_law: str, wheels: Sequence[str]) -> Active:
+    effect, given = _effect(setting.name), setting.model_extra or {}
+    names = [parameter.name for parameter in effect.parameters]
+    faults = [f"{effect.name} has no parameter {key}; known: {', '.join(names)}" for key in given if key not in names]
+    if effect.base_law not in (None, shear_law):
+        faults.append(f"{effect.name} can be added to shear_law = {effect.base_law} only")
+    values: dict[str, Any] = {}
+    for parameter in effect.parameters:
+        try:
+            value = given.get(parameter.name, parameter.neutral)
+            values[parameter.name] = (
+                _of_wheels(value, parameter, wheels) if effect.each_wheel else _within(value, parameter)
+            )
+        except ConfigError as error:
+            faults += [f"{effect.name}.{parameter.name}: {fault}" for fault in error.faults]
+    if faults:
+        raise ConfigError(faults)
+    return Active(effect, values)
+
+
+def _effect(name: str) -> Effect:
+    if name not in CATALOGUE:
+        raise ConfigError([f"no effect is named {name}; known: {', '.join(CATALOGUE)}"])
+    return CATALOGUE[name]
+
+
+def _of_wheels(given: Any, parameter: Parameter, wheels: Sequence[str]) -> Any:
+    if not _by_wheel(given):
+        return np.full(len(wheels), _within(given, parameter))
+    if unknown := [name for name in given if name not in wheels]:
+        raise ConfigError([f"no wheel is named {name}" for name in unknown])
+    return np.array([_within(given.get(name, parameter.neutral), parameter) for name in wheels])
+
+
+def _by_wheel(given: Any) -> bool:
+    return isinstance(given, Mapping) and "value" not in given
+
+
+def _within(given: Any, parameter: Parameter) -> float:
+    if isinstance(given, Mapping) and set(given) <= {"value", "std"}:
+        given = given.get("value")
+    value = _number(given)
+    if not parameter.low <= value <= parameter.high:
+        raise ConfigError([f"{value:g} is not within {parameter.low:g}..{parameter.high:g}"])
+    return value
+
+
+def _number(given: Any) -> float:
+    try:
+        value = math.nan if isinstance(given, bool) else float(given)
+    except (TypeError, ValueError):
+        value = math.nan
+    if not math.isfinite(value):
+        raise ConfigError([f"{given!r} is not a number"])
+    return value

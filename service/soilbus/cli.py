@@ -81,6 +81,10 @@ def _parser() -> argparse.ArgumentParser:
 
     sub = command("simulate", _simulate, "simulated tractor, to a bus in real time or to a log", "optional")
     sub.add_argument("--soil", action="append", default=[], metavar="NAME", help="soil; repeat it for a sequence")
+    sub.add_argument(
+        "--effect", action="append", default=[], metavar="NAME=VALUE",
+        help="an effect on wheels or sensors; NAME.PARAMETER=VALUE for another than its first parameter; repeatable",
+    )  # fmt: skip
     sub.add_argument("--duration", type=float, default=120.0, metavar="S")
     sub.add_argument("--seed", type=_natural, default=1)
     sub.add_argument("--start", nargs=2, type=float, metavar=("LAT", "LON"), help="where it starts [deg]")
@@ -196,13 +200,14 @@ def _replay(args: argparse.Namespace) -> None:
 
 
 def _simulate(args: argparse.Namespace) -> None:
+    from soilbus.assembly import with_effects
     from soilbus.can.bus import BusError
     from soilbus.simulator.course import course
     from soilbus.simulator.drive import SimulationError
     from soilbus.simulator.play import play, scenario_over
     from soilbus.simulator.recording import simulate
 
-    config = _configured_or_demo(args)
+    config = with_effects(_configured_or_demo(args), args.effect)
     try:
         way = course(args.start, args.heading, args.rows)
         recording = simulate(config, scenario_over(args.soil or ["loam"], args.duration, way), args.seed)

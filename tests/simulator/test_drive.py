@@ -197,7 +197,6 @@ def test_a_tractor_that_bogs_down_ends_the_drive_there():
     ("overrides", "scenario", "reason"),
     [
         ((), Scenario(5.0, (Patch(0.0, "mire", MIRE),), draft=Swing(0.0, 100.0)), "cannot drive on mire"),
-        (('model.effects=[{name="lugs"}]',), demo(5.0), "no effects"),
     ],
 )
 def test_what_cannot_be_driven_says_so(overrides, scenario, reason):

@@ -2,22 +2,26 @@
 
 Quasi-static: at 50 samples a second, ground speed and its rate of change are given, and
 slip, draft, loads, sinkages and torques are those at which the wheel-soil model balances
-exactly.  Straight ahead: turning is not modelled, a side slope only shifts load.
+exactly.  Straight ahead: turning is not modelled, a side slope only shifts load.  Effects
+at the wheels and forces that no sensor sees take part in the balance; what effects do to
+sensors is the sensors' part.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.assembly import chassis_of
+from soilbus.assembly import chassis_of, effects_of
 from soilbus.config import Config, Wheel
 from soilbus.simulator.course import positions
-from soilbus.simulator.equilibrium import Equilibrium, Situation, solve
+from soilbus.simulator.equilibrium import Equilibrium, Mechanics, Situation, solve, surroundings
 from soilbus.simulator.scenario import SAMPLE_RATE, Scenario, Swing, realise, soil_along, soil_names
+from soilbus.terra.effects.effect import Active, Surroundings
 from soilbus.terra.stress import Array
 from soilbus.terra.vehicle import Chassis, axle_loads, pull_required
 from soilbus.terra.wheel import WheelModel, sinkage
@@ -35,10 +39,13 @@ class Drive:
     where slip was prescribed), soil (names); and for each wheel W slip.W, entry_angle.W, sinkage.W, load.W,
     torque.W (at the wheel), drawbar_pull.W, speed.W [rad/s], torque_limit.W (nan: unknown).
     The drive ends early, at `bogged_at` [s], where no slip lets the tractor go on.
+    `effects` are those it was driven with, `surroundings` what these may depend on (N, W).
     """
 
     columns: dict[str, NDArray[Any]]
     bogged_at: float | None
+    effects: tuple[Active, ...]
+    surroundings: Surroundings
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,13 +57,15 @@ class _Motion:
     pitch: Array
 
 
-def drive(config: Config, scenario: Scenario, seed: int) -> Drive:
+def drive(config: Config, scenario: Scenario, seed: int, effects: Sequence[Active] = ()) -> Drive:
     """Drive the configured vehicle through one realisation of the scenario.
 
-    Raises SimulationError without a vehicle, with effects, and where the tractor cannot
-    even start; KeyError for an unknown soil.
+    With the effects of config.model.effects and `effects` besides.  Raises SimulationError
+    without a vehicle and where the tractor cannot even start; KeyError for an unknown
+    soil; ConfigError for effects that cannot be.
     """
     chassis = _chassis(config)
+    present = (*effects_of(config), *effects)
     rng = np.random.default_rng(seed)
     t = np.arange(round(scenario.duration * SAMPLE_RATE)) / SAMPLE_RATE
     speed = realise(scenario.speed, t, rng)
@@ -64,14 +73,33 @@ def drive(config: Config, scenario: Scenario, seed: int) -> Drive:
     pitch = np.interp(speed.integral, knots[:, 0], knots[:, 1])
     motion = _Motion(t, speed.integral, speed.value, speed.rate, pitch)
     situation = _situation(config.wheel, chassis, scenario, motion, rng)
-    result = solve(situation, WheelModel(shear_law=config.model.shear_law))
+    rear = np.array([wheel.axle == "rear" for wheel in config.wheel])
+    model = WheelModel(shear_law=config.model.shear_law)
+    mechanics = Mechanics(model, rear, chassis.mass, scenario.duration, present)
+    result = solve(_held_back(situation, mechanics), mechanics)
     stuck = np.flatnonzero(~result.found)
     end = int(stuck[0]) if len(stuck) else len(t)
     if end < 2:
         soil = soil_names(scenario.soils, motion.distance[:1])[0]
         raise SimulationError(f"the tractor cannot drive on {soil}: no slip lets it move")
     columns = _columns(config.wheel, scenario, motion, situation, result)
-    return Drive({name: column[:end] for name, column in columns.items()}, float(t[end]) if len(stuck) else None)
+    around: tuple[Any, ...] = surroundings(situation, mechanics, result.slip, result.draft)
+    return Drive(
+        {name: column[:end] for name, column in columns.items()},
+        float(t[end]) if len(stuck) else None,
+        present,
+        Surroundings(*(a if np.ndim(a) < 2 else a[:end] for a in around)),
+    )
+
+
+def _held_back(situation: Situation, mechanics: Mechanics) -> Situation:
+    """The situation with the forces of effects that hold the vehicle back, as if it pulled no draft."""
+    resistance, nothing = situation.resistance, np.zeros(len(situation.t))
+    around = surroundings(situation, mechanics, nothing, nothing)
+    for effect, values in mechanics.effects:
+        if effect.resistance is not None:
+            resistance = resistance + np.ravel(effect.resistance(around, values))
+    return situation._replace(resistance=resistance)
 
 
 def _chassis(config: Config) -> Chassis:
@@ -80,8 +108,6 @@ def _chassis(config: Config) -> Chassis:
         raise SimulationError("the simulator needs a [vehicle] with [[wheel]]s")
     if {wheel.axle for wheel in config.wheel} != {"front", "rear"}:
         raise SimulationError("the simulator needs wheels on both axles")
-    if config.model.effects:
-        raise SimulationError("model.effects: the simulator has no effects yet")
     return chassis
 
 
@@ -109,6 +135,10 @@ def _situation(
 
     demand, slip_limit, least = _driver(scenario, motion.t, rng)
     return Situation(
+        motion.t,
+        motion.distance,
+        motion.speed,
+        motion.acceleration,
         pull_required(chassis, 0.0, motion.pitch, motion.acceleration),
         level,
         (loads(test_draft) - level) / test_draft,

@@ -6,15 +6,20 @@ system: s is the smallest of the slips at which the demanded draft is met, the s
 is reached (which may be passed as long as no draft at all is held), and a motor is at its
 torque limit.  Draft and torque grow with slip, so the smallest Newton step towards any of
 these is the step towards the one that holds.
+
+Effects take part as they are, by differences in place of derivatives, and start from the
+equilibrium without them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.terra.effects.effect import Active, Surroundings, forces_with
 from soilbus.terra.stress import Array
 from soilbus.terra.wheel import (
     MAX_ENTRY_ANGLE,
@@ -32,13 +37,15 @@ MAX_SLIP = 0.95
 _MIN_SLIP = -0.5
 _TOLERANCE = 1e-10
 _MAX_STEPS = 60
+_DIFFERENCE = 1e-6  # relative; Newton's steps need not be exact
 _STRIDE = 10  # every tenth instant first: its neighbours then start next to their solution
 
 
 class Situation(NamedTuple):
     """What is given at N instants for M wheels; all arrays end in N.
 
-    `resistance` [N] (N,) is the pull that slope and inertia take, `level_load` [N] (M, N)
+    `t` [s], `distance` [m], `ground_speed` [m/s] and `acceleration` [m/s^2] (N,) are the
+    motion, `resistance` [N] (N,) is the pull that slope and inertia take, `level_load` [N] (M, N)
     the wheel loads without draft, `load_per_draft` (M, N) their change with it,
     `deviation` (M, N) each wheel's slip beyond the common one, `soil` (6, M, N) in the
     order of wheel.Soil, `demand` [N] (N,) the draft asked for (inf: as much as goes),
@@ -46,6 +53,10 @@ class Situation(NamedTuple):
     limit gives way.
     """
 
+    t: Array
+    distance: Array
+    ground_speed: Array
+    acceleration: Array
     resistance: Array
     level_load: Array
     load_per_draft: Array
@@ -59,6 +70,36 @@ class Situation(NamedTuple):
     least_draft: Array
 
 
+class Mechanics(NamedTuple):
+    """The wheel-soil model, effects on it, and what of the record they may depend on (see Surroundings).
+
+    rear (M,) tells which wheels run in the rut of another; mass [kg], duration [s].
+    """
+
+    model: WheelModel
+    rear: NDArray[np.bool_]
+    mass: float
+    duration: float
+    effects: Sequence[Active] = ()
+
+    @property
+    def plain(self) -> bool:
+        """Whether no effect changes the forces at the wheels."""
+        return all(effect.wheel is None and effect.forces is None for effect, _ in self.effects)
+
+
+class _Slopes(NamedTuple):
+    """Forces (3, M, N) and their derivatives by entry angle, common slip and draft."""
+
+    forces: Array
+    by_angle: Array
+    by_slip: Array
+    by_draft: Any
+
+
+_Forces = Callable[[Situation, Array, Array, Array], _Slopes]
+
+
 class Equilibrium(NamedTuple):
     """Common slip (N,), draft [N] (N,), entry angle [rad] (M, N), forces (3, M, N) by
     wheel.FORCES, and whether an equilibrium was found (N,)."""
@@ -70,26 +111,43 @@ class Equilibrium(NamedTuple):
     found: NDArray[np.bool_]
 
 
-def solve(situation: Situation, model: WheelModel) -> Equilibrium:
+def solve(situation: Situation, mechanics: Mechanics) -> Equilibrium:
     """The equilibrium at each instant, residuals below 1e-10 of the weight where found."""
     n_instants = len(situation.demand)
     coarse = np.unique(np.append(np.arange(0, n_instants, _STRIDE), n_instants - 1))
-    knots = _newton(_at(situation, coarse), _from_scratch(_at(situation, coarse), model), model)
+    knots = _from_scratch(_at(situation, coarse), mechanics)
     good = coarse[knots.found]
     if not len(good):
-        return _newton(situation, _from_scratch(situation, model), model)
+        return _from_scratch(situation, mechanics)
 
     def between(values: Array) -> Array:
         return np.interp(np.arange(n_instants), good, values[knots.found])
 
     angles = np.stack([between(row) for row in knots.entry_angle])
-    result = _newton(situation, (between(knots.slip), between(knots.draft), angles), model)
+    result = _newton(situation, (between(knots.slip), between(knots.draft), angles), _forces_of(mechanics))
     lost = np.flatnonzero(~result.found)
     if len(lost):
-        again = _newton(_at(situation, lost), _from_scratch(_at(situation, lost), model), model)
+        again = _from_scratch(_at(situation, lost), mechanics)
         for whole, part in zip(result, again, strict=True):
             whole[..., lost] = part
     return result
+
+
+def surroundings(situation: Situation, mechanics: Mechanics, slip: Array, draft: Array) -> Surroundings:
+    """What effects may depend on, instants first, at a common slip (N,) and draft [N] (N,)."""
+    column = slip + situation.deviation
+    return Surroundings(
+        t=situation.t[:, None],
+        distance=situation.distance[:, None],
+        load=(situation.level_load + situation.load_per_draft * draft).T,
+        ground_speed=situation.ground_speed[:, None],
+        wheel_speed=(situation.ground_speed / (situation.radius * (1.0 - column))).T,
+        rear=mechanics.rear,
+        draft=draft[:, None],
+        acceleration=situation.acceleration[:, None],
+        mass=mechanics.mass,
+        duration=mechanics.duration,
+    )
 
 
 def wheel_state(situation: Situation, slip: Array, entry_angle: Array) -> WheelState:
@@ -102,24 +160,66 @@ def _at(situation: Situation, index: NDArray[np.intp]) -> Situation:
     return Situation(*(a[..., index] for a in situation))
 
 
-def _from_scratch(situation: Situation, model: WheelModel) -> tuple[Array, Array, Array]:
-    """A first guess: little slip and draft, entry angles that carry the level loads."""
+def _from_scratch(situation: Situation, mechanics: Mechanics) -> Equilibrium:
+    """The equilibrium from little slip and draft and entry angles that carry the level loads, effects added last."""
     slip = np.minimum(0.1, situation.slip_limit)
-    load = situation.level_load
+    load, model = situation.level_load, mechanics.model
     unknown = wheel_state(situation, slip, np.full_like(load, np.nan))
     angle = entry_angle_for_load(load.ravel(), WheelState(*(np.ravel(a) for a in unknown)), model, tolerance=1e-3)
     angle = np.where(np.isfinite(angle), angle, 1.0).reshape(load.shape)
-    return slip, np.zeros_like(slip), angle
+    plain = _newton(situation, (slip, np.zeros_like(slip), angle), _exact(model))
+    if mechanics.plain:
+        return plain
+    return _newton(situation, (plain.slip, plain.draft, plain.entry_angle), _by_differences(mechanics))
 
 
-def _newton(situation: Situation, guess: tuple[Array, Array, Array], model: WheelModel) -> Equilibrium:
+def _forces_of(mechanics: Mechanics) -> _Forces:
+    return _exact(mechanics.model) if mechanics.plain else _by_differences(mechanics)
+
+
+def _exact(model: WheelModel) -> _Forces:
+    """Forces of the model without effects."""
+
+    def slopes(situation: Situation, slip: Array, draft: Array, angle: Array) -> _Slopes:
+        flat, jacobian = wheel_forces_and_derivatives(wheel_state(situation, slip, angle), model)
+        forces = flat.reshape(3, *angle.shape)
+        by_angle, by_slip = (jacobian[:, i].reshape(3, *angle.shape) for i in (0, 1))
+        return _Slopes(forces, by_angle, by_slip, np.zeros((3, 1, 1)))
+
+    return slopes
+
+
+def _by_differences(mechanics: Mechanics) -> _Forces:
+    """Forces of the model with its effects."""
+
+    def forces(situation: Situation, slip: Array, draft: Array, angle: Array) -> Array:
+        state = WheelState(*(np.transpose(a) for a in wheel_state(situation, slip, angle)))
+        around = surroundings(situation, mechanics, slip, draft)
+        return np.swapaxes(forces_with(mechanics.effects, state, mechanics.model, around), 1, 2)
+
+    def slopes(situation: Situation, slip: Array, draft: Array, angle: Array) -> _Slopes:
+        here = forces(situation, slip, draft, angle)
+        turn, pull = _DIFFERENCE * angle, _DIFFERENCE * situation.level_load.sum(axis=0)
+        return _Slopes(
+            here,
+            (forces(situation, slip, draft, angle + turn) - here) / turn,
+            (forces(situation, slip + _DIFFERENCE, draft, angle) - here) / _DIFFERENCE,
+            (forces(situation, slip, draft + pull, angle) - here) / pull,
+        )
+
+    return slopes
+
+
+def _newton(situation: Situation, guess: tuple[Array, Array, Array], slopes: _Forces) -> Equilibrium:
     slip, draft, angle = (np.array(a, float) for a in guess)
     forces = np.empty((3, *angle.shape))
     found = np.zeros(len(slip), bool)
     todo = np.arange(len(slip))
     for _ in range(_MAX_STEPS):
         part = _at(situation, todo)
-        forces[..., todo], step, miss = _linearised(part, slip[todo], draft[todo], angle[..., todo], model)
+        at = slopes(part, slip[todo], draft[todo], angle[..., todo])
+        step, miss = _step(part, slip[todo], draft[todo], at)
+        forces[..., todo] = at.forces
         at_rest = miss + np.abs(step[0]) < _TOLERANCE
         found[todo] = at_rest
         todo, d_slip, d_draft, d_angle = todo[~at_rest], *(a[..., ~at_rest] for a in step)
@@ -134,31 +234,27 @@ def _newton(situation: Situation, guess: tuple[Array, Array, Array], model: Whee
     return Equilibrium(slip, draft, angle, forces, found & pulls)
 
 
-def _linearised(
-    situation: Situation, slip: Array, draft: Array, angle: Array, model: WheelModel
-) -> tuple[Array, tuple[Array, Array, Array], Array]:
-    """Forces (3, M, N), Newton steps of slip, draft and angles, relative residual (N,)."""
-    shape = angle.shape
-    flat, jacobian = wheel_forces_and_derivatives(wheel_state(situation, slip, angle), model)
-    forces = flat.reshape(3, *shape)
-    (W_a, DP_a, T_a), (W_s, DP_s, T_s) = (jacobian[:, i].reshape(3, *shape) for i in (0, 1))
-    lever = situation.load_per_draft
-    load_miss = situation.level_load + lever * draft - forces[0]
+def _step(situation: Situation, slip: Array, draft: Array, at: _Slopes) -> tuple[tuple[Array, Array, Array], Array]:
+    """Newton steps of slip, draft and angles, relative residual (N,)."""
+    forces = at.forces
+    (W_a, DP_a, T_a), (W_s, DP_s, T_s), (W_d, DP_d, T_d) = at.by_angle, at.by_slip, at.by_draft
+    load_miss = situation.level_load + situation.load_per_draft * draft - forces[0]
+    lever = situation.load_per_draft - W_d
     pull_miss = forces[1].sum(axis=0) - draft - situation.resistance
     weight = situation.level_load.sum(axis=0)
     residual = (np.abs(load_miss).max(axis=0) + np.abs(pull_miss)) / weight
 
     # Each angle follows from its load: d_angle = (load_miss + lever d_draft - W_s d_slip) / W_a.
-    def along_load(by_angle: Array, by_slip: Array, value: Any) -> tuple[Any, Any, Any]:
+    def along_load(by_angle: Array, by_slip: Array, by_draft: Array, value: Any) -> tuple[Any, Any, Any]:
         """Constant, change with slip and change with draft of a force, angles eliminated."""
         share = by_angle / W_a
-        return value + share * load_miss, by_slip - share * W_s, share * lever
+        return value + share * load_miss, by_slip - share * W_s, by_draft + share * lever
 
-    constant, by_slip, by_draft = along_load(DP_a, DP_s, forces[1])
+    constant, by_slip, by_draft = along_load(DP_a, DP_s, DP_d, forces[1])
     A = constant.sum(axis=0) - draft - situation.resistance
     B = np.maximum(by_slip.sum(axis=0), 1e-6 * weight)  # past the greatest pull: on to the limits
     C = by_draft.sum(axis=0) - 1.0
-    T_0, T_slip, T_draft = along_load(T_a, T_s, forces[2] - situation.torque_limit)
+    T_0, T_slip, T_draft = along_load(T_a, T_s, T_d, forces[2] - situation.torque_limit)
     to_torque = np.min(-(T_0 - T_draft * A / C) / np.maximum(T_slip - T_draft * B / C, 1e-9), axis=0)
     to_demand = -(A + C * (situation.demand - draft)) / B
     to_least = -(A + C * (situation.least_draft - draft)) / B
@@ -166,4 +262,4 @@ def _linearised(
     d_slip = np.minimum.reduce([to_demand, to_limit, to_torque, MAX_SLIP - slip])
     d_slip = np.clip(d_slip, -0.15, 0.15)
     d_draft = -(A + B * d_slip) / C
-    return forces, (d_slip, d_draft, (load_miss + lever * d_draft - W_s * d_slip) / W_a), residual
+    return (d_slip, d_draft, (load_miss + lever * d_draft - W_s * d_slip) / W_a), residual

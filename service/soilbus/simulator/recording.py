@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ from soilbus.config import Config
 from soilbus.simulator.drive import drive
 from soilbus.simulator.scenario import Scenario
 from soilbus.simulator.sensors import measure
+from soilbus.terra.effects.effect import Active
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,10 +29,11 @@ class Recording:
     bogged_at: float | None = None
 
 
-def simulate(config: Config, scenario: Scenario, seed: int) -> Recording:
+def simulate(config: Config, scenario: Scenario, seed: int, effects: Sequence[Active] = ()) -> Recording:
     """Drive the configured vehicle through the scenario; the same seed gives the same recording.
 
-    Raises SimulationError and KeyError as `drive.drive`.
+    With the effects of config.model.effects and `effects` besides.  Raises SimulationError,
+    KeyError and ConfigError as `drive.drive`.
     """
-    done = drive(config, scenario, seed)
+    done = drive(config, scenario, seed, effects)
     return Recording(done.columns, measure(done, config, seed), seed, done.bogged_at)

@@ -1,11 +1,13 @@
-"""What the sensors make of the truth: rates, noise, gain errors; quantisation is the frames' part."""
+"""What the sensors make of the truth: rates, effects, noise, gain errors; quantisation is the frames' part."""
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soilbus.can.channels import Column
 from soilbus.config import Config, Noise
@@ -40,15 +42,15 @@ def fitted(config: Config) -> Iterator[tuple[str, str]]:
 def measure(drive: Drive, config: Config, seed: int) -> dict[str, Column]:
     """Noisy samples of every mapped channel, SI, by channel name (can.channels).
 
-    Each value is truth times a gain fixed for the drive, plus white noise (config [noise]);
-    positions are off by POSITION_NOISE.
+    Each value is what effects leave of the truth, times a gain fixed for the drive, plus
+    white noise (config [noise]); positions are off by POSITION_NOISE.
     """
     columns: dict[str, Column] = {}
-    t = drive.columns["t"]
+    t, told = drive.columns["t"], drive.columns | _changed(drive, [wheel.name for wheel in config.wheel])
     for quantity, wheel in fitted(config):
         name = f"{quantity}.{wheel}" if wheel else quantity
         every = slice(None, None, _DIVIDERS.get(quantity, 1))
-        truth, rng = drive.columns[name], channel_rng(seed, name)
+        truth, rng = told[name], channel_rng(seed, name)
         if quantity in ("latitude", "longitude"):
             parallel = 1.0 if quantity == "latitude" else np.cos(drive.columns["latitude"])
             truth = wrapped(truth + POSITION_NOISE / (SEMI_MAJOR_AXIS * parallel) * rng.standard_normal(len(t)))
@@ -56,6 +58,24 @@ def measure(drive: Drive, config: Config, seed: int) -> dict[str, Column]:
             truth = disturbed(truth, getattr(config.noise, quantity), config.estimator.window, rng)
         columns[name] = Column(t[every].copy(), truth[every].copy())
     return columns
+
+
+def _changed(drive: Drive, wheels: list[str]) -> dict[str, NDArray[Any]]:
+    """Columns (N,) of draft, torques and loads as sensors without noise tell them."""
+    around = drive.surroundings
+    torque, load = (np.stack([drive.columns[f"{q}.{wheel}"] for wheel in wheels], axis=1) for q in ("torque", "load"))
+    draft = drive.columns["draft"]
+    for effect, values in drive.effects:
+        if effect.torque is not None:
+            torque = effect.torque(torque, around, values)
+        if effect.load is not None:
+            load = load + effect.load(around, values)
+        if effect.draft is not None:
+            draft = draft + np.ravel(effect.draft(drive.columns["draft"], around, values))
+    changed = {"draft": draft}
+    for i, wheel in enumerate(wheels):
+        changed |= {f"torque.{wheel}": torque[:, i], f"load.{wheel}": load[:, i]}
+    return changed
 
 
 def disturbed(truth: Array, noise: Noise, window: float, rng: np.random.Generator) -> Array:

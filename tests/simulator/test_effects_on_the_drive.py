@@ -1,0 +1,246 @@
+"""Effects act on the simulated wheels and sensors as they say, and the balance holds with them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from soilbus.assembly import effects_of, with_effects
+from soilbus.cli import main
+from soilbus.config import Config, ConfigError
+from soilbus.simulator.drive import drive
+from soilbus.simulator.recording import Recording, simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.effects.effect import Active, Effect
+from soilbus.terra.soils import soil_named
+from soilbus.terra.wheel import WheelModel, state_on, wheel_forces
+
+WHEELS = ("FL", "FR", "RL", "RR")
+GRAVITY, MASS = 9.80665, 2300.0
+HILLS = ((0.0, 0.0), (8.0, 0.06), (20.0, -0.03))
+DRIVE = Scenario(15.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.4), slope=HILLS)
+NOISELESS = [f"noise.{q}.{kind}=0.0" for q in ("torque", "load", "draft") for kind in ("gain", "relative", "of_mean")]
+
+
+def own(**hooks) -> Active:
+    return Active(Effect("own", "", "", "", (), **hooks), {})
+
+
+def total(columns, quantity):
+    return sum(columns[f"{quantity}.{wheel}"] for wheel in WHEELS)
+
+
+def stiffer(state, model, around, values):
+    return state._replace(K_L=1.4 * state.K_L, c=0.8 * state.c), model
+
+
+def rolling_loss(forces, state, around, values):
+    return forces - np.stack([0.01 * forces[0], 0.03 * around.load, 0.0 * forces[2]])
+
+
+@pytest.mark.parametrize("scenario", [DRIVE, Scenario(15.0, DRIVE.soils, draft=Swing(500.0, 9000.0))])
+def test_an_effect_that_is_another_soil_drives_as_on_that_soil(scenario):
+    config, loam = reference_configuration(), soil_named("loam")
+    other = loam._replace(k_c=1.4 * loam.k_c, k_phi=1.4 * loam.k_phi, c=0.8 * loam.c)
+    on_other = Scenario(
+        15.0, (Patch(0.0, "other", other),), draft=scenario.draft, slip=scenario.slip, slope=scenario.slope
+    )
+    by_effect = drive(config, scenario, 5, [own(wheel=stiffer)]).columns
+    exact = drive(config, on_other, 5).columns
+    for name in set(exact) - {"soil"}:
+        scale = np.nanmax(np.abs(exact[name]), initial=1e-300)
+        assert by_effect[name] == pytest.approx(exact[name], abs=1e-8 * scale, nan_ok=True), name
+
+
+def test_the_balance_holds_with_forces_that_depend_on_load_and_a_resistance_in_no_reading():
+    def against(around, values):
+        return 300.0 + 5.0 * around.t + 0.0 * around.ground_speed
+
+    config = reference_configuration()
+    columns = drive(config, DRIVE, 5, [own(forces=rolling_loss), own(resistance=against)]).columns
+    along = MASS * (columns["acceleration"] + GRAVITY * np.sin(columns["pitch"])) + 300.0 + 5.0 * columns["t"]
+    assert np.abs(total(columns, "drawbar_pull") - along - columns["draft"]).max() < 1e-8 * MASS * GRAVITY
+    for wheel, radius, width in (("FL", 0.50, 0.26), ("RR", 0.62, 0.38)):
+        angle, slip, load = (columns[f"{quantity}.{wheel}"] for quantity in ("entry_angle", "slip", "load"))
+        of_soil = wheel_forces(state_on(soil_named("loam"), angle, slip, radius, width), WheelModel())
+        assert load == pytest.approx(0.99 * of_soil[0], rel=1e-8)
+        assert columns[f"drawbar_pull.{wheel}"] == pytest.approx(of_soil[1] - 0.03 * load, abs=1e-8 * MASS * GRAVITY)
+
+
+def test_what_effects_see_is_what_happens():
+    seen = {}
+
+    def look(torque, around, values):
+        seen.update(around._asdict())
+        return torque
+
+    done = drive(reference_configuration(), DRIVE, 5)
+    recording = simulate(reference_configuration(), DRIVE, 5, [own(torque=look)])
+    for name in ("t", "distance", "ground_speed", "draft", "acceleration"):
+        assert np.array_equal(seen[name][:, 0], done.columns[name]), name
+    for i, wheel in enumerate(WHEELS):
+        assert np.array_equal(seen["load"][:, i], recording.truth[f"load.{wheel}"])
+        assert seen["wheel_speed"][:, i] == pytest.approx(recording.truth[f"speed.{wheel}"], rel=1e-12)
+    assert seen["rear"].tolist() == [False, False, True, True]
+    assert (seen["mass"], seen["duration"]) == (MASS, 15.0)
+
+
+def test_effects_on_sensors_leave_the_truth_and_come_before_the_noise():
+    config = reference_configuration([*NOISELESS, *(f"noise.{q}.absolute=1.0" for q in ("torque", "load"))])
+    effects = [
+        own(torque=lambda torque, around, values: 0.9 * torque - around.wheel_speed),
+        own(draft=lambda draft, around, values: 100.0 + 0.1 * draft),
+        own(load=lambda around, values: np.array([0.0, 50.0, 0.0, -70.0]) + 0.0 * around.load),
+    ]
+    plain, told = simulate(config, DRIVE, 5), simulate(config, DRIVE, 5, effects)
+    assert all(
+        np.array_equal(plain.truth[n], told.truth[n], equal_nan=plain.truth[n].dtype.kind == "f") for n in plain.truth
+    )
+
+    def change(name):
+        return told.channels[name].value - plain.channels[name].value
+
+    truth = plain.truth
+    assert change("draft") == pytest.approx(100.0 + 0.1 * truth["draft"], abs=1e-8)
+    for wheel, offset in zip(WHEELS, (0.0, 50.0, 0.0, -70.0), strict=True):
+        assert change(f"torque.{wheel}") == pytest.approx(
+            -0.1 * truth[f"torque.{wheel}"] - truth[f"speed.{wheel}"], abs=1e-8
+        )
+        assert change(f"load.{wheel}") == pytest.approx(offset, abs=1e-8)
+        assert np.array_equal(told.channels[f"speed.{wheel}"].value, plain.channels[f"speed.{wheel}"].value)
+
+
+def test_an_effect_may_bog_the_tractor_down():
+    def swamp(state, model, around, values):
+        sinking = np.where(around.distance > 12.0, 0.05, 1.0)
+        return state._replace(K_L=state.K_L * sinking, c=state.c * sinking, tan_phi=state.tan_phi * sinking), model
+
+    recording = simulate(reference_configuration(), DRIVE, 5, [own(wheel=swamp)])
+    assert recording.truth["distance"][-1] + 0.1 > 12.0
+    assert recording.bogged_at is not None
+    assert recording.bogged_at < 14.0
+    assert {len(column.t) for name, column in recording.channels.items() if "torque" in name} == {
+        len(recording.truth["t"])
+    }
+
+
+def alike(one: Recording, other: Recording) -> bool:
+    return all(np.array_equal(one.channels[name].value, other.channels[name].value) for name in one.channels)
+
+
+def test_configuration_and_argument_bring_the_same_effects():
+    effect = CATALOGUE["slip_sinkage"]
+    first, *others = effect.parameters
+    value = first.neutral + 0.5 * first.std
+    argument = [Active(effect, {first.name: value} | {p.name: p.neutral for p in others})]
+    by_argument = simulate(reference_configuration(), DRIVE, 5, argument)
+    written = reference_configuration(
+        [f"model.effects=[{{name='slip_sinkage', {first.name}={{value={value}, std=0.1}}}}]"]
+    )
+    for config in (written, with_effects(reference_configuration(), [f"slip_sinkage={value}"])):
+        assert alike(simulate(config, DRIVE, 5), by_argument)
+    assert not alike(simulate(reference_configuration(), DRIVE, 5), by_argument)
+
+
+def offsets(config: Config, wheels=None) -> list[float]:
+    (active,) = effects_of(config, wheels)
+    return active.values[active.effect.parameters[0].name].tolist()
+
+
+def test_parameters_of_single_wheels():
+    name = CATALOGUE["wheel_load_offset"].parameters[0].name
+    config = with_effects(reference_configuration(), [f"wheel_load_offset.{name}.RL=120"])
+    assert offsets(config) == [0.0, 0.0, 120.0, 0.0]
+    assert offsets(config, ["RR", "RL"]) == [0.0, 120.0]
+    assert offsets(with_effects(config, ["wheel_load_offset=-40"])) == [-40.0] * 4
+    twice = with_effects(reference_configuration(), ["wheel_load_offset=-40", f"wheel_load_offset.{name}.FR=10"])
+    assert offsets(twice) == [-40.0, 10.0, -40.0, -40.0]
+    table = f"model.effects=[{{name='wheel_load_offset', {name}={{FL=1, RR={{value=2, std=3}}}}}}]"
+    assert offsets(reference_configuration([table])) == [1.0, 0.0, 0.0, 2.0]
+
+
+def test_effects_come_in_the_order_of_the_catalogue_whoever_wrote_them():
+    order = [
+        active.effect.name
+        for active in effects_of(with_effects(reference_configuration(), ["inertia=0", "slip_sinkage=0"]))
+    ]
+    assert order == sorted(order, key=list(CATALOGUE).index)
+    assert set(order) == {"inertia", "slip_sinkage"}
+
+
+@pytest.mark.parametrize(
+    ("effects", "says"),
+    [
+        ("{name='cheese'}", "no effect is named cheese; known: slip_sinkage, "),
+        ("{name='slip_sinkage', smell=1.0}", "slip_sinkage has no parameter smell; known: "),
+        ("{name='slip_sinkage'}, {name='slip_sinkage'}", "two effects are named slip_sinkage"),
+        ("{name='exponential_shear'}", "exponential_shear can be added to shear_law = rational only"),
+        ("{name='wheel_load_offset', offset={XX=1.0}}", "no wheel is named XX"),
+        ("{name='grade', PARAMETER=true}", "True is not a number"),
+        ("{name='grade', PARAMETER='steep'}", "'steep' is not a number"),
+        ("{name='grade', PARAMETER={std=1.0}}", "None is not a number"),
+        ("{name='grade', PARAMETER=1e9}", "1e+09 is not within"),
+    ],
+)
+def test_effects_that_cannot_be_are_one_line_each(effects, says):
+    text = effects.replace("PARAMETER", CATALOGUE["grade"].parameters[0].name)
+    with pytest.raises(ConfigError) as error:
+        drive(reference_configuration([f"model.effects=[{text}]"]), DRIVE, 5)
+    (line,) = error.value.faults
+    assert line.startswith("model.effects: ")
+    assert says in line
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("cheese=1", "known: slip_sinkage, "),
+        ("slip_sinkage", "expected NAME=VALUE"),
+        ("slip_sinkage.a.b.c=1", "expected NAME=VALUE"),
+        ("slip_sinkage.smell=1", "no parameter smell"),
+        ("slip_sinkage=much", "'much' is not a number"),
+        ("slip_sinkage=1e9", "not within"),
+    ],
+)
+def test_a_wrong_effect_on_the_command_line_is_one_line_and_exit_2(text, says, tmp_path, capsys):
+    assert main(["simulate", "--duration", "2", "--effect", text, "--log", str(tmp_path / "x.log")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert says in line
+    assert not list(tmp_path.iterdir())
+
+
+def test_simulate_with_effects_writes_another_log(tmp_path):
+    logs = [tmp_path / "a.log", tmp_path / "b.log"]
+    for log, effects in zip(logs, ([], ["--effect", "slip_sinkage=0.3", "--effect", "draft_offset=200"]), strict=True):
+        assert main(["simulate", "--duration", "4", *effects, "--log", str(log)]) == 0
+    plain, changed = (log.read_text().splitlines() for log in logs)
+    assert len(plain) == len(changed)
+    assert 0.1 < np.mean([a != b for a, b in zip(plain, changed, strict=True)]) < 0.9
+
+
+@pytest.mark.parametrize("name", list(CATALOGUE))
+def test_every_effect_of_the_catalogue_can_be_driven(name):
+    effect = CATALOGUE[name]
+    config = reference_configuration([f"model.shear_law={effect.base_law or 'exponential'}"])
+    values = {p.name: np.clip(p.neutral + 0.5 * p.std, p.low, p.high) for p in effect.parameters}
+    if effect.each_wheel:
+        values = {parameter: np.full(4, value) for parameter, value in values.items()}
+    scenario = Scenario(15.0, DRIVE.soils, slip=Swing(0.1, 0.3))
+    changed, plain = simulate(config, scenario, 5, [Active(effect, values)]), simulate(config, scenario, 5)
+    assert changed.bogged_at is None
+    assert not alike(changed, plain)
+    columns, around = changed.truth, drive(config, scenario, 5, [Active(effect, values)]).surroundings
+    along = MASS * (columns["acceleration"] + GRAVITY * np.sin(columns["pitch"])) + columns["draft"]
+    if effect.resistance is not None:
+        along = along + np.ravel(effect.resistance(around, values))
+    assert np.abs(total(columns, "drawbar_pull") - along).max() < 1e-8 * MASS * GRAVITY
+
+
+def test_without_effects_nothing_is_computed_by_differences(monkeypatch):
+    import soilbus.simulator.equilibrium as equilibrium
+
+    monkeypatch.setattr(equilibrium, "forces_with", None)
+    sensors_only = [own(load=lambda around, values: 10.0 + 0.0 * around.load)]
+    assert len(drive(reference_configuration(), excited("loam", 4.0), 1, sensors_only).columns["t"]) == 200
