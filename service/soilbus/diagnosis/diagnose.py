@@ -60,7 +60,8 @@ def diagnose(
     law = records[0].learned.model.shear_law
     candidates = [effect for effect in catalogue if effect.base_law in (None, law)]
     where = disagreements(base)
-    present, additions = base, []
+    present = base
+    additions: list[Addition] = []
     while len(additions) < MAX_EFFECTS:
         progress(f"looking for effect {len(additions) + 1}")
         left = [effect for effect in candidates if effect.name not in present.names]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +63,7 @@ def scores(
     found = []
     for effect in candidates:
         columns = np.array([i for i, f in enumerate(free) if f.effect == effect.name])
-        found.append(_score(effect, columns, normals, present))
+        found.append(_score(effect, columns, free, normals))
     return sorted(found, key=lambda score: score.evidence)
 
 
@@ -92,27 +93,52 @@ def _normal(
     return _Normal(fitting, place, by_effects, left, answer)
 
 
-def _score(effect: Effect, columns: NDArray[np.intp], normals: Sequence[_Normal], present: Completion) -> Score:
+def _score(effect: Effect, columns: NDArray[np.intp], free: Sequence[Free], normals: Sequence[_Normal]) -> Score:
     """One effect's score over all recordings; with parameters of its own in each where it is of the recording."""
     block = np.ix_(columns, columns)
-    if effect.of_record:
-        parts = [(n.left[block], n.by_effects[columns]) for n in normals]
-    else:
-        parts = [(sum(n.left[block] for n in normals), sum(n.by_effects[columns] for n in normals))]
-    fall, logdet, pulls = 0.0, 0.0, []
-    for left, gradient in parts:
-        information = left + np.eye(len(columns))
-        pull = -np.linalg.solve(information, gradient)
-        fall += float(-gradient @ pull)
-        logdet += float(np.linalg.slogdet(information)[1])
-        pulls.append(pull)
+    own = [free[i] for i in columns.tolist()]
+    parts = [(n.left[block], n.by_effects[columns]) for n in normals]
     if not effect.of_record:
-        pulls *= len(normals)
-    starts = tuple(_start(n, columns, pull, present) for n, pull in zip(normals, pulls, strict=True))
+        left, gradient = (np.sum([part[i] for part in parts], axis=0) for i in (0, 1))
+        parts = [(left, gradient)]
+    solutions = [_within(left + np.eye(len(own)), gradient, own) for left, gradient in parts]
+    fall = sum(solution.fall for solution in solutions)
+    logdet = sum(solution.logdet for solution in solutions)
+    pulls = [solution.pull for solution in solutions] * (1 if effect.of_record else len(normals))
+    starts = tuple(_start(n, columns, pull) for n, pull in zip(normals, pulls, strict=True))
     return Score(effect, fall, logdet - fall, starts)
 
 
-def _start(normal: _Normal, columns: NDArray[np.intp], pull: Array, present: Completion) -> Start:
+class _Solution(NamedTuple):
+    """Parameters (P,) in prior std, by how much the cost falls there, and log determinant of the information."""
+
+    pull: Array
+    fall: float
+    logdet: float
+
+
+def _within(information: Array, gradient: Array, free: Sequence[Free]) -> _Solution:
+    """Least cost of the parabola with the parameters inside their ranges: those that would leave stay at the edge."""
+    low, high = (np.array([(getattr(f.parameter, edge) - f.value) / f.std for f in free]) for edge in ("low", "high"))
+    pull = np.zeros(len(free))
+    inside = np.ones(len(free), bool)
+    for _ in range(len(free) + 1):
+        at_edge = np.where(inside, 0.0, pull)
+        rest = gradient + information @ at_edge
+        pull = at_edge.copy()
+        if inside.any():
+            pull[inside] = -np.linalg.solve(information[np.ix_(inside, inside)], rest[inside])
+        leaving = inside & ((pull < low) | (pull > high))
+        if not leaving.any():
+            break
+        pull = np.clip(pull, low, high)
+        inside &= ~leaving
+    fall = float(-2.0 * gradient @ pull - pull @ information @ pull)
+    kept = np.ix_(inside, inside)
+    return _Solution(pull, fall, float(np.linalg.slogdet(information[kept])[1]) if inside.any() else 0.0)
+
+
+def _start(normal: _Normal, columns: NDArray[np.intp], pull: Array) -> Start:
     pull = pull * min(1.0, MAX_PULL / max(float(np.abs(pull).max(initial=0.0)), 1e-12))
     step = -normal.answer[:, columns] @ pull
     fitting, place = normal.fitting, normal.place

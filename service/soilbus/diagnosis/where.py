@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,7 +114,7 @@ def _regions(regressors: dict[str, Array], known: NDArray[np.bool_]) -> Iterator
         edges = np.quantile(values[every], [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0])
         if not edges[3] > edges[0]:
             continue
-        for low, high in zip(edges[:3], edges[1:], strict=True):
+        for low, high in pairwise(edges.tolist()):
             members = every[(values[every] >= low) & (values[every] <= high)]
             if len(members) >= FEWEST:
                 yield f"{name} {low:.3g}..{high:.3g}", members

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from soilbus.estimation.linearised import Latents
 from soilbus.estimation.residuals import MAX_TURN, Response, WindowProblem
 from soilbus.estimation.window import Rig, Window
-from soilbus.terra.effects.effect import Active, Effect, Parameter, Surroundings, forces_with
+from soilbus.terra.effects.along import stretches
+from soilbus.terra.effects.effect import Active, Effect, Parameter, Surroundings, forces_with, wheel_with
 from soilbus.terra.stress import lumped_modulus
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE, MIN_ENTRY_ANGLE, Soil, WheelModel, WheelState, sinkage
 
@@ -29,6 +30,8 @@ STEP = 1e-6
 """Relative step of the differences; in standard deviations of a parameter, STEP_OF_EFFECT."""
 STEP_OF_EFFECT = 1e-4
 LOAD_ROUNDS = 6
+SMOOTHED = 9
+"""Instants through which a parabola smooths the torque that comes from other instants."""
 DRAFT_ROUNDS = 3
 """Fixed-point rounds from a reading of the hitch to the draft: its error is a few per cent of it."""
 
@@ -60,10 +63,14 @@ def parameters_of(effect: Effect, n_wheels: int) -> list[Free]:
 
 
 class _Outcome(NamedTuple):
-    """Load that the soil carries beyond what it must, drawbar pull, torque reading, sinkage (4, N, W); pull (N,)."""
+    """Load that the soil carries beyond what it must, drawbar pull, torque reading, sinkage (4, N, W); pull (N,).
+
+    late (N, W) is what other instants add to the torque readings.
+    """
 
     wheels: Array
     pull: Array
+    late: Array
 
 
 class CompletedProblem(WindowProblem):
@@ -131,15 +138,15 @@ class CompletedProblem(WindowProblem):
         at = self._outcome(soil, active, latents, angle)
 
         def by(changed: _Outcome, step: Any) -> _Outcome:
-            return _Outcome((changed.wheels - at.wheels) / step, (changed.pull - at.pull) / _of_instant(step))
+            return _Outcome((changed.wheels - at.wheels) / step, (changed.pull - at.pull) / _of_instant(step), at.late)
 
         turn = STEP * angle
-        by_angle = by(self._outcome(soil, active, latents, angle + turn), turn).wheels
+        by_angle = by(self._outcome(soil, active, latents, angle + turn, at.late), turn).wheels
         by_latents = []
         for name in ("load", "speed", "ground_speed"):
             value = getattr(latents, name)
             step = STEP * np.abs(value)
-            changed = self._outcome(soil, active, _with(latents, name, value + step), angle)
+            changed = self._outcome(soil, active, _with(latents, name, value + step), angle, at.late)
             by_latents.append(by(changed, step if step.ndim == 2 else step[:, None]).wheels)
         by_soil = self._by_soil(soil, active, latents, at)
         by_effects = np.zeros((4, len(self.free), self.n, self.n_wheels))
@@ -148,7 +155,7 @@ class CompletedProblem(WindowProblem):
             shifted = pulls.copy()
             shifted[i] += STEP_OF_EFFECT
             d = by(self._outcome(soil, self.active(shifted), latents, angle), STEP_OF_EFFECT)
-            by_effects[:, i], pull_by_effects[i] = d
+            by_effects[:, i], pull_by_effects[i] = d.wheels, d.pull
         slope, off = by_angle[0], -at.wheels[0]
         along = by_angle[1:] / slope  # what a load more turns into, by way of the entry angle
 
@@ -182,7 +189,14 @@ class CompletedProblem(WindowProblem):
         np.divide(out[:, 1], self.rig.width, out=out[:, 0])  # both act through K_L = k_c/b + k_phi
         return out
 
-    def _outcome(self, soil: Soil, active: Sequence[Active], latents: Latents, angle: Array) -> _Outcome:
+    def _outcome(
+        self, soil: Soil, active: Sequence[Active], latents: Latents, angle: Array, late: Array | None = None
+    ) -> _Outcome:
+        """What the model says at given entry angles; `late` as found at other latents, which it hardly depends on.
+
+        What an effect brings in from other instants is taken from a smoothed torque, and
+        not followed through their latents: each instant is solved for by itself.
+        """
         around = self._surroundings(latents)
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
         K_L = lumped_modulus(soil.k_c, soil.k_phi, self.rig.width)
@@ -190,9 +204,10 @@ class CompletedProblem(WindowProblem):
             angle, slip, self.rig.radius, self.rig.width, K_L, soil.n, float(np.tan(soil.phi)), soil.c, soil.K
         )
         load, pull, torque = forces_with(active, state, self.model, around)
+        late = self._from_other_instants(active, torque, around) if late is None else late
         error, missing, draft = np.zeros_like(load), np.zeros(self.n), self.draft
         for effect, values in active:
-            if effect.torque is not None:
+            if effect.torque is not None and not effect.mixes_instants:
                 torque = effect.torque(torque, around, values)
             if effect.load is not None:
                 error = error + effect.load(around, values)
@@ -200,9 +215,20 @@ class CompletedProblem(WindowProblem):
                 missing = missing + effect.resistance(around, values)
         for _ in range(DRAFT_ROUNDS if any(e.draft is not None for e, _ in active) else 0):
             draft = self.draft - sum(e.draft(draft, around, v) for e, v in active if e.draft is not None)
-        depth = sinkage(angle, self.rig.radius)
+        depth = sinkage(angle, wheel_with(active, state, self.model, around)[0].radius)
         excess = load - (latents.load - error)
-        return _Outcome(np.stack([excess, pull, torque, np.broadcast_to(depth, load.shape)]), missing + draft - self.draft)
+        wheels = np.stack([excess, pull, torque + late, np.broadcast_to(depth, load.shape)])
+        return _Outcome(wheels, missing + draft - self.draft, late)
+
+    def _from_other_instants(self, active: Sequence[Active], torque: Array, around: Surroundings) -> Array:
+        """What effects that mix instants add to the torque readings (N, W)."""
+        mixing = [(e, v) for e, v in active if e.torque is not None and e.mixes_instants]
+        smooth = smoothed(self.t, torque) if mixing else torque
+        late = np.zeros_like(torque)
+        for effect, values in mixing:
+            if effect.torque is not None:
+                late += effect.torque(smooth, around, values) - smooth
+        return late
 
     def _surroundings(self, latents: Latents) -> Surroundings:
         chassis = self.rig.chassis
@@ -217,7 +243,28 @@ class CompletedProblem(WindowProblem):
             acceleration=self.acceleration[:, None],
             mass=0.0 if chassis is None else chassis.mass,
             duration=self.duration,
+            length=self.length,
         )
+
+
+def smoothed(t: Array, values: Array) -> Array:
+    """Values (N, W) at times t [s] (N,) by a parabola through the SMOOTHED nearest instants of the same stretch.
+
+    Savitzky & Golay 1964 (Anal. Chem. 36:1627); shorter stretches stay as they are.
+    """
+    out = np.array(values, float)
+    half = SMOOTHED // 2
+    powers = np.arange(SMOOTHED)[:, None] - half
+    fit = np.linalg.pinv(powers ** np.arange(3))  # (3, SMOOTHED)
+    through = (powers ** np.arange(3)) @ fit  # row i: the parabola's value at place i
+    for run in stretches(t):
+        if len(run) < SMOOTHED:
+            continue
+        windows = np.lib.stride_tricks.sliding_window_view(values[run], SMOOTHED, axis=0)  # (n, W, SMOOTHED)
+        out[run[half : len(run) - half]] = windows @ through[half]
+        out[run[:half]] = through[:half] @ values[run[:SMOOTHED]]
+        out[run[len(run) - half :]] = through[half + 1 :] @ values[run[-SMOOTHED:]]
+    return out
 
 
 def _of_instant(step: Any) -> Any:

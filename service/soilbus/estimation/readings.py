@@ -72,6 +72,7 @@ class Readings:
         self.load_var, self.speed_var = np.where(usable, load_var, 0.0), np.where(usable, speed_var, 0.0)
         self.since, self.distance = travelled(self.t, self.ground_speed, window.t)
         self.duration = float(window.t[-1] - window.t[0]) if len(window.t) else 0.0
+        self.length = float(self.distance[-1]) if len(self.distance) else 0.0
         self._balance(take, usable)
         self.gain_names, self.gain_std = self._gains()
         self.n_sensors = len(self.gain_names)

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.terra.effects.effect import Active, Surroundings, forces_with
+from soilbus.terra.effects.effect import Active, Surroundings, forces_with, wheel_with
 from soilbus.terra.stress import Array
 from soilbus.terra.wheel import (
     MAX_ENTRY_ANGLE,
@@ -28,6 +28,7 @@ from soilbus.terra.wheel import (
     WheelModel,
     WheelState,
     entry_angle_for_load,
+    sinkage,
     state_on,
     wheel_forces_and_derivatives,
 )
@@ -154,6 +155,14 @@ def wheel_state(situation: Situation, slip: Array, entry_angle: Array) -> WheelS
     """States of all wheels (M, N) at a common slip (N,) and entry angles [rad] (M, N)."""
     soil = Soil(*situation.soil)
     return state_on(soil, entry_angle, slip + situation.deviation, situation.radius, situation.width)
+
+
+def sinkages(situation: Situation, mechanics: Mechanics, at: Equilibrium) -> Array:
+    """Sinkage [m] of all wheels (M, N): of the circle that effects make of the nominal one."""
+    state = WheelState(*(np.transpose(a) for a in wheel_state(situation, at.slip, at.entry_angle)))
+    around = surroundings(situation, mechanics, at.slip, at.draft)
+    state, _ = wheel_with(mechanics.effects, state, mechanics.model, around)
+    return np.asarray(np.transpose(sinkage(state.entry_angle, state.radius)))
 
 
 def _at(situation: Situation, index: NDArray[np.intp]) -> Situation:
