@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from soilbus.diagnosis.completion import Completion, complete
+from soilbus.diagnosis.learned import Correction, corrections
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.score import scores
 from soilbus.diagnosis.verdict import PAYS, PLAUSIBLE, SURE, Verdict, gap_limit, probabilities
@@ -37,13 +38,17 @@ class Addition:
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """What was found; base is the present model, completed the one with the effects added."""
+    """What was found; base is the present model, completed the one with the effects added.
+
+    learned describes what is left where the verdict is unknown.
+    """
 
     verdict: Verdict
     where: tuple[Disagreement, ...]
     additions: tuple[Addition, ...]
     base: Completion
     completed: Completion
+    learned: tuple[Correction, ...]
 
 
 def diagnose(
@@ -70,7 +75,9 @@ def diagnose(
             break
         addition, present = found
         additions.append(addition)
-    return Diagnosis(_verdict(base, present, additions), tuple(where), tuple(additions), base, present)
+    verdict = _verdict(base, present, additions)
+    learned = corrections(list(records), present) if verdict is Verdict.UNKNOWN else []
+    return Diagnosis(verdict, tuple(where), tuple(additions), base, present, tuple(learned))
 
 
 def _round(
