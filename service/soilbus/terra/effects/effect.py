@@ -26,7 +26,8 @@ class Surroundings(NamedTuple):
     t [s] and distance [m] since the start of the record; load of the wheel [N];
     ground_speed [m/s]; wheel_speed [rad/s]; rear tells which wheels run in the rut of
     another; draft [N] and acceleration [m/s^2] of the vehicle, mass [kg] of it; duration
-    [s] of the record.  Slips are those of the nominal radius, 1 - V/(r omega).
+    [s] and length [m] of the whole record (length 0: unknown).  Slips are those of the
+    nominal radius, 1 - V/(r omega).
     """
 
     t: Any
@@ -39,11 +40,16 @@ class Surroundings(NamedTuple):
     acceleration: Any
     mass: float
     duration: float
+    length: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One parameter of an effect: absent at `neutral`, prior sd `std` about it, confined to low..high; SI unit."""
+    """One parameter of an effect: absent at `neutral`, prior sd `std` about it, confined to low..high; SI unit.
+
+    `starts`: further values that a search does well to begin at, where the sensitivity at
+    `neutral` alone may be blind (the depth of a pan below all sinkages of a record).
+    """
 
     name: str
     unit: str
@@ -51,6 +57,7 @@ class Parameter:
     std: float
     low: float
     high: float
+    starts: tuple[float, ...] = ()
 
 
 WheelHook = Callable[[WheelState, WheelModel, Surroundings, Values], tuple[WheelState, WheelModel]]
@@ -75,6 +82,7 @@ class Effect:
     hitch, reading less truth, of true drafts (N,).  load: errors [N] (N, W) of the wheel
     load cells.  resistance: force [N] (N,) that holds the vehicle back and is in no reading.
     base_law: the shear law of models to which the effect can be added, None for any.
+    of_record: its parameters describe the ground of one record and mean nothing in another.
     """
 
     name: str
@@ -90,6 +98,12 @@ class Effect:
     load: ErrorHook | None = None
     resistance: ErrorHook | None = None
     base_law: str | None = None
+    of_record: bool = False
+
+    @property
+    def neutral(self) -> dict[str, float]:
+        """Values at which the effect is absent."""
+        return {p.name: p.neutral for p in self.parameters}
 
 
 class Active(NamedTuple):
@@ -99,11 +113,19 @@ class Active(NamedTuple):
     values: Values
 
 
-def forces_with(active: Sequence[Active], state: WheelState, model: WheelModel, around: Surroundings) -> Array:
-    """Load W [N], drawbar pull DP [N] and torque T [N m] of wheels with these effects: array (3, ...)."""
+def wheel_with(
+    active: Sequence[Active], state: WheelState, model: WheelModel, around: Surroundings
+) -> tuple[WheelState, WheelModel]:
+    """State and model of wheels with these effects: its radius, not the nominal one, gives the sinkage."""
     for effect, values in active:
         if effect.wheel is not None:
             state, model = effect.wheel(state, model, around, values)
+    return state, model
+
+
+def forces_with(active: Sequence[Active], state: WheelState, model: WheelModel, around: Surroundings) -> Array:
+    """Load W [N], drawbar pull DP [N] and torque T [N m] of wheels with these effects: array (3, ...)."""
+    state, model = wheel_with(active, state, model, around)
     forces = wheel_forces(state, model)
     for effect, values in active:
         if effect.forces is not None:

@@ -1,0 +1,66 @@
+"""The way and the time of a record: shares of it, curves through knots, stretches without a gap."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.terra.effects.effect import Surroundings
+from soilbus.terra.stress import Array
+
+_GAP = 3.0  # times the median step
+
+
+def share_of_way(around: Surroundings) -> Any:
+    """0 at the start of the record, 1 at its end: by distance where its length is known, by time otherwise."""
+    if around.length > 0.0:
+        return np.asarray(around.distance) / around.length
+    if around.duration > 0.0:
+        return np.asarray(around.t) / around.duration
+    return np.zeros(np.shape(around.t))
+
+
+def through_knots(share: Any, heights: Sequence[float]) -> Array:
+    """The natural cubic spline through heights at equally spaced shares 0..1 of the way, level beyond.
+
+    Linear in the heights; twice as near to a smooth profile as straight lines between as many knots.
+    """
+    y = np.asarray(heights, float)
+    last = len(y) - 1
+    place = np.clip(np.asarray(share, float), 0.0, 1.0) * last
+    left = np.minimum(np.nan_to_num(place).astype(int), last - 1)
+    to_left = place - left
+    to_right = 1.0 - to_left
+    bend = _bending(len(y)) @ y
+    line = to_right * y[left] + to_left * y[left + 1]
+    return np.asarray(line + (to_right**3 - to_right) * bend[left] + (to_left**3 - to_left) * bend[left + 1])
+
+
+@cache
+def _bending(knots: int) -> Array:
+    """What makes a sixth of the second derivatives at knots one apart from the heights there; none at the ends."""
+    differences = np.zeros((knots, knots))
+    system = np.eye(knots)
+    for i in range(1, knots - 1):
+        differences[i, i - 1 : i + 2] = 1.0, -2.0, 1.0
+        system[i, i - 1 : i + 2] = 1.0, 4.0, 1.0
+    return np.asarray(np.linalg.solve(system, differences))
+
+
+def instants(values: Any) -> Array:
+    """One value for each instant (N,) of what all wheels share: (N,), (N, 1) or (N, W)."""
+    array: Array = np.asarray(values, float)
+    return array[:, 0] if array.ndim == 2 else array
+
+
+def stretches(t: Array) -> list[NDArray[np.intp]]:
+    """Indices of times [s] (N,) in runs that go forward without a gap."""
+    step = np.diff(t)
+    forward = step[step > 0.0]
+    usual = float(np.median(forward)) if len(forward) else 0.0
+    cuts: NDArray[np.intp] = np.flatnonzero((step <= 0.0) | (step > _GAP * usual)) + 1
+    return np.split(np.arange(len(t)), cuts.tolist())

@@ -1,0 +1,167 @@
+"""Where and how wheel and soil touch: the stresses' shape, soil pushed ahead, lugs, a flexible carcass."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from soilbus.terra.effects.effect import Effect, Parameter, Surroundings, Values
+from soilbus.terra.stress import Array
+from soilbus.terra.wheel import WheelModel, WheelState, sinkage
+
+
+def _stress_peak_shift(
+    state: WheelState, model: WheelModel, around: Surroundings, values: Values
+) -> tuple[WheelState, WheelModel]:
+    """theta_m / theta_1 = peak_c1 + c1 + (peak_c2 + c2) s."""
+    c1, c2 = model.peak_c1 + values["c1"], model.peak_c2 + values["c2"]
+    return state, replace(model, peak_c1=c1, peak_c2=c2, one_off=True)
+
+
+STRESS_PEAK_SHIFT = Effect(
+    name="stress_peak_shift",
+    physics="The greatest pressure does not sit half way round the contact, and it moves forward with slip.",
+    source="theta_m = (c1 + c2 s) theta_1, c1 0.18 to 0.43, c2 0.32 in sand: Wong & Reece 1967 (J. Terramech. 4:81)",
+    tells="slips from 0.05 to beyond 0.4 with a sinkage sensor; a push that changes with slip is no draft offset",
+    parameters=(
+        Parameter("c2", "1", 0.0, 0.2, -0.1, 0.35),
+        Parameter("c1", "1", 0.0, 0.12, -0.3, 0.1),
+    ),
+    wheel=_stress_peak_shift,
+)
+
+
+def _rut_recovery(
+    state: WheelState, model: WheelModel, around: Surroundings, values: Values
+) -> tuple[WheelState, WheelModel]:
+    """theta_2 = -recovery theta_1."""
+    return state, replace(model, exit_ratio=model.exit_ratio - values["recovery"], one_off=True)
+
+
+RUT_RECOVERY = Effect(
+    name="rut_recovery",
+    physics="The rut springs back behind the axle and pushes the wheel forward: contact ends behind the lowest point.",
+    source="exit angle behind the axle: Wong & Reece 1967 (J. Terramechanics 4:81); Ishigami et al. 2007"
+    " (J. Field Robotics 24:233)",
+    tells="rut depth behind the wheel against sinkage under it; loads from light to heavy",
+    parameters=(Parameter("recovery", "1", 0.0, 0.2, 0.0, 0.6),),
+    wheel=_rut_recovery,
+)
+
+
+def _exponential_shear(
+    state: WheelState, model: WheelModel, around: Surroundings, values: Values
+) -> tuple[WheelState, WheelModel]:
+    """A share of the shear strength mobilised by 1 - exp(-j/K) instead of j/(j + K)."""
+    return state, replace(model, exponential_share=model.exponential_share + values["share"], one_off=True)
+
+
+EXPONENTIAL_SHEAR = Effect(
+    name="exponential_shear",
+    physics="Soil mobilises its shear strength faster with displacement than the rational law says: exponentially.",
+    source="Janosi & Hanamoto 1961 (1st Int. Conf. Mechanics of Soil-Vehicle Systems, Turin);"
+    " the rational law: Xi et al. 2024 eq. 12",
+    tells="slips from 0.02 to beyond 0.4: the two laws part in between",
+    parameters=(Parameter("share", "1", 0.0, 1.0, -0.3, 1.3),),
+    wheel=_exponential_shear,
+    base_law="rational",
+)
+
+
+def _bulldozing(forces: Array, state: WheelState, around: Surroundings, values: Values) -> Array:
+    """Drawbar pull less b (density z^2 / 2 + cohesive_factor c z)."""
+    z = sinkage(state.entry_angle, state.radius)
+    ahead = state.width * (values["density"] * z**2 / 2.0 + values["cohesive_factor"] * state.c * z)
+    return np.stack([forces[0], forces[1] - ahead, forces[2]])
+
+
+BULLDOZING = Effect(
+    name="bulldozing",
+    physics="The wheel pushes a wedge of soil ahead of it, which costs drawbar pull but no torque at the rim.",
+    source="passive earth pressure b (gamma Kp z^2 / 2 + 2 c sqrt(Kp) z), or Bekker's N factors in its place:"
+    " Bekker 1969; Hetherington & Littleton 1978 (J. Terramechanics 15:95)",
+    tells="loads from light to heavy (it grows faster than the sinkage) and a sinkage sensor;"
+    " a constant push is a draft offset",
+    parameters=(
+        Parameter("density", "N/m^3", 0.0, 1e5, 0.0, 2e6),
+        Parameter("cohesive_factor", "1", 0.0, 3.0, 0.0, 30.0),
+    ),
+    forces=_bulldozing,
+)
+
+
+def _lugged_soil(
+    state: WheelState, model: WheelModel, around: Surroundings, values: Values
+) -> tuple[WheelState, WheelModel]:
+    """c (1 + 2 h/b) and tan phi (1 + 0.64 (h/b) arccot(h/b))."""
+    ratio = values["height"] / state.width
+    friction = 1.0 + 0.64 * ratio * (np.pi / 2.0 - np.arctan(ratio))
+    return state._replace(c=state.c * (1.0 + 2.0 * ratio), tan_phi=state.tan_phi * friction), model
+
+
+def _lugged_arm(forces: Array, state: WheelState, around: Surroundings, values: Values) -> Array:
+    """Shear acts at the radius r + h share."""
+    arm = 1.0 + values["height"] * values["share"] / state.radius
+    return np.stack([forces[0], forces[1], forces[2] * arm])
+
+
+LUGS = Effect(
+    name="lugs",
+    physics="Lugs hold a block of soil between them: it shears along their tips and along both its sides.",
+    source="side shear of a grouser: Bekker 1956, Theory of Land Locomotion; Wong 2008, ch. 4; shear radius between rim"
+    " and tip: Ding et al. 2011 (J. Terramechanics 48:27)",
+    tells="cohesive soil, and draft beside torque; on cohesionless soil they are a greater tan phi and no data tell",
+    parameters=(
+        Parameter("height", "m", 0.0, 0.03, 0.0, 0.12),
+        Parameter("share", "1", 0.5, 0.25, 0.0, 1.0),
+    ),
+    wheel=_lugged_soil,
+    forces=_lugged_arm,
+)
+
+_MOST_DEFLECTION = 0.3  # of the width; then the rim strikes through
+
+
+def _substitute_circle(
+    state: WheelState, model: WheelModel, around: Surroundings, values: Values
+) -> tuple[WheelState, WheelModel]:
+    """The greater circle through the deepest point and the point where the flattened tyre enters the soil.
+
+    A hub at the height r - delta above the deepest point gives
+    r*^2 - r* (r - delta) = delta (2 r - delta) / (2 (1 - cos theta_1)).
+    """
+    r, delta = state.radius, _deflection(state, around, values)
+    half = (r - delta) / 2.0
+    circle = half + np.sqrt(half**2 + delta * (2.0 * r - delta) / (2.0 * sinkage(state.entry_angle, 1.0)))
+    slip = 1.0 - (1.0 - state.slip) * r / _rolling(r, delta)
+    return state._replace(radius=circle, slip=slip), model
+
+
+def _flattened_arm(forces: Array, state: WheelState, around: Surroundings, values: Values) -> Array:
+    """Torque at the arm of the rolling radius, by virtual work, instead of that of the substitute circle."""
+    circle, delta = state.radius, _deflection(state, around, values)
+    z = sinkage(state.entry_angle, circle)
+    nominal = (z * (circle + delta) + delta**2 / 2.0) / (z + delta)  # whose substitute circle it is
+    return np.stack([forces[0], forces[1], forces[2] * (_rolling(nominal, delta) / circle)])
+
+
+def _deflection(state: WheelState, around: Surroundings, values: Values) -> Any:
+    return np.minimum(values["compliance"] * np.maximum(around.load, 0.0), _MOST_DEFLECTION * state.width)
+
+
+def _rolling(radius: Any, deflection: Any) -> Any:
+    return radius - deflection / 3.0
+
+
+TYRE_DEFLECTION = Effect(
+    name="tyre_deflection",
+    physics="The tyre flattens under load: it touches the ground like a greater wheel, and rolls like a smaller one.",
+    source="substitute circle: Bekker 1969; Schmid 1995 (J. Terramechanics 32:3); Harnisch et al. 2005 (Vehicle System"
+    " Dynamics 43 suppl.:384); rolling radius less a third of the deflection: Wong 2008, ch. 1",
+    tells="firm ground at several loads (the rolling radius shrinks), a sinkage sensor, another tyre pressure",
+    parameters=(Parameter("compliance", "m/N", 0.0, 4e-6, 0.0, 2e-5),),
+    wheel=_substitute_circle,
+    forces=_flattened_arm,
+)

@@ -1,0 +1,79 @@
+"""What sensors tell wrongly: the load cells of hitch and wheels, a torque that comes late."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from soilbus.terra.effects.along import instants, stretches
+from soilbus.terra.effects.effect import Effect, Parameter, Surroundings, Values
+from soilbus.terra.stress import Array
+
+_LOAD_CELLS = (
+    "zero and span of load cells: OIML R 60 (2021); draft cells 6.5 to 7.2 % off in the field: Cogent Eng. 2024"
+)
+
+
+def _draft_offset(draft: Array, around: Surroundings, values: Values) -> Array:
+    return np.full(np.shape(draft), float(values["offset"]))
+
+
+DRAFT_OFFSET = Effect(
+    name="draft_offset",
+    physics="The load cell at the hitch has lost its zero: it adds the same force to every draft.",
+    source=_LOAD_CELLS,
+    tells="a stretch with the implement lifted: the draft must then read zero",
+    parameters=(Parameter("offset", "N", 0.0, 300.0, -5000.0, 5000.0),),
+    draft=_draft_offset,
+)
+
+
+def _draft_gain(draft: Array, around: Surroundings, values: Values) -> Array:
+    return np.asarray(values["gain"] * draft)
+
+
+DRAFT_GAIN = Effect(
+    name="draft_gain",
+    physics="The load cell at the hitch tells every draft too great or too small by the same share.",
+    source=_LOAD_CELLS,
+    tells="drafts from none to great at one slip, a weight hung on the hitch",
+    parameters=(Parameter("gain", "1", 0.0, 0.1, -0.5, 0.5),),
+    draft=_draft_gain,
+)
+
+
+def _late(torque: Array, around: Surroundings, values: Values) -> Array:
+    """T(t - delay), on straight lines between instants; before the first instant of a run, its value."""
+    t, late = instants(around.t), np.array(torque, float)
+    for run in stretches(t):
+        if len(run) >= 2:
+            then = np.clip(t[run] - values["delay"], t[run[0]], None)
+            before = np.clip(np.searchsorted(t[run], then, side="right") - 1, 0, len(run) - 2)
+            first, second = run[before], run[before + 1]
+            part = ((then - t[first]) / (t[second] - t[first]))[:, None]
+            late[run] = torque[first] + part * (torque[second] - torque[first])
+    return late
+
+
+TORQUE_LAG = Effect(
+    name="torque_lag",
+    physics="The torque comes late: filtered or queued on its way, it belongs to a moment that has passed.",
+    source="pure delay of a channel: Ljung, System Identification (2nd ed. 1999)",
+    tells="quick changes of draft or speed; driving evenly hides it",
+    parameters=(Parameter("delay", "s", 0.0, 0.2, 0.0, 0.6),),
+    torque=_late,
+)
+
+
+def _wheel_load_offset(around: Surroundings, values: Values) -> Array:
+    return np.asarray(values["offset"] + np.zeros(np.shape(around.load)))
+
+
+WHEEL_LOAD_OFFSET = Effect(
+    name="wheel_load_offset",
+    physics="The load cell of a wheel has lost its zero: it adds the same force to every load.",
+    source=_LOAD_CELLS,
+    tells="weighing the vehicle standing: the loads must add up to its weight",
+    parameters=(Parameter("offset", "N", 0.0, 200.0, -3000.0, 3000.0),),
+    each_wheel=True,
+    load=_wheel_load_offset,
+)

@@ -1,0 +1,134 @@
+"""What the soil does that Bekker's curve does not know: it is dug out, hurried, driven over, layered, changing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from soilbus.terra.effects.along import share_of_way, through_knots
+from soilbus.terra.effects.effect import Effect, Parameter, Surroundings, Values
+from soilbus.terra.wheel import WheelModel, WheelState
+
+REFERENCE_SPEED = 1.0
+"""Ground speed [m/s] for which the soil's own K_L holds."""
+_LEAST_SPEED = 0.05
+_LEAST_EXPONENT = 0.05
+
+
+def _slip_sinkage(
+    state: WheelState, model: WheelModel, around: Surroundings, values: Values
+) -> tuple[WheelState, WheelModel]:
+    """n + exponent s, K_L exp(-softening s) for slips s > 0."""
+    slip = np.maximum(state.slip, 0.0)
+    n = np.maximum(state.n + values["exponent"] * slip, np.minimum(state.n, _LEAST_EXPONENT))
+    return state._replace(n=n, K_L=state.K_L * np.exp(-values["softening"] * slip)), model
+
+
+SLIP_SINKAGE = Effect(
+    name="slip_sinkage",
+    physics="A slipping wheel digs: it carries soil away from under itself and sinks deeper than its load asks.",
+    source="n = n0 + n1 s: Ding et al. 2010 (J. Central South Univ. Technol. 17:129); sinkage times a function of slip,"
+    " which a softer K_L gives: Lyasko 2010 (J. Terramechanics 47:21)",
+    tells="a sinkage sensor, and slips from 0.05 to beyond 0.4 at one load",
+    parameters=(
+        Parameter("exponent", "1", 0.0, 0.3, -0.2, 1.5),
+        Parameter("softening", "1", 0.0, 0.6, -1.0, 4.0),
+    ),
+    wheel=_slip_sinkage,
+)
+
+
+def _rate_stiffening(
+    state: WheelState, model: WheelModel, around: Surroundings, values: Values
+) -> tuple[WheelState, WheelModel]:
+    """K_L (V / V0)^m."""
+    speed = np.maximum(np.abs(around.ground_speed), _LEAST_SPEED)
+    return state._replace(K_L=state.K_L * (speed / REFERENCE_SPEED) ** values["exponent"]), model
+
+
+RATE_STIFFENING = Effect(
+    name="rate_stiffening",
+    physics="Soil and its pore water need time to give way: pressed faster, the ground carries more.",
+    source="pressure grows with a power of the sinkage rate: Pope 1969 (J. Terramechanics 6); Grahn 1991 (ibid. 28)",
+    tells="the same ground at two speeds, a factor of two or more apart",
+    parameters=(Parameter("exponent", "1", 0.0, 0.15, -0.3, 0.6),),
+    wheel=_rate_stiffening,
+)
+
+
+def _multipass(
+    state: WheelState, model: WheelModel, around: Surroundings, values: Values
+) -> tuple[WheelState, WheelModel]:
+    """Rear wheels: K_L exp(stiffness); c and tan phi exp(density)."""
+    rear = np.asarray(around.rear, float)
+    strength = np.exp(values["density"] * rear)
+    K_L = state.K_L * np.exp(values["stiffness"] * rear)
+    return state._replace(K_L=K_L, c=state.c * strength, tan_phi=state.tan_phi * strength), model
+
+
+MULTIPASS = Effect(
+    name="multipass",
+    physics="Rear wheels run in ruts that the front wheels have compacted: there the soil is stiffer and stronger.",
+    source="Holm 1969 (J. Terramechanics 6); density form: Wong, Theory of Ground Vehicles (4th ed. 2008), ch. 2",
+    tells="driving one axle beside the other's ruts (crab steering, reversing), a sinkage sensor at both axles",
+    parameters=(
+        Parameter("stiffness", "1", 0.0, 0.5, -0.7, 2.5),
+        Parameter("density", "1", 0.0, 0.1, -0.3, 0.6),
+    ),
+    wheel=_multipass,
+)
+
+
+def _hardpan(
+    state: WheelState, model: WheelModel, around: Surroundings, values: Values
+) -> tuple[WheelState, WheelModel]:
+    """From a depth on, pressure grows (1 + stiffness) times as fast as the soil's own."""
+    return state, replace(model, pan_depth=values["depth"], pan_stiffness=values["stiffness"], one_off=True)
+
+
+HARDPAN = Effect(
+    name="hardpan",
+    physics="Below the tilled layer lies a stiffer one: once a wheel reaches it, it hardly sinks further.",
+    source="two-layer pressure-sinkage curve: Bekker, Introduction to Terrain-Vehicle Systems (1969);"
+    " Wong, Terramechanics and Off-Road Vehicle Engineering (2nd ed. 2010), ch. 4",
+    tells="loads from light to heavy, a sinkage sensor",
+    parameters=(
+        Parameter("stiffness", "1", 0.0, 5.0, 0.0, 50.0),
+        Parameter("depth", "m", 0.04, 0.04, 0.002, 0.3, starts=(0.005, 0.01, 0.02, 0.08, 0.15)),
+    ),
+    wheel=_hardpan,
+)
+
+DRIFT_KNOTS = 3
+
+
+def _drift_of(name: str, share: np.ndarray, values: Values) -> np.ndarray:
+    bends = [0.0, *(values[f"{name}_{i + 1}"] for i in range(DRIFT_KNOTS)), 0.0]
+    return np.asarray(values[name] * (np.clip(share, 0.0, 1.0) - 0.5) + through_knots(share, bends))
+
+
+def _soil_drift(
+    state: WheelState, model: WheelModel, around: Surroundings, values: Values
+) -> tuple[WheelState, WheelModel]:
+    """K_L, and c and tan phi together, times the exponential of a line along the way that may bend."""
+    share = share_of_way(around)
+    strength = np.exp(_drift_of("strength", share, values))
+    K_L = state.K_L * np.exp(_drift_of("stiffness", share, values))
+    return state._replace(K_L=K_L, c=state.c * strength, tan_phi=state.tan_phi * strength), model
+
+
+SOIL_DRIFT = Effect(
+    name="soil_drift",
+    physics="The soil itself changes along the field: moisture and texture, and stiffness and strength with them.",
+    source="log-normal variation along the way: Oliver & Webster 2014 (Catena 113:56)",
+    tells="driving the same way back: what belongs to the place comes again, what belongs to time does not",
+    parameters=(
+        Parameter("stiffness", "1", 0.0, 0.4, -3.0, 3.0),
+        *(Parameter(f"stiffness_{i + 1}", "1", 0.0, 0.2, -1.5, 1.5) for i in range(DRIFT_KNOTS)),
+        Parameter("strength", "1", 0.0, 0.15, -1.0, 1.0),
+        *(Parameter(f"strength_{i + 1}", "1", 0.0, 0.08, -0.5, 0.5) for i in range(DRIFT_KNOTS)),
+    ),
+    wheel=_soil_drift,
+    of_record=True,
+)

@@ -1,0 +1,103 @@
+"""What the vehicle adds: rolling radii, a drive line that takes torque, slopes and masses not accounted for."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from soilbus.terra.effects.along import instants, share_of_way, stretches, through_knots
+from soilbus.terra.effects.effect import Effect, Parameter, Surroundings, Values
+from soilbus.terra.stress import Array
+from soilbus.terra.vehicle import GRAVITY
+from soilbus.terra.wheel import WheelModel, WheelState
+
+
+def _drive_line(torque: Array, around: Surroundings, values: Values) -> Array:
+    """At the motor: T + (share |T| + drag) in the direction of rotation."""
+    way = np.where(np.asarray(around.wheel_speed) < 0.0, -1.0, 1.0)
+    return np.asarray(torque + way * (values["share"] * np.abs(torque) + values["drag"]))
+
+
+DRIVETRAIN_LOSS = Effect(
+    name="drivetrain_loss",
+    physics="Gears and bearings between motor and wheel take torque that never reaches the ground.",
+    source="loss in proportion to load and a drag without load: Niemann & Winter, Maschinenelemente 2 (2003);"
+    " ISO/TR 14179-1:2001",
+    tells="wheels turning off the ground (the drag alone), or torque cells at the wheels",
+    parameters=(
+        Parameter("share", "1", 0.0, 0.06, 0.0, 0.4),
+        Parameter("drag", "N m", 0.0, 20.0, 0.0, 400.0),
+    ),
+    torque=_drive_line,
+)
+
+SLOPE_KNOTS = 8
+
+
+def _unmeasured_slope(around: Surroundings, values: Values) -> Array:
+    """m g sin of a slope that changes smoothly between knots."""
+    departures = [0.0, *(float(values[f"slope_{i}"]) for i in range(1, SLOPE_KNOTS))]
+    slope = values["slope_0"] + through_knots(instants(share_of_way(around)), departures)
+    return np.asarray(around.mass * GRAVITY * np.sin(slope))
+
+
+GRADE = Effect(
+    name="grade",
+    physics="The field is not level, and gravity holds back or pushes what no sensor has told of.",
+    source="weight along the slope, m g sin(slope): Wong 2008, ch. 3; natural cubic spline between knots",
+    tells="driving both ways on the slope, or a pitch sensor; a slope that never changes is a draft offset",
+    parameters=tuple(Parameter(f"slope_{i}", "rad", 0.0, 0.03, -0.3, 0.3) for i in range(SLOPE_KNOTS)),
+    resistance=_unmeasured_slope,
+    of_record=True,
+)
+
+
+def _true_radius(
+    state: WheelState, model: WheelModel, around: Surroundings, values: Values
+) -> tuple[WheelState, WheelModel]:
+    """r (1 + error), and the slip that follows from it at the same V and omega."""
+    rear = np.asarray(around.rear, float)
+    scale = 1.0 + values["front"] * (1.0 - rear) + values["rear"] * rear
+    return state._replace(radius=state.radius * scale, slip=1.0 - (1.0 - state.slip) / scale), model
+
+
+ROLLING_RADIUS = Effect(
+    name="rolling_radius",
+    physics="The tyres are not of the radius written down: worn, or others fitted; so slip is not what it seems.",
+    source="slip 1 - V/(r omega): Wong 2008, ch. 1",
+    tells="rolling free without draft or torque on firm ground: slip must then be nearly zero; a sinkage sensor",
+    parameters=(
+        Parameter("front", "1", 0.0, 0.03, -0.15, 0.15),
+        Parameter("rear", "1", 0.0, 0.03, -0.15, 0.15),
+    ),
+    wheel=_true_radius,
+)
+
+
+def _moving_mass(around: Surroundings, values: Values) -> Array:
+    """mass_share m a."""
+    return np.asarray(values["mass_share"] * around.mass * instants(around.acceleration))
+
+
+def _spinning_wheels(torque: Array, around: Surroundings, values: Values) -> Array:
+    """T + wheel_inertia d omega / dt."""
+    t = instants(around.t)
+    speed = np.broadcast_to(around.wheel_speed, np.shape(torque))
+    rate = np.zeros(speed.shape)
+    for run in stretches(t):
+        if len(run) >= 3:
+            rate[run] = np.gradient(speed[run], t[run], axis=0)
+    return np.asarray(torque + values["wheel_inertia"] * rate)
+
+
+INERTIA = Effect(
+    name="inertia",
+    physics="Speeding up takes force and torque that go into moving masses and spinning wheels, not into the ground.",
+    source="rotating and towed masses beside m a: Mitschke & Wallentowitz, Dynamik der Kraftfahrzeuge (2014)",
+    tells="speeding up and slowing down sharply on the same ground, an accelerometer",
+    parameters=(
+        Parameter("mass_share", "1", 0.0, 0.5, -1.0, 3.0),
+        Parameter("wheel_inertia", "kg m^2", 0.0, 20.0, 0.0, 400.0),
+    ),
+    torque=_spinning_wheels,
+    resistance=_moving_mass,
+)
