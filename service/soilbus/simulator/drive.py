@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from soilbus.assembly import chassis_of, effects_of
 from soilbus.config import Config, Wheel
 from soilbus.simulator.course import positions
-from soilbus.simulator.equilibrium import Equilibrium, Mechanics, Situation, solve, surroundings
+from soilbus.simulator.equilibrium import Equilibrium, Mechanics, Situation, sinkages, solve, surroundings
 from soilbus.simulator.scenario import SAMPLE_RATE, Scenario, Swing, realise, soil_along, soil_names
 from soilbus.terra.effects.effect import Active, Surroundings
 from soilbus.terra.stress import Array
 from soilbus.terra.vehicle import Chassis, axle_loads, pull_required
-from soilbus.terra.wheel import WheelModel, sinkage
+from soilbus.terra.wheel import WheelModel
 
 
 class SimulationError(Exception):
@@ -75,14 +75,14 @@ def drive(config: Config, scenario: Scenario, seed: int, effects: Sequence[Activ
     situation = _situation(config.wheel, chassis, scenario, motion, rng)
     rear = np.array([wheel.axle == "rear" for wheel in config.wheel])
     model = WheelModel(shear_law=config.model.shear_law)
-    mechanics = Mechanics(model, rear, chassis.mass, scenario.duration, present)
+    mechanics = Mechanics(model, rear, chassis.mass, scenario.duration, float(motion.distance[-1]), present)
     result = solve(_held_back(situation, mechanics), mechanics)
     stuck = np.flatnonzero(~result.found)
     end = int(stuck[0]) if len(stuck) else len(t)
     if end < 2:
         soil = soil_names(scenario.soils, motion.distance[:1])[0]
         raise SimulationError(f"the tractor cannot drive on {soil}: no slip lets it move")
-    columns = _columns(config.wheel, scenario, motion, situation, result)
+    columns = _columns(config.wheel, scenario, motion, situation, result, sinkages(situation, mechanics, result))
     around: tuple[Any, ...] = surroundings(situation, mechanics, result.slip, result.draft)
     return Drive(
         {name: column[:end] for name, column in columns.items()},
@@ -171,7 +171,7 @@ def _driver(scenario: Scenario, t: Array, rng: np.random.Generator) -> tuple[Arr
 
 
 def _columns(
-    wheels: list[Wheel], scenario: Scenario, motion: _Motion, situation: Situation, result: Equilibrium
+    wheels: list[Wheel], scenario: Scenario, motion: _Motion, situation: Situation, result: Equilibrium, sunk: Array
 ) -> dict[str, NDArray[Any]]:
     latitude, longitude = positions(scenario.course, motion.distance)
     columns: dict[str, NDArray[Any]] = {
@@ -192,7 +192,7 @@ def _columns(
         of_wheel = {
             "slip": slip[i],
             "entry_angle": result.entry_angle[i],
-            "sinkage": sinkage(result.entry_angle[i], wheel.radius),
+            "sinkage": sunk[i],
             "load": situation.level_load[i] + situation.load_per_draft[i] * result.draft,
             "drawbar_pull": result.forces[1, i],
             "torque": result.forces[2, i],
