@@ -99,7 +99,6 @@ def _sample(problem: CompletedProblem, at: Linearised, latents: Latents, gains: 
     scale = np.abs(raw[known]).mean() / max(float(np.abs(z[known, place]).mean()), 1e-12)
     own = None if place == W else place % (W + 1)
     slip = 1.0 - latents.ground_speed[:, None] / (r * latents.speed)
-    turned = np.cumsum(latents.speed * np.gradient(problem.t)[:, None], axis=0)
     wheels = {"slip": slip, "load": latents.load / latents.load.mean(0), "sinkage": sinkage(latents.entry_angle, r)}
     by = {name: (v.mean(1) if own is None else v[:, own]) for name, v in wheels.items()}
     by["sinkage"] = by["sinkage"] / by["sinkage"].mean()
@@ -109,7 +108,7 @@ def _sample(problem: CompletedProblem, at: Linearised, latents: Latents, gains: 
     by["acceleration"] = problem.acceleration
     by["draft"] = problem.draft / max(float(np.abs(problem.draft).mean()), 1e-9)
     products = {f"{a} {b}": by[a] * by[b] for a, b in (("slip", "slip"), ("slip", "load"), ("slip", "speed"))}
-    angle = turned.mean(1) if own is None else turned[:, own]
+    angle = problem.wheel_angle.mean(1) if own is None else problem.wheel_angle[:, own]
     waves = {f"{f.__name__}({k} wheel angle)": f(k * angle) for k in HARMONICS for f in (np.sin, np.cos)}
     regressors = {"1": np.ones(len(z))} | by | products | waves
     return _Sample(z[known, place], np.full(int(known.sum()), scale), {n: v[known] for n, v in regressors.items()})
