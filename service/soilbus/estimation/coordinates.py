@@ -22,8 +22,10 @@ MAX_STEP = 0.7
 """Longest step of a coordinate."""
 BOUND = 4.0
 """Prior standard deviations of the logarithm to which a free parameter is confined."""
+MAX_PHI = 1.2
+"""Largest free friction angle [rad], beyond any soil's: the model ends at a right angle."""
 
-_K_C, _K_PHI, _N = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n"))
+_K_C, _K_PHI, _N, _PHI = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "phi"))
 
 
 @dataclass(frozen=True)
@@ -82,8 +84,12 @@ class Coordinates:
         if _K_PHI in self._column:
             K_L = np.exp(position[self._column[_K_PHI]] - soil[_N] * np.log(TYPICAL_DEPTH))
             soil[_K_PHI] = max(K_L - soil[_K_C] / self.width, 0.01 * K_L)
+        return self.within(soil)
+
+    def within(self, soil: Array) -> Array:
+        """The soil (6,) with each free parameter brought to the nearest that is near the prior and physical."""
         low, high = self._bounds
-        soil[free] = np.minimum(np.maximum(soil[free], low), high)
+        soil[self.free] = np.minimum(np.maximum(soil[self.free], low), high)
         return soil
 
     @cached_property
@@ -94,7 +100,8 @@ class Coordinates:
     @cached_property
     def _bounds(self) -> tuple[Array, Array]:
         centre, bound = self.prior.median[self.free], np.exp(BOUND * self.prior.log_std[self.free])
-        return centre / bound, centre * bound
+        most = np.where(self.free == _PHI, MAX_PHI, np.inf)
+        return centre / bound, np.minimum(centre * bound, most)
 
     def moved(self, soil: Array, step: Array) -> Array:
         """The soil (6,) after a step (F,) of the coordinates, shortened where it is long."""

@@ -31,6 +31,9 @@ ENOUGH = 0.02
 """Relative fall of the cost below which the approach has done its part."""
 WORSE = 20.0
 """Rise of the cost that a step may bring: where the cost bends, steps that overshoot come back by themselves."""
+SLOWLY = 0.5
+"""Length of a step over that of the last, in the same direction, above which steps are extrapolated."""
+MAX_STRIDE = 8.0
 THINNED = 24
 """Instants of a window that the search for good starts looks at."""
 MAX_KINDS = 2
@@ -206,6 +209,12 @@ def _approach(fitting: Fitting, soil: Array, most: int) -> Place | None:
     return None
 
 
+def _stride(point: Point, last: Array, step: Array) -> float:
+    """How many times this step to go where it follows the last one and shrinks slowly (Aitken's extrapolation)."""
+    shrinks = float(last @ point.information @ step) / point.length(last)
+    return min(1.0 / max(1.0 - shrinks, 1.0 / MAX_STRIDE), MAX_STRIDE) if shrinks > SLOWLY else 1.0
+
+
 def _settle(fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OVER, before: float = 0.0) -> Fit | None:
     """Steps of soil, gains and latents together from a place near the optimum.
 
@@ -216,13 +225,14 @@ def _settle(fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OV
     best: tuple[Place, Point] | None = None
     share, length, refused = 1.0, np.inf, 0
     iterations, converged = near.trials, False
+    last_step: Array | None = None
     for _ in range(most):
         iterations += 1
         point = fitting.point(near)
         if best is not None and (point is None or point.cost > best[1].cost + WORSE):
             near, point = best
-            share *= 0.4
-            before = 0.0  # nothing can be foreseen after a refused step
+            share = 0.4 * min(share, 1.0)
+            before, last_step = 0.0, None  # nothing can be foreseen after a refused step
             refused += 1
             if refused > MAX_REFUSED:
                 break
@@ -233,7 +243,10 @@ def _settle(fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OV
             return None
         best = (near, point)
         length = point.length(full)
+        if last_step is not None and share == 1.0:
+            share = _stride(point, last_step, full)
         near = fitting.moved(near, point, share * full)
+        last_step = full if share == 1.0 else None
         converged = length < CONVERGED or (share == 1.0 and length * length < left_over * before)
         before = length if share == 1.0 else 0.0
         if converged:
