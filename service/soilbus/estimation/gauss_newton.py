@@ -32,7 +32,7 @@ ENOUGH = 0.02
 WORSE = 20.0
 """Rise of the cost that a step may bring: where the cost bends, steps that overshoot come back by themselves."""
 SLOWLY = 0.5
-"""Length of a step over that of the last, in the same direction, above which steps are extrapolated."""
+"""Length of a step over that of the last, along it, above which steps are extrapolated."""
 MAX_STRIDE = 8.0
 THINNED = 24
 """Instants of a window that the search for good starts looks at."""
@@ -44,7 +44,7 @@ MAX_HOPELESS = 5
 HOPELESS = 60.0
 """Cost for each thinned instant beyond which the window cannot be one soil."""
 MAX_REFUSED = 5
-"""Steps taken back after which a fit has failed: what is left is noise of the linear model."""
+"""Steps taken back one after the other after which a fit has failed: what is left is noise of the linear model."""
 PLAUSIBLE = 3.0
 """Cost per residual, gains held, up to which an optimum of the search may be the soil's."""
 SAME_END = 0.02
@@ -105,6 +105,9 @@ def fit_window(problem: WindowProblem, prior: SoilPrior, before: Belief | None =
                 best = fit
             if best is not None and best.converged:
                 return best
+        if best is not None and best.chi2 < PLAUSIBLE:
+            closer = _approach(Fitting(problem, prior, before, with_gains=False), best.belief.soil, MAX_ITERATIONS, 0.0)
+            best = best if closer is None else _settle(fitting, closer, MAX_ITERATIONS) or best
     return best
 
 
@@ -184,7 +187,7 @@ def resume(ahead: Foreseen) -> Fit | None:
         return _settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED, first)
 
 
-def _approach(fitting: Fitting, soil: Array, most: int) -> Place | None:
+def _approach(fitting: Fitting, soil: Array, most: int, least: float = ENOUGH) -> Place | None:
     """Levenberg-damped steps of the soil alone, until they are short."""
     place = fitting.start(soil)
     point = fitting.point(place)
@@ -202,17 +205,20 @@ def _approach(fitting: Fitting, soil: Array, most: int) -> Place | None:
         if new is None or new.cost >= point.cost:
             damping *= 10.0
             continue
-        enough = point.cost - new.cost < ENOUGH * point.cost
+        enough = point.cost - new.cost < least * point.cost
         place, point, damping = new_place, new, damping * 0.1
         if enough:
             return replace(place, cost=point.cost, trials=trials)
     return None
 
 
-def _stride(point: Point, last: Array, step: Array) -> float:
-    """How many times this step to go where it follows the last one and shrinks slowly (Aitken's extrapolation)."""
-    shrinks = float(last @ point.information @ step) / point.length(last)
-    return min(1.0 / max(1.0 - shrinks, 1.0 / MAX_STRIDE), MAX_STRIDE) if shrinks > SLOWLY else 1.0
+def _stride(point: Point, last: Array, share: float, step: Array) -> float:
+    """How many times a step to go that follows this share of the last one (Aitken's extrapolation).
+
+    More than once where steps shrink slowly, less where they turn back.
+    """
+    left = 1.0 - (1.0 - float(last @ point.information @ step) / point.length(last)) / share
+    return min(1.0 / max(1.0 - left, 1.0 / MAX_STRIDE), MAX_STRIDE) if abs(left) > SLOWLY else 1.0
 
 
 def _settle(fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OVER, before: float = 0.0) -> Fit | None:
@@ -226,27 +232,31 @@ def _settle(fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OV
     share, length, refused = 1.0, np.inf, 0
     iterations, converged = near.trials, False
     last_step: Array | None = None
+    last_share = 1.0
     for _ in range(most):
         iterations += 1
         point = fitting.point(near)
         if best is not None and (point is None or point.cost > best[1].cost + WORSE):
             near, point = best
+            if refused == 1:
+                near = fitting.carried(near)
+                point = fitting.point(near)
             share = 0.4 * min(share, 1.0)
             before, last_step = 0.0, None  # nothing can be foreseen after a refused step
             refused += 1
             if refused > MAX_REFUSED:
                 break
         else:
-            share = min(2.0 * share, 1.0)
+            share, refused = min(2.0 * share, 1.0), 0
         full = None if point is None else point.step()
         if point is None or full is None:
             return None
         best = (near, point)
         length = point.length(full)
         if last_step is not None and share == 1.0:
-            share = _stride(point, last_step, full)
+            share = _stride(point, last_step, last_share, full)
         near = fitting.moved(near, point, share * full)
-        last_step = full if share == 1.0 else None
+        last_step, last_share = full, share
         converged = length < CONVERGED or (share == 1.0 and length * length < left_over * before)
         before = length if share == 1.0 else 0.0
         if converged:
