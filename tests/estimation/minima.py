@@ -70,7 +70,11 @@ def two_wheels(config: Config) -> Config:
 def cases() -> Iterator[Case]:
     """Windows of all kinds."""
     for soil in KINDS:
-        free, known, field = reference_configuration(), reference_configuration(told(soil)), load_config(FIELD, told(soil))
+        free, known, field = (
+            reference_configuration(),
+            reference_configuration(told(soil)),
+            load_config(FIELD, told(soil)),
+        )
         for sinkage in (True, False):
             for seconds in (2.0, 10.0):
                 yield case("c and K free", free, soil, seconds, sinkage=sinkage)
@@ -90,7 +94,9 @@ def apart(fit: Fit, other: Fit) -> float:
     """Largest deviation of a parameter of one fit from another's, in standard deviations of the other."""
     std = np.sqrt(np.diag(other.posterior.log_covariance))
     free = std > 0.0
-    return float(np.max(np.abs(np.log(np.asarray(fit.posterior.soil) / other.posterior.soil)[free] / std[free]), initial=0))
+    return float(
+        np.max(np.abs(np.log(np.asarray(fit.posterior.soil) / other.posterior.soil)[free] / std[free]), initial=0)
+    )
 
 
 def main() -> None:
@@ -99,6 +105,7 @@ def main() -> None:
     parser.add_argument("--only", default="")
     args = parser.parse_args()
     import time
+
     for one in cases():
         if args.only not in one.name:
             continue
@@ -116,7 +123,11 @@ def main() -> None:
         same = sum(e.cost < best.cost + SAME_COST and apart(e, best) < SAME_SOIL for e in good)
         off = sum(e.cost < best.cost + SAME_COST and apart(e, best) >= SAME_SOIL for e in good)
         worse = [e for e in good if e.cost >= best.cost + SAME_COST]
-        print(f"{one.name:40s} same {same} off {off} worse {len(worse)} notconv {notc} none {none}; fit +{fit.cost - best.cost:.3f} apart {apart(fit, best):.3f} conv {fit.converged} | {1e3*t_fit:.0f} ms, {1e3 * t / args.count:.1f} ms each", sorted({round(e.cost - best.cost, 1) for e in worse})[:6], flush=True)
+        print(
+            f"{one.name:40s} same {same} off {off} worse {len(worse)} notconv {notc} none {none}; fit +{fit.cost - best.cost:.3f} apart {apart(fit, best):.3f} conv {fit.converged} | {1e3 * t_fit:.0f} ms, {1e3 * t / args.count:.1f} ms each",
+            sorted({round(e.cost - best.cost, 1) for e in worse})[:6],
+            flush=True,
+        )
 
 
 if __name__ == "__main__":
