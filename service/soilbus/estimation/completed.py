@@ -51,6 +51,10 @@ class Free:
         """effect.parameter, with the wheel's number where it has one."""
         return f"{self.effect}.{self.parameter.name}" + ("" if self.wheel is None else f".{self.wheel}")
 
+    def within(self, pull: float) -> bool:
+        """Whether so many prior std from the prior value is inside the parameter's range."""
+        return self.parameter.low <= self.value + self.std * pull <= self.parameter.high
+
     def at(self, pull: float) -> float:
         """The parameter's value so many prior std from its prior value, kept inside its range."""
         return min(max(self.value + self.std * pull, self.parameter.low), self.parameter.high)
