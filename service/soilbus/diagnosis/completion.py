@@ -174,21 +174,20 @@ def _complete(
 
 
 def _fitted(problem: CompletedProblem, prior: SoilPrior, before: Belief, start: Start | None) -> Fit | None:
-    """The best of what starts lead to, until one converges: the given one, half way to it, anywhere."""
+    """Where the given start leads, or one half way to it: whichever converges, or leaves the parameters' range."""
     if start is None:
         return fit_window(problem, prior, before)
     best: Fit | None = None
     for share in (1.0, 0.5):
         pulls = share * start.gains[problem.n_sensors :]
-        gains = np.concatenate([start.gains[: problem.n_sensors], pulls])
-        gains = np.where(problem.gain_std > 0.0, gains, 0.0)
+        gains = np.where(problem.gain_std > 0.0, np.concatenate([start.gains[: problem.n_sensors], pulls]), 0.0)
         fit = continued(problem, prior, before, start.soil, gains)
-        if fit is not None and fit.converged:
+        if fit is None:
+            continue
+        leaves = not all(f.within(u) for f, u in zip(problem.free, fit.gains[problem.n_sensors :], strict=True))
+        if fit.converged or leaves:
             return fit
-        best = fit if best is None or (fit is not None and fit.cost < best.cost) else best
-    other = fit_window(problem, prior, before)
-    if other is not None and (best is None or other.converged or other.cost < best.cost):
-        return other
+        best = fit if best is None or fit.cost < best.cost else best
     return best
 
 
