@@ -6,11 +6,11 @@ import itertools
 import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 
-from soilbus.config import Config
+from soilbus.config import Config, Prior
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -101,9 +101,9 @@ def _case(kind: str, seed: int, number: int, forms: tuple[Form, ...], size: str)
     titles = tuple(form.title for form in forms)
     rng = np.random.default_rng([seed, zlib.crc32("/".join([kind, *titles, size, str(number)]).encode())])
     name = str(rng.choice(SOILS))
-    soil, with_sinkage = soil_named(name), bool(rng.integers(2))
+    soil, with_sinkage = soil_named(name), bool(rng.integers(2)) or any(form.by_sinkage for form in forms)
     config = _told(kind, soil, with_sinkage, rng)
-    setting = Setting(soil, _plain_sinkage(config, soil), rng)
+    setting = Setting(soil, _plain_sinkage(soil), rng)
     how = together([form.hide(form.sizes[SIZES.index(size)], setting) for form in forms])
     sensors = "sinkage" if with_sinkage else "bare"
     return Case(
@@ -130,11 +130,11 @@ def _told(kind: str, soil: Soil, with_sinkage: bool, rng: np.random.Generator) -
     """
     hard = kind == "hard"
     low, high = (0.30, 0.40) if hard else (0.20, 0.25)
-    settings = []
+    config, prior = _tractor(), {}
     for parameter in ("c", "K"):
-        value = getattr(soil, parameter) * (1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(low, high))
-        settings += [f"soil.{parameter}.value={value}", f"soil.{parameter}.std={high * value}"]
-    config = reference_configuration(settings)
+        value = float(getattr(soil, parameter) * (1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(low, high)))
+        prior[parameter] = Prior(value=value, std=high * value)
+    config = config.model_copy(update={"soil": config.soil.model_copy(update=prior)})
     if hard:
         channels = {q: getattr(config.noise, q) for q in type(config.noise).model_fields}
         louder = {q: noise.model_copy(update={"gain": 3.0 * noise.gain}) for q, noise in channels.items()}
@@ -158,8 +158,15 @@ def _scenario(kind: str, soil: str, rng: np.random.Generator) -> Scenario:
     )  # fmt: skip
 
 
-def _plain_sinkage(config: Config, soil: Soil) -> float:
+@cache
+def _tractor() -> Config:
+    return reference_configuration()
+
+
+@cache
+def _plain_sinkage(soil: Soil) -> float:
     """Sinkage [m] of a rear wheel under a quarter of the tractor at a slip of 0.2."""
+    config = _tractor()
     assert config.vehicle is not None
     wheel = next(w for w in config.wheel if w.axle == "rear")
     state = state_on(soil, np.nan, 0.2, wheel.radius, wheel.width)

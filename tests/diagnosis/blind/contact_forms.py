@@ -13,8 +13,9 @@ from soilbus.terra.stress import Array
 from soilbus.terra.wheel import WheelState
 
 from .form import Form, Hidden, Setting, by_hooks
-from .rim import change
+from .rim import change, rim_forces
 
+Deflection = Callable[[Any, float], Any]
 SOIL_WEIGHT = 16e3
 """Of moist soil [N/m^3]."""
 
@@ -86,13 +87,41 @@ def _peak_mobilised(forces: Array, state: WheelState, around: Any, values: Any) 
     return forces + change(state, peak=0.5 - values["size"] * np.exp(-j / (2.0 * state.K)))
 
 
-def _soft_tyre(deflection: Callable[[Any, float], Any]) -> Callable[[float, Setting], Hidden]:
-    """Hidden by a deflection [m] of load and size: Schmid's substitute circle, and a smaller rolling radius."""
+def _slower(deflection: Deflection) -> Callable[..., Any]:
+    """Slip from the smaller rolling radius of a flattened tyre, as a `wheel` hook."""
+
+    def wheel(state: WheelState, model: Any, around: Any, values: Any) -> Any:
+        flattened = deflection(np.maximum(around.load, 1.0), values["size"]) / state.radius
+        return state._replace(slip=1.0 - (1.0 - state.slip) / _rolls(flattened)), model
+
+    return wheel
+
+
+def _flat_tyre(deflection: Deflection) -> Callable[[float, Setting], Hidden]:
+    """A flat in the middle of the contact, and the round tyre, pushed down by it, before and behind."""
+
+    def forces(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+        r, delta = state.radius, deflection(np.maximum(around.load, 1.0), values["size"])
+        z = r * (1.0 - np.cos(state.entry_angle))
+        entry, flat = np.arccos(1.0 - (z + delta) / r), np.arccos(1.0 - delta / r)
+        tyre = rim_forces(
+            state._replace(entry_angle=entry),
+            pressure=lambda depth: state.K_L * np.minimum(depth, z) ** state.n,
+            leave=-flat,
+        )
+        tyre[2] *= _rolls(delta / r)
+        return forces + tyre - rim_forces(state)
+
+    return by_hooks(wheel=_slower(deflection), forces=forces)
+
+
+def _round_tyre(deflection: Deflection) -> Callable[[float, Setting], Hidden]:
+    """Schmid's substitute circle, sqrt(r* z) = sqrt(r (z + delta)) + sqrt(r delta)."""
 
     def wheel(state: WheelState, model: Any, around: Any, values: Any) -> Any:
         r, delta = state.radius, deflection(np.maximum(around.load, 1.0), values["size"])
-        greater = r + 2.0 * np.sqrt(delta * r / (1.0 - np.cos(state.entry_angle)))
-        return state._replace(radius=greater, slip=1.0 - (1.0 - state.slip) / _rolls(delta / r)), model
+        slower, model = _slower(deflection)(state, model, around, values)
+        return slower._replace(radius=r + 2.0 * np.sqrt(delta * r / (1.0 - np.cos(state.entry_angle)))), model
 
     def forces(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
         delta = deflection(np.maximum(around.load, 1.0), values["size"])
@@ -128,6 +157,7 @@ FORMS = (
         "widths",
         (0.2, 0.7, 2.0),
         by_hooks(forces=_rankine),
+        other=False,
     ),
     Form(
         "bulldozing",
@@ -163,6 +193,7 @@ FORMS = (
         "1",
         (0.003, 0.02, 0.10),
         by_hooks(forces=_rebound),
+        other=False,
     ),
     Form(
         "stress_peak_shift",
@@ -178,7 +209,7 @@ FORMS = (
         "linear",
         "Wong & Reece 1967, c1 and c2",
         "1",
-        (0.2, 0.6, 1.5),
+        (0.1, 0.3, 1.0),
         by_hooks(forces=_peak_linear),
         other=False,
     ),
@@ -193,10 +224,10 @@ FORMS = (
     Form(
         "tyre_deflection",
         "spring",
-        "Schmid 1995, deflection in proportion to load",
+        "flat and round parts: Fujimoto 1977; deflection in proportion to load",
         "m/N",
         (5e-7, 2e-6, 6e-6),
-        _soft_tyre(lambda load, k: k * load),
+        _flat_tyre(lambda load, k: k * load),
     ),
     Form(
         "tyre_deflection",
@@ -204,7 +235,7 @@ FORMS = (
         "Schmid 1995, deflection of a power of the load",
         "m at 6 kN",
         (0.003, 0.012, 0.036),
-        _soft_tyre(lambda load, k: k * (load / 6000.0) ** 0.65),
+        _round_tyre(lambda load, k: k * (load / 6000.0) ** 0.65),
     ),
     Form(
         "exponential_shear", "range", "Janosi & Hanamoto 1961; slips to", "1", (0.10, 0.20, 0.40), _shear, other=False

@@ -64,8 +64,9 @@ class Form:
     """One formula of an effect.
 
     effect: its name in the catalogue, "" where it is not in there.  sizes: from barely
-    visible to large, in `unit`.  other: the formula is not the catalogue's.  imitable: an
-    effect outside the catalogue that one inside might pass for.
+    visible to large, in `unit`.  other: no parameters make the catalogue's formula this one.
+    by_sinkage: nothing but a sinkage sensor shows it.  imitable: an effect outside the
+    catalogue that one inside might pass for.
     """
 
     effect: str
@@ -75,6 +76,7 @@ class Form:
     sizes: tuple[float, float, float]
     hide: Callable[[float, Setting], Hidden]
     other: bool = True
+    by_sinkage: bool = False
     imitable: bool = False
 
     @property

@@ -126,7 +126,15 @@ FORMS = (
         "slip_sinkage", "exponent", "Ding et al. 2010: n0 + n1 s + n2 s^2", "1", (0.03, 0.1, 0.4), by_hooks(wheel=_ding)
     ),
     Form("slip_sinkage", "factor", "Lyasko 2010: (1 + s) / (1 - 0.5 s)", "1", (0.1, 0.4, 1.2), by_hooks(wheel=_lyasko)),
-    Form("slip_sinkage", "offset", "Reece 1965: h s / (1 - s)", "m", (0.003, 0.010, 0.030), by_hooks(wheel=_reece)),
+    Form(
+        "slip_sinkage",
+        "offset",
+        "Reece 1965: h s / (1 - s)",
+        "m",
+        (0.003, 0.010, 0.030),
+        by_hooks(wheel=_reece),
+        by_sinkage=True,
+    ),
     Form("multipass", "stiffness", "Holm 1969, with K", "1", (0.1, 0.4, 1.5), by_hooks(wheel=_compacted)),
     Form(
         "multipass",
@@ -135,6 +143,7 @@ FORMS = (
         "1",
         (0.02, 0.06, 0.2),
         by_hooks(wheel=_denser),
+        other=False,
     ),
     Form("multipass", "rut", "reloading: Wong 2008, ch. 2", "sinkages", (0.05, 0.2, 0.6), by_hooks(forces=_in_the_rut)),
     Form(

@@ -156,7 +156,9 @@ def _signed(hide: Callable[[float, Setting], Hidden]) -> Callable[[float, Settin
 
 
 FORMS = (
-    Form("drivetrain_loss", "efficiency", "T / eta", "1", (0.015, 0.05, 0.15), by_hooks(torque=_efficiency)),
+    Form(
+        "drivetrain_loss", "efficiency", "T / eta", "1", (0.015, 0.05, 0.15), by_hooks(torque=_efficiency), other=False
+    ),
     Form(
         "drivetrain_loss",
         "constant",
@@ -167,7 +169,9 @@ FORMS = (
         other=False,
     ),
     Form("drivetrain_loss", "viscous", "churning oil", "N m s", (4.0, 15.0, 50.0), by_hooks(torque=_viscous)),
-    Form("torque_lag", "delay", "whole samples of 20 ms", "s", (0.04, 0.12, 0.40), by_hooks(torque=_delayed)),
+    Form(
+        "torque_lag", "delay", "whole samples of 20 ms", "s", (0.04, 0.12, 0.40), by_hooks(torque=_delayed), other=False
+    ),
     Form("torque_lag", "filter", "first-order low pass", "s", (0.04, 0.12, 0.40), by_hooks(torque=_filtered)),
     Form(
         "grade",
