@@ -104,7 +104,7 @@ def _case(kind: str, seed: int, number: int, forms: tuple[Form, ...], size: str)
     soil, with_sinkage = soil_named(name), bool(rng.integers(2)) or any(form.by_sinkage for form in forms)
     config = _told(kind, soil, with_sinkage, rng)
     setting = Setting(soil, _plain_sinkage(soil), rng)
-    how = together([form.hide(form.sizes[SIZES.index(size)], setting) for form in forms])
+    how = together([form.hide(form.size(size, with_sinkage), setting) for form in forms])
     sensors = "sinkage" if with_sinkage else "bare"
     return Case(
         id="/".join(part for part in (kind, "+".join(titles), size, name, sensors, f"{seed}.{number}") if part),

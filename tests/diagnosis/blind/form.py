@@ -63,8 +63,9 @@ def together(parts: Sequence[Hidden]) -> Hidden:
 class Form:
     """One formula of an effect.
 
-    effect: its name in the catalogue, "" where it is not in there.  sizes: from barely
-    visible to large, in `unit`.  other: no parameters make the catalogue's formula this one.
+    effect: its name in the catalogue, "" where it is not in there.  small: the size, in
+    `unit`, that is barely visible with a sinkage sensor and without; large: as great as it
+    gets.  other: no parameters make the catalogue's formula this one.
     by_sinkage: nothing but a sinkage sensor shows it.  imitable: an effect outside the
     catalogue that one inside might pass for.
     """
@@ -73,11 +74,17 @@ class Form:
     name: str
     source: str
     unit: str
-    sizes: tuple[float, float, float]
+    small: tuple[float, float]
+    large: float
     hide: Callable[[float, Setting], Hidden]
     other: bool = True
     by_sinkage: bool = False
     imitable: bool = False
+
+    def size(self, name: str, with_sinkage: bool) -> float:
+        """One of SIZES in `unit`; the medium one lies as many times above the small as below the large one."""
+        small = self.small[0 if with_sinkage else 1]
+        return float(small * (self.large / small) ** (SIZES.index(name) / 2.0))
 
     @property
     def title(self) -> str:

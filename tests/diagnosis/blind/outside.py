@@ -100,24 +100,34 @@ def _nodding_radar(name: str, t: Array, recording: Recording, size: float) -> Ar
 
 
 FORMS = (
-    Form("", "torque_ripple", "locked to the wheel angle", "1", (0.005, 0.02, 0.08), by_hooks(torque=_ripple)),
+    Form("", "torque_ripple", "locked to the wheel angle", "1", (0.0012, 0.0012), 0.08, by_hooks(torque=_ripple)),
     Form(
         "",
         "draft_leak",
         "draft in the wheel load cells",
         "1",
-        (0.02, 0.07, 0.2),
+        (0.0055, 0.0055),
+        0.2,
         by_hooks(load=_draft_leak),
         imitable=True,
     ),
-    Form("", "tooth_error", "once a turn of each wheel", "1", (0.0015, 0.005, 0.02), _channels(_tooth)),
-    Form("", "draft_saturated", "amplifier at its end", "1", (0.1, 0.25, 0.5), by_hooks(draft=_saturated)),
-    Form("", "draft_sticking", "hysteresis of the pin", "N", (50.0, 150.0, 500.0), by_hooks(draft=_sticking)),
-    Form("", "row_spacing", "soil changes every 0.75 m", "1", (0.03, 0.1, 0.4), by_hooks(wheel=_rows)),
+    Form("", "tooth_error", "once a turn of each wheel", "1", (0.001, 0.001), 0.02, _channels(_tooth)),
+    Form("", "draft_saturated", "amplifier at its end", "1", (0.01, 0.01), 0.5, by_hooks(draft=_saturated)),
+    Form("", "draft_sticking", "hysteresis of the pin", "N", (8.0, 8.0), 500.0, by_hooks(draft=_sticking)),
+    Form("", "row_spacing", "soil changes every 0.75 m", "1", (0.003, 0.003), 0.4, by_hooks(wheel=_rows)),
     Form(
-        "", "cross_talk", "torques of an axle mixed", "1", (0.05, 0.2, 0.5), by_hooks(torque=_cross_talk), imitable=True
+        "",
+        "cross_talk",
+        "torques of an axle mixed",
+        "1",
+        (0.02, 0.02),
+        0.5,
+        by_hooks(torque=_cross_talk),
+        imitable=True,
     ),
-    Form("", "warming_torque", "span settles", "1", (0.005, 0.02, 0.08), by_hooks(torque=_warm_torque), imitable=True),
-    Form("", "bouncing", "load cells at 1.3 Hz", "N", (50.0, 150.0, 600.0), by_hooks(load=_bouncing)),
-    Form("", "nodding_radar", "ground speed every 2 s", "1", (0.003, 0.01, 0.04), _channels(_nodding_radar)),
+    Form(
+        "", "warming_torque", "span settles", "1", (0.0033, 0.0033), 0.08, by_hooks(torque=_warm_torque), imitable=True
+    ),
+    Form("", "bouncing", "load cells at 1.3 Hz", "N", (5.5, 5.5), 600.0, by_hooks(load=_bouncing)),
+    Form("", "nodding_radar", "ground speed every 2 s", "1", (0.0017, 0.0017), 0.04, _channels(_nodding_radar)),
 )

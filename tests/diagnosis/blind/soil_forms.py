@@ -123,43 +123,56 @@ def _along(state: WheelState, more: Any) -> WheelState:
 
 FORMS = (
     Form(
-        "slip_sinkage", "exponent", "Ding et al. 2010: n0 + n1 s + n2 s^2", "1", (0.03, 0.1, 0.4), by_hooks(wheel=_ding)
+        "slip_sinkage",
+        "exponent",
+        "Ding et al. 2010: n0 + n1 s + n2 s^2",
+        "1",
+        (0.006, 0.016),
+        0.4,
+        by_hooks(wheel=_ding),
     ),
-    Form("slip_sinkage", "factor", "Lyasko 2010: (1 + s) / (1 - 0.5 s)", "1", (0.1, 0.4, 1.2), by_hooks(wheel=_lyasko)),
+    Form(
+        "slip_sinkage", "factor", "Lyasko 2010: (1 + s) / (1 - 0.5 s)", "1", (0.02, 0.05), 1.2, by_hooks(wheel=_lyasko)
+    ),
     Form(
         "slip_sinkage",
         "offset",
         "Reece 1965: h s / (1 - s)",
         "m",
-        (0.003, 0.010, 0.030),
+        (0.0013, 0.0013),
+        0.03,
         by_hooks(wheel=_reece),
         by_sinkage=True,
     ),
-    Form("multipass", "stiffness", "Holm 1969, with K", "1", (0.1, 0.4, 1.5), by_hooks(wheel=_compacted)),
+    Form("multipass", "stiffness", "Holm 1969, with K", "1", (0.04, 0.4), 1.5, by_hooks(wheel=_compacted)),
     Form(
         "multipass",
         "density",
         "Wong 2008, ch. 2, in proportions of his own",
         "1",
-        (0.02, 0.06, 0.2),
+        (0.0075, 0.02),
+        0.2,
         by_hooks(wheel=_denser),
         other=False,
     ),
-    Form("multipass", "rut", "reloading: Wong 2008, ch. 2", "sinkages", (0.05, 0.2, 0.6), by_hooks(forces=_in_the_rut)),
     Form(
-        "rate_stiffening", "log", "logarithm of the loading rate", "1", (0.02, 0.07, 0.25), by_hooks(wheel=_logarithm)
+        "multipass", "rut", "reloading: Wong 2008, ch. 2", "sinkages", (0.02, 0.045), 0.6, by_hooks(forces=_in_the_rut)
+    ),
+    Form(
+        "rate_stiffening", "log", "logarithm of the loading rate", "1", (0.012, 0.02), 0.25, by_hooks(wheel=_logarithm)
     ),
     Form(
         "rate_stiffening",
         "penetration",
         "penetration velocity: Grahn 1991",
         "1",
-        (0.02, 0.07, 0.25),
+        (0.012, 0.02),
+        0.25,
         by_hooks(wheel=_penetration),
     ),
-    Form("hardpan", "sharp", "bed of springs", "1", (0.3, 1.5, 8.0), by_hooks(forces=_sharp)),
-    Form("hardpan", "graded", "denser with depth", "1", (0.1, 0.4, 1.5), by_hooks(forces=_graded)),
-    Form("soil_drift", "ramp", "straight line in each parameter", "1", (0.06, 0.2, 0.6), _ramp),
-    Form("soil_drift", "border", "tanh", "1", (0.06, 0.2, 0.6), by_hooks(wheel=_border)),
-    Form("soil_drift", "undulating", "sine", "1", (0.06, 0.2, 0.6), by_hooks(wheel=_undulating)),
+    Form("hardpan", "sharp", "bed of springs", "1", (0.8, 0.9), 8.0, by_hooks(forces=_sharp)),
+    Form("hardpan", "graded", "denser with depth", "1", (0.3, 0.33), 2.0, by_hooks(forces=_graded)),
+    Form("soil_drift", "ramp", "straight line in each parameter", "1", (0.006, 0.009), 0.6, _ramp),
+    Form("soil_drift", "border", "tanh", "1", (0.004, 0.006), 0.6, by_hooks(wheel=_border)),
+    Form("soil_drift", "undulating", "sine", "1", (0.005, 0.007), 0.6, by_hooks(wheel=_undulating)),
 )

@@ -21,12 +21,11 @@ from soilbus.terra.wheel import WheelModel, WheelState, state_on, wheel_forces
 from . import outside
 from .__main__ import main
 from .cases import FORMS, KINDS, SOILS, Case, cases
-from .form import SIZES, Form, Hidden, Setting
+from .form import Form, Hidden, Setting
 from .rim import rim_forces
 
 RADII, WIDTHS = np.array([0.50, 0.50, 0.62, 0.62]), np.array([0.26, 0.26, 0.38, 0.38])
 WHEELS = ("FL", "FR", "RL", "RR")
-LARGE = SIZES.index("large")
 
 
 def titles(forms: tuple[Form, ...]) -> list[str]:
@@ -78,7 +77,7 @@ def test_every_effect_of_the_catalogue_and_five_others_are_hidden():
     assert {form.effect for form in FORMS} == set(CATALOGUE)
     assert len([form for form in outside.FORMS if not form.imitable]) >= 5
     assert all(form.effect == "" for form in outside.FORMS)
-    assert all(list(form.sizes) == sorted(form.sizes) for form in (*FORMS, *outside.FORMS))
+    assert all(2.0 * max(form.small) <= form.large for form in (*FORMS, *outside.FORMS))
     singles = list(cases("single", 1))
     assert {case.forms for case in singles} == {(title,) for title in titles(FORMS)}
     assert {case.soil_name for case in singles} == set(SOILS)
@@ -199,7 +198,7 @@ LOOSELY = [form for form in FORMS if form.title not in ("soil_drift:ramp", "expo
 @pytest.mark.parametrize("form", LOOSELY, ids=titles(tuple(LOOSELY)))
 def test_another_form_is_another_and_the_same_form_the_same(form, standard):
     sinkage = float(np.mean(standard.columns["sinkage.RL"]))
-    how = form.hide(form.sizes[LARGE], Setting(soil_named("loam"), sinkage, np.random.default_rng(1)))
+    how = form.hide(form.large, Setting(soil_named("loam"), sinkage, np.random.default_rng(1)))
     if not how.effects:
         assert form.other  # it gets into the recording by another way altogether
         return

@@ -29,10 +29,9 @@ def _viscous(torque: Array, around: Any, values: Any) -> Array:
 
 
 def _delayed(torque: Array, around: Any, values: Any) -> Array:
-    """Whole samples late, as a queue is."""
-    step = float(around.t[1, 0] - around.t[0, 0])
-    late = np.maximum(np.arange(len(torque)) - round(values["size"] / step), 0)
-    return torque[late]
+    """Late, as from a queue."""
+    t = np.ravel(around.t)
+    return np.stack([np.interp(t - values["size"], t, of_wheel) for of_wheel in torque.T], axis=1)
 
 
 def _filtered(torque: Array, around: Any, values: Any) -> Array:
@@ -157,38 +156,39 @@ def _signed(hide: Callable[[float, Setting], Hidden]) -> Callable[[float, Settin
 
 FORMS = (
     Form(
-        "drivetrain_loss", "efficiency", "T / eta", "1", (0.015, 0.05, 0.15), by_hooks(torque=_efficiency), other=False
+        "drivetrain_loss", "efficiency", "T / eta", "1", (0.022, 0.024), 0.15, by_hooks(torque=_efficiency), other=False
     ),
     Form(
         "drivetrain_loss",
         "constant",
         "drag without load",
         "N m",
-        (10.0, 35.0, 120.0),
+        (17.0, 40.0),
+        150.0,
         by_hooks(torque=_dragging),
         other=False,
     ),
-    Form("drivetrain_loss", "viscous", "churning oil", "N m s", (4.0, 15.0, 50.0), by_hooks(torque=_viscous)),
-    Form(
-        "torque_lag", "delay", "whole samples of 20 ms", "s", (0.04, 0.12, 0.40), by_hooks(torque=_delayed), other=False
-    ),
-    Form("torque_lag", "filter", "first-order low pass", "s", (0.04, 0.12, 0.40), by_hooks(torque=_filtered)),
+    Form("drivetrain_loss", "viscous", "churning oil", "N m s", (1.2, 1.2), 50.0, by_hooks(torque=_viscous)),
+    Form("torque_lag", "delay", "as from a queue", "s", (0.01, 0.01), 0.4, by_hooks(torque=_delayed), other=False),
+    Form("torque_lag", "filter", "first-order low pass", "s", (0.011, 0.011), 0.4, by_hooks(torque=_filtered)),
     Form(
         "grade",
         "sines",
         "constant and sines of the way",
         "rad",
-        (0.004, 0.012, 0.04),
+        (0.0005, 0.0005),
+        0.04,
         by_hooks(resistance=_swaying_slope),
     ),
-    Form("grade", "hill", "a hill with its load transfer", "rad", (0.008, 0.025, 0.08), _hill),
-    Form("grade", "no_sensor", "undulating field, pitch not measured", "rad", (0.008, 0.025, 0.08), _no_pitch_sensor),
+    Form("grade", "hill", "a hill with its load transfer", "rad", (0.0006, 0.0006), 0.08, _hill),
+    Form("grade", "no_sensor", "undulating field, pitch not measured", "rad", (0.0006, 0.0006), 0.08, _no_pitch_sensor),
     Form(
         "inertia",
         "towed",
         "implement behind the hitch",
         "kg",
-        (100.0, 400.0, 1500.0),
+        (60.0, 60.0),
+        1500.0,
         by_hooks(resistance=_towed),
         other=False,
     ),
@@ -197,7 +197,8 @@ FORMS = (
         "flywheel",
         "motors ahead of the gears",
         "kg m^2",
-        (8.0, 30.0, 120.0),
+        (2.2, 2.2),
+        120.0,
         by_hooks(torque=_flywheel),
         other=False,
     ),
@@ -206,7 +207,8 @@ FORMS = (
         "one",
         "zero of one cell",
         "N",
-        (60.0, 200.0, 700.0),
+        (155.0, 190.0),
+        900.0,
         _offsets((1.0, 0.0, 0.0, 0.0)),
         other=False,
     ),
@@ -215,7 +217,8 @@ FORMS = (
         "two",
         "zeros of two cells",
         "N",
-        (60.0, 200.0, 700.0),
+        (110.0, 130.0),
+        900.0,
         _offsets((1.0, 0.0, 0.0, -0.6)),
         other=False,
     ),
@@ -224,7 +227,8 @@ FORMS = (
         "constant",
         "zero of the cell",
         "N",
-        (60.0, 200.0, 700.0),
+        (105.0, 600.0),
+        1500.0,
         _signed(by_hooks(draft=_constant_error)),
         other=False,
     ),
@@ -233,7 +237,8 @@ FORMS = (
         "warming",
         "zero that settles with warmth",
         "N",
-        (60.0, 200.0, 700.0),
+        (93.0, 250.0),
+        1500.0,
         _signed(by_hooks(draft=_warming_up)),
     ),
     Form(
@@ -241,20 +246,22 @@ FORMS = (
         "gain",
         "span of the cell",
         "1",
-        (0.02, 0.07, 0.25),
+        (0.042, 0.042),
+        0.25,
         _signed(by_hooks(draft=_steeper)),
         other=False,
     ),
     Form(
-        "draft_gain", "bent", "span that grows with the draft", "1", (0.02, 0.07, 0.25), _signed(by_hooks(draft=_bent))
+        "draft_gain", "bent", "span that grows with the draft", "1", (0.04, 0.04), 0.25, _signed(by_hooks(draft=_bent))
     ),
-    Form("rolling_radius", "one_axle", "other tyres at the front", "1", (0.004, 0.012, 0.04), _tyres({"front": 1.0})),
+    Form("rolling_radius", "one_axle", "other tyres at the front", "1", (0.03, 0.025), 0.1, _tyres({"front": 1.0})),
     Form(
         "rolling_radius",
         "both_axles",
         "other tyres all round",
         "1",
-        (0.004, 0.012, 0.04),
+        (0.02, 0.018),
+        0.08,
         _tyres({"front": 1.0, "rear": 0.7}),
     ),
 )
