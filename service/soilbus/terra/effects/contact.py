@@ -85,7 +85,7 @@ BULLDOZING = Effect(
     tells="loads from light to heavy (it grows faster than the sinkage) and a sinkage sensor;"
     " a constant push is a draft offset",
     parameters=(
-        Parameter("density", "N/m^3", 0.0, 1e5, 0.0, 2e6),
+        Parameter("density", "N/m^3", 0.0, 2e5, 0.0, 2e6),
         Parameter("cohesive_factor", "1", 0.0, 3.0, 0.0, 30.0),
     ),
     forces=_bulldozing,

@@ -33,7 +33,7 @@ SLIP_SINKAGE = Effect(
     tells="a sinkage sensor, and slips from 0.05 to beyond 0.4 at one load",
     parameters=(
         Parameter("exponent", "1", 0.0, 0.3, -0.2, 1.5),
-        Parameter("softening", "1", 0.0, 0.6, -1.0, 4.0),
+        Parameter("softening", "1", 0.0, 0.6, -2.0, 4.0),
     ),
     wheel=_slip_sinkage,
 )
