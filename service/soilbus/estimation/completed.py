@@ -130,6 +130,13 @@ class CompletedProblem(WindowProblem):
                 break
         return Latents(base.load, base.speed, base.ground_speed, angle)
 
+    def sinkages(self, soil: Soil, gains: Array, latents: Latents) -> Array:
+        """As WindowProblem, of the circles that the effects make of the wheels."""
+        if not self.effects:
+            return super().sinkages(soil, gains, latents)
+        active = self.active(gains[self.n_sensors :])
+        return np.asarray(self._outcome(soil, active, latents, latents.entry_angle).wheels[3])
+
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         if not self.effects:
             return super()._response(soil, gains, latents)

@@ -26,7 +26,7 @@ from soilbus.report.page import html_table, page, picture
 
 Array = NDArray[np.float64]
 
-REGRESSORS = ("slip", "load, kN", "time, s")
+REGRESSORS = ("slip", "load of a wheel, kN", "time, s")
 MOST_POINTS = 3000
 """Residuals of a channel that a picture shows; the means are of all."""
 BINS = 12
@@ -138,7 +138,7 @@ def _clouds(completion: Completion) -> dict[str, dict[str, Array]]:
         for i, (channel, wheel) in enumerate(channels(wheels, problem.with_sinkage)):
             one = wheels.index(wheel) if wheel else None
             of_slip, of_load = (
-                (slip.mean(1), latents.load.sum(1)) if one is None else (slip[:, one], latents.load[:, one])
+                (slip.mean(1), latents.load.mean(1)) if one is None else (slip[:, one], latents.load[:, one])
             )
             table = np.column_stack([of_slip, of_load / 1e3, problem.since, z[:, i]])[np.isfinite(z[:, i])]
             found.setdefault(channel, {}).setdefault(wheel, []).append(table)
