@@ -16,6 +16,7 @@ from soilbus.diagnosis.where import channels
 from soilbus.report.findings import (
     SENTENCES,
     admission_line,
+    chance_text,
     effect_lines,
     gap_line,
     place_lines,
@@ -80,7 +81,7 @@ def _places(findings: Findings) -> str:
     where = findings.diagnosis.where
     if not where:
         return f"<p>{html.escape(place_lines(where)[0])}</p>"
-    rows = [(p.channel, p.wheel or "-", p.region, size_text(p), f"{p.significance:.1e}") for p in where]
+    rows = [(p.channel, p.wheel or "-", p.region, size_text(p), chance_text(p.significance)) for p in where]
     return html_table(("channel", "wheel", "region", "size", "chance that noise does it"), rows)
 
 
