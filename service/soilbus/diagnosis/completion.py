@@ -139,9 +139,12 @@ def complete(
 ) -> Completion | None:
     """A model with these effects fitted to all recordings; None where a fit fails.
 
-    A parameter that would leave its range is held at the edge.
+    Parameters of effects that the records' model has already keep the prior they have
+    there; one that would leave its range is held at the edge.
     """
-    free = tuple(f for effect in effects for f in parameters_of(effect, len(records[0].learned.rig.wheels)))
+    present = records[0].learned
+    known = {e.name: [f for f in present.free if f.effect == e.name] for e in present.effects}
+    free = tuple(f for effect in effects for f in known.get(effect.name) or parameters_of(effect, present.n_wheels))
     for _ in range(len(free) + 1):
         completion = _complete(records, prior, effects, free, starts)
         if completion is None or completion.free_at_edge is None:
