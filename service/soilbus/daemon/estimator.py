@@ -16,7 +16,7 @@ from soilbus.daemon.positions import Position
 from soilbus.estimation.gauss_newton import Fit
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.soil_class import SoilClasses, guessed
-from soilbus.estimation.tracker import Ground, Settings, Tracked, Tracker
+from soilbus.estimation.tracker import MIN_ROWS, Ground, Settings, Tracked, Tracker
 from soilbus.estimation.window import Window
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.traversability import Demand, Status, Traversability, judge
@@ -82,9 +82,12 @@ class WindowEstimator:
         self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
         self._guess = guessed(self.prior, prior_of(Config()))
         settings = config.estimator
+        least = MIN_ROWS if config.table is None else 1  # a table's rows are chosen with care, and few
         self._tracker = Tracker(
             self.rig, self.prior, self.model,
-            Settings(settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift),
+            Settings(
+                settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift, least
+            ),
         )  # fmt: skip
 
     def solve(self, task: WindowTask) -> WindowResult:
