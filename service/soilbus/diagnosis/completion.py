@@ -90,6 +90,11 @@ class Completion:
         return sum(check.rows for check in self.checks)
 
     @property
+    def rows(self) -> int:
+        """Residuals of all blocks."""
+        return self.checked_rows + sum(fit.rows for fit in self.fits)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of the effects."""
         return tuple(effect.name for effect in self.effects)

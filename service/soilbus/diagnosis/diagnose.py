@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from soilbus.diagnosis.completion import Completion, complete
+import numpy as np
+
+from soilbus.diagnosis.completion import Completion, Start, complete
+from soilbus.diagnosis.learned import Correction, corrections
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.score import scores
-from soilbus.diagnosis.verdict import PAYS, PLAUSIBLE, SURE, Verdict, gap_limit, probabilities
+from soilbus.diagnosis.verdict import PLAUSIBLE, SURE, Verdict, is_real, pays, probabilities
 from soilbus.diagnosis.where import Disagreement, disagreements
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
@@ -19,6 +22,8 @@ TRIED = 6
 WORTH_TRYING = -2.0
 """Foreseen change of -2 log evidence above which a candidate is not fitted."""
 NOTHING = "none"
+SAME = 1.0
+"""Difference of -2 log evidence that is none."""
 
 
 class NotFitted(Exception):
@@ -37,13 +42,17 @@ class Addition:
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """What was found; base is the present model, completed the one with the effects added."""
+    """What was found; base is the present model, completed the one with the effects added.
+
+    learned describes what is left where the verdict is unknown.
+    """
 
     verdict: Verdict
     where: tuple[Disagreement, ...]
     additions: tuple[Addition, ...]
     base: Completion
     completed: Completion
+    learned: tuple[Correction, ...]
 
 
 def diagnose(
@@ -70,7 +79,11 @@ def diagnose(
             break
         addition, present = found
         additions.append(addition)
-    return Diagnosis(_verdict(base, present, additions), tuple(where), tuple(additions), base, present)
+        if len(additions) > 1:
+            additions, present = _reconsidered(records, prior, present, additions, candidates)
+    verdict = _verdict(base, present, additions)
+    learned = corrections(list(records), present) if verdict is Verdict.UNKNOWN else []
+    return Diagnosis(verdict, tuple(where), tuple(additions), base, present, tuple(learned))
 
 
 def _round(
@@ -88,16 +101,47 @@ def _round(
         return None
     falls = {name: present.evidence - completion.evidence for name, (_, completion) in tried.items()}
     best = max(falls, key=lambda name: falls[name])
-    if falls[best] < PAYS:
+    if not pays(falls[best], present.gap, present.checked_rows, present.rows):
         return None
-    chances = probabilities({NOTHING: 0.0} | {name: -fall for name, fall in falls.items()}, present.checked_rows)
+    chances = probabilities({NOTHING: 0.0} | {name: -fall for name, fall in falls.items()})
     others = {n: p for n, p in chances.items() if n not in (best, NOTHING) and p >= PLAUSIBLE}
     effect, completion = tried[best]
     return Addition(effect, chances[best], others, falls), completion
 
 
+def _reconsidered(
+    records: Sequence[Record],
+    prior: SoilPrior,
+    present: Completion,
+    additions: Sequence[Addition],
+    candidates: Sequence[Effect],
+) -> tuple[list[Addition], Completion]:
+    """Each earlier effect named anew beside the later ones: alone, it may have stood for two."""
+    chosen = list(additions)
+    for i in range(len(additions) - 1):
+        without = _without(records, prior, present, chosen[i].effect)
+        if without is None:
+            continue
+        found = _round(records, prior, without, [e for e in candidates if e.name not in without.names])
+        if found is not None and found[1].evidence < present.evidence + SAME:
+            chosen[i], present = found
+    order = {name: i for i, name in enumerate(present.names)}
+    return sorted(chosen, key=lambda addition: order[addition.effect.name]), present
+
+
+def _without(records: Sequence[Record], prior: SoilPrior, present: Completion, effect: Effect) -> Completion | None:
+    """The present model less one effect, fitted from where it stands."""
+    n_sensors = records[0].learned.n_sensors
+    kept = [n_sensors + i for i, f in enumerate(present.free) if f.effect != effect.name]
+    starts = [
+        Start(fit.belief.soil, np.concatenate([fit.belief.gains[:n_sensors], fit.belief.gains[kept]]))
+        for fit in present.fits
+    ]
+    return complete(records, prior, [e for e in present.effects if e.name != effect.name], starts)
+
+
 def _verdict(base: Completion, completed: Completion, additions: Sequence[Addition]) -> Verdict:
-    if completed.gap > gap_limit(completed.checked_rows):
+    if is_real(base.gap, completed.gap, completed.checked_rows):
         return Verdict.UNKNOWN
     if not additions:
         return Verdict.NONE
