@@ -381,9 +381,14 @@ def load_config(path: Path | str, overrides: Iterable[str] = ()) -> Config:
         raise ConfigError([f"{path}: {error.strerror or error}"]) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError([f"{path}: not TOML: {error}"]) from None
+    return parse_config(overridden(raw, overrides), folder=path.parent, source=str(path))
+
+
+def overridden(raw: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
+    """The nested mappings, changed in place by KEY=VALUE overrides; ConfigError for one that cannot be."""
     for text in overrides:
         _override(raw, text)
-    return parse_config(raw, folder=path.parent, source=str(path))
+    return raw
 
 
 def parse_config(raw: Mapping[str, Any], folder: Path = Path("."), source: str = "configuration") -> Config:
@@ -432,7 +437,8 @@ def _child(here: Any, part: str, path: str, text: str) -> Any:
         raise ConfigError([f"--set {text}: no {path}"])
     child = here.setdefault(part, {})
     if isinstance(child, str):  # "Message.Signal" grows into its table form
-        child = here[part] = {"signal": child}
+        here[part] = {"signal": child}
+        child = here[part]
     if not isinstance(child, (dict, list)):
         raise ConfigError([f"--set {text}: {path} is a value, not a table"])
     return child

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.assembly import completion_of, model_of, prior_of, rig_of
 from soilbus.capability import PullCurve
 from soilbus.config import Config
 from soilbus.daemon.intake import WindowTask
@@ -88,6 +88,7 @@ class WindowEstimator:
             Settings(
                 settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift, least
             ),
+            *completion_of(config),
         )  # fmt: skip
 
     def solve(self, task: WindowTask) -> WindowResult:

@@ -121,9 +121,13 @@ class Start:
 def complete(
     records: Sequence[Record], prior: SoilPrior, effects: Sequence[Effect], starts: Sequence[Start] | None = None
 ) -> Completion | None:
-    """A model with these effects fitted to all recordings; None where a fit fails."""
-    n_wheels = len(records[0].learned.rig.wheels)
-    free = tuple(f for effect in effects for f in parameters_of(effect, n_wheels))
+    """A model with these effects fitted to all recordings; None where a fit fails.
+
+    Parameters of effects that the records' model has already keep the prior they have there.
+    """
+    present = records[0].learned
+    known_of = {e.name: [f for f in present.free if f.effect == e.name] for e in present.effects}
+    free = tuple(f for effect in effects for f in known_of.get(effect.name) or parameters_of(effect, present.n_wheels))
     fits, checks, befores = [], [], []
     known: Belief | None = None
     for i, record in enumerate(records):

@@ -63,7 +63,7 @@ def diagnose(
 ) -> Diagnosis:
     """The whole of it; NotFitted where already the present model cannot be fitted."""
     progress("fitting the present model")
-    base = complete(records, prior, ())
+    base = complete(records, prior, records[0].learned.effects)
     if base is None:
         raise NotFitted("the present model does not converge on these recordings")
     law = records[0].learned.model.shear_law

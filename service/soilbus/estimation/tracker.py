@@ -10,6 +10,7 @@ the soil and what is known of the sensors.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -17,12 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
+from soilbus.estimation.completed import CompletedProblem, Free
 from soilbus.estimation.coordinates import Coordinates
 from soilbus.estimation.gauss_newton import Fit, fit_window, foreseen, resume
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.soil_change import Crossing, suspicion, without_crossing
 from soilbus.estimation.window import Rig, Window
+from soilbus.terra.effects.effect import Effect
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import WheelModel
 
@@ -102,8 +105,17 @@ def elsewhere(prior: SoilPrior) -> SoilPrior:
 class Tracker:
     """Solves one window after the other; all state from window to window is here."""
 
-    def __init__(self, rig: Rig, prior: SoilPrior, model: WheelModel, settings: Settings) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        prior: SoilPrior,
+        model: WheelModel,
+        settings: Settings,
+        effects: Sequence[Effect] = (),
+        free: Sequence[Free] = (),
+    ) -> None:
         self.rig, self.prior, self.model, self.settings = rig, prior, model, settings
+        self.effects, self.free = tuple(effects), tuple(free)
         self.forget()
 
     @property
@@ -232,4 +244,5 @@ class Tracker:
         return window.rows(np.flatnonzero(window.t >= self._crossing.end))
 
     def _problem(self, window: Window) -> WindowProblem:
-        return WindowProblem(window, self.rig, self.model, self.settings.min_speed, self.settings.max_turn)
+        speed, turn = self.settings.min_speed, self.settings.max_turn
+        return CompletedProblem(window, self.rig, self.model, speed, turn, self.effects, self.free)
