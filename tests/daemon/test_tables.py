@@ -12,9 +12,9 @@ from availability import unavailable
 from single_wheel import NOISE, RIG, WIDTH, noisy, sweep, write_csv
 from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.config import Config, ConfigError, parse_config
+from soilbus.daemon.diagnose import diagnose_logs
 from soilbus.daemon.outputs import json_line
-from soilbus.daemon.tables import TableError, candidates, records_of, replay_tables, runs_of, window_of_rows
-from soilbus.diagnosis.diagnose import diagnose
+from soilbus.daemon.tables import TableError, candidates, recordings_of_tables, replay_tables, runs_of, window_of_rows
 from soilbus.diagnosis.records import TooLittle
 from soilbus.diagnosis.verdict import Verdict
 from soilbus.estimation.gauss_newton import fit_window
@@ -235,10 +235,7 @@ def test_diagnosis_of_tables_names_what_was_hidden_and_nothing_where_nothing_was
             write_csv(tmp_path / f"{i}.csv", noisy(sweep(soil, LOADS, slips, active), rng))
             for i, soil in enumerate(beds)
         ]
-        config = rig()
-        records = [record for path in paths for record in records_of(config, path)[0]]
-        runs = [run for path in paths for run in runs_of(config, path)]
-        found = diagnose(records, prior_of(config), candidates(config, runs))
+        found = diagnose_logs(rig(), paths).diagnosis
         assert found.verdict is verdict
         assert [a.effect.name for a in found.additions] == [a.effect.name for a in active]
     assert found.base.gap > 2.0 > 1.6 > found.completed.gap
@@ -246,23 +243,24 @@ def test_diagnosis_of_tables_names_what_was_hidden_and_nothing_where_nothing_was
 
 def test_a_table_of_few_rows_learns_from_two_thirds_spread_over_all_slips(tmp_path, measured):
     first = {k: v[:7] for k, v in measured.items()}
-    (record,), too_short = records_of(rig(), write_csv(tmp_path / "t.csv", first))
-    assert (record.learned.n, record.checked.n, too_short) == (5, 2, [])
+    recordings = recordings_of_tables(rig(), [write_csv(tmp_path / "t.csv", first)])
+    (record,) = recordings.records
+    assert (record.learned.n, record.checked.n, recordings.too_short) == (5, 2, ())
     assert (
         record.learned.slip.min() < record.checked.slip.min() <= record.checked.slip.max() < record.learned.slip.max()
     )
     with pytest.raises(TooLittle, match="5 usable rows are too few"):
-        records_of(rig(), write_csv(tmp_path / "s.csv", {k: v[:5] for k, v in measured.items()}))
+        recordings_of_tables(rig(), [write_csv(tmp_path / "s.csv", {k: v[:5] for k, v in measured.items()})])
 
 
 def test_effects_that_a_table_cannot_tell_are_no_candidates(tmp_path, measured):
     path = write_csv(tmp_path / "t.csv", measured | {"s": np.arange(len(measured["slip"]))})
-    names = {effect.name for effect in candidates(rig(), runs_of(rig(), path))}
+    records = recordings_of_tables(rig(), [path]).records
+    names = {effect.name for effect in candidates(rig(), records)}
     assert set(CATALOGUE) - names == {
         "rate_stiffening", "inertia", "torque_lag", "soil_drift", "grade", "multipass",
     }  # fmt: skip
-    with_times = rig(t="s")
-    names = {effect.name for effect in candidates(with_times, runs_of(with_times, path))}
+    names = {effect.name for effect in candidates(rig(t="s"), records)}
     assert set(CATALOGUE) - names == {"rate_stiffening", "inertia", "multipass"}
 
 

@@ -18,11 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.assembly import model_of, rig_of
+from soilbus.assembly import completion_of, model_of, rig_of
 from soilbus.config import Column, Config, Table
 from soilbus.daemon.estimator import WindowEstimator, WindowResult
 from soilbus.daemon.intake import WindowTask, column_means
 from soilbus.daemon.positions import PositionTrack
+from soilbus.daemon.recordings import Recordings
+from soilbus.daemon.replay import LogError
 from soilbus.diagnosis.records import Record, TooLittle, record_of_rows
 from soilbus.estimation.readings import MAX_SLIP, MIN_SLIP
 from soilbus.estimation.window import Rig, Window, window_of_samples
@@ -46,7 +48,7 @@ OF_SEVERAL_WHEELS = frozenset({"multipass"})
 _ROLES = ("wheel_load", "slip", "drawbar_pull", "torque", "sinkage", "t")
 
 
-class TableError(Exception):
+class TableError(LogError):
     """A table cannot be read; the text says in one line where and why."""
 
 
@@ -114,30 +116,30 @@ def _task(index: int, run: Run, rig: Rig) -> WindowTask:
     )
 
 
-def record_of_run(run: Run, config: Config) -> Record:
-    """A run as the diagnosis wants it; TooLittle where it has too few rows."""
-    return record_of_rows(run.name, run.window, rig_of(config), model_of(config))
-
-
-def records_of(config: Config, path: Path) -> tuple[list[Record], list[str]]:
-    """The runs of a table that are long enough to be diagnosed, and the names of the others.
-
-    TableError as runs_of(); TooLittle where no run is long enough.
-    """
+def recordings_of_tables(config: Config, paths: Sequence[Path]) -> Recordings:
+    """The runs of tables as the diagnosis wants them; TableError as runs_of(), TooLittle for a table of short runs."""
+    rig, model = rig_of(config), model_of(config)
+    effects, free = completion_of(config)
     records: list[Record] = []
-    too_short: list[str] = []
-    for run in runs_of(config, path):
-        try:
-            records.append(record_of_run(run, config))
-        except TooLittle as error:
-            too_short.append(run.name)
-            fault = error
-    if not records:
-        raise fault
-    return records, too_short
+    first, too_short, rejected, samples = [], [], Counter[str](), 0
+    for path in paths:
+        first.append(len(records))
+        for run in runs_of(config, path):
+            samples += run.window.samples
+            rejected += Counter(run.rejected)
+            try:
+                record = record_of_rows(run.name, run.window, rig, model)
+            except TooLittle as error:
+                too_short.append(run.name)
+                fault = error
+                continue
+            records.append(Record(run.name, *(p.completed(effects, free) for p in (record.learned, record.checked))))
+        if len(records) == first[-1]:
+            raise fault
+    return Recordings(tuple(records), tuple(first), samples, dict(rejected.most_common()), tuple(too_short))
 
 
-def candidates(config: Config, runs: Sequence[Run]) -> list[Effect]:
+def candidates(config: Config, records: Sequence[Record]) -> list[Effect]:
     """The effects that a table can tell, with priors for a wheel of this size and load.
 
     Not those of the true speed, of other wheels, nor, without a column of times, those
@@ -146,7 +148,7 @@ def candidates(config: Config, runs: Sequence[Run]) -> list[Effect]:
     unknown = OF_TRUE_SPEED | OF_SEVERAL_WHEELS
     if config.table is None or config.table.t is None:
         unknown |= OF_TIME
-    load = float(np.mean(np.concatenate([run.window.load[:, 0] for run in runs])))
+    load = float(np.mean(np.concatenate([record.learned.load[:, 0] for record in records])))
     radius = config.wheel[0].radius
     return [for_wheel(effect, load, radius) for effect in CATALOGUE.values() if effect.name not in unknown]
 
