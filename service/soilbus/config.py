@@ -188,6 +188,12 @@ class Table(_Section):
             raise ValueError("map at least one of drawbar_pull, torque and sinkage: nothing to compare the model with")
         return self
 
+    @property
+    def columns(self) -> dict[str, Column]:
+        """The mapped columns of numbers, by role."""
+        roles = ("wheel_load", "slip", "drawbar_pull", "torque", "sinkage", "t")
+        return {role: column for role in roles if (column := getattr(self, role)) is not None}
+
 
 class Noise(_Section):
     """One channel's error: sd of each sample and sd of a gain fixed over a recording.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from soilbus.diagnosis.records import TooLittle
 from soilbus.diagnosis.verdict import Verdict
 from soilbus.estimation.gauss_newton import fit_window
 from soilbus.estimation.residuals import WindowProblem
+from soilbus.report.configuration import configuration_report
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active, Effect
 from soilbus.terra.effects.size import LOAD, RADIUS, for_wheel
@@ -284,3 +286,12 @@ def test_the_published_table_is_read_with_its_missing_torques(field_recording):
     assert len(run.window.t) == 5
     assert np.isnan(run.window.torque).all()
     np.testing.assert_allclose(run.window.draft, [8.1, 8.6, 8.8, 9.6, 10.5])
+
+
+def test_check_lists_the_columns_and_what_they_tell():
+    text = configuration_report(rig(torque=None, slip={"column": "slip_percent", "factor": 0.01}))
+    assert re.search(r"slip +slip_percent +0\.01", text)
+    assert re.search(r"K +yes: drawbar pull over varied slip", text)
+    only_depth = configuration_report(rig(torque=None, drawbar_pull=None))
+    assert re.search(r"phi +no: needs torque or drawbar pull", only_depth)
+    assert re.search(r"n +yes: sinkage", only_depth)

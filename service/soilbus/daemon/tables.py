@@ -45,7 +45,6 @@ MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
 OF_TRUE_SPEED = frozenset({"rate_stiffening", "inertia"})
 OF_TIME = frozenset({"torque_lag", "soil_drift", "grade"})
 OF_SEVERAL_WHEELS = frozenset({"multipass"})
-_ROLES = ("wheel_load", "slip", "drawbar_pull", "torque", "sinkage", "t")
 
 
 class TableError(LogError):
@@ -75,8 +74,7 @@ def runs_of(config: Config, path: Path) -> list[Run]:
     chosen = _chosen(path, columns, table.where)
     if not chosen:
         raise TableError(f"{path}: no row in it" + (" that [table] where asks for" if table.where else ""))
-    roles = {role: getattr(table, role) for role in _ROLES if getattr(table, role) is not None}
-    values = {role: _numbers(path, columns, column, chosen) for role, column in roles.items()}
+    values = {role: _numbers(path, columns, column, chosen) for role, column in table.columns.items()}
     names = [path.name] * len(chosen)
     if table.run is not None:
         names = [f"{path.name}, {str(columns[table.run][row]).strip()}" for row in chosen]
@@ -196,7 +194,7 @@ def window_of_rows(rig: Rig, t: Array, values: Mapping[str, Array], rim_speed: f
 
 def _needed(table: Table) -> list[str]:
     """Names of the columns that must be there."""
-    mapped = [getattr(table, role).column for role in _ROLES if getattr(table, role) is not None]
+    mapped = [column.column for column in table.columns.values()]
     return list(dict.fromkeys([*mapped, *([table.run] if table.run else []), *table.where]))
 
 
