@@ -31,6 +31,8 @@ SETTLING = 1.0
 """The same, below which the latents and gains join in."""
 ENOUGH = 0.02
 """Relative fall of the cost below which the approach has done its part."""
+LITTLE = 1e-3
+"""The same where other parameters than the soil's move too."""
 WORSE = 20.0
 """Rise of the cost that a step may bring: where the cost bends, steps that overshoot come back by themselves."""
 SLOWLY = 0.5
@@ -204,12 +206,14 @@ def descend(problem: WindowProblem, prior: SoilPrior, start: Soil, before: Belie
         return None if near is None else _settle(Fitting(problem, prior, before), near, MAX_ITERATIONS)
 
 
-def continued(problem: WindowProblem, prior: SoilPrior, before: Belief, soil: Array, gains: Array) -> Fit | None:
-    """Descent of everything together from a soil (6,) and gains (G,) near the optimum; None as descend()."""
-    fitting = Fitting(problem, prior, before)
+def continued(
+    problem: WindowProblem, prior: SoilPrior, before: Belief, soil: Array, gains: Array, first: int
+) -> Fit | None:
+    """Descent from a soil (6,) and gains (G,), of which those from the `first` on move with the soil from the start."""
     with np.errstate(all="ignore"):
-        latents = problem.carried(problem.start(Soil(*soil.tolist())), Soil(*soil.tolist()), gains)
-        return _settle(fitting, Place(soil, gains, latents, np.inf, 0), MAX_ITERATIONS)
+        moving = Fitting(problem, prior, before, first=first)
+        near = _approach(moving, soil, MAX_ITERATIONS, LITTLE, gains)
+        return None if near is None else _settle(Fitting(problem, prior, before), near, MAX_ITERATIONS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,9 +246,11 @@ def resume(ahead: Foreseen) -> Fit | None:
         return _settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED, first)
 
 
-def _approach(fitting: Fitting, soil: Array, most: int, least: float = ENOUGH) -> Place | None:
-    """Levenberg-damped steps of the soil alone, until they are short."""
-    place = fitting.start(soil)
+def _approach(
+    fitting: Fitting, soil: Array, most: int, least: float = ENOUGH, gains: Array | None = None
+) -> Place | None:
+    """Levenberg-damped steps of the soil and the active gains, latents as measured, until they are short."""
+    place = fitting.start(soil, gains=gains)
     point = fitting.point(place)
     damping, trials = 1e-3, 1
     while point is not None:
@@ -253,8 +259,7 @@ def _approach(fitting: Fitting, soil: Array, most: int, least: float = ENOUGH) -
             return None
         if point.length(step) < SETTLING or trials >= most or damping > 1e6:
             return replace(place, cost=point.cost, trials=trials)
-        new_soil = fitting.coordinates.moved(place.soil, step)
-        new_place = fitting.start(new_soil, place.latents.entry_angle)
+        new_place = fitting.restarted(place, step)
         new = fitting.point(new_place)
         trials += 1
         if new is None or new.cost >= point.cost:
