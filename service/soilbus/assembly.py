@@ -10,6 +10,7 @@ import numpy as np
 
 from soilbus.config import Config, ConfigError
 from soilbus.config import Effect as EffectSetting
+from soilbus.estimation.completed import Free
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.window import Rig, SensorNoise
 from soilbus.terra.effects.catalogue import CATALOGUE
@@ -19,15 +20,20 @@ from soilbus.terra.wheel import FAST_NODES, WheelModel
 
 
 def rig_of(config: Config) -> Rig:
-    """The vehicle with the wheels that have all of torque, speed and load."""
-    wheels = [w for w in config.wheel if w.torque and w.speed and w.load]
+    """The vehicle with the wheels that have all of torque, speed and load; the one wheel of a test rig."""
+    of_table = config.table is not None
+    wheels = [w for w in config.wheel if of_table or (w.torque and w.speed and w.load)]
+    noise = {q: SensorNoise(**getattr(config.noise, q).model_dump()) for q in type(config.noise).model_fields}
+    slip = noise.pop("slip")
+    if of_table:  # its speeds are stand-ins for the slip, see tables.py
+        noise |= {"speed": SensorNoise(), "ground_speed": slip}
     return Rig(
         wheels=tuple(w.name for w in wheels),
         radius=np.array([w.radius for w in wheels]),
         width=np.array([w.width for w in wheels]),
-        front=np.array([w.axle == "front" for w in wheels], dtype=bool),
+        front=np.array([of_table or w.axle == "front" for w in wheels], dtype=bool),
         chassis=chassis_of(config),
-        noise={q: SensorNoise(**getattr(config.noise, q).model_dump()) for q in type(config.noise).model_fields},
+        noise=noise,
     )
 
 
@@ -42,10 +48,7 @@ def prior_of(config: Config) -> SoilPrior:
 
 
 def model_of(config: Config) -> WheelModel:
-    """The wheel-soil model for fits; ConfigError for an effect that the catalogue lacks."""
-    unknown = [e.name for e in config.model.effects]
-    if unknown:
-        raise ConfigError([f"model.effects: no effect is named {name}" for name in unknown])
+    """The wheel-soil model for fits, without effects."""
     return WheelModel(shear_law=config.model.shear_law, nodes=FAST_NODES)
 
 
@@ -77,6 +80,29 @@ def effects_of(config: Config, wheels: Sequence[str] | None = None) -> tuple[Act
         Active(effect, {name: value[place] if np.ndim(value) else value for name, value in values.items()})
         for effect, values in (found[name] for name in CATALOGUE if name in found)
     )
+
+
+def completion_of(config: Config) -> tuple[tuple[Effect, ...], tuple[Free, ...]]:
+    """The effects that complete the estimator's model, and what is known of their parameters.
+
+    Those of model.effects but for the ones that describe the ground of one recording
+    (Effect.of_record).  A parameter's value is the prior's mean and its std the prior's; one
+    without std is held.  Wheels count as in rig_of.  ConfigError as `effects_of`.
+    """
+    wheels = rig_of(config).wheels
+    settings = {setting.name: setting.model_extra or {} for setting in config.model.effects}
+    active = [a for a in effects_of(config, wheels) if not a.effect.of_record]
+    free: list[Free] = []
+    for effect, values in active:
+        for parameter in effect.parameters:
+            given = settings[effect.name].get(parameter.name)
+            if not effect.each_wheel:
+                free.append(Free(effect.name, parameter, None, values[parameter.name], _std(given)))
+                continue
+            for i, name in enumerate(wheels):
+                of_wheel = given.get(name) if isinstance(given, Mapping) and _by_wheel(given) else given
+                free.append(Free(effect.name, parameter, i, float(values[parameter.name][i]), _std(of_wheel)))
+    return tuple(effect for effect, _ in active), tuple(free)
 
 
 def with_effects(config: Config, texts: Iterable[str]) -> Config:
@@ -154,11 +180,20 @@ def _by_wheel(given: Any) -> bool:
 
 def _within(given: Any, parameter: Parameter) -> float:
     if isinstance(given, Mapping) and set(given) <= {"value", "std"}:
+        _std(given)
         given = given.get("value")
     value = _number(given)
     if not parameter.low <= value <= parameter.high:
         raise ConfigError([f"{value:g} is not within {parameter.low:g}..{parameter.high:g}"])
     return value
+
+
+def _std(given: Any) -> float:
+    """The std that a parameter is given with, 0 where it has none."""
+    std = _number(given.get("std", 0.0)) if isinstance(given, Mapping) else 0.0
+    if std < 0.0:
+        raise ConfigError([f"std {std:g} is less than 0"])
+    return std
 
 
 def _number(given: Any) -> float:

@@ -96,6 +96,14 @@ def _parser() -> argparse.ArgumentParser:
     target.add_argument("--bus", action="store_true", help="send to the configured bus in real time")
     target.add_argument("--log", type=Path, metavar="OUT", help="write a log (.log .log.gz .asc .blf)")
 
+    sub = command("diagnose", _diagnose, "what the model misses: find, name, add, show")
+    sub.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="recordings of one vehicle")
+    sub.add_argument("--json", type=Path, metavar="OUT", help="write the findings as JSON; - for stdout")
+    sub.add_argument("--report", type=Path, metavar="OUT.html", help="self-contained HTML with plots (extra: plots)")
+    sub.add_argument(
+        "--model-out", type=Path, metavar="OUT.toml", help="the configuration with the effects found, for any command"
+    )
+
     sub = command("watch", _watch, "live terminal dashboard that reads only our frames", "optional")
     sub.add_argument("--seconds", type=float, metavar="S", help="stop after this time")
 
@@ -220,6 +228,42 @@ def _simulate(args: argparse.Namespace) -> None:
         print(f"soilbus: the tractor is stuck after {recording.bogged_at:.1f} s", file=sys.stderr)
 
 
+def _diagnose(args: argparse.Namespace) -> None:
+    from soilbus.config_file import with_effects_text
+    from soilbus.daemon.diagnose import diagnose_logs
+    from soilbus.daemon.replay import LogError
+    from soilbus.diagnosis.diagnose import NotFitted
+    from soilbus.diagnosis.model_out import effect_tables
+    from soilbus.diagnosis.records import TooLittle
+    from soilbus.report.findings import findings_json, findings_text
+    from soilbus.report.progress import phases
+
+    config = _configured(args)
+    if args.report is not None:
+        _need("matplotlib", "plots", "--report")
+        from soilbus.report.diagnosis import diagnosis_report
+    _check_folders(args.json, args.report, args.model_out)
+    try:
+        with phases("diagnose") as say:
+            findings = diagnose_logs(config, args.logs, say)
+    except (LogError, NotFitted, TooLittle) as error:
+        raise WorkError(str(error)) from None
+    texts: list[tuple[Path, str]] = []
+    if args.json is not None:
+        texts.append((args.json, findings_json(findings)))
+    if args.report is not None:
+        texts.append((args.report, diagnosis_report(findings)))
+    if args.model_out is not None:
+        effects, notes = effect_tables(findings.diagnosis.completed)
+        text = with_effects_text(Path(args.config), args.set, effects, args.model_out.parent, notes)
+        texts.append((args.model_out, text))
+    for path, text in texts:
+        with _whole_file(path) as out:
+            out.write(text)
+    if all(str(path) != "-" for path, _ in texts):
+        print(findings_text(findings), end="")
+
+
 def _watch(args: argparse.Namespace) -> None:
     from soilbus.can.bus import BusError
     from soilbus.report.dashboard import watch
@@ -310,6 +354,13 @@ def _need(module: str, extra: str, what: str) -> None:
 
     if find_spec(module) is None:
         raise WorkError(f"{what} needs the extra soilbus[{extra}]")
+
+
+def _check_folders(*paths: Path | None) -> None:
+    """Long work asks first whether there is a place for what comes of it."""
+    for path in paths:
+        if path is not None and not path.parent.is_dir():
+            raise WorkError(f"{path}: no folder {path.parent}")
 
 
 @contextmanager

@@ -25,6 +25,17 @@ def shipped_dbc(name: str) -> Path:
     raise FileNotFoundError(f"soilbus ships no {name}")
 
 
+def located(folder: Path, name: str) -> Path:
+    """Path of the DBC file that a configuration in this folder calls so: beside it, or ours by name."""
+    beside = folder / name
+    if beside.is_file():
+        return beside
+    try:
+        return shipped_dbc(name)
+    except FileNotFoundError:
+        return beside
+
+
 def load_databases(config: Config) -> Database:
     """All DBC files of the configuration as one database.
 
@@ -37,7 +48,7 @@ def load_databases(config: Config) -> Database:
     messages: dict[str, tuple[str, Message]] = {}
     for name in config.dbc.input:
         try:
-            for message in _read(_located(config, name)).messages:
+            for message in _read(located(config.folder, name)).messages:
                 first, known = messages.setdefault(message.name, (name, message))
                 if not _same(known, message):
                     faults.append(f"dbc.input: {first} and {name} define message {message.name} differently")
@@ -56,7 +67,7 @@ def checked_messages(config: Config) -> frozenset[str]:
     Those are messages with both signals in DBC files that soilbus ships; what another maker's
     Checksum means is not known.
     """
-    ours = [path for name in config.dbc.input if _is_shipped(path := _located(config, name))]
+    ours = [path for name in config.dbc.input if _is_shipped(path := located(config.folder, name))]
     found = (m for path in ours for m in _read(path).messages)
     return frozenset(m.name for m in found if checksum_byte_of(m) is not None)
 
@@ -68,7 +79,7 @@ def output_database(config: Config) -> Database:
     """
     name = config.output.dbc
     try:
-        database = _read(_located(config, name))
+        database = _read(located(config.folder, name))
         ours = {m.name for m in _read(shipped_dbc("soilbus.dbc")).messages}
     except OSError as error:
         raise ConfigError([f"output.dbc: {name}: {error.strerror or error}"]) from None
@@ -78,16 +89,6 @@ def output_database(config: Config) -> Database:
     if missing:
         raise ConfigError([f"output.dbc: {name}: no message {', '.join(missing)}"])
     return database
-
-
-def _located(config: Config, name: str) -> Path:
-    beside = config.folder / name
-    if beside.is_file():
-        return beside
-    try:
-        return shipped_dbc(name)
-    except FileNotFoundError:
-        return beside
 
 
 def _is_shipped(path: Path) -> bool:

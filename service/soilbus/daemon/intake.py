@@ -171,6 +171,20 @@ class Intake:
         self.ingest(math.inf)
         return tasks + self.due(now)
 
+    def taken_whole(self) -> Window | None:
+        """All that was ingested since the clock was last set, as one window; what comes later begins anew.
+
+        None where there is no sample; the bin that has just begun is left out.
+        """
+        bins, end = self._bins, max(self.last_seen.values(), default=-math.inf)
+        window = None
+        if bins is not None and end - bins.origin >= bins.bin_length:
+            end = bins.origin + math.floor((end - bins.origin) / bins.bin_length) * bins.bin_length
+            window = forward(bins.window(bins.origin, end))
+            self.refusals.note(WILD, bins.new_wild())
+        self._restart()
+        return window
+
     def _task(self, bins: BinStore, end: float) -> WindowTask:
         start = end - self._settings.window
         window = forward(bins.window(start, end))

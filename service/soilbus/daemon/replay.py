@@ -114,6 +114,17 @@ def replay(
 
 
 def _tasks(intake: Intake, logs: Sequence[Path], progress: Callable[[int, float], None] | None) -> Iterator[WindowTask]:
+    last = 0.0
+    for last in fed(intake, logs, progress):
+        yield from intake.due(last)
+    yield from intake.finish(last)
+
+
+def fed(intake: Intake, logs: Sequence[Path], progress: Callable[[int, float], None] | None = None) -> Iterator[float]:
+    """Feeds the frames of the logs to an intake; LogError as read_log().
+
+    Yields the time [s] when a window has ended, every second of the recording, and at its end.
+    """
     feed = intake.admission.feed
     last = 0.0
     n = 0
@@ -126,12 +137,12 @@ def _tasks(intake: Intake, logs: Sequence[Path], progress: Callable[[int, float]
                 continue
             last = t
             if last >= due or last < due - 2.0:
-                yield from intake.due(last)
+                yield last
                 due = min(intake.next_end, last + 1.0)
                 if progress is not None:
                     progress(n, last)
             feed(t, identifier, extended, data, remote)
-    yield from intake.finish(last)
+    yield last
 
 
 @contextmanager
@@ -168,9 +179,9 @@ def _estimate(task: WindowTask) -> Undecided:
     return _estimator.estimate(task)
 
 
-def check_heard(pipeline: Pipeline, logs: Iterable[Path]) -> None:
+def check_heard(listener: Pipeline | Intake, logs: Iterable[Path]) -> None:
     """Raises LogError where not one frame of a mapped message was in the logs."""
-    counts = pipeline.admission.counts
+    counts = listener.admission.counts
     if not sum(counts.received.values()):
         names = ", ".join(str(p) for p in logs)
         raise LogError(f"{names}: none of its {counts.unknown} frames is in the DBC: a log of another bus?")

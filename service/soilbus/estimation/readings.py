@@ -23,7 +23,8 @@ GAIN_QUANTITIES = ("torque", "load", "speed", "ground_speed", "draft")
 _BY_INSTANT = (
     "t", "usable", "torque", "torque_var", "has_torque", "sinkage", "sinkage_var", "has_sinkage", "load", "load_var",
     "speed", "speed_var", "ground_speed", "ground_speed_var", "slip", "draft", "draft_var", "demand", "demand_var",
-    "has_balance", "_measured", "_measured_var", "_row_var", "_known",
+    "has_balance", "since", "distance", "wheel_angle", "acceleration",
+    "_measured", "_measured_var", "_row_var", "_known",
 )  # fmt: skip
 """Attributes of a window's problem with a row for each instant."""
 
@@ -70,8 +71,13 @@ class Readings:
         self.load = np.where(usable, load, 1e3)
         self.speed = np.where(usable, speed, self.ground_speed[:, None] / (0.8 * rig.radius))
         self.load_var, self.speed_var = np.where(usable, load_var, 0.0), np.where(usable, speed_var, 0.0)
+        self.since, self.distance = travelled(self.t, self.ground_speed, window.t)
+        self.duration = float(window.t[-1] - window.t[0]) if len(window.t) else 0.0
+        self.length = float(self.distance[-1]) if len(self.distance) else 0.0
+        self.wheel_angle = turned(self.t, self.speed)
         self._balance(take, usable)
         self.gain_names, self.gain_std = self._gains()
+        self.n_sensors = len(self.gain_names)
         self.slip = slip[kept]
         self._measured = np.concatenate([self.load, self.speed, self.ground_speed[:, None]], axis=1)
         self._measured_var = np.concatenate([self.load_var, self.speed_var, self.ground_speed_var[:, None]], axis=1)
@@ -94,6 +100,7 @@ class Readings:
         """The pull that draft, slope and inertia ask of the wheels, and its variance."""
         self.draft, draft_var, known = take("draft")
         demand, variance = self.draft.copy(), draft_var.copy()
+        acceleration = np.zeros_like(demand)
         if self.rig.chassis is not None:
             mass = self.rig.chassis.mass
             pitch, pitch_var, has_pitch = take("pitch")
@@ -106,6 +113,7 @@ class Readings:
                 acceleration, acceleration_var = differentiated_speed(self.t, self.ground_speed, self.ground_speed_var)
             demand += mass * (GRAVITY * np.sin(pitch) + acceleration)
             variance += mass**2 * ((GRAVITY * np.cos(pitch)) ** 2 * pitch_var + acceleration_var)
+        self.acceleration = acceleration
         self.demand, self.demand_var = demand, variance
         self.draft_var = np.where(known & usable.all(axis=1), draft_var, 0.0)
         self.has_balance = known & usable.all(axis=1)
@@ -129,13 +137,28 @@ class Readings:
         """Number of residuals that count."""
         return self._n_known
 
-    def _part(self, instants: slice | NDArray[np.intp]) -> Self:
-        """The same with only these instants."""
+    def part(self, instants: slice | NDArray[np.intp]) -> Self:
+        """The same with only these of its instants."""
         part = copy(self)
         for name in _BY_INSTANT:
             setattr(part, name, getattr(self, name)[instants])
         part._count()
         return part
+
+
+def travelled(t: Array, ground_speed: Array, window: Array) -> tuple[Array, Array]:
+    """Time [s] and distance [m] (N,) of instants t (N,) since the first bin of a window at times (M,)."""
+    if not len(t):
+        return np.zeros(0), np.zeros(0)
+    mean = (ground_speed[1:] + ground_speed[:-1]) / 2.0
+    first = ground_speed[0] * (t[0] - window[0])
+    return t - window[0], np.concatenate([[0.0], np.cumsum(mean * np.diff(t))]) + first
+
+
+def turned(t: Array, speed: Array) -> Array:
+    """Angles [rad] (N, W) that wheels of these speeds [rad/s] (N, W) have turned since the first of times t (N,)."""
+    steps = (speed[1:] + speed[:-1]) / 2.0 * np.diff(t)[:, None]
+    return np.concatenate([np.zeros((min(len(t), 1), speed.shape[1])), np.cumsum(steps, axis=0)])
 
 
 def differentiated_speed(t: Array, speed: Array, variance: Array, half_width: int = 3) -> tuple[Array, Array]:

@@ -41,20 +41,29 @@ SAME_INSTANT = 1e-3
 """Times [s] closer than this are those of one bin."""
 
 
-class _Wheels(NamedTuple):
+class Response(NamedTuple):
     """Drawbar pull, torque and sinkage (3, N, W) of wheels that carry the latent loads.
 
-    by: their derivatives (3, 7, N, W) by slip and the soil parameters, by_load: by the
-    load.  load_by (7, N, W), load_slope, off: derivatives of the load at the latent entry
-    angle, by that angle, and how much it is off (N, W).
+    by_load, by_speed, by_ground: their derivatives (3, N, W) by the latents, by_soil
+    (3, 6, N, W) and by_effects (3, P, N, W) those by the soil parameters and by what else
+    the model has.  load_by_slip (N, W), load_by_soil (6, N, W), load_slope, off (N, W):
+    derivatives of the load at the latent entry angle, by that angle, and how much it is off.
+    pull (N,) [N] is what the wheels must pull besides what the readings ask for, with its
+    derivatives by the effects (P, N).
     """
 
     value: Array
-    by: Array
     by_load: Array
-    load_by: Array
+    by_speed: Array
+    by_ground: Array
+    by_soil: Array
+    load_by_slip: Array
+    load_by_soil: Array
     load_slope: Array
     off: Array
+    by_effects: Array
+    pull: Array
+    pull_by_effects: Array
 
 
 class WindowProblem(Readings):
@@ -70,15 +79,15 @@ class WindowProblem(Readings):
         """The same window with at most so many of its usable instants, evenly spread."""
         if self.n <= most:
             return self
-        return self._part(np.linspace(0, self.n - 1, most).round().astype(int))
+        return self.part(np.linspace(0, self.n - 1, most).round().astype(int))
 
     def start(self, soil: Soil, guess: Array | None = None) -> Latents:
         """Latents at the measured values, entry angles solved for this soil from a guess (N, W)."""
         angle = np.full((self.n, self.n_wheels), np.nan) if guess is None else guess
         return self.carried(Latents(self.load.copy(), self.speed.copy(), self.ground_speed.copy(), angle), soil)
 
-    def carried(self, latents: Latents, soil: Soil) -> Latents:
-        """The same latents with the entry angles at which this soil carries their loads."""
+    def carried(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
+        """The same latents with the entry angles at which this soil carries their loads; gains (G,) as linearise()."""
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
         state = self._state(soil, latents.entry_angle, slip)
         angle = entry_angle_for_load(latents.load.ravel(), state, self.model, tolerance=START_TOLERANCE)
@@ -86,15 +95,15 @@ class WindowProblem(Readings):
         angle = np.where(np.isfinite(angle), angle, MAX_ENTRY_ANGLE * 0.98)
         return Latents(latents.load, latents.speed, latents.ground_speed, angle)
 
-    def sinkages(self, latents: Latents) -> Array:
-        """Sinkage [m] of each wheel at each instant (N, W), nan where the wheel is not usable."""
-        return np.where(self.usable, sinkage(latents.entry_angle, self.rig.radius), np.nan)
+    def sinkages(self, soil: Soil, gains: Array, latents: Latents) -> Array:
+        """Sinkage [m] of each wheel at each instant (N, W), whether it is usable or not."""
+        return np.asarray(sinkage(latents.entry_angle, self.rig.radius))
 
-    def mean_sinkage(self, latents: Latents) -> Array:
-        """Mean sinkage [m] of each wheel (W,), nan for a wheel that is never usable."""
+    def mean_sinkage(self, soil: Soil, gains: Array, latents: Latents) -> Array:
+        """Mean sinkage [m] of each wheel (W,), nan for a wheel that is never usable; gains (G,) as linearise()."""
         known = self.usable.sum(0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray(np.where(self.usable, self.sinkages(latents), 0.0).sum(0) / known)
+            return np.asarray(np.where(self.usable, self.sinkages(soil, gains, latents), 0.0).sum(0) / known)
 
     def after(self, before: Optimum) -> tuple[Latents, Linearised]:
         """Latents and model of this window at the optimum of one that ends a little earlier.
@@ -105,7 +114,7 @@ class WindowProblem(Readings):
         shared = self._shared(before.t)
         if before.at.by_latents.shape[1] != self._n_residuals:
             shared = 0
-        new = self._part(slice(shared, None))
+        new = self.part(slice(shared, None))
         start = new._measured_on(self._angle_curve(before.latents))
         at = new.linearise(Soil(*before.soil.tolist()), before.gains, start)
         if not shared:
@@ -144,30 +153,26 @@ class WindowProblem(Readings):
 
     def linearise(self, soil: Soil, gains: Array, latents: Latents) -> Linearised:
         """Whitened residuals and derivatives at a soil, gains (G,) and latents."""
-        W, rim = self.n_wheels, self.rig.radius * latents.speed
-        carried = latents.ground_speed[:, None] / rim  # 1 - slip
-        at = self._at_the_loads(soil, latents, 1.0 - carried)
-        A = self._by_latents(at.by_load, at.by[:, 0], carried / latents.speed, -1.0 / rim)
+        W = self.n_wheels
+        at = self._response(soil, gains, latents)
+        A = self._by_latents(at)
 
-        # A sensor reads (1 + gain) times the truth, plus noise: readings are scaled back, and their
-        # noise with them, else a gain that makes everything smaller would seem to fit better.
-        scale = 1.0 / (1.0 + gains)
-        of_torque, of_latents, of_draft = scale[:W], scale[W:-1], scale[-1]
-        corrected, variance = self._measured * of_latents, self._measured_var * of_latents**2
+        of_torque, of_latents, of_draft, corrected, variance, row_var = self._corrected(gains)
         draft, draft_var = self.draft * of_draft, self.draft_var * of_draft**2
-        row_var = self._row_var.copy()
-        row_var[:, :W] *= of_torque**2
-        row_var[:, W] += draft_var - self.draft_var
 
         rows = np.zeros((*A.shape[:2], 7 + len(gains)))
-        residual, by_soil, by_gain = rows[:, :, 0], rows[:, :, 1:7], rows[:, :, 7:]
+        residual, by_soil, by_gain = rows[:, :, 0], rows[:, :, 1:7], rows[:, :, 7 : 7 + self.n_sensors]
+        by_effects = rows[:, :, 7 + self.n_sensors :]
         residual[:, :W] = self.torque * of_torque - at.value[1]
-        residual[:, W] = self.demand - self.draft + draft - at.value[0].sum(1)
-        by_soil[:, :W] = -at.by[1, 1:].transpose(1, 2, 0)
-        by_soil[:, W] = -at.by[0, 1:].sum(2).T
+        residual[:, W] = self.demand - self.draft + draft + at.pull - at.value[0].sum(1)
+        by_soil[:, :W] = -at.by_soil[1].transpose(1, 2, 0)
+        by_soil[:, W] = -at.by_soil[0].sum(2).T
+        by_effects[:, :W] = -at.by_effects[1].transpose(1, 2, 0)
+        by_effects[:, W] = (at.pull_by_effects - at.by_effects[0].sum(2)).T
         if self.with_sinkage:
             residual[:, W + 1 :] = self.sinkage - at.value[2]
-            by_soil[:, W + 1 :] = -at.by[2, 1:].transpose(1, 2, 0)
+            by_soil[:, W + 1 :] = -at.by_soil[2].transpose(1, 2, 0)
+            by_effects[:, W + 1 :] = -at.by_effects[2].transpose(1, 2, 0)
         now = np.concatenate([latents.load, latents.speed, latents.ground_speed[:, None]], axis=1)
         latent_by_gain = now * of_latents
         diagonals(by_gain[:, :W, :W])[:] = -of_torque * at.value[1]
@@ -189,14 +194,42 @@ class WindowProblem(Readings):
             by_gain=latent_by_gain,
             off=at.off,
             load_slope=at.load_slope,
-            load_by_slip=at.load_by[0],
-            load_by_soil=at.load_by[1:],
+            load_by_slip=at.load_by_slip,
+            load_by_soil=at.load_by_soil,
         )
 
-    def _at_the_loads(self, soil: Soil, latents: Latents, slip: Array) -> _Wheels:
+    def _corrected(self, gains: Array) -> tuple[Array, Array, float, Array, Array, Array]:
+        """Readings less their gain errors (G,): factors of torques, latents and draft; latents with variance; rows'.
+
+        A sensor reads (1 + gain) times the truth, plus noise: readings are scaled back, and
+        their noise with them, else a gain that makes everything smaller would seem to fit better.
+        """
+        W, of_sensors = self.n_wheels, 1.0 / (1.0 + gains[: self.n_sensors])
+        of_torque, of_latents, of_draft = of_sensors[:W], of_sensors[W:-1], float(of_sensors[-1])
+        row_var = self._row_var.copy()
+        row_var[:, :W] *= of_torque**2
+        row_var[:, W] += self.draft_var * (of_draft**2 - 1.0)
+        return of_torque, of_latents, of_draft, self._measured * of_latents, self._measured_var * of_latents**2, row_var
+
+    def standardised(self, at: Linearised, gains: Array) -> tuple[Array, Array]:
+        """Each residual given the others of its instant, over its std (N, m), and the derivatives (N, m, 6 + G).
+
+        Rows of an instant: torque of each wheel, the draft balance, sinkage of each wheel
+        where there are sensors; standard normal where model and noise are right, nan where
+        there is no reading.
+        """
+        variance, row_var = self._corrected(gains)[4:]
+        inverse = inverse_covariance(at.by_latents, variance, row_var, self.n_wheels)
+        root = np.sqrt(diagonals(inverse))
+        weighed = at.weighed.reshape(*root.shape, -1) / root[:, :, None]
+        weighed[~self._known] = np.nan
+        return weighed[:, :, 0], weighed[:, :, 1:]
+
+    def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         """The wheels with the entry angle eliminated: it follows the load."""
-        shape = (self.n, self.n_wheels)
-        forces, d = wheel_forces_and_derivatives(self._state(soil, latents.entry_angle, slip), self.model)
+        shape, rim = (self.n, self.n_wheels), self.rig.radius * latents.speed
+        carried = latents.ground_speed[:, None] / rim  # 1 - slip
+        forces, d = wheel_forces_and_derivatives(self._state(soil, latents.entry_angle, 1.0 - carried), self.model)
         forces, d = forces.reshape(3, *shape), d.reshape(3, 7, *shape)
         slope, off = d[0, 0], latents.load - forces[0]
         load_by = self._by_slip_and_soil(d[0], soil)
@@ -209,7 +242,20 @@ class WindowProblem(Readings):
         value = by_load * off
         value[:2] += forces[1:]
         value[2] += sinkage(latents.entry_angle, self.rig.radius)
-        return _Wheels(value, by, by_load, load_by, slope, off)
+        return Response(
+            value=value,
+            by_load=by_load,
+            by_speed=by[:, 0] * (carried / latents.speed),
+            by_ground=by[:, 0] / -rim,
+            by_soil=by[:, 1:],
+            load_by_slip=load_by[0],
+            load_by_soil=load_by[1:],
+            load_slope=slope,
+            off=off,
+            by_effects=np.zeros((3, 0, *shape)),
+            pull=np.zeros(self.n),
+            pull_by_effects=np.zeros((0, self.n)),
+        )
 
     def _by_slip_and_soil(self, d: Array, soil: Soil) -> Array:
         """Derivatives (7, N, W) by slip, k_c, k_phi, n, phi, c, K of one force from those by INPUTS."""
@@ -220,24 +266,23 @@ class WindowProblem(Readings):
         out[4] *= 1.0 + np.tan(soil.phi) ** 2
         return out
 
-    def _by_latents(self, by_load: Array, by_slip: Array, slip_by_speed: Array, slip_by_ground: Array) -> Array:
-        """Derivatives A (N, m, 2 W + 1) of the residuals from those of DP, T and z (3, N, W)."""
+    def _by_latents(self, at: Response) -> Array:
+        """Derivatives A (N, m, 2 W + 1) of the residuals from those of DP, T and z."""
         N, W = self.n, self.n_wheels
-        by_speed, by_ground = by_slip * slip_by_speed, by_slip * slip_by_ground
         A = np.zeros((N, self._n_residuals, 2 * W + 1))
-        A[:, W, :W], A[:, W, W : 2 * W], A[:, W, 2 * W] = by_load[0], by_speed[0], by_ground[0].sum(1)
+        A[:, W, :W], A[:, W, W : 2 * W], A[:, W, 2 * W] = at.by_load[0], at.by_speed[0], at.by_ground[0].sum(1)
         for kind, first in ((1, 0), (2, W + 1)) if self.with_sinkage else ((1, 0),):
             wheel_rows = A[:, first : first + W]
-            diagonals(wheel_rows[:, :, :W])[:] = by_load[kind]
-            diagonals(wheel_rows[:, :, W : 2 * W])[:] = by_speed[kind]
-            wheel_rows[:, :, 2 * W] = by_ground[kind]
+            diagonals(wheel_rows[:, :, :W])[:] = at.by_load[kind]
+            diagonals(wheel_rows[:, :, W : 2 * W])[:] = at.by_speed[kind]
+            wheel_rows[:, :, 2 * W] = at.by_ground[kind]
         return np.negative(A, out=A)
 
     def updated(self, at: Linearised, latents: Latents, soil_step: Array, gain_step: Array) -> Latents:
         """Latents after a step (6,) of the soil and (G,) of the gains, by the linear model."""
         N, W = self.n, self.n_wheels
         left = (at.weighed @ np.concatenate([[1.0], soil_step, gain_step])).reshape(N, 1, at.by_latents.shape[1])
-        new = at.corrected - at.variance * (left @ at.by_latents)[:, 0] - at.by_gain * gain_step[W:-1]
+        new = at.corrected - at.variance * (left @ at.by_latents)[:, 0] - at.by_gain * gain_step[W : self.n_sensors - 1]
         load, speed, ground = new[:, :W], new[:, W : 2 * W], new[:, 2 * W]
         slip_change = (latents.ground_speed[:, None] / latents.speed - ground[:, None] / speed) / self.rig.radius
         change = load - latents.load + at.off - at.load_by_slip * slip_change

@@ -10,6 +10,7 @@ the soil and what is known of the sensors.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -17,12 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
+from soilbus.estimation.completed import CompletedProblem, Free
 from soilbus.estimation.coordinates import Coordinates
 from soilbus.estimation.gauss_newton import Fit, fit_window, foreseen, resume
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.soil_change import Crossing, suspicion, without_crossing
 from soilbus.estimation.window import Rig, Window
+from soilbus.terra.effects.effect import Effect
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import WheelModel
 
@@ -67,7 +70,7 @@ class Settings:
     """What the tracker needs to be told; times s, speeds m/s.
 
     drift: sd of the logarithm of each soil coordinate after one window; it grows with the
-    square root of time.
+    square root of time.  min_rows: residuals below which a window is not fitted.
     """
 
     window: float
@@ -75,6 +78,7 @@ class Settings:
     max_turn: float
     max_chi2: float
     drift: float
+    min_rows: int = MIN_ROWS
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,8 +105,17 @@ def elsewhere(prior: SoilPrior) -> SoilPrior:
 class Tracker:
     """Solves one window after the other; all state from window to window is here."""
 
-    def __init__(self, rig: Rig, prior: SoilPrior, model: WheelModel, settings: Settings) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        prior: SoilPrior,
+        model: WheelModel,
+        settings: Settings,
+        effects: Sequence[Effect] = (),
+        free: Sequence[Free] = (),
+    ) -> None:
         self.rig, self.prior, self.model, self.settings = rig, prior, model, settings
+        self.effects, self.free = tuple(effects), tuple(free)
         self.forget()
 
     @property
@@ -127,12 +140,12 @@ class Tracker:
         problem = self._problem(window)
         since = self._crossing.end if new and self._crossing else start
         left_out = problem.standstill, problem.turning
-        if problem.n_rows < MIN_ROWS:
+        if problem.n_rows < self.settings.min_rows:
             self._fit = None
             return Tracked(None, False, Ground.SAME, since, *left_out)
         before = self._known_at(since, problem)
         last = self._fit
-        if last is None:
+        if last is None or last.rival is not None:
             fit = self._afresh(problem, before)
         else:
             ahead = foreseen(problem, self._here, last, before)
@@ -181,7 +194,7 @@ class Tracker:
         if fit is not None and not tracked.mismatch:
             self._good_until = end
             if end - tracked.since >= LEARNED * self.settings.window and tracked.ground is not Ground.CHANGING:
-                self._beliefs.append((end, fit.belief))
+                self._beliefs.append((end, fit.whole))
         return tracked
 
     def _known_at(self, t: float, problem: WindowProblem) -> Belief:
@@ -231,4 +244,5 @@ class Tracker:
         return window.rows(np.flatnonzero(window.t >= self._crossing.end))
 
     def _problem(self, window: Window) -> WindowProblem:
-        return WindowProblem(window, self.rig, self.model, self.settings.min_speed, self.settings.max_turn)
+        speed, turn = self.settings.min_speed, self.settings.max_turn
+        return CompletedProblem(window, self.rig, self.model, speed, turn, self.effects, self.free)

@@ -10,6 +10,23 @@ from contextlib import contextmanager
 @contextmanager
 def progress(title: str) -> Iterator[Callable[[int, float], None] | None]:
     """Yields a function to call with frames read and time in the recording [s]; None in a pipe."""
+    with phases(title) as say:
+        if say is None:
+            yield None
+            return
+        start: list[float] = []
+
+        def step(frames: int, t: float) -> None:
+            if not start:
+                start.append(t)
+            say(f"{frames} frames, {t - start[0]:.0f} s of recording")
+
+        yield step
+
+
+@contextmanager
+def phases(title: str) -> Iterator[Callable[[str], None] | None]:
+    """Yields a function to call with what is being done; None in a pipe."""
     if not sys.stderr.isatty():
         yield None
         return
@@ -19,11 +36,4 @@ def progress(title: str) -> Iterator[Callable[[int, float], None] | None]:
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(title)
-        start: list[float] = []
-
-        def step(frames: int, t: float) -> None:
-            if not start:
-                start.append(t)
-            bar.update(task, description=f"{title}: {frames} frames, {t - start[0]:.0f} s of recording")
-
-        yield step
+        yield lambda what: bar.update(task, description=f"{title}: {what}")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 import html
-import io
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,14 +12,20 @@ import numpy as np
 
 from soilbus.config import Config
 from soilbus.daemon.pipeline import Pipeline, WindowResult
+from soilbus.report.page import html_table, page, picture
 from soilbus.traversability import Status
 
 
 def summary(results: Sequence[WindowResult], pipeline: Pipeline) -> str:
     """A few lines: windows by status, soil, decisions, refused samples by reason."""
     counts = pipeline.admission.counts
-    received = sum(counts.received.values())
-    lines = [f"{len(results)} windows from {received} mapped frames ({counts.unknown} of other identifiers)"]
+    heard = f"{sum(counts.received.values())} mapped frames ({counts.unknown} of other identifiers)"
+    return summary_of(results, heard, pipeline.intake.refusals.total)
+
+
+def summary_of(results: Sequence[WindowResult], heard: str, refused: Counter[str]) -> str:
+    """The same of windows from anything that `heard` tells of, with the samples refused by reason."""
+    lines = [f"{len(results)} windows from {heard}"]
     for (status, reason), n in Counter((str(r.status), r.reason) for r in results).most_common():
         lines.append(f"  {n:5d} {status}" + ("" if reason == "none" else f": {reason}"))
     good = [r for r in results if r.status is Status.VALID]
@@ -31,13 +35,17 @@ def summary(results: Sequence[WindowResult], pipeline: Pipeline) -> str:
         lines.append(f"bearing pressure {bearing / 1e3:.1f} +- {std / 1e3:.1f} kPa (medians of the valid windows)")
     states = Counter(str(r.traversability.state) for r in results)
     lines.append("traversability " + (", ".join(f"{s} {n}" for s, n in states.most_common()) or "unknown"))
-    refused = pipeline.intake.refusals.total
     lines.append("refused samples " + (", ".join(f"{reason} {n}" for reason, n in refused.most_common()) or "none"))
     return "\n".join(lines) + "\n"
 
 
 def html_report(results: Sequence[WindowResult], pipeline: Pipeline, config: Config, logs: Sequence[Path]) -> str:
     """A self-contained page with plots over time; needs matplotlib (extra: plots)."""
+    return page_of(results, summary(results, pipeline), logs)
+
+
+def page_of(results: Sequence[WindowResult], text: str, logs: Sequence[Path]) -> str:
+    """The same under any summary."""
     rows = [
         (
             f"{r.t:.1f}",
@@ -50,20 +58,16 @@ def html_report(results: Sequence[WindowResult], pipeline: Pipeline, config: Con
         for r in results
     ]
     head = ("t, s", "status", "bearing pressure, kPa", "chi²", "traversability", "refused samples")
-    cells = "".join("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in rows)
-    names = ", ".join(html.escape(p.name) for p in logs)
-    return (
-        "<!doctype html><html lang=en><meta charset=utf-8><title>soilbus replay</title>"
-        "<style>body{font:15px system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem}"
-        "table{border-collapse:collapse;font-size:13px}td,th{padding:.15rem .6rem;border-bottom:1px solid #ddd;"
-        "text-align:left}img{max-width:100%}pre{background:#f6f6f6;padding:1rem}</style>"
-        f"<h1>{names}</h1><pre>{html.escape(summary(results, pipeline))}</pre>"
-        f"<img alt='estimates over time' src='data:image/png;base64,{_plots(results)}'>"
-        "<table><tr>" + "".join(f"<th>{h}</th>" for h in head) + f"</tr>{cells}</table></html>\n"
+    return page(
+        "soilbus replay",
+        ", ".join(p.name for p in logs),
+        f"<pre>{html.escape(text)}</pre>",
+        picture(_plots(results), "estimates over time"),
+        html_table(head, rows),
     )
 
 
-def _plots(results: Sequence[WindowResult]) -> str:
+def _plots(results: Sequence[WindowResult]) -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 9), layout="constrained")
@@ -83,9 +87,7 @@ def _plots(results: Sequence[WindowResult]) -> str:
     axes[3].set_xlabel("end of window, s")
     if results and results[0].slip:
         axes[3].legend(ncols=4)
-    png = io.BytesIO()
-    figure.savefig(png, format="png", dpi=110)
-    return base64.b64encode(png.getvalue()).decode()
+    return figure
 
 
 def _band(axis: Any, t: Sequence[float], values: Sequence[tuple[float, float]], label: str) -> None:

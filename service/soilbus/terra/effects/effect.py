@@ -82,6 +82,7 @@ class Effect:
     hitch, reading less truth, of true drafts (N,).  load: errors [N] (N, W) of the wheel
     load cells.  resistance: force [N] (N,) that holds the vehicle back and is in no reading.
     base_law: the shear law of models to which the effect can be added, None for any.
+    mixes_instants: `torque` needs other instants than its own.
     of_record: its parameters describe the ground of one record and mean nothing in another.
     """
 
@@ -99,6 +100,7 @@ class Effect:
     resistance: ErrorHook | None = None
     base_law: str | None = None
     of_record: bool = False
+    mixes_instants: bool = False
 
     @property
     def neutral(self) -> dict[str, float]:

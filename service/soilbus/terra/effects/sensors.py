@@ -42,11 +42,11 @@ DRAFT_GAIN = Effect(
 
 
 def _late(torque: Array, around: Surroundings, values: Values) -> Array:
-    """T(t - delay), on straight lines between instants; before the first instant of a run, its value."""
+    """T(t - delay), on straight lines between instants and on beyond the first one of a run."""
     t, late = instants(around.t), np.array(torque, float)
     for run in stretches(t):
         if len(run) >= 2:
-            then = np.clip(t[run] - values["delay"], t[run[0]], None)
+            then = t[run] - values["delay"]
             before = np.clip(np.searchsorted(t[run], then, side="right") - 1, 0, len(run) - 2)
             first, second = run[before], run[before + 1]
             part = ((then - t[first]) / (t[second] - t[first]))[:, None]
@@ -61,6 +61,7 @@ TORQUE_LAG = Effect(
     tells="quick changes of draft or speed; driving evenly hides it",
     parameters=(Parameter("delay", "s", 0.0, 0.2, 0.0, 0.6),),
     torque=_late,
+    mixes_instants=True,
 )
 
 

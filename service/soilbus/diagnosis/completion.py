@@ -1,0 +1,230 @@
+"""A model with some effects, fitted to the recordings of one vehicle.
+
+The vehicle's gain errors and the parameters of its effects are the same in all recordings,
+the soil is each recording's own.  So one recording after the other is fitted, each with
+what those before it told of gains and effects; the evidences of the parts add up to that
+of the whole, as do those of the blocks learned from and of the blocks held out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.diagnosis.records import Record
+from soilbus.estimation.belief import Belief
+from soilbus.estimation.completed import CompletedProblem, Free, parameters_of
+from soilbus.estimation.gauss_newton import Fit, continued, fit_window
+from soilbus.estimation.linearised import Latents, Linearised
+from soilbus.estimation.normal_equations import Fitting, Place
+from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
+from soilbus.terra.effects.effect import Effect
+from soilbus.terra.wheel import Soil
+
+Array = NDArray[np.float64]
+
+_SOIL = len(PARAMETERS)
+CHECK_ROUNDS = 3
+"""Linearisations that bring the latents of held-out blocks to their values under a model."""
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Where the fit of one recording may begin: soil (6,), sensors' gains and effects' parameters (G,)."""
+
+    soil: Array
+    gains: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """Held-out blocks of one recording under a fitted model: the problem, its latents and residuals there.
+
+    chi2 weighs the residuals by what the fit leaves open of soil, gains and effects besides
+    the noise: with a dozen rows learned from that is no less than the noise itself.
+    """
+
+    problem: CompletedProblem
+    latents: Latents
+    at: Linearised
+    evidence: float
+    chi2: float
+
+    @property
+    def rows(self) -> int:
+        """Residuals that count."""
+        return self.problem.n_rows
+
+
+@dataclass(frozen=True, slots=True)
+class Completion:
+    """A model with effects as fitted: one Fit and one Checked for each recording.
+
+    before holds what was known when each recording's turn came.
+    """
+
+    effects: tuple[Effect, ...]
+    free: tuple[Free, ...]
+    before: tuple[Belief, ...]
+    fits: tuple[Fit, ...]
+    checks: tuple[Checked, ...]
+
+    @property
+    def evidence(self) -> float:
+        """-2 log of the likelihood of all data, whatever soils, gains and parameters may be, up to a constant."""
+        return sum(fit.evidence for fit in self.fits) + self.predicted
+
+    @property
+    def predicted(self) -> float:
+        """-2 log of the likelihood of the held-out blocks after the others, up to the same."""
+        return sum(check.evidence for check in self.checks)
+
+    @property
+    def cost(self) -> float:
+        """-2 log posterior of what was learned from, up to a constant."""
+        return sum(fit.cost for fit in self.fits)
+
+    @property
+    def gap(self) -> float:
+        """Reduced chi-square of the held-out blocks."""
+        return sum(check.chi2 for check in self.checks) / max(self.checked_rows, 1)
+
+    @property
+    def checked_rows(self) -> int:
+        """Residuals of the held-out blocks."""
+        return sum(check.rows for check in self.checks)
+
+    @property
+    def rows(self) -> int:
+        """Residuals of all blocks."""
+        return self.checked_rows + sum(fit.rows for fit in self.fits)
+
+    @property
+    def converged(self) -> bool:
+        """Whether every fit ended at its optimum."""
+        return all(fit.converged for fit in self.fits)
+
+    @property
+    def free_at_edge(self) -> tuple[Free, ...] | None:
+        """The parameters with those held that would leave their range; None where none would."""
+        pulls = self.fits[-1].belief.gains[self.checks[-1].problem.n_sensors :].tolist()
+        leaves = [f.std > 0.0 and not f.within(u) for f, u in zip(self.free, pulls, strict=True)]
+        if not any(leaves):
+            return None
+        return tuple(
+            replace(f, value=f.at(u), std=0.0) if leaving else f
+            for f, u, leaving in zip(self.free, pulls, leaves, strict=True)
+        )
+
+    def as_starts(self) -> tuple[Start, ...]:
+        """Where these fits ended."""
+        return tuple(Start(fit.belief.soil, fit.belief.gains) for fit in self.fits)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects."""
+        return tuple(effect.name for effect in self.effects)
+
+    def parameters(self) -> dict[str, dict[str, Estimate]]:
+        """Value and std of each parameter by effect, as the last recording leaves them; wheels' own as name_WHEEL."""
+        belief, problem = self.fits[-1].belief, self.checks[-1].problem
+        std = np.sqrt(np.diag(belief.covariance))[_SOIL + problem.n_sensors :]
+        out: dict[str, dict[str, Estimate]] = {name: {} for name in self.names}
+        for free, pull, spread in zip(self.free, belief.gains[problem.n_sensors :].tolist(), std.tolist(), strict=True):
+            name = free.parameter.name + ("" if free.wheel is None else f"_{problem.rig.wheels[free.wheel]}")
+            out[free.effect][name] = Estimate(free.at(pull), free.std * spread)
+        return out
+
+
+def complete(
+    records: Sequence[Record], prior: SoilPrior, effects: Sequence[Effect], starts: Sequence[Start] | None = None
+) -> Completion | None:
+    """A model with these effects fitted to all recordings; None where a fit fails.
+
+    Parameters of effects that the records' model has already keep the prior they have
+    there; one that would leave its range is held at the edge.
+    """
+    present = records[0].learned
+    known = {e.name: [f for f in present.free if f.effect == e.name] for e in present.effects}
+    free = tuple(f for effect in effects for f in known.get(effect.name) or parameters_of(effect, present.n_wheels))
+    for _ in range(len(free) + 1):
+        completion = _complete(records, prior, effects, free, starts)
+        if completion is None or completion.free_at_edge is None:
+            break
+        free = completion.free_at_edge
+        starts = completion.as_starts()
+    return completion
+
+
+def _complete(
+    records: Sequence[Record],
+    prior: SoilPrior,
+    effects: Sequence[Effect],
+    free: tuple[Free, ...],
+    starts: Sequence[Start] | None,
+) -> Completion | None:
+    fits, checks, befores = [], [], []
+    known: Belief | None = None
+    for i, record in enumerate(records):
+        problem = record.learned.completed(effects, free)
+        before = Belief.of(prior, problem.gain_std) if known is None else _of_next(known, prior, problem, effects)
+        fit = _fitted(problem, prior, before, None if starts is None else starts[i])
+        if fit is None:
+            return None
+        fits.append(fit)
+        befores.append(before)
+        checks.append(check(record.checked.completed(effects, free), prior, fit))
+        known = fit.belief
+    return Completion(tuple(effects), free, tuple(befores), tuple(fits), tuple(checks))
+
+
+def _fitted(problem: CompletedProblem, prior: SoilPrior, before: Belief, start: Start | None) -> Fit | None:
+    """Where the given start leads, or one half way to it: whichever converges, or leaves the parameters' range."""
+    if start is None:
+        return fit_window(problem, prior, before)
+    best: Fit | None = None
+    for share in (1.0, 0.5):
+        pulls = share * start.gains[problem.n_sensors :]
+        gains = np.where(problem.gain_std > 0.0, np.concatenate([start.gains[: problem.n_sensors], pulls]), 0.0)
+        fit = continued(problem, prior, before, start.soil, gains)
+        if fit is None:
+            continue
+        leaves = not all(f.within(u) for f, u in zip(problem.free, fit.gains[problem.n_sensors :], strict=True))
+        if fit.converged or leaves:
+            return fit
+        best = fit if best is None or fit.cost < best.cost else best
+    return best
+
+
+def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects: Sequence[Effect]) -> Belief:
+    """What one recording tells of the next: all but the soil and what belongs to one recording only."""
+    after = known.of_another_soil(prior)
+    own = {effect.name for effect in effects if effect.of_record}
+    gone = [problem.n_sensors + i for i, free in enumerate(problem.free) if free.effect in own]
+    gains, covariance = after.gains.copy(), after.covariance.copy()
+    for i in gone:
+        covariance[_SOIL + i] = covariance[:, _SOIL + i] = 0.0
+        covariance[_SOIL + i, _SOIL + i] = problem.gain_std[i] ** 2
+        gains[i] = 0.0
+    return Belief(after.soil, gains, covariance)
+
+
+def check(problem: CompletedProblem, prior: SoilPrior, fit: Fit) -> Checked:
+    """Held-out blocks under a model fitted to the others."""
+    soil, gains = Soil(*fit.belief.soil.tolist()), fit.belief.gains
+    latents = problem.carried(problem.start(soil), soil, gains)
+    fitting = Fitting(problem, prior, fit.belief)
+    with np.errstate(all="ignore"):
+        at = problem.linearise(soil, gains, latents)
+        for _ in range(CHECK_ROUNDS - 1):
+            latents = problem.updated(at, latents, np.zeros(_SOIL), np.zeros(len(gains)))
+            at = problem.linearise(soil, gains, latents)
+        point = fitting.with_before(Place(fit.belief.soil, gains, latents, np.inf, 0), at)
+        step = None if point is None else point.step()
+    if point is None or step is None:
+        return Checked(problem, latents, at, np.inf, np.inf)
+    length = point.length(step)
+    return Checked(problem, latents, at, point.evidence - length, point.cost - length)

@@ -1,0 +1,71 @@
+"""Recordings as the diagnosis wants them: time blocks to learn from, and others to check with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.estimation.completed import CompletedProblem
+from soilbus.estimation.window import Rig, Window
+from soilbus.terra.wheel import WheelModel
+
+BLOCK = 4.0
+"""Length of a time block [s]: long beside a sensor's lag, short beside a sweep of slip."""
+CHECKED = 3
+"""Every so manieth block is held out."""
+FEWEST = 12
+"""Instants that each part of a recording must have."""
+FEWEST_ROWS = 6
+"""Rows that a table must have."""
+
+
+class TooLittle(ValueError):
+    """A recording holds too little to be divided; the text says what."""
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One recording: the instants that models are fitted to, and those held out."""
+
+    name: str
+    learned: CompletedProblem
+    checked: CompletedProblem
+
+    def thinned(self, every: int) -> Record:
+        """The same with every so manieth instant."""
+        learned, checked = (part.part(slice(None, None, every)) for part in (self.learned, self.checked))
+        return Record(self.name, learned, checked)
+
+
+def record_of(name: str, window: Window, rig: Rig, model: WheelModel, min_speed: float, max_turn: float) -> Record:
+    """One recording divided into blocks; TooLittle where it has not enough usable instants."""
+    problem = CompletedProblem(window, rig, model, min_speed, max_turn)
+    held_out = checked_instants(problem.since)
+    parts = np.flatnonzero(~held_out), np.flatnonzero(held_out)
+    if min(map(len, parts)) < FEWEST:
+        raise TooLittle(f"{name}: {problem.n} usable instants are too few to learn from some and check with others")
+    learned, checked = (problem.part(part) for part in parts)
+    return Record(name, learned, checked)
+
+
+def record_of_rows(name: str, window: Window, rig: Rig, model: WheelModel) -> Record:
+    """A table of steady states, of which every third row is held out; TooLittle where it has not enough usable ones.
+
+    Rows do not hang together in time as the instants of a drive do, so blocks of them would
+    only part small slips from large: every third row has its neighbours among the others.
+    """
+    problem = CompletedProblem(window, rig, model, min_speed=0.0)
+    if problem.n < FEWEST_ROWS:
+        raise TooLittle(f"{name}: {problem.n} usable rows are too few to learn from some and check with others")
+    held_out = np.arange(problem.n) % CHECKED == CHECKED // 2
+    learned, checked = (problem.part(np.flatnonzero(part)) for part in (~held_out, held_out))
+    return Record(name, learned, checked)
+
+
+def checked_instants(since: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which instants, so many seconds since the start (N,), are held out."""
+    span = float(since[-1] - since[0]) if len(since) else 0.0
+    length = min(BLOCK, span / (3 * CHECKED)) if span > 0.0 else BLOCK
+    return np.asarray((since / max(length, 1e-9)).astype(int) % CHECKED == CHECKED - 1)

@@ -1,0 +1,62 @@
+"""From evidences to a verdict: none, named, ambiguous or unknown, with probabilities.
+
+The constants were set on one half of the blind cases (`python -m tests.diagnosis.blind`)
+and are reported on the other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from enum import StrEnum
+
+
+class Verdict(StrEnum):
+    """What the diagnosis comes to."""
+
+    NONE = "none"
+    NAMED = "named"
+    AMBIGUOUS = "ambiguous"
+    UNKNOWN = "unknown"
+
+
+PAYS = 16.0
+"""Fall of -2 log evidence from which an effect is added."""
+TEMPERATURE = 3.0
+"""By how much evidences are less certain than they say: no effect's formula is the field's."""
+SURE = 0.8
+"""Probability from which a name stands alone."""
+PLAUSIBLE = 0.02
+"""Probability from which a name belongs to the set."""
+WORTH = 0.25
+"""Share of a real gap's excess over noise that an effect must explain to be added."""
+UNEXPLAINED = 0.35
+"""Share of it that may be left by effects that are named: none has the formula of the field."""
+REAL_GAP = 4.0
+"""Standard deviations of a reduced chi-square beyond which a gap is real."""
+LEAST_GAP = 1.04
+"""Reduced chi-square up to which no gap is told, however many residuals: noise is not known better."""
+
+
+def probabilities(evidence: Mapping[str, float]) -> dict[str, float]:
+    """Probability of each name from its -2 log evidence, the largest first."""
+    least = min(evidence.values())
+    weights = {name: math.exp(-(e - least) / (2.0 * TEMPERATURE)) for name, e in evidence.items()}
+    total = sum(weights.values())
+    return dict(sorted(((n, w / total) for n, w in weights.items()), key=lambda item: -item[1]))
+
+
+def gap_limit(rows: int) -> float:
+    """Reduced chi-square of so many held-out residuals up to which noise explains them."""
+    return max(LEAST_GAP, 1.0 + REAL_GAP * math.sqrt(2.0 / max(rows, 1)))
+
+
+def pays(fall: float, gap: float, checked_rows: int, rows: int) -> bool:
+    """Whether an effect is worth adding that lowers -2 log evidence so far, at a present gap on so many residuals."""
+    excess = (gap - 1.0) * rows if gap > gap_limit(checked_rows) else 0.0
+    return fall > max(PAYS, WORTH * excess)
+
+
+def is_real(before: float, after: float, checked_rows: int) -> bool:
+    """Whether a gap is left that the effects added do not explain."""
+    return after > gap_limit(checked_rows) and after - 1.0 > UNEXPLAINED * (before - 1.0)

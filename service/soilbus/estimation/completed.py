@@ -1,0 +1,312 @@
+"""A window's residuals under a wheel-soil model that effects complete.
+
+The parameters of the effects take their place beside the gain errors of the sensors: each
+as (parameter - value) / std, zero with variance one before any data.  Derivatives are
+differences here: an effect is any small function, and a dozen evaluations of the forces are
+cheaper than a derivative by hand for every pair of effects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.estimation.linearised import Latents
+from soilbus.estimation.residuals import MAX_TURN, Response, WindowProblem
+from soilbus.estimation.window import Rig, Window
+from soilbus.terra.effects.along import stretches
+from soilbus.terra.effects.effect import Active, Effect, Parameter, Surroundings, forces_with, wheel_with
+from soilbus.terra.stress import lumped_modulus
+from soilbus.terra.wheel import MAX_ENTRY_ANGLE, MIN_ENTRY_ANGLE, Soil, WheelModel, WheelState, sinkage
+
+Array = NDArray[np.float64]
+
+STEP = 1e-6
+"""Relative step of the differences; in standard deviations of a parameter, STEP_OF_EFFECT."""
+STEP_OF_EFFECT = 1e-4
+LOAD_ROUNDS = 6
+SMOOTHED = 9
+"""Instants through which a parabola smooths the torque that comes from other instants."""
+DRAFT_ROUNDS = 3
+"""Fixed-point rounds from a reading of the hitch to the draft: its error is a few per cent of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Free:
+    """One parameter of an effect, of one wheel (its number) or of all (None): value and std of the prior."""
+
+    effect: str
+    parameter: Parameter
+    wheel: int | None
+    value: float
+    std: float
+
+    @property
+    def name(self) -> str:
+        """effect.parameter, with the wheel's number where it has one."""
+        return f"{self.effect}.{self.parameter.name}" + ("" if self.wheel is None else f".{self.wheel}")
+
+    def within(self, pull: float) -> bool:
+        """Whether so many prior std from the prior value is inside the parameter's range."""
+        return self.parameter.low <= self.value + self.std * pull <= self.parameter.high
+
+    def at(self, pull: float) -> float:
+        """The parameter's value so many prior std from its prior value, kept inside its range."""
+        return min(max(self.value + self.std * pull, self.parameter.low), self.parameter.high)
+
+
+def parameters_of(effect: Effect, n_wheels: int) -> list[Free]:
+    """The parameters of an effect as before any data: absent, with the catalogue's prior."""
+    wheels: Sequence[int | None] = range(n_wheels) if effect.each_wheel else (None,)
+    return [Free(effect.name, p, w, p.neutral, p.std) for p in effect.parameters for w in wheels]
+
+
+def active_at(effects: Sequence[Effect], free: Sequence[Free], pulls: Array, n_wheels: int) -> list[Active]:
+    """The effects with their values where the parameters are so many std (P,) from their prior values."""
+    values: dict[str, dict[str, Any]] = {e.name: {} for e in effects}
+    for f, u in zip(free, pulls.tolist(), strict=True):
+        of_effect = values[f.effect]
+        if f.wheel is None:
+            of_effect[f.parameter.name] = f.at(u)
+        else:
+            of_effect.setdefault(f.parameter.name, np.zeros(n_wheels))[f.wheel] = f.at(u)
+    return [Active(e, values[e.name]) for e in effects]
+
+
+class _Outcome(NamedTuple):
+    """Load that the soil carries beyond what it must, drawbar pull, torque reading, sinkage (4, N, W); pull (N,).
+
+    late (N, W) is what other instants add to the torque readings.
+    """
+
+    wheels: Array
+    pull: Array
+    late: Array
+
+
+class _Contact(NamedTuple):
+    """Load, drawbar pull and torque between wheels and ground (3, N, W), sinkage (N, W), what effects depend on."""
+
+    forces: Array
+    depth: Array
+    around: Surroundings
+
+
+class CompletedProblem(WindowProblem):
+    """One window's data and the model with effects; `free` are the effects' parameters (P)."""
+
+    def __init__(
+        self,
+        window: Window,
+        rig: Rig,
+        model: WheelModel,
+        min_speed: float,
+        max_turn: float = MAX_TURN,
+        effects: Sequence[Effect] = (),
+        free: Sequence[Free] = (),
+    ) -> None:
+        super().__init__(window, rig, model, min_speed, max_turn)
+        self._complete(effects, free)
+
+    def completed(self, effects: Sequence[Effect], free: Sequence[Free]) -> Self:
+        """The same data under a model with these effects, and no others, with these parameters."""
+        other = copy(self)
+        other._complete(effects, free)
+        return other
+
+    def _complete(self, effects: Sequence[Effect], free: Sequence[Free]) -> None:
+        self.effects, self.free = tuple(effects), tuple(free)
+        std = [float(f.std > 0.0) for f in self.free]
+        self.gain_names = [*self.gain_names[: self.n_sensors], *(f.name for f in self.free)]
+        self.gain_std = np.concatenate([self.gain_std[: self.n_sensors], std])
+
+    def active(self, pulls: Array) -> list[Active]:
+        """The effects with their values where the parameters are so many std (P,) from their prior values."""
+        return active_at(self.effects, self.free, pulls, self.n_wheels)
+
+    def carried(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
+        """As WindowProblem; without gains the effects' parameters are at their prior values."""
+        base = super().carried(latents, soil, gains)
+        if not self.effects:
+            return base
+        active = self.active(np.zeros(len(self.free)) if gains is None else gains[self.n_sensors :])
+        angle, nothing = base.entry_angle, np.zeros_like(base.load)
+        for _ in range(LOAD_ROUNDS):
+            excess, more = (
+                self._told(self._contact(soil, active, base, turned), active, base, nothing).wheels[0]
+                for turned in (angle, angle * (1.0 + STEP))
+            )
+            slope = (more - excess) / STEP
+            with np.errstate(all="ignore"):
+                step = np.where(slope > 0.0, -excess / slope, 0.0)
+            angle = np.clip(angle * np.exp(np.clip(step, -0.5, 0.5)), MIN_ENTRY_ANGLE, MAX_ENTRY_ANGLE * 0.98)
+            if np.abs(step).max(initial=0.0) < 1e-3:
+                break
+        return Latents(base.load, base.speed, base.ground_speed, angle)
+
+    def sinkages(self, soil: Soil, gains: Array, latents: Latents) -> Array:
+        """As WindowProblem, of the circles that the effects make of the wheels."""
+        if not self.effects:
+            return super().sinkages(soil, gains, latents)
+        active = self.active(gains[self.n_sensors :])
+        return np.asarray(self._contact(soil, active, latents, latents.entry_angle).depth)
+
+    def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
+        if not self.effects:
+            return super()._response(soil, gains, latents)
+        pulls = gains[self.n_sensors :]
+        active, angle = self.active(pulls), latents.entry_angle
+        here = self._contact(soil, active, latents, angle)
+        at = self._told(here, active, latents, None)
+
+        def by(changed: _Outcome, step: Any) -> _Outcome:
+            return _Outcome((changed.wheels - at.wheels) / step, (changed.pull - at.pull) / _of_instant(step), at.late)
+
+        def by_moving(moved: Latents, step: Any) -> Array:
+            contact = self._contact(soil, active, moved, moved.entry_angle)
+            return by(self._told(contact, active, moved, at.late), step).wheels
+
+        by_latents = {}
+        for name in ("entry_angle", "load", "speed", "ground_speed"):
+            value = getattr(latents, name)
+            step = STEP * np.abs(value)
+            by_latents[name] = by_moving(_with(latents, name, value + step), step if step.ndim == 2 else step[:, None])
+        by_angle = by_latents["entry_angle"]
+        by_soil = self._by_soil(soil, active, latents, at)
+        by_effects = np.zeros((4, len(self.free), self.n, self.n_wheels))
+        pull_by_effects = np.zeros((len(self.free), self.n))
+        at_wheels = {e.name for e in self.effects if e.wheel is not None or e.forces is not None}
+        for i in np.flatnonzero(self.gain_std[self.n_sensors :] > 0.0):
+            shifted = pulls.copy()
+            shifted[i] += STEP_OF_EFFECT
+            other = self.active(shifted)
+            contact = self._contact(soil, other, latents, angle) if self.free[i].effect in at_wheels else here
+            d = by(self._told(contact, other, latents, None), STEP_OF_EFFECT)
+            by_effects[:, i], pull_by_effects[i] = d.wheels, d.pull
+        slope, off = by_angle[0], -at.wheels[0]
+        along = by_angle[1:] / slope  # what a load more turns into, by way of the entry angle
+
+        def held(d: Array) -> Array:
+            """Derivatives (3, ..., N, W) with the entry angle following the load."""
+            return np.asarray(d[1:] - (along[:, None] if d.ndim == 4 else along) * d[0])
+
+        value = at.wheels[1:] + along * off
+        return Response(
+            value=value,
+            by_load=held(by_latents["load"]),
+            by_speed=held(by_latents["speed"]),
+            by_ground=held(by_latents["ground_speed"]),
+            by_soil=held(by_soil),
+            load_by_slip=by_latents["speed"][0] * self.rig.radius * latents.speed**2 / latents.ground_speed[:, None],
+            load_by_soil=by_soil[0],
+            load_slope=slope,
+            off=off,
+            by_effects=held(by_effects),
+            pull=at.pull,
+            pull_by_effects=pull_by_effects,
+        )
+
+    def _by_soil(self, soil: Soil, active: Sequence[Active], latents: Latents, at: _Outcome) -> Array:
+        """Derivatives (4, 6, N, W) by k_c, k_phi, n, phi, c, K at held entry angles."""
+        out = np.empty((4, 6, self.n, self.n_wheels))
+        for i, name in enumerate(Soil._fields[1:], 1):
+            step = STEP * max(abs(getattr(soil, name)), 1e-9)
+            changed = soil._replace(**{name: getattr(soil, name) + step})
+            contact = self._contact(changed, active, latents, latents.entry_angle)
+            out[:, i] = (self._told(contact, active, latents, None).wheels - at.wheels) / step
+        np.divide(out[:, 1], self.rig.width, out=out[:, 0])  # both act through K_L = k_c/b + k_phi
+        return out
+
+    def _contact(self, soil: Soil, active: Sequence[Active], latents: Latents, angle: Array) -> _Contact:
+        """What happens between wheels and ground at given entry angles."""
+        around = self._surroundings(latents)
+        slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
+        K_L = lumped_modulus(soil.k_c, soil.k_phi, self.rig.width)
+        state = WheelState(
+            angle, slip, self.rig.radius, self.rig.width, K_L, soil.n, float(np.tan(soil.phi)), soil.c, soil.K
+        )
+        forces = forces_with(active, state, self.model, around)
+        depth = sinkage(angle, wheel_with(active, state, self.model, around)[0].radius)
+        return _Contact(forces, np.broadcast_to(depth, angle.shape), around)
+
+    def _told(self, contact: _Contact, active: Sequence[Active], latents: Latents, late: Array | None) -> _Outcome:
+        """What sensors and the balance of forces make of it; `late` as found at other latents.
+
+        What an effect brings in from other instants is taken from a smoothed torque, and
+        not followed through their latents: each instant is solved for by itself.
+        """
+        (load, pull, torque), depth, around = contact
+        late = self._from_other_instants(active, torque, around) if late is None else late
+        error, missing, draft = np.zeros_like(load), np.zeros(self.n), self.draft
+        for effect, values in active:
+            if effect.torque is not None and not effect.mixes_instants:
+                torque = effect.torque(torque, around, values)
+            if effect.load is not None:
+                error = error + effect.load(around, values)
+            if effect.resistance is not None:
+                missing = missing + effect.resistance(around, values)
+        for _ in range(DRAFT_ROUNDS if any(e.draft is not None for e, _ in active) else 0):
+            draft = self.draft - sum(e.draft(draft, around, v) for e, v in active if e.draft is not None)
+        excess = load - (latents.load - error)
+        return _Outcome(np.stack([excess, pull, torque + late, depth]), missing + draft - self.draft, late)
+
+    def _from_other_instants(self, active: Sequence[Active], torque: Array, around: Surroundings) -> Array:
+        """What effects that mix instants add to the torque readings (N, W)."""
+        mixing = [(e, v) for e, v in active if e.torque is not None and e.mixes_instants]
+        smooth = smoothed(self.t, torque) if mixing else torque
+        late = np.zeros_like(torque)
+        for effect, values in mixing:
+            if effect.torque is not None:
+                late += effect.torque(smooth, around, values) - smooth
+        return late
+
+    def _surroundings(self, latents: Latents) -> Surroundings:
+        chassis = self.rig.chassis
+        return Surroundings(
+            t=self.since[:, None],
+            distance=self.distance[:, None],
+            load=latents.load,
+            ground_speed=latents.ground_speed[:, None],
+            wheel_speed=latents.speed,
+            rear=~self.rig.front,
+            draft=self.draft[:, None],
+            acceleration=self.acceleration[:, None],
+            mass=0.0 if chassis is None else chassis.mass,
+            duration=self.duration,
+            length=self.length,
+        )
+
+
+def smoothed(t: Array, values: Array) -> Array:
+    """Values (N, W) at times t [s] (N,) by a parabola through the SMOOTHED nearest instants of the same stretch.
+
+    Savitzky & Golay 1964 (Anal. Chem. 36:1627); shorter stretches stay as they are.
+    """
+    out = np.array(values, float)
+    half = SMOOTHED // 2
+    powers = np.arange(SMOOTHED)[:, None] - half
+    fit = np.linalg.pinv(powers ** np.arange(3))  # (3, SMOOTHED)
+    through = (powers ** np.arange(3)) @ fit  # row i: the parabola's value at place i
+    for run in stretches(t):
+        if len(run) < SMOOTHED:
+            continue
+        windows = np.lib.stride_tricks.sliding_window_view(values[run], SMOOTHED, axis=0)  # (n, W, SMOOTHED)
+        out[run[half : len(run) - half]] = windows @ through[half]
+        out[run[:half]] = through[:half] @ values[run[:SMOOTHED]]
+        out[run[len(run) - half :]] = through[half + 1 :] @ values[run[-SMOOTHED:]]
+    return out
+
+
+def _of_instant(step: Any) -> Any:
+    """A step by instant (N,) of one by instant and wheel."""
+    return step[:, 0] if np.ndim(step) == 2 else step
+
+
+def _with(latents: Latents, name: str, value: Array) -> Latents:
+    parts = {n: getattr(latents, n) for n in ("load", "speed", "ground_speed", "entry_angle")}
+    return Latents(**(parts | {name: value}))

@@ -1,0 +1,208 @@
+"""What `soilbus diagnose` tells: as JSON (keys: DESIGN.md) and as text."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from soilbus.config import Config
+from soilbus.daemon.diagnose import Findings
+from soilbus.diagnosis.completion import Completion
+from soilbus.diagnosis.diagnose import Addition
+from soilbus.diagnosis.verdict import Verdict, gap_limit
+from soilbus.diagnosis.where import Disagreement
+from soilbus.estimation.posterior import Estimate, Posterior
+from soilbus.report.table import table
+from soilbus.terra.effects.catalogue import CATALOGUE
+
+MOST_PLACES = 8
+"""Places of disagreement that the text lists."""
+SENTENCES = {
+    Verdict.NONE: "model and data agree: nothing is missing",
+    Verdict.NAMED: "an effect is missing, and the data tell which",
+    Verdict.AMBIGUOUS: "an effect is missing, and the data do not tell for sure which",
+    Verdict.UNKNOWN: "something is missing that no effect of the catalogue explains",
+}
+UNITS = {"torque": "N m", "draft": "N", "sinkage": "m"}
+
+
+def findings_json(findings: Findings) -> str:
+    """The whole as one JSON object; null for what is not finite."""
+    diagnosis, recordings = findings.diagnosis, findings.recordings
+    soils = [
+        {"log": name, "before": _soil(b, findings), "after": _soil(a, findings)} for name, b, a in findings.soils()
+    ]
+    told = {
+        "verdict": str(diagnosis.verdict),
+        "sentence": SENTENCES[diagnosis.verdict],
+        "where": [_place(place) for place in diagnosis.where],
+        "effects": [_effect(addition, findings.diagnosis.completed) for addition in diagnosis.additions],
+        "gap": {
+            "before": diagnosis.base.gap,
+            "after": findings.diagnosis.completed.gap,
+            "noise_floor": 1.0,
+            "limit": gap_limit(diagnosis.base.checked_rows),
+            "residuals": diagnosis.base.checked_rows,
+        },
+        "soil_before": soils[0]["before"],
+        "soil_after": soils[0]["after"],
+        "soils": soils,
+        "model": {name: _estimates(values) for name, values in findings.diagnosis.completed.parameters().items()},
+        "samples": recordings.samples,
+        "rejected": recordings.rejected,
+        "too_short": list(recordings.too_short),
+        "seconds": round(findings.seconds, 3),
+    }
+    return json.dumps(_finite(told), indent=1, allow_nan=False) + "\n"
+
+
+def _place(place: Disagreement) -> dict[str, Any]:
+    names = ("channel", "wheel", "region", "size", "significance")
+    return {name: getattr(place, name) for name in names}
+
+
+def _effect(addition: Addition, completed: Completion) -> dict[str, Any]:
+    effect = addition.effect
+    return {
+        "name": effect.name,
+        "parameters": _estimates(completed.parameters()[effect.name]),
+        "probability": addition.probability,
+        "alternatives": [{"name": name, "probability": p} for name, p in addition.alternatives.items()],
+        "sentence": effect.physics,
+        "source": effect.source,
+        "why_ambiguous": why_ambiguous(addition),
+        "tells": {name: CATALOGUE[name].tells for name in (effect.name, *addition.alternatives)},
+        "evidence": dict(sorted(addition.falls.items(), key=lambda item: -item[1])),
+    }
+
+
+def why_ambiguous(addition: Addition) -> str | None:
+    """Why the alternatives of an effect stay in the set; None where there are none."""
+    if not addition.alternatives:
+        return None
+    best = addition.falls[addition.effect.name]
+    others = ", ".join(f"{name} by {addition.falls[name]:.0f}" for name in addition.alternatives)
+    return (
+        f"{addition.effect.name} lowers -2 log evidence by {best:.0f}, {others}: "
+        "in this recording they change torque, draft and sinkage alike"
+    )
+
+
+def _soil(posterior: Posterior, findings: Findings) -> dict[str, Any]:
+    settings = findings.config.estimator
+    bearing = posterior.bearing_pressure(settings.z_ref, settings.b_ref)
+    pressure = {"z_ref": settings.z_ref, "b_ref": settings.b_ref, "value": bearing.value, "std": bearing.std}
+    return {**_estimates(posterior.parameters()), "bearing_pressure": pressure}
+
+
+def _estimates(estimates: dict[str, Estimate]) -> dict[str, dict[str, float]]:
+    return {name: {"value": e.value, "std": e.std} for name, e in estimates.items()}
+
+
+def _finite(value: Any) -> Any:
+    """The same with None for every number that is not finite."""
+    if isinstance(value, dict):
+        return {key: _finite(v) for key, v in value.items()}
+    if isinstance(value, list):
+        return [_finite(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def findings_text(findings: Findings) -> str:
+    """The whole for a reader at a terminal."""
+    diagnosis = findings.diagnosis
+    lines = [f"{diagnosis.verdict}: {SENTENCES[diagnosis.verdict]}", "", gap_line(findings)]
+    lines += [f"  {line}" for line in place_lines(diagnosis.where)]
+    for number, addition in enumerate(diagnosis.additions, 1):
+        lines += ["", *effect_lines(number, addition, findings.diagnosis.completed)]
+    lines += ["", *_soil_lines(findings), "", admission_line(findings)]
+    return "\n".join(lines) + "\n"
+
+
+def gap_line(findings: Findings) -> str:
+    """The gap before and after, beside what noise alone does."""
+    base, after = findings.diagnosis.base, findings.diagnosis.completed
+    return (
+        f"gap {base.gap:.3f} -> {after.gap:.3f} (reduced chi-square of {base.checked_rows} held-out residuals; "
+        f"noise alone: 1, hardly ever above {gap_limit(base.checked_rows):.2f})"
+    )
+
+
+def place_lines(where: Sequence[Disagreement]) -> list[str]:
+    """The places of disagreement, the clearest first."""
+    if not where:
+        return ["no channel disagrees with the model anywhere by more than noise"]
+    shown = [
+        f"{_channel(p)}, {p.region}: {size_text(p)} (chance {chance_text(p.significance)})" for p in where[:MOST_PLACES]
+    ]
+    left = len(where) - len(shown)
+    return [*shown, f"and {left} more"] if left else shown
+
+
+def chance_text(chance: float) -> str:
+    """A probability that may be too small for a float."""
+    return f"{chance:.0e}" if chance > 0.0 else "< 1e-300"
+
+
+def _channel(place: Disagreement) -> str:
+    return f"{place.channel}.{place.wheel}" if place.wheel else place.channel
+
+
+def size_text(place: Disagreement) -> str:
+    """The size of a disagreement in words."""
+    if place.region == "scatter":
+        return f"residuals {place.size:.2f} times the noise"
+    if place.region == "gain":
+        return f"an implausible gain error of {100 * place.size:+.2f} %"
+    return f"reading less model {place.size:+.3g} {UNITS.get(place.channel, '')}".rstrip()
+
+
+def effect_lines(number: int, addition: Addition, completed: Completion) -> list[str]:
+    """One effect: its parameters, what it is, what else it may be, what would tell."""
+    effect = addition.effect
+    lines = [f"{number}. {effect.name}, probability {addition.probability:.2f}", f"   {effect.physics}"]
+    units = {parameter.name: parameter.unit for parameter in effect.parameters}
+    for name, estimate in completed.parameters()[effect.name].items():
+        unit = units.get(name) or units[name.rpartition("_")[0]]
+        lines.append(f"   {name} = {estimate.value:.4g} +- {estimate.std:.2g} {unit}".rstrip(" 1"))
+    if addition.alternatives:
+        others = ", ".join(f"{name} {p:.2f}" for name, p in addition.alternatives.items())
+        lines += [f"   or: {others}", f"   {why_ambiguous(addition)}", "   what would tell them apart:"]
+        lines += [f"   - {name}: {CATALOGUE[name].tells}" for name in (effect.name, *addition.alternatives)]
+    return lines
+
+
+def _soil_lines(findings: Findings) -> list[str]:
+    lines: list[str] = []
+    several = len(findings.recordings.first) > 1
+    for name, before, after in findings.soils():
+        head = (f"soil of {name}" if several else "soil", "before", "after")
+        lines += table(head, soil_rows(before, after, findings.config)).splitlines()
+    return lines
+
+
+def soil_rows(before: Posterior, after: Posterior, config: Config) -> list[tuple[str, str, str]]:
+    """Name and unit, value and std before and after, of the bearing pressure and each soil parameter."""
+    z_ref, b_ref = config.estimator.z_ref, config.estimator.b_ref
+    both = [{"bearing pressure, kPa": _scaled(p.bearing_pressure(z_ref, b_ref), 1e3)} for p in (before, after)]
+    units = {"k_c": ("kN/m^(n+1)", 1e3), "k_phi": ("kN/m^(n+2)", 1e3), "n": ("", 1.0)}
+    units |= {"phi": ("deg", math.pi / 180.0), "c": ("kPa", 1e3), "K": ("mm", 1e-3)}
+    for told, posterior in zip(both, (before, after), strict=True):
+        for name, estimate in posterior.parameters().items():
+            unit, size = units[name]
+            told[f"{name}, {unit}".rstrip(", ")] = _scaled(estimate, size)
+    return [(name, both[0][name], both[1][name]) for name in both[0]]
+
+
+def _scaled(estimate: Estimate, unit: float) -> str:
+    return f"{estimate.value / unit:.4g} +- {estimate.std / unit:.2g}"
+
+
+def admission_line(findings: Findings) -> str:
+    """Samples used and refused."""
+    recordings = findings.recordings
+    refused = ", ".join(f"{reason} {n}" for reason, n in recordings.rejected.items()) or "none"
+    short = f"; too short to use: {', '.join(recordings.too_short)}" if recordings.too_short else ""
+    return f"{recordings.samples} samples of {len(recordings.first)} logs; refused samples: {refused}{short}"
