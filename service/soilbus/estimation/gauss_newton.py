@@ -74,7 +74,8 @@ class Fit:
     sinkage (W,) is the mean over the window [m], nan where unknown; belief holds soil and
     gains (relative errors, by problem.gain_names) for the windows to come, optimum is for
     resume(); rival is another optimum that the data leave about as likely, where one was
-    looked for and found.
+    looked for and found; averaged is the mean of the whole posterior, where that was worked
+    out (see `marginal`).
     """
 
     belief: Belief
@@ -86,6 +87,7 @@ class Fit:
     iterations: int
     converged: bool
     rival: Rival | None = None
+    averaged: Belief | None = None
 
     @property
     def posterior(self) -> Posterior:
@@ -94,7 +96,9 @@ class Fit:
 
     @property
     def whole(self) -> Belief:
-        """Soil and gains with the spread of both optima where there is a rival."""
+        """Soil and gains to be reported and passed on: more than the top of the posterior, where more is known."""
+        if self.averaged is not None:
+            return self.averaged
         return self.belief if self.rival is None else self.belief.mixed(self.rival.belief, self.rival.share)
 
     @property
@@ -232,6 +236,11 @@ def resume(ahead: Foreseen) -> Fit | None:
             near = fitting.moved(near, point, step)
         first = 0.0 if point is None or step is None else point.length(step)
         return _settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED, first)
+
+
+def settled(fitting: Fitting, near: Place) -> Fit | None:
+    """Descent from a place near the optimum; None where the numbers stop being finite."""
+    return _settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED)
 
 
 def _approach(fitting: Fitting, soil: Array, most: int, least: float = ENOUGH) -> Place | None:

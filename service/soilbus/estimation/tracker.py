@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.coordinates import Coordinates
 from soilbus.estimation.gauss_newton import Fit, fit_window, foreseen, resume
+from soilbus.estimation.marginal import with_whole
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.soil_change import Crossing, suspicion, without_crossing
@@ -148,6 +149,8 @@ class Tracker:
                         return self._remembered(replace(changed, standstill=left_out[0], turning=left_out[1]), end)
             if self.mismatch(fit):
                 fit = self._afresh(problem, before)
+        if fit is not None and not self.mismatch(fit):
+            fit = with_whole(problem, self._here, before, fit)
         ground = Ground.NEW if new else Ground.SAME
         return self._remembered(Tracked(fit, self.mismatch(fit), ground, since, *left_out), end)
 
