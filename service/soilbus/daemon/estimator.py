@@ -203,10 +203,12 @@ class WindowEstimator:
             return Status.NOT_EXCITED, "ambiguous"
         posterior = fit.whole.posterior
         bearing, tan_phi = self._bearing(posterior), posterior.tan_phi()
-        if bearing.std > self._settings.max_bearing_std * bearing.value:
-            return Status.NOT_EXCITED, "not_excited load_range"
-        if tan_phi.std > self._settings.max_tan_phi_std * tan_phi.value:
-            return Status.NOT_EXCITED, "not_excited slip_range"
+        lacking = {
+            "load_range": bearing.std > self._settings.max_bearing_std * bearing.value,
+            "slip_range": tan_phi.std > self._settings.max_tan_phi_std * tan_phi.value,
+        }
+        if any(lacking.values()):
+            return Status.NOT_EXCITED, " ".join(["not_excited", *(name for name, it_is in lacking.items() if it_is)])
         return Status.VALID, "none"
 
     def _failure(self, tracked: Tracked) -> str | None:

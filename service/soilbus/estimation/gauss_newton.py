@@ -49,6 +49,8 @@ MAX_REFUSED = 5
 """Steps taken back one after the other after which a fit has failed: what is left is noise of the linear model."""
 APART = 2.0
 """Standard deviations between two optima from which they are told apart."""
+ALIKE, WIDER = 0.5, 1.2
+"""How far, and how many times wider, a posterior may be than its top says and count as Gaussian [sd]."""
 RARE = 0.05
 """Share of the probability below which a rival does not count."""
 PLAUSIBLE = 3.0
@@ -100,6 +102,16 @@ class Fit:
         if self.averaged is not None:
             return self.averaged
         return self.belief if self.rival is None else self.belief.mixed(self.rival.belief, self.rival.share)
+
+    @property
+    def is_gaussian(self) -> bool:
+        """Whether the whole posterior is much as its top says; else it cannot be the prior of later windows."""
+        if self.averaged is None or self.rival is not None:
+            return self.rival is None
+        known = np.flatnonzero(np.diag(self.belief.covariance) > 0.0)
+        own, whole = (b.covariance[np.ix_(known, known)] for b in (self.belief, self.averaged))
+        wider = np.linalg.eigvals(np.linalg.solve(own, whole)).real
+        return bool(self.posterior.distance(self.averaged.posterior.soil) < ALIKE and wider.max() < WIDER**2)
 
     @property
     def gains(self) -> Array:

@@ -138,8 +138,10 @@ class Tracker:
         else:
             ahead = foreseen(problem, self._here, last, before)
             fit = resume(ahead)
+            if fit is None or not fit.converged:  # a long valley is no sign of another soil
+                fit = fit_window(problem, self._here, before)
             if self._good_until > end - self.settings.window and end - since > GRACE * self.settings.window:
-                known = ahead.fitting.given(last.belief)
+                known = ahead.fitting.given(last.whole)
                 sure = float(last.optimum.t[-1]) - LOOK_BACK * self.settings.window
                 first = int(np.searchsorted(problem.t, sure))
                 doubt = suspicion(known, ahead.place, ahead.at, first, ALARM)
@@ -183,7 +185,8 @@ class Tracker:
             self._distrusted = tracked.mismatch
         if fit is not None and not tracked.mismatch:
             self._good_until = end
-            if end - tracked.since >= LEARNED * self.settings.window and tracked.ground is not Ground.CHANGING:
+            learned = end - tracked.since >= LEARNED * self.settings.window and fit.is_gaussian
+            if learned and tracked.ground is not Ground.CHANGING:
                 self._beliefs.append((end, fit.whole))
         return tracked
 
