@@ -26,7 +26,7 @@ from soilbus.estimation.residuals import WindowProblem
 
 Array = NDArray[np.float64]
 
-WELL_KNOWN = 0.02
+WELL_KNOWN = 0.05
 """Sd of the logarithm of n below which a posterior with one top counts as Gaussian."""
 LONGEST = 0.1
 """Longest first step of the logarithm of n; each next one is longer."""
