@@ -143,9 +143,10 @@ def test_excited_windows_of_four_wheels_are_not_ambiguous():
 def test_no_belief_grows_from_one_of_two_optima():
     scenario = Scenario(12.0, (Patch(0.0, "wet_clay"),), slip=minima.EXCITED)
     estimator = WindowEstimator(TWO)
+    told = 0
     for task in tasks(TWO, scenario, 3):
         result = estimator.solve(task)
         if result.reason == "ambiguous":
-            (end, belief) = estimator._tracker._beliefs[-1]
-            assert end == task.end
-            assert belief.covariance[:6, :6] == pytest.approx(result.posterior.log_covariance)
+            told += 1
+            assert not estimator._tracker._beliefs
+    assert told > 0
