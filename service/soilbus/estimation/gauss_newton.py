@@ -51,6 +51,8 @@ MAX_REFUSED = 5
 """Steps taken back one after the other after which a fit has failed: what is left is noise of the linear model."""
 APART = 2.0
 """Standard deviations between two optima from which they are told apart."""
+ALIKE, WIDER = 0.5, 1.2
+"""How far, and how many times wider, a posterior may be than its top says and count as Gaussian [sd]."""
 RARE = 0.05
 """Share of the probability below which a rival does not count."""
 PLAUSIBLE = 3.0
@@ -76,7 +78,8 @@ class Fit:
     sinkage (W,) is the mean over the window [m], nan where unknown; belief holds soil and
     gains (relative errors, by problem.gain_names) for the windows to come, optimum is for
     resume(); rival is another optimum that the data leave about as likely, where one was
-    looked for and found.
+    looked for and found; averaged is the mean of the whole posterior, where that was worked
+    out (see `marginal`).
     """
 
     belief: Belief
@@ -88,6 +91,7 @@ class Fit:
     iterations: int
     converged: bool
     rival: Rival | None = None
+    averaged: Belief | None = None
 
     @property
     def posterior(self) -> Posterior:
@@ -96,8 +100,20 @@ class Fit:
 
     @property
     def whole(self) -> Belief:
-        """Soil and gains with the spread of both optima where there is a rival."""
+        """Soil and gains to be reported and passed on: more than the top of the posterior, where more is known."""
+        if self.averaged is not None:
+            return self.averaged
         return self.belief if self.rival is None else self.belief.mixed(self.rival.belief, self.rival.share)
+
+    @property
+    def is_gaussian(self) -> bool:
+        """Whether the whole posterior is much as its top says; else it cannot be the prior of later windows."""
+        if self.averaged is None or self.rival is not None:
+            return self.rival is None
+        known = np.flatnonzero(np.diag(self.belief.covariance) > 0.0)
+        own, whole = (b.covariance[np.ix_(known, known)] for b in (self.belief, self.averaged))
+        wider = np.linalg.eigvals(np.linalg.solve(own, whole)).real
+        return bool(self.posterior.distance(self.averaged.posterior.soil) < ALIKE and wider.max() < WIDER**2)
 
     @property
     def gains(self) -> Array:
@@ -244,6 +260,11 @@ def resume(ahead: Foreseen) -> Fit | None:
             near = fitting.moved(near, point, step)
         first = 0.0 if point is None or step is None else point.length(step)
         return _settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED, first)
+
+
+def settled(fitting: Fitting, near: Place) -> Fit | None:
+    """Descent from a place near the optimum; None where the numbers stop being finite."""
+    return _settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED)
 
 
 def _approach(
