@@ -13,13 +13,15 @@ from numpy.typing import NDArray
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.linearised import Linearised, Optimum
 from soilbus.estimation.normal_equations import Fitting, Place, Point
-from soilbus.estimation.posterior import Posterior, SoilPrior
+from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.soil_class import foretelling
 from soilbus.terra.soils import KINDS, SOILS
 from soilbus.terra.wheel import Soil
 
 Array = NDArray[np.float64]
+
+_K_C = PARAMETERS.index("k_c")
 
 MAX_ITERATIONS = 30
 MAX_RESUMED = 10
@@ -57,6 +59,12 @@ RARE = 0.05
 """Share of the probability below which a rival does not count."""
 PLAUSIBLE = 3.0
 """Cost per residual, gains held, up to which an optimum of the search may be the soil's."""
+ILL_TOLD = 0.6
+"""Std of log k_c below which a fit tells k_c, and no other optimum across it is looked for."""
+FAR = 10.0
+"""Standard deviations on a few instants beyond which an end is not the optimum looked at."""
+FAR_ABOVE = 1.5
+"""Ratio of costs on a few instants beyond which an end is no rival."""
 SAME_END = 0.02
 """Relative difference in cost of two descents that are taken to have met at one optimum."""
 
@@ -164,9 +172,14 @@ def _with_rival(fitting: Fitting, thin: Fitting, found: Fit) -> Fit:
     What was found stays alone where there is no other, or none that is nearly as likely
     and that its standard deviations exclude.
     """
-    start = fitting.coordinates.across(found.belief.soil) if np.ptp(fitting.problem.rig.width) > 0.0 else None
+    ill_told = math.sqrt(found.posterior.log_covariance[_K_C, _K_C]) > ILL_TOLD
+    start = (
+        fitting.coordinates.across(found.belief.soil) if ill_told and np.ptp(fitting.problem.rig.width) > 0.0 else None
+    )
     end = None if start is None else _approach(thin, start, MAX_APPROACH)
-    other = None if end is None else _settle(fitting, fitting.start(end.soil), MAX_ITERATIONS)
+    if end is None or not _elsewhere(thin, found.belief.soil, end):
+        return found
+    other = _settle(fitting, fitting.start(end.soil), MAX_ITERATIONS)
     if other is None or not other.converged:
         return found
     better, worse = (found, other) if found.evidence <= other.evidence else (other, found)
@@ -174,6 +187,15 @@ def _with_rival(fitting: Fitting, thin: Fitting, found: Fit) -> Fit:
     if better.posterior.distance(worse.posterior.soil) < APART:
         return better
     return better if share < RARE else replace(better, rival=Rival(worse.belief, share))
+
+
+def _elsewhere(thin: Fitting, soil: Array, end: Place) -> bool:
+    """Whether a descent on a few instants ended about as low as where a soil is, and far from it."""
+    point = thin.point(thin.start(soil))
+    if point is None or end.cost > FAR_ABOVE * point.cost:
+        return False
+    off = thin.coordinates.position(end.soil) - thin.coordinates.position(soil)
+    return point.length(off) > FAR**2
 
 
 def _promising(thin: Fitting) -> list[Place]:

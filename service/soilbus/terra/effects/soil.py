@@ -21,7 +21,7 @@ _LEAST_EXPONENT = 0.05
 def _slip_sinkage(
     state: WheelState, model: WheelModel, around: Surroundings, values: Values
 ) -> tuple[WheelState, WheelModel]:
-    """n + exponent s and K_L exp(-softening s) for slips s > 0; the exponent leaves the pressure at TYPICAL_DEPTH alone."""
+    """n + exponent s, K_L exp(-softening s), for slips s > 0; at TYPICAL_DEPTH the exponent does nothing."""
     slip = np.maximum(state.slip, 0.0)
     n = np.maximum(state.n + values["exponent"] * slip, np.minimum(state.n, _LEAST_EXPONENT))
     softer = values["softening"] * slip + (n - state.n) * np.log(TYPICAL_DEPTH)
