@@ -20,7 +20,7 @@ from soilbus.estimation.linearised import Latents
 from soilbus.estimation.residuals import MAX_TURN, Response, WindowProblem
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.effects.along import stretches
-from soilbus.terra.effects.effect import Active, Effect, Parameter, Surroundings, forces_with, wheel_with
+from soilbus.terra.effects.effect import Active, Effect, Parameter, Surroundings, forces_with, true_draft, wheel_with
 from soilbus.terra.stress import lumped_modulus
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE, MIN_ENTRY_ANGLE, Soil, WheelModel, WheelState, sinkage
 
@@ -32,8 +32,6 @@ STEP_OF_EFFECT = 1e-4
 LOAD_ROUNDS = 6
 SMOOTHED = 9
 """Instants through which a parabola smooths the torque that comes from other instants."""
-DRAFT_ROUNDS = 3
-"""Fixed-point rounds from a reading of the hitch to the draft: its error is a few per cent of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,7 +215,7 @@ class CompletedProblem(WindowProblem):
         )
         load, pull, torque = forces_with(active, state, self.model, around)
         late = self._from_other_instants(active, torque, around) if late is None else late
-        error, missing, draft = np.zeros_like(load), np.zeros(self.n), self.draft
+        error, missing = np.zeros_like(load), np.zeros(self.n)
         for effect, values in active:
             if effect.torque is not None and not effect.mixes_instants:
                 torque = effect.torque(torque, around, values)
@@ -225,8 +223,7 @@ class CompletedProblem(WindowProblem):
                 error = error + effect.load(around, values)
             if effect.resistance is not None:
                 missing = missing + effect.resistance(around, values)
-        for _ in range(DRAFT_ROUNDS if any(e.draft is not None for e, _ in active) else 0):
-            draft = self.draft - sum(e.draft(draft, around, v) for e, v in active if e.draft is not None)
+        draft = true_draft(active, self.draft, around)
         depth = sinkage(angle, wheel_with(active, state, self.model, around)[0].radius)
         excess = load - (latents.load - error)
         wheels = np.stack([excess, pull, torque + late, np.broadcast_to(depth, load.shape)])
