@@ -84,7 +84,17 @@ def test_what_effects_see_is_what_happens():
         assert np.array_equal(seen["load"][:, i], recording.truth[f"load.{wheel}"])
         assert seen["wheel_speed"][:, i] == pytest.approx(recording.truth[f"speed.{wheel}"], rel=1e-12)
     assert seen["rear"].tolist() == [False, False, True, True]
-    assert (seen["mass"], seen["duration"]) == (MASS, 15.0)
+    assert (seen["mass"], seen["duration"], seen["length"]) == (MASS, 15.0, done.columns["distance"][-1])
+
+
+def test_a_worn_tyre_sinks_by_its_own_radius():
+    worn = Active(CATALOGUE["rolling_radius"], {"front": -0.06, "rear": 0.0})
+    columns = drive(reference_configuration(), DRIVE, 5, [worn]).columns
+    for wheel, radius in (("FL", 0.47), ("RR", 0.62)):
+        assert columns[f"sinkage.{wheel}"] == pytest.approx(radius * (1.0 - np.cos(columns[f"entry_angle.{wheel}"])))
+    # Slip is told with the nominal radius: truly the smaller wheel slips less.
+    slip = 1.0 - columns["ground_speed"] / (0.50 * columns["speed.FL"])
+    assert columns["slip.FL"] == pytest.approx(slip, abs=1e-12)
 
 
 def test_effects_on_sensors_leave_the_truth_and_come_before_the_noise():

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from itertools import pairwise
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
-from scipy.optimize import brentq
 
+from adaptive import adaptive_forces
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import (
     EXACT_NODES,
@@ -30,52 +28,6 @@ from soilbus.terra.wheel import (
 )
 
 R, B = 0.5, 0.3
-EXACT = {"epsabs": 0.0, "epsrel": 1e-11, "limit": 200}
-
-
-def adaptive_forces(state: WheelState, model: WheelModel) -> np.ndarray:
-    """W, DP and T of one wheel by scipy.integrate.quad, equation by equation (numbers of Xi et al. 2024)."""
-    theta1, slip, r, b, K_L, n, tan_phi, c, K = (float(v) for v in state)
-    theta_m = (model.peak_c1 + model.peak_c2 * slip) * theta1  # eq. 4
-    theta2 = model.exit_ratio * theta1
-
-    def sigma(theta: float) -> float:
-        """Eqs. 7 and 8, with the bracket that eq. 8 has lost (notes.md)."""
-        front = theta if theta >= theta_m else theta1 - (theta - theta2) / (theta_m - theta2) * (theta1 - theta_m)
-        # cos(front) - cos(theta1), without cancellation
-        z = 2.0 * r * math.sin((theta1 + front) / 2.0) * math.sin((theta1 - front) / 2.0)
-        return K_L * max(z, 0.0) ** n
-
-    def displacement(theta: float) -> float:
-        """Eqs. 15 and 16: the integral of the rim's slip velocity."""
-        return r * ((theta1 - theta) - (1.0 - slip) * (math.sin(theta1) - math.sin(theta)))
-
-    def tau(theta: float) -> float:
-        """Eqs. 11 and 12; in skid the shear acts the other way."""
-        x = displacement(theta) / K
-        share = 1.0 - math.exp(-abs(x)) if model.shear_law == "exponential" else abs(x) / (abs(x) + 1.0)
-        return math.copysign((c + sigma(theta) * tan_phi) * share, x)
-
-    # Each end of each part gets sixth-power nodes: sigma may start as z**0.1 there.
-    splits = {theta2, theta_m, theta1}
-    grid = np.linspace(theta2, theta1, 400)[:-1]
-    values = [displacement(theta) for theta in grid]
-    for i in range(len(grid) - 1):
-        if values[i] * values[i + 1] < 0.0:
-            splits.add(brentq(displacement, grid[i], grid[i + 1], xtol=1e-15))
-
-    def integral(f: Callable[[float], float]) -> float:
-        total = 0.0
-        for low, high in pairwise(sorted(splits)):
-            half = (high - low) / 2.0
-            for end, way in ((low, half), (high, -half)):
-                total += half * quad(lambda u: f(end + way * u**6) * 6.0 * u**5, 0.0, 1.0, **EXACT)[0]  # noqa: B023
-        return total
-
-    W = r * b * integral(lambda t: sigma(t) * math.cos(t) + tau(t) * math.sin(t))  # eq. 20
-    DP = r * b * integral(lambda t: tau(t) * math.cos(t) - sigma(t) * math.sin(t))  # eq. 21
-    T = r * r * b * integral(tau)  # eq. 22
-    return np.array([W, DP, T])
 
 
 def wheels(seed: int, size: int, slip: tuple[float, float] = (0.0, 0.95), c: float = 70e3) -> WheelState:

@@ -5,20 +5,30 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from soilbus.diagnosis.completion import Completion, complete
+import numpy as np
+
+from soilbus.diagnosis.completion import Completion, Start, complete
+from soilbus.diagnosis.learned import Correction, corrections
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.score import scores
-from soilbus.diagnosis.verdict import PAYS, PLAUSIBLE, SURE, Verdict, gap_limit, probabilities
+from soilbus.diagnosis.score import Score, scores
+from soilbus.diagnosis.verdict import PLAUSIBLE, SURE, Verdict, is_real, pays, probabilities
 from soilbus.diagnosis.where import Disagreement, disagreements
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
 
 MAX_EFFECTS = 3
-TRIED = 6
-"""Candidates of a round that are fitted."""
+TRIED = 8
+"""Candidates of a round that are fitted to a few instants."""
+FITTED = 4
+"""Those of them that are fitted to all."""
+THINNED = 4
+NEAR = 0.2
+"""Share of the best one's fall on a few instants below which a candidate is out."""
 WORTH_TRYING = -2.0
 """Foreseen change of -2 log evidence above which a candidate is not fitted."""
 NOTHING = "none"
+SAME = 1.0
+"""Difference of -2 log evidence that is none."""
 
 
 class NotFitted(Exception):
@@ -37,13 +47,17 @@ class Addition:
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """What was found; base is the present model, completed the one with the effects added."""
+    """What was found; base is the present model, completed the one with the effects added.
+
+    learned describes what is left where the verdict is unknown.
+    """
 
     verdict: Verdict
     where: tuple[Disagreement, ...]
     additions: tuple[Addition, ...]
     base: Completion
     completed: Completion
+    learned: tuple[Correction, ...]
 
 
 def diagnose(
@@ -70,7 +84,11 @@ def diagnose(
             break
         addition, present = found
         additions.append(addition)
-    return Diagnosis(_verdict(base, present, additions), tuple(where), tuple(additions), base, present)
+        if len(additions) > 1:
+            additions, present = _reconsidered(records, prior, present, additions, candidates)
+    verdict = _verdict(base, present, additions)
+    learned = corrections(list(records), present) if verdict is Verdict.UNKNOWN else []
+    return Diagnosis(verdict, tuple(where), tuple(additions), base, present, tuple(learned))
 
 
 def _round(
@@ -78,26 +96,75 @@ def _round(
 ) -> tuple[Addition, Completion] | None:
     """The best effect to add to the present model; None where none pays."""
     tried: dict[str, tuple[Effect, Completion]] = {}
-    for score in scores(records, prior, present, candidates)[:TRIED]:
-        if score.evidence > WORTH_TRYING:
-            break
+    for score in _promising(records, prior, present, candidates):
         completion = complete(records, prior, (*present.effects, score.effect), score.starts)
-        if completion is not None:
+        if completion is not None and completion.converged:
             tried[score.effect.name] = score.effect, completion
     if not tried:
         return None
     falls = {name: present.evidence - completion.evidence for name, (_, completion) in tried.items()}
     best = max(falls, key=lambda name: falls[name])
-    if falls[best] < PAYS:
+    if not pays(falls[best], present.gap, present.checked_rows, present.rows):
         return None
-    chances = probabilities({NOTHING: 0.0} | {name: -fall for name, fall in falls.items()}, present.checked_rows)
+    chances = probabilities({NOTHING: 0.0} | {name: -fall for name, fall in falls.items()})
     others = {n: p for n, p in chances.items() if n not in (best, NOTHING) and p >= PLAUSIBLE}
     effect, completion = tried[best]
     return Addition(effect, chances[best], others, falls), completion
 
 
+def _promising(
+    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect]
+) -> list[Score]:
+    """The few candidates worth a fit of all data: foreseen by their scores, tried on a few instants."""
+    foreseen = [s for s in scores(records, prior, present, candidates)[:TRIED] if s.evidence < WORTH_TRYING]
+    if len(foreseen) <= FITTED:
+        return foreseen
+    few = [record.thinned(THINNED) for record in records]
+    before = complete(few, prior, present.effects, present.as_starts())
+    if before is None:
+        return foreseen[:FITTED]
+    falls: list[tuple[float, Score]] = []
+    for score in foreseen:
+        completion = complete(few, prior, (*present.effects, score.effect), score.starts)
+        if completion is not None:
+            falls.append((before.evidence - completion.evidence, score))
+    falls.sort(key=lambda item: -item[0])
+    return [score for fall, score in falls[:FITTED] if fall > NEAR * falls[0][0]]
+
+
+def _reconsidered(
+    records: Sequence[Record],
+    prior: SoilPrior,
+    present: Completion,
+    additions: Sequence[Addition],
+    candidates: Sequence[Effect],
+) -> tuple[list[Addition], Completion]:
+    """Each earlier effect named anew beside the later ones: alone, it may have stood for two."""
+    chosen = list(additions)
+    for i in range(len(additions) - 1):
+        without = _without(records, prior, present, chosen[i].effect)
+        if without is None:
+            continue
+        found = _round(records, prior, without, [e for e in candidates if e.name not in without.names])
+        if found is not None and found[1].evidence < present.evidence + SAME:
+            chosen[i], present = found
+    order = {name: i for i, name in enumerate(present.names)}
+    return sorted(chosen, key=lambda addition: order[addition.effect.name]), present
+
+
+def _without(records: Sequence[Record], prior: SoilPrior, present: Completion, effect: Effect) -> Completion | None:
+    """The present model less one effect, fitted from where it stands."""
+    n_sensors = records[0].learned.n_sensors
+    kept = [n_sensors + i for i, f in enumerate(present.free) if f.effect != effect.name]
+    starts = [
+        Start(fit.belief.soil, np.concatenate([fit.belief.gains[:n_sensors], fit.belief.gains[kept]]))
+        for fit in present.fits
+    ]
+    return complete(records, prior, [e for e in present.effects if e.name != effect.name], starts)
+
+
 def _verdict(base: Completion, completed: Completion, additions: Sequence[Addition]) -> Verdict:
-    if completed.gap > gap_limit(completed.checked_rows):
+    if is_real(base.gap, completed.gap, completed.checked_rows):
         return Verdict.UNKNOWN
     if not additions:
         return Verdict.NONE

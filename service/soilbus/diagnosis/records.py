@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +31,11 @@ class Record:
     learned: CompletedProblem
     checked: CompletedProblem
 
+    def thinned(self, every: int) -> Record:
+        """The same with every so manieth instant."""
+        learned, checked = (part.part(slice(None, None, every)) for part in (self.learned, self.checked))
+        return Record(self.name, learned, checked)
+
 
 def record_of(name: str, window: Window, rig: Rig, model: WheelModel, min_speed: float, max_turn: float) -> Record:
     """One recording divided into blocks; TooLittle where it has not enough usable instants."""
@@ -49,8 +53,3 @@ def checked_instants(since: NDArray[np.float64]) -> NDArray[np.bool_]:
     span = float(since[-1] - since[0]) if len(since) else 0.0
     length = min(BLOCK, span / (3 * CHECKED)) if span > 0.0 else BLOCK
     return np.asarray((since / max(length, 1e-9)).astype(int) % CHECKED == CHECKED - 1)
-
-
-def wheel_names(records: Sequence[Record]) -> tuple[str, ...]:
-    """The wheels of the vehicle that all records are of."""
-    return records[0].learned.rig.wheels

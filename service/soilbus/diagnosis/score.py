@@ -24,7 +24,7 @@ from soilbus.terra.effects.effect import Effect
 
 Array = NDArray[np.float64]
 
-MAX_PULL = 2.0
+MAX_STEP = 2.0
 """Prior standard deviations to which a foreseen parameter is confined: linear is not for ever."""
 
 
@@ -56,26 +56,55 @@ class _Normal:
 def scores(
     records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect]
 ) -> list[Score]:
-    """The candidates in the order of what they are foreseen to explain, the best first."""
-    n_wheels = len(records[0].learned.rig.wheels)
-    free = [f for effect in candidates for f in parameters_of(effect, n_wheels)]
-    normals = [_normal(r, prior, present, i, candidates, free) for i, r in enumerate(records)]
-    found = []
-    for effect in candidates:
-        columns = np.array([i for i, f in enumerate(free) if f.effect == effect.name])
-        found.append(_score(effect, columns, free, normals))
+    """The candidates in the order of what they are foreseen to explain, the best first.
+
+    A parameter with further starts is looked at from each of them; the best counts.
+    """
+    found = _scores_at(records, prior, present, candidates, 0)
+    for turn in range(1, 1 + max((len(p.starts) for e in candidates for p in e.parameters), default=0)):
+        again = [e for e in candidates if any(len(p.starts) >= turn for p in e.parameters)]
+        for score in _scores_at(records, prior, present, again, turn):
+            place = [s.effect.name for s in found].index(score.effect.name)
+            if score.evidence < found[place].evidence:
+                found[place] = score
     return sorted(found, key=lambda score: score.evidence)
 
 
+def _scores_at(
+    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect], turn: int
+) -> list[Score]:
+    """Scores from the neutral values (turn 0), or from the parameters' further starts."""
+    n_wheels = len(records[0].learned.rig.wheels)
+    free = [f for effect in candidates for f in parameters_of(effect, n_wheels)]
+    begin = np.array([(_start_value(f, turn) - f.value) / f.std for f in free])
+    normals = [_normal(r, prior, present, i, candidates, free, begin) for i, r in enumerate(records)]
+    found = []
+    for effect in candidates:
+        columns = np.array([i for i, f in enumerate(free) if f.effect == effect.name])
+        found.append(_score(effect, columns, free, normals, begin))
+    return found
+
+
+def _start_value(free: Free, turn: int) -> float:
+    starts = free.parameter.starts
+    return starts[turn - 1] if 0 < turn <= len(starts) else free.value
+
+
 def _normal(
-    record: Record, prior: SoilPrior, present: Completion, i: int, candidates: Sequence[Effect], free: Sequence[Free]
+    record: Record,
+    prior: SoilPrior,
+    present: Completion,
+    i: int,
+    candidates: Sequence[Effect],
+    free: Sequence[Free],
+    begin: Array,
 ) -> _Normal:
     problem = record.learned.completed((*present.effects, *candidates), (*present.free, *free))
     fit, before, P = present.fits[i], present.before[i], len(free)
     covariance = np.zeros((len(before.covariance) + P,) * 2)
     covariance[:-P, :-P], covariance[-P:, -P:] = before.covariance, np.eye(P)
     extended = Belief(before.soil, np.concatenate([before.gains, np.zeros(P)]), covariance)
-    gains = np.concatenate([fit.optimum.gains, np.zeros(P)])
+    gains = np.concatenate([fit.optimum.gains, begin])
     place = Place(fit.optimum.soil, gains, fit.optimum.latents, np.inf, 0)
     fitting = Fitting(problem, prior, extended)
     with np.errstate(all="ignore"):
@@ -89,61 +118,64 @@ def _normal(
         raise np.linalg.LinAlgError("the present model's information is singular")
     answer = inverse[1] @ information[base, new]
     left = information[new, new] - np.eye(P) - information[new, base] @ answer
-    by_effects = point.gradient[new] - answer.T @ point.gradient[base]
+    by_effects = point.gradient[new] - begin - answer.T @ point.gradient[base]  # of the data alone
     return _Normal(fitting, place, by_effects, left, answer)
 
 
-def _score(effect: Effect, columns: NDArray[np.intp], free: Sequence[Free], normals: Sequence[_Normal]) -> Score:
+def _score(
+    effect: Effect, columns: NDArray[np.intp], free: Sequence[Free], normals: Sequence[_Normal], begin: Array
+) -> Score:
     """One effect's score over all recordings; with parameters of its own in each where it is of the recording."""
-    block = np.ix_(columns, columns)
+    block, at = np.ix_(columns, columns), begin[columns]
     own = [free[i] for i in columns.tolist()]
     parts = [(n.left[block], n.by_effects[columns]) for n in normals]
     if not effect.of_record:
         left, gradient = (np.sum([part[i] for part in parts], axis=0) for i in (0, 1))
         parts = [(left, gradient)]
-    solutions = [_within(left + np.eye(len(own)), gradient, own) for left, gradient in parts]
-    fall = sum(solution.fall for solution in solutions)
+    solutions = [_within(left + np.eye(len(own)), gradient + at, at, own) for left, gradient in parts]
+    fall = sum(solution.fall for solution in solutions) - len(solutions) * float(at @ at)
     logdet = sum(solution.logdet for solution in solutions)
-    pulls = [solution.pull for solution in solutions] * (1 if effect.of_record else len(normals))
-    starts = tuple(_start(n, columns, pull) for n, pull in zip(normals, pulls, strict=True))
+    steps = [solution.step for solution in solutions] * (1 if effect.of_record else len(normals))
+    starts = tuple(_start(n, columns, at, step) for n, step in zip(normals, steps, strict=True))
     return Score(effect, fall, logdet - fall, starts)
 
 
 class _Solution(NamedTuple):
-    """Parameters (P,) in prior std, by how much the cost falls there, and log determinant of the information."""
+    """Step of the parameters (P,) in prior std, by how much the cost falls, and log determinant of the information."""
 
-    pull: Array
+    step: Array
     fall: float
     logdet: float
 
 
-def _within(information: Array, gradient: Array, free: Sequence[Free]) -> _Solution:
+def _within(information: Array, gradient: Array, begin: Array, free: Sequence[Free]) -> _Solution:
     """Least cost of the parabola with the parameters inside their ranges: those that would leave stay at the edge."""
     low, high = (np.array([(getattr(f.parameter, edge) - f.value) / f.std for f in free]) for edge in ("low", "high"))
-    pull = np.zeros(len(free))
+    low, high = low - begin, high - begin
+    step = np.zeros(len(free))
     inside = np.ones(len(free), bool)
     for _ in range(len(free) + 1):
-        at_edge = np.where(inside, 0.0, pull)
+        at_edge = np.where(inside, 0.0, step)
         rest = gradient + information @ at_edge
-        pull = at_edge.copy()
+        step = at_edge.copy()
         if inside.any():
-            pull[inside] = -np.linalg.solve(information[np.ix_(inside, inside)], rest[inside])
-        leaving = inside & ((pull < low) | (pull > high))
+            step[inside] = -np.linalg.solve(information[np.ix_(inside, inside)], rest[inside])
+        leaving = inside & ((step < low) | (step > high))
         if not leaving.any():
             break
-        pull = np.clip(pull, low, high)
+        step = np.clip(step, low, high)
         inside &= ~leaving
-    fall = float(-2.0 * gradient @ pull - pull @ information @ pull)
+    fall = float(-2.0 * gradient @ step - step @ information @ step)
     kept = np.ix_(inside, inside)
-    return _Solution(pull, fall, float(np.linalg.slogdet(information[kept])[1]) if inside.any() else 0.0)
+    return _Solution(step, fall, float(np.linalg.slogdet(information[kept])[1]) if inside.any() else 0.0)
 
 
-def _start(normal: _Normal, columns: NDArray[np.intp], pull: Array) -> Start:
-    pull = pull * min(1.0, MAX_PULL / max(float(np.abs(pull).max(initial=0.0)), 1e-12))
-    step = -normal.answer[:, columns] @ pull
+def _start(normal: _Normal, columns: NDArray[np.intp], begin: Array, step: Array) -> Start:
+    step = step * min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-12))
+    follow = -normal.answer[:, columns] @ step
     fitting, place = normal.fitting, normal.place
     n_free, n_known = len(fitting.free), len(place.gains) - len(normal.left)
-    soil = fitting.coordinates.moved(place.soil, step[:n_free])
+    soil = fitting.coordinates.moved(place.soil, follow[:n_free])
     gains = place.gains[:n_known].copy()
-    gains[fitting.active[fitting.active < n_known]] += step[n_free:]
-    return Start(soil, np.concatenate([gains, pull]))
+    gains[fitting.active[fitting.active < n_known]] += follow[n_free:]
+    return Start(soil, np.concatenate([gains, begin + step]))

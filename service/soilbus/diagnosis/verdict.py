@@ -28,13 +28,17 @@ SURE = 0.8
 """Probability from which a name stands alone."""
 PLAUSIBLE = 0.02
 """Probability from which a name belongs to the set."""
+WORTH = 0.25
+"""Share of a real gap's excess over noise that an effect must explain to be added."""
+UNEXPLAINED = 0.35
+"""Share of it that may be left by effects that are named: none has the formula of the field."""
 REAL_GAP = 4.0
 """Standard deviations of a reduced chi-square beyond which a gap is real."""
 LEAST_GAP = 1.04
 """Reduced chi-square up to which no gap is told, however many residuals: noise is not known better."""
 
 
-def probabilities(evidence: Mapping[str, float], rows: int) -> dict[str, float]:
+def probabilities(evidence: Mapping[str, float]) -> dict[str, float]:
     """Probability of each name from its -2 log evidence, the largest first."""
     least = min(evidence.values())
     weights = {name: math.exp(-(e - least) / (2.0 * TEMPERATURE)) for name, e in evidence.items()}
@@ -45,3 +49,14 @@ def probabilities(evidence: Mapping[str, float], rows: int) -> dict[str, float]:
 def gap_limit(rows: int) -> float:
     """Reduced chi-square of so many held-out residuals up to which noise explains them."""
     return max(LEAST_GAP, 1.0 + REAL_GAP * math.sqrt(2.0 / max(rows, 1)))
+
+
+def pays(fall: float, gap: float, checked_rows: int, rows: int) -> bool:
+    """Whether an effect is worth adding that lowers -2 log evidence so far, at a present gap on so many residuals."""
+    excess = (gap - 1.0) * rows if gap > gap_limit(checked_rows) else 0.0
+    return fall > max(PAYS, WORTH * excess)
+
+
+def is_real(before: float, after: float, checked_rows: int) -> bool:
+    """Whether a gap is left that the effects added do not explain."""
+    return after > gap_limit(checked_rows) and after - 1.0 > UNEXPLAINED * (before - 1.0)

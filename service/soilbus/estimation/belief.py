@@ -40,6 +40,13 @@ class Belief:
         """What is known of the soil alone."""
         return Posterior(Soil(*self.soil.tolist()), self.covariance[:_SOIL, :_SOIL])
 
+    def mixed(self, other: Belief, share: float) -> Belief:
+        """The same with the spread, about it, of what is this with probability 1 - share and another with share."""
+        held = np.diag(self.covariance)[:_SOIL] == 0.0
+        off = np.concatenate([np.where(held, 0.0, np.log(other.soil / self.soil)), other.gains - self.gains])
+        of_other = other.covariance + np.outer(off, off)
+        return replace(self, covariance=(1.0 - share) * self.covariance + share * of_other)
+
     def drifted(self, soil: Array, gains: Array) -> Belief:
         """Later: the soil's logarithms may have changed with covariance (6, 6), the gains with variance (G,)."""
         covariance = self.covariance.copy()

@@ -49,6 +49,10 @@ class Free:
         """effect.parameter, with the wheel's number where it has one."""
         return f"{self.effect}.{self.parameter.name}" + ("" if self.wheel is None else f".{self.wheel}")
 
+    def within(self, pull: float) -> bool:
+        """Whether so many prior std from the prior value is inside the parameter's range."""
+        return self.parameter.low <= self.value + self.std * pull <= self.parameter.high
+
     def at(self, pull: float) -> float:
         """The parameter's value so many prior std from its prior value, kept inside its range."""
         return min(max(self.value + self.std * pull, self.parameter.low), self.parameter.high)
@@ -81,6 +85,14 @@ class _Outcome(NamedTuple):
     wheels: Array
     pull: Array
     late: Array
+
+
+class _Contact(NamedTuple):
+    """Load, drawbar pull and torque between wheels and ground (3, N, W), sinkage (N, W), what effects depend on."""
+
+    forces: Array
+    depth: Array
+    around: Surroundings
 
 
 class CompletedProblem(WindowProblem):
@@ -121,10 +133,12 @@ class CompletedProblem(WindowProblem):
         if not self.effects:
             return base
         active = self.active(np.zeros(len(self.free)) if gains is None else gains[self.n_sensors :])
-        angle = base.entry_angle
+        angle, nothing = base.entry_angle, np.zeros_like(base.load)
         for _ in range(LOAD_ROUNDS):
-            excess = self._outcome(soil, active, base, angle).wheels[0]
-            more = self._outcome(soil, active, base, angle * (1.0 + STEP)).wheels[0]
+            excess, more = (
+                self._told(self._contact(soil, active, base, turned), active, base, nothing).wheels[0]
+                for turned in (angle, angle * (1.0 + STEP))
+            )
             slope = (more - excess) / STEP
             with np.errstate(all="ignore"):
                 step = np.where(slope > 0.0, -excess / slope, 0.0)
@@ -138,33 +152,39 @@ class CompletedProblem(WindowProblem):
         if not self.effects:
             return super().sinkages(soil, gains, latents)
         active = self.active(gains[self.n_sensors :])
-        return np.asarray(self._outcome(soil, active, latents, latents.entry_angle).wheels[3])
+        return np.asarray(self._contact(soil, active, latents, latents.entry_angle)[1])
 
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         if not self.effects:
             return super()._response(soil, gains, latents)
         pulls = gains[self.n_sensors :]
         active, angle = self.active(pulls), latents.entry_angle
-        at = self._outcome(soil, active, latents, angle)
+        here = self._contact(soil, active, latents, angle)
+        at = self._told(here, active, latents, None)
 
         def by(changed: _Outcome, step: Any) -> _Outcome:
             return _Outcome((changed.wheels - at.wheels) / step, (changed.pull - at.pull) / _of_instant(step), at.late)
 
-        turn = STEP * angle
-        by_angle = by(self._outcome(soil, active, latents, angle + turn, at.late), turn).wheels
-        by_latents = []
-        for name in ("load", "speed", "ground_speed"):
+        def by_moving(moved: Latents, step: Any) -> Array:
+            contact = self._contact(soil, active, moved, moved.entry_angle)
+            return by(self._told(contact, active, moved, at.late), step).wheels
+
+        by_latents = {}
+        for name in ("entry_angle", "load", "speed", "ground_speed"):
             value = getattr(latents, name)
             step = STEP * np.abs(value)
-            changed = self._outcome(soil, active, _with(latents, name, value + step), angle, at.late)
-            by_latents.append(by(changed, step if step.ndim == 2 else step[:, None]).wheels)
+            by_latents[name] = by_moving(_with(latents, name, value + step), step if step.ndim == 2 else step[:, None])
+        by_angle = by_latents["entry_angle"]
         by_soil = self._by_soil(soil, active, latents, at)
         by_effects = np.zeros((4, len(self.free), self.n, self.n_wheels))
         pull_by_effects = np.zeros((len(self.free), self.n))
+        at_wheels = {e.name for e in self.effects if e.wheel is not None or e.forces is not None}
         for i in np.flatnonzero(self.gain_std[self.n_sensors :] > 0.0):
             shifted = pulls.copy()
             shifted[i] += STEP_OF_EFFECT
-            d = by(self._outcome(soil, self.active(shifted), latents, angle), STEP_OF_EFFECT)
+            other = self.active(shifted)
+            contact = self._contact(soil, other, latents, angle) if self.free[i].effect in at_wheels else here
+            d = by(self._told(contact, other, latents, None), STEP_OF_EFFECT)
             by_effects[:, i], pull_by_effects[i] = d.wheels, d.pull
         slope, off = by_angle[0], -at.wheels[0]
         along = by_angle[1:] / slope  # what a load more turns into, by way of the entry angle
@@ -176,11 +196,11 @@ class CompletedProblem(WindowProblem):
         value = at.wheels[1:] + along * off
         return Response(
             value=value,
-            by_load=held(by_latents[0]),
-            by_speed=held(by_latents[1]),
-            by_ground=held(by_latents[2]),
+            by_load=held(by_latents["load"]),
+            by_speed=held(by_latents["speed"]),
+            by_ground=held(by_latents["ground_speed"]),
             by_soil=held(by_soil),
-            load_by_slip=by_latents[1][0] * self.rig.radius * latents.speed**2 / latents.ground_speed[:, None],
+            load_by_slip=by_latents["speed"][0] * self.rig.radius * latents.speed**2 / latents.ground_speed[:, None],
             load_by_soil=by_soil[0],
             load_slope=slope,
             off=off,
@@ -195,25 +215,30 @@ class CompletedProblem(WindowProblem):
         for i, name in enumerate(Soil._fields[1:], 1):
             step = STEP * max(abs(getattr(soil, name)), 1e-9)
             changed = soil._replace(**{name: getattr(soil, name) + step})
-            out[:, i] = (self._outcome(changed, active, latents, latents.entry_angle).wheels - at.wheels) / step
+            contact = self._contact(changed, active, latents, latents.entry_angle)
+            out[:, i] = (self._told(contact, active, latents, None).wheels - at.wheels) / step
         np.divide(out[:, 1], self.rig.width, out=out[:, 0])  # both act through K_L = k_c/b + k_phi
         return out
 
-    def _outcome(
-        self, soil: Soil, active: Sequence[Active], latents: Latents, angle: Array, late: Array | None = None
-    ) -> _Outcome:
-        """What the model says at given entry angles; `late` as found at other latents, which it hardly depends on.
-
-        What an effect brings in from other instants is taken from a smoothed torque, and
-        not followed through their latents: each instant is solved for by itself.
-        """
+    def _contact(self, soil: Soil, active: Sequence[Active], latents: Latents, angle: Array) -> _Contact:
+        """What happens between wheels and ground at given entry angles."""
         around = self._surroundings(latents)
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
         K_L = lumped_modulus(soil.k_c, soil.k_phi, self.rig.width)
         state = WheelState(
             angle, slip, self.rig.radius, self.rig.width, K_L, soil.n, float(np.tan(soil.phi)), soil.c, soil.K
         )
-        load, pull, torque = forces_with(active, state, self.model, around)
+        forces = forces_with(active, state, self.model, around)
+        depth = sinkage(angle, wheel_with(active, state, self.model, around)[0].radius)
+        return _Contact(forces, np.broadcast_to(depth, angle.shape), around)
+
+    def _told(self, contact: _Contact, active: Sequence[Active], latents: Latents, late: Array | None) -> _Outcome:
+        """What sensors and the balance of forces make of it; `late` as found at other latents.
+
+        What an effect brings in from other instants is taken from a smoothed torque, and
+        not followed through their latents: each instant is solved for by itself.
+        """
+        (load, pull, torque), depth, around = contact
         late = self._from_other_instants(active, torque, around) if late is None else late
         error, missing = np.zeros_like(load), np.zeros(self.n)
         for effect, values in active:
@@ -224,10 +249,8 @@ class CompletedProblem(WindowProblem):
             if effect.resistance is not None:
                 missing = missing + effect.resistance(around, values)
         draft = true_draft(active, self.draft, around)
-        depth = sinkage(angle, wheel_with(active, state, self.model, around)[0].radius)
         excess = load - (latents.load - error)
-        wheels = np.stack([excess, pull, torque + late, np.broadcast_to(depth, load.shape)])
-        return _Outcome(wheels, missing + draft - self.draft, late)
+        return _Outcome(np.stack([excess, pull, torque + late, depth]), missing + draft - self.draft, late)
 
     def _from_other_instants(self, active: Sequence[Active], torque: Array, around: Surroundings) -> Array:
         """What effects that mix instants add to the torque readings (N, W)."""

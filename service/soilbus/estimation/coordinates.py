@@ -7,6 +7,7 @@ badly, so in plain logarithms the optimum lies in a long curved valley.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,8 +23,12 @@ MAX_STEP = 0.7
 """Longest step of a coordinate."""
 BOUND = 4.0
 """Prior standard deviations of the logarithm to which a free parameter is confined."""
+LITTLE, MUCH = 0.03, 0.4
+"""Shares of k_c in the modulus under a mean tyre, on either side of what most windows can tell from none."""
+MAX_PHI = 1.2
+"""Largest free friction angle [rad], beyond any soil's: the model ends at a right angle."""
 
-_K_C, _K_PHI, _N = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n"))
+_K_C, _K_PHI, _N, _PHI = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "phi"))
 
 
 @dataclass(frozen=True)
@@ -82,8 +87,27 @@ class Coordinates:
         if _K_PHI in self._column:
             K_L = np.exp(position[self._column[_K_PHI]] - soil[_N] * np.log(TYPICAL_DEPTH))
             soil[_K_PHI] = max(K_L - soil[_K_C] / self.width, 0.01 * K_L)
+        return self.within(soil)
+
+    def across(self, soil: Array) -> Array | None:
+        """A soil (6,) that carries a mean tyre as this one does, with much of k_c instead of little, or the reverse.
+
+        The cost is all but a parabola in k_c, but not in its logarithm: where k_c is so
+        small that it does nothing, only the prior counts, and there may be one optimum
+        there and one where k_c does much.  None where k_c and k_phi are not both free.
+        """
+        if not {_K_C, _K_PHI} <= self._column.keys():
+            return None
+        K_L = soil[_K_PHI] + soil[_K_C] / self.width
+        share = LITTLE if soil[_K_C] / self.width > math.sqrt(LITTLE * MUCH) * K_L else MUCH
+        other = soil.copy()
+        other[_K_C], other[_K_PHI] = share * K_L * self.width, (1.0 - share) * K_L
+        return self.within(other)
+
+    def within(self, soil: Array) -> Array:
+        """The soil (6,) with each free parameter brought to the nearest that is near the prior and physical."""
         low, high = self._bounds
-        soil[free] = np.minimum(np.maximum(soil[free], low), high)
+        soil[self.free] = np.minimum(np.maximum(soil[self.free], low), high)
         return soil
 
     @cached_property
@@ -94,7 +118,8 @@ class Coordinates:
     @cached_property
     def _bounds(self) -> tuple[Array, Array]:
         centre, bound = self.prior.median[self.free], np.exp(BOUND * self.prior.log_std[self.free])
-        return centre / bound, centre * bound
+        most = np.where(self.free == _PHI, MAX_PHI, np.inf)
+        return centre / bound, np.minimum(centre * bound, most)
 
     def moved(self, soil: Array, step: Array) -> Array:
         """The soil (6,) after a step (F,) of the coordinates, shortened where it is long."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +33,9 @@ ENOUGH = 0.02
 """Relative fall of the cost below which the approach has done its part."""
 WORSE = 20.0
 """Rise of the cost that a step may bring: where the cost bends, steps that overshoot come back by themselves."""
+SLOWLY = 0.5
+"""Length of a step over that of the last, along it, above which steps are extrapolated."""
+MAX_STRIDE = 8.0
 THINNED = 24
 """Instants of a window that the search for good starts looks at."""
 MAX_KINDS = 2
@@ -41,11 +46,22 @@ MAX_HOPELESS = 5
 HOPELESS = 60.0
 """Cost for each thinned instant beyond which the window cannot be one soil."""
 MAX_REFUSED = 5
-"""Steps taken back after which a fit has failed: what is left is noise of the linear model."""
+"""Steps taken back one after the other after which a fit has failed: what is left is noise of the linear model."""
+APART = 2.0
+"""Standard deviations between two optima from which they are told apart."""
+RARE = 0.05
+"""Share of the probability below which a rival does not count."""
 PLAUSIBLE = 3.0
 """Cost per residual, gains held, up to which an optimum of the search may be the soil's."""
 SAME_END = 0.02
 """Relative difference in cost of two descents that are taken to have met at one optimum."""
+
+
+class Rival(NamedTuple):
+    """Another optimum than a fit's, and its share of the probability of both (Laplace)."""
+
+    belief: Belief
+    share: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +73,8 @@ class Fit:
     cost per residual (reduced: each parameter has its prior as one more residual).
     sinkage (W,) is the mean over the window [m], nan where unknown; belief holds soil and
     gains (relative errors, by problem.gain_names) for the windows to come, optimum is for
-    resume().
+    resume(); rival is another optimum that the data leave about as likely, where one was
+    looked for and found.
     """
 
     belief: Belief
@@ -68,11 +85,17 @@ class Fit:
     rows: int
     iterations: int
     converged: bool
+    rival: Rival | None = None
 
     @property
     def posterior(self) -> Posterior:
         """What is known of the soil."""
         return self.belief.posterior
+
+    @property
+    def whole(self) -> Belief:
+        """Soil and gains with the spread of both optima where there is a rival."""
+        return self.belief if self.rival is None else self.belief.mixed(self.rival.belief, self.rival.share)
 
     @property
     def gains(self) -> Array:
@@ -92,27 +115,57 @@ def fit_window(problem: WindowProblem, prior: SoilPrior, before: Belief | None =
     at a finite optimum.
     """
     before = Belief.of(prior, problem.gain_std) if before is None else before
-    best: Fit | None = None
     fitting = Fitting(problem, prior, before)
+    thin = Fitting(problem.thinned(THINNED), prior, before, with_gains=False)
     with np.errstate(all="ignore"):
-        for end in _promising(Fitting(problem.thinned(THINNED), prior, before, with_gains=False), prior)[:MAX_SETTLED]:
-            most = MAX_ITERATIONS if end.cost < HOPELESS * THINNED else MAX_HOPELESS
-            fit = _settle(fitting, replace(fitting.start(end.soil), trials=end.trials), most)
-            if fit is not None and (best is None or (fit.converged, -fit.cost) > (best.converged, -best.cost)):
-                best = fit
-            if best is not None and best.converged:
-                return best
+        best = _best(fitting, thin)
+        if best is None or best.chi2 > PLAUSIBLE:
+            return best
+        if not best.converged:
+            near = _approach(Fitting(problem, prior, before, with_gains=False), best.belief.soil, MAX_ITERATIONS, 0.0)
+            best = best if near is None else _settle(fitting, near, MAX_ITERATIONS) or best
+        return _with_rival(fitting, thin, best) if best.converged else best
+
+
+def _best(fitting: Fitting, thin: Fitting) -> Fit | None:
+    """The first of the optima on a few instants that leads to one of all."""
+    best: Fit | None = None
+    for end in _promising(thin)[:MAX_SETTLED]:
+        most = MAX_ITERATIONS if end.cost < HOPELESS * THINNED else MAX_HOPELESS
+        fit = _settle(fitting, replace(fitting.start(end.soil), trials=end.trials), most)
+        if fit is not None and (best is None or (fit.converged, -fit.cost) > (best.converged, -best.cost)):
+            best = fit
+        if best is not None and best.converged:
+            return best
     return best
 
 
-def _promising(thin: Fitting, prior: SoilPrior) -> list[Place]:
+def _with_rival(fitting: Fitting, thin: Fitting, found: Fit) -> Fit:
+    """The more likely of an optimum and the one across from it, with the other as its rival.
+
+    What was found stays alone where there is no other, or none that is nearly as likely
+    and that its standard deviations exclude.
+    """
+    start = fitting.coordinates.across(found.belief.soil) if np.ptp(fitting.problem.rig.width) > 0.0 else None
+    end = None if start is None else _approach(thin, start, MAX_APPROACH)
+    other = None if end is None else _settle(fitting, fitting.start(end.soil), MAX_ITERATIONS)
+    if other is None or not other.converged:
+        return found
+    better, worse = (found, other) if found.evidence <= other.evidence else (other, found)
+    share = 1.0 / (1.0 + math.exp(min(0.5 * (worse.evidence - better.evidence), 50.0)))
+    if better.posterior.distance(worse.posterior.soil) < APART:
+        return better
+    return better if share < RARE else replace(better, rival=Rival(worse.belief, share))
+
+
+def _promising(thin: Fitting) -> list[Place]:
     """Optima on a few instants of the window, the best first.
 
     Descents from unlike soils that meet at a plausible cost are proof enough; otherwise
     every start is tried.
     """
     ends: list[Place] = []
-    for start in starting_soils(thin.problem, prior, thin.before):
+    for start in starting_soils(thin.problem, thin.coordinates.prior, thin.before):
         end = _approach(thin, np.asarray(start), MAX_APPROACH)
         if end is None:
             continue
@@ -189,7 +242,7 @@ def resume(ahead: Foreseen) -> Fit | None:
         return _settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED, first)
 
 
-def _approach(fitting: Fitting, soil: Array, most: int) -> Place | None:
+def _approach(fitting: Fitting, soil: Array, most: int, least: float = ENOUGH) -> Place | None:
     """Levenberg-damped steps of the soil alone, until they are short."""
     place = fitting.start(soil)
     point = fitting.point(place)
@@ -207,11 +260,20 @@ def _approach(fitting: Fitting, soil: Array, most: int) -> Place | None:
         if new is None or new.cost >= point.cost:
             damping *= 10.0
             continue
-        enough = point.cost - new.cost < ENOUGH * point.cost
+        enough = point.cost - new.cost < least * point.cost
         place, point, damping = new_place, new, damping * 0.1
         if enough:
             return replace(place, cost=point.cost, trials=trials)
     return None
+
+
+def _stride(point: Point, last: Array, share: float, step: Array) -> float:
+    """How many times a step to go that follows this share of the last one (Aitken's extrapolation).
+
+    More than once where steps shrink slowly, less where they turn back.
+    """
+    left = 1.0 - (1.0 - float(last @ point.information @ step) / point.length(last)) / share
+    return min(1.0 / max(1.0 - left, 1.0 / MAX_STRIDE), MAX_STRIDE) if abs(left) > SLOWLY else 1.0
 
 
 def _settle(fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OVER, before: float = 0.0) -> Fit | None:
@@ -224,24 +286,32 @@ def _settle(fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OV
     best: tuple[Place, Point] | None = None
     share, length, refused = 1.0, np.inf, 0
     iterations, converged = near.trials, False
+    last_step: Array | None = None
+    last_share = 1.0
     for _ in range(most):
         iterations += 1
         point = fitting.point(near)
         if best is not None and (point is None or point.cost > best[1].cost + WORSE):
             near, point = best
-            share *= 0.4
-            before = 0.0  # nothing can be foreseen after a refused step
+            if refused == 1:
+                near = fitting.carried(near)
+                point = fitting.point(near)
+            share = 0.4 * min(share, 1.0)
+            before, last_step = 0.0, None  # nothing can be foreseen after a refused step
             refused += 1
             if refused > MAX_REFUSED:
                 break
         else:
-            share = min(2.0 * share, 1.0)
+            share, refused = min(2.0 * share, 1.0), 0
         full = None if point is None else point.step()
         if point is None or full is None:
             return None
         best = (near, point)
         length = point.length(full)
+        if last_step is not None and share == 1.0:
+            share = _stride(point, last_step, last_share, full)
         near = fitting.moved(near, point, share * full)
+        last_step, last_share = full, share
         converged = length < CONVERGED or (share == 1.0 and length * length < left_over * before)
         before = length if share == 1.0 else 0.0
         if converged:
@@ -256,8 +326,8 @@ def _settle(fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OV
         belief=belief,
         sinkage=fitting.problem.mean_sinkage(near.as_soil(), near.gains, near.latents),
         optimum=Optimum(fitting.problem.t, last.soil, last.gains, last.latents, point.at),
-        cost=point.cost - length,
-        evidence=point.evidence - length,
+        cost=point.cost - (length if converged else 0.0),
+        evidence=point.evidence - (length if converged else 0.0),
         rows=fitting.problem.n_rows,
         iterations=iterations,
         converged=converged,

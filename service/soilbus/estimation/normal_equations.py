@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,6 +150,10 @@ class Fitting:
         if np.max(np.abs(latents.entry_angle / place.latents.entry_angle - 1.0), initial=0.0) > LONG_TURN:
             latents = self.problem.carried(latents, Soil(*soil.tolist()), gains)
         return Place(soil, gains, latents, point.cost, place.trials)
+
+    def carried(self, place: Place) -> Place:
+        """The same place with the entry angles solved anew: linear models in a row may have lost them."""
+        return replace(place, latents=self.problem.carried(place.latents, place.as_soil()))
 
     def belief(self, place: Place, point: Point) -> Belief | None:
         """What is known at the optimum; None where the information is singular."""

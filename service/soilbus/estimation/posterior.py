@@ -97,6 +97,12 @@ class Posterior:
         """Tangent of the internal friction angle."""
         return self._estimate(tan_phi(self.soil))
 
+    def distance(self, soil: Soil) -> float:
+        """How many standard deviations a soil is away, all free parameters together (Mahalanobis)."""
+        free = np.flatnonzero(np.diag(self.log_covariance) > 0.0)
+        off = np.log(np.asarray(soil)[free] / np.asarray(self.soil)[free])
+        return _root(float(off @ np.linalg.solve(self.log_covariance[np.ix_(free, free)], off)))
+
     def derived(self, z_ref: float, b_ref: float, widths: Iterable[float] = ()) -> Derived:
         """What a window tells best, jointly: bearing_pressure (z_ref, b_ref [m]), tan_phi and K_L of tyres.
 

@@ -23,7 +23,8 @@ GAIN_QUANTITIES = ("torque", "load", "speed", "ground_speed", "draft")
 _BY_INSTANT = (
     "t", "usable", "torque", "torque_var", "has_torque", "sinkage", "sinkage_var", "has_sinkage", "load", "load_var",
     "speed", "speed_var", "ground_speed", "ground_speed_var", "slip", "draft", "draft_var", "demand", "demand_var",
-    "has_balance", "since", "distance", "acceleration", "_measured", "_measured_var", "_row_var", "_known",
+    "has_balance", "since", "distance", "wheel_angle", "acceleration",
+    "_measured", "_measured_var", "_row_var", "_known",
 )  # fmt: skip
 """Attributes of a window's problem with a row for each instant."""
 
@@ -73,6 +74,7 @@ class Readings:
         self.since, self.distance = travelled(self.t, self.ground_speed, window.t)
         self.duration = float(window.t[-1] - window.t[0]) if len(window.t) else 0.0
         self.length = float(self.distance[-1]) if len(self.distance) else 0.0
+        self.wheel_angle = turned(self.t, self.speed)
         self._balance(take, usable)
         self.gain_names, self.gain_std = self._gains()
         self.n_sensors = len(self.gain_names)
@@ -151,6 +153,12 @@ def travelled(t: Array, ground_speed: Array, window: Array) -> tuple[Array, Arra
     mean = (ground_speed[1:] + ground_speed[:-1]) / 2.0
     first = ground_speed[0] * (t[0] - window[0])
     return t - window[0], np.concatenate([[0.0], np.cumsum(mean * np.diff(t))]) + first
+
+
+def turned(t: Array, speed: Array) -> Array:
+    """Angles [rad] (N, W) that wheels of these speeds [rad/s] (N, W) have turned since the first of times t (N,)."""
+    steps = (speed[1:] + speed[:-1]) / 2.0 * np.diff(t)[:, None]
+    return np.concatenate([np.zeros((min(len(t), 1), speed.shape[1])), np.cumsum(steps, axis=0)])
 
 
 def differentiated_speed(t: Array, speed: Array, variance: Array, half_width: int = 3) -> tuple[Array, Array]:

@@ -144,7 +144,7 @@ class Tracker:
             return Tracked(None, False, Ground.SAME, since, *left_out)
         before = self._known_at(since, problem)
         last = self._fit
-        if last is None:
+        if last is None or last.rival is not None:
             fit = self._afresh(problem, before)
         else:
             ahead = foreseen(problem, self._here, last, before)
@@ -193,7 +193,7 @@ class Tracker:
         if fit is not None and not tracked.mismatch:
             self._good_until = end
             if end - tracked.since >= LEARNED * self.settings.window and tracked.ground is not Ground.CHANGING:
-                self._beliefs.append((end, fit.belief))
+                self._beliefs.append((end, fit.whole))
         return tracked
 
     def _known_at(self, t: float, problem: WindowProblem) -> Belief:

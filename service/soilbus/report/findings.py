@@ -11,6 +11,7 @@ from soilbus.config import Config
 from soilbus.daemon.diagnose import Findings
 from soilbus.diagnosis.completion import Completion
 from soilbus.diagnosis.diagnose import Addition
+from soilbus.diagnosis.learned import WARNING, Correction
 from soilbus.diagnosis.verdict import Verdict, gap_limit
 from soilbus.diagnosis.where import Disagreement
 from soilbus.estimation.posterior import Estimate, Posterior
@@ -50,6 +51,8 @@ def findings_json(findings: Findings) -> str:
         "soil_after": soils[0]["after"],
         "soils": soils,
         "model": {name: _estimates(values) for name, values in findings.diagnosis.completed.parameters().items()},
+        "learned": [_correction(correction) for correction in diagnosis.learned],
+        "warning": WARNING if diagnosis.learned else None,
         "samples": recordings.samples,
         "rejected": recordings.rejected,
         "too_short": list(recordings.too_short),
@@ -75,6 +78,16 @@ def _effect(addition: Addition, completed: Completion) -> dict[str, Any]:
         "why_ambiguous": why_ambiguous(addition),
         "tells": {name: CATALOGUE[name].tells for name in (effect.name, *addition.alternatives)},
         "evidence": dict(sorted(addition.falls.items(), key=lambda item: -item[1])),
+    }
+
+
+def _correction(correction: Correction) -> dict[str, Any]:
+    return {
+        "channel": correction.channel,
+        "wheel": correction.wheel,
+        "formula": correction.formula,
+        "terms": {term.regressor: term.coefficient for term in correction.terms},
+        "explained": correction.explained,
     }
 
 
@@ -117,6 +130,8 @@ def findings_text(findings: Findings) -> str:
     lines += [f"  {line}" for line in place_lines(diagnosis.where)]
     for number, addition in enumerate(diagnosis.additions, 1):
         lines += ["", *effect_lines(number, addition, findings.diagnosis.completed)]
+    if diagnosis.learned:
+        lines += ["", "what is left, described:", *(f"  {line}" for line in learned_lines(diagnosis.learned))]
     lines += ["", *_soil_lines(findings), "", admission_line(findings)]
     return "\n".join(lines) + "\n"
 
@@ -146,7 +161,7 @@ def chance_text(chance: float) -> str:
     return f"{chance:.0e}" if chance > 0.0 else "< 1e-300"
 
 
-def _channel(place: Disagreement) -> str:
+def _channel(place: Disagreement | Correction) -> str:
     return f"{place.channel}.{place.wheel}" if place.wheel else place.channel
 
 
@@ -166,12 +181,23 @@ def effect_lines(number: int, addition: Addition, completed: Completion) -> list
     units = {parameter.name: parameter.unit for parameter in effect.parameters}
     for name, estimate in completed.parameters()[effect.name].items():
         unit = units.get(name) or units[name.rpartition("_")[0]]
-        lines.append(f"   {name} = {estimate.value:.4g} +- {estimate.std:.2g} {unit}".rstrip(" 1"))
+        std = f"+- {estimate.std:.2g}" if estimate.std > 0.0 else "(held)"
+        lines.append(f"   {name} = {estimate.value:.4g} {std}" + ("" if unit == "1" else f" {unit}"))
     if addition.alternatives:
         others = ", ".join(f"{name} {p:.2f}" for name, p in addition.alternatives.items())
         lines += [f"   or: {others}", f"   {why_ambiguous(addition)}", "   what would tell them apart:"]
         lines += [f"   - {name}: {CATALOGUE[name].tells}" for name in (effect.name, *addition.alternatives)]
     return lines
+
+
+def learned_lines(learned: Sequence[Correction]) -> list[str]:
+    """The descriptions of what no effect explains, and what they are worth."""
+    told = [
+        f"{_channel(c)}: reading less model = {c.formula} [{UNITS[c.channel]}] "
+        f"({100 * c.explained:.0f} % of the held-out excess)"
+        for c in learned
+    ]
+    return [*told, WARNING]
 
 
 def _soil_lines(findings: Findings) -> list[str]:

@@ -75,7 +75,7 @@ def drive(config: Config, scenario: Scenario, seed: int, effects: Sequence[Activ
     situation = _situation(config.wheel, chassis, scenario, motion, rng)
     rear = np.array([wheel.axle == "rear" for wheel in config.wheel])
     model = WheelModel(shear_law=config.model.shear_law)
-    mechanics = Mechanics(model, rear, chassis.mass, scenario.duration, present)
+    mechanics = Mechanics(model, rear, chassis.mass, scenario.duration, float(motion.distance[-1]), present)
     result = solve(_held_back(situation, mechanics), mechanics)
     stuck = np.flatnonzero(~result.found)
     end = int(stuck[0]) if len(stuck) else len(t)
@@ -171,7 +171,7 @@ def _driver(scenario: Scenario, t: Array, rng: np.random.Generator) -> tuple[Arr
 
 
 def _columns(
-    wheels: list[Wheel], scenario: Scenario, motion: _Motion, situation: Situation, result: Equilibrium, depth: Array
+    wheels: list[Wheel], scenario: Scenario, motion: _Motion, situation: Situation, result: Equilibrium, sunk: Array
 ) -> dict[str, NDArray[Any]]:
     latitude, longitude = positions(scenario.course, motion.distance)
     columns: dict[str, NDArray[Any]] = {
@@ -192,7 +192,7 @@ def _columns(
         of_wheel = {
             "slip": slip[i],
             "entry_angle": result.entry_angle[i],
-            "sinkage": depth[i],
+            "sinkage": sunk[i],
             "load": situation.level_load[i] + situation.load_per_draft[i] * result.draft,
             "drawbar_pull": result.forces[1, i],
             "torque": result.forces[2, i],

@@ -74,13 +74,14 @@ class Situation(NamedTuple):
 class Mechanics(NamedTuple):
     """The wheel-soil model, effects on it, and what of the record they may depend on (see Surroundings).
 
-    rear (M,) tells which wheels run in the rut of another; mass [kg], duration [s].
+    rear (M,) tells which wheels run in the rut of another; mass [kg], duration [s], length [m].
     """
 
     model: WheelModel
     rear: NDArray[np.bool_]
     mass: float
     duration: float
+    length: float
     effects: Sequence[Active] = ()
 
     @property
@@ -148,21 +149,29 @@ def surroundings(situation: Situation, mechanics: Mechanics, slip: Array, draft:
         acceleration=situation.acceleration[:, None],
         mass=mechanics.mass,
         duration=mechanics.duration,
+        length=mechanics.length,
     )
+
+
+def sinkages(situation: Situation, mechanics: Mechanics, at: Equilibrium) -> Array:
+    """Sinkages [m] (M, N), of the circles that effects make of the wheels."""
+    state, around = (
+        _transposed(situation, at.slip, at.entry_angle),
+        surroundings(situation, mechanics, at.slip, at.draft),
+    )
+    changed, _ = wheel_with(mechanics.effects, state, mechanics.model, around)
+    return np.asarray(sinkage(at.entry_angle, np.transpose(changed.radius)))
+
+
+def _transposed(situation: Situation, slip: Array, entry_angle: Array) -> WheelState:
+    """States (N, M), as effects want them."""
+    return WheelState(*(np.transpose(a) for a in wheel_state(situation, slip, entry_angle)))
 
 
 def wheel_state(situation: Situation, slip: Array, entry_angle: Array) -> WheelState:
     """States of all wheels (M, N) at a common slip (N,) and entry angles [rad] (M, N)."""
     soil = Soil(*situation.soil)
     return state_on(soil, entry_angle, slip + situation.deviation, situation.radius, situation.width)
-
-
-def sinkages(situation: Situation, mechanics: Mechanics, at: Equilibrium) -> Array:
-    """Sinkage [m] of all wheels (M, N): of the circle that effects make of the nominal one."""
-    state = WheelState(*(np.transpose(a) for a in wheel_state(situation, at.slip, at.entry_angle)))
-    around = surroundings(situation, mechanics, at.slip, at.draft)
-    state, _ = wheel_with(mechanics.effects, state, mechanics.model, around)
-    return np.asarray(np.transpose(sinkage(state.entry_angle, state.radius)))
 
 
 def _at(situation: Situation, index: NDArray[np.intp]) -> Situation:
@@ -202,7 +211,7 @@ def _by_differences(mechanics: Mechanics) -> _Forces:
     """Forces of the model with its effects."""
 
     def forces(situation: Situation, slip: Array, draft: Array, angle: Array) -> Array:
-        state = WheelState(*(np.transpose(a) for a in wheel_state(situation, slip, angle)))
+        state = _transposed(situation, slip, angle)
         around = surroundings(situation, mechanics, slip, draft)
         return np.swapaxes(forces_with(mechanics.effects, state, mechanics.model, around), 1, 2)
 

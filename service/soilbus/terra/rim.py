@@ -9,7 +9,9 @@ are those of Xi et al. 2024.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cache
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -72,16 +74,32 @@ def fixed_shares(q: Quadrature) -> tuple[Array, Array]:
     return on_branches(*gauss(q.nodes, q.power), q.peak, q.exit)
 
 
-def split_nodes(theta: Array, slip: Array, peak: Any, q: Quadrature) -> tuple[Array, Array]:
-    """Nodes x and weights on 0..1 for skid, (2 M + 4, N), split where shear changes sign."""
+def split_nodes(splits: Sequence[Array], q: Quadrature) -> tuple[Array, Array]:
+    """Nodes x and weights on 0..1, (M + 2, N) for each panel between places (N,) on 0..1."""
     x, xw = gauss(q.nodes + 2, 3)  # shear is steep where it changes sign
     u, w = gauss(q.nodes + 2, 2)  # the branch may start just before the split
+    edges = [*np.sort(np.stack(splits), axis=0), np.ones(np.shape(splits[0]))]
+    widths = [after - before for before, after in pairwise(edges)]
+    return (
+        np.concatenate([edges[0] * x, *(start + width * u for start, width in zip(edges, widths, strict=False))]),
+        np.concatenate([edges[0] * xw, *(width * w for width in widths)]),
+    )
+
+
+def place_of_turn(theta: Array, slip: Array, peak: Any, q: Quadrature) -> Array:
+    """Where on 0..1 (N,) the shear of a skidding wheel changes sign; 1 if nowhere."""
     turn = _turning_angle(theta, slip, q.exit)
     front = (theta - turn) / (theta * (1.0 - peak))
     rear = (turn - q.exit * theta) / (theta * (peak - q.exit))
     split = np.clip(np.where(turn > peak * theta, front, rear), 0.0, 1.0)
-    split = np.where(np.isfinite(turn), split, 1.0)
-    return np.concatenate([split * x, split + (1.0 - split) * u]), np.concatenate([split * xw, (1.0 - split) * w])
+    return np.asarray(np.where(np.isfinite(turn), split, 1.0))
+
+
+def place_of_depth(theta: Array, depth: Any, peak: Any) -> Array:
+    """Where on 0..1 (N,) the rim reaches a depth over radius; 1 if nowhere."""
+    cos = np.cos(theta) + depth
+    angle = np.arccos(np.minimum(cos, 1.0))
+    return np.asarray(np.clip((theta - angle) / (theta * (1.0 - peak)), 0.0, 1.0))
 
 
 def _turning_angle(entry: Array, slip: Array, exit_ratio: float) -> Array:

@@ -19,6 +19,8 @@ from soilbus.terra.rim import (
     fixed_shares,
     gauss,
     on_branches,
+    place_of_depth,
+    place_of_turn,
     rim_at,
     rim_of_fixed_shares,
     split_nodes,
@@ -206,7 +208,8 @@ class _Stress(NamedTuple):
     A field of normal stress P with one of shear stress Q adds P cos + Q sin to the load,
     Q cos - P sin to the drawbar pull and Q to the torque.  normal is the normal stress;
     the shear stress is tan_phi rubbed + c stuck; mobilising is its derivative by the
-    displacement j_K over K.
+    displacement j_K over K.  steep is the derivative of normal by the logarithm of the
+    depth, over n; with by_sill, steep log_z + by_sill is its derivative by n.
     """
 
     rim: Rim
@@ -214,6 +217,8 @@ class _Stress(NamedTuple):
     weight: Array
     log_z: Array  # (M, N)
     normal: Array
+    steep: Array
+    by_sill: Array | None
     rubbed: Array
     stuck: Array
     shear_share: Array
@@ -224,9 +229,12 @@ class _Stress(NamedTuple):
 def _stress(state: WheelState, model: WheelModel, skid: bool) -> _Stress:
     theta, slip, r, _, K_L, n, _, _, K = state
     q = model.quadrature
-    if skid or model.peak_c2 or model.one_off:
+    if skid or model.peak_c2 or model.pan_stiffness or model.one_off:
         peak = np.asarray(model.peak_c1 + model.peak_c2 * slip)
-        x, w = split_nodes(theta, slip, peak, q) if skid else gauss(q.nodes, q.power)
+        splits = [place_of_turn(theta, slip, peak, q)] if skid else []
+        if model.pan_stiffness:
+            splits.append(place_of_depth(theta, model.pan_depth / r, peak))
+        x, w = split_nodes(splits, q) if splits else gauss(q.nodes, q.power)
         share, weight = on_branches(x, w, peak, q.exit)
         rim = rim_at(theta, share, r / K)
     else:
@@ -234,13 +242,18 @@ def _stress(state: WheelState, model: WheelModel, skid: bool) -> _Stress:
         rim = rim_of_fixed_shares(theta, q, r / K)
     log_z = np.log(r * rim.depth)
     sigma = np.exp(n * log_z + np.log(K_L))  # the rear takes the front's stress (eqs. 5-9)
+    normal = steep = sigma * weight
+    by_sill = None
     if model.pan_stiffness:
-        sigma = sigma + _pan_pressure(r * rim.depth, K_L, n, model)
-    normal = sigma * weight
+        below = r * rim.depth > model.pan_depth
+        sill = model.pan_stiffness * K_L * model.pan_depth**n * below * weight
+        steep = normal * (1.0 + model.pan_stiffness * below)
+        normal = steep - sill
+        by_sill = -sill * np.log(max(model.pan_depth, 1e-300))
     j_K = slip * rim.travel
     j_K += rim.creep
     g, dg = _mobilised(j_K, model)
-    return _Stress(rim, share, weight, log_z, normal, normal * g, weight * g, g, dg, j_K)
+    return _Stress(rim, share, weight, log_z, normal, steep, by_sill, normal * g, weight * g, g, dg, j_K)
 
 
 def _mobilised(j_K: Array, model: WheelModel) -> tuple[Any, Any]:
@@ -250,12 +263,6 @@ def _mobilised(j_K: Array, model: WheelModel) -> tuple[Any, Any]:
         return share, slope
     w, (other, other_slope) = model.exponential_share, SHEAR_LAWS["exponential"](j_K)
     return (1.0 - w) * share + w * other, (1.0 - w) * slope + w * other_slope
-
-
-def _pan_pressure(depth: Array, K_L: Any, n: Any, model: WheelModel) -> Array:
-    """Pressure [Pa] that a hard pan adds at a depth [m]; zero above it."""
-    own = K_L * np.maximum(depth, model.pan_depth) ** n - K_L * model.pan_depth**n
-    return np.asarray(model.pan_stiffness * own)
 
 
 def _shear(at: _Stress, state: WheelState) -> tuple[Array, Array]:
@@ -269,7 +276,7 @@ def _shear(at: _Stress, state: WheelState) -> tuple[Array, Array]:
 
 def _entering(at: _Stress, state: WheelState, tau: Array, mobilising: Array) -> tuple[Array, Array]:
     """Fields by the entry angle: stresses grow, and the nodes turn with it.  The torque wants Q + share normal."""
-    normal = at.normal * (state.n * at.rim.deepening)
+    normal = at.steep * (state.n * at.rim.deepening)
     rate = state.slip * at.rim.travel_rate
     rate += at.rim.creep_rate
     rate *= mobilising
@@ -330,9 +337,11 @@ def _forces_and_jacobian(state: WheelState, model: WheelModel, skid: bool) -> Ar
     at = _stress(state, model, skid)
     tau, mobilising = _shear(at, state)
     changes = np.empty((6, *at.normal.shape))
-    np.multiply(at.normal, at.log_z, out=changes[0])
+    np.multiply(at.steep, at.log_z, out=changes[0])
+    if at.by_sill is not None:
+        changes[0] += at.by_sill
     changes[1], changes[2] = _entering(at, state, tau, mobilising)
-    np.multiply(at.rubbed, at.log_z, out=changes[3])
+    np.multiply(at.shear_share, changes[0], out=changes[3])
     np.multiply(mobilising, at.rim.travel, out=changes[4])
     np.multiply(mobilising, at.j_K, out=changes[5])
     parts = _integrals(np.stack([at.normal, at.rubbed, at.stuck]), 1, at.rim)
@@ -364,10 +373,11 @@ def _by_peak(at: _Stress, state: WheelState, model: WheelModel, tau: Array, mobi
     rim, peak = at.rim, model.peak_c1 + model.peak_c2 * state.slip
     turn = state.entry_angle * (1.0 - at.share[0]) / (1.0 - peak)
     spread = np.stack([-1.0 / (1.0 - peak), 1.0 / (peak - model.exit_ratio)])[:, None]
-    growth = spread - state.n * rim.sin[0] * turn / rim.depth
+    shallower = state.n * rim.sin[0] * turn / rim.depth
+    normal = at.normal * spread - at.steep * shallower
     glide = state.radius / state.K * ((1.0 - state.slip) * rim.cos - 1.0)
-    shear = state.tan_phi * at.rubbed * growth + mobilising * glide * turn + state.c * at.stuck * spread
-    normal = at.normal * growth + turn * tau
+    shear = state.tan_phi * at.shear_share * normal + mobilising * glide * turn + state.c * at.stuck * spread
+    normal = normal + turn * tau
     around = shear.sum((0, 1))
     shear = shear - turn * at.normal
     load = _dot(normal, rim.cos) + _dot(shear, rim.sin)

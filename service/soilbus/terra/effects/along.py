@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,30 @@ def share_of_way(around: Surroundings) -> Any:
 
 
 def through_knots(share: Any, heights: Sequence[float]) -> Array:
-    """Straight lines between heights at equally spaced shares 0..1 of the way, level beyond."""
-    return np.asarray(np.interp(share, np.linspace(0.0, 1.0, len(heights)), heights))
+    """The natural cubic spline through heights at equally spaced shares 0..1 of the way, level beyond.
+
+    Linear in the heights; twice as near to a smooth profile as straight lines between as many knots.
+    """
+    y = np.asarray(heights, float)
+    last = len(y) - 1
+    place = np.clip(np.asarray(share, float), 0.0, 1.0) * last
+    left = np.minimum(np.nan_to_num(place).astype(int), last - 1)
+    to_left = place - left
+    to_right = 1.0 - to_left
+    bend = _bending(len(y)) @ y
+    line = to_right * y[left] + to_left * y[left + 1]
+    return np.asarray(line + (to_right**3 - to_right) * bend[left] + (to_left**3 - to_left) * bend[left + 1])
+
+
+@cache
+def _bending(knots: int) -> Array:
+    """What makes a sixth of the second derivatives at knots one apart from the heights there; none at the ends."""
+    differences = np.zeros((knots, knots))
+    system = np.eye(knots)
+    for i in range(1, knots - 1):
+        differences[i, i - 1 : i + 2] = 1.0, -2.0, 1.0
+        system[i, i - 1 : i + 2] = 1.0, 4.0, 1.0
+    return np.asarray(np.linalg.solve(system, differences))
 
 
 def instants(values: Any) -> Array:

@@ -86,7 +86,7 @@ BULLDOZING = Effect(
     " a constant push is a draft offset",
     parameters=(
         Parameter("density", "N/m^3", 0.0, 2e5, 0.0, 2e6),
-        Parameter("cohesive_factor", "1", 0.0, 5.0, 0.0, 40.0),
+        Parameter("cohesive_factor", "1", 0.0, 3.0, 0.0, 30.0),
     ),
     forces=_bulldozing,
 )

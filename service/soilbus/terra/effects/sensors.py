@@ -50,7 +50,7 @@ def _late(torque: Array, around: Surroundings, values: Values) -> Array:
             before = np.clip(np.searchsorted(t[run], then, side="right") - 1, 0, len(run) - 2)
             first, second = run[before], run[before + 1]
             part = ((then - t[first]) / (t[second] - t[first]))[:, None]
-            late[run] = torque[first] + part * (torque[second] - torque[first])
+            late[run] = (1.0 - part) * torque[first] + part * torque[second]
     return late
 
 

@@ -33,7 +33,7 @@ SLIP_SINKAGE = Effect(
     tells="a sinkage sensor, and slips from 0.05 to beyond 0.4 at one load",
     parameters=(
         Parameter("exponent", "1", 0.0, 0.3, -0.2, 1.5),
-        Parameter("softening", "1", 0.0, 0.6, -1.0, 4.0),
+        Parameter("softening", "1", 0.0, 0.6, -2.0, 4.0),
     ),
     wheel=_slip_sinkage,
 )
@@ -111,7 +111,7 @@ def _drift_of(name: str, share: np.ndarray, values: Values) -> np.ndarray:
 def _soil_drift(
     state: WheelState, model: WheelModel, around: Surroundings, values: Values
 ) -> tuple[WheelState, WheelModel]:
-    """K_L, and c and tan phi together, times the exponential of a bent line along the way."""
+    """K_L, and c and tan phi together, times the exponential of a line along the way that may bend."""
     share = share_of_way(around)
     strength = np.exp(_drift_of("strength", share, values))
     K_L = state.K_L * np.exp(_drift_of("stiffness", share, values))

@@ -30,11 +30,11 @@ DRIVETRAIN_LOSS = Effect(
     torque=_drive_line,
 )
 
-SLOPE_KNOTS = 6
+SLOPE_KNOTS = 8
 
 
 def _unmeasured_slope(around: Surroundings, values: Values) -> Array:
-    """m g sin of a slope that changes along straight lines between knots."""
+    """m g sin of a slope that changes smoothly between knots."""
     departures = [0.0, *(float(values[f"slope_{i}"]) for i in range(1, SLOPE_KNOTS))]
     slope = values["slope_0"] + through_knots(instants(share_of_way(around)), departures)
     return np.asarray(around.mass * GRAVITY * np.sin(slope))
@@ -43,7 +43,7 @@ def _unmeasured_slope(around: Surroundings, values: Values) -> Array:
 GRADE = Effect(
     name="grade",
     physics="The field is not level, and gravity holds back or pushes what no sensor has told of.",
-    source="weight along the slope, m g sin(slope); linear interpolation between knots",
+    source="weight along the slope, m g sin(slope): Wong 2008, ch. 3; natural cubic spline between knots",
     tells="driving both ways on the slope, or a pitch sensor; a slope that never changes is a draft offset",
     parameters=tuple(Parameter(f"slope_{i}", "rad", 0.0, 0.03, -0.3, 0.3) for i in range(SLOPE_KNOTS)),
     resistance=_unmeasured_slope,

@@ -1,0 +1,161 @@
+"""Effects of the soil against integrals by scipy, hand formulas and limits."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+from adaptive import adaptive_forces
+from soilbus.terra.effects.along import share_of_way, through_knots
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.effects.effect import Active, forces_with, wheel_with
+from soilbus.terra.soils import soil_named
+from soilbus.terra.wheel import (
+    INPUTS,
+    WheelModel,
+    WheelState,
+    entry_angle_for_load,
+    sinkage,
+    state_on,
+    wheel_forces,
+    wheel_forces_and_derivatives,
+)
+from wheels_around import REAR, one_wheel, wheels_around
+
+MODEL = WheelModel("rational")
+STATE, AROUND = wheels_around(seed=7)
+
+
+def changed(name: str, state: WheelState = STATE, around=AROUND, **values: float) -> WheelState:
+    effect = CATALOGUE[name]
+    return wheel_with([Active(effect, effect.neutral | values)], state, MODEL, around)[0]
+
+
+@pytest.mark.parametrize("slip", [0.0, 0.1, 0.4, 0.8])
+def test_the_sinkage_exponent_grows_with_slip(slip):
+    """Ding et al. 2010: sigma = K_L z^(n0 + n1 s)."""
+    state = state_on(soil_named("loam"), 0.4, slip, 0.5, 0.3)
+    ours = forces_with(
+        [Active(CATALOGUE["slip_sinkage"], {"exponent": 0.5, "softening": 0.0})], state, MODEL, one_wheel(AROUND)
+    )
+    true = adaptive_forces(state, MODEL, pressure=lambda z: state.K_L * z ** (0.7 + 0.5 * slip))
+    assert np.max(np.abs(ours - true)) < 1e-6 * true[0]
+
+
+def test_softening_gives_sinkage_times_a_function_of_slip():
+    """Lyasko's form: z = z0 f(s) at equal pressure is K_L f(s)^-n, here f = exp(0.9 s / n)."""
+    pressure, s = 4e4, 0.35
+    state = state_on(soil_named("loam"), 0.4, s, 0.5, 0.3)
+    soft = changed("slip_sinkage", state, one_wheel(AROUND), softening=0.9)
+    z0, z = ((pressure / K_L) ** (1.0 / state.n) for K_L in (state.K_L, soft.K_L))
+    assert z / z0 == pytest.approx(math.exp(0.9 * s / state.n), rel=1e-12)
+
+
+def test_skid_does_not_dig():
+    state = STATE._replace(slip=-np.abs(STATE.slip))
+    dug = changed("slip_sinkage", state, exponent=1.0, softening=2.0)
+    assert np.array_equal(dug.K_L, np.broadcast_to(state.K_L, dug.K_L.shape))
+    assert np.all(dug.n == state.n)
+
+
+def test_an_exponent_stays_positive_on_the_softest_law():
+    state = STATE._replace(n=0.11)
+    assert np.all(changed("slip_sinkage", state, exponent=-0.2).n > 0.0)
+    assert np.all(changed("slip_sinkage", state._replace(n=0.03)).n == 0.03)
+
+
+def test_bearing_grows_with_a_power_of_the_speed():
+    stiff = changed("rate_stiffening", exponent=0.2)
+    assert pytest.approx(STATE.K_L * AROUND.ground_speed**0.2 * np.ones(4), rel=1e-12) == stiff.K_L
+    still = changed("rate_stiffening", around=AROUND._replace(ground_speed=0.0), exponent=0.2)
+    assert np.all(still.K_L > 0.3 * STATE.K_L)
+
+
+def test_only_rear_wheels_run_in_ruts():
+    values = {"stiffness": math.log(2.5), "density": math.log(1.2)}
+    effect = Active(CATALOGUE["multipass"], values)
+    ours, plain = forces_with([effect], STATE, MODEL, AROUND), wheel_forces(STATE, MODEL)
+    packed = STATE._replace(K_L=2.5 * STATE.K_L, c=1.2 * STATE.c, tan_phi=1.2 * STATE.tan_phi)
+    assert np.array_equal(ours[..., ~REAR], plain[..., ~REAR])
+    assert ours[..., REAR] == pytest.approx(wheel_forces(packed, MODEL)[..., REAR], rel=1e-10)
+
+
+@pytest.mark.parametrize("depth", [0.005, 0.02, 0.035])
+@pytest.mark.parametrize("soil", ["wet_clay", "loam", "dry_sand"])
+def test_a_hard_pan_adds_to_the_pressure_below_its_depth(soil, depth):
+    state = state_on(soil_named(soil), 0.45, 0.2, 0.5, 0.3)
+
+    def pressure(z: float) -> float:
+        own = state.K_L * z**state.n
+        return own if z < depth else own + 6.0 * (own - state.K_L * depth**state.n)
+
+    ours = forces_with(
+        [Active(CATALOGUE["hardpan"], {"stiffness": 6.0, "depth": depth})], state, MODEL, one_wheel(AROUND)
+    )
+    true = adaptive_forces(state, MODEL, pressure=pressure, kink=depth)
+    assert np.max(np.abs(ours - true)) < 1e-8 * true[0]
+
+
+def test_a_hard_pan_that_is_not_reached_changes_nothing():
+    pan = Active(CATALOGUE["hardpan"], {"stiffness": 20.0, "depth": 0.3})
+    state = STATE._replace(entry_angle=0.3)
+    plain = wheel_forces(state, MODEL)
+    ours = forces_with([pan], state, MODEL, AROUND)
+    assert np.max(np.abs(ours - plain), axis=(1, 2)) / np.max(plain[0]) == pytest.approx(0.0, abs=1e-7)
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_derivatives_know_of_the_pan(name):
+    """Central differences, in drive and in skid, with a peak that moves and a rut that recovers."""
+    model = WheelModel("rational", 0.45, 0.2, -0.2, pan_depth=0.02, pan_stiffness=6.0)
+    forces, jacobian = wheel_forces_and_derivatives(STATE, model)
+    at = np.asarray(getattr(STATE, name))
+    step = 1e-5 * np.abs(at)
+    up, down = (wheel_forces(STATE._replace(**{name: at + way * step}), model) for way in (1.0, -1.0))
+    miss = np.abs((up - down) / (2.0 * step) - jacobian[:, INPUTS.index(name)]) * np.abs(at)
+    assert np.max(miss) < 1e-7 * np.max(forces[0])
+
+
+def test_a_wheel_that_reaches_the_pan_hardly_sinks_further():
+    """A tenfold load doubles no sinkage where the pan is near rigid."""
+    state = state_on(soil_named("loam"), np.nan, 0.1, 0.5, 0.3)
+    _, pan = wheel_with(
+        [Active(CATALOGUE["hardpan"], {"stiffness": 50.0, "depth": 0.03})], state, MODEL, one_wheel(AROUND)
+    )
+    shallow, deep, soft = (
+        float(sinkage(entry_angle_for_load(load, state, model), 0.5))
+        for load, model in ((4e3, pan), (4e4, pan), (4e4, MODEL))
+    )
+    assert 0.02 < shallow < deep < 0.1 < soft
+
+
+def test_the_soil_drifts_along_the_way():
+    values = {"stiffness": 0.8, "stiffness_1": 0.3, "stiffness_2": -0.2, "stiffness_3": 0.1, "strength": -0.4,
+              "strength_2": 0.15}  # fmt: skip
+    soil = changed("soil_drift", **values)
+    u = AROUND.distance / AROUND.length
+    knots = np.linspace(0.0, 1.0, 5)
+    bend = CubicSpline(knots, [0.0, 0.3, -0.2, 0.1, 0.0], bc_type="natural")(u)
+    assert np.log(soil.K_L / STATE.K_L) == pytest.approx((0.8 * (u - 0.5) + bend) * np.ones(4), rel=1e-10)
+    bend = CubicSpline(knots, [0.0, 0.0, 0.15, 0.0, 0.0], bc_type="natural")(u)
+    for strength in (soil.tan_phi / STATE.tan_phi, soil.c / STATE.c):
+        assert np.log(strength) == pytest.approx((-0.4 * (u - 0.5) + bend) * np.ones(1), rel=1e-10)
+    assert CATALOGUE["soil_drift"].of_record
+
+
+def test_the_share_of_the_way_is_told_by_distance_else_by_time():
+    assert share_of_way(AROUND)[-1, 0] == pytest.approx(1.0)
+    assert share_of_way(AROUND._replace(length=0.0)) == pytest.approx(AROUND.t / AROUND.duration)
+    assert np.all(share_of_way(AROUND._replace(length=0.0, duration=0.0)) == 0.0)
+
+
+def test_the_curve_through_knots_is_the_natural_spline_and_level_beyond():
+    heights = [0.1, -0.4, 0.3, 0.2, 0.9, -0.1, 0.0]
+    u = np.linspace(0.0, 1.0, 97)
+    true = CubicSpline(np.linspace(0.0, 1.0, 7), heights, bc_type="natural")(u)
+    assert through_knots(u, heights) == pytest.approx(true, abs=1e-13)
+    assert through_knots([-0.5, 1.5], heights) == pytest.approx([0.1, 0.0], abs=1e-13)
+    assert np.isnan(through_knots(np.nan, heights))

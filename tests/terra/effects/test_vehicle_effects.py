@@ -1,0 +1,123 @@
+"""Effects of the vehicle and of its sensors against hand formulas, np.interp and exact derivatives."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+from soilbus.terra.effects.along import stretches
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.effects.effect import Active, wheel_with
+from soilbus.terra.vehicle import slip_ratio
+from soilbus.terra.wheel import WheelModel
+from wheels_around import RADIUS, REAR, wheels_around
+
+STATE, AROUND = wheels_around(seed=8)
+T = np.linspace(0.0, 30.0, 301)
+
+
+def torque_of(name: str, torque: np.ndarray, around=AROUND, **values: float) -> np.ndarray:
+    effect = CATALOGUE[name]
+    return effect.torque(torque, around, effect.neutral | values)
+
+
+def test_a_drive_line_takes_torque_driving_and_braking():
+    torque = np.array([[500.0, -200.0], [500.0, 500.0]])
+    around = AROUND._replace(wheel_speed=np.array([[2.0, 2.0], [2.0, -2.0]]))
+    reading = torque_of("drivetrain_loss", torque, around, share=0.1, drag=15.0)
+    assert reading == pytest.approx(np.array([[565.0, -165.0], [565.0, 435.0]]))
+
+
+def test_a_constant_slope_holds_back_as_the_weight_along_it():
+    grade = CATALOGUE["grade"]
+    held = grade.resistance(AROUND, grade.neutral | {"slope_0": 0.05})
+    assert held.shape == (len(AROUND.t),)
+    assert held == pytest.approx(2300.0 * 9.80665 * math.sin(0.05), rel=1e-12)
+    assert grade.parameters[0].name == "slope_0"
+
+
+def test_a_slope_changes_along_the_way():
+    grade = CATALOGUE["grade"]
+    departures = [0.0, 0.02, -0.01, 0.0, 0.03, 0.0, 0.01, -0.02]
+    values = {f"slope_{i}": d for i, d in enumerate(departures)} | {"slope_0": 0.01}
+    u = (AROUND.distance / AROUND.length)[:, 0]
+    slope = 0.01 + CubicSpline(np.linspace(0.0, 1.0, 8), departures, bc_type="natural")(u)
+    assert grade.resistance(AROUND, values) == pytest.approx(2300.0 * 9.80665 * np.sin(slope), rel=1e-10)
+    assert set(values) == set(grade.neutral)
+    assert grade.of_record
+
+
+def test_worn_tyres_slip_otherwise_than_they_seem():
+    worn, _ = wheel_with(
+        [Active(CATALOGUE["rolling_radius"], {"front": -0.05, "rear": 0.03})], STATE, WheelModel(), AROUND
+    )
+    true = np.where(REAR, 1.03, 0.95) * RADIUS
+    assert worn.radius == pytest.approx(true, rel=1e-12)
+    assert worn.slip == pytest.approx(slip_ratio(true, AROUND.wheel_speed, AROUND.ground_speed), abs=1e-12)
+
+
+def test_moving_masses_hold_back_when_speeding_up():
+    inertia = CATALOGUE["inertia"]
+    held = inertia.resistance(AROUND, {"mass_share": 0.4, "wheel_inertia": 0.0})
+    assert held == pytest.approx(0.4 * 2300.0 * AROUND.acceleration[:, 0], rel=1e-12)
+
+
+def test_spinning_wheels_take_torque():
+    """omega = 2 + sin(t/2): the torque of J is J cos(t/2)/2, to the second order in the step."""
+    speed = np.stack([2.0 + np.sin(0.5 * T), np.full(len(T), 2.0)], axis=1)
+    around = AROUND._replace(t=T[:, None], wheel_speed=speed)
+    reading = torque_of("inertia", np.full((len(T), 2), 300.0), around, wheel_inertia=40.0)
+    assert reading[1:-1, 0] == pytest.approx(300.0 + 20.0 * np.cos(0.5 * T[1:-1]), abs=0.02)
+    assert reading[:, 1] == pytest.approx(300.0, rel=1e-12)
+
+
+@pytest.mark.parametrize("size", [1, 2])
+def test_too_few_instants_have_no_rate(size):
+    around = AROUND._replace(t=T[:size, None], wheel_speed=np.linspace(1.0, 2.0, size)[:, None])
+    torque = np.full((size, 1), 300.0)
+    assert np.array_equal(torque_of("inertia", torque, around, wheel_inertia=40.0), torque)
+    assert np.array_equal(torque_of("torque_lag", torque, around, delay=0.3), torque)
+
+
+@pytest.mark.parametrize("delay", [0.03, 0.1, 0.25, 0.6])
+def test_a_late_torque_is_the_torque_of_an_earlier_moment(delay):
+    torque = np.stack([500.0 + 200.0 * np.sin(1.3 * T), 400.0 + 10.0 * T], axis=1)
+    late = torque_of("torque_lag", torque, AROUND._replace(t=T[:, None]), delay=delay)
+    for wheel in range(2):
+        assert late[:, wheel] == pytest.approx(np.interp(T - delay, T, torque[:, wheel]), rel=1e-12)
+    begun = delay < T
+    assert late[begun, 0] == pytest.approx(500.0 + 200.0 * np.sin(1.3 * (T[begun] - delay)), abs=0.5)
+
+
+def test_nothing_is_late_or_fast_across_a_gap():
+    """Two runs with a minute between: each as if alone."""
+    t = np.concatenate([T[:50], T[:50] + 65.0])
+    torque, around = np.repeat([200.0, 900.0], 50)[:, None], AROUND._replace(t=t[:, None])
+    assert np.array_equal(torque_of("torque_lag", torque, around, delay=0.4), torque)
+    around = around._replace(wheel_speed=np.repeat([1.0, 3.0], 50)[:, None])
+    assert torque_of("inertia", torque, around, wheel_inertia=30.0) == pytest.approx(torque, rel=1e-12)
+
+
+def test_runs_end_at_gaps_and_where_time_goes_back():
+    t = np.array([0.0, 0.1, 0.2, 5.0, 5.1, 4.0, 4.1])
+    assert [run.tolist() for run in stretches(t)] == [[0, 1, 2], [3, 4], [5, 6]]
+    assert [run.tolist() for run in stretches(t[:1])] == [[0]]
+
+
+def test_the_hitchs_load_cell_has_zero_and_span():
+    draft = np.array([-500.0, 0.0, 4000.0])
+    offset, gain = CATALOGUE["draft_offset"], CATALOGUE["draft_gain"]
+    assert offset.draft(draft, AROUND, {"offset": 250.0}).tolist() == [250.0, 250.0, 250.0]
+    assert gain.draft(draft, AROUND, {"gain": -0.1}) == pytest.approx([50.0, 0.0, -400.0])
+
+
+def test_each_wheels_load_cell_has_its_own_zero():
+    effect = CATALOGUE["wheel_load_offset"]
+    assert effect.each_wheel
+    error = effect.load(AROUND, {"offset": np.array([100.0, 0.0, -300.0, 50.0])})
+    assert error.shape == AROUND.load.shape
+    assert np.all(error == [100.0, 0.0, -300.0, 50.0])
+    assert [e.name for e in CATALOGUE.values() if e.each_wheel] == ["wheel_load_offset"]
