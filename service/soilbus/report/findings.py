@@ -231,4 +231,6 @@ def admission_line(findings: Findings) -> str:
     recordings = findings.recordings
     refused = ", ".join(f"{reason} {n}" for reason, n in recordings.rejected.items()) or "none"
     short = f"; too short to use: {', '.join(recordings.too_short)}" if recordings.too_short else ""
-    return f"{recordings.samples} samples of {len(recordings.first)} logs; refused samples: {refused}{short}"
+    n = len(recordings.first)
+    logs = "one log" if n == 1 else f"{n} logs"
+    return f"{recordings.samples} samples of {logs}; refused samples: {refused}{short}"
