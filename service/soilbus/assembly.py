@@ -20,15 +20,20 @@ from soilbus.terra.wheel import FAST_NODES, WheelModel
 
 
 def rig_of(config: Config) -> Rig:
-    """The vehicle with the wheels that have all of torque, speed and load."""
-    wheels = [w for w in config.wheel if w.torque and w.speed and w.load]
+    """The vehicle with the wheels that have all of torque, speed and load; the one wheel of a test rig."""
+    of_table = config.table is not None
+    wheels = [w for w in config.wheel if of_table or (w.torque and w.speed and w.load)]
+    noise = {q: SensorNoise(**getattr(config.noise, q).model_dump()) for q in type(config.noise).model_fields}
+    slip = noise.pop("slip")
+    if of_table:  # its speeds are stand-ins for the slip, see tables.py
+        noise |= {"speed": SensorNoise(), "ground_speed": slip}
     return Rig(
         wheels=tuple(w.name for w in wheels),
         radius=np.array([w.radius for w in wheels]),
         width=np.array([w.width for w in wheels]),
-        front=np.array([w.axle == "front" for w in wheels], dtype=bool),
+        front=np.array([of_table or w.axle == "front" for w in wheels], dtype=bool),
         chassis=chassis_of(config),
-        noise={q: SensorNoise(**getattr(config.noise, q).model_dump()) for q in type(config.noise).model_fields},
+        noise=noise,
     )
 
 

@@ -18,6 +18,7 @@ from pydantic import (
     NonNegativeFloat,
     PositiveFloat,
     ValidationError,
+    field_validator,
     model_validator,
 )
 
@@ -93,11 +94,12 @@ class Signal(_Section):
 class Wheel(_Section):
     """One wheel and its sensors; radius is the rolling radius [m], width the tyre's [m].
 
-    `max_torque` [N m] is the motor's limit at the wheel where no signal tells it.
+    `max_torque` [N m] is the motor's limit at the wheel where no signal tells it.  Only the
+    wheel of a test rig has no axle.
     """
 
     name: Name
-    axle: Literal["front", "rear"]
+    axle: Literal["front", "rear"] | None = None
     radius: PositiveFloat
     width: PositiveFloat
     gear_ratio: PositiveFloat = 1.0
@@ -136,6 +138,63 @@ class Signals(_Section):
         return self
 
 
+class Column(_Section):
+    """A column of a table: its name, or a table with the factor that brings it to SI."""
+
+    column: Annotated[str, Field(min_length=1)]
+    factor: float = 1.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_text(cls, value: Any) -> Any:
+        return {"column": value} if isinstance(value, str) else value
+
+    @field_validator("factor")
+    @classmethod
+    def _not_zero(cls, value: float) -> float:
+        if value == 0.0:
+            raise ValueError("a factor of 0 leaves nothing of the column")
+        return value
+
+
+class Table(_Section):
+    """A test rig's table, each row one steady state: where its quantities stand.
+
+    wheel_load [N], drawbar_pull [N] positive forward, torque [N m] about the axle, slip
+    (1 - V/(r omega)), sinkage [m], t [s].  The soil bed is the same in all rows, or in those
+    with the same value of the column `run`.  Only rows that equal `where` count.
+    """
+
+    wheel_load: Column
+    slip: Column
+    drawbar_pull: Column | None = None
+    torque: Column | None = None
+    sinkage: Column | None = None
+    t: Column | None = None
+    run: Annotated[str, Field(min_length=1)] | None = None
+    where: dict[str, Any] = Field(default_factory=dict)
+
+    @field_validator("where")
+    @classmethod
+    def _comparable(cls, value: dict[str, Any]) -> dict[str, Any]:
+        for column, wanted in value.items():
+            if isinstance(wanted, bool) or not isinstance(wanted, (str, int, float)):
+                raise ValueError(f"{column} must be a text or a number")
+        return value
+
+    @model_validator(mode="after")
+    def _tells_something(self) -> Table:
+        if self.drawbar_pull is self.torque is self.sinkage is None:
+            raise ValueError("map at least one of drawbar_pull, torque and sinkage: nothing to compare the model with")
+        return self
+
+    @property
+    def columns(self) -> dict[str, Column]:
+        """The mapped columns of numbers, by role."""
+        roles = ("wheel_load", "slip", "drawbar_pull", "torque", "sinkage", "t")
+        return {role: column for role in roles if (column := getattr(self, role)) is not None}
+
+
 class Noise(_Section):
     """One channel's error: sd of each sample and sd of a gain fixed over a recording.
 
@@ -166,6 +225,8 @@ class NoiseOfChannels(_Section):
     sinkage: Noise = Noise(absolute=0.005)
     pitch: Noise = Noise(absolute=0.003)
     acceleration: Noise = Noise(absolute=0.02)
+    slip: Noise = Noise(absolute=0.005)
+    """Of a table that tells slip itself; its gain is the relative error of 1 - slip."""
 
 
 class Prior(_Section):
@@ -285,6 +346,7 @@ class Config(_Section):
     vehicle: Vehicle | None = None
     wheel: list[Wheel] = Field(default_factory=list, max_length=8)
     signals: Signals = Signals()
+    table: Table | None = None
     noise: NoiseOfChannels = NoiseOfChannels()
     soil: SoilPrior = SoilPrior()
     estimator: Estimator = Estimator()
@@ -300,6 +362,11 @@ class Config(_Section):
             raise ValueError(f"two wheels are named {name}")
         if len(self.wheel) > 1 and self.vehicle is None:
             raise ValueError("several wheels need a [vehicle]")
+        if self.table is not None and (self.vehicle is not None or len(self.wheel) != 1):
+            raise ValueError("[table] is of a test rig: exactly one [[wheel]] and no [vehicle]")
+        for w in self.wheel:
+            if w.axle is None and self.table is None:
+                raise ValueError(f"wheel {w.name}: axle: missing")
         return self
 
     @property

@@ -1,4 +1,4 @@
-"""From recorded logs to a diagnosis."""
+"""From recorded logs, or tables of a test rig, to a diagnosis."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from soilbus.assembly import prior_of
 from soilbus.can.dbc_files import load_databases
 from soilbus.config import Config
 from soilbus.daemon.recordings import Recordings, recordings_of
+from soilbus.daemon.tables import candidates, recordings_of_tables
 from soilbus.diagnosis.diagnose import Diagnosis, NotFitted, diagnose
 from soilbus.estimation.posterior import Posterior
 from soilbus.terra.effects.catalogue import CATALOGUE
@@ -35,18 +36,23 @@ class Findings:
 
 
 def diagnose_logs(config: Config, logs: Sequence[Path], say: Callable[[str], None] | None = None) -> Findings:
-    """Reads the logs and diagnoses them together; `say` is told what is being done.
+    """Reads the logs and diagnoses them together; `say` is told what is being done.  With [table] logs are tables.
 
     Raises LogError and TooLittle as recordings_of(), NotFitted where the present model
     cannot be fitted, ConfigError where configuration and database do not fit.
     """
     tell = say or (lambda _: None)
-    recordings = recordings_of(
-        config, load_databases(config), logs, lambda frames, _: tell(f"reading, {frames} frames") if say else None
-    )
+    if config.table is None:
+        recordings = recordings_of(
+            config, load_databases(config), logs, lambda frames, _: tell(f"reading, {frames} frames") if say else None
+        )
+        catalogue = list(CATALOGUE.values())
+    else:
+        recordings = recordings_of_tables(config, logs)
+        catalogue = candidates(config, recordings.records)
     begin = time.perf_counter()
     try:
-        diagnosis = diagnose(recordings.records, prior_of(config), list(CATALOGUE.values()), tell)
+        diagnosis = diagnose(recordings.records, prior_of(config), catalogue, tell)
     except np.linalg.LinAlgError as error:
         raise NotFitted(f"the recordings do not determine the model: {error}") from None
     return Findings(diagnosis, recordings, config, time.perf_counter() - begin)

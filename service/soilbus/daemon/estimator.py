@@ -18,7 +18,7 @@ from soilbus.estimation.completed import active_at
 from soilbus.estimation.gauss_newton import Fit
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.soil_class import SoilClasses, guessed
-from soilbus.estimation.tracker import Ground, Settings, Tracked, Tracker
+from soilbus.estimation.tracker import MIN_ROWS, Ground, Settings, Tracked, Tracker
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.effects.effect import Active, Surroundings, true_draft
 from soilbus.terra.effects.steady import CompletedModel
@@ -89,9 +89,12 @@ class WindowEstimator:
         self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
         self._guess = guessed(self.prior, prior_of(Config()))
         settings = config.estimator
+        least = MIN_ROWS if config.table is None else 1  # a table's rows are chosen with care, and few
         self._tracker = Tracker(
             self.rig, self.prior, self.model,
-            Settings(settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift),
+            Settings(
+                settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift, least
+            ),
             *self._completion,
         )  # fmt: skip
 

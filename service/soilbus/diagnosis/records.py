@@ -17,6 +17,8 @@ CHECKED = 3
 """Every so manieth block is held out."""
 FEWEST = 12
 """Instants that each part of a recording must have."""
+FEWEST_ROWS = 6
+"""Rows that a table must have."""
 
 
 class TooLittle(ValueError):
@@ -45,6 +47,20 @@ def record_of(name: str, window: Window, rig: Rig, model: WheelModel, min_speed:
     if min(map(len, parts)) < FEWEST:
         raise TooLittle(f"{name}: {problem.n} usable instants are too few to learn from some and check with others")
     learned, checked = (problem.part(part) for part in parts)
+    return Record(name, learned, checked)
+
+
+def record_of_rows(name: str, window: Window, rig: Rig, model: WheelModel) -> Record:
+    """A table of steady states, of which every third row is held out; TooLittle where it has not enough usable ones.
+
+    Rows do not hang together in time as the instants of a drive do, so blocks of them would
+    only part small slips from large: every third row has its neighbours among the others.
+    """
+    problem = CompletedProblem(window, rig, model, min_speed=0.0)
+    if problem.n < FEWEST_ROWS:
+        raise TooLittle(f"{name}: {problem.n} usable rows are too few to learn from some and check with others")
+    held_out = np.arange(problem.n) % CHECKED == CHECKED // 2
+    learned, checked = (problem.part(np.flatnonzero(part)) for part in (~held_out, held_out))
     return Record(name, learned, checked)
 
 

@@ -70,7 +70,7 @@ class Settings:
     """What the tracker needs to be told; times s, speeds m/s.
 
     drift: sd of the logarithm of each soil coordinate after one window; it grows with the
-    square root of time.
+    square root of time.  min_rows: residuals below which a window is not fitted.
     """
 
     window: float
@@ -78,6 +78,7 @@ class Settings:
     max_turn: float
     max_chi2: float
     drift: float
+    min_rows: int = MIN_ROWS
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +140,7 @@ class Tracker:
         problem = self._problem(window)
         since = self._crossing.end if new and self._crossing else start
         left_out = problem.standstill, problem.turning
-        if problem.n_rows < MIN_ROWS:
+        if problem.n_rows < self.settings.min_rows:
             self._fit = None
             return Tracked(None, False, Ground.SAME, since, *left_out)
         before = self._known_at(since, problem)

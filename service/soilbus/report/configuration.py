@@ -8,20 +8,27 @@ from soilbus.assembly import completion_of, effects_of, rig_of
 from soilbus.can.channels import Channel
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.mapping import channels_of, without_unit
-from soilbus.config import Config, defaults_text
+from soilbus.config import Config, Table, defaults_text
 from soilbus.report.table import table
 
 
 def configuration_report(config: Config) -> str:
     """The whole report as text; ConfigError lists every fault."""
+    completion_of(config)
+    if config.table is not None:
+        columns = [(role, c.column, f"{c.factor:g}") for role, c in config.table.columns.items()]
+        return _report(config, [table(("role", "column", "factor to SI"), columns)])
     database = load_databases(config)
     channels = channels_of(config, database)
-    effects = effect_lines(config)
     output_database(config)
     assumed = {c.name for c in without_unit(channels, database)}
     rows = [_row(channel, database, channel.name in assumed) for channel in channels]
     head = ("role", "signal", "unit", "factor to SI", "plausible", "every", "status")
-    parts = [table(head, rows)]
+    return _report(config, [table(head, rows)])
+
+
+def _report(config: Config, parts: list[str]) -> str:
+    effects = effect_lines(config)
     parts += [f"{name:<8} {verdict}\n" for name, verdict in identifiable(config)]
     if effects:
         parts.append("\nEffects in the model:\n" + "".join(f"{line}\n" for line in effects))
@@ -68,7 +75,9 @@ def identifiable(config: Config) -> list[tuple[str, str]]:
     """(parameter, verdict) for each soil parameter: told by which sensors, or why not."""
     rig = rig_of(config)
     held = {name for name, prior in config.soil_prior.items() if prior.std == 0.0}
-    if not rig.wheels or config.signals.ground_speed is None:
+    if config.table is not None:
+        verdicts = _told_by(config.table)
+    elif not rig.wheels or config.signals.ground_speed is None:
         verdicts = dict.fromkeys(config.soil_prior, "no: needs torque, speed and load of a wheel and a ground speed")
     else:
         draft = config.signals.draft is not None
@@ -85,3 +94,18 @@ def identifiable(config: Config) -> list[tuple[str, str]]:
             "K": "yes: torque over varied slip",
         }
     return [(name, "held by the configuration" if name in held else text) for name, text in verdicts.items()]
+
+
+def _told_by(columns: Table) -> dict[str, str]:
+    """What the columns of a test rig tell of each soil parameter."""
+    forces = " and ".join(role.replace("_", " ") for role in ("torque", "drawbar_pull") if role in columns.columns)
+    depth = "yes: sinkage over varied load" if columns.sinkage else f"weakly: {forces} alone; sinkage would tell more"
+    strength = f"{forces} over varied" if forces else "no: needs torque or drawbar pull (prior kept)"
+    return {
+        "k_c": "no: needs two tyre widths (prior kept)",
+        "k_phi": depth,
+        "n": depth,
+        "phi": f"yes: {strength} load and slip" if forces else strength,
+        "c": f"partly: {strength} load; the prior counts" if forces else strength,
+        "K": f"yes: {strength} slip" if forces else strength,
+    }

@@ -19,8 +19,13 @@ from soilbus.traversability import Status
 def summary(results: Sequence[WindowResult], pipeline: Pipeline) -> str:
     """A few lines: windows by status, soil, decisions, refused samples by reason."""
     counts = pipeline.admission.counts
-    received = sum(counts.received.values())
-    lines = [f"{len(results)} windows from {received} mapped frames ({counts.unknown} of other identifiers)"]
+    heard = f"{sum(counts.received.values())} mapped frames ({counts.unknown} of other identifiers)"
+    return summary_of(results, heard, pipeline.intake.refusals.total)
+
+
+def summary_of(results: Sequence[WindowResult], heard: str, refused: Counter[str]) -> str:
+    """The same of windows from anything that `heard` tells of, with the samples refused by reason."""
+    lines = [f"{len(results)} windows from {heard}"]
     for (status, reason), n in Counter((str(r.status), r.reason) for r in results).most_common():
         lines.append(f"  {n:5d} {status}" + ("" if reason == "none" else f": {reason}"))
     good = [r for r in results if r.status is Status.VALID]
@@ -30,13 +35,17 @@ def summary(results: Sequence[WindowResult], pipeline: Pipeline) -> str:
         lines.append(f"bearing pressure {bearing / 1e3:.1f} +- {std / 1e3:.1f} kPa (medians of the valid windows)")
     states = Counter(str(r.traversability.state) for r in results)
     lines.append("traversability " + (", ".join(f"{s} {n}" for s, n in states.most_common()) or "unknown"))
-    refused = pipeline.intake.refusals.total
     lines.append("refused samples " + (", ".join(f"{reason} {n}" for reason, n in refused.most_common()) or "none"))
     return "\n".join(lines) + "\n"
 
 
 def html_report(results: Sequence[WindowResult], pipeline: Pipeline, config: Config, logs: Sequence[Path]) -> str:
     """A self-contained page with plots over time; needs matplotlib (extra: plots)."""
+    return page_of(results, summary(results, pipeline), logs)
+
+
+def page_of(results: Sequence[WindowResult], text: str, logs: Sequence[Path]) -> str:
+    """The same under any summary."""
     rows = [
         (
             f"{r.t:.1f}",
@@ -52,7 +61,7 @@ def html_report(results: Sequence[WindowResult], pipeline: Pipeline, config: Con
     return page(
         "soilbus replay",
         ", ".join(p.name for p in logs),
-        f"<pre>{html.escape(summary(results, pipeline))}</pre>",
+        f"<pre>{html.escape(text)}</pre>",
         picture(_plots(results), "estimates over time"),
         html_table(head, rows),
     )

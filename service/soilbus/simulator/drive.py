@@ -125,7 +125,7 @@ def _situation(
     test_draft = chassis.mass  # any draft will do, loads are linear in it
     level = loads(0.0)
     ahead = {"front": chassis.wheelbase - chassis.cg_ahead_of_rear_axle, "rear": -chassis.cg_ahead_of_rear_axle}
-    position = np.stack([motion.distance + ahead[wheel.axle] for wheel in wheels])
+    position = np.stack([motion.distance + ahead[str(wheel.axle)] for wheel in wheels])
     soil = soil_along(scenario.soils, position, scenario.transition)
     spread = Swing(-scenario.slip_spread, scenario.slip_spread)
     limits = [wheel.max_torque or np.inf for wheel in wheels]

@@ -1,0 +1,34 @@
+"""The catalogue's priors are for wheels of tractors; here they are brought to another wheel's size."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from soilbus.terra.effects.effect import Effect, Parameter
+
+LOAD = 5600.0
+"""Load [N] of the wheels that the catalogue's priors are for."""
+RADIUS = 0.56
+"""Radius [m] of these wheels."""
+
+
+def for_wheel(effect: Effect, load: float, radius: float) -> Effect:
+    """The effect with parameters [N, N m, m, m/N] in proportion to a wheel of this load [N] and radius [m].
+
+    Everything else of an effect is the soil's or a share, and stays.  Without this a load
+    cell's zero with a prior sd of 300 N could never be told on a wheel that carries 80 N.
+    """
+    force, length = load / LOAD, radius / RADIUS
+    of_unit = {"N": force, "N m": force * length, "m": length, "m/N": length / force}
+    return replace(effect, parameters=tuple(_times(p, of_unit.get(p.unit, 1.0)) for p in effect.parameters))
+
+
+def _times(p: Parameter, scale: float) -> Parameter:
+    return replace(
+        p,
+        neutral=p.neutral * scale,
+        std=p.std * scale,
+        low=p.low * scale,
+        high=p.high * scale,
+        starts=tuple(start * scale for start in p.starts),
+    )

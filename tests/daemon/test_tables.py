@@ -1,0 +1,297 @@
+"""Tables of a test rig: what is read, what is refused and why, and whether the estimate is as good as it says."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from availability import unavailable
+from single_wheel import NOISE, RIG, WIDTH, noisy, sweep, write_csv
+from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.config import Config, ConfigError, parse_config
+from soilbus.daemon.diagnose import diagnose_logs
+from soilbus.daemon.outputs import json_line
+from soilbus.daemon.tables import TableError, candidates, recordings_of_tables, replay_tables, runs_of, window_of_rows
+from soilbus.diagnosis.records import TooLittle
+from soilbus.diagnosis.verdict import Verdict
+from soilbus.estimation.gauss_newton import fit_window
+from soilbus.estimation.residuals import WindowProblem
+from soilbus.report.configuration import configuration_report
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.effects.effect import Active, Effect
+from soilbus.terra.effects.size import LOAD, RADIUS, for_wheel
+from soilbus.terra.soils import SOILS
+from soilbus.terra.wheel import Soil
+from soilbus.traversability import Status
+
+TRUTH = Soil(k_c=2e3, k_phi=1.5e6, n=0.8, phi=0.5, c=2e3, K=0.015)
+LOADS, SLIPS = (800.0, 1500.0), np.linspace(0.03, 0.6, 9)
+
+
+def rig(**table: object) -> Config:
+    raw = tomllib.loads(RIG)
+    raw["table"] = {k: v for k, v in (raw["table"] | table).items() if v is not None}
+    return parse_config(raw)
+
+
+@pytest.fixture(scope="module")
+def measured() -> dict[str, np.ndarray]:
+    return noisy(sweep(TRUTH, LOADS, SLIPS), np.random.default_rng(1))
+
+
+def fault(raw_change: dict[str, object]) -> str:
+    with pytest.raises(ConfigError) as error:
+        parse_config(tomllib.loads(RIG) | raw_change)
+    assert len(error.value.faults) == 1, error.value.faults
+    return error.value.faults[0]
+
+
+def test_configuration_of_a_rig_is_checked_with_a_line_for_each_fault():
+    table = tomllib.loads(RIG)["table"]
+    wheel = tomllib.loads(RIG)["wheel"][0]
+    assert "table.slip: missing" in fault({"table": {k: v for k, v in table.items() if k != "slip"}})
+    assert "table.slipp: unknown key" in fault({"table": table | {"slipp": "x"}})
+    assert "factor of 0" in fault({"table": table | {"slip": {"column": "s", "factor": 0.0}}})
+    assert "nothing to compare" in fault({"table": {"wheel_load": "load", "slip": "slip"}})
+    assert "source must be a text or a number" in fault({"table": table | {"where": {"source": [1, 2]}}})
+    vehicle = {"mass": 1.0, "wheelbase": 2.0, "cg_ahead_of_rear_axle": 1.0, "cg_height": 1.0}
+    assert "no [vehicle]" in fault({"vehicle": vehicle})
+    with pytest.raises(ConfigError, match="axle: missing"):
+        parse_config({"wheel": [wheel]})
+
+
+def test_units_are_brought_to_si_and_a_missing_cell_is_nan_never_zero(tmp_path):
+    path = write_csv(
+        tmp_path / "a.csv",
+        {
+            "load": [0.1, 0.2, 0.3],
+            "slip_percent": [10, 20, 30],
+            "pull": [1.0, "", 3.0],
+            "torque": ["NaN", 5, 6],
+            "sink_mm": [1, 2, "n/a"],
+        },
+    )
+    config = rig(
+        wheel_load={"column": "load", "factor": 1e3},
+        slip={"column": "slip_percent", "factor": 0.01},
+        sinkage={"column": "sink_mm", "factor": 1e-3},
+    )
+    (run,) = runs_of(config, path)
+    window = run.window
+    np.testing.assert_allclose(window.load[:, 0], [100.0, 200.0, 300.0])
+    np.testing.assert_allclose(window.draft, [1.0, np.nan, 3.0])
+    np.testing.assert_allclose(window.torque[:, 0], [np.nan, 5.0, 6.0])
+    np.testing.assert_allclose(window.sinkage[:, 0], [1e-3, 2e-3, np.nan])
+    np.testing.assert_allclose(1.0 - window.ground_speed / (0.3 * window.speed[:, 0]), [0.1, 0.2, 0.3])
+    problem = WindowProblem(window, rig_of(config), model_of(config), config.estimator.min_speed)
+    assert problem.n_rows == 6  # nine cells of three channels, three of them missing
+
+
+def test_the_slips_error_is_that_of_one_less_the_ratio_of_speeds():
+    config = rig()
+    t, values = np.arange(3.0), {"wheel_load": np.full(3, 900.0), "slip": np.array([0.0, 0.4, 0.97])}
+    window = window_of_rows(rig_of(config), t, values, rim_speed=20.0)
+    np.testing.assert_allclose(window.variance["ground_speed"], (20.0 * NOISE["slip"]) ** 2)
+    np.testing.assert_allclose(window.variance["speed"], 0.0)
+
+
+def test_rows_without_load_or_slip_are_left_out_and_counted(tmp_path):
+    columns = {"load": [900, "", 900, 900, -5], "slip": [0.1, 0.2, "", 0.99, 0.3], "pull": 5, "torque": 6, "sink": 0.01}
+    columns = {k: v if isinstance(v, list) else [v] * 5 for k, v in columns.items()}
+    (run,) = runs_of(rig(), write_csv(tmp_path / "a.csv", columns))
+    assert len(run.window.t) == 1
+    assert run.rejected == {"no_load": 1, "no_slip": 1, "slip_range": 1, "load_range": 1}
+
+
+def test_runs_are_recordings_and_where_picks_rows(tmp_path):
+    columns = {"bed": ["b", "a", "b", "a"], "lugs": [0, 0.0, "0.0", 1], "load": [1, 2, 3, 4], "slip": [0.1] * 4}
+    path = write_csv(tmp_path / "t.csv", columns | {"pull": [0] * 4, "torque": [0] * 4, "sink": [0] * 4})
+    found = runs_of(rig(run="bed", where={"lugs": 0}), path)
+    assert [run.name for run in found] == ["t.csv, b", "t.csv, a"]
+    assert [run.window.load[:, 0].tolist() for run in found] == [[1.0, 3.0], [2.0]]
+    (only,) = runs_of(rig(where={"bed": "a"}), path)
+    assert only.window.load[:, 0].tolist() == [2.0, 4.0]
+    with pytest.raises(TableError, match="where"):
+        runs_of(rig(where={"bed": "c"}), path)
+
+
+def test_rows_follow_their_times(tmp_path, measured):
+    n = len(measured["slip"])
+    path = write_csv(tmp_path / "t.csv", measured | {"ms": 500.0 * np.arange(n)[::-1]})
+    (run,) = runs_of(rig(t={"column": "ms", "factor": 1e-3}), path)
+    np.testing.assert_allclose(run.window.t, 0.5 * np.arange(n))
+    np.testing.assert_allclose(run.window.load[:, 0], measured["load"][::-1])
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("load,slip,pull,torque\n1,0.1,2,3\n", "no column sink; it has load, slip, pull, torque"),
+        ("load,slip,pull,torque,sink,sink\n", "two columns are named sink"),
+        ("load,slip,pull,torque,sink\n1,0.1,two,3,0\n", "row 1, column pull: 'two' is not a number"),
+        ("load,slip,pull,torque,sink\n1,0.1,inf,3,0\n", "row 1, column pull: 'inf' is not a number"),
+        ("load,slip,pull,torque,sink\n1,0.1,2\n", "row 1 has 3 cells under a header of 5"),
+        ("load,slip,pull,torque,sink\n", "no row in it"),
+        ("", "it has none"),
+        ("load,slip,pull,torque,sink\n1,,2,3,0\n", "no usable row in it \\(no_slip\\)"),
+        ('load,slip\n"1,0.1\n', "not CSV text"),
+    ],
+)
+def test_a_table_that_cannot_be_used_gets_one_clear_line(tmp_path, text, complaint):
+    path = tmp_path / "a.csv"
+    path.write_text(text)
+    with pytest.raises(TableError, match=complaint) as error:
+        runs_of(rig(), path)
+    assert "\n" not in str(error.value)
+    assert str(path) in str(error.value)
+
+
+def test_files_that_are_no_tables_are_named(tmp_path):
+    (tmp_path / "a.parquet").write_bytes(b"PAR0 nothing of the kind")
+    (tmp_path / "a.csv").write_bytes(b"\xff\xfe\x00")
+    for name, complaint in (
+        ("none.csv", "No such file"), ("a.xlsx", "not a table"), ("a.csv", "not CSV"), ("a.parquet", "Parquet"),
+    ):  # fmt: skip
+        with pytest.raises(TableError, match=complaint):
+            runs_of(rig(), tmp_path / name)
+
+
+def test_parquet_tells_the_same_as_csv(tmp_path, measured):
+    try:
+        import pyarrow
+        from pyarrow.parquet import write_table
+    except ModuleNotFoundError:
+        unavailable("no pyarrow (extra: tables)")
+    values = {k: [None if i == 3 and k == "pull" else float(x) for i, x in enumerate(v)] for k, v in measured.items()}
+    write_table(pyarrow.table(values | {"bed": ["x"] * len(values["load"])}), tmp_path / "t.parquet")
+    texts = {k: ["" if x is None else repr(x) for x in v] for k, v in values.items()}
+    (one,) = runs_of(rig(where={"bed": "x"}), tmp_path / "t.parquet")
+    (other,) = runs_of(rig(), write_csv(tmp_path / "t.csv", texts))
+    for quantity in ("t", "load", "torque", "sinkage", "draft", "ground_speed"):
+        np.testing.assert_array_equal(getattr(one.window, quantity), getattr(other.window, quantity))
+    assert np.isnan(one.window.draft[3])
+
+
+def test_without_pyarrow_a_parquet_file_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
+    with pytest.raises(TableError, match=r"soilbus\[tables\]"):
+        runs_of(rig(), tmp_path / "a.parquet")
+
+
+@pytest.mark.parametrize("missing", [(), ("torque", "sinkage"), ("drawbar_pull", "torque")], ids=str)
+def test_estimates_from_twenty_rows_cover_the_truth(missing):
+    """Soils drawn from the prior: two standard deviations hold the truth in 95 of 100 cases."""
+    config = rig()
+    the_rig, model, prior = rig_of(config), model_of(config), prior_of(config)
+    rng, deviations = np.random.default_rng(3), []
+    while len(deviations) < 25:
+        truth = Soil(*(prior.median * np.exp(0.6 * prior.log_std * rng.standard_normal(6))))
+        try:
+            rows = noisy(sweep(truth, (1000.0, 2000.0), np.linspace(0.02, 0.6, 10)), rng)
+        except ValueError:  # this soil does not carry the wheel
+            continue
+        values = {"wheel_load": rows["load"], "slip": rows["slip"], "drawbar_pull": rows["pull"]}
+        values |= {"torque": rows["torque"], "sinkage": rows["sink"]}
+        values = {role: v for role, v in values.items() if role not in missing}
+        window = window_of_rows(the_rig, np.arange(len(rows["slip"])), values)
+        fit = fit_window(WindowProblem(window, the_rig, model, min_speed=0.0), prior)
+        assert fit is not None
+        bearing, tan_phi = fit.posterior.bearing_pressure(0.02, WIDTH), fit.posterior.tan_phi()
+        true_bearing = (truth.k_c / WIDTH + truth.k_phi) * 0.02**truth.n
+        deviations.append(
+            (
+                np.log(true_bearing / bearing.value) * bearing.value / bearing.std,
+                np.log(np.tan(truth.phi) / tan_phi.value) * tan_phi.value / tan_phi.std,
+            )
+        )
+    inside = np.abs(deviations) < 2.0
+    assert (inside.mean(0) >= 0.84).all()  # 21 of 25: less has a chance of 0.2 % at 95 %
+    assert (np.std(deviations, axis=0) > 0.5).all()  # and the intervals are no wider than need be
+
+
+def test_replay_of_a_table_is_a_window_for_each_run(tmp_path, measured):
+    n = len(measured["slip"])
+    path = write_csv(tmp_path / "t.csv", measured | {"bed": [i % 2 for i in range(n)]})
+    results = list(replay_tables(rig(run="bed"), [path, path]))
+    assert [r.index for r in results] == [0, 1, 2, 3]
+    for result in results:
+        assert result.status in (Status.VALID, Status.NOT_EXCITED)
+        true = (TRUTH.k_c / 0.3 + TRUTH.k_phi) * 0.02**TRUTH.n
+        assert abs(result.bearing.value - true) < 3.0 * result.bearing.std
+        assert result.slip["rig"] == pytest.approx(measured["slip"].mean(), abs=0.05)
+        assert '"bearing_pressure"' in json_line(result, rig())
+
+
+def test_diagnosis_of_tables_names_what_was_hidden_and_nothing_where_nothing_was(tmp_path):
+    rng = np.random.default_rng(5)
+    slips = np.linspace(0.03, 0.6, 12)
+    beds = (TRUTH, SOILS["upland_sandy_loam_51"])
+    effect = CATALOGUE["slip_sinkage"]
+    hidden = [Active(effect, effect.neutral | {"softening": 1.5})]
+    for active, verdict in (([], Verdict.NONE), (hidden, Verdict.NAMED)):
+        paths = [
+            write_csv(tmp_path / f"{i}.csv", noisy(sweep(soil, LOADS, slips, active), rng))
+            for i, soil in enumerate(beds)
+        ]
+        found = diagnose_logs(rig(), paths).diagnosis
+        assert found.verdict is verdict
+        assert [a.effect.name for a in found.additions] == [a.effect.name for a in active]
+    assert found.base.gap > 2.0 > 1.6 > found.completed.gap
+
+
+def test_a_table_of_few_rows_learns_from_two_thirds_spread_over_all_slips(tmp_path, measured):
+    first = {k: v[:7] for k, v in measured.items()}
+    recordings = recordings_of_tables(rig(), [write_csv(tmp_path / "t.csv", first)])
+    (record,) = recordings.records
+    assert (record.learned.n, record.checked.n, recordings.too_short) == (5, 2, ())
+    assert (
+        record.learned.slip.min() < record.checked.slip.min() <= record.checked.slip.max() < record.learned.slip.max()
+    )
+    with pytest.raises(TooLittle, match="5 usable rows are too few"):
+        recordings_of_tables(rig(), [write_csv(tmp_path / "s.csv", {k: v[:5] for k, v in measured.items()})])
+
+
+def test_effects_that_a_table_cannot_tell_are_no_candidates(tmp_path, measured):
+    path = write_csv(tmp_path / "t.csv", measured | {"s": np.arange(len(measured["slip"]))})
+    records = recordings_of_tables(rig(), [path]).records
+    names = {effect.name for effect in candidates(rig(), records)}
+    assert set(CATALOGUE) - names == {
+        "rate_stiffening", "inertia", "torque_lag", "soil_drift", "grade", "multipass",
+    }  # fmt: skip
+    names = {effect.name for effect in candidates(rig(t="s"), records)}
+    assert set(CATALOGUE) - names == {"rate_stiffening", "inertia", "multipass"}
+
+
+def test_priors_of_effects_grow_with_the_wheel_and_only_where_they_have_its_unit():
+    def std(effect: Effect) -> list[float]:
+        return [p.std for p in effect.parameters]
+
+    for name, factor in (("draft_offset", 2.0), ("slip_sinkage", 1.0), ("tyre_deflection", 1.5)):
+        effect = CATALOGUE[name]
+        larger = for_wheel(effect, 2.0 * LOAD, 3.0 * RADIUS)
+        assert std(larger) == pytest.approx([factor * s for s in std(effect)])
+        assert larger.parameters[0].high == pytest.approx(factor * effect.parameters[0].high)
+    assert for_wheel(CATALOGUE["hardpan"], LOAD, 0.1 * RADIUS).parameters[1].starts[0] == pytest.approx(5e-4)
+
+
+def test_the_published_table_is_read_with_its_missing_torques(field_recording):
+    path: Path = field_recording("single-wheel-published.csv")
+    columns = {"wheel_load": "vertical_load_n", "drawbar_pull": "meas_drawbar_pull_n", "torque": "meas_torque_nm"}
+    columns |= {"sinkage": "meas_sinkage_m", "where": {"source": "hurrell2025_rashid1"}}
+    (run,) = runs_of(rig(**columns), path)
+    assert len(run.window.t) == 5
+    assert np.isnan(run.window.torque).all()
+    np.testing.assert_allclose(run.window.draft, [8.1, 8.6, 8.8, 9.6, 10.5])
+
+
+def test_check_lists_the_columns_and_what_they_tell():
+    text = configuration_report(rig(torque=None, slip={"column": "slip_percent", "factor": 0.01}))
+    assert re.search(r"slip +slip_percent +0\.01", text)
+    assert re.search(r"K +yes: drawbar pull over varied slip", text)
+    only_depth = configuration_report(rig(torque=None, drawbar_pull=None))
+    assert re.search(r"phi +no: needs torque or drawbar pull", only_depth)
+    assert re.search(r"n +yes: sinkage", only_depth)
