@@ -82,7 +82,7 @@ def _candidates(findings: Findings) -> Iterator[str]:
 def _places(findings: Findings) -> str:
     where = findings.diagnosis.where
     if not where:
-        return f"<p>{html.escape(place_lines(where)[0])}</p>"
+        return f"<p>{html.escape(place_lines(findings)[0])}</p>"
     rows = [(p.channel, p.wheel or "-", p.region, size_text(p), chance_text(p.significance)) for p in where]
     return html_table(("channel", "wheel", "region", "size", "chance that noise does it"), rows)
 

@@ -127,7 +127,7 @@ def findings_text(findings: Findings) -> str:
     """The whole for a reader at a terminal."""
     diagnosis = findings.diagnosis
     lines = [f"{diagnosis.verdict}: {SENTENCES[diagnosis.verdict]}", "", gap_line(findings)]
-    lines += [f"  {line}" for line in place_lines(diagnosis.where)]
+    lines += [f"  {line}" for line in place_lines(findings)]
     for number, addition in enumerate(diagnosis.additions, 1):
         lines += ["", *effect_lines(number, addition, findings.diagnosis.completed)]
     if diagnosis.learned:
@@ -145,8 +145,11 @@ def gap_line(findings: Findings) -> str:
     )
 
 
-def place_lines(where: Sequence[Disagreement]) -> list[str]:
+def place_lines(findings: Findings) -> list[str]:
     """The places of disagreement, the clearest first."""
+    base, where = findings.diagnosis.base, findings.diagnosis.where
+    if not where and base.gap > gap_limit(base.checked_rows):
+        return ["too few held-out residuals in any region to tell where model and data disagree"]
     if not where:
         return ["no channel disagrees with the model anywhere by more than noise"]
     shown = [
