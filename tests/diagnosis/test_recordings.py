@@ -20,7 +20,8 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 
 CONFIG = reference_configuration()
-SECONDS = 24.0
+DATABASE = load_databases(CONFIG)
+SECONDS = 16.0
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +32,7 @@ def log(tmp_path_factory) -> Path:
 
 
 def listener() -> Intake:
-    return Intake(CONFIG, load_databases(CONFIG))
+    return Intake(CONFIG, DATABASE)
 
 
 def shifted(line: str, by: float) -> str:
@@ -55,7 +56,7 @@ def test_a_record_holds_the_bins_of_the_windows_of_replay(log):
     assert whole.t[-1] - whole.t[0] == pytest.approx(SECONDS, abs=0.3)
     intake = listener()
     windows = [task.window for now in fed(intake, [log]) for task in intake.due(now)]
-    assert len(windows) == 14
+    assert len(windows) == 6
     inner = slice(1, -1)  # the first and the last bin have no neighbour on one side
     for window in windows:
         first = int(np.argmin(np.abs(whole.t - window.t[0])))
@@ -93,14 +94,14 @@ def test_parts_too_short_are_told_and_left_out(log, tmp_path):
     lines = log.read_text().splitlines(keepends=True)
     two = tmp_path / "two.log"
     two.write_text("".join([*lines, *(shifted(line, 1000.0) for line in lines[:1000])]))
-    found = recordings_of(CONFIG, load_databases(CONFIG), [two])
+    found = recordings_of(CONFIG, DATABASE, [two])
     assert [record.name for record in found.records] == ["two.log"]
     assert found.too_short == ("two.log, part 2",)
 
 
 def test_what_was_never_heard_is_told(log, tmp_path):
-    dbc = load_databases(CONFIG).get_message_by_name("WheelLoads")
+    dbc = DATABASE.get_message_by_name("WheelLoads")
     deaf = tmp_path / "deaf.log"
     deaf.write_text("".join(line for line in log.open() if f"{dbc.frame_id:X}#" not in line))
     with pytest.raises(TooLittle, match=r"^deaf\.log.*never heard: load\.FL, load\.FR, load\.RL, load\.RR$"):
-        recordings_of(CONFIG, load_databases(CONFIG), [deaf])
+        recordings_of(CONFIG, DATABASE, [deaf])

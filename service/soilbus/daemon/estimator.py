@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +19,8 @@ from soilbus.estimation.gauss_newton import Fit
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.soil_class import SoilClasses, guessed
 from soilbus.estimation.tracker import MIN_ROWS, Ground, Settings, Tracked, Tracker
-from soilbus.estimation.window import Window
+from soilbus.estimation.window import Rig, Window
+from soilbus.terra.effects.effect import Active, Surroundings, true_draft
 from soilbus.terra.effects.steady import CompletedModel
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.traversability import Demand, Status, Traversability, judge
@@ -132,8 +134,10 @@ class WindowEstimator:
             position=task.track.at((tracked.since + task.end) / 2.0),
             failure=self._failure(tracked),
         )
-        model = self._completed(fit, task.window)
-        return Undecided(result, self._demand(task.window), task.torque_limit, stuck, task.fresh, model)
+        effects = self._effects(fit)
+        model = CompletedModel.of(self.model, effects, self._usual_speed(task.window))
+        demand = self._demand(task.window, effects)
+        return Undecided(result, demand, task.torque_limit, stuck, task.fresh, model)
 
     def decide(self, window: Undecided) -> WindowResult:
         """The result with its traversability; windows in their order, here or in another process."""
@@ -145,14 +149,11 @@ class WindowEstimator:
             way = replace(way, state=Way.NO_GO, probability=0.0, limit="slip")
         return replace(window.result, traversability=way)
 
-    def _completed(self, fit: Fit | None, window: Window) -> CompletedModel:
-        """The model with the effects as this window leaves them, for the decision."""
+    def _effects(self, fit: Fit | None) -> list[Active]:
+        """The effects with their parameters as a fit leaves them, else as configured."""
         effects, free = self._completion
-        if fit is None or not effects:
-            return CompletedModel(self.model)
-        moving = window.ground_speed[window.ground_speed > self._settings.min_speed]
-        active = active_at(effects, free, fit.gains[len(fit.gains) - len(free) :], len(self.rig.wheels))
-        return CompletedModel.of(self.model, active, float(moving.mean()) if len(moving) else 1.0)
+        pulls = np.zeros(len(free)) if fit is None else fit.gains[len(fit.gains) - len(free) :]
+        return active_at(effects, free, pulls, len(self.rig.wheels))
 
     def _honest(self, tracked: Tracked, fit: Fit) -> Posterior:
         """Posterior, of both optima where there are two, widened where the residuals are larger than the noise."""
@@ -176,7 +177,12 @@ class WindowEstimator:
         known = zip(self.rig.wheels, fit.sinkage.tolist(), strict=True)
         return {wheel: z if math.isfinite(z) else None for wheel, z in known}
 
-    def _demand(self, window: Window) -> Demand | None:
+    def _usual_speed(self, window: Window) -> float:
+        """Mean ground speed [m/s] while the vehicle moves, the least one where it does not."""
+        moving = window.ground_speed[window.ground_speed > self._settings.min_speed]
+        return float(moving.mean()) if len(moving) else self._settings.min_speed
+
+    def _demand(self, window: Window, effects: Sequence[Active]) -> Demand | None:
         """Draft and slope, over the last hop or the whole window, whichever asks for more.
 
         A driver who has just lifted the implement because it was too much still wants it
@@ -185,7 +191,8 @@ class WindowEstimator:
         if self.rig.chassis is None or not len(window.t):
             return None
         slope = np.where(np.isfinite(window.pitch), np.sin(window.pitch), 0.0)
-        pull = window.draft + self.rig.chassis.mass * GRAVITY * slope
+        draft = true_draft(effects, window.draft, _surroundings(window, self.rig))
+        pull = draft + self.rig.chassis.mass * GRAVITY * slope
         recent = pull[window.t > window.t[-1] - self._settings.hop]
         recent, pull = recent[np.isfinite(recent)], pull[np.isfinite(pull)]
         if not len(recent):
@@ -246,3 +253,20 @@ class WindowEstimator:
         one, other = fit.posterior, fit.rival.belief.posterior
         pairs = ((self._bearing(one), self._bearing(other)), (one.tan_phi(), other.tan_phi()))
         return any(abs(a.value - b.value) > AMBIGUOUS * a.std for a, b in pairs)
+
+
+def _surroundings(window: Window, rig: Rig) -> Surroundings:
+    """What effects may depend on, as measured."""
+    t = (window.t - window.t[0])[:, None]
+    return Surroundings(
+        t=t,
+        distance=np.zeros_like(t),
+        load=window.load,
+        ground_speed=window.ground_speed[:, None],
+        wheel_speed=window.speed,
+        rear=~rig.front,
+        draft=window.draft[:, None],
+        acceleration=window.acceleration[:, None],
+        mass=0.0 if rig.chassis is None else rig.chassis.mass,
+        duration=float(t[-1, 0]),
+    )

@@ -20,9 +20,19 @@ from soilbus.estimation.linearised import Latents
 from soilbus.estimation.residuals import MAX_TURN, Response, WindowProblem
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.effects.along import stretches
-from soilbus.terra.effects.effect import Active, Effect, Parameter, Surroundings, forces_with, wheel_with
+from soilbus.terra.effects.effect import Active, Effect, Parameter, Surroundings, true_draft, wheel_with
 from soilbus.terra.stress import lumped_modulus
-from soilbus.terra.wheel import MAX_ENTRY_ANGLE, MIN_ENTRY_ANGLE, Soil, WheelModel, WheelState, sinkage
+from soilbus.terra.wheel import (
+    INPUTS,
+    MAX_ENTRY_ANGLE,
+    MIN_ENTRY_ANGLE,
+    Soil,
+    WheelModel,
+    WheelState,
+    sinkage,
+    wheel_forces,
+    wheel_forces_and_derivatives,
+)
 
 Array = NDArray[np.float64]
 
@@ -32,8 +42,6 @@ STEP_OF_EFFECT = 1e-4
 LOAD_ROUNDS = 6
 SMOOTHED = 9
 """Instants through which a parabola smooths the torque that comes from other instants."""
-DRAFT_ROUNDS = 3
-"""Fixed-point rounds from a reading of the hitch to the draft: its error is a few per cent of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +107,25 @@ class _Contact(NamedTuple):
     forces: Array
     depth: Array
     around: Surroundings
+
+
+class _Bare(NamedTuple):
+    """Wheels as the effects' hooks leave them, with forces (3, N, W) and derivatives (3, 7, N, W) by INPUTS."""
+
+    state: WheelState
+    model: WheelModel
+    forces: Array
+    by_inputs: Array
+
+    def forces_at(self, state: WheelState, model: WheelModel) -> Array:
+        """Forces (3, N, W) of other wheels: along the tangent, which is all that a difference sees, where it holds."""
+        same_wheel = np.array_equal(state.radius, self.state.radius) and np.array_equal(state.width, self.state.width)
+        if model != self.model or not same_wheel:
+            return wheel_forces(state, model)
+        change = np.empty(self.by_inputs.shape[1:])
+        for i, name in enumerate(INPUTS):
+            change[i] = getattr(state, name) - getattr(self.state, name)
+        return np.asarray(self.forces + np.einsum("fi...,i...->f...", self.by_inputs, change))
 
 
 class CompletedProblem(WindowProblem):
@@ -171,14 +198,15 @@ class CompletedProblem(WindowProblem):
             return super()._response(soil, gains, latents)
         pulls = gains[self.n_sensors :]
         active, angle = self.active(pulls), latents.entry_angle
-        here = self._contact(soil, active, latents, angle)
+        near = self._bare(soil, active, latents, angle)
+        here = self._contact(soil, active, latents, angle, near)
         at = self._told(here, active, latents, None)
 
         def by(changed: _Outcome, step: Any) -> _Outcome:
             return _Outcome((changed.wheels - at.wheels) / step, (changed.pull - at.pull) / _of_instant(step), at.late)
 
         def by_moving(moved: Latents, step: Any) -> Array:
-            contact = self._contact(soil, active, moved, moved.entry_angle)
+            contact = self._contact(soil, active, moved, moved.entry_angle, near)
             return by(self._told(contact, active, moved, at.late), step).wheels
 
         by_latents = {}
@@ -187,7 +215,7 @@ class CompletedProblem(WindowProblem):
             step = STEP * np.abs(value)
             by_latents[name] = by_moving(_with(latents, name, value + step), step if step.ndim == 2 else step[:, None])
         by_angle = by_latents["entry_angle"]
-        by_soil = self._by_soil(soil, active, latents, at)
+        by_soil = self._by_soil(soil, active, latents, at, near)
         by_effects = np.zeros((4, len(self.free), self.n, self.n_wheels))
         pull_by_effects = np.zeros((len(self.free), self.n))
         at_wheels = {e.name for e in self.effects if e.wheel is not None or e.forces is not None}
@@ -196,7 +224,7 @@ class CompletedProblem(WindowProblem):
             inward = STEP_OF_EFFECT if self.free[i].within(pulls[i] + STEP_OF_EFFECT) else -STEP_OF_EFFECT
             shifted[i] += inward
             other = self.active(shifted)
-            contact = self._contact(soil, other, latents, angle) if self.free[i].effect in at_wheels else here
+            contact = self._contact(soil, other, latents, angle, near) if self.free[i].effect in at_wheels else here
             d = by(self._told(contact, other, latents, None), inward)
             by_effects[:, i], pull_by_effects[i] = d.wheels, d.pull
         slope, off = by_angle[0], -at.wheels[0]
@@ -223,28 +251,42 @@ class CompletedProblem(WindowProblem):
             pull_by_effects=pull_by_effects,
         )
 
-    def _by_soil(self, soil: Soil, active: Sequence[Active], latents: Latents, at: _Outcome) -> Array:
+    def _by_soil(self, soil: Soil, active: Sequence[Active], latents: Latents, at: _Outcome, near: _Bare) -> Array:
         """Derivatives (4, 6, N, W) by k_c, k_phi, n, phi, c, K at held entry angles."""
         out = np.empty((4, 6, self.n, self.n_wheels))
         for i, name in enumerate(Soil._fields[1:], 1):
             step = STEP * max(abs(getattr(soil, name)), 1e-9)
             changed = soil._replace(**{name: getattr(soil, name) + step})
-            contact = self._contact(changed, active, latents, latents.entry_angle)
+            contact = self._contact(changed, active, latents, latents.entry_angle, near)
             out[:, i] = (self._told(contact, active, latents, None).wheels - at.wheels) / step
         np.divide(out[:, 1], self.rig.width, out=out[:, 0])  # both act through K_L = k_c/b + k_phi
         return out
 
-    def _contact(self, soil: Soil, active: Sequence[Active], latents: Latents, angle: Array) -> _Contact:
-        """What happens between wheels and ground at given entry angles."""
-        around = self._surroundings(latents)
+    def _contact(
+        self, soil: Soil, active: Sequence[Active], latents: Latents, angle: Array, near: _Bare | None = None
+    ) -> _Contact:
+        """What happens between wheels and ground at given entry angles; only a small step away from `near`."""
+        state, around = self._wheels(soil, latents, angle)
+        state, model = wheel_with(active, state, self.model, around)
+        forces = wheel_forces(state, model) if near is None else near.forces_at(state, model)
+        for effect, values in active:
+            if effect.forces is not None:
+                forces = effect.forces(forces, state, around, values)
+        return _Contact(forces, np.broadcast_to(sinkage(angle, state.radius), angle.shape), around)
+
+    def _bare(self, soil: Soil, active: Sequence[Active], latents: Latents, angle: Array) -> _Bare:
+        """The wheels at given entry angles, with derivatives."""
+        state, around = self._wheels(soil, latents, angle)
+        state, model = wheel_with(active, state, self.model, around)
+        return _Bare(state, model, *wheel_forces_and_derivatives(state, model))
+
+    def _wheels(self, soil: Soil, latents: Latents, angle: Array) -> tuple[WheelState, Surroundings]:
+        """The wheels before any effect, and what effects depend on."""
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
         K_L = lumped_modulus(soil.k_c, soil.k_phi, self.rig.width)
-        state = WheelState(
-            angle, slip, self.rig.radius, self.rig.width, K_L, soil.n, float(np.tan(soil.phi)), soil.c, soil.K
-        )
-        forces = forces_with(active, state, self.model, around)
-        depth = sinkage(angle, wheel_with(active, state, self.model, around)[0].radius)
-        return _Contact(forces, np.broadcast_to(depth, angle.shape), around)
+        tan_phi = float(np.tan(soil.phi))
+        state = WheelState(angle, slip, self.rig.radius, self.rig.width, K_L, soil.n, tan_phi, soil.c, soil.K)
+        return state, self._surroundings(latents)
 
     def _told(self, contact: _Contact, active: Sequence[Active], latents: Latents, late: Array | None) -> _Outcome:
         """What sensors and the balance of forces make of it; `late` as found at other latents.
@@ -254,7 +296,7 @@ class CompletedProblem(WindowProblem):
         """
         (load, pull, torque), depth, around = contact
         late = self._from_other_instants(active, torque, around) if late is None else late
-        error, missing, draft = np.zeros_like(load), np.zeros(self.n), self.draft
+        error, missing = np.zeros_like(load), np.zeros(self.n)
         for effect, values in active:
             if effect.torque is not None and not effect.mixes_instants:
                 torque = effect.torque(torque, around, values)
@@ -262,8 +304,7 @@ class CompletedProblem(WindowProblem):
                 error = error + effect.load(around, values)
             if effect.resistance is not None:
                 missing = missing + effect.resistance(around, values)
-        for _ in range(DRAFT_ROUNDS if any(e.draft is not None for e, _ in active) else 0):
-            draft = self.draft - sum(e.draft(draft, around, v) for e, v in active if e.draft is not None)
+        draft = true_draft(active, self.draft, around)
         excess = load - (latents.load - error)
         return _Outcome(np.stack([excess, pull, torque + late, depth]), missing + draft - self.draft, late)
 

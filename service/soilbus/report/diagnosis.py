@@ -19,6 +19,7 @@ from soilbus.report.findings import (
     chance_text,
     effect_lines,
     gap_line,
+    learned_lines,
     place_lines,
     size_text,
     soil_rows,
@@ -51,6 +52,7 @@ def diagnosis_report(findings: Findings) -> str:
         "<p>Each residual given the others of its instant, in standard deviations of the whole noise. "
         f"Lines: means over {BINS} equally filled bins; where nothing is missing they stay near 0.</p>",
         *_pictures(findings),
+        *_learned(findings),
         "<h2>Soil</h2>",
         *_soils(findings),
         f"<p>{html.escape(admission_line(findings))}</p>",
@@ -80,9 +82,15 @@ def _candidates(findings: Findings) -> Iterator[str]:
 def _places(findings: Findings) -> str:
     where = findings.diagnosis.where
     if not where:
-        return f"<p>{html.escape(place_lines(where)[0])}</p>"
+        return f"<p>{html.escape(place_lines(findings)[0])}</p>"
     rows = [(p.channel, p.wheel or "-", p.region, size_text(p), chance_text(p.significance)) for p in where]
     return html_table(("channel", "wheel", "region", "size", "chance that noise does it"), rows)
+
+
+def _learned(findings: Findings) -> Iterator[str]:
+    if findings.diagnosis.learned:
+        yield "<h2>What is left, described</h2>"
+        yield f"<pre>{html.escape(chr(10).join(learned_lines(findings.diagnosis.learned)))}</pre>"
 
 
 def _soils(findings: Findings) -> Iterator[str]:

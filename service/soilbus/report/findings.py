@@ -11,6 +11,7 @@ from soilbus.config import Config
 from soilbus.daemon.diagnose import Findings
 from soilbus.diagnosis.completion import Completion
 from soilbus.diagnosis.diagnose import Addition
+from soilbus.diagnosis.learned import WARNING, Correction
 from soilbus.diagnosis.verdict import Verdict, gap_limit
 from soilbus.diagnosis.where import Disagreement
 from soilbus.estimation.posterior import Estimate, Posterior
@@ -50,6 +51,8 @@ def findings_json(findings: Findings) -> str:
         "soil_after": soils[0]["after"],
         "soils": soils,
         "model": {name: _estimates(values) for name, values in findings.diagnosis.completed.parameters().items()},
+        "learned": [_correction(correction) for correction in diagnosis.learned],
+        "warning": WARNING if diagnosis.learned else None,
         "samples": recordings.samples,
         "rejected": recordings.rejected,
         "too_short": list(recordings.too_short),
@@ -75,6 +78,16 @@ def _effect(addition: Addition, completed: Completion) -> dict[str, Any]:
         "why_ambiguous": why_ambiguous(addition),
         "tells": {name: CATALOGUE[name].tells for name in (effect.name, *addition.alternatives)},
         "evidence": dict(sorted(addition.falls.items(), key=lambda item: -item[1])),
+    }
+
+
+def _correction(correction: Correction) -> dict[str, Any]:
+    return {
+        "channel": correction.channel,
+        "wheel": correction.wheel,
+        "formula": correction.formula,
+        "terms": {term.regressor: term.coefficient for term in correction.terms},
+        "explained": correction.explained,
     }
 
 
@@ -114,9 +127,11 @@ def findings_text(findings: Findings) -> str:
     """The whole for a reader at a terminal."""
     diagnosis = findings.diagnosis
     lines = [f"{diagnosis.verdict}: {SENTENCES[diagnosis.verdict]}", "", gap_line(findings)]
-    lines += [f"  {line}" for line in place_lines(diagnosis.where)]
+    lines += [f"  {line}" for line in place_lines(findings)]
     for number, addition in enumerate(diagnosis.additions, 1):
         lines += ["", *effect_lines(number, addition, findings.diagnosis.completed)]
+    if diagnosis.learned:
+        lines += ["", "what is left, described:", *(f"  {line}" for line in learned_lines(diagnosis.learned))]
     lines += ["", *_soil_lines(findings), "", admission_line(findings)]
     return "\n".join(lines) + "\n"
 
@@ -130,8 +145,11 @@ def gap_line(findings: Findings) -> str:
     )
 
 
-def place_lines(where: Sequence[Disagreement]) -> list[str]:
+def place_lines(findings: Findings) -> list[str]:
     """The places of disagreement, the clearest first."""
+    base, where = findings.diagnosis.base, findings.diagnosis.where
+    if not where and base.gap > gap_limit(base.checked_rows):
+        return ["too few held-out residuals in any region to tell where model and data disagree"]
     if not where:
         return ["no channel disagrees with the model anywhere by more than noise"]
     shown = [
@@ -146,7 +164,7 @@ def chance_text(chance: float) -> str:
     return f"{chance:.0e}" if chance > 0.0 else "< 1e-300"
 
 
-def _channel(place: Disagreement) -> str:
+def _channel(place: Disagreement | Correction) -> str:
     return f"{place.channel}.{place.wheel}" if place.wheel else place.channel
 
 
@@ -166,12 +184,23 @@ def effect_lines(number: int, addition: Addition, completed: Completion) -> list
     units = {parameter.name: parameter.unit for parameter in effect.parameters}
     for name, estimate in completed.parameters()[effect.name].items():
         unit = units.get(name) or units[name.rpartition("_")[0]]
-        lines.append(f"   {name} = {estimate.value:.4g} +- {estimate.std:.2g} {unit}".rstrip(" 1"))
+        std = f"+- {estimate.std:.2g}" if estimate.std > 0.0 else "(held)"
+        lines.append(f"   {name} = {estimate.value:.4g} {std}" + ("" if unit == "1" else f" {unit}"))
     if addition.alternatives:
         others = ", ".join(f"{name} {p:.2f}" for name, p in addition.alternatives.items())
         lines += [f"   or: {others}", f"   {why_ambiguous(addition)}", "   what would tell them apart:"]
         lines += [f"   - {name}: {CATALOGUE[name].tells}" for name in (effect.name, *addition.alternatives)]
     return lines
+
+
+def learned_lines(learned: Sequence[Correction]) -> list[str]:
+    """The descriptions of what no effect explains, and what they are worth."""
+    told = [
+        f"{_channel(c)}: reading less model = {c.formula} [{UNITS[c.channel]}] "
+        f"({100 * c.explained:.0f} % of the held-out excess)"
+        for c in learned
+    ]
+    return [*told, WARNING]
 
 
 def _soil_lines(findings: Findings) -> list[str]:
@@ -205,4 +234,6 @@ def admission_line(findings: Findings) -> str:
     recordings = findings.recordings
     refused = ", ".join(f"{reason} {n}" for reason, n in recordings.rejected.items()) or "none"
     short = f"; too short to use: {', '.join(recordings.too_short)}" if recordings.too_short else ""
-    return f"{recordings.samples} samples of {len(recordings.first)} logs; refused samples: {refused}{short}"
+    n = len(recordings.first)
+    logs = "one log" if n == 1 else f"{n} logs"
+    return f"{recordings.samples} samples of {logs}; refused samples: {refused}{short}"

@@ -26,9 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.allocator import keep_freed_memory
-from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.assembly import completion_of, model_of, prior_of, rig_of
 from soilbus.config import Config
 from soilbus.estimation.bound import cramer_rao
+from soilbus.estimation.completed import CompletedProblem
 from soilbus.estimation.gauss_newton import fit_window
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
@@ -200,7 +201,10 @@ def _problem(
         name: (column.t, np.interp(column.t, truth["t"], truth[name]) if of_truth else column.value)
         for name, column in columns.items()
     })  # fmt: skip
-    return WindowProblem(store.window(0.0, duration), rig, model_of(config), config.estimator.min_speed)
+    window, settings = store.window(0.0, duration), config.estimator
+    return CompletedProblem(
+        window, rig, model_of(config), settings.min_speed, settings.max_turn, *completion_of(config)
+    )
 
 
 def _logarithms(posterior: Posterior, config: Config) -> tuple[Array, Array]:

@@ -16,6 +16,9 @@ from typing import Any, NamedTuple
 from soilbus.terra.stress import Array
 from soilbus.terra.wheel import WheelModel, WheelState, wheel_forces
 
+DRAFT_ROUNDS = 3
+"""Fixed-point rounds from a reading of the hitch to the draft: its error is a few per cent of it."""
+
 Values = Mapping[str, Any]
 """Parameters of an effect by name: floats, or one for each wheel (W,)."""
 
@@ -133,3 +136,12 @@ def forces_with(active: Sequence[Active], state: WheelState, model: WheelModel, 
         if effect.forces is not None:
             forces = effect.forces(forces, state, around, values)
     return forces
+
+
+def true_draft(active: Sequence[Active], reading: Array, around: Surroundings) -> Array:
+    """Draft [N] (N,) for which the load cell at the hitch, with the errors of these effects, gives the reading (N,)."""
+    errors = [(effect.draft, values) for effect, values in active if effect.draft is not None]
+    draft = reading
+    for _ in range(DRAFT_ROUNDS if errors else 0):
+        draft = reading - sum(error(draft, around, values) for error, values in errors)
+    return draft

@@ -1,0 +1,113 @@
+"""What a completed model says the tractor can pull is what the simulated tractor pulls."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from soilbus.assembly import completion_of, effects_of, rig_of, with_effects
+from soilbus.can.dbc_files import load_databases
+from soilbus.capability import pull_curve
+from soilbus.daemon.pipeline import Pipeline
+from soilbus.daemon.replay import fed
+from soilbus.estimation.completed import active_at
+from soilbus.simulator.drive import drive
+from soilbus.simulator.frames import frames, write_log
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
+from soilbus.terra.effects.steady import CompletedModel
+from soilbus.terra.soils import SOILS
+from soilbus.terra.wheel import Soil, WheelModel
+
+CONFIG = reference_configuration()
+SPEED, SLIPS = 1.3, (0.08, 0.2, 0.4)
+ON_WHEELS = (
+    "multipass=0.5", "slip_sinkage=0.15", "stress_peak_shift.c2=0.1", "rut_recovery=0.15", "lugs=0.03",
+    "bulldozing=1e5", "rate_stiffening=0.1", "tyre_deflection=4e-6", "rolling_radius.rear=0.03",
+)  # fmt: skip
+
+
+def completed(*effects: str) -> CompletedModel:
+    return CompletedModel.of(WheelModel(), effects_of(with_effects(CONFIG, effects)), SPEED)
+
+
+def curve(model: CompletedModel, soil: Soil, slips=SLIPS):
+    return pull_curve(soil, rig_of(CONFIG), model, np.array(slips), np.zeros(len(slips), bool))
+
+
+@pytest.mark.parametrize("effect", ON_WHEELS)
+def test_the_pull_is_that_of_a_simulated_drive(effect):
+    at = curve(completed(effect), SOILS["loam"])
+    config = with_effects(CONFIG, [effect])
+    plain = curve(CompletedModel(WheelModel()), SOILS["loam"]).pull
+    for i, slip in enumerate(SLIPS):
+        scenario = Scenario(
+            0.1, (Patch(0.0, "loam"),), speed=Swing(SPEED, SPEED), slip=Swing(slip, slip), slip_spread=0.0,
+            side_shift=Swing(0.0, 0.0),
+        )  # fmt: skip
+        truth = drive(config, scenario, 1).columns
+        assert at.pull[i] == pytest.approx(truth["draft"][0], abs=0.5)
+        torques = [truth[f"torque.{wheel}"][0] for wheel in ("FL", "FR", "RL", "RR")]
+        assert at.torque[:, i] == pytest.approx(torques, abs=0.2)
+    assert np.abs(at.pull - plain).max() > 10.0
+
+
+def test_the_drive_line_asks_more_of_the_motors_for_the_same_pull():
+    plain = curve(CompletedModel(WheelModel()), SOILS["loam"])
+    lossy = curve(completed("drivetrain_loss=0.05", "drivetrain_loss.drag=20"), SOILS["loam"])
+    assert lossy.pull == pytest.approx(plain.pull, abs=1e-3)
+    assert lossy.torque == pytest.approx(1.05 * plain.torque + 20.0, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "effect", ["torque_lag=0.2", "draft_offset=300", "wheel_load_offset=200", "inertia=0.5", "grade=0.05"]
+)
+def test_sensors_and_records_do_not_change_the_pull(effect):
+    plain = curve(CompletedModel(WheelModel()), SOILS["loam"])
+    assert curve(completed(effect), SOILS["loam"]).pull == pytest.approx(plain.pull, abs=1e-3)
+
+
+@pytest.mark.parametrize("effect", ["multipass=0.5", "tyre_deflection=4e-6"])
+def test_gradients_are_those_of_the_curve(effect):
+    model, soil = completed(effect), SOILS["loam"]
+    at = curve(model, soil)
+    for i, name in enumerate(Soil._fields):
+        step = 1e-3 * getattr(soil, name)
+        ends = [curve(model, soil._replace(**{name: getattr(soil, name) + s})).pull for s in (-step, step)]
+        slope = (ends[1] - ends[0]) / (2.0 * step)
+        scale = getattr(soil, name)
+        assert at.pull_by_soil[i] * scale == pytest.approx(slope * scale, rel=0.02, abs=3.0)
+
+
+def test_the_demand_is_the_draft_without_the_error_of_its_load_cell(tmp_path):
+    config = with_effects(CONFIG, ["draft_offset=300", "draft_gain=0.05"])
+    log = tmp_path / "drive.log"
+    write_log(frames(simulate(config, excited("loam", 10.2), seed=3), config), log)
+    needs = []
+    for known in (CONFIG, config):
+        pipeline = Pipeline(known, load_databases(known))
+        for now in fed(pipeline.intake, [log]):
+            needs += [pipeline.estimator.estimate(task).demand.pull for task in pipeline.intake.due(now)]
+    told, true = needs
+    assert told - true == pytest.approx(300.0 + 0.05 * true, rel=0.02)
+
+
+def test_values_in_the_decision_are_those_of_the_window():
+    setting = '[{name="multipass",stiffness={value=0.4,std=0.1},density=0.05},{name="soil_drift",stiffness=0.1}]'
+    config = reference_configuration([f"model.effects={setting}"])
+    effects, free = completion_of(config)
+    assert [effect.name for effect in effects] == ["multipass"]  # the drift is of one record
+    assert [(f.name, f.value, f.std) for f in free] == [
+        ("multipass.stiffness", 0.4, 0.1), ("multipass.density", 0.05, 0.0)
+    ]  # fmt: skip
+    (active,) = active_at(effects, free, np.array([1.5, 0.0]), 4)
+    assert active.values == pytest.approx({"stiffness": 0.55, "density": 0.05})
+    Pipeline(config, load_databases(config))
+
+
+def test_each_wheel_has_its_own_values():
+    text = '[{name="wheel_load_offset",offset={FL={value=100.0,std=20.0},RR=50.0}}]'
+    config = reference_configuration([f"model.effects={text}"])
+    _, free = completion_of(config)
+    assert [(f.wheel, f.value, f.std) for f in free] == [(0, 100.0, 20.0), (1, 0.0, 0.0), (2, 0.0, 0.0), (3, 50.0, 0.0)]

@@ -1,0 +1,102 @@
+"""Text, JSON and page of diagnoses that are not clear: a set of names, a gap without a name, numbers that are none."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import pytest
+
+from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.daemon.diagnose import Findings
+from soilbus.daemon.recordings import Recordings
+from soilbus.diagnosis.completion import complete
+from soilbus.diagnosis.diagnose import Addition, Diagnosis
+from soilbus.diagnosis.learned import WARNING, Correction, Term
+from soilbus.diagnosis.records import record_of
+from soilbus.diagnosis.verdict import Verdict
+from soilbus.diagnosis.where import Disagreement
+from soilbus.estimation.window import BinStore
+from soilbus.report.diagnosis import diagnosis_report
+from soilbus.report.findings import findings_json, findings_text
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import excited
+from soilbus.terra.effects.catalogue import CATALOGUE
+
+CONFIG = reference_configuration()
+OFFSET = Addition(CATALOGUE["draft_offset"], 0.6, {"grade": 0.3, "bulldozing": 0.1}, {
+    "draft_offset": 52.0, "grade": 48.0, "bulldozing": 41.0, "lugs": 2.0,
+})  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def findings() -> Findings:
+    """A plain drive, said to be ambiguous."""
+    rig, store = rig_of(CONFIG), BinStore(rig_of(CONFIG), 0.1, 0.0)
+    channels = simulate(CONFIG, excited("loam", 24.0), seed=2).channels
+    store.add({name: (c.t, c.value) for name, c in channels.items() if name in rig.channels})
+    record = record_of("<a & b>.log", store.window(0.0, 24.0), rig, model_of(CONFIG), 0.2, 0.15)
+    base, completed = (complete([record], prior_of(CONFIG), effects) for effects in ((), (OFFSET.effect,)))
+    assert base is not None
+    assert completed is not None
+    where = (Disagreement("draft", "", "slip 0.20..0.35", 312.0, 0.0), Disagreement("load", "FL", "gain", 0.031, 1e-5))
+    diagnosis = Diagnosis(Verdict.AMBIGUOUS, where, (OFFSET,), base, completed, ())
+    recordings = Recordings((record,), (0,), 1234, {"bad_checksum": 7}, ("<a & b>.log, part 2",))
+    return Findings(diagnosis, recordings, CONFIG, 1.5)
+
+
+def with_verdict(findings: Findings, verdict: Verdict, **changes) -> Findings:
+    return dataclasses.replace(findings, diagnosis=dataclasses.replace(findings.diagnosis, verdict=verdict, **changes))
+
+
+def unknown(findings: Findings) -> Findings:
+    learned = Correction("torque", "RL", (Term("1", 3.0), Term("sin(1 wheel angle)", -120.0)), 0.83)
+    return with_verdict(findings, Verdict.UNKNOWN, additions=(), completed=findings.diagnosis.base, learned=(learned,))
+
+
+def test_a_set_is_told_with_probabilities_reason_and_what_would_tell(findings):
+    text = findings_text(findings)
+    assert "1. draft_offset, probability 0.60\n" in text
+    assert "or: grade 0.30, bulldozing 0.10" in text
+    assert "draft_offset lowers -2 log evidence by 52, grade by 48, bulldozing by 41" in text
+    for name in ("draft_offset", "grade", "bulldozing"):
+        assert f"- {name}: {CATALOGUE[name].tells}\n" in text
+    assert "draft, slip 0.20..0.35: reading less model +312 N (chance < 1e-300)" in text
+    assert "load.FL, gain: an implausible gain error of +3.10 % (chance 1e-05)" in text
+    assert "1234 samples of one log; refused samples: bad_checksum 7; too short to use: <a & b>.log, part 2" in text
+
+
+def test_a_set_in_json(findings):
+    effect = json.loads(findings_json(findings))["effects"][0]
+    assert effect["alternatives"] == [{"name": "grade", "probability": 0.3}, {"name": "bulldozing", "probability": 0.1}]
+    assert effect["tells"].keys() == {"draft_offset", "grade", "bulldozing"}
+    assert "alike" in effect["why_ambiguous"]
+
+
+def test_what_has_no_name_is_described_with_a_warning(findings):
+    text, told = findings_text(unknown(findings)), json.loads(findings_json(unknown(findings)))
+    assert text.startswith("unknown: ")
+    line = "torque.RL: reading less model = +3 -120 sin(1 wheel angle) [N m] (83 % of the held-out excess)"
+    assert line in text
+    assert WARNING in text
+    assert told["warning"] == WARNING
+    assert told["learned"][0]["terms"] == {"1": 3.0, "sin(1 wheel angle)": -120.0}
+    assert line in diagnosis_report(unknown(findings))
+
+
+def test_pages_show_names_as_text_and_one_picture_where_nothing_was_added(findings):
+    page, plain = diagnosis_report(findings), diagnosis_report(unknown(findings))
+    assert "<h1>&lt;a &amp; b&gt;.log</h1>" in page
+    assert "<a & b>" not in page
+    assert (page.count("<img"), plain.count("<img")) == (2, 1)
+    rows = [name for name in OFFSET.falls if f"<td>{name}</td>" in page]
+    assert rows == list(OFFSET.falls)
+
+
+def test_what_is_not_finite_is_null(findings):
+    check = dataclasses.replace(findings.diagnosis.base.checks[0], evidence=float("nan"))
+    base = dataclasses.replace(findings.diagnosis.base, checks=(check,))
+    place = Disagreement("draft", "", "everywhere", float("inf"), 0.0)
+    told = findings_json(with_verdict(findings, Verdict.AMBIGUOUS, base=base, where=(place,)))
+    assert json.loads(told, parse_constant=pytest.fail)["where"][0]["size"] is None

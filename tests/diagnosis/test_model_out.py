@@ -1,0 +1,111 @@
+"""The completed model as a configuration file: what is written reads back as the same model, whatever the vehicle."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from soilbus.assembly import completion_of, model_of, prior_of, rig_of
+from soilbus.can.dbc_files import located, shipped_dbc
+from soilbus.config import ConfigError, load_config
+from soilbus.config_file import with_effects_text
+from soilbus.diagnosis.completion import complete
+from soilbus.diagnosis.model_out import effect_tables
+from soilbus.diagnosis.records import record_of
+from soilbus.estimation.window import BinStore
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import TRACTOR, reference_configuration
+from soilbus.simulator.scenario import excited
+from soilbus.terra.effects.catalogue import CATALOGUE
+
+
+@pytest.fixture(scope="module")
+def record():
+    config = reference_configuration()
+    store = BinStore(rig_of(config), 0.1, 0.0)
+    channels = simulate(config, excited("loam", 30.0), seed=2).channels
+    store.add({name: (c.t, c.value) for name, c in channels.items() if name in rig_of(config).channels})
+    return record_of("x", store.window(0.0, 30.0), rig_of(config), model_of(config), 0.2, 0.15)
+
+
+def written(tmp_path: Path, tables, overrides=(), notes=()) -> Path:
+    path = tmp_path / "out.toml"
+    path.write_text(with_effects_text(TRACTOR, overrides, tables, tmp_path, notes))
+    return path
+
+
+def test_what_is_written_is_the_model_that_was_fitted(record, tmp_path):
+    effects = [CATALOGUE[name] for name in ("draft_offset", "wheel_load_offset", "soil_drift")]
+    fitted = complete([record], prior_of(reference_configuration()), effects)
+    tables, notes = effect_tables(fitted)
+    config = load_config(written(tmp_path, tables, notes=notes))
+    kept, free = completion_of(config)
+    assert [effect.name for effect in kept] == ["draft_offset", "wheel_load_offset"]
+    told = fitted.parameters()
+    of_wheels = [told["wheel_load_offset"][f"offset_{wheel}"] for wheel in rig_of(config).wheels]
+    expected = [told["draft_offset"]["offset"], *of_wheels]
+    np.testing.assert_allclose([(f.value, f.std) for f in free], [(e.value, e.std) for e in expected], rtol=1e-5)
+    assert "# soil_drift (" in (tmp_path / "out.toml").read_text()
+    assert "is left out" in notes[0]
+
+
+numbers = st.floats(0.001, 0.3)
+
+
+@settings(max_examples=25, deadline=None)
+@given(numbers, numbers, st.lists(st.sampled_from(["FL", "FR", "RL", "RR"]), unique=True, min_size=1))
+def test_values_and_stds_read_back(tmp_path_factory, value, std, wheels):
+    tables = [
+        {"name": "slip_sinkage", "exponent": {"value": value, "std": std}},
+        {"name": "wheel_load_offset", "offset": {w: {"value": value, "std": std} for w in wheels}},
+    ]
+    config = load_config(written(tmp_path_factory.mktemp("x"), tables))
+    _, free = completion_of(config)
+    by_name = {f.name: (f.value, f.std) for f in free}
+    assert by_name["slip_sinkage.exponent"] == (value, std)
+    for i, wheel in enumerate(rig_of(config).wheels):
+        assert by_name[f"wheel_load_offset.offset.{i}"] == ((value, std) if wheel in wheels else (0.0, 0.0))
+
+
+def test_overrides_and_comments_are_kept(tmp_path):
+    overrides = ["wheel.FL.radius=0.51", "signals.ground_speed.timeout=2.5", "model.shear_law=rational"]
+    path = written(tmp_path, [{"name": "exponential_shear", "share": 0.9}], overrides)
+    config = load_config(path)
+    assert config.model_dump(exclude={"model"}) == load_config(TRACTOR, overrides).model_dump(exclude={"model"})
+    assert config.model.shear_law == "rational"
+    assert "# Reference tractor of soilbus" in path.read_text()
+    tomllib.loads(path.read_text())
+
+
+def test_effects_in_the_file_are_replaced(tmp_path):
+    first = written(tmp_path, [{"name": "lugs", "height": 0.03}])
+    text = with_effects_text(first, [], [{"name": "multipass", "stiffness": 0.5}], tmp_path)
+    assert [effect["name"] for effect in tomllib.loads(text)["model"]["effects"]] == ["multipass"]
+    block = first.read_text().split("[model]")[0] + '[[model.effects]]\nname = "lugs"\nheight = 0.03\n'
+    first.write_text(block)
+    text = with_effects_text(first, [], [{"name": "multipass", "stiffness": 0.5}], tmp_path)
+    assert [effect["name"] for effect in tomllib.loads(text)["model"]["effects"]] == ["multipass"]
+
+
+def test_dbc_files_are_found_from_the_new_place(tmp_path):
+    here, there = tmp_path / "here", tmp_path / "there"
+    (here / "dbc").mkdir(parents=True), there.mkdir()
+    config = here / "c.toml"
+    (here / "dbc/own.dbc").write_text(shipped_dbc("tractor.dbc").read_text())
+    (there / "iso11783.dbc").write_text("another file of the same name")
+    config.write_text(TRACTOR.read_text().replace('"tractor.dbc"', '"dbc/own.dbc", "iso11783.dbc"'))
+    for place in (there, here, Path("/")):
+        names = tomllib.loads(with_effects_text(config, [], [], place))["dbc"]["input"]
+        expected = [here / "dbc/own.dbc", shipped_dbc("iso11783.dbc")]
+        assert [located(place, name).resolve() for name in names] == [path.resolve() for path in expected]
+    assert tomllib.loads(with_effects_text(config, [], [], here))["dbc"]["input"] == ["dbc/own.dbc", "iso11783.dbc"]
+
+
+def test_a_configuration_that_cannot_be_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="unknown key"):
+        with_effects_text(TRACTOR, ["modell.effects=[]"], [], tmp_path)
