@@ -16,8 +16,9 @@ from soilbus.config import Config, ConfigError, parse_config
 from soilbus.daemon.diagnose import diagnose_logs
 from soilbus.daemon.outputs import json_line
 from soilbus.daemon.tables import TableError, candidates, recordings_of_tables, replay_tables, runs_of, window_of_rows
-from soilbus.diagnosis.records import TooLittle
-from soilbus.diagnosis.verdict import Verdict
+from soilbus.diagnosis.completion import complete
+from soilbus.diagnosis.records import TooLittle, record_of_rows
+from soilbus.diagnosis.verdict import Verdict, gap_limit
 from soilbus.estimation.gauss_newton import fit_window
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.report.configuration import configuration_report
@@ -241,6 +242,24 @@ def test_diagnosis_of_tables_names_what_was_hidden_and_nothing_where_nothing_was
         assert found.verdict is verdict
         assert [a.effect.name for a in found.additions] == [a.effect.name for a in active]
     assert found.base.gap > 2.0 > 1.6 > found.completed.gap
+
+
+def test_six_rows_with_nothing_missing_show_no_gap():
+    """What four rows leave open of the soil is no gap: the reduced chi-square of the two others is 1 on average."""
+    config, slips = rig(), (0.0, 0.1, 0.2, 0.3, 0.4, 0.6)
+    the_rig, model, prior = rig_of(config), model_of(config), prior_of(config)
+    rng, gaps = np.random.default_rng(7), []
+    while len(gaps) < 25:
+        truth = Soil(*(prior.median * np.exp(0.6 * prior.log_std * rng.standard_normal(6))))
+        try:
+            rows = noisy(sweep(truth, (1500.0,), slips), rng)
+        except ValueError:  # this soil does not carry the wheel
+            continue
+        values = {"wheel_load": rows["load"], "slip": rows["slip"], "drawbar_pull": rows["pull"]}
+        window = window_of_rows(the_rig, np.arange(6.0), values | {"torque": rows["torque"], "sinkage": rows["sink"]})
+        gaps.append(complete([record_of_rows("", window, the_rig, model)], prior, ()).gap)
+    assert np.mean(gaps) == pytest.approx(1.0, abs=0.35)  # 25 times 6 residuals: sd 0.12, and the model is not linear
+    assert np.mean(np.array(gaps) > gap_limit(6)) <= 0.08
 
 
 def test_a_table_of_few_rows_learns_from_two_thirds_spread_over_all_slips(tmp_path, measured):
