@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.window import Rig
+from soilbus.terra.effects.steady import CompletedModel
 from soilbus.terra.stress import lumped_modulus
 from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads
 from soilbus.terra.wheel import (
@@ -24,7 +25,6 @@ from soilbus.terra.wheel import (
     WheelModel,
     WheelState,
     entry_angle_for_load,
-    wheel_forces_and_derivatives,
 )
 
 Array = NDArray[np.float64]
@@ -114,7 +114,7 @@ class _Axles:
 def pull_curve(
     soil: Soil,
     rig: Rig,
-    model: WheelModel,
+    model: WheelModel | CompletedModel,
     slip: Array,
     on_grade: NDArray[np.bool_],
     start: PullCurve | None = None,
@@ -124,6 +124,7 @@ def pull_curve(
     Raises ValueError for a rig without a chassis.
     """
     axles = _Axles.of(rig)
+    completed = model if isinstance(model, CompletedModel) else CompletedModel(model)
     K_L = lumped_modulus(soil.k_c, soil.k_phi, axles.width)
     slips, radius, width, K_L = (a.copy() for a in np.broadcast_arrays(slip, axles.radius, axles.width, K_L))
     shape, tolerance = slips.shape, PULL_TOLERANCE * axles.chassis.mass * GRAVITY
@@ -140,10 +141,12 @@ def pull_curve(
         pull = np.zeros(len(slip))
         load = axles.loads(pull, on_grade)
         guess = state(np.full(shape, np.nan))
-        angle = entry_angle_for_load(np.broadcast_to(load, shape), guess, model, tolerance=1e-2)
+        angle = entry_angle_for_load(np.broadcast_to(load, shape), guess, completed.model, tolerance=1e-2)
     with np.errstate(all="ignore"):
         for _ in range(MAX_ITERATIONS):
-            forces, d = wheel_forces_and_derivatives(state(angle), model)
+            forces, d = completed.forces_and_derivatives(
+                state(angle), ~axles.front, load, np.where(on_grade, 0.0, pull), axles.chassis.mass
+            )
             by_load = d[1:, 0] / d[0, 0]  # pull and torque by load, the entry angle following
             shift = (axles.loads(pull + SMALL_PULL, on_grade) - axles.loads(pull, on_grade)) / SMALL_PULL
             off = load - forces[0]
@@ -179,7 +182,9 @@ def slip_grid(max_slip: float) -> Array:
     return np.geomspace(MIN_SLIP, max_slip, GRID)
 
 
-def largest_pull(curve: PullCurve, torque_limit: Array, soil: Soil, rig: Rig, model: WheelModel) -> Capability | None:
+def largest_pull(
+    curve: PullCurve, torque_limit: Array, soil: Soil, rig: Rig, model: WheelModel | CompletedModel
+) -> Capability | None:
     """Largest pull of a curve (all of it level, or all graded) within wheel torques up to torque_limit (W,) [N m].
 
     nan in torque_limit: that wheel's limit is not known and does not count.  Where even
@@ -210,7 +215,7 @@ def largest_pull(curve: PullCurve, torque_limit: Array, soil: Soil, rig: Rig, mo
 
 
 def _at_torque_limit(
-    curve: PullCurve, below: int, torque_limit: Array, soil: Soil, rig: Rig, model: WheelModel
+    curve: PullCurve, below: int, torque_limit: Array, soil: Soil, rig: Rig, model: WheelModel | CompletedModel
 ) -> Capability:
     """The pull where the first wheel meets its torque limit, between two points of the curve.
 

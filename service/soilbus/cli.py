@@ -242,6 +242,7 @@ def _diagnose(args: argparse.Namespace) -> None:
     if args.report is not None:
         _need("matplotlib", "plots", "--report")
         from soilbus.report.diagnosis import diagnosis_report
+    _check_folders(args.json, args.report, args.model_out)
     try:
         with phases("diagnose") as say:
             findings = diagnose_logs(config, args.logs, say)
@@ -353,6 +354,13 @@ def _need(module: str, extra: str, what: str) -> None:
 
     if find_spec(module) is None:
         raise WorkError(f"{what} needs the extra soilbus[{extra}]")
+
+
+def _check_folders(*paths: Path | None) -> None:
+    """Long work asks first whether there is a place for what comes of it."""
+    for path in paths:
+        if path is not None and not path.parent.is_dir():
+            raise WorkError(f"{path}: no folder {path.parent}")
 
 
 @contextmanager

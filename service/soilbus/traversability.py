@@ -13,6 +13,7 @@ from soilbus.capability import PullCurve, largest_pull, pull_curve, slip_for_pul
 from soilbus.config import Traversability as Settings
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.window import Rig
+from soilbus.terra.effects.steady import CompletedModel
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import WheelModel
 
@@ -66,7 +67,7 @@ def judge(
     status: Status,
     demand: Demand | None,
     rig: Rig,
-    model: WheelModel,
+    model: WheelModel | CompletedModel,
     torque_limit: NDArray[np.float64],
     settings: Settings,
     last: PullCurve | None = None,

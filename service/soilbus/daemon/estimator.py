@@ -13,11 +13,13 @@ from soilbus.capability import PullCurve
 from soilbus.config import Config
 from soilbus.daemon.intake import WindowTask
 from soilbus.daemon.positions import Position
+from soilbus.estimation.completed import active_at
 from soilbus.estimation.gauss_newton import Fit
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.soil_class import SoilClasses, guessed
 from soilbus.estimation.tracker import MIN_ROWS, Ground, Settings, Tracked, Tracker
 from soilbus.estimation.window import Window
+from soilbus.terra.effects.steady import CompletedModel
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.traversability import Demand, Status, Traversability, judge
 from soilbus.traversability import State as Way
@@ -61,7 +63,8 @@ class Undecided:
     """A window's estimate with what the decision needs besides; its traversability is still unknown.
 
     demand is None where the draft is not known; torque_limit (W,) [N m]; stuck: the wheels
-    turn on the spot; fresh: nothing of the window before may be carried over.
+    turn on the spot; fresh: nothing of the window before may be carried over; model: with the
+    effects' parameters as the window leaves them.
     """
 
     result: WindowResult
@@ -69,6 +72,7 @@ class Undecided:
     torque_limit: NDArray[np.float64]
     stuck: bool
     fresh: bool
+    model: CompletedModel
 
 
 class WindowEstimator:
@@ -77,6 +81,7 @@ class WindowEstimator:
     def __init__(self, config: Config) -> None:
         self.config = config
         self.rig, self.prior, self.model = rig_of(config), prior_of(config), model_of(config)
+        self._completion = completion_of(config)
         self._settings = config.estimator
         self._pull_curve: PullCurve | None = None
         self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
@@ -88,7 +93,7 @@ class WindowEstimator:
             Settings(
                 settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift, least
             ),
-            *completion_of(config),
+            *self._completion,
         )  # fmt: skip
 
     def solve(self, task: WindowTask) -> WindowResult:
@@ -123,17 +128,27 @@ class WindowEstimator:
             soil_class=self._soil_class(posterior),
             position=task.track.at((tracked.since + task.end) / 2.0),
         )
-        return Undecided(result, self._demand(task.window), task.torque_limit, stuck, task.fresh)
+        model = self._completed(fit, task.window)
+        return Undecided(result, self._demand(task.window), task.torque_limit, stuck, task.fresh, model)
 
     def decide(self, window: Undecided) -> WindowResult:
         """The result with its traversability; windows in their order, here or in another process."""
         way, self._pull_curve = judge(
-            window.result.posterior, window.result.status, window.demand, self.rig, self.model, window.torque_limit,
+            window.result.posterior, window.result.status, window.demand, self.rig, window.model, window.torque_limit,
             self.config.traversability, None if window.fresh else self._pull_curve,
         )  # fmt: skip
         if window.stuck:
             way = replace(way, state=Way.NO_GO, probability=0.0, limit="slip")
         return replace(window.result, traversability=way)
+
+    def _completed(self, fit: Fit | None, window: Window) -> CompletedModel:
+        """The model with the effects as this window leaves them, for the decision."""
+        effects, free = self._completion
+        if fit is None or not effects:
+            return CompletedModel(self.model)
+        moving = window.ground_speed[window.ground_speed > self._settings.min_speed]
+        active = active_at(effects, free, fit.gains[len(fit.gains) - len(free) :], len(self.rig.wheels))
+        return CompletedModel.of(self.model, active, float(moving.mean()) if len(moving) else 1.0)
 
     def _honest(self, tracked: Tracked, fit: Fit) -> Posterior:
         """Posterior with its covariance widened where the residuals are larger than the noise."""

@@ -9,7 +9,7 @@ of the whole, as do those of the blocks learned from and of the blocks held out.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,14 @@ Array = NDArray[np.float64]
 _SOIL = len(PARAMETERS)
 CHECK_ROUNDS = 3
 """Linearisations that bring the latents of held-out blocks to their values under a model."""
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Where the fit of one recording may begin: soil (6,), sensors' gains and effects' parameters (G,)."""
+
+    soil: Array
+    gains: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +103,27 @@ class Completion:
         return self.checked_rows + sum(fit.rows for fit in self.fits)
 
     @property
+    def converged(self) -> bool:
+        """Whether every fit ended at its optimum."""
+        return all(fit.converged for fit in self.fits)
+
+    @property
+    def free_at_edge(self) -> tuple[Free, ...] | None:
+        """The parameters with those held that would leave their range; None where none would."""
+        pulls = self.fits[-1].belief.gains[self.checks[-1].problem.n_sensors :].tolist()
+        leaves = [f.std > 0.0 and not f.within(u) for f, u in zip(self.free, pulls, strict=True)]
+        if not any(leaves):
+            return None
+        return tuple(
+            replace(f, value=f.at(u), std=0.0) if leaving else f
+            for f, u, leaving in zip(self.free, pulls, leaves, strict=True)
+        )
+
+    def as_starts(self) -> tuple[Start, ...]:
+        """Where these fits ended."""
+        return tuple(Start(fit.belief.soil, fit.belief.gains) for fit in self.fits)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of the effects."""
         return tuple(effect.name for effect in self.effects)
@@ -110,32 +139,39 @@ class Completion:
         return out
 
 
-@dataclass(frozen=True, slots=True)
-class Start:
-    """Where the fit of one recording may begin: soil (6,), sensors' gains and effects' parameters (G,)."""
-
-    soil: Array
-    gains: Array
-
-
 def complete(
     records: Sequence[Record], prior: SoilPrior, effects: Sequence[Effect], starts: Sequence[Start] | None = None
 ) -> Completion | None:
     """A model with these effects fitted to all recordings; None where a fit fails.
 
-    Parameters of effects that the records' model has already keep the prior they have there.
+    Parameters of effects that the records' model has already keep the prior they have
+    there; one that would leave its range is held at the edge.
     """
     present = records[0].learned
-    known_of = {e.name: [f for f in present.free if f.effect == e.name] for e in present.effects}
-    free = tuple(f for effect in effects for f in known_of.get(effect.name) or parameters_of(effect, present.n_wheels))
+    known = {e.name: [f for f in present.free if f.effect == e.name] for e in present.effects}
+    free = tuple(f for effect in effects for f in known.get(effect.name) or parameters_of(effect, present.n_wheels))
+    for _ in range(len(free) + 1):
+        completion = _complete(records, prior, effects, free, starts)
+        if completion is None or completion.free_at_edge is None:
+            break
+        free = completion.free_at_edge
+        starts = completion.as_starts()
+    return completion
+
+
+def _complete(
+    records: Sequence[Record],
+    prior: SoilPrior,
+    effects: Sequence[Effect],
+    free: tuple[Free, ...],
+    starts: Sequence[Start] | None,
+) -> Completion | None:
     fits, checks, befores = [], [], []
     known: Belief | None = None
     for i, record in enumerate(records):
         problem = record.learned.completed(effects, free)
         before = _of_first(record, prior, problem) if known is None else _of_next(known, prior, problem, effects)
-        fit = fit_window(problem, prior, before) if starts is None else None
-        if starts is not None:
-            fit = continued(problem, prior, before, starts[i].soil, starts[i].gains)
+        fit = _fitted(problem, prior, before, None if starts is None else starts[i])
         if fit is None:
             return None
         fits.append(fit)
@@ -154,6 +190,24 @@ def _of_first(record: Record, prior: SoilPrior, problem: CompletedProblem) -> Be
     n = len(record.known.gains)
     gains[:n], covariance[: _SOIL + n, : _SOIL + n] = record.known.gains, record.known.covariance
     return Belief(record.known.soil, gains, covariance)
+
+
+def _fitted(problem: CompletedProblem, prior: SoilPrior, before: Belief, start: Start | None) -> Fit | None:
+    """Where the given start leads, or one half way to it: whichever converges, or leaves the parameters' range."""
+    if start is None:
+        return fit_window(problem, prior, before)
+    best: Fit | None = None
+    for share in (1.0, 0.5):
+        pulls = share * start.gains[problem.n_sensors :]
+        gains = np.where(problem.gain_std > 0.0, np.concatenate([start.gains[: problem.n_sensors], pulls]), 0.0)
+        fit = continued(problem, prior, before, start.soil, gains)
+        if fit is None:
+            continue
+        leaves = not all(f.within(u) for f, u in zip(problem.free, fit.gains[problem.n_sensors :], strict=True))
+        if fit.converged or leaves:
+            return fit
+        best = fit if best is None or fit.cost < best.cost else best
+    return best
 
 
 def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects: Sequence[Effect]) -> Belief:

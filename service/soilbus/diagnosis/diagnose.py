@@ -10,15 +10,20 @@ import numpy as np
 from soilbus.diagnosis.completion import Completion, Start, complete
 from soilbus.diagnosis.learned import Correction, corrections
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.score import scores
+from soilbus.diagnosis.score import Score, scores
 from soilbus.diagnosis.verdict import PLAUSIBLE, SURE, Verdict, is_real, pays, probabilities
 from soilbus.diagnosis.where import Disagreement, disagreements
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
 
 MAX_EFFECTS = 3
-TRIED = 6
-"""Candidates of a round that are fitted."""
+TRIED = 8
+"""Candidates of a round that are fitted to a few instants."""
+FITTED = 4
+"""Those of them that are fitted to all."""
+THINNED = 4
+NEAR = 0.2
+"""Share of the best one's fall on a few instants below which a candidate is out."""
 WORTH_TRYING = -2.0
 """Foreseen change of -2 log evidence above which a candidate is not fitted."""
 NOTHING = "none"
@@ -91,11 +96,9 @@ def _round(
 ) -> tuple[Addition, Completion] | None:
     """The best effect to add to the present model; None where none pays."""
     tried: dict[str, tuple[Effect, Completion]] = {}
-    for score in scores(records, prior, present, candidates)[:TRIED]:
-        if score.evidence > WORTH_TRYING:
-            break
+    for score in _promising(records, prior, present, candidates):
         completion = complete(records, prior, (*present.effects, score.effect), score.starts)
-        if completion is not None:
+        if completion is not None and completion.converged:
             tried[score.effect.name] = score.effect, completion
     if not tried:
         return None
@@ -107,6 +110,26 @@ def _round(
     others = {n: p for n, p in chances.items() if n not in (best, NOTHING) and p >= PLAUSIBLE}
     effect, completion = tried[best]
     return Addition(effect, chances[best], others, falls), completion
+
+
+def _promising(
+    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect]
+) -> list[Score]:
+    """The few candidates worth a fit of all data: foreseen by their scores, tried on a few instants."""
+    foreseen = [s for s in scores(records, prior, present, candidates)[:TRIED] if s.evidence < WORTH_TRYING]
+    if len(foreseen) <= FITTED:
+        return foreseen
+    few = [record.thinned(THINNED) for record in records]
+    before = complete(few, prior, present.effects, present.as_starts())
+    if before is None:
+        return foreseen[:FITTED]
+    falls: list[tuple[float, Score]] = []
+    for score in foreseen:
+        completion = complete(few, prior, (*present.effects, score.effect), score.starts)
+        if completion is not None:
+            falls.append((before.evidence - completion.evidence, score))
+    falls.sort(key=lambda item: -item[0])
+    return [score for fall, score in falls[:FITTED] if fall > NEAR * falls[0][0]]
 
 
 def _reconsidered(

@@ -46,6 +46,12 @@ class Record:
         learned, checked = (part.completed(effects, free) for part in (self.learned, self.checked))
         return Record(self.name, learned, checked, known)
 
+    def thinned(self, every: int) -> Record:
+        """The same with every so manieth instant; a table of few rows stays whole."""
+        parts = self.learned, self.checked
+        learned, checked = (part.part(slice(None, None, min(every, part.n // FEWEST + 1))) for part in parts)
+        return Record(self.name, learned, checked, self.known)
+
 
 def record_of(name: str, window: Window, rig: Rig, model: WheelModel, min_speed: float, max_turn: float) -> Record:
     """One recording divided into blocks; TooLittle where it has not enough usable instants."""
@@ -79,8 +85,3 @@ def checked_instants(since: NDArray[np.float64]) -> NDArray[np.bool_]:
     span = float(since[-1] - since[0]) if len(since) else 0.0
     length = min(BLOCK, span / (3 * CHECKED)) if span > 0.0 else BLOCK
     return np.asarray((since / max(length, 1e-9)).astype(int) % CHECKED == CHECKED - 1)
-
-
-def wheel_names(records: Sequence[Record]) -> tuple[str, ...]:
-    """The wheels of the vehicle that all records are of."""
-    return records[0].learned.rig.wheels

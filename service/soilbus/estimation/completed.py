@@ -51,6 +51,10 @@ class Free:
         """effect.parameter, with the wheel's number where it has one."""
         return f"{self.effect}.{self.parameter.name}" + ("" if self.wheel is None else f".{self.wheel}")
 
+    def within(self, pull: float) -> bool:
+        """Whether so many prior std from the prior value is inside the parameter's range."""
+        return self.parameter.low <= self.value + self.std * pull <= self.parameter.high
+
     def at(self, pull: float) -> float:
         """The parameter's value so many prior std from its prior value, kept inside its range."""
         return min(max(self.value + self.std * pull, self.parameter.low), self.parameter.high)
@@ -60,6 +64,18 @@ def parameters_of(effect: Effect, n_wheels: int) -> list[Free]:
     """The parameters of an effect as before any data: absent, with the catalogue's prior."""
     wheels: Sequence[int | None] = range(n_wheels) if effect.each_wheel else (None,)
     return [Free(effect.name, p, w, p.neutral, p.std) for p in effect.parameters for w in wheels]
+
+
+def active_at(effects: Sequence[Effect], free: Sequence[Free], pulls: Array, n_wheels: int) -> list[Active]:
+    """The effects with their values where the parameters are so many std (P,) from their prior values."""
+    values: dict[str, dict[str, Any]] = {e.name: {} for e in effects}
+    for f, u in zip(free, pulls.tolist(), strict=True):
+        of_effect = values[f.effect]
+        if f.wheel is None:
+            of_effect[f.parameter.name] = f.at(u)
+        else:
+            of_effect.setdefault(f.parameter.name, np.zeros(n_wheels))[f.wheel] = f.at(u)
+    return [Active(e, values[e.name]) for e in effects]
 
 
 class _Outcome(NamedTuple):
@@ -111,14 +127,7 @@ class CompletedProblem(WindowProblem):
 
     def active(self, pulls: Array) -> list[Active]:
         """The effects with their values where the parameters are so many std (P,) from their prior values."""
-        values: dict[str, dict[str, Any]] = {e.name: {} for e in self.effects}
-        for f, u in zip(self.free, pulls.tolist(), strict=True):
-            of_effect = values[f.effect]
-            if f.wheel is None:
-                of_effect[f.parameter.name] = f.at(u)
-            else:
-                of_effect.setdefault(f.parameter.name, np.zeros(self.n_wheels))[f.wheel] = f.at(u)
-        return [Active(e, values[e.name]) for e in self.effects]
+        return active_at(self.effects, self.free, pulls, self.n_wheels)
 
     def carried(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
         """As WindowProblem; without gains the effects' parameters are at their prior values."""
@@ -139,6 +148,13 @@ class CompletedProblem(WindowProblem):
             if np.abs(step).max(initial=0.0) < 1e-3:
                 break
         return Latents(base.load, base.speed, base.ground_speed, angle)
+
+    def sinkages(self, soil: Soil, gains: Array, latents: Latents) -> Array:
+        """As WindowProblem, of the circles that the effects make of the wheels."""
+        if not self.effects:
+            return super().sinkages(soil, gains, latents)
+        active = self.active(gains[self.n_sensors :])
+        return np.asarray(self._outcome(soil, active, latents, latents.entry_angle).wheels[3])
 
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         if not self.effects:

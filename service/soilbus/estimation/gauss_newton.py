@@ -324,10 +324,10 @@ def _settle(fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OV
         return None
     return Fit(
         belief=belief,
-        sinkage=fitting.problem.mean_sinkage(near.latents),
+        sinkage=fitting.problem.mean_sinkage(near.as_soil(), near.gains, near.latents),
         optimum=Optimum(fitting.problem.t, last.soil, last.gains, last.latents, point.at),
-        cost=point.cost - length,
-        evidence=point.evidence - length,
+        cost=point.cost - (length if converged else 0.0),
+        evidence=point.evidence - (length if converged else 0.0),
         rows=fitting.problem.n_rows,
         iterations=iterations,
         converged=converged,

@@ -95,15 +95,15 @@ class WindowProblem(Readings):
         angle = np.where(np.isfinite(angle), angle, MAX_ENTRY_ANGLE * 0.98)
         return Latents(latents.load, latents.speed, latents.ground_speed, angle)
 
-    def sinkages(self, latents: Latents) -> Array:
-        """Sinkage [m] of each wheel at each instant (N, W), nan where the wheel is not usable."""
-        return np.where(self.usable, sinkage(latents.entry_angle, self.rig.radius), np.nan)
+    def sinkages(self, soil: Soil, gains: Array, latents: Latents) -> Array:
+        """Sinkage [m] of each wheel at each instant (N, W), whether it is usable or not."""
+        return np.asarray(sinkage(latents.entry_angle, self.rig.radius))
 
-    def mean_sinkage(self, latents: Latents) -> Array:
-        """Mean sinkage [m] of each wheel (W,), nan for a wheel that is never usable."""
+    def mean_sinkage(self, soil: Soil, gains: Array, latents: Latents) -> Array:
+        """Mean sinkage [m] of each wheel (W,), nan for a wheel that is never usable; gains (G,) as linearise()."""
         known = self.usable.sum(0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray(np.where(self.usable, self.sinkages(latents), 0.0).sum(0) / known)
+            return np.asarray(np.where(self.usable, self.sinkages(soil, gains, latents), 0.0).sum(0) / known)
 
     def after(self, before: Optimum) -> tuple[Latents, Linearised]:
         """Latents and model of this window at the optimum of one that ends a little earlier.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from cantools.database.can import Database
 
-from soilbus.assembly import completion_of, rig_of
+from soilbus.assembly import completion_of, effects_of, rig_of
 from soilbus.can.channels import Channel
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.mapping import channels_of, without_unit
@@ -28,9 +28,29 @@ def configuration_report(config: Config) -> str:
 
 
 def _report(config: Config, parts: list[str]) -> str:
+    effects = effect_lines(config)
     parts += [f"{name:<8} {verdict}\n" for name, verdict in identifiable(config)]
+    if effects:
+        parts.append("\nEffects in the model:\n" + "".join(f"{line}\n" for line in effects))
     parts.append("\nSettings in force (defaults included):\n" + defaults_text(config) + "\n")
     return "\n".join(parts[:1]) + "\nWhat these sensors can tell of the soil:\n" + "".join(parts[1:])
+
+
+def effect_lines(config: Config) -> list[str]:
+    """A line for each effect: which of its parameters are estimated and which held, or why it does not count."""
+    effects, free = completion_of(config)
+    lines = []
+    for effect, _ in effects_of(config):
+        if effect not in effects:
+            lines.append(f"{effect.name}: for simulate only; it describes the ground of one recording, no other's")
+            continue
+        own = [f for f in free if f.effect == effect.name]
+        estimated, held = (
+            list(dict.fromkeys(f.parameter.name for f in own if (f.std > 0.0) == e)) for e in (True, False)
+        )
+        parts = [f"{what} {', '.join(names)}" for what, names in (("estimated:", estimated), ("held:", held)) if names]
+        lines.append(f"{effect.name}: {'; '.join(parts)}")
+    return lines
 
 
 def _row(channel: Channel, database: Database, unit_assumed: bool) -> tuple[str, ...]:

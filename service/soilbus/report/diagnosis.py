@@ -16,6 +16,7 @@ from soilbus.diagnosis.where import channels
 from soilbus.report.findings import (
     SENTENCES,
     admission_line,
+    chance_text,
     effect_lines,
     gap_line,
     place_lines,
@@ -26,7 +27,7 @@ from soilbus.report.page import html_table, page, picture
 
 Array = NDArray[np.float64]
 
-REGRESSORS = ("slip", "load, kN", "time, s")
+REGRESSORS = ("slip", "load of a wheel, kN", "time, s")
 MOST_POINTS = 3000
 """Residuals of a channel that a picture shows; the means are of all."""
 BINS = 12
@@ -80,7 +81,7 @@ def _places(findings: Findings) -> str:
     where = findings.diagnosis.where
     if not where:
         return f"<p>{html.escape(place_lines(where)[0])}</p>"
-    rows = [(p.channel, p.wheel or "-", p.region, size_text(p), f"{p.significance:.1e}") for p in where]
+    rows = [(p.channel, p.wheel or "-", p.region, size_text(p), chance_text(p.significance)) for p in where]
     return html_table(("channel", "wheel", "region", "size", "chance that noise does it"), rows)
 
 
@@ -138,7 +139,7 @@ def _clouds(completion: Completion) -> dict[str, dict[str, Array]]:
         for i, (channel, wheel) in enumerate(channels(wheels, problem.with_sinkage)):
             one = wheels.index(wheel) if wheel else None
             of_slip, of_load = (
-                (slip.mean(1), latents.load.sum(1)) if one is None else (slip[:, one], latents.load[:, one])
+                (slip.mean(1), latents.load.mean(1)) if one is None else (slip[:, one], latents.load[:, one])
             )
             table = np.column_stack([of_slip, of_load / 1e3, problem.since, z[:, i]])[np.isfinite(z[:, i])]
             found.setdefault(channel, {}).setdefault(wheel, []).append(table)

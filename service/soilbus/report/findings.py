@@ -134,9 +134,16 @@ def place_lines(where: Sequence[Disagreement]) -> list[str]:
     """The places of disagreement, the clearest first."""
     if not where:
         return ["no channel disagrees with the model anywhere by more than noise"]
-    shown = [f"{_channel(p)}, {p.region}: {size_text(p)} (chance {p.significance:.0e})" for p in where[:MOST_PLACES]]
+    shown = [
+        f"{_channel(p)}, {p.region}: {size_text(p)} (chance {chance_text(p.significance)})" for p in where[:MOST_PLACES]
+    ]
     left = len(where) - len(shown)
     return [*shown, f"and {left} more"] if left else shown
+
+
+def chance_text(chance: float) -> str:
+    """A probability that may be too small for a float."""
+    return f"{chance:.0e}" if chance > 0.0 else "< 1e-300"
 
 
 def _channel(place: Disagreement) -> str:

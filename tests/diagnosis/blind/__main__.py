@@ -1,0 +1,81 @@
+"""`PYTHONPATH=service python -m tests.diagnosis.blind`: hidden effects diagnosed, and the score."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+from soilbus.allocator import keep_freed_memory
+from soilbus.simulator.drive import SimulationError
+
+from .cases import KINDS, Case, cases
+from .table import report
+from .trial import Trial, tried
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse, diagnose, print."""
+    parser = argparse.ArgumentParser(prog="python -m tests.diagnosis.blind", description=__doc__)
+    parser.add_argument("--seed", type=int, default=1, help="picks soils, sensors and drives (1)")
+    parser.add_argument("--kind", choices=KINDS, action="append", help="repeatable; all by default")
+    parser.add_argument("--half", choices=("tune", "report"), help="both by default")
+    parser.add_argument("--only", default="", help="only cases with this in their id")
+    parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--list", action="store_true", help="name the cases without driving them")
+    parser.add_argument("--json", help="write one object a line for each case")
+    chosen = parser.parse_args(arguments)
+    wanted = [
+        case
+        for kind in chosen.kind or KINDS
+        for case in cases(kind, chosen.seed)
+        if chosen.half in (None, case.half) and chosen.only in case.id
+    ]
+    if chosen.list:
+        print("\n".join(f"{case.half:7}{case.id}" for case in wanted))
+        return 0
+    trials = []
+    out = open(chosen.json, "w") if chosen.json else None  # noqa: SIM115
+    for case, trial in _trials(wanted, chosen.processes):
+        if trial is None:
+            print(f"{case.id}: cannot be driven", flush=True)
+            continue
+        trials.append(trial)
+        names = " + ".join(" or ".join(f"{n} {p:.2f}" for n, p in one.items()) for one in trial.sets)
+        print(
+            f"{trial.half:7}{trial.id} [{trial.visible:.0f}]: {trial.verdict} {names}"
+            f" gap {trial.gap_before:.3f} -> {trial.gap_after:.3f} {trial.seconds:.1f} s",
+            flush=True,
+        )
+        if out is not None:
+            print(json.dumps(trial.as_json()), file=out, flush=True)
+    print(report(trials))
+    return 0
+
+
+def _trials(wanted: Sequence[Case], count: int) -> Iterator[tuple[Case, Trial | None]]:
+    if count < 2:
+        for case in wanted:
+            yield case, _trial((case.kind, case.id))
+        return
+    with ProcessPoolExecutor(count, get_context("spawn"), initializer=keep_freed_memory) as pool:
+        yield from zip(wanted, pool.map(_trial, [(case.kind, case.id) for case in wanted]), strict=True)
+
+
+def _trial(key: tuple[str, str]) -> Trial | None:
+    """The case of this kind and id; forms are functions and do not travel between processes."""
+    kind, name = key
+    seed = int(name.rpartition("/")[2].partition(".")[0])
+    case = next(case for case in cases(kind, seed) if case.id == name)
+    try:
+        return tried(case)
+    except SimulationError:
+        return None
+
+
+if __name__ == "__main__":
+    keep_freed_memory()
+    sys.exit(main())

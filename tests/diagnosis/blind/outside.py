@@ -1,0 +1,133 @@
+"""Effects that the catalogue does not have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from soilbus.simulator.recording import Recording
+from soilbus.simulator.scenario import SAMPLE_RATE
+from soilbus.terra.stress import Array
+
+from .form import Form, Hidden, Setting, by_hooks
+
+
+def _turned(omega: Array) -> Array:
+    """Angles [rad] through which wheels have turned."""
+    return np.cumsum(omega, axis=0) / SAMPLE_RATE
+
+
+def _ripple(torque: Array, around: Any, values: Any) -> Array:
+    """Five lugs a turn come into the ground one after the other."""
+    return torque * (1.0 + values["size"] * np.sin(5.0 * _turned(around.wheel_speed)))
+
+
+def _draft_leak(around: Any, values: Any) -> Array:
+    """The frame of the load cells bends under the draft: the front reads less, the rear more."""
+    sign = np.where(np.asarray(around.rear), 1.0, -1.0)
+    return values["size"] * np.asarray(around.draft) * sign
+
+
+def _cross_talk(torque: Array, around: Any, values: Any) -> Array:
+    """Each torque takes on a share of what the other wheel of its axle has beyond it."""
+    return torque + values["size"] * (torque[:, [1, 0, 3, 2]] - torque)
+
+
+def _warm_torque(torque: Array, around: Any, values: Any) -> Array:
+    """The torque cells' span settles as they warm up."""
+    return torque * (1.0 + values["size"] * np.exp(-around.t / 25.0))
+
+
+def _bouncing(around: Any, values: Any) -> Array:
+    """The axles bounce on their tyres at 1.3 Hz; the cells tell it, soil and slip do not follow."""
+    phase = np.array([0.0, 0.6, 2.0, 2.6])
+    return values["size"] * np.sin(2.0 * np.pi * 1.3 * around.t + phase) + 0.0 * around.load
+
+
+def _rows(state: Any, model: Any, around: Any, values: Any) -> Any:
+    """Harder and softer ground every 0.75 m, the spacing of maize, driven across; axles one wheelbase apart."""
+    x = around.distance - 1.95 * np.asarray(around.rear)
+    return state._replace(K_L=state.K_L * (1.0 + values["size"] * np.sin(2.0 * np.pi * x / 0.75))), model
+
+
+def _saturated(draft: Array, around: Any, values: Any) -> Array:
+    """The amplifier gives no more than a part of the greatest draft."""
+    greatest = (1.0 - values["size"]) * float(np.max(draft))
+    return np.minimum(draft, greatest) - draft
+
+
+def _sticking(draft: Array, around: Any, values: Any) -> Array:
+    """Friction in the pin: the reading follows only when the draft has moved away by more than the band."""
+    told = np.empty_like(draft)
+    held = draft[0]
+    for i, true in enumerate(draft):
+        held = min(max(held, true - values["size"]), true + values["size"])
+        told[i] = held
+    return told - draft
+
+
+def _channels(change: Callable[[str, Array, Recording, float], Array | None]) -> Callable[[float, Setting], Hidden]:
+    """Hidden by a change of measured channels: factors (N,) by channel name, None for none."""
+
+    def hide(size: float, setting: Setting) -> Hidden:
+        def after(recording: Recording) -> Recording:
+            changed = {}
+            for name, column in recording.channels.items():
+                factor = change(name, column.t, recording, size)
+                if factor is not None:
+                    changed[name] = replace(column, value=column.value * factor)
+            return replace(recording, channels=recording.channels | changed)
+
+        return Hidden(after=after)
+
+    return hide
+
+
+def _tooth(name: str, t: Array, recording: Recording, size: float) -> Array | None:
+    """A toothed wheel that runs out of true: its teeth pass too fast and too slowly once a turn."""
+    if not name.startswith("speed."):
+        return None
+    turned = _turned(recording.truth[name])
+    return np.asarray(1.0 + size * np.sin(np.interp(t, recording.truth["t"], turned)))
+
+
+def _nodding_radar(name: str, t: Array, recording: Recording, size: float) -> Array | None:
+    """The radar looks down at an angle that nods with the soil's profile, every two seconds."""
+    return 1.0 + size * np.sin(2.0 * np.pi * t / 2.0) if name == "ground_speed" else None
+
+
+FORMS = (
+    Form("", "torque_ripple", "locked to the wheel angle", "1", (0.0012, 0.0012), 0.08, by_hooks(torque=_ripple)),
+    Form(
+        "",
+        "draft_leak",
+        "draft in the wheel load cells",
+        "1",
+        (0.0055, 0.0055),
+        0.2,
+        by_hooks(load=_draft_leak),
+        imitable=True,
+    ),
+    Form("", "tooth_error", "once a turn of each wheel", "1", (0.001, 0.001), 0.02, _channels(_tooth)),
+    Form("", "draft_saturated", "amplifier at its end", "1", (0.01, 0.01), 0.5, by_hooks(draft=_saturated)),
+    Form("", "draft_sticking", "hysteresis of the pin", "N", (8.0, 8.0), 500.0, by_hooks(draft=_sticking)),
+    Form("", "row_spacing", "soil changes every 0.75 m", "1", (0.003, 0.003), 0.4, by_hooks(wheel=_rows)),
+    Form(
+        "",
+        "cross_talk",
+        "torques of an axle mixed",
+        "1",
+        (0.02, 0.02),
+        0.5,
+        by_hooks(torque=_cross_talk),
+        imitable=True,
+    ),
+    Form(
+        "", "warming_torque", "span settles", "1", (0.0033, 0.0033), 0.08, by_hooks(torque=_warm_torque), imitable=True
+    ),
+    Form("", "bouncing", "load cells at 1.3 Hz", "N", (5.5, 5.5), 600.0, by_hooks(load=_bouncing)),
+    Form("", "nodding_radar", "ground speed every 2 s", "1", (0.0017, 0.0017), 0.04, _channels(_nodding_radar)),
+)

@@ -1,0 +1,104 @@
+"""What the trials come to: shares with their targets, confusion matrix, calibration of probabilities."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from .trial import Trial
+
+VISIBLE, BARELY = 100.0, 20.0
+BINS = (0.0, 0.2, 0.5, 0.8, 0.95, 1.001)
+
+
+def report(trials: Sequence[Trial]) -> str:
+    """All of it as text."""
+    parts = []
+    for half in ("tune", "report"):
+        chosen = [t for t in trials if t.half == half]
+        parts.append(f"== {half} half: {len(chosen)} cases")
+        parts += [f"  {line}" for line in shares(chosen)]
+    parts += ["", "== confusion, visible single effects (rows: hidden; columns: named first)", confusion(trials)]
+    parts += ["", "== calibration: first probability told, cases, share that was right", *calibration(trials)]
+    return "\n".join(parts) + "\n"
+
+
+def shares(trials: Sequence[Trial]) -> Iterator[str]:
+    """One line for each figure."""
+    single = [t for t in trials if t.kind == "single"]
+    visible = [t for t in single if t.visible >= VISIBLE]
+    barely = [t for t in single if BARELY <= t.visible < VISIBLE]
+    yield _share("visible: named first", [first(t) == t.hidden[0] for t in visible], ">= 90 %")
+    yield _share("visible: in the set", [t.hidden[0] in in_set(t) for t in visible], ">= 97 %")
+    yield _share("barely visible: in the set", [t.hidden[0] in in_set(t) for t in barely], ">= 80 %")
+    for kind, most in (("plain", "<= 3 %"), ("hard", "<= 10 %")):
+        nulls = [t for t in trials if t.kind == kind]
+        yield _share(f"nulls, {kind}: falsely named", [bool(t.named) for t in nulls], most)
+        yield _share(f"nulls, {kind}: falsely named or unknown", [t.verdict != "none" for t in nulls], "")
+    outside = [t for t in trials if t.kind == "outside" and not t.imitable and t.gap_before > 1.1]
+    yield _share(
+        "outside the catalogue, not imitable, gap > 1.1: unknown", [t.verdict == "unknown" for t in outside], ">= 90 %"
+    )
+    pairs = [t for t in trials if t.kind == "pair" and t.visible >= 2.0 * VISIBLE]
+    yield _share("pairs: both named", [set(t.hidden) <= set(t.named) for t in pairs], "")
+    yield _share("pairs: both in the sets", [set(t.hidden) <= in_set(t) for t in pairs], ">= 80 %")
+    done = [t for t in visible if t.named]
+    yield _share("completed: gap <= 1.15", [t.gap_after <= 1.15 for t in done], ">= 85 %")
+    excess = [t for t in done if t.gap_before > 1.1]
+    gone = [t.gap_after - 1.0 <= 0.1 * (t.gap_before - 1.0) for t in excess]
+    yield _share("completed: 90 % of the excess gone (gap before > 1.1)", gone, ">= 85 %")
+    if done:
+        before, after = (
+            float(np.median(np.abs([getattr(t, f"bearing_{w}") for t in done]))) for w in ("before", "after")
+        )
+        yield f"bearing pressure, median error: {100 * before:.1f} % -> {100 * after:.1f} %  (<= 2 %)"
+    if trials:
+        seconds = [t.seconds for t in trials]
+        yield f"processor time: median {np.median(seconds):.1f} s, most {max(seconds):.1f} s  (<= 5 s)"
+
+
+def first(trial: Trial) -> str:
+    """The name that explains most, empty where none is given."""
+    return trial.named[0] if trial.named else ""
+
+
+def in_set(trial: Trial) -> set[str]:
+    """Every name that is given with a probability."""
+    return {name for one in trial.sets for name in one}
+
+
+def confusion(trials: Sequence[Trial]) -> str:
+    """Hidden against first named, visible single effects only; what is right is a plain count."""
+    counts: dict[str, Counter[str]] = {}
+    for t in trials:
+        if t.kind == "single" and t.visible >= VISIBLE:
+            counts.setdefault(t.hidden[0], Counter())[first(t) or t.verdict] += 1
+    return "\n".join(
+        f"  {hidden:18} " + ", ".join(f"{name} {n}" for name, n in named.most_common())
+        for hidden, named in counts.items()
+    )
+
+
+def calibration(trials: Sequence[Trial]) -> Iterator[str]:
+    """Of visible and barely visible single effects."""
+    told = [
+        (t.sets[0][t.named[0]], t.named[0] == t.hidden[0])
+        for t in trials
+        if t.kind == "single" and t.named and t.visible >= BARELY
+    ]
+    for low, high in zip(BINS, BINS[1:], strict=False):
+        members = [(p, right) for p, right in told if low <= p < high]
+        if members:
+            mean = np.mean([p for p, _ in members])
+            yield f"  {mean:.2f}  {len(members):4}  {np.mean([r for _, r in members]):.2f}"
+
+
+def _share(what: str, right: Sequence[bool], target: str) -> str:
+    n = len(right)
+    return (
+        f"{what}: {sum(right)} of {n}"
+        + (f" = {100.0 * sum(right) / n:.0f} %" if n else "")
+        + f"  ({target})" * bool(target)
+    )

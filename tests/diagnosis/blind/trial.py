@@ -1,0 +1,112 @@
+"""One blind case through the diagnosis, and what there is to score of it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.diagnosis.completion import Completion, complete
+from soilbus.diagnosis.diagnose import Diagnosis, diagnose
+from soilbus.diagnosis.records import Record, record_of
+from soilbus.diagnosis.score import scores
+from soilbus.estimation.window import BinStore
+from soilbus.terra.effects.catalogue import CATALOGUE
+
+from .cases import Case
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A case's truth beside the diagnosis.
+
+    named: names added, the one that explains most first; sets: for each of them all names
+    with probabilities.  visible: by how much the true effects lower the penalised cost (nan
+    for what the catalogue lacks).  bearing_*: relative errors of the bearing pressure.
+    """
+
+    id: str
+    kind: str
+    half: str
+    hidden: tuple[str, ...]
+    size: str
+    imitable: bool
+    verdict: str
+    named: tuple[str, ...]
+    sets: tuple[dict[str, float], ...]
+    falls: tuple[dict[str, float], ...]
+    visible: float
+    gap_before: float
+    gap_after: float
+    rows: int
+    bearing_before: float
+    bearing_after: float
+    seconds: float
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain objects."""
+        return asdict(self)
+
+
+def record_of_case(case: Case) -> Record:
+    """What the diagnosis is given."""
+    config, recording = case.config, case.recording
+    rig, settings = rig_of(config), case.config.estimator
+    store = BinStore(rig, settings.bin, 0.0)
+    columns = {n: (c.t, c.value) for n, c in recording.channels.items() if n in rig.channels}
+    store.add(columns)
+    end = max(float(t[-1]) for t, _ in columns.values())
+    return record_of(case.id, store.window(0.0, end), rig, model_of(config), settings.min_speed, settings.max_turn)
+
+
+def tried(case: Case) -> Trial:
+    """The case diagnosed; SimulationError if it cannot be driven."""
+    record, prior = record_of_case(case), prior_of(case.config)
+    begin = time.process_time()
+    found = diagnose([record], prior, list(CATALOGUE.values()))
+    seconds = time.process_time() - begin
+    order = sorted(found.additions, key=lambda a: -a.falls[a.effect.name])
+    return Trial(
+        id=case.id,
+        kind=case.kind,
+        half=case.half,
+        hidden=case.hidden,
+        size=case.size,
+        imitable=case.imitable,
+        verdict=str(found.verdict),
+        named=tuple(a.effect.name for a in order),
+        sets=tuple({a.effect.name: a.probability} | a.alternatives for a in order),
+        falls=tuple(a.falls for a in order),
+        visible=_visible(case, record, found),
+        gap_before=found.base.gap,
+        gap_after=found.completed.gap,
+        rows=found.base.checked_rows,
+        bearing_before=_bearing_error(case, found.base),
+        bearing_after=_bearing_error(case, found.completed),
+        seconds=seconds,
+    )
+
+
+def _visible(case: Case, record: Record, found: Diagnosis) -> float:
+    """Fall of -2 log posterior, learned and held-out blocks, when the true effects are added to the present model."""
+    if not case.hidden:
+        return float("nan")
+    prior, present = prior_of(case.config), found.base
+    for name in case.hidden:
+        start = scores([record], prior, present, [CATALOGUE[name]])[0].starts
+        more = complete([record], prior, (*present.effects, CATALOGUE[name]), start)
+        present = present if more is None else more
+    return _cost(found.base) - _cost(present)
+
+
+def _cost(completion: Completion) -> float:
+    return completion.cost + sum(check.at.chi2 for check in completion.checks)
+
+
+def _bearing_error(case: Case, completion: Completion) -> float:
+    settings = case.config.estimator
+    found = completion.fits[0].posterior.bearing_pressure(settings.z_ref, settings.b_ref).value
+    return float(np.log(found / case.soil.bearing_pressure(settings.z_ref, settings.b_ref)))

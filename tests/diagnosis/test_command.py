@@ -1,0 +1,211 @@
+"""`soilbus diagnose` as a user types it: an effect hidden in a log is found, named, added, and the daemon knows it."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from soilbus.can.dbc_files import load_databases, shipped_dbc
+from soilbus.cli import main
+from soilbus.config import load_config
+from soilbus.simulator.reference import TRACTOR
+
+SOIL_KEYS = {"k_c", "k_phi", "n", "phi", "c", "K", "bearing_pressure"}
+TRUE_PRESSURE = (5300.0 / 0.3 + 1.515e6) * 0.02**0.7
+"""Of the simulator's loam, under the reference plate [Pa]."""
+HIDDEN = {"stiffness": 0.5, "density": 0.05}
+
+
+class Diagnosed(NamedTuple):
+    log: Path
+    config: Path
+    found: dict[str, Any]
+    text: str
+    report: str
+    model: Path
+
+
+def simulated(log: Path, seed: int, *more: str, seconds: int = 60) -> Path:
+    effects = [f"--effect=multipass.{name}={value}" for name, value in HIDDEN.items()]
+    command = ["simulate", "--duration", str(seconds), "--seed", str(seed), "--log", str(log), *effects, *more]
+    assert main(command) == 0
+    return log
+
+
+@pytest.fixture(scope="module")
+def diagnosed(tmp_path_factory) -> Diagnosed:
+    """A recording in which rear wheels run in compacted ruts, under a configuration of its own with its own DBC."""
+    folder = tmp_path_factory.mktemp("vehicle")
+    (folder / "elsewhere").mkdir()
+    shutil.copy(shipped_dbc("tractor.dbc"), folder / "mine.dbc")
+    config = folder / "mine.toml"
+    config.write_text(TRACTOR.read_text().replace('"tractor.dbc"', '"mine.dbc"') + "\n[soil.n]\nstd = 0.3 # my guess\n")
+    log = simulated(folder / "ruts.log", 5)
+    out, report, model = folder / "out.json", folder / "out.html", folder / "elsewhere/completed.toml"
+    outputs = ["--json", out, "--report", report, "--model-out", model]
+    # a process of its own, whose output is whole and not a terminal
+    done = run("diagnose", "--config", config, log, *outputs, "--set", "soil.c.value=2900.0")
+    assert (done.returncode, done.stderr) == (0, "")
+    return Diagnosed(log, config, json.loads(out.read_text()), done.stdout, report.read_text(), model)
+
+
+def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+    program = "import sys; from soilbus.cli import main; sys.exit(main())"
+    return subprocess.run([sys.executable, "-c", program, *map(str, arguments)], capture_output=True, text=True)
+
+
+def deviations(pressure: dict[str, float]) -> float:
+    return abs(pressure["value"] - TRUE_PRESSURE) / pressure["std"]
+
+
+def test_the_hidden_effect_is_named_and_the_gap_closes(diagnosed):
+    found = diagnosed.found
+    assert found["verdict"] == "named"
+    assert [effect["name"] for effect in found["effects"]] == ["multipass"]
+    effect = found["effects"][0]
+    assert effect["probability"] > 0.95
+    for name, told in effect["parameters"].items():
+        assert abs(told["value"] - HIDDEN[name]) < 3.0 * told["std"] < 0.2
+    assert found["gap"]["before"] > 2.0 > found["gap"]["limit"] > found["gap"]["after"]
+    assert found["gap"]["noise_floor"] == 1.0
+    assert deviations(found["soil_before"]["bearing_pressure"]) > 10.0
+    assert deviations(found["soil_after"]["bearing_pressure"]) < 3.0
+
+
+def test_json_has_the_keys_of_the_design(diagnosed):
+    found = diagnosed.found
+    assert {"verdict", "where", "effects", "gap", "soil_before", "soil_after", "soils"} <= found.keys()
+    for place in found["where"]:
+        assert place.keys() == {"channel", "wheel", "region", "size", "significance"}
+        assert 0.0 <= place["significance"] <= 0.01
+    for soil in (found["soil_before"], found["soil_after"]):
+        assert soil.keys() == SOIL_KEYS
+        assert all(math.isfinite(v) for told in soil.values() for v in told.values())
+    assert [soil["log"] for soil in found["soils"]] == ["ruts.log"]
+    assert found["soils"][0]["after"] == found["soil_after"]
+    assert found["rejected"] == {}
+
+
+def test_text_tells_verdict_effect_physics_and_soil(diagnosed):
+    text = diagnosed.text
+    assert text.startswith("named: ")
+    assert "1. multipass, probability 1.00" in text
+    assert "Rear wheels run in ruts" in text
+    before, after = (diagnosed.found["gap"][key] for key in ("before", "after"))
+    assert f"gap {before:.3f} -> {after:.3f}" in text
+    told = diagnosed.found["soil_after"]["bearing_pressure"]["value"] / 1e3
+    assert re.search(rf"bearing pressure, kPa .* {told:.4g} \+-", text)
+
+
+def test_report_needs_nothing_but_itself(diagnosed):
+    report = diagnosed.report
+    assert len(re.findall("<img alt='residuals (?:before|after)' src='data:image/png;base64,", report)) == 2
+    assert set(re.findall(r"""(?:src|href|url)\s*[=(]\s*['"]?(.{5})""", report)) == {"data:"}
+    assert "Candidates for effect 1" in report
+    assert "<td>multipass</td>" in report
+
+
+def test_model_out_is_the_configuration_with_the_effect(diagnosed):
+    completed, given = load_config(diagnosed.model), load_config(diagnosed.config, ["soil.c.value=2900.0"])
+    assert [effect.name for effect in completed.model.effects] == ["multipass"]
+    assert completed.soil_prior == given.soil_prior
+    left = {"model", "dbc"}
+    assert completed.model_dump(exclude=left) == given.model_dump(exclude=left)
+    assert "std = 0.3 # my guess" in diagnosed.model.read_text()
+    names = {message.name for message in load_databases(completed).messages}
+    assert names == {message.name for message in load_databases(given).messages}
+    told = diagnosed.found["effects"][0]["parameters"]
+    for name, value in (completed.model.effects[0].model_extra or {}).items():
+        assert value == pytest.approx(told[name], rel=1e-5)
+
+
+def test_check_says_what_is_estimated(diagnosed, capsys):
+    assert main(["check", "--config", str(diagnosed.model)]) == 0
+    assert "multipass: estimated: stiffness, density\n" in capsys.readouterr().out
+
+
+def test_replay_with_the_completed_model_is_valid_where_the_plain_model_fails(diagnosed, tmp_path):
+    def windows(config: Path) -> list[dict[str, Any]]:
+        out = tmp_path / "windows.jsonl"
+        assert main(["replay", "--config", str(config), str(diagnosed.log), "--json", str(out)]) == 0
+        return [json.loads(line) for line in out.read_text().splitlines()]
+
+    plain, completed = windows(diagnosed.config), windows(diagnosed.model)
+    assert len(plain) == len(completed) == 50
+    assert not any(window["status"] == "valid" for window in plain)
+    assert [window["status"] for window in completed] == ["valid"] * 50
+    chi2 = [window["chi2"] for window in completed]
+    assert 0.9 < sum(chi2) / 50 < 1.05
+    assert max(deviations(window["bearing_pressure"]) for window in completed) < 3.0
+
+
+def test_simulate_drives_with_the_completed_model(diagnosed, tmp_path):
+    completed, plain = tmp_path / "a.log", tmp_path / "b.log"
+    for config, log in ((diagnosed.model, completed), (diagnosed.config, plain)):
+        assert main(["simulate", "--config", str(config), "--duration", "2", "--log", str(log)]) == 0
+    assert completed.read_text() != plain.read_text()
+
+
+def test_nothing_is_missing_under_the_completed_model_on_other_ground(diagnosed, tmp_path, capsys):
+    logs = [simulated(tmp_path / f"{soil}.log", 9, "--soil", soil, seconds=40) for soil in ("wet_clay", "loam")]
+    capsys.readouterr()
+    assert main(["diagnose", "--config", str(diagnosed.model), *map(str, logs), "--json", "-"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["verdict"] == "none"
+    assert found["effects"] == []
+    assert found["gap"]["before"] == found["gap"]["after"] < found["gap"]["limit"]
+    clay, loam = found["soils"]
+    assert (clay["log"], loam["log"]) == ("wet_clay.log", "loam.log")
+    assert clay["after"] == found["soil_after"]
+    assert deviations(loam["after"]["bearing_pressure"]) < 3.0 < deviations(clay["after"]["bearing_pressure"])
+    assert abs(found["model"]["multipass"]["stiffness"]["value"] - 0.5) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda log: log[: len(log) // 2 - 20], "cut off or damaged after"),
+        (lambda log: "".join(log.splitlines(keepends=True)[:1500]), "usable instants are too few"),
+        (lambda log: re.sub(r" can0 \w+#", " can0 123#", log), "a log of another bus?"),
+        (lambda log: "", "no frame in it"),
+    ],
+    ids=["cut", "short", "other bus", "empty"],
+)
+def test_logs_that_cannot_be_used_give_one_line_and_no_files(diagnosed, tmp_path, capsys, change, message):
+    log, out = tmp_path / "bad.log", tmp_path / "out"
+    out.mkdir()
+    log.write_text(change(diagnosed.log.read_text()))
+    capsys.readouterr()
+    outputs = ["--json", str(out / "a"), "--report", str(out / "b"), "--model-out", str(out / "c")]
+    assert main(["diagnose", "--config", str(diagnosed.config), str(log), *outputs]) == 1
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert len(told.err.splitlines()) == 1
+    assert message in told.err
+    assert list(out.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["--set", "model.effect=[]"], 2, "model.effect: unknown key"),
+        (["--set", 'model.effects=[{name="cheese"}]'], 2, "no effect is named cheese"),
+        (["--set", 'model.effects=[{name="multipass",stiffness={value=0.5,std=-1}}]'], 2, "std -1 is less than 0"),
+        (["--json", "/nonexistent/out.json"], 1, "/nonexistent/out.json: no folder /nonexistent"),
+        (["--model-out", "/nonexistent/out.toml"], 1, "no folder"),
+    ],
+)
+def test_mistakes_are_told_before_any_work(diagnosed, capsys, arguments, code, message):
+    assert main(["diagnose", "--config", str(diagnosed.config), str(diagnosed.log), *arguments]) == code
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert len(told.err.splitlines()) == 1
+    assert message in told.err
