@@ -154,7 +154,7 @@ class CompletedProblem(WindowProblem):
         if not self.effects:
             return super().sinkages(soil, gains, latents)
         active = self.active(gains[self.n_sensors :])
-        return np.asarray(self._outcome(soil, active, latents, latents.entry_angle).wheels[3])
+        return np.asarray(self._contact(soil, active, latents, latents.entry_angle).depth)
 
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         if not self.effects:
