@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 from availability import unavailable
 from single_wheel import NOISE, RIG, WIDTH, noisy, sweep, write_csv
 from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.cli import main
 from soilbus.config import Config, ConfigError, parse_config
 from soilbus.daemon.diagnose import diagnose_logs
 from soilbus.daemon.outputs import json_line
@@ -314,3 +316,24 @@ def test_check_lists_the_columns_and_what_they_tell():
     only_depth = configuration_report(rig(torque=None, drawbar_pull=None))
     assert re.search(r"phi +no: needs torque or drawbar pull", only_depth)
     assert re.search(r"n +yes: sinkage", only_depth)
+
+
+def test_the_command_line_takes_tables_and_answers_faults_in_one_line(tmp_path, measured, capsys):
+    table = write_csv(tmp_path / "t.csv", measured)
+    config = tmp_path / "rig.toml"
+    config.write_text(RIG)
+    arguments = ["diagnose", "--config", str(config), str(table)]
+    assert main([*arguments, "--json", "-"]) == 0
+    findings = json.loads(capsys.readouterr().out)
+    assert findings["verdict"] == "none"
+    assert findings["effects"] == []
+    assert findings["gap"]["before"] < gap_limit(18)
+    for change, code, complaint in (
+        ("table.torque=twist", 1, "no column twist"),
+        ("table.torque.factor=0", 2, "factor of 0"),
+        ("table.where={x=[1]}", 2, "x must be a text or a number"),
+    ):
+        assert main([*arguments, "--set", change]) == code
+        error = capsys.readouterr().err
+        assert complaint in error
+        assert error.count("\n") == 1
