@@ -61,6 +61,54 @@ def test_a_new_soil_is_known_two_seconds_after_its_border(first, second):
             assert abs(off(r, second)) < 3.0
 
 
+SLOW_AT_THE_BORDER = {"speed": Swing(1.0, 1.8)}
+GRADUAL = {"speed": Swing(SPEED, SPEED + 1e-6), "transition": 5.0}
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "seed", "how"),
+    [
+        ("wet_clay", "loam", 2, SLOW_AT_THE_BORDER),
+        ("loam", "dry_sand", 3, SLOW_AT_THE_BORDER),
+        ("dry_sand", "loam", 5, SLOW_AT_THE_BORDER),
+        ("wet_clay", "loam", 1, GRADUAL),
+        ("loam", "dry_sand", 2, GRADUAL),
+    ],
+)
+def test_a_border_may_be_longer_than_thought(first, second, seed, how):
+    # All of these were a mismatch until not one sample of the border was in the window any more.
+    config = reference_configuration()
+    scenario = Scenario(24.0, (Patch(0.0, first), Patch(12.0 * SPEED, second)), slip=Swing(0.05, 0.40), **how)
+    truth = simulate(config, scenario, seed).truth
+    # Where the front wheels meet the border and the rear ones leave it.
+    border = 12.0 * SPEED + np.array([-1.0, 0.95 + scenario.transition])
+    reached, left = np.interp(border, truth["distance"], truth["t"])
+    tracker = tracker_of(config)
+    for window, end in windows(config, scenario, seed):
+        result = tracker.estimate(window, end)
+        if end < reached:
+            assert result.ground is Ground.SAME
+            assert abs(off(result, first)) < 3.5
+        elif end < reached + 3.0:
+            assert not result.mismatch
+        elif end > left + 2.0:
+            assert not result.mismatch
+            assert result.ground is not Ground.CHANGING
+            assert abs(off(result, second)) < 3.5
+
+
+def test_what_no_soil_explains_is_a_mismatch_and_no_new_soil():
+    # From 13 s on the right rear wheel seems to pull with no torque: the other three are as they were.
+    config = reference_configuration()
+    scenario = Scenario(24.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))
+    tracker = tracker_of(config)
+    for window, end in windows(config, scenario, 6):
+        torque = np.where((window.t > 13.0)[:, None] & (np.arange(4) == 3), 0.0, window.torque)
+        result = tracker.estimate(replace(window, torque=torque), end)
+        if end > 16.5:
+            assert result.mismatch
+
+
 def test_one_soil_for_minutes_stays_one_soil_and_the_errors_as_said():
     config = reference_configuration()
     scenario = Scenario(200.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))

@@ -10,15 +10,17 @@ the soil and what is known of the sensors.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.coordinates import Coordinates
-from soilbus.estimation.gauss_newton import Fit, fit_window, foreseen, resume
+from soilbus.estimation.gauss_newton import Fit, Foreseen, fit_window, foreseen, resume
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.soil_change import Crossing, suspicion, without_crossing
@@ -38,12 +40,16 @@ TRUST, TRUST_AGAIN = 3.5, 0.0
 """Standard deviations of chi-square that a window may have above the allowed: always, and after a mismatch."""
 LOOK_BACK = 0.2
 """Share of a window before the end of the last fit's data from which on a change is looked for."""
+RECENT = 2.0
+"""Windows since the last one that the model described, within which another soil may be why it no longer does."""
+PATIENCE = 0.3
+"""Share of a window after the first sign of another soil until its data, if no soil explains them, are a mismatch."""
 GRACE = 0.3
 """Share of a window that a new soil must fill before the next change is looked for."""
 LEARNED = 0.5
 """Share of a window that its data must fill for later windows to build on it: the posterior of less is not Gaussian."""
-BORDER = 0.5
-"""Length after the first sign of another soil that is of neither, in wheelbases."""
+BORDERS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.5, 10.5)
+"""Lengths after the first sign of another soil that may be of neither, in wheelbases: borders are sharp or gradual."""
 GAIN_MEMORY = 60.0
 """Windows in which a sensor's gain error may change by its whole uncertainty."""
 WHEELBASE = 2.0
@@ -92,6 +98,13 @@ class Tracked:
     turning: int = 0
 
 
+class Alarm(NamedTuple):
+    """When the data first disagreed with the soil known [s], and how fast the vehicle then was [m/s]."""
+
+    t: float
+    speed: float
+
+
 def elsewhere(prior: SoilPrior) -> SoilPrior:
     """Prior of a soil that the vehicle came upon: at least as wide as known soils differ, what is held stays held."""
     soils = np.log(list(SOILS.values()))
@@ -116,6 +129,7 @@ class Tracker:
         self._distrusted = False
         self._fit: Fit | None = None
         self._good_until = -math.inf
+        self._alarm: Alarm | None = None
         self._crossing: Crossing | None = None
         self._beliefs: list[tuple[float, Belief]] = []
 
@@ -132,24 +146,43 @@ class Tracker:
             return Tracked(None, False, Ground.SAME, since, *left_out)
         before = self._known_at(since, problem)
         last = self._fit
+        changed = None
         if last is None:
             fit = self._afresh(problem, before)
+            if self.mismatch(fit) and self._alarm is not None:
+                changed = self._another_soil(window, self._alarm, fit, before, None)
         else:
             ahead = foreseen(problem, self._here, last, before)
             fit = resume(ahead)
-            if self._good_until > end - self.settings.window and end - since > GRACE * self.settings.window:
-                known = ahead.fitting.given(last.belief)
-                sure = float(last.optimum.t[-1]) - LOOK_BACK * self.settings.window
-                first = int(np.searchsorted(problem.t, sure))
-                doubt = suspicion(known, ahead.place, ahead.at, first, ALARM)
-                if doubt.ratio > ALARM or self.mismatch(fit):
-                    changed = self._two_soils(window, float(problem.t[doubt.instant]), before, last)
-                    if changed is not None:
-                        return self._remembered(replace(changed, standstill=left_out[0], turning=left_out[1]), end)
-            if self.mismatch(fit):
+            self._alarm = self._alarm_in(window, ahead, last, fit, end - since)
+            if self._alarm is not None:
+                changed = self._another_soil(window, self._alarm, fit, before, last)
+            if changed is None and self.mismatch(fit):
                 fit = self._afresh(problem, before)
+        if changed is not None:
+            return self._remembered(replace(changed, standstill=left_out[0], turning=left_out[1]), end)
         ground = Ground.NEW if new else Ground.SAME
         return self._remembered(Tracked(fit, self.mismatch(fit), ground, since, *left_out), end)
+
+    def _alarm_in(self, window: Window, ahead: Foreseen, last: Fit, fit: Fit | None, filled: float) -> Alarm | None:
+        """The first sign of another soil in a window of which the present one fills so much [s], if there is any.
+
+        As long as nothing explains the data since, the alarm stays what it was; after some
+        windows another soil is no longer believed to be the cause.
+        """
+        end, length = float(window.t[-1]), self.settings.window
+        if self._alarm is not None and self.mismatch(fit):
+            return self._alarm if self._alarm.t > end - RECENT * length else None
+        if self._good_until <= end - length or filled <= GRACE * length:
+            return None
+        t = ahead.fitting.problem.t
+        first = int(np.searchsorted(t, float(last.optimum.t[-1]) - LOOK_BACK * length))
+        doubt = suspicion(ahead.fitting.given(last.belief), ahead.place, ahead.at, first, ALARM)
+        if doubt.ratio <= ALARM and not self.mismatch(fit):
+            return None
+        begin = float(t[doubt.instant])
+        near = window.ground_speed[(window.t >= begin - 1.0) & (window.t <= begin)]
+        return Alarm(begin, max(float(np.nanmean(near)), self.settings.min_speed))
 
     def _afresh(self, problem: WindowProblem, before: Belief) -> Fit | None:
         """A fit that starts anywhere; what was known of the soil counts only where it agrees with the data."""
@@ -199,30 +232,50 @@ class Tracker:
         directions = coordinates.log_directions(belief.soil)
         return belief.drifted(self.settings.drift**2 * elapsed * (directions @ directions.T), gains)
 
-    def _two_soils(self, window: Window, t: float, before: Belief, last: Fit) -> Tracked | None:
-        """The window as two soils of which the second begins at t [s], if that is much likelier than one; else None."""
-        near = (window.t >= t - 1.0) & (window.t <= t)
-        speed = max(float(np.nanmean(window.ground_speed[near])), self.settings.min_speed)
-        length = WHEELBASE if self.rig.chassis is None else self.rig.chassis.wheelbase
-        lag = length / speed
-        crossing = Crossing(t - _SAME_TIME, t + BORDER * lag, 0.0 if self.rig.chassis is None else lag)
-        apart = without_crossing(window, crossing, self.rig.front)
-        first = self._problem(apart.rows(np.flatnonzero(apart.t < crossing.begin)))
-        second = self._problem(apart.rows(np.flatnonzero(apart.t >= crossing.end)))
-        old = resume(foreseen(first, self._here, last, before)) if first.n_rows >= MIN_NEW_ROWS else None
-        if old is None or self.mismatch(old):
+    def _another_soil(
+        self, window: Window, alarm: Alarm, one: Fit | None, before: Belief, last: Fit | None
+    ) -> Tracked | None:
+        """The window as two soils, the second from the alarm on, if that is much likelier than `one`; else None.
+
+        Without a last fit, or where the first soil is out of the window, the second alone.
+        """
+        first = self._problem(window.rows(np.flatnonzero(window.t < alarm.t - _SAME_TIME)))
+        old = None
+        if last is not None and first.n_rows >= MIN_NEW_ROWS:
+            old = resume(foreseen(first, self._here, last, before))
+        if self.mismatch(old):
+            old = None
+        if old is None and not self.mismatch(one):
             return None
-        if second.n_rows < MIN_NEW_ROWS:
-            return Tracked(old, False, Ground.CHANGING, float(apart.t[0]))
         there = elsewhere(self.prior)
-        new = fit_window(second, there, self._known_at(t, second).of_another_soil(there))
-        if new is None or self.mismatch(new):
-            return None
-        one = fit_window(self._problem(apart), self._here, before)
-        if one is not None and one.converged and one.evidence - old.evidence - new.evidence < CHANGED:
-            return None
-        self._crossing, self._here = crossing, there
-        return Tracked(new, False, Ground.NEW, crossing.end)
+        waits = True
+        for crossing in self._crossings(alarm):
+            apart = without_crossing(window, crossing, self.rig.front)
+            second = self._problem(apart.rows(np.flatnonzero(apart.t >= crossing.end)))
+            arrived = crossing.end + crossing.lag if self._distrusted else crossing.end
+            if second.n_rows < MIN_NEW_ROWS or window.t[-1] < arrived:
+                break  # after a mismatch the wheels of both axles must agree, and agree with the draft
+            waits = self.mismatch(one) and window.t[-1] < alarm.t + PATIENCE * self.settings.window
+            new = fit_window(second, there, self._known_at(alarm.t, second).of_another_soil(there))
+            if new is None or self.mismatch(new):
+                continue
+            if old is not None and not self._likelier(old, new, fit_window(self._problem(apart), self._here, before)):
+                return None
+            self._crossing, self._here = crossing, there
+            return Tracked(new, False, Ground.NEW, crossing.end)
+        return Tracked(old, False, Ground.CHANGING, float(window.t[0])) if old is not None and waits else None
+
+    def _crossings(self, alarm: Alarm) -> Iterator[Crossing]:
+        """Borders of growing length that begin at the alarm."""
+        chassis = self.rig.chassis
+        wheelbase = WHEELBASE if chassis is None else chassis.wheelbase
+        lag = wheelbase / alarm.speed
+        for share in BORDERS:
+            yield Crossing(alarm.t - _SAME_TIME, alarm.t + share * lag, 0.0 if chassis is None else lag)
+
+    def _likelier(self, old: Fit, new: Fit, one: Fit | None) -> bool:
+        """Whether two soils explain much better what one, of the same data, explains."""
+        return one is None or not one.converged or one.evidence - old.evidence - new.evidence >= CHANGED
 
     def _of_this_soil(self, window: Window) -> Window:
         if self._crossing is None:
