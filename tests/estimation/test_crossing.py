@@ -89,7 +89,7 @@ def test_what_no_soil_explains_is_a_mismatch_and_no_new_soil():
 
 
 def test_one_soil_for_minutes_stays_one_soil_and_the_errors_as_said():
-    config = reference_configuration()
+    config = reference_configuration(["estimator.soil_drift=0.005"])  # what may drift by 3 % is soon forgotten
     scenario = Scenario(200.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))
     tracker = tracker_of(config)
     results = [tracker.estimate(w, end) for w, end in windows(config, simulate(config, scenario, 1))]

@@ -21,7 +21,9 @@ from numpy.typing import NDArray
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.coordinates import Coordinates
 from soilbus.estimation.gauss_newton import Fit, Foreseen, fit_window, foreseen, resume
+from soilbus.estimation.normal_equations import Fitting
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+from soilbus.estimation.present import at_present
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.soil_change import Crossing, suspicion, without_crossing
 from soilbus.estimation.window import Rig, Window
@@ -44,6 +46,8 @@ RECENT = 2.0
 """Windows since the last one that the model described, within which another soil may be why it no longer does."""
 PATIENCE = 0.3
 """Share of a window after the first sign of another soil until its data, if no soil explains them, are a mismatch."""
+SINCE_THE_MIDDLE = 0.5
+"""Windows that a soil may have drifted since it was what a fit that takes it for constant says."""
 GRACE = 0.3
 """Share of a window that a new soil must fill before the next change is looked for."""
 LEARNED = 0.5
@@ -153,7 +157,7 @@ class Tracker:
                 changed = self._another_soil(window, self._alarm, fit, before, None)
         else:
             ahead = foreseen(problem, self._here, last, before)
-            fit = resume(ahead)
+            fit = self._now(ahead.fitting, resume(ahead))
             self._alarm = self._alarm_in(window, ahead, last, fit, end - since)
             if self._alarm is not None:
                 changed = self._another_soil(window, self._alarm, fit, before, last)
@@ -177,8 +181,10 @@ class Tracker:
             return None
         t = ahead.fitting.problem.t
         first = int(np.searchsorted(t, float(last.optimum.t[-1]) - LOOK_BACK * length))
-        doubt = suspicion(ahead.fitting.given(last.belief), ahead.place, ahead.at, first, ALARM)
-        if doubt.ratio <= ALARM and not self.mismatch(fit):
+        place = replace(last.belief, soil=last.optimum.soil, gains=last.optimum.gains)
+        known = place.drifted(self._drift(place, SINCE_THE_MIDDLE), np.zeros(len(place.gains)))
+        doubt = suspicion(ahead.fitting.given(known), ahead.place, ahead.at, first, ALARM)
+        if doubt.ratio <= ALARM and fit is not None and fit.chi2 <= self.chi2_limit(fit):
             return None
         begin = float(t[doubt.instant])
         near = window.ground_speed[(window.t >= begin - 1.0) & (window.t <= begin)]
@@ -186,15 +192,26 @@ class Tracker:
 
     def _afresh(self, problem: WindowProblem, before: Belief) -> Fit | None:
         """A fit that starts anywhere; what was known of the soil counts only where it agrees with the data."""
-        fit = fit_window(problem, self._here, before)
+        fit = self._fitted(problem, self._here, before)
         if not self.mismatch(fit) or not self._beliefs:
             return fit
         there = elsewhere(self.prior)
-        other = fit_window(problem, there, before.of_another_soil(there))
+        other = self._fitted(problem, there, before.of_another_soil(there))
         if self.mismatch(other):
             return fit
         self._here = there
         return other
+
+    def _fitted(self, problem: WindowProblem, prior: SoilPrior, before: Belief) -> Fit | None:
+        """A fit that starts anywhere, of the present soil."""
+        fit = fit_window(problem, prior, before)
+        return fit if fit is None else self._now(Fitting(problem, prior, before), fit)
+
+    def _now(self, fitting: Fitting, fit: Fit | None) -> Fit | None:
+        """A fit with the soil as it is at the end of the window."""
+        if fit is None or not fit.converged:
+            return fit
+        return at_present(fitting, fit, self.settings.window, self.settings.drift)
 
     def mismatch(self, fit: Fit | None) -> bool:
         """Whether a fit failed or leaves more than noise."""
@@ -224,13 +241,16 @@ class Tracker:
             return Belief.of(self._here, problem.gain_std)
         self._beliefs = self._beliefs[ended[-1] :]
         end, belief = self._beliefs[0]
-        elapsed = (t - end) / self.settings.window + 1.0
-        gains = problem.gain_std**2 * min(elapsed / GAIN_MEMORY, 1.0)
+        elapsed = (t - end) / self.settings.window
+        gains = problem.gain_std**2 * min((elapsed + 1.0) / GAIN_MEMORY, 1.0)
         if self._crossing is not None and end <= self._crossing.end:
             return belief.of_another_soil(self._here).drifted(np.zeros((_SOIL, _SOIL)), gains)
-        coordinates = Coordinates(self._here, float(self.rig.width.mean()))
-        directions = coordinates.log_directions(belief.soil)
-        return belief.drifted(self.settings.drift**2 * elapsed * (directions @ directions.T), gains)
+        return belief.drifted(self._drift(belief, elapsed), gains)
+
+    def _drift(self, belief: Belief, elapsed: float) -> Array:
+        """Covariance (6, 6) by which the soil's logarithms drift in so many windows."""
+        directions = Coordinates(self._here, float(self.rig.width.mean())).log_directions(belief.soil)
+        return np.asarray(self.settings.drift**2 * elapsed * (directions @ directions.T))
 
     def _another_soil(
         self, window: Window, alarm: Alarm, one: Fit | None, before: Belief, last: Fit | None
@@ -242,7 +262,8 @@ class Tracker:
         first = self._problem(window.rows(np.flatnonzero(window.t < alarm.t - _SAME_TIME)))
         old = None
         if last is not None and first.n_rows >= MIN_NEW_ROWS:
-            old = resume(foreseen(first, self._here, last, before))
+            ahead = foreseen(first, self._here, last, before)
+            old = self._now(ahead.fitting, resume(ahead))
         if self.mismatch(old):
             old = None
         if old is None and not self.mismatch(one):
@@ -256,10 +277,10 @@ class Tracker:
             if second.n_rows < MIN_NEW_ROWS or window.t[-1] < arrived:
                 break  # after a mismatch the wheels of both axles must agree, and agree with the draft
             waits = self.mismatch(one) and window.t[-1] < alarm.t + PATIENCE * self.settings.window
-            new = fit_window(second, there, self._known_at(alarm.t, second).of_another_soil(there))
+            new = self._fitted(second, there, self._known_at(alarm.t, second).of_another_soil(there))
             if new is None or self.mismatch(new):
                 continue
-            if old is not None and not self._likelier(old, new, fit_window(self._problem(apart), self._here, before)):
+            if old is not None and not self._likelier(old, new, self._fitted(self._problem(apart), self._here, before)):
                 return None
             self._crossing, self._here = crossing, there
             return Tracked(new, False, Ground.NEW, crossing.end)
