@@ -69,7 +69,7 @@ def test_the_filter_is_the_joint_solution_for_the_soils_of_all_pieces(drift, sim
     place = Place(fit.optimum.soil, fit.optimum.gains, fit.optimum.latents, 0.0, 0)
     at, directions = fit.optimum.at, fitting.directions(place)
     free, kept = len(fitting.free), directions.shape[1]
-    whole = fitting.with_before(place, at)
+    known = fitting.before_at(place)
     n = free * PIECES + kept - free
     information, gradient = np.zeros((n, n)), np.zeros(n)
     gains = np.arange(free * PIECES, n)
@@ -82,8 +82,8 @@ def test_the_filter_is_the_joint_solution_for_the_soils_of_all_pieces(drift, sim
         information[np.ix_(of, of)] += by.T @ weighed
         gradient[of] += weighed.T @ at.rows[rows, 0]
         if piece == 0:
-            information[np.ix_(of, of)] += whole.known
-            gradient[of] += whole.gradient - directions.T @ at.normal[:, 0]
+            information[np.ix_(of, of)] += known.information
+            gradient[of] += known.gradient
         else:
             link = np.zeros((free, n))
             link[:, of[:free]], link[:, of[:free] - free] = np.eye(free), -np.eye(free)

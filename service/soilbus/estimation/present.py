@@ -9,19 +9,19 @@ a constant one would be late by half a window, and too sure of itself.
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.gauss_newton import Fit
-from soilbus.estimation.normal_equations import Fitting, Place, Point, solved
+from soilbus.estimation.normal_equations import Fitting, Place, solved
 
 Array = NDArray[np.float64]
 
 PIECES = 5
 """Pieces of a whole window."""
+_ENDS = np.arange(1.0, PIECES + 1.0) / PIECES
 
 
 def at_present(fitting: Fitting, fit: Fit, window: float, drift: float) -> Fit:
@@ -31,42 +31,39 @@ def at_present(fitting: Fitting, fit: Fit, window: float, drift: float) -> Fit:
     The same fit where nothing wanders or the numbers stop being finite.  Cost and evidence
     stay those of a constant soil: a wandering one would explain too much that is no soil.
     """
+    if not drift:
+        return fit
     optimum, t = fit.optimum, fit.optimum.t
     place = Place(optimum.soil, optimum.gains, optimum.latents, fit.cost, 0)
-    whole = fitting.with_before(place, optimum.at)
-    if whole is None or not drift:
-        return fit
-    since_end = (t[-1] - t) / window * PIECES
-    cuts = np.searchsorted(-since_end, -np.arange(PIECES - 1.0, 0.0, -1.0), side="right")
-    cuts = np.unique([0, *cuts.tolist(), len(t)])
-    stiffness = PIECES / drift**2
+    before = fitting.before_at(place)
     free, m = len(fitting.free), optimum.at.by_latents.shape[1]
     directions = fitting.directions(place)
-    of_residual = np.column_stack([np.eye(len(directions))[:, 0], directions])
-    joint = np.zeros((of_residual.shape[1],) * 2)  # cost, minus half its gradient, and information of the piece's soil
-    joint[1:, 1:] = whole.known
-    joint[0, 1:] = joint[1:, 0] = whole.gradient - directions.T @ optimum.at.normal[:, 0]
+    of_residual = np.zeros((len(directions), 1 + directions.shape[1]))
+    of_residual[0, 0] = 1.0
+    of_residual[:, 1:] = directions
+    joint = np.zeros((of_residual.shape[1],) * 2)  # cost, half its gradient, information: of gains and the piece's soil
+    joint[1:, 1:] = before.information
+    joint[0, 1:] = joint[1:, 0] = before.gradient
     soil = slice(1, 1 + free)
-    for k, (begin, end) in enumerate(zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True)):
-        if k:
-            step = joint[soil, soil] + stiffness * np.eye(free)
+    stiff = np.eye(free) * PIECES / drift**2
+    ends = np.searchsorted(t - t[-1], window * (_ENDS - 1.0), side="right").tolist()
+    for begin, end in zip([0, *ends[:-1]], ends, strict=True):
+        if begin:
             link = joint[:, soil].copy()
-            link[soil] = -stiffness * np.eye(free)
+            step = link[soil] + stiff
+            link[soil] = -stiff
             joint[soil] = joint[:, soil] = 0.0
-            joint[soil, soil] = stiffness * np.eye(free)
+            joint[soil, soil] = stiff
             joint -= link @ np.linalg.solve(step, link.T)
-        rows = slice(begin * m, end * m)
-        normal = optimum.at.rows[rows].T @ optimum.at.weighed[rows]
-        joint += of_residual.T @ normal @ of_residual
+        if end > begin:
+            rows = slice(begin * m, end * m)
+            joint += of_residual.T @ (optimum.at.rows[rows].T @ optimum.at.weighed[rows]) @ of_residual
     inverse = solved(joint[1:, 1:], joint[1:, 0])
     if inverse is None:
         return fit
+    step, covariance = inverse
     gains = place.gains.copy()
-    gains[fitting.active] -= inverse[0][free:]
-    now = replace(place, soil=fitting.coordinates.moved(place.soil, -inverse[0][:free]), gains=gains)
-    left = Point(joint[1:, 1:], whole.known, whole.bend, joint[1:, 0], whole.cost, optimum.at)
-    belief = fitting.belief(now, left)
-    if belief is None:
-        return fit
-    within = fitting.coordinates.log_directions(now.soil) * drift / math.sqrt(3.0 * PIECES)
-    return replace(fit, belief=belief.drifted(within @ within.T, np.zeros(len(gains))))
+    gains[fitting.active] -= step[free:]
+    covariance[:free, :free] += np.eye(free) * drift**2 / (3.0 * PIECES)  # the end of the last piece is not its mean
+    now = replace(place, soil=fitting.coordinates.moved(place.soil, -step[:free]), gains=gains)
+    return replace(fit, belief=fitting.believed(now, covariance))

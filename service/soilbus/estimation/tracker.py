@@ -183,7 +183,7 @@ class Tracker:
         first = int(np.searchsorted(t, float(last.optimum.t[-1]) - LOOK_BACK * length))
         place = replace(last.belief, soil=last.optimum.soil, gains=last.optimum.gains)
         known = place.drifted(self._drift(place, SINCE_THE_MIDDLE), np.zeros(len(place.gains)))
-        doubt = suspicion(ahead.fitting.given(known), ahead.place, ahead.at, first, ALARM)
+        doubt = suspicion(ahead.fitting, known, ahead.place, ahead.at, first, ALARM)
         if doubt.ratio <= ALARM and fit is not None and fit.chi2 <= self.chi2_limit(fit):
             return None
         begin = float(t[doubt.instant])
