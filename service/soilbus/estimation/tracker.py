@@ -10,7 +10,6 @@ the soil and what is known of the sensors.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
@@ -43,7 +42,7 @@ TRUST, TRUST_AGAIN = 3.5, 0.0
 LOOK_BACK = 0.2
 """Share of a window before the end of the last fit's data from which on a change is looked for."""
 RECENT = 2.0
-"""Windows since the last one that the model described, within which another soil may be why it no longer does."""
+"""Windows after the first sign of another soil within which it may be why the model fails; then something else is."""
 PATIENCE = 0.3
 """Share of a window after the first sign of another soil until its data, if no soil explains them, are a mismatch."""
 SINCE_THE_MIDDLE = 0.5
@@ -149,6 +148,8 @@ class Tracker:
             self._fit = None
             return Tracked(None, False, Ground.SAME, since, *left_out)
         before = self._known_at(since, problem)
+        if self._alarm is not None and self._alarm.t <= end - RECENT * self.settings.window:
+            self._alarm = None  # another soil would have been found by now
         last = self._fit
         changed = None
         if last is None:
@@ -171,12 +172,11 @@ class Tracker:
     def _alarm_in(self, window: Window, ahead: Foreseen, last: Fit, fit: Fit | None, filled: float) -> Alarm | None:
         """The first sign of another soil in a window of which the present one fills so much [s], if there is any.
 
-        As long as nothing explains the data since, the alarm stays what it was; after some
-        windows another soil is no longer believed to be the cause.
+        As long as nothing explains the data since, the alarm stays what it was.
         """
         end, length = float(window.t[-1]), self.settings.window
         if self._alarm is not None and self.mismatch(fit):
-            return self._alarm if self._alarm.t > end - RECENT * length else None
+            return self._alarm
         if self._good_until <= end - length or filled <= GRACE * length:
             return None
         t = ahead.fitting.problem.t
@@ -270,7 +270,7 @@ class Tracker:
             return None
         there = elsewhere(self.prior)
         waits = True
-        for crossing in self._crossings(alarm):
+        for crossing in self._crossings(alarm, float(window.t[0])):
             apart = without_crossing(window, crossing, self.rig.front)
             second = self._problem(apart.rows(np.flatnonzero(apart.t >= crossing.end)))
             arrived = crossing.end + crossing.lag if self._distrusted else crossing.end
@@ -286,13 +286,14 @@ class Tracker:
             return Tracked(new, False, Ground.NEW, crossing.end)
         return Tracked(old, False, Ground.CHANGING, float(window.t[0])) if old is not None and waits else None
 
-    def _crossings(self, alarm: Alarm) -> Iterator[Crossing]:
-        """Borders of growing length that begin at the alarm."""
+    def _crossings(self, alarm: Alarm, start: float) -> list[Crossing]:
+        """Borders of growing length that begin at the alarm; of those over before `start` [s] only the last."""
         chassis = self.rig.chassis
-        wheelbase = WHEELBASE if chassis is None else chassis.wheelbase
-        lag = wheelbase / alarm.speed
-        for share in BORDERS:
-            yield Crossing(alarm.t - _SAME_TIME, alarm.t + share * lag, 0.0 if chassis is None else lag)
+        lag = (WHEELBASE if chassis is None else chassis.wheelbase) / alarm.speed
+        ends = [alarm.t + share * lag for share in BORDERS]
+        over = sum(end <= start for end in ends)
+        apart = 0.0 if chassis is None else lag
+        return [Crossing(alarm.t - _SAME_TIME, end, apart) for end in ends[max(over - 1, 0) :]]
 
     def _likelier(self, old: Fit, new: Fit, one: Fit | None) -> bool:
         """Whether two soils explain much better what one, of the same data, explains."""
