@@ -442,8 +442,8 @@ def _child(here: Any, part: str, path: str, text: str) -> Any:
                 return item
         raise ConfigError([f"--set {text}: no {path}"])
     child = here.setdefault(part, {})
-    if isinstance(child, str):  # "Message.Signal" grows into its table form
-        here[part] = {"signal": child}
+    if isinstance(child, str):  # "Message.Signal", or the name of a column, grows into its table form
+        here[part] = {"column" if path.startswith("table.") else "signal": child}
         child = here[part]
     if not isinstance(child, (dict, list)):
         raise ConfigError([f"--set {text}: {path} is a value, not a table"])

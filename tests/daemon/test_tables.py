@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -12,12 +13,14 @@ import pytest
 from availability import unavailable
 from single_wheel import NOISE, RIG, WIDTH, noisy, sweep, write_csv
 from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.cli import main
 from soilbus.config import Config, ConfigError, parse_config
 from soilbus.daemon.diagnose import diagnose_logs
 from soilbus.daemon.outputs import json_line
 from soilbus.daemon.tables import TableError, candidates, recordings_of_tables, replay_tables, runs_of, window_of_rows
-from soilbus.diagnosis.records import TooLittle
-from soilbus.diagnosis.verdict import Verdict
+from soilbus.diagnosis.completion import complete
+from soilbus.diagnosis.records import TooLittle, record_of_rows
+from soilbus.diagnosis.verdict import Verdict, gap_limit
 from soilbus.estimation.gauss_newton import fit_window
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.report.configuration import configuration_report
@@ -243,6 +246,24 @@ def test_diagnosis_of_tables_names_what_was_hidden_and_nothing_where_nothing_was
     assert found.base.gap > 2.0 > 1.6 > found.completed.gap
 
 
+def test_six_rows_with_nothing_missing_show_no_gap():
+    """What four rows leave open of the soil is no gap: the reduced chi-square of the two others is 1 on average."""
+    config, slips = rig(), (0.0, 0.1, 0.2, 0.3, 0.4, 0.6)
+    the_rig, model, prior = rig_of(config), model_of(config), prior_of(config)
+    rng, gaps = np.random.default_rng(7), []
+    while len(gaps) < 25:
+        truth = Soil(*(prior.median * np.exp(0.6 * prior.log_std * rng.standard_normal(6))))
+        try:
+            rows = noisy(sweep(truth, (1500.0,), slips), rng)
+        except ValueError:  # this soil does not carry the wheel
+            continue
+        values = {"wheel_load": rows["load"], "slip": rows["slip"], "drawbar_pull": rows["pull"]}
+        window = window_of_rows(the_rig, np.arange(6.0), values | {"torque": rows["torque"], "sinkage": rows["sink"]})
+        gaps.append(complete([record_of_rows("", window, the_rig, model)], prior, ()).gap)
+    assert np.mean(gaps) == pytest.approx(1.0, abs=0.35)  # 25 times 6 residuals: sd 0.12, and the model is not linear
+    assert np.mean(np.array(gaps) > gap_limit(6)) <= 0.08
+
+
 def test_a_table_of_few_rows_learns_from_two_thirds_spread_over_all_slips(tmp_path, measured):
     first = {k: v[:7] for k, v in measured.items()}
     recordings = recordings_of_tables(rig(), [write_csv(tmp_path / "t.csv", first)])
@@ -251,8 +272,8 @@ def test_a_table_of_few_rows_learns_from_two_thirds_spread_over_all_slips(tmp_pa
     assert (
         record.learned.slip.min() < record.checked.slip.min() <= record.checked.slip.max() < record.learned.slip.max()
     )
-    with pytest.raises(TooLittle, match="5 usable rows are too few"):
-        recordings_of_tables(rig(), [write_csv(tmp_path / "s.csv", {k: v[:5] for k, v in measured.items()})])
+    with pytest.raises(TooLittle, match="4 usable rows are too few"):
+        recordings_of_tables(rig(), [write_csv(tmp_path / "s.csv", {k: v[:4] for k, v in measured.items()})])
 
 
 def test_effects_that_a_table_cannot_tell_are_no_candidates(tmp_path, measured):
@@ -295,3 +316,24 @@ def test_check_lists_the_columns_and_what_they_tell():
     only_depth = configuration_report(rig(torque=None, drawbar_pull=None))
     assert re.search(r"phi +no: needs torque or drawbar pull", only_depth)
     assert re.search(r"n +yes: sinkage", only_depth)
+
+
+def test_the_command_line_takes_tables_and_answers_faults_in_one_line(tmp_path, measured, capsys):
+    table = write_csv(tmp_path / "t.csv", measured)
+    config = tmp_path / "rig.toml"
+    config.write_text(RIG)
+    arguments = ["diagnose", "--config", str(config), str(table)]
+    assert main([*arguments, "--json", "-"]) == 0
+    findings = json.loads(capsys.readouterr().out)
+    assert findings["verdict"] == "none"
+    assert findings["effects"] == []
+    assert findings["gap"]["before"] < gap_limit(18)
+    for change, code, complaint in (
+        ("table.torque=twist", 1, "no column twist"),
+        ("table.torque.factor=0", 2, "factor of 0"),
+        ("table.where={x=[1]}", 2, "x must be a text or a number"),
+    ):
+        assert main([*arguments, "--set", change]) == code
+        error = capsys.readouterr().err
+        assert complaint in error
+        assert error.count("\n") == 1

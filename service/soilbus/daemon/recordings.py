@@ -57,7 +57,7 @@ def recordings_of(
                 fault = fault or error
                 too_short.append(name)
                 continue
-            records.append(Record(name, *(p.completed(effects, free) for p in (record.learned, record.checked))))
+            records.append(record.completed(effects, free))
         check_heard(intake, [path])
         rejected += intake.refusals.total
         if len(records) == first[-1]:

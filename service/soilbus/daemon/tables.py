@@ -12,6 +12,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -131,7 +132,7 @@ def recordings_of_tables(config: Config, paths: Sequence[Path]) -> Recordings:
                 too_short.append(run.name)
                 fault = error
                 continue
-            records.append(Record(run.name, *(p.completed(effects, free) for p in (record.learned, record.checked))))
+            records.append(record.completed(effects, free))
         if len(records) == first[-1]:
             raise fault
     return Recordings(tuple(records), tuple(first), samples, dict(rejected.most_common()), tuple(too_short))
@@ -227,14 +228,14 @@ def _csv(path: Path, needed: Sequence[str]) -> Columns:
 
 def _parquet(path: Path, needed: Sequence[str]) -> Columns:
     try:
-        from pyarrow import ArrowException
-        from pyarrow.parquet import read_schema, read_table
+        arrow: Any = import_module("pyarrow")  # typed only in part
+        parquet: Any = import_module("pyarrow.parquet")
     except ModuleNotFoundError:
         raise TableError(f"{path}: a Parquet file needs the extra soilbus[tables]") from None
     try:
-        _check_columns(path, read_schema(path).names, needed)
-        table = read_table(path, columns=list(needed))
-    except ArrowException as error:
+        _check_columns(path, parquet.read_schema(path).names, needed)
+        table = parquet.read_table(path, columns=list(needed))
+    except arrow.ArrowException as error:
         raise TableError(f"{path}: not a Parquet file that can be read ({_one_line(error)})") from None
     return {name: table.column(name).to_pylist() for name in needed}
 

@@ -170,7 +170,7 @@ def _complete(
     known: Belief | None = None
     for i, record in enumerate(records):
         problem = record.learned.completed(effects, free)
-        before = Belief.of(prior, problem.gain_std) if known is None else _of_next(known, prior, problem, effects)
+        before = _of_first(record, prior, problem) if known is None else _of_next(known, prior, problem, effects)
         fit = _fitted(problem, prior, before, None if starts is None else starts[i])
         if fit is None:
             return None
@@ -179,6 +179,17 @@ def _complete(
         checks.append(check(record.checked.completed(effects, free), prior, fit))
         known = fit.belief
     return Completion(tuple(effects), free, tuple(befores), tuple(fits), tuple(checks))
+
+
+def _of_first(record: Record, prior: SoilPrior, problem: CompletedProblem) -> Belief:
+    """What is known before the first recording; nothing yet of effects that its model had not."""
+    before = Belief.of(prior, problem.gain_std)
+    if record.known is None:
+        return before
+    gains, covariance = before.gains.copy(), before.covariance.copy()
+    n = len(record.known.gains)
+    gains[:n], covariance[: _SOIL + n, : _SOIL + n] = record.known.gains, record.known.covariance
+    return Belief(record.known.soil, gains, covariance)
 
 
 def _fitted(problem: CompletedProblem, prior: SoilPrior, before: Belief, start: Start | None) -> Fit | None:

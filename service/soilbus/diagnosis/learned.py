@@ -73,6 +73,8 @@ def corrections(records: list[Record], completion: Completion) -> list[Correctio
     names = channels(records[0].learned.rig.wheels, records[0].learned.with_sinkage)
     for place, (channel, wheel) in enumerate(names):
         learned, checked = (_joined(list(part)) for part in zip(*_samples(records, completion, place), strict=True))
+        if not len(learned.z) or not len(checked.z):  # a channel that is not there
+            continue
         terms = _selected(learned)
         explained = _explained(checked, terms)
         if terms and explained > WORTH:
@@ -96,7 +98,7 @@ def _sample(problem: CompletedProblem, at: Linearised, latents: Latents, gains: 
     W, r = problem.n_wheels, problem.rig.radius
     known = np.isfinite(z[:, place])
     raw = at.rows[:, 0].reshape(z.shape)[:, place]
-    scale = np.abs(raw[known]).mean() / max(float(np.abs(z[known, place]).mean()), 1e-12)
+    scale = np.abs(raw[known]).sum() / max(float(np.abs(z[known, place]).sum()), 1e-12)
     own = None if place == W else place % (W + 1)
     slip = 1.0 - latents.ground_speed[:, None] / (r * latents.speed)
     wheels = {"slip": slip, "load": latents.load / latents.load.mean(0), "sinkage": sinkage(latents.entry_angle, r)}

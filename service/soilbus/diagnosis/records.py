@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.completed import CompletedProblem
+from soilbus.estimation.belief import Belief
+from soilbus.estimation.completed import CompletedProblem, Free
 from soilbus.estimation.window import Rig, Window
+from soilbus.terra.effects.effect import Effect
 from soilbus.terra.wheel import WheelModel
 
 BLOCK = 4.0
@@ -17,7 +20,7 @@ CHECKED = 3
 """Every so manieth block is held out."""
 FEWEST = 12
 """Instants that each part of a recording must have."""
-FEWEST_ROWS = 6
+FEWEST_ROWS = 5
 """Rows that a table must have."""
 
 
@@ -27,16 +30,27 @@ class TooLittle(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One recording: the instants that models are fitted to, and those held out."""
+    """One recording: the instants that models are fitted to, and those held out.
+
+    known is what an earlier fit on the same soil left behind of soil, gains and the
+    parameters that the model has; it counts in place of the prior in the first recording.
+    """
 
     name: str
     learned: CompletedProblem
     checked: CompletedProblem
+    known: Belief | None = None
+
+    def completed(self, effects: Sequence[Effect], free: Sequence[Free], known: Belief | None = None) -> Record:
+        """The same under a model with these effects and parameters, of which so much is known."""
+        learned, checked = (part.completed(effects, free) for part in (self.learned, self.checked))
+        return Record(self.name, learned, checked, known)
 
     def thinned(self, every: int) -> Record:
-        """The same with every so manieth instant."""
-        learned, checked = (part.part(slice(None, None, every)) for part in (self.learned, self.checked))
-        return Record(self.name, learned, checked)
+        """The same with every so manieth instant; a table of few rows stays whole."""
+        parts = self.learned, self.checked
+        learned, checked = (part.part(slice(None, None, min(every, part.n // FEWEST + 1))) for part in parts)
+        return Record(self.name, learned, checked, self.known)
 
 
 def record_of(name: str, window: Window, rig: Rig, model: WheelModel, min_speed: float, max_turn: float) -> Record:
@@ -51,15 +65,17 @@ def record_of(name: str, window: Window, rig: Rig, model: WheelModel, min_speed:
 
 
 def record_of_rows(name: str, window: Window, rig: Rig, model: WheelModel) -> Record:
-    """A table of steady states, of which every third row is held out; TooLittle where it has not enough usable ones.
+    """A table of steady states, of which a third is held out; TooLittle where it has not enough usable rows.
 
-    Rows do not hang together in time as the instants of a drive do, so blocks of them would
-    only part small slips from large: every third row has its neighbours among the others.
+    Rows do not hang together in time as the instants of a drive do, and blocks of them would
+    only part small slips from large.  So it is every third row in the order of slip, that
+    has its neighbours among the others.
     """
     problem = CompletedProblem(window, rig, model, min_speed=0.0)
     if problem.n < FEWEST_ROWS:
         raise TooLittle(f"{name}: {problem.n} usable rows are too few to learn from some and check with others")
-    held_out = np.arange(problem.n) % CHECKED == CHECKED // 2
+    rank = np.argsort(np.argsort(problem.slip.mean(1), kind="stable"))
+    held_out = rank % CHECKED == CHECKED // 2
     learned, checked = (problem.part(np.flatnonzero(part)) for part in (~held_out, held_out))
     return Record(name, learned, checked)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +70,14 @@ class Point:
         return float(step @ self.information @ step)
 
 
+class Known(NamedTuple):
+    """What was known before, as a parabola of coordinates and active gains: information, half its gradient, cost."""
+
+    information: Array
+    gradient: Array
+    cost: float
+
+
 class Fitting:
     """A window's residuals together with what was known before: free coordinates (F), active gains (A)."""
 
@@ -112,25 +121,29 @@ class Fitting:
     def with_before(self, place: Place, at: Linearised) -> Point | None:
         """Those of residuals linearised already."""
         free = len(self.free)
-        off = np.concatenate([np.log(place.soil[self.free]), place.gains[self.active]]) - self._mean
         directions = self.directions(place)
         gradient = directions.T @ at.normal[:, 0]
-        by_known = self._by_known(place)
-        known = self.precision(place)
-        bend = np.zeros(known.shape)
+        known = self.before_at(place)
+        bend = np.zeros((len(gradient), len(gradient)))
         bend[:free, :free] = self.coordinates.bend(gradient[:free])
-        pull = self._precision @ off
-        cost = at.chi2 + float(off @ pull)
+        cost = at.chi2 + known.cost
         if not np.isfinite(cost):
             return None
         return Point(
-            information=directions.T @ at.normal @ directions + known,
-            known=known,
+            information=directions.T @ at.normal @ directions + known.information,
+            known=known.information,
             bend=bend,
-            gradient=gradient + by_known.T @ pull,
+            gradient=gradient + known.gradient,
             cost=cost,
             at=at,
         )
+
+    def before_at(self, place: Place) -> Known:
+        """What was known before, seen from a place."""
+        off = np.concatenate([np.log(place.soil[self.free]), place.gains[self.active]]) - self._mean
+        by_known = self._by_known(place)
+        pull = self._precision @ off
+        return Known(by_known.T @ self._precision @ by_known, by_known.T @ pull, float(off @ pull))
 
     def directions(self, place: Place) -> Array:
         """What a column of Linearised.rows (1 + 6 + G) has of each coordinate and active gain (F + A)."""
@@ -139,11 +152,6 @@ class Fitting:
         directions[1:7, :free] = place.soil[:, None] * self._log_directions(place.soil)
         directions[7 + self.active, free + np.arange(len(self.active))] = 1.0
         return directions
-
-    def precision(self, place: Place) -> Array:
-        """Information (F + A, F + A) of what was known before, by the coordinates at a place."""
-        by_known = self._by_known(place)
-        return np.asarray(by_known.T @ self._precision @ by_known)
 
     def _by_known(self, place: Place) -> Array:
         free = len(self.free)
@@ -171,13 +179,15 @@ class Fitting:
     def belief(self, place: Place, point: Point) -> Belief | None:
         """What is known at the optimum; None where the information is singular."""
         inverse = solved(point.information, point.gradient)
-        if inverse is None:
-            return None
+        return None if inverse is None else self.believed(place, inverse[1])
+
+    def believed(self, place: Place, covariance: Array) -> Belief:
+        """A place with the covariance (F + A, F + A) of its coordinates and active gains."""
         free, n_gains = len(self.free), len(place.gains)
         spread = np.zeros((_SOIL + n_gains, free + len(self.active)))
         spread[:_SOIL, :free] = self._log_directions(place.soil)
         spread[_SOIL + self.active, free + np.arange(len(self.active))] = 1.0
-        return Belief(place.soil, place.gains, spread @ inverse[1] @ spread.T)
+        return Belief(place.soil, place.gains, spread @ covariance @ spread.T)
 
     def _log_directions(self, soil: Array) -> Array:
         return self.coordinates.log_directions(soil)

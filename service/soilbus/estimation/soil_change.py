@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.estimation.belief import Belief
 from soilbus.estimation.linearised import Linearised
 from soilbus.estimation.normal_equations import Fitting, Place
 from soilbus.estimation.window import Window
@@ -28,11 +29,11 @@ class Suspicion(NamedTuple):
     ratio: float
 
 
-def suspicion(known: Fitting, place: Place, at: Linearised, first: int, enough: float) -> Suspicion:
+def suspicion(fitting: Fitting, before: Belief, place: Place, at: Linearised, first: int, enough: float) -> Suspicion:
     """The likeliest beginning of another soil among the instants from `first` on.
 
-    The residuals are linearised at a place that earlier data told (`at`); known.before is
-    what they told.  Below `enough` the ratio is only an upper bound.
+    The residuals are linearised at a place that earlier data told (`at`); `before` is what
+    they told.  Below `enough` the ratio is only an upper bound.
     """
     n, m = at.by_latents.shape[:2]
     if first >= n:
@@ -43,13 +44,14 @@ def suspicion(known: Fitting, place: Place, at: Linearised, first: int, enough: 
     ratio = _ratio(misfit, count)
     if ratio.max() <= enough:
         return Suspicion(first + int(np.argmax(ratio)), float(ratio.max()))
+    known = fitting.given(before)
     by_known = known.directions(place)
     gradient = np.einsum("imk,im->ik", weighed, rows[:, :, 0]) @ by_known
     information = by_known.T @ np.einsum("imk,iml->ikl", rows, weighed) @ by_known
-    before = known.precision(place)
-    begin = int(np.argmax(_ratio(misfit - _explained(gradient, information + before), count)))
+    told = known.before_at(place).information
+    begin = int(np.argmax(_ratio(misfit - _explained(gradient, information + told), count)))
     # From there on together: another point within what is known must not pass for another soil.
-    left = misfit[begin:].sum() - _explained(gradient[begin:].sum(0), information[begin:].sum(0) + before)
+    left = misfit[begin:].sum() - _explained(gradient[begin:].sum(0), information[begin:].sum(0) + told)
     return Suspicion(first + begin, float(_ratio(left[None], count[begin:].sum(keepdims=True))[0]))
 
 

@@ -13,6 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +21,11 @@ from numpy.typing import NDArray
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.completed import CompletedProblem, Free
 from soilbus.estimation.coordinates import Coordinates
-from soilbus.estimation.gauss_newton import Fit, fit_window, foreseen, resume
+from soilbus.estimation.gauss_newton import Fit, Foreseen, fit_window, foreseen, resume
 from soilbus.estimation.marginal import with_whole
+from soilbus.estimation.normal_equations import Fitting
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+from soilbus.estimation.present import at_present
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.soil_change import Crossing, suspicion, without_crossing
 from soilbus.estimation.window import Rig, Window
@@ -42,12 +45,18 @@ TRUST, TRUST_AGAIN = 3.5, 0.0
 """Standard deviations of chi-square that a window may have above the allowed: always, and after a mismatch."""
 LOOK_BACK = 0.2
 """Share of a window before the end of the last fit's data from which on a change is looked for."""
+RECENT = 2.0
+"""Windows after the first sign of another soil within which it may be why the model fails; then something else is."""
+PATIENCE = 0.3
+"""Share of a window after the first sign of another soil until its data, if no soil explains them, are a mismatch."""
+SINCE_THE_MIDDLE = 0.5
+"""Windows that a soil may have drifted since it was what a fit that takes it for constant says."""
 GRACE = 0.3
 """Share of a window that a new soil must fill before the next change is looked for."""
 LEARNED = 0.5
 """Share of a window that its data must fill for later windows to build on it: the posterior of less is not Gaussian."""
-BORDER = 0.5
-"""Length after the first sign of another soil that is of neither, in wheelbases."""
+BORDERS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.5, 10.5)
+"""Lengths after the first sign of another soil that may be of neither, in wheelbases: borders are sharp or gradual."""
 GAIN_MEMORY = 60.0
 """Windows in which a sensor's gain error may change by its whole uncertainty."""
 WHEELBASE = 2.0
@@ -97,6 +106,13 @@ class Tracked:
     turning: int = 0
 
 
+class Alarm(NamedTuple):
+    """When the data first disagreed with the soil known [s], and how fast the vehicle then was [m/s]."""
+
+    t: float
+    speed: float
+
+
 def elsewhere(prior: SoilPrior) -> SoilPrior:
     """Prior of a soil that the vehicle came upon: at least as wide as known soils differ, what is held stays held."""
     soils = np.log(list(SOILS.values()))
@@ -130,6 +146,7 @@ class Tracker:
         self._distrusted = False
         self._fit: Fit | None = None
         self._good_until = -math.inf
+        self._alarm: Alarm | None = None
         self._crossing: Crossing | None = None
         self._beliefs: list[tuple[float, Belief]] = []
 
@@ -145,41 +162,74 @@ class Tracker:
             self._fit = None
             return Tracked(None, False, Ground.SAME, since, *left_out)
         before = self._known_at(since, problem)
+        if self._alarm is not None and self._alarm.t <= end - RECENT * self.settings.window:
+            self._alarm = None  # another soil would have been found by now
         last = self._fit
+        changed = None
         if last is None or last.rival is not None:
             fit = self._afresh(problem, before)
+            if self.mismatch(fit) and self._alarm is not None:
+                changed = self._another_soil(window, self._alarm, fit, before, None)
         else:
             ahead = foreseen(problem, self._here, last, before)
-            fit = resume(ahead)
+            fit = self._now(ahead.fitting, resume(ahead))
             if fit is None or not fit.converged:  # a long valley is no sign of another soil
-                fit = fit_window(problem, self._here, before)
-            if self._good_until > end - self.settings.window and end - since > GRACE * self.settings.window:
-                known = ahead.fitting.given(last.whole)
-                sure = float(last.optimum.t[-1]) - LOOK_BACK * self.settings.window
-                first = int(np.searchsorted(problem.t, sure))
-                doubt = suspicion(known, ahead.place, ahead.at, first, ALARM)
-                if doubt.ratio > ALARM or self.mismatch(fit):
-                    changed = self._two_soils(window, float(problem.t[doubt.instant]), before, last)
-                    if changed is not None:
-                        return self._remembered(replace(changed, standstill=left_out[0], turning=left_out[1]), end)
-            if self.mismatch(fit):
+                fit = self._fitted(problem, self._here, before)
+            self._alarm = self._alarm_in(window, ahead, last, fit, end - since)
+            if self._alarm is not None:
+                changed = self._another_soil(window, self._alarm, fit, before, last)
+            if changed is None and self.mismatch(fit):
                 fit = self._afresh(problem, before)
+        if changed is not None:
+            return self._remembered(replace(changed, standstill=left_out[0], turning=left_out[1]), end)
         if fit is not None and not self.mismatch(fit):
             fit = with_whole(problem, self._here, before, fit)
         ground = Ground.NEW if new else Ground.SAME
         return self._remembered(Tracked(fit, self.mismatch(fit), ground, since, *left_out), end)
 
+    def _alarm_in(self, window: Window, ahead: Foreseen, last: Fit, fit: Fit | None, filled: float) -> Alarm | None:
+        """The first sign of another soil in a window of which the present one fills so much [s], if there is any.
+
+        As long as nothing explains the data since, the alarm stays what it was.
+        """
+        end, length = float(window.t[-1]), self.settings.window
+        if self._alarm is not None and self.mismatch(fit):
+            return self._alarm
+        if self._good_until <= end - length or filled <= GRACE * length:
+            return None
+        t = ahead.fitting.problem.t
+        first = int(np.searchsorted(t, float(last.optimum.t[-1]) - LOOK_BACK * length))
+        place = replace(last.whole, soil=last.optimum.soil, gains=last.optimum.gains)
+        known = place.drifted(self._drift(place, SINCE_THE_MIDDLE), np.zeros(len(place.gains)))
+        doubt = suspicion(ahead.fitting, known, ahead.place, ahead.at, first, ALARM)
+        if doubt.ratio <= ALARM and fit is not None and fit.chi2 <= self.chi2_limit(fit):
+            return None
+        begin = float(t[doubt.instant])
+        near = window.ground_speed[(window.t >= begin - 1.0) & (window.t <= begin)]
+        return Alarm(begin, max(float(np.nanmean(near)), self.settings.min_speed))
+
     def _afresh(self, problem: WindowProblem, before: Belief) -> Fit | None:
         """A fit that starts anywhere; what was known of the soil counts only where it agrees with the data."""
-        fit = fit_window(problem, self._here, before)
+        fit = self._fitted(problem, self._here, before)
         if not self.mismatch(fit) or not self._beliefs:
             return fit
         there = elsewhere(self.prior)
-        other = fit_window(problem, there, before.of_another_soil(there))
+        other = self._fitted(problem, there, before.of_another_soil(there))
         if self.mismatch(other):
             return fit
         self._here = there
         return other
+
+    def _fitted(self, problem: WindowProblem, prior: SoilPrior, before: Belief) -> Fit | None:
+        """A fit that starts anywhere, of the present soil."""
+        fit = fit_window(problem, prior, before)
+        return fit if fit is None else self._now(Fitting(problem, prior, before), fit)
+
+    def _now(self, fitting: Fitting, fit: Fit | None) -> Fit | None:
+        """A fit with the soil as it is at the end of the window."""
+        if fit is None or not fit.converged:
+            return fit
+        return at_present(fitting, fit, self.settings.window, self.settings.drift)
 
     def mismatch(self, fit: Fit | None) -> bool:
         """Whether a fit failed or leaves more than noise."""
@@ -210,38 +260,64 @@ class Tracker:
             return Belief.of(self._here, problem.gain_std)
         self._beliefs = self._beliefs[ended[-1] :]
         end, belief = self._beliefs[0]
-        elapsed = (t - end) / self.settings.window + 1.0
-        gains = problem.gain_std**2 * min(elapsed / GAIN_MEMORY, 1.0)
+        elapsed = (t - end) / self.settings.window
+        gains = problem.gain_std**2 * min((elapsed + 1.0) / GAIN_MEMORY, 1.0)
         if self._crossing is not None and end <= self._crossing.end:
             return belief.of_another_soil(self._here).drifted(np.zeros((_SOIL, _SOIL)), gains)
-        coordinates = Coordinates(self._here, float(self.rig.width.mean()))
-        directions = coordinates.log_directions(belief.soil)
-        return belief.drifted(self.settings.drift**2 * elapsed * (directions @ directions.T), gains)
+        return belief.drifted(self._drift(belief, elapsed), gains)
 
-    def _two_soils(self, window: Window, t: float, before: Belief, last: Fit) -> Tracked | None:
-        """The window as two soils of which the second begins at t [s], if that is much likelier than one; else None."""
-        near = (window.t >= t - 1.0) & (window.t <= t)
-        speed = max(float(np.nanmean(window.ground_speed[near])), self.settings.min_speed)
-        length = WHEELBASE if self.rig.chassis is None else self.rig.chassis.wheelbase
-        lag = length / speed
-        crossing = Crossing(t - _SAME_TIME, t + BORDER * lag, 0.0 if self.rig.chassis is None else lag)
-        apart = without_crossing(window, crossing, self.rig.front)
-        first = self._problem(apart.rows(np.flatnonzero(apart.t < crossing.begin)))
-        second = self._problem(apart.rows(np.flatnonzero(apart.t >= crossing.end)))
-        old = resume(foreseen(first, self._here, last, before)) if first.n_rows >= MIN_NEW_ROWS else None
-        if old is None or self.mismatch(old):
+    def _drift(self, belief: Belief, elapsed: float) -> Array:
+        """Covariance (6, 6) by which the soil's logarithms drift in so many windows."""
+        directions = Coordinates(self._here, float(self.rig.width.mean())).log_directions(belief.soil)
+        return np.asarray(self.settings.drift**2 * elapsed * (directions @ directions.T))
+
+    def _another_soil(
+        self, window: Window, alarm: Alarm, one: Fit | None, before: Belief, last: Fit | None
+    ) -> Tracked | None:
+        """The window as two soils, the second from the alarm on, if that is much likelier than `one`; else None.
+
+        Without a last fit, or where the first soil is out of the window, the second alone.
+        """
+        first = self._problem(window.rows(np.flatnonzero(window.t < alarm.t - _SAME_TIME)))
+        old = None
+        if last is not None and first.n_rows >= MIN_NEW_ROWS:
+            ahead = foreseen(first, self._here, last, before)
+            old = self._now(ahead.fitting, resume(ahead))
+        if self.mismatch(old):
+            old = None
+        if old is None and not self.mismatch(one):
             return None
-        if second.n_rows < MIN_NEW_ROWS:
-            return Tracked(old, False, Ground.CHANGING, float(apart.t[0]))
         there = elsewhere(self.prior)
-        new = fit_window(second, there, self._known_at(t, second).of_another_soil(there))
-        if new is None or self.mismatch(new):
-            return None
-        one = fit_window(self._problem(apart), self._here, before)
-        if one is not None and one.converged and one.evidence - old.evidence - new.evidence < CHANGED:
-            return None
-        self._crossing, self._here = crossing, there
-        return Tracked(new, False, Ground.NEW, crossing.end)
+        waits = True
+        for crossing in self._crossings(alarm, float(window.t[0])):
+            apart = without_crossing(window, crossing, self.rig.front)
+            second = self._problem(apart.rows(np.flatnonzero(apart.t >= crossing.end)))
+            arrived = crossing.end + crossing.lag if self._distrusted else crossing.end
+            if second.n_rows < MIN_NEW_ROWS or window.t[-1] < arrived:
+                break  # after a mismatch the wheels of both axles must agree, and agree with the draft
+            waits = self.mismatch(one) and window.t[-1] < alarm.t + PATIENCE * self.settings.window
+            known = self._known_at(alarm.t, second).of_another_soil(there)
+            new = self._fitted(second, there, known)
+            if new is None or self.mismatch(new):
+                continue
+            if old is not None and not self._likelier(old, new, self._fitted(self._problem(apart), self._here, before)):
+                return None
+            self._crossing, self._here = crossing, there
+            return Tracked(with_whole(second, there, known, new), False, Ground.NEW, crossing.end)
+        return Tracked(old, False, Ground.CHANGING, float(window.t[0])) if old is not None and waits else None
+
+    def _crossings(self, alarm: Alarm, start: float) -> list[Crossing]:
+        """Borders of growing length that begin at the alarm; of those over before `start` [s] only the last."""
+        chassis = self.rig.chassis
+        lag = (WHEELBASE if chassis is None else chassis.wheelbase) / alarm.speed
+        ends = [alarm.t + share * lag for share in BORDERS]
+        over = sum(end <= start for end in ends)
+        apart = 0.0 if chassis is None else lag
+        return [Crossing(alarm.t - _SAME_TIME, end, apart) for end in ends[max(over - 1, 0) :]]
+
+    def _likelier(self, old: Fit, new: Fit, one: Fit | None) -> bool:
+        """Whether two soils explain much better what one, of the same data, explains."""
+        return one is None or not one.converged or one.evidence - old.evidence - new.evidence >= CHANGED
 
     def _of_this_soil(self, window: Window) -> Window:
         if self._crossing is None:

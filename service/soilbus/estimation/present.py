@@ -1,0 +1,69 @@
+"""The soil under the wheels now, where a window's fit takes it for constant.
+
+At the optimum of the fit the window is linear.  It is cut into pieces of which each has
+its own soil, a random walk away from that of the piece before, while the sensors' gain
+errors stay what they are: an information filter from piece to piece (e.g. Anderson &
+Moore, Optimal Filtering, 1979, sect. 6.3).  What the last piece has is the present soil;
+a constant one would be late by half a window, and too sure of itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.estimation.gauss_newton import Fit
+from soilbus.estimation.normal_equations import Fitting, Place, solved
+
+Array = NDArray[np.float64]
+
+PIECES = 5
+"""Pieces of a whole window."""
+_ENDS = np.arange(1.0, PIECES + 1.0) / PIECES
+
+
+def at_present(fitting: Fitting, fit: Fit, window: float, drift: float) -> Fit:
+    """The fit with the belief of a soil that wanders.
+
+    drift: sd by which each coordinate of the soil changes in the time of one window [s].
+    The same fit where nothing wanders or the numbers stop being finite.  Cost and evidence
+    stay those of a constant soil: a wandering one would explain too much that is no soil.
+    """
+    if not drift:
+        return fit
+    optimum, t = fit.optimum, fit.optimum.t
+    place = Place(optimum.soil, optimum.gains, optimum.latents, fit.cost, 0)
+    before = fitting.before_at(place)
+    free, m = len(fitting.free), optimum.at.by_latents.shape[1]
+    directions = fitting.directions(place)
+    of_residual = np.zeros((len(directions), 1 + directions.shape[1]))
+    of_residual[0, 0] = 1.0
+    of_residual[:, 1:] = directions
+    joint = np.zeros((of_residual.shape[1],) * 2)  # cost, half its gradient, information: of gains and the piece's soil
+    joint[1:, 1:] = before.information
+    joint[0, 1:] = joint[1:, 0] = before.gradient
+    soil = slice(1, 1 + free)
+    stiff = np.eye(free) * PIECES / drift**2
+    ends = np.searchsorted(t - t[-1], window * (_ENDS - 1.0), side="right").tolist()
+    for begin, end in zip([0, *ends[:-1]], ends, strict=True):
+        if begin:
+            link = joint[:, soil].copy()
+            step = link[soil] + stiff
+            link[soil] = -stiff
+            joint[soil] = joint[:, soil] = 0.0
+            joint[soil, soil] = stiff
+            joint -= link @ np.linalg.solve(step, link.T)
+        if end > begin:
+            rows = slice(begin * m, end * m)
+            joint += of_residual.T @ (optimum.at.rows[rows].T @ optimum.at.weighed[rows]) @ of_residual
+    inverse = solved(joint[1:, 1:], joint[1:, 0])
+    if inverse is None:
+        return fit
+    step, covariance = inverse
+    gains = place.gains.copy()
+    gains[fitting.active] -= step[free:]
+    covariance[:free, :free] += np.eye(free) * drift**2 / (3.0 * PIECES)  # the end of the last piece is not its mean
+    now = replace(place, soil=fitting.coordinates.moved(place.soil, -step[:free]), gains=gains)
+    return replace(fit, belief=fitting.believed(now, covariance))

@@ -1,0 +1,98 @@
+"""What published points tell whatever the details: the rest is for `python -m tests.diagnosis.published` to print."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.diagnosis.completion import complete
+from soilbus.diagnosis.diagnose import diagnose
+from soilbus.diagnosis.records import record_of
+from soilbus.diagnosis.verdict import Verdict, gap_limit
+from soilbus.estimation.window import BinStore
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import excited
+from soilbus.terra.effects.catalogue import CATALOGUE
+
+from .published import configuration, diagnosed, records_of, strain
+
+TESTED_PHI = math.radians(31.9)
+"""Friction angle of the soil of Ding et al. 2011, from their shear tests."""
+
+
+@pytest.fixture(scope="module")
+def points(field_recording):
+    return field_recording("single-wheel-published.csv")
+
+
+@pytest.fixture(scope="module")
+def ding(points):
+    return {
+        (wheel, errors): diagnosed("ding2011", wheel, errors, points)
+        for wheel in ("smooth", "lugged")
+        for errors in (1, 2)
+    }
+
+
+@pytest.mark.parametrize("errors", [1, 2])
+@pytest.mark.parametrize("wheel", ["smooth", "lugged"])
+def test_both_wheels_of_ding_dig_in_as_they_slip(ding, wheel, errors):
+    """Their own finding, from which n = n0 + n1 s comes, outlives errors twice as large as assumed.
+
+    Those leave a shift of the stress peak not far behind.
+    """
+    found = ding[wheel, errors]
+    first = found.additions[0]
+    assert first.effect.name == "slip_sinkage"
+    others = max(fall for name, fall in first.falls.items() if name != "slip_sinkage")
+    assert first.falls["slip_sinkage"] > (1.3 if errors == 1 else 1.0) * others
+    assert found.completed.gap - 1.0 < 0.5 * (found.base.gap - 1.0)
+    assert found.completed.parameters()["slip_sinkage"]["exponent"].value == pytest.approx(0.7, abs=0.3)
+
+
+def test_only_the_lugged_wheel_finds_the_friction_of_the_soil_itself(ding):
+    """The prior holds both to 31.9 deg with 3 deg; the smooth rim slides before the soil shears."""
+    told = {wheel: ding[wheel, 1].completed.fits[-1].posterior.parameters()["phi"] for wheel in ("smooth", "lugged")}
+    assert abs(told["lugged"].value - TESTED_PHI) < 2.0 * told["lugged"].std
+    assert told["smooth"].value + 3.0 * told["smooth"].std < TESTED_PHI
+
+
+@pytest.mark.parametrize("errors", [1, 2])
+def test_the_smooth_wheels_soil_is_strained_by_the_lugged_wheel(points, ding, errors):
+    """Something differs between them beside what both share; six points each do not tell what for sure."""
+    config = configuration("ding2011", "lugged", errors)
+    records = records_of(config, points, ding["smooth", errors].completed)
+    shown = complete(records, prior_of(config), records[0].learned.effects)
+    assert shown.names == ("slip_sinkage",)
+    assert strain(shown) > 1.5
+    again = records_of(configuration("ding2011", "smooth", errors), points, ding["smooth", errors].completed)
+    assert strain(complete(again, prior_of(config), again[0].learned.effects)) < 0.5  # its own points do not
+
+
+def test_points_without_torque_are_diagnosed(points):
+    found = diagnosed("rashid1", "lugged", 2, points)
+    assert found.base.rows == 10  # five pulls and five sinkages
+    assert found.base.gap > gap_limit(found.base.checked_rows)
+    assert found.verdict is not Verdict.NONE
+
+
+def test_the_papers_shear_law_against_exponential_soil_is_named():
+    """Xi et al. 2024 take tau = (c + sigma tan phi) j / (j + K); the simulated soil follows Janosi and Hanamoto."""
+    seconds = 60.0
+    recording = simulate(reference_configuration(), excited("dry_sand", seconds), 3, ())
+    config = reference_configuration(['model.shear_law="rational"'])
+    rig = rig_of(config)
+    bins = BinStore(rig, config.estimator.bin, 0.0)
+    bins.add({name: (c.t, c.value) for name, c in recording.channels.items() if name in rig.channels})
+    settings = config.estimator
+    window = bins.window(0.0, seconds)
+    record = record_of("drive", window, rig, model_of(config), settings.min_speed, settings.max_turn)
+    found = diagnose([record], prior_of(config), list(CATALOGUE.values()))
+    assert found.verdict is Verdict.NAMED
+    assert [addition.effect.name for addition in found.additions] == ["exponential_shear"]
+    share = found.completed.parameters()["exponential_shear"]["share"]
+    assert abs(share.value - 1.0) < 3.0 * share.std
+    assert share.std < 0.2
