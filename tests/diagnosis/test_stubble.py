@@ -1,0 +1,32 @@
+"""A recording that nobody here wrote: the plain model fails on every window, the completed one on none."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from soilbus.cli import main
+
+FIELD = Path(__file__).resolve().parents[1] / "field/field.toml"
+
+
+def test_stubble_is_described_once_its_effect_is_in_the_model(field_recording, tmp_path, capsys):
+    log, model = str(field_recording("stubble.log.gz")), tmp_path / "completed.toml"
+    assert main(["diagnose", "--config", str(FIELD), log, "--json", "-", "--model-out", str(model)]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["verdict"] == "named"
+    assert [effect["name"] for effect in found["effects"]] == ["rate_stiffening"]
+    assert found["gap"]["before"] > 3.0 > found["gap"]["limit"] > found["gap"]["after"]
+    status, chi2 = {}, {}
+    for name, config in (("plain", FIELD), ("completed", model)):
+        assert main(["replay", "--config", str(config), log, "--json", str(tmp_path / name)]) == 0
+        windows = [json.loads(line) for line in (tmp_path / name).read_text().splitlines()]
+        status[name] = Counter(window["status"] for window in windows)
+        chi2[name] = [window["chi2"] for window in windows if window["chi2"] is not None]
+    assert status["plain"]["valid"] == 0
+    assert status["completed"]["valid"] >= 0.95 * sum(status["completed"].values()) > 100.0
+    assert np.median(chi2["plain"]) > 2.0
+    assert np.median(chi2["completed"]) < 1.15
