@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.config import Config, load_config
-from soilbus.estimation.coordinates import BOUND
+from soilbus.estimation.coordinates import BOUND, Coordinates
 from soilbus.estimation.gauss_newton import Fit, descend, fit_window
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.residuals import WindowProblem
@@ -28,6 +29,7 @@ from soilbus.terra.wheel import Soil
 FIELD = Path(__file__).resolve().parents[1] / "field/field.toml"
 KINDS = ("loam", "wet_clay", "dry_sand")
 EXCITED = Swing(0.05, 0.40)
+LEANING = Swing(-0.15, 0.15)
 SAME_COST, SAME_SOIL = 0.1, 0.1
 """Cost, and deviation of any parameter in posterior standard deviations, within which two optima are one."""
 
@@ -40,20 +42,39 @@ class Case(NamedTuple):
     prior: SoilPrior
 
 
-def case(
-    name: str, config: Config, soil: str, seconds: float = 10.0, slip: Swing = EXCITED, sinkage: bool = True,
-    seed: int = 1, side_shift: Swing = Swing(-0.15, 0.15),
-) -> Case:  # fmt: skip
+class Ends(NamedTuple):
+    """Where descents ended: at the best optimum of all, at another as good, at a worse one, or nowhere.
+
+    worse (count,) are their costs above the best's; fit is what `fit_window` says, above its
+    cost above the best's and off its largest deviation from it; seconds are those of one descent.
+    """
+
+    same: int
+    other: int
+    worse: list[float]
+    failed: int
+    fit: Fit
+    above: float
+    off: float
+    seconds: float
+
+
+def constant(slip: float) -> Swing:
+    """No swing at all."""
+    return Swing(slip, slip + 1e-6)
+
+
+def window(
+    config: Config, soil: str, seconds: float = 10.0, slip: Swing = EXCITED, sinkage: bool = True, seed: int = 1,
+    side_shift: Swing = LEANING,
+) -> WindowProblem:  # fmt: skip
     """A window of a simulated drive on a known soil."""
     scenario = Scenario(seconds, (Patch(0.0, soil),), slip=slip, side_shift=side_shift)
     rig, channels = rig_of(config), simulate(config, scenario, seed).channels
+    wanted = [c for c in rig.channels if c in channels and (sinkage or not c.startswith("sinkage"))]
     store = BinStore(rig, config.estimator.bin, 0.0)
-    store.add({
-        c: (channels[c].t, channels[c].value)
-        for c in rig.channels if c in channels and (sinkage or not c.startswith("sinkage"))
-    })  # fmt: skip
-    problem = WindowProblem(store.window(0.0, seconds), rig, model_of(config), config.estimator.min_speed)
-    return Case(f"{name}, {soil}, {seconds:g} s" + (", sinkage" if sinkage else ""), problem, prior_of(config))
+    store.add({c: (channels[c].t, channels[c].value) for c in wanted})
+    return WindowProblem(store.window(0.0, seconds), rig, model_of(config), config.estimator.min_speed)
 
 
 def told(soil: str) -> list[str]:
@@ -70,64 +91,77 @@ def two_wheels(config: Config) -> Config:
 def cases() -> Iterator[Case]:
     """Windows of all kinds."""
     for soil in KINDS:
-        free, known, field = (
-            reference_configuration(),
-            reference_configuration(told(soil)),
-            load_config(FIELD, told(soil)),
-        )
-        for sinkage in (True, False):
-            for seconds in (2.0, 10.0):
-                yield case("c and K free", free, soil, seconds, sinkage=sinkage)
-                yield case("c and K known", known, soil, seconds, sinkage=sinkage)
-            yield case("field rig", field, soil, sinkage=sinkage)
-            yield case("two wheels", two_wheels(free), soil, sinkage=sinkage)
-            yield case("constant slip", free, soil, slip=Swing(0.15, 0.15 + 1e-6), sinkage=sinkage)
+        free, known = reference_configuration(), reference_configuration(told(soil))
+        kinds = [
+            ("c and K free", free, 2.0, EXCITED), ("c and K free", free, 10.0, EXCITED),
+            ("c and K known", known, 2.0, EXCITED), ("c and K known", known, 10.0, EXCITED),
+            ("field rig", load_config(FIELD, told(soil)), 10.0, EXCITED),
+            ("two wheels", two_wheels(free), 10.0, EXCITED),
+            ("constant slip", free, 10.0, constant(0.15)),
+        ]  # fmt: skip
+        for name, config, seconds, slip in kinds:
+            for sinkage in (True, False):
+                what = f"{name}, {soil}, {seconds:g} s{', sinkage' if sinkage else ''}"
+                yield Case(what, window(config, soil, seconds, slip, sinkage), prior_of(config))
 
 
-def drawn(prior: SoilPrior, rng: np.random.Generator, width: float) -> Soil:
-    """A soil of the prior, kept as near to it as a fit keeps its own."""
-    deviation = np.clip(rng.standard_normal(len(prior.median)), -BOUND, BOUND)
-    return Soil(*(prior.median * np.exp(prior.log_std * deviation)).tolist())
+def starts(prior: SoilPrior, width: float, count: int, seed: int) -> Iterator[Soil]:
+    """Soils of the prior, kept as near to it as a fit keeps its own; width [m] is the mean tyre's."""
+    coordinates = Coordinates(prior, width)
+    for deviation in np.random.default_rng(seed).standard_normal((count, len(prior.median))).clip(-BOUND, BOUND):
+        yield Soil(*coordinates.within(prior.median * np.exp(prior.log_std * deviation)).tolist())
 
 
 def apart(fit: Fit, other: Fit) -> float:
     """Largest deviation of a parameter of one fit from another's, in standard deviations of the other."""
     std = np.sqrt(np.diag(other.posterior.log_covariance))
     free = std > 0.0
-    return float(
-        np.max(np.abs(np.log(np.asarray(fit.posterior.soil) / other.posterior.soil)[free] / std[free]), initial=0)
-    )
+    off = np.log(np.asarray(fit.posterior.soil) / np.asarray(other.posterior.soil))
+    return float(np.max(np.abs(off[free] / std[free]), initial=0.0))
 
 
-def main() -> None:
+def descents(problem: WindowProblem, prior: SoilPrior, count: int, seed: int) -> tuple[list[Fit], int]:
+    """The descents that converged, and how many did not."""
+    ends = [descend(problem, prior, s) for s in starts(prior, float(problem.rig.width.mean()), count, seed)]
+    good = [end for end in ends if end is not None and end.converged]
+    return good, count - len(good)
+
+
+def ends_of(case: Case, count: int, seed: int) -> Ends:
+    """Descents from so many starts, and the fit beside them."""
+    fit = fit_window(case.problem, case.prior)
+    if fit is None or not fit.converged:
+        raise ValueError(f"{case.name}: no fit")
+    begin = time.process_time()
+    good, failed = descents(case.problem, case.prior, count, seed)
+    seconds = (time.process_time() - begin) / count
+    best = min([*good, fit], key=lambda end: end.cost)
+    as_good = [end for end in good if end.cost < best.cost + SAME_COST]
+    same = sum(apart(end, best) < SAME_SOIL for end in as_good)
+    worse = [end.cost - best.cost for end in good if end.cost >= best.cost + SAME_COST]
+    return Ends(same, len(as_good) - same, worse, failed, fit, fit.cost - best.cost, apart(fit, best), seconds)
+
+
+def line(name: str, ends: Ends, count: int) -> str:
+    """One line of the table."""
+    shares = "  ".join(f"{100.0 * n / count:5.1f}" for n in (ends.same, ends.other, len(ends.worse), ends.failed))
+    said = "-" if ends.fit.rival is None else f"rival, share {ends.fit.rival.share:.2f}"
+    return f"{name:38s} {shares}   {ends.above:7.3f} {ends.off:6.2f}  {1e3 * ends.seconds:5.1f}  {said}"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("count", type=int)
-    parser.add_argument("--only", default="")
-    args = parser.parse_args()
-    import time
-
-    for one in cases():
-        if args.only not in one.name:
-            continue
-        rng = np.random.default_rng(1)
-        begin = time.time()
-        fit = fit_window(one.problem, one.prior)
-        t_fit = time.time() - begin
-        begin = time.time()
-        ends = [descend(one.problem, one.prior, drawn(one.prior, rng, 0.3)) for _ in range(args.count)]
-        t = time.time() - begin
-        none = sum(e is None for e in ends)
-        notc = sum(e is not None and not e.converged for e in ends)
-        good = [e for e in ends if e is not None and e.converged]
-        best = min([*good, fit], key=lambda e: e.cost)
-        same = sum(e.cost < best.cost + SAME_COST and apart(e, best) < SAME_SOIL for e in good)
-        off = sum(e.cost < best.cost + SAME_COST and apart(e, best) >= SAME_SOIL for e in good)
-        worse = [e for e in good if e.cost >= best.cost + SAME_COST]
-        print(
-            f"{one.name:40s} same {same} off {off} worse {len(worse)} notconv {notc} none {none}; fit +{fit.cost - best.cost:.3f} apart {apart(fit, best):.3f} conv {fit.converged} | {1e3 * t_fit:.0f} ms, {1e3 * t / args.count:.1f} ms each",
-            sorted({round(e.cost - best.cost, 1) for e in worse})[:6],
-            flush=True,
-        )
+    parser.add_argument("--only", default="", help="cases with this in their name")
+    parser.add_argument("--seed", type=int, default=1)
+    args = parser.parse_args(arguments)
+    print(f"{args.count} starts each; shares in %: at the best optimum, at another as good, at a worse one, nowhere;")
+    print("the fit: cost above the best's, deviation from it in standard deviations; ms of a descent\n")
+    print(f"{'window':38s}  same  other  worse   none     above    off     ms  the fit says")
+    for case in cases():
+        if args.only in case.name:
+            print(line(case.name, ends_of(case, args.count, args.seed), args.count), flush=True)
 
 
 if __name__ == "__main__":

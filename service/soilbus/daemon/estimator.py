@@ -28,6 +28,8 @@ MIN_NEW_SOIL = 0.2
 """Share of a window that a new soil must fill before its estimate is valid."""
 STUCK_RIM_SPEED = 2.5
 """Least rim speed of a vehicle that is stuck, in units of the least speed at which slip is judged."""
+AMBIGUOUS = 2.0
+"""Standard deviations of bearing pressure or tan phi by which another optimum makes a window ambiguous."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +40,7 @@ class WindowResult:
     rejected counts refused samples of the window by reason.  posterior is None where
     status is invalid.  soil_class is the probability of each known soil and of `unknown`,
     the largest first.  position is in the middle of the data that count: of the window, or
-    of its part on a new soil.
+    of its part on a new soil.  failure is the kind of a solve that failed, None where none did.
     """
 
     t: float
@@ -56,6 +58,7 @@ class WindowResult:
     iterations: int = 0
     soil_class: dict[str, float] | None = None
     position: Position | None = None
+    failure: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +130,7 @@ class WindowEstimator:
             iterations=0 if fit is None else fit.iterations,
             soil_class=self._soil_class(posterior),
             position=task.track.at((tracked.since + task.end) / 2.0),
+            failure=self._failure(tracked),
         )
         model = self._completed(fit, task.window)
         return Undecided(result, self._demand(task.window), task.torque_limit, stuck, task.fresh, model)
@@ -151,10 +155,11 @@ class WindowEstimator:
         return CompletedModel.of(self.model, active, float(moving.mean()) if len(moving) else 1.0)
 
     def _honest(self, tracked: Tracked, fit: Fit) -> Posterior:
-        """Posterior with its covariance widened where the residuals are larger than the noise."""
+        """Posterior, of both optima where there are two, widened where the residuals are larger than the noise."""
+        posterior = fit.whole.posterior
         if not tracked.mismatch:
-            return fit.posterior
-        return Posterior(fit.posterior.soil, fit.posterior.log_covariance * max(fit.chi2, 1.0))
+            return posterior
+        return Posterior(posterior.soil, posterior.log_covariance * max(fit.chi2, 1.0))
 
     def _bearing(self, posterior: Posterior) -> Estimate:
         return posterior.bearing_pressure(self._settings.z_ref, self._settings.b_ref)
@@ -201,20 +206,43 @@ class WindowEstimator:
         fit = tracked.fit
         if task.missing:
             return Status.INVALID, "input_missing " + " ".join(task.missing)
-        if fit is None:
+        if fit is None and not tracked.mismatch:
             if tracked.standstill + tracked.turning > 0:
                 return Status.NOT_EXCITED, "standstill" if tracked.standstill >= tracked.turning else "turning"
             return Status.INVALID, "input_stale " + " ".join(task.poor) if task.poor else "no_convergence"
-        if tracked.mismatch:
-            status = Status.DEGRADED if fit.converged else Status.INVALID
-            return status, "model_mismatch" if fit.chi2 > self._tracker.chi2_limit(fit) else "no_convergence"
+        failure = self._failure(tracked)
+        if fit is None or failure is not None:
+            status = Status.DEGRADED if fit is not None and fit.converged else Status.INVALID
+            return status, "model_mismatch" if failure == "model_mismatch" else "no_convergence"
         if task.poor:
             return Status.DEGRADED, "input_stale " + " ".join(task.poor)
         if tracked.ground is Ground.CHANGING or tracked.since > task.end - MIN_NEW_SOIL * self._settings.window:
             return Status.NOT_EXCITED, "not_excited new_soil"
-        bearing, tan_phi = self._bearing(fit.posterior), fit.posterior.tan_phi()
-        if bearing.std > self._settings.max_bearing_std * bearing.value:
-            return Status.NOT_EXCITED, "not_excited load_range"
-        if tan_phi.std > self._settings.max_tan_phi_std * tan_phi.value:
-            return Status.NOT_EXCITED, "not_excited slip_range"
+        if self._ambiguous(fit):
+            return Status.NOT_EXCITED, "ambiguous"
+        posterior = fit.whole.posterior
+        bearing, tan_phi = self._bearing(posterior), posterior.tan_phi()
+        lacking = {
+            "load_range": bearing.std > self._settings.max_bearing_std * bearing.value,
+            "slip_range": tan_phi.std > self._settings.max_tan_phi_std * tan_phi.value,
+        }
+        if any(lacking.values()):
+            return Status.NOT_EXCITED, " ".join(["not_excited", *(name for name, it_is in lacking.items() if it_is)])
         return Status.VALID, "none"
+
+    def _failure(self, tracked: Tracked) -> str | None:
+        """In what way a solve failed: not_finite, model_mismatch or no_convergence; None where it did not."""
+        fit = tracked.fit
+        if not tracked.mismatch:
+            return None
+        if fit is None:
+            return "not_finite"
+        return "model_mismatch" if fit.chi2 > self._tracker.chi2_limit(fit) else "no_convergence"
+
+    def _ambiguous(self, fit: Fit) -> bool:
+        """Whether another soil, about as likely, has a bearing pressure or tan phi that the fit excludes."""
+        if fit.rival is None:
+            return False
+        one, other = fit.posterior, fit.rival.belief.posterior
+        pairs = ((self._bearing(one), self._bearing(other)), (one.tan_phi(), other.tan_phi()))
+        return any(abs(a.value - b.value) > AMBIGUOUS * a.std for a, b in pairs)

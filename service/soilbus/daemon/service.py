@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from importlib.metadata import PackageNotFoundError, version
@@ -60,6 +60,8 @@ class Service:
         self.notifier, self.clock, self.on_window = notifier, clock, on_window
         self.result: WindowResult | None = None
         self.deadline_misses = 0
+        self.failures: Counter[str] = Counter()
+        """Failed solves by kind, since the start."""
         self._workers = workers
         self._pending: deque[Future[WindowResult]] = deque()
         self._stopping = False
@@ -140,6 +142,8 @@ class Service:
         while self._result_waits():
             self.result = self._pending.popleft().result()
             self._solved_at = now
+            if self.result.failure is not None:
+                self.failures[self.result.failure] += 1
             for message, values in hop_frames(self.result):
                 self.bus.send(self.publisher.frame(message, values))
             if self.on_window is not None:
@@ -247,6 +251,8 @@ class Service:
             bearing = self.result.bearing
             text += f", bearing pressure {bearing.value / 1e3:.1f} +- {bearing.std / 1e3:.1f} kPa"
             text += f", {self.present_way(now)}"
+        if self.failures:
+            text += ", failed solves: " + ", ".join(f"{kind} {n}" for kind, n in self.failures.most_common())
         self.notifier.status(text)
 
 

@@ -193,21 +193,14 @@ def _of_first(record: Record, prior: SoilPrior, problem: CompletedProblem) -> Be
 
 
 def _fitted(problem: CompletedProblem, prior: SoilPrior, before: Belief, start: Start | None) -> Fit | None:
-    """Where the given start leads, or one half way to it: whichever converges, or leaves the parameters' range."""
+    """From the given start, or from anywhere; a fit that has not converged goes on from where it is."""
     if start is None:
-        return fit_window(problem, prior, before)
-    best: Fit | None = None
-    for share in (1.0, 0.5):
-        pulls = share * start.gains[problem.n_sensors :]
-        gains = np.where(problem.gain_std > 0.0, np.concatenate([start.gains[: problem.n_sensors], pulls]), 0.0)
-        fit = continued(problem, prior, before, start.soil, gains)
-        if fit is None:
-            continue
-        leaves = not all(f.within(u) for f, u in zip(problem.free, fit.gains[problem.n_sensors :], strict=True))
-        if fit.converged or leaves:
+        fit = fit_window(problem, prior, before)
+        if fit is None or fit.converged:
             return fit
-        best = fit if best is None or fit.cost < best.cost else best
-    return best
+        start = Start(fit.belief.soil, fit.belief.gains)
+    gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
+    return continued(problem, prior, before, start.soil, gains, problem.n_sensors)
 
 
 def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects: Sequence[Effect]) -> Belief:

@@ -10,7 +10,7 @@ import numpy as np
 from soilbus.diagnosis.completion import Completion, Start, complete
 from soilbus.diagnosis.learned import Correction, corrections
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.score import Score, scores
+from soilbus.diagnosis.score import scores
 from soilbus.diagnosis.verdict import PLAUSIBLE, SURE, Verdict, is_real, pays, probabilities
 from soilbus.diagnosis.where import Disagreement, disagreements
 from soilbus.estimation.posterior import SoilPrior
@@ -96,10 +96,10 @@ def _round(
 ) -> tuple[Addition, Completion] | None:
     """The best effect to add to the present model; None where none pays."""
     tried: dict[str, tuple[Effect, Completion]] = {}
-    for score in _promising(records, prior, present, candidates):
-        completion = complete(records, prior, (*present.effects, score.effect), score.starts)
-        if completion is not None and completion.converged:
-            tried[score.effect.name] = score.effect, completion
+    for effect, starts in _promising(records, prior, present, candidates):
+        completion = complete(records, prior, (*present.effects, effect), starts)
+        if completion is not None:
+            tried[effect.name] = effect, completion
     if not tried:
         return None
     falls = {name: present.evidence - completion.evidence for name, (_, completion) in tried.items()}
@@ -114,22 +114,20 @@ def _round(
 
 def _promising(
     records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect]
-) -> list[Score]:
-    """The few candidates worth a fit of all data: foreseen by their scores, tried on a few instants."""
+) -> list[tuple[Effect, Sequence[Start]]]:
+    """The few candidates worth a fit of all data, and where it starts: foreseen by scores, tried on a few instants."""
     foreseen = [s for s in scores(records, prior, present, candidates)[:TRIED] if s.evidence < WORTH_TRYING]
-    if len(foreseen) <= FITTED:
-        return foreseen
     few = [record.thinned(THINNED) for record in records]
-    before = complete(few, prior, present.effects, present.as_starts())
+    before = complete(few, prior, present.effects, present.as_starts()) if foreseen else None
     if before is None:
-        return foreseen[:FITTED]
-    falls: list[tuple[float, Score]] = []
+        return [(score.effect, score.starts) for score in foreseen[:FITTED]]
+    falls: list[tuple[float, Effect, Sequence[Start]]] = []
     for score in foreseen:
         completion = complete(few, prior, (*present.effects, score.effect), score.starts)
         if completion is not None:
-            falls.append((before.evidence - completion.evidence, score))
+            falls.append((before.evidence - completion.evidence, score.effect, completion.as_starts()))
     falls.sort(key=lambda item: -item[0])
-    return [score for fall, score in falls[:FITTED] if fall > NEAR * falls[0][0]]
+    return [(effect, starts) for fall, effect, starts in falls[:FITTED] if fall > NEAR * falls[0][0]]
 
 
 def _reconsidered(

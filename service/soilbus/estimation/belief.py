@@ -47,6 +47,14 @@ class Belief:
         of_other = other.covariance + np.outer(off, off)
         return replace(self, covariance=(1.0 - share) * self.covariance + share * of_other)
 
+    def given(self, parameter: int, log: float) -> Belief:
+        """What is known of everything else if the logarithm of a free parameter is this: held from then on."""
+        along = self.covariance[:, parameter] / self.covariance[parameter, parameter]
+        off = along * (log - np.log(self.soil[parameter]))
+        covariance = self.covariance - np.outer(along, self.covariance[parameter])
+        covariance[parameter] = covariance[:, parameter] = 0.0
+        return Belief(self.soil * np.exp(off[:_SOIL]), self.gains + off[_SOIL:], covariance)
+
     def drifted(self, soil: Array, gains: Array) -> Belief:
         """Later: the soil's logarithms may have changed with covariance (6, 6), the gains with variance (G,)."""
         covariance = self.covariance.copy()

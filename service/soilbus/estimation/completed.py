@@ -55,6 +55,10 @@ class Free:
         """Whether so many prior std from the prior value is inside the parameter's range."""
         return self.parameter.low <= self.value + self.std * pull <= self.parameter.high
 
+    def allowed(self, pull: float) -> float:
+        """So many prior std, kept inside the parameter's range."""
+        return pull if self.within(pull) or self.std == 0.0 else (self.at(pull) - self.value) / self.std
+
     def at(self, pull: float) -> float:
         """The parameter's value so many prior std from its prior value, kept inside its range."""
         return min(max(self.value + self.std * pull, self.parameter.low), self.parameter.high)
@@ -129,9 +133,15 @@ class CompletedProblem(WindowProblem):
         """The effects with their values where the parameters are so many std (P,) from their prior values."""
         return active_at(self.effects, self.free, pulls, self.n_wheels)
 
+    def allowed(self, gains: Array) -> Array:
+        """Gains with the effects' parameters inside their ranges."""
+        inside = [f.allowed(u) for f, u in zip(self.free, gains[self.n_sensors :].tolist(), strict=True)]
+        return np.concatenate([gains[: self.n_sensors], inside])
+
     def carried(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
         """As WindowProblem; without gains the effects' parameters are at their prior values."""
-        base = super().carried(latents, soil, gains)
+        solved = np.isfinite(latents.entry_angle).all() and bool(self.effects)
+        base = latents if solved else super().carried(latents, soil, gains)
         if not self.effects:
             return base
         active = self.active(np.zeros(len(self.free)) if gains is None else gains[self.n_sensors :])
@@ -183,10 +193,11 @@ class CompletedProblem(WindowProblem):
         at_wheels = {e.name for e in self.effects if e.wheel is not None or e.forces is not None}
         for i in np.flatnonzero(self.gain_std[self.n_sensors :] > 0.0):
             shifted = pulls.copy()
-            shifted[i] += STEP_OF_EFFECT
+            inward = STEP_OF_EFFECT if self.free[i].within(pulls[i] + STEP_OF_EFFECT) else -STEP_OF_EFFECT
+            shifted[i] += inward
             other = self.active(shifted)
             contact = self._contact(soil, other, latents, angle) if self.free[i].effect in at_wheels else here
-            d = by(self._told(contact, other, latents, None), STEP_OF_EFFECT)
+            d = by(self._told(contact, other, latents, None), inward)
             by_effects[:, i], pull_by_effects[i] = d.wheels, d.pull
         slope, off = by_angle[0], -at.wheels[0]
         along = by_angle[1:] / slope  # what a load more turns into, by way of the entry angle
@@ -204,6 +215,7 @@ class CompletedProblem(WindowProblem):
             by_soil=held(by_soil),
             load_by_slip=by_latents["speed"][0] * self.rig.radius * latents.speed**2 / latents.ground_speed[:, None],
             load_by_soil=by_soil[0],
+            load_by_effects=by_effects[0],
             load_slope=slope,
             off=off,
             by_effects=held(by_effects),

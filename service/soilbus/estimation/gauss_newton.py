@@ -31,6 +31,8 @@ SETTLING = 1.0
 """The same, below which the latents and gains join in."""
 ENOUGH = 0.02
 """Relative fall of the cost below which the approach has done its part."""
+LITTLE = 1e-3
+"""The same where other parameters than the soil's move too."""
 WORSE = 20.0
 """Rise of the cost that a step may bring: where the cost bends, steps that overshoot come back by themselves."""
 SLOWLY = 0.5
@@ -49,6 +51,8 @@ MAX_REFUSED = 5
 """Steps taken back one after the other after which a fit has failed: what is left is noise of the linear model."""
 APART = 2.0
 """Standard deviations between two optima from which they are told apart."""
+ALIKE, WIDER = 0.5, 1.2
+"""How far, and how many times wider, a posterior may be than its top says and count as Gaussian [sd]."""
 RARE = 0.05
 """Share of the probability below which a rival does not count."""
 PLAUSIBLE = 3.0
@@ -74,7 +78,8 @@ class Fit:
     sinkage (W,) is the mean over the window [m], nan where unknown; belief holds soil and
     gains (relative errors, by problem.gain_names) for the windows to come, optimum is for
     resume(); rival is another optimum that the data leave about as likely, where one was
-    looked for and found.
+    looked for and found; averaged is the mean of the whole posterior, where that was worked
+    out (see `marginal`).
     """
 
     belief: Belief
@@ -86,6 +91,7 @@ class Fit:
     iterations: int
     converged: bool
     rival: Rival | None = None
+    averaged: Belief | None = None
 
     @property
     def posterior(self) -> Posterior:
@@ -94,8 +100,20 @@ class Fit:
 
     @property
     def whole(self) -> Belief:
-        """Soil and gains with the spread of both optima where there is a rival."""
+        """Soil and gains to be reported and passed on: more than the top of the posterior, where more is known."""
+        if self.averaged is not None:
+            return self.averaged
         return self.belief if self.rival is None else self.belief.mixed(self.rival.belief, self.rival.share)
+
+    @property
+    def is_gaussian(self) -> bool:
+        """Whether the whole posterior is much as its top says; else it cannot be the prior of later windows."""
+        if self.averaged is None or self.rival is not None:
+            return self.rival is None
+        known = np.flatnonzero(np.diag(self.belief.covariance) > 0.0)
+        own, whole = (b.covariance[np.ix_(known, known)] for b in (self.belief, self.averaged))
+        wider = np.linalg.eigvals(np.linalg.solve(own, whole)).real
+        return bool(self.posterior.distance(self.averaged.posterior.soil) < ALIKE and wider.max() < WIDER**2)
 
     @property
     def gains(self) -> Array:
@@ -204,12 +222,14 @@ def descend(problem: WindowProblem, prior: SoilPrior, start: Soil, before: Belie
         return None if near is None else _settle(Fitting(problem, prior, before), near, MAX_ITERATIONS)
 
 
-def continued(problem: WindowProblem, prior: SoilPrior, before: Belief, soil: Array, gains: Array) -> Fit | None:
-    """Descent of everything together from a soil (6,) and gains (G,) near the optimum; None as descend()."""
-    fitting = Fitting(problem, prior, before)
+def continued(
+    problem: WindowProblem, prior: SoilPrior, before: Belief, soil: Array, gains: Array, first: int
+) -> Fit | None:
+    """Descent from a soil (6,) and gains (G,), of which those from the `first` on move with the soil from the start."""
     with np.errstate(all="ignore"):
-        latents = problem.carried(problem.start(Soil(*soil.tolist())), Soil(*soil.tolist()), gains)
-        return _settle(fitting, Place(soil, gains, latents, np.inf, 0), MAX_ITERATIONS)
+        moving = Fitting(problem, prior, before, first=first)
+        near = _approach(moving, soil, MAX_ITERATIONS, LITTLE, gains)
+        return None if near is None else _settle(Fitting(problem, prior, before), near, MAX_ITERATIONS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,9 +262,16 @@ def resume(ahead: Foreseen) -> Fit | None:
         return _settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED, first)
 
 
-def _approach(fitting: Fitting, soil: Array, most: int, least: float = ENOUGH) -> Place | None:
-    """Levenberg-damped steps of the soil alone, until they are short."""
-    place = fitting.start(soil)
+def settled(fitting: Fitting, near: Place) -> Fit | None:
+    """Descent from a place near the optimum; None where the numbers stop being finite."""
+    return _settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED)
+
+
+def _approach(
+    fitting: Fitting, soil: Array, most: int, least: float = ENOUGH, gains: Array | None = None
+) -> Place | None:
+    """Levenberg-damped steps of the soil and the active gains, latents as measured, until they are short."""
+    place = fitting.start(soil, gains=gains)
     point = fitting.point(place)
     damping, trials = 1e-3, 1
     while point is not None:
@@ -253,8 +280,7 @@ def _approach(fitting: Fitting, soil: Array, most: int, least: float = ENOUGH) -
             return None
         if point.length(step) < SETTLING or trials >= most or damping > 1e6:
             return replace(place, cost=point.cost, trials=trials)
-        new_soil = fitting.coordinates.moved(place.soil, step)
-        new_place = fitting.start(new_soil, place.latents.entry_angle)
+        new_place = fitting.restarted(place, step)
         new = fitting.point(new_place)
         trials += 1
         if new is None or new.cost >= point.cost:

@@ -50,6 +50,7 @@ class Linearised:
     load_slope: Array  # (N, W) dW/d entry angle
     load_by_slip: Array
     load_by_soil: Array  # (6, N, W)
+    load_by_effects: Array  # (P, N, W)
 
     @property
     def chi2(self) -> float:
@@ -73,6 +74,7 @@ class Linearised:
             load_slope=np.concatenate([self.load_slope[first:], new.load_slope]),
             load_by_slip=np.concatenate([self.load_by_slip[first:], new.load_by_slip]),
             load_by_soil=np.concatenate([self.load_by_soil[:, first:], new.load_by_soil], axis=1),
+            load_by_effects=np.concatenate([self.load_by_effects[:, first:], new.load_by_effects], axis=1),
         )
 
 

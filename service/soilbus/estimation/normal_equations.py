@@ -72,10 +72,14 @@ class Point:
 class Fitting:
     """A window's residuals together with what was known before: free coordinates (F), active gains (A)."""
 
-    def __init__(self, problem: WindowProblem, prior: SoilPrior, before: Belief, with_gains: bool = True) -> None:
+    def __init__(
+        self, problem: WindowProblem, prior: SoilPrior, before: Belief, with_gains: bool = True, first: int = 0
+    ) -> None:
+        """Raises ValueError where `before` has no proper covariance; gains before the `first` one are held."""
         self.problem, self.before = problem, before
         self.coordinates = Coordinates(prior, float(problem.rig.width.mean()))
         known = np.diag(before.covariance)[_SOIL:] > 0.0 if with_gains else np.zeros(len(before.gains), bool)
+        known[:first] = False
         self.active = np.flatnonzero(known)
         self.free = self.coordinates.free
         kept = np.concatenate([self.free, _SOIL + self.active])
@@ -89,9 +93,17 @@ class Fitting:
         """The same with something else known before."""
         return Fitting(self.problem, self.coordinates.prior, before)
 
-    def start(self, soil: Array, guess: Array | None = None) -> Place:
-        """A soil with gains as believed and latents as measured; entry angles solved from a guess (N, W)."""
-        return Place(soil, self.before.gains, self.problem.start(Soil(*soil.tolist()), guess), np.inf, 0)
+    def start(self, soil: Array, guess: Array | None = None, gains: Array | None = None) -> Place:
+        """A soil with gains as believed, or these (G,), and latents as measured; angles solved from a guess (N, W)."""
+        gains = self.before.gains if gains is None else gains
+        return Place(soil, gains, self.problem.start(Soil(*soil.tolist()), guess, gains), np.inf, 0)
+
+    def restarted(self, place: Place, step: Array) -> Place:
+        """The place after a step (F + A,) with latents as measured."""
+        free, gains = len(self.free), place.gains.copy()
+        gains[self.active] += step[free:]
+        soil = self.coordinates.moved(place.soil, step[:free])
+        return self.start(soil, place.latents.entry_angle, self.problem.allowed(gains))
 
     def point(self, place: Place) -> Point | None:
         """The normal equations at a place; None where the model is not finite."""
@@ -147,7 +159,8 @@ class Fitting:
         gain_step[self.active] = step[free:]
         latents = self.problem.updated(point.at, place.latents, soil - place.soil, gain_step)
         gains = place.gains + gain_step
-        if np.max(np.abs(latents.entry_angle / place.latents.entry_angle - 1.0), initial=0.0) > LONG_TURN:
+        turn = np.max(np.abs(latents.entry_angle / place.latents.entry_angle - 1.0), initial=0.0)
+        if turn > LONG_TURN or len(point.at.load_by_effects):  # effects may bend where the soil alone does not
             latents = self.problem.carried(latents, Soil(*soil.tolist()), gains)
         return Place(soil, gains, latents, point.cost, place.trials)
 

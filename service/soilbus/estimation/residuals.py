@@ -59,6 +59,7 @@ class Response(NamedTuple):
     by_soil: Array
     load_by_slip: Array
     load_by_soil: Array
+    load_by_effects: Array
     load_slope: Array
     off: Array
     by_effects: Array
@@ -75,16 +76,20 @@ class WindowProblem(Readings):
         super().__init__(window, rig, min_speed, max_turn)
         self.model = model
 
+    def allowed(self, gains: Array) -> Array:
+        """Gains (G,) with what has a range kept inside it."""
+        return gains
+
     def thinned(self, most: int) -> WindowProblem:
         """The same window with at most so many of its usable instants, evenly spread."""
         if self.n <= most:
             return self
         return self.part(np.linspace(0, self.n - 1, most).round().astype(int))
 
-    def start(self, soil: Soil, guess: Array | None = None) -> Latents:
-        """Latents at the measured values, entry angles solved for this soil from a guess (N, W)."""
+    def start(self, soil: Soil, guess: Array | None = None, gains: Array | None = None) -> Latents:
+        """Latents at the measured values, entry angles solved for this soil (and gains) from a guess (N, W)."""
         angle = np.full((self.n, self.n_wheels), np.nan) if guess is None else guess
-        return self.carried(Latents(self.load.copy(), self.speed.copy(), self.ground_speed.copy(), angle), soil)
+        return self.carried(Latents(self.load.copy(), self.speed.copy(), self.ground_speed.copy(), angle), soil, gains)
 
     def carried(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
         """The same latents with the entry angles at which this soil carries their loads; gains (G,) as linearise()."""
@@ -196,6 +201,7 @@ class WindowProblem(Readings):
             load_slope=at.load_slope,
             load_by_slip=at.load_by_slip,
             load_by_soil=at.load_by_soil,
+            load_by_effects=at.load_by_effects,
         )
 
     def _corrected(self, gains: Array) -> tuple[Array, Array, float, Array, Array, Array]:
@@ -250,6 +256,7 @@ class WindowProblem(Readings):
             by_soil=by[:, 1:],
             load_by_slip=load_by[0],
             load_by_soil=load_by[1:],
+            load_by_effects=np.zeros((0, *shape)),
             load_slope=slope,
             off=off,
             by_effects=np.zeros((3, 0, *shape)),
@@ -287,6 +294,8 @@ class WindowProblem(Readings):
         slip_change = (latents.ground_speed[:, None] / latents.speed - ground[:, None] / speed) / self.rig.radius
         change = load - latents.load + at.off - at.load_by_slip * slip_change
         change -= (soil_step @ at.load_by_soil.reshape(6, -1)).reshape(N, W)
+        if len(at.load_by_effects):
+            change -= np.tensordot(gain_step[self.n_sensors :], at.load_by_effects, 1)
         low, high = latents.entry_angle * 0.6, np.minimum(latents.entry_angle * 1.6, MAX_ENTRY_ANGLE)
         angle = np.clip(latents.entry_angle + change / at.load_slope, low, high)
         return Latents(load, speed, ground, angle)

@@ -21,6 +21,7 @@ from soilbus.estimation.belief import Belief
 from soilbus.estimation.completed import CompletedProblem, Free
 from soilbus.estimation.coordinates import Coordinates
 from soilbus.estimation.gauss_newton import Fit, fit_window, foreseen, resume
+from soilbus.estimation.marginal import with_whole
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.soil_change import Crossing, suspicion, without_crossing
@@ -150,8 +151,10 @@ class Tracker:
         else:
             ahead = foreseen(problem, self._here, last, before)
             fit = resume(ahead)
+            if fit is None or not fit.converged:  # a long valley is no sign of another soil
+                fit = fit_window(problem, self._here, before)
             if self._good_until > end - self.settings.window and end - since > GRACE * self.settings.window:
-                known = ahead.fitting.given(last.belief)
+                known = ahead.fitting.given(last.whole)
                 sure = float(last.optimum.t[-1]) - LOOK_BACK * self.settings.window
                 first = int(np.searchsorted(problem.t, sure))
                 doubt = suspicion(known, ahead.place, ahead.at, first, ALARM)
@@ -161,6 +164,8 @@ class Tracker:
                         return self._remembered(replace(changed, standstill=left_out[0], turning=left_out[1]), end)
             if self.mismatch(fit):
                 fit = self._afresh(problem, before)
+        if fit is not None and not self.mismatch(fit):
+            fit = with_whole(problem, self._here, before, fit)
         ground = Ground.NEW if new else Ground.SAME
         return self._remembered(Tracked(fit, self.mismatch(fit), ground, since, *left_out), end)
 
@@ -193,7 +198,8 @@ class Tracker:
             self._distrusted = tracked.mismatch
         if fit is not None and not tracked.mismatch:
             self._good_until = end
-            if end - tracked.since >= LEARNED * self.settings.window and tracked.ground is not Ground.CHANGING:
+            learned = end - tracked.since >= LEARNED * self.settings.window and fit.is_gaussian
+            if learned and tracked.ground is not Ground.CHANGING:
                 self._beliefs.append((end, fit.whole))
         return tracked
 

@@ -16,7 +16,7 @@ from soilbus.traversability import Status
 
 
 def summary(results: Sequence[WindowResult], pipeline: Pipeline) -> str:
-    """A few lines: windows by status, soil, decisions, refused samples by reason."""
+    """A few lines: windows by status, soil, decisions, failed solves by kind, refused samples by reason."""
     counts = pipeline.admission.counts
     heard = f"{sum(counts.received.values())} mapped frames ({counts.unknown} of other identifiers)"
     return summary_of(results, heard, pipeline.intake.refusals.total)
@@ -34,8 +34,14 @@ def summary_of(results: Sequence[WindowResult], heard: str, refused: Counter[str
         lines.append(f"bearing pressure {bearing / 1e3:.1f} +- {std / 1e3:.1f} kPa (medians of the valid windows)")
     states = Counter(str(r.traversability.state) for r in results)
     lines.append("traversability " + (", ".join(f"{s} {n}" for s, n in states.most_common()) or "unknown"))
-    lines.append("refused samples " + (", ".join(f"{reason} {n}" for reason, n in refused.most_common()) or "none"))
+    lines.append("failed solves " + counted(Counter(r.failure for r in results if r.failure)))
+    lines.append("refused samples " + counted(refused))
     return "\n".join(lines) + "\n"
+
+
+def counted(counts: Counter[str]) -> str:
+    """As in "wild 3, stale 1", the most frequent first; "none" without any."""
+    return ", ".join(f"{name} {n}" for name, n in counts.most_common()) or "none"
 
 
 def html_report(results: Sequence[WindowResult], text: str, logs: Sequence[Path]) -> str:

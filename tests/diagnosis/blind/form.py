@@ -67,7 +67,7 @@ class Form:
     `unit`, that is barely visible with a sinkage sensor and without; large: as great as it
     gets.  other: no parameters make the catalogue's formula this one.
     by_sinkage: nothing but a sinkage sensor shows it.  imitable: an effect outside the
-    catalogue that one inside might pass for.
+    catalogue, more than a fifth of which one inside does to the same readings.
     """
 
     effect: str

@@ -112,7 +112,9 @@ FORMS = (
         imitable=True,
     ),
     Form("", "tooth_error", "once a turn of each wheel", "1", (0.001, 0.001), 0.02, _channels(_tooth)),
-    Form("", "draft_saturated", "amplifier at its end", "1", (0.01, 0.01), 0.5, by_hooks(draft=_saturated)),
+    Form(
+        "", "draft_saturated", "amplifier at its end", "1", (0.01, 0.01), 0.5, by_hooks(draft=_saturated), imitable=True
+    ),
     Form("", "draft_sticking", "hysteresis of the pin", "N", (8.0, 8.0), 500.0, by_hooks(draft=_sticking)),
     Form("", "row_spacing", "soil changes every 0.75 m", "1", (0.003, 0.003), 0.4, by_hooks(wheel=_rows)),
     Form(
@@ -123,7 +125,6 @@ FORMS = (
         (0.02, 0.02),
         0.5,
         by_hooks(torque=_cross_talk),
-        imitable=True,
     ),
     Form(
         "", "warming_torque", "span settles", "1", (0.0033, 0.0033), 0.08, by_hooks(torque=_warm_torque), imitable=True

@@ -12,6 +12,8 @@ from soilbus.terra.wheel import WheelModel, WheelState
 
 REFERENCE_SPEED = 1.0
 """Ground speed [m/s] for which the soil's own K_L holds."""
+TYPICAL_DEPTH = 0.05
+"""Depth [m] at which a change of n with slip leaves the pressure as it is, so that the two parameters act apart."""
 _LEAST_SPEED = 0.05
 _LEAST_EXPONENT = 0.05
 
@@ -19,10 +21,11 @@ _LEAST_EXPONENT = 0.05
 def _slip_sinkage(
     state: WheelState, model: WheelModel, around: Surroundings, values: Values
 ) -> tuple[WheelState, WheelModel]:
-    """n + exponent s, K_L exp(-softening s) for slips s > 0."""
+    """n + exponent s and K_L exp(-softening s) for slips s > 0; the exponent leaves the pressure at TYPICAL_DEPTH alone."""
     slip = np.maximum(state.slip, 0.0)
     n = np.maximum(state.n + values["exponent"] * slip, np.minimum(state.n, _LEAST_EXPONENT))
-    return state._replace(n=n, K_L=state.K_L * np.exp(-values["softening"] * slip)), model
+    softer = values["softening"] * slip + (n - state.n) * np.log(TYPICAL_DEPTH)
+    return state._replace(n=n, K_L=state.K_L * np.exp(-softer)), model
 
 
 SLIP_SINKAGE = Effect(
@@ -32,8 +35,8 @@ SLIP_SINKAGE = Effect(
     " which a softer K_L gives: Lyasko 2010 (J. Terramechanics 47:21)",
     tells="a sinkage sensor, and slips from 0.05 to beyond 0.4 at one load",
     parameters=(
-        Parameter("exponent", "1", 0.0, 0.3, -0.2, 1.5),
         Parameter("softening", "1", 0.0, 0.6, -2.0, 4.0),
+        Parameter("exponent", "1", 0.0, 0.3, -0.5, 1.5),
     ),
     wheel=_slip_sinkage,
 )

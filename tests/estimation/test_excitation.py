@@ -1,0 +1,141 @@
+"""Windows with too little variation: what is missing is named, what is determined is told, and intervals are right."""
+
+from __future__ import annotations
+
+import minima
+import numpy as np
+import pytest
+from drives import tasks
+from scipy.stats import binom, chi2
+
+from soilbus.assembly import prior_of
+from soilbus.daemon.estimator import WindowEstimator
+from soilbus.estimation.belief import Belief
+from soilbus.estimation.gauss_newton import fit_window
+from soilbus.estimation.marginal import with_whole
+from soilbus.simulator.monte_carlo import NORMAL_95, missed
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.terra.soils import SOILS
+from soilbus.traversability import State, Status
+
+STILL, LEANING = Swing(0.0, 1e-9), Swing(-0.3, 0.3)
+SLIPS = (0.05, 0.1, 0.2, 0.35)
+DRIVES = 10
+Z_REF, B_REF = 0.02, 0.3
+CHANCE = 1e-3
+"""Probability that a figure just on its target fails here."""
+
+
+def rough(soil, *more):
+    """Settings by which c and K are known to 25 % and k_c to 50 %."""
+    k_c = SOILS[soil].k_c
+    return reference_configuration([*minima.told(soil), f"soil.k_c.value={k_c}", f"soil.k_c.std={0.5 * k_c}", *more])
+
+
+def deviations(posterior, soil):
+    """Errors of bearing pressure and tan phi in their standard deviations."""
+    bearing, tan_phi = posterior.bearing_pressure(Z_REF, B_REF), posterior.tan_phi()
+    off = np.log(bearing.value / SOILS[soil].bearing_pressure(Z_REF, B_REF)) / (bearing.std / bearing.value)
+    return off, (tan_phi.value - np.tan(SOILS[soil].phi)) / tan_phi.std
+
+
+def of_drive(soil, sinkage, seed):
+    """Deviations of a window of constant slip and loads, and of its top alone."""
+    config = rough(soil)
+    problem = minima.window(config, soil, 10.0, minima.constant(SLIPS[seed % 4]), sinkage, 100 + seed, STILL)
+    prior = missed(prior_of(config), SOILS[soil], np.random.default_rng([seed, 9]))
+    fit = fit_window(problem, prior)
+    whole = with_whole(problem, prior, Belief.of(prior, problem.gain_std), fit)
+    return deviations(whole.whole.posterior, soil), deviations(fit.posterior, soil)
+
+
+@pytest.fixture(scope="module")
+def constant_drives():
+    """Deviations (drives, 2) of the whole posterior and of its top, by sensors and soil."""
+    return {
+        (sinkage, soil): np.array([of_drive(soil, sinkage, seed) for seed in range(DRIVES)]).transpose(1, 0, 2)
+        for sinkage in (True, False)
+        for soil in minima.KINDS
+    }
+
+
+@pytest.mark.parametrize("sinkage", [True, False], ids=["sinkage", "no sinkage"])
+@pytest.mark.parametrize("soil", ["loam", "dry_sand"])
+def test_constant_driving_has_right_intervals(sinkage, soil, constant_drives):
+    z = constant_drives[sinkage, soil][0]
+    held = (np.abs(z) < NORMAL_95).sum(axis=0)
+    assert (held >= binom.ppf(CHANCE, DRIVES, 0.95)).all(), held / DRIVES
+    rms = np.sqrt((z**2).mean(axis=0))
+    low, high = np.sqrt(chi2.ppf([CHANCE, 1.0 - CHANCE], DRIVES) / DRIVES)
+    assert ((rms > 0.8 * low) & (rms < 1.25 * high)).all(), rms
+
+
+def test_on_clay_the_top_alone_is_more_overconfident(constant_drives):
+    # Not yet right there (bearing pressure: 1.25 is the aim), but better than without.
+    z = np.concatenate([constant_drives[sinkage, "wet_clay"] for sinkage in (True, False)], axis=1)
+    whole, top = np.sqrt((z**2).mean(axis=1))
+    assert whole[0] < 0.9 * top[0]
+    assert whole[1] < 1.25 * np.sqrt(chi2.ppf(1.0 - CHANCE, 2 * DRIVES) / (2 * DRIVES))
+
+
+@pytest.mark.parametrize("soil", minima.KINDS)
+def test_minutes_of_constant_driving_stay_right(soil):
+    last = []
+    for seed in range(2):
+        config = rough(soil, "estimator.hop=5.0")
+        scenario = Scenario(80.0, (Patch(0.0, soil),), slip=minima.constant(SLIPS[seed + 1]), side_shift=STILL)
+        estimator = WindowEstimator(config)
+        results = [estimator.estimate(task).result for task in tasks(config, scenario, seed)]
+        last += [deviations(r.posterior, soil) for r in results[-6::5] if r.posterior is not None]
+    assert len(last) == 4
+    assert np.abs(last).max() < 3.0
+    assert np.sqrt(np.mean(np.square(last), axis=0)).max() < 1.6  # two windows of a drive share gains: few errors
+
+
+# --- what is missing ---
+
+
+def said(soil, slip, shift, sinkage=True, overrides=(), seconds=10.0, seed=1):
+    config = reference_configuration([f"estimator.window={seconds}", *overrides])
+    scenario = Scenario(seconds, (Patch(0.0, soil),), slip=slip, side_shift=shift)
+    return WindowEstimator(config).solve(next(tasks(config, scenario, seed, "none" if sinkage else "sinkage")))
+
+
+@pytest.mark.parametrize("soil", ["wet_clay", "xi_wet_clay", "clayey_soil_38"])
+def test_constant_loads_with_varied_slip_lack_a_range_of_loads(soil):
+    short = said(soil, minima.EXCITED, STILL, sinkage=False, seconds=2.0)
+    assert (short.status, short.reason) == (Status.NOT_EXCITED, "not_excited load_range")
+    assert short.traversability.state is not State.GO
+    varied = said(soil, minima.EXCITED, LEANING, sinkage=False, seconds=2.0)
+    assert varied.bearing.std / varied.bearing.value < 0.8 * short.bearing.std / short.bearing.value
+
+
+@pytest.mark.parametrize("soil", ["loam", "lete_sand", "sandy_loam_23_michigan"])
+def test_varied_loads_with_constant_slip_lack_a_range_of_slips(soil):
+    strict = ["estimator.max_tan_phi_std=0.05"]
+    still = said(soil, minima.constant(0.05), LEANING, overrides=strict)
+    assert (still.status, still.reason) == (Status.NOT_EXCITED, "not_excited slip_range")
+    varied = said(soil, minima.EXCITED, LEANING, overrides=strict)
+    assert varied.posterior.tan_phi().std < 0.6 * still.posterior.tan_phi().std
+
+
+@pytest.mark.parametrize("soil", ["wet_clay", "dry_sand", "clayey_soil_38"])
+def test_both_are_named_where_both_are_missing(soil):
+    strict = ["estimator.max_tan_phi_std=0.03", "estimator.max_bearing_std=0.01"]
+    result = said(soil, minima.constant(0.05), STILL, sinkage=False, overrides=strict, seconds=2.0)
+    assert (result.status, result.reason) == (Status.NOT_EXCITED, "not_excited load_range slip_range")
+
+
+@pytest.mark.parametrize("soil", ["loam", "dry_sand", "clayey_soil_38"])
+def test_the_pressure_at_the_depth_of_the_wheels_is_told_all_the_same(soil):
+    result = said(soil, minima.constant(0.15), STILL, seconds=2.0, overrides=["estimator.max_bearing_std=0.01"])
+    assert result.status is Status.NOT_EXCITED
+    width = 0.38
+    at_wheel = result.posterior.bearing_pressure(result.sinkage["RL"], width)
+    truth = SOILS[soil].bearing_pressure(result.sinkage["RL"], width)
+    assert at_wheel.std < 0.1 * at_wheel.value
+    assert abs(at_wheel.value - truth) < 3.0 * at_wheel.std + 0.02 * truth
+    assert all(e.std > 0.0 for e in result.posterior.parameters().values())
+    away = result.posterior.bearing_pressure(10.0 * result.sinkage["RL"], width)
+    assert away.std / away.value > at_wheel.std / at_wheel.value

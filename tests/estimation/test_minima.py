@@ -1,0 +1,153 @@
+"""One optimum from wherever the search starts, or a word that there are two; nothing outside what is physical."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import minima
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from soilbus.assembly import prior_of
+from soilbus.estimation.coordinates import BOUND, MAX_PHI
+from soilbus.estimation.gauss_newton import descend, fit_window
+from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+from soilbus.simulator.reference import reference_configuration
+from soilbus.terra.soils import SOILS
+from soilbus.terra.wheel import Soil
+
+STARTS = 20
+KINDS = [
+    ("loam", 10.0, minima.EXCITED, False), ("wet_clay", 2.0, minima.EXCITED, True),
+    ("dry_sand", 2.0, minima.EXCITED, False), ("wet_clay", 10.0, minima.constant(0.15), True),
+    ("loam", 2.0, minima.constant(0.15), False),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("soil", "seconds", "slip", "sinkage"), KINDS)
+def test_random_starts_of_the_prior_end_at_what_the_fit_finds(soil, seconds, slip, sinkage):
+    config = reference_configuration()
+    case = minima.Case("", minima.window(config, soil, seconds, slip, sinkage), prior_of(config))
+    ends = minima.ends_of(case, STARTS, 3)
+    assert ends.above < minima.SAME_COST
+    assert ends.off < minima.SAME_SOIL
+    assert ends.other == 0
+    assert not ends.worse
+    assert ends.failed <= 0.1 * STARTS
+    assert ends.fit.rival is None
+
+
+@pytest.fixture(scope="module")
+def torn():
+    """Two wheels of unlike widths on wet clay: k_c may be what it is, or nothing."""
+    config = minima.two_wheels(reference_configuration())
+    return minima.window(config, "wet_clay", seed=3), prior_of(config)
+
+
+def test_two_optima_as_likely_are_a_fit_with_a_rival(torn):
+    problem, prior = torn
+    fit = fit_window(problem, prior)
+    assert fit.converged
+    rival = fit.rival
+    assert 0.05 < rival.share <= 0.5
+    again = descend(problem, prior, rival.belief.posterior.soil)  # it is an optimum indeed
+    assert again.converged
+    assert minima.apart(again, fit) > 2.0
+    assert again.posterior.distance(rival.belief.posterior.soil) < 0.1
+    assert rival.share == pytest.approx(1.0 / (1.0 + math.exp(0.5 * (again.evidence - fit.evidence))), abs=0.01)
+
+
+def test_what_is_passed_on_covers_both_optima(torn):
+    fit = fit_window(*torn)
+    one, other, whole = fit.belief, fit.rival.belief, fit.whole
+    off = np.log(other.soil / one.soil)
+    share = fit.rival.share
+    for k in range(6):
+        expected = (1.0 - share) * one.covariance[k, k] + share * (other.covariance[k, k] + off[k] ** 2)
+        assert whole.covariance[k, k] == pytest.approx(expected)
+    assert whole.posterior.distance(Soil(*other.soil)) < 3.0 < one.posterior.distance(Soil(*other.soil))
+    truth = SOILS["wet_clay"].bearing_pressure(0.02, 0.3)
+    bearing = whole.posterior.bearing_pressure(0.02, 0.3)
+    assert abs(bearing.value - truth) < 2.0 * bearing.std
+
+
+def test_held_or_inseparable_moduli_have_no_rival(torn):
+    problem, prior = torn
+    held = SoilPrior(prior.median, np.where(np.arange(6) == PARAMETERS.index("k_c"), 0.0, prior.log_std))
+    assert fit_window(problem, held).rival is None
+    config = reference_configuration([f"wheel.{w}.width=0.3" for w in ("FL", "FR", "RL", "RR")])
+    assert fit_window(minima.window(config, "wet_clay", 2.0, seed=3), prior).rival is None
+
+
+@pytest.fixture(scope="module")
+def short():
+    config = reference_configuration()
+    scenario = minima.Scenario(2.0, (minima.Patch(0.0, "loam"),), slip=minima.EXCITED)
+    rig, channels = minima.rig_of(config), minima.simulate(config, scenario, 1).channels
+    store = minima.BinStore(rig, config.estimator.bin, 0.0)
+    store.add({c: (channels[c].t, channels[c].value) for c in rig.channels if c in channels})
+    return store.window(0.0, 2.0), rig, minima.model_of(config), prior_of(config)
+
+
+CHANNELS = ("torque", "load", "speed", "sinkage", "ground_speed", "draft")
+HARM = st.tuples(
+    st.sampled_from(CHANNELS),
+    st.sampled_from(["spiked", "constant", "scaled", "shuffled", "nan", "inf", "negative", "zero"]),
+    st.floats(-8.0, 8.0),
+)
+
+
+def harmed(window, harms, seed):
+    rng = np.random.default_rng(seed)
+    values = {}
+    for name, harm, size in harms:
+        column = values.get(name, getattr(window, name)).copy()
+        some = rng.random(column.shape) < 0.3
+        with np.errstate(over="ignore", invalid="ignore"):
+            match harm:
+                case "spiked":
+                    column[some] *= 10.0**size
+                case "constant":
+                    column[...] = 10.0**size
+                case "scaled":
+                    column *= 10.0 ** (size / 8.0)
+                case "shuffled":
+                    rng.shuffle(column)
+                case "nan":
+                    column[some] = np.nan
+                case "inf":
+                    column[some] = np.inf
+                case "negative":
+                    column *= -1.0
+                case "zero":
+                    column[...] = 0.0
+        values[name] = column
+    return replace(window, **values)
+
+
+@settings(derandomize=True, deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(harms=st.lists(HARM, max_size=3), rows=st.integers(1, 20), seed=st.integers(0, 9))
+def test_whatever_the_data_every_fit_is_physical(harms, rows, seed, short):
+    window, rig, model, prior = short
+    problem = minima.WindowProblem(harmed(window, harms, seed).rows(np.arange(rows)), rig, model, 0.2)
+    fit = fit_window(problem, prior)
+    if fit is None:
+        return
+    soil = np.asarray(fit.posterior.soil)
+    assert np.isfinite(soil).all()
+    assert (soil > 0.0).all()
+    assert fit.posterior.soil.phi <= MAX_PHI < 0.5 * math.pi
+    away = np.abs(np.log(soil / prior.median)) / prior.log_std
+    assert away.max() < BOUND * (1.0 + 1e-9)
+    for belief in (fit.belief, fit.whole):
+        assert np.isfinite(belief.gains).all()
+        spread = np.sqrt(np.diag(belief.covariance))
+        assert np.isfinite(spread).all()
+        scaled = belief.covariance[spread > 0.0][:, spread > 0.0] / np.outer(*[spread[spread > 0.0]] * 2)
+        assert np.linalg.eigvalsh(scaled).min() > -1e-9
+        assert (spread[:6] <= prior.log_std * (1.0 + 1e-6)).all() or fit.rival is not None
+    assert math.isfinite(fit.cost) or not fit.converged
+    assert math.isfinite(fit.evidence) or not fit.converged
