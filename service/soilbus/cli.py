@@ -15,10 +15,13 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from soilbus.allocator import keep_freed_memory
 from soilbus.config import Config, ConfigError, load_config
+
+if TYPE_CHECKING:
+    from soilbus.daemon.pipeline import WindowResult
 
 DONE, FAILED, WRONG_USAGE = 0, 1, 2
 
@@ -163,19 +166,21 @@ def _check(args: argparse.Namespace) -> None:
 
 def _replay(args: argparse.Namespace) -> None:
     from soilbus.can.dbc_files import load_databases
-    from soilbus.daemon.outputs import json_line
-    from soilbus.daemon.pipeline import Pipeline, WindowResult
+    from soilbus.daemon.pipeline import Pipeline
     from soilbus.daemon.replay import LogError, check_heard, estimator_beside, replay
     from soilbus.report.progress import progress
     from soilbus.report.soil_map import check_position_is_mapped, soil_map
-    from soilbus.report.windows import html_report, summary
+    from soilbus.report.windows import summary
 
     config = _configured(args)
-    pipeline = Pipeline(config, load_databases(config))
     if args.map is not None:
         check_position_is_mapped(config)
     if args.report is not None:
         _need("matplotlib", "plots", "--report")
+    if config.table is not None:
+        _replay_tables(args, config)
+        return
+    pipeline = Pipeline(config, load_databases(config))
     results: list[WindowResult] = []
     cut_off: LogError | None = None
     with estimator_beside(config) as workers, progress("replay") as step:
@@ -190,13 +195,7 @@ def _replay(args: argparse.Namespace) -> None:
             cut_off = error
     if cut_off is not None:
         print(f"soilbus: {cut_off}; {len(results)} windows before that are kept", file=sys.stderr)
-    if args.json is not None:
-        with _whole_file(args.json) as out:
-            for result in results:
-                out.write(json_line(result, config) + "\n")
-    if args.report is not None:
-        with _whole_file(args.report) as out:
-            out.write(html_report(results, pipeline, config, args.logs))
+    _write_windows(args, config, results, summary(results, pipeline))
     if args.map is not None:
         text, left_out = soil_map(results)
         with _whole_file(args.map) as out:
@@ -205,6 +204,38 @@ def _replay(args: argparse.Namespace) -> None:
             print(f"soilbus: {left_out} of {len(results)} windows have no position: not on the map", file=sys.stderr)
     if "-" not in (str(args.json), str(args.map)):
         print(summary(results, pipeline), end="")
+
+
+def _replay_tables(args: argparse.Namespace, config: Config) -> None:
+    from collections import Counter
+
+    from soilbus.daemon.replay import LogError
+    from soilbus.daemon.tables import replay_tables
+    from soilbus.report.windows import summary_of
+
+    try:
+        results = list(replay_tables(config, args.logs))
+    except LogError as error:
+        raise WorkError(str(error)) from None
+    refused = sum((Counter(result.rejected) for result in results), Counter[str]())
+    text = summary_of(results, f"{len(args.logs)} tables", refused)
+    _write_windows(args, config, results, text)
+    if str(args.json) != "-":
+        print(text, end="")
+
+
+def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[WindowResult], text: str) -> None:
+    """What --json and --report ask for, under a summary."""
+    from soilbus.daemon.outputs import json_line
+    from soilbus.report.windows import html_report
+
+    if args.json is not None:
+        with _whole_file(args.json) as out:
+            for result in results:
+                out.write(json_line(result, config) + "\n")
+    if args.report is not None:
+        with _whole_file(args.report) as out:
+            out.write(html_report(results, text, args.logs))
 
 
 def _simulate(args: argparse.Namespace) -> None:

@@ -337,3 +337,17 @@ def test_the_command_line_takes_tables_and_answers_faults_in_one_line(tmp_path, 
         error = capsys.readouterr().err
         assert complaint in error
         assert error.count("\n") == 1
+
+
+def test_replay_of_tables_writes_the_daemons_json_and_summary(tmp_path, measured, capsys):
+    table = write_csv(tmp_path / "t.csv", measured)
+    config = tmp_path / "rig.toml"
+    config.write_text(RIG)
+    assert main(["replay", "--config", str(config), str(table), str(table), "--json", "-"]) == 0
+    windows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [window["window"] for window in windows] == [0, 1]
+    assert windows[0]["soil"] == windows[1]["soil"]
+    assert main(["replay", "--config", str(config), str(table)]) == 0
+    assert "1 windows from 1 tables" in capsys.readouterr().out
+    assert main(["replay", "--config", str(config), str(tmp_path / "none.csv")]) == 1
+    assert capsys.readouterr().err.count("\n") == 1

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from soilbus.config import Config
 from soilbus.daemon.pipeline import Pipeline, WindowResult
 from soilbus.report.page import html_table, page, picture
 from soilbus.traversability import Status
@@ -45,13 +44,8 @@ def counted(counts: Counter[str]) -> str:
     return ", ".join(f"{name} {n}" for name, n in counts.most_common()) or "none"
 
 
-def html_report(results: Sequence[WindowResult], pipeline: Pipeline, config: Config, logs: Sequence[Path]) -> str:
-    """A self-contained page with plots over time; needs matplotlib (extra: plots)."""
-    return page_of(results, summary(results, pipeline), logs)
-
-
-def page_of(results: Sequence[WindowResult], text: str, logs: Sequence[Path]) -> str:
-    """The same under any summary."""
+def html_report(results: Sequence[WindowResult], text: str, logs: Sequence[Path]) -> str:
+    """A self-contained page with plots over time under a summary; needs matplotlib (extra: plots)."""
     rows = [
         (
             f"{r.t:.1f}",
