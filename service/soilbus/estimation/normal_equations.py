@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.coordinates import Coordinates
 from soilbus.estimation.linearised import Latents, Linearised
+from soilbus.estimation.moments import leaning_moments
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.terra.wheel import Soil
@@ -20,6 +21,7 @@ Indices = NDArray[np.intp]
 LONG_TURN = 0.2
 """Relative change of an entry angle from which the angles are solved again, not extrapolated."""
 _SOIL = len(PARAMETERS)
+_K_C = PARAMETERS.index("k_c")
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +102,7 @@ class Fitting:
     def with_before(self, place: Place, at: Linearised) -> Point | None:
         """Those of residuals linearised already."""
         free = len(self.free)
-        off = np.concatenate([np.log(place.soil[self.free]), place.gains[self.active]]) - self._mean
+        off = self._off(place)
         directions = self.directions(place)
         gradient = directions.T @ at.normal[:, 0]
         by_known = self._by_known(place)
@@ -119,6 +121,10 @@ class Fitting:
             cost=cost,
             at=at,
         )
+
+    def _off(self, place: Place) -> Array:
+        """How far (F + A,) the free parameters' logarithms and the active gains are from what was known."""
+        return np.asarray(np.concatenate([np.log(place.soil[self.free]), place.gains[self.active]]) - self._mean)
 
     def directions(self, place: Place) -> Array:
         """What a column of Linearised.rows (1 + 6 + G) has of each coordinate and active gain (F + A)."""
@@ -151,15 +157,35 @@ class Fitting:
         return Place(soil, place.gains + gain_step, latents, point.cost, place.trials)
 
     def belief(self, place: Place, point: Point) -> Belief | None:
-        """What is known at the optimum; None where the information is singular."""
-        inverse = solved(point.information, point.gradient)
-        if inverse is None:
+        """Mean and covariance of what is known where this is the optimum; None where the information is singular."""
+        moments = self._moments(place, point)
+        if moments is None:
             return None
+        mean, covariance = moments
         free, n_gains = len(self.free), len(place.gains)
+        soil = self.coordinates.soil_at(self.coordinates.position(place.soil) + mean[:free])
+        gains = place.gains.copy()
+        gains[self.active] += mean[free:]
         spread = np.zeros((_SOIL + n_gains, free + len(self.active)))
-        spread[:_SOIL, :free] = self._log_directions(place.soil)
+        spread[:_SOIL, :free] = self._log_directions(soil)
         spread[_SOIL + self.active, free + np.arange(len(self.active))] = 1.0
-        return Belief(place.soil, place.gains, spread @ inverse[1] @ spread.T)
+        return Belief(soil, gains, spread @ covariance @ spread.T)
+
+    def _moments(self, place: Place, point: Point) -> tuple[Array, Array] | None:
+        """Mean (F + A,) and covariance (F + A, F + A) of the coordinates and gains about the optimum."""
+        if _K_C not in self.free:
+            inverse = solved(point.information, point.gradient)
+            return None if inverse is None else (np.zeros(len(point.gradient)), inverse[1])
+        # What was known is Gaussian in the logarithm of k_c, the data and K_L are linear in k_c: two columns for one.
+        by_known = np.insert(self._by_known(place), 1, 0.0, axis=1)
+        by_known[0, :2] = 0.0, 1.0
+        quadratic = by_known.T @ self._precision @ by_known
+        both = np.ix_(*2 * [np.delete(np.arange(len(quadratic)), 1)])
+        quadratic[both] += point.information - point.known
+        pull = float(self._precision[0] @ self._off(place))
+        gradient = np.zeros(len(quadratic))
+        gradient[:2] = -pull, pull  # at the optimum the data pull as much the other way
+        return leaning_moments(quadratic, gradient)
 
     def _log_directions(self, soil: Array) -> Array:
         return self.coordinates.log_directions(soil)
