@@ -20,8 +20,6 @@ Array = NDArray[np.float64]
 TYPICAL_DEPTH = 0.03
 MAX_STEP = 0.7
 """Longest step of a coordinate."""
-MAX_SHARE = 0.99
-"""Largest share of K_L that k_c may have."""
 BOUND = 4.0
 """Prior standard deviations of the logarithm to which a free parameter is confined."""
 
@@ -47,17 +45,13 @@ class Coordinates:
         directions[free, np.arange(len(free))] = 1.0
         column = self._column
         if _K_PHI in column:
-            share = soil[_K_C] / (soil[_K_C] + soil[_K_PHI] * self.width)
-            by_K_L = np.zeros(len(free))
-            by_K_L[column[_K_PHI]] = 1.0
-            if _N in column:
-                by_K_L[column[_N]] = -soil[_N] * np.log(TYPICAL_DEPTH)
+            k_phi = soil[_K_PHI]
+            K_L = k_phi + soil[_K_C] / self.width
+            directions[_K_PHI, column[_K_PHI]] = K_L / k_phi
             if _K_C in column:
-                directions[_K_C] += by_K_L
-                directions[_K_PHI] = by_K_L
-                directions[_K_PHI, column[_K_C]] = -share / (1.0 - share)
-            else:
-                directions[_K_PHI] = by_K_L / (1.0 - share)
+                directions[_K_PHI, column[_K_C]] = -soil[_K_C] / self.width / k_phi
+            if _N in column:
+                directions[_K_PHI, column[_N]] = -K_L / k_phi * soil[_N] * np.log(TYPICAL_DEPTH)
         return directions
 
     def bend(self, gradient: Array) -> Array:
@@ -76,10 +70,8 @@ class Coordinates:
         """Coordinates (F,) of a soil (6,)."""
         logs = np.log(soil[self.free])
         if _K_PHI in self._column:
-            log_K_L = np.log(soil[_K_PHI] + soil[_K_C] / self.width)
-            logs[self._column[_K_PHI]] = log_K_L + soil[_N] * np.log(TYPICAL_DEPTH)
-            if _K_C in self._column:
-                logs[self._column[_K_C]] -= log_K_L + np.log(self.width)
+            K_L = soil[_K_PHI] + soil[_K_C] / self.width
+            logs[self._column[_K_PHI]] = np.log(K_L) + soil[_N] * np.log(TYPICAL_DEPTH)
         return logs
 
     def soil_at(self, position: Array) -> Array:
@@ -89,9 +81,7 @@ class Coordinates:
         soil[free] = np.exp(position)
         if _K_PHI in self._column:
             K_L = np.exp(position[self._column[_K_PHI]] - soil[_N] * np.log(TYPICAL_DEPTH))
-            if _K_C in self._column:
-                soil[_K_C] = min(soil[_K_C], MAX_SHARE) * K_L * self.width
-            soil[_K_PHI] = max(K_L - soil[_K_C] / self.width, (1.0 - MAX_SHARE) * K_L)
+            soil[_K_PHI] = max(K_L - soil[_K_C] / self.width, 0.01 * K_L)
         low, high = self._bounds
         soil[free] = np.minimum(np.maximum(soil[free], low), high)
         return soil

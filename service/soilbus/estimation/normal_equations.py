@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
-from soilbus.estimation.coordinates import Coordinates
+from soilbus.estimation.coordinates import TYPICAL_DEPTH, Coordinates
 from soilbus.estimation.linearised import Latents, Linearised
-from soilbus.estimation.moments import leaning_moments
+from soilbus.estimation.moments import Moments, moments_along_share
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.terra.wheel import Soil
@@ -20,8 +20,10 @@ Indices = NDArray[np.intp]
 
 LONG_TURN = 0.2
 """Relative change of an entry angle from which the angles are solved again, not extrapolated."""
+WELL_TOLD = 0.5
+"""Sd of the logarithm of K_L at a typical depth from which on k_c and k_phi are each as known before."""
 _SOIL = len(PARAMETERS)
-_K_C = PARAMETERS.index("k_c")
+_K_C, _K_PHI, _N = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,35 +159,61 @@ class Fitting:
         return Place(soil, place.gains + gain_step, latents, point.cost, place.trials)
 
     def belief(self, place: Place, point: Point) -> Belief | None:
-        """Mean and covariance of what is known where this is the optimum; None where the information is singular."""
-        moments = self._moments(place, point)
-        if moments is None:
+        """What is known, where this is the optimum; None where the information is singular."""
+        inverse = solved(point.information, point.gradient)
+        if inverse is None:
             return None
-        mean, covariance = moments
-        free, n_gains = len(self.free), len(place.gains)
-        soil = self.coordinates.soil_at(self.coordinates.position(place.soil) + mean[:free])
-        gains = place.gains.copy()
-        gains[self.active] += mean[free:]
-        spread = np.zeros((_SOIL + n_gains, free + len(self.active)))
-        spread[:_SOIL, :free] = self._log_directions(soil)
-        spread[_SOIL + self.active, free + np.arange(len(self.active))] = 1.0
+        soil, gains, covariance = place.soil, place.gains, inverse[1]
+        if self._with_share and covariance[_K_PHI, _K_PHI] < WELL_TOLD**2:
+            moments = self._moments(place, point)
+            if moments is None:
+                return None
+            free = len(self.free)
+            by_share = self._by_share(soil)
+            soil = self.coordinates.soil_at(self.coordinates.position(soil) + by_share[:free] @ moments.mean)
+            gains = gains.copy()
+            gains[self.active] += moments.mean[free:]
+            by_share = self._by_share(soil)
+            covariance = by_share @ moments.covariance @ by_share.T
+        spread = self._spread(soil)
         return Belief(soil, gains, spread @ covariance @ spread.T)
 
-    def _moments(self, place: Place, point: Point) -> tuple[Array, Array] | None:
-        """Mean (F + A,) and covariance (F + A, F + A) of the coordinates and gains about the optimum."""
-        if _K_C not in self.free:
-            inverse = solved(point.information, point.gradient)
-            return None if inverse is None else (np.zeros(len(point.gradient)), inverse[1])
-        # What was known is Gaussian in the logarithm of k_c, the data and K_L are linear in k_c: two columns for one.
-        by_known = np.insert(self._by_known(place), 1, 0.0, axis=1)
-        by_known[0, :2] = 0.0, 1.0
-        quadratic = by_known.T @ self._precision @ by_known
-        both = np.ix_(*2 * [np.delete(np.arange(len(quadratic)), 1)])
-        quadratic[both] += point.information - point.known
-        pull = float(self._precision[0] @ self._off(place))
+    def _moments(self, place: Place, point: Point) -> Moments | None:
+        """Moments of the logarithm of k_c's share in K_L, the other coordinates and the gains, about the optimum."""
+        others = np.arange(1, len(point.gradient))
+        by_share = self._by_share(place.soil)
+        by_changes = np.zeros((len(others) + 1, len(others) + 3))  # of what was known: k_c and k_phi have s K_L each
+        by_changes[others, others + 2] = 1.0
+        by_changes[[_K_C, _K_PHI], 3:] = by_share[_K_C, 1:]
+        by_changes[[_K_C, _K_PHI], [1, 2]] = 1.0
+        quadratic = by_changes.T @ self._precision @ by_changes
+        of_data = np.concatenate([[0], others + 2])
+        quadratic[np.ix_(of_data, of_data)] += by_share.T @ (point.information - point.known) @ by_share
+        k_c, k_phi = place.soil[[_K_C, _K_PHI]]
+        share = k_c / (k_c + k_phi * self.coordinates.width)
+        pull = (self._precision @ self._off(place))[[_K_C, _K_PHI]]
         gradient = np.zeros(len(quadratic))
-        gradient[:2] = -pull, pull  # at the optimum the data pull as much the other way
-        return leaning_moments(quadratic, gradient)
+        gradient[:3] = pull[1] * share / (1.0 - share) - pull[0], *pull  # the data pull as much the other way
+        return moments_along_share(quadratic, gradient, share)
+
+    @property
+    def _with_share(self) -> bool:
+        return bool(np.isin([_K_C, _K_PHI], self.free).all())
+
+    def _by_share(self, soil: Array) -> Array:
+        """Derivatives (F + A, F + A) of the coordinates, where log k_c is one, by those where that of its share is."""
+        by_share = np.eye(len(self.free) + len(self.active))
+        by_share[_K_C, _K_PHI] = 1.0
+        by_share[_K_C, : len(self.free)] += np.where(self.free == _N, -soil[_N] * np.log(TYPICAL_DEPTH), 0.0)
+        return by_share
+
+    def _spread(self, soil: Array) -> Array:
+        """What the parameters' logarithms and all gains (6 + G) have of each coordinate and active gain (F + A)."""
+        free = len(self.free)
+        spread = np.zeros((_SOIL + len(self.before.gains), free + len(self.active)))
+        spread[:_SOIL, :free] = self._log_directions(soil)
+        spread[_SOIL + self.active, free + np.arange(len(self.active))] = 1.0
+        return spread
 
     def _log_directions(self, soil: Array) -> Array:
         return self.coordinates.log_directions(soil)
