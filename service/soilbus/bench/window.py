@@ -95,7 +95,7 @@ def distance(window: Window, ours: Fit | None, peer: Soil) -> float:
         raise AssertionError("our fit failed")
     free = window.prior.free
     std = np.sqrt(np.diag(ours.belief.covariance)[free])
-    return float(np.max(np.abs(np.log(np.asarray(peer) / ours.belief.soil)[free]) / std))
+    return float(np.max(np.abs(np.log(np.asarray(peer) / np.asarray(ours.mode))[free]) / std))
 
 
 def by_finite_differences(window: Window, least_squares: Any) -> Soil:

@@ -55,12 +55,13 @@ class Fit:
     cost is -2 log posterior up to a constant: chi-square of the residuals and of what was
     known before; evidence is -2 log of the data's likelihood, up to the same.  chi2 is
     cost per residual (reduced: each parameter has its prior as one more residual).
-    sinkage (W,) is the mean over the window [m], nan where unknown; belief holds soil and
-    gains (relative errors, by problem.gain_names) for the windows to come, optimum is for
-    resume().
+    belief holds soil and gains (relative errors, by problem.gain_names) by their means, for
+    the windows to come; mode is the most probable soil.  sinkage (W,) is the mean over the
+    window [m], nan where unknown; optimum is for resume().
     """
 
     belief: Belief
+    mode: Soil
     sinkage: Array
     optimum: Optimum
     cost: float
@@ -246,6 +247,7 @@ def _settle(fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OV
         return None
     return Fit(
         belief=belief,
+        mode=near.as_soil(),
         sinkage=fitting.problem.mean_sinkage(near.latents),
         optimum=Optimum(fitting.problem.t, last.soil, last.gains, last.latents, point.at),
         cost=point.cost - length,
