@@ -56,12 +56,12 @@ class Fit:
     known before; evidence is -2 log of the data's likelihood, up to the same.  chi2 is
     cost per residual (reduced: each parameter has its prior as one more residual).
     belief holds soil and gains (relative errors, by problem.gain_names) by their means, for
-    the windows to come; mode is the most probable soil.  sinkage (W,) is the mean over the
+    the windows to come; mode is where they are most probable, with the curvature there.  sinkage (W,) is the mean over the
     window [m], nan where unknown; optimum is for resume().
     """
 
     belief: Belief
-    mode: Soil
+    mode: Belief
     sinkage: Array
     optimum: Optimum
     cost: float
@@ -242,12 +242,12 @@ def _settle(fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OV
     if best is None:
         return None
     last, point = best
-    belief = fitting.belief(near, point)
-    if belief is None:
+    beliefs = fitting.beliefs(near, point)
+    if beliefs is None:
         return None
     return Fit(
-        belief=belief,
-        mode=near.as_soil(),
+        belief=beliefs[0],
+        mode=beliefs[1],
         sinkage=fitting.problem.mean_sinkage(near.latents),
         optimum=Optimum(fitting.problem.t, last.soil, last.gains, last.latents, point.at),
         cost=point.cost - length,

@@ -158,25 +158,24 @@ class Fitting:
             latents = self.problem.carried(latents, Soil(*soil.tolist()))
         return Place(soil, place.gains + gain_step, latents, point.cost, place.trials)
 
-    def belief(self, place: Place, point: Point) -> Belief | None:
-        """What is known, where this is the optimum; None where the information is singular."""
+    def beliefs(self, place: Place, point: Point) -> tuple[Belief, Belief] | None:
+        """What this optimum tells, by its moments and by its curvature; None where the information is singular."""
         inverse = solved(point.information, point.gradient)
         if inverse is None:
             return None
-        soil, gains, covariance = place.soil, place.gains, inverse[1]
-        if self._with_share and covariance[_K_PHI, _K_PHI] < WELL_TOLD**2:
-            moments = self._moments(place, point)
-            if moments is None:
-                return None
-            free = len(self.free)
-            by_share = self._by_share(soil)
-            soil = self.coordinates.soil_at(self.coordinates.position(soil) + by_share[:free] @ moments.mean)
-            gains = gains.copy()
-            gains[self.active] += moments.mean[free:]
-            by_share = self._by_share(soil)
-            covariance = by_share @ moments.covariance @ by_share.T
-        spread = self._spread(soil)
-        return Belief(soil, gains, spread @ covariance @ spread.T)
+        covariance = inverse[1]
+        mode = self._belief(place.soil, place.gains, covariance)
+        if not self._with_share or covariance[_K_PHI, _K_PHI] > WELL_TOLD**2:
+            return mode, mode
+        moments = self._moments(place, point)
+        if moments is None:
+            return None
+        free, gains = len(self.free), place.gains.copy()
+        step = self._by_share(place.soil) @ moments.mean
+        soil = self.coordinates.soil_at(self.coordinates.position(place.soil) + step[:free])
+        gains[self.active] += step[free:]
+        by_share = self._by_share(soil)
+        return self._belief(soil, gains, by_share @ moments.covariance @ by_share.T), mode
 
     def _moments(self, place: Place, point: Point) -> Moments | None:
         """Moments of the logarithm of k_c's share in K_L, the other coordinates and the gains, about the optimum."""
@@ -207,13 +206,13 @@ class Fitting:
         by_share[_K_C, : len(self.free)] += np.where(self.free == _N, -soil[_N] * np.log(TYPICAL_DEPTH), 0.0)
         return by_share
 
-    def _spread(self, soil: Array) -> Array:
-        """What the parameters' logarithms and all gains (6 + G) have of each coordinate and active gain (F + A)."""
+    def _belief(self, soil: Array, gains: Array, covariance: Array) -> Belief:
+        """The belief with this covariance (F + A, F + A) of coordinates and active gains."""
         free = len(self.free)
-        spread = np.zeros((_SOIL + len(self.before.gains), free + len(self.active)))
+        spread = np.zeros((_SOIL + len(gains), free + len(self.active)))
         spread[:_SOIL, :free] = self._log_directions(soil)
         spread[_SOIL + self.active, free + np.arange(len(self.active))] = 1.0
-        return spread
+        return Belief(soil, gains, spread @ covariance @ spread.T)
 
     def _log_directions(self, soil: Array) -> Array:
         return self.coordinates.log_directions(soil)
