@@ -56,8 +56,8 @@ class Fit:
     known before; evidence is -2 log of the data's likelihood, up to the same.  chi2 is
     cost per residual (reduced: each parameter has its prior as one more residual).
     belief holds soil and gains (relative errors, by problem.gain_names) by their means, for
-    the windows to come; mode is where they are most probable, with the curvature there.  sinkage (W,) is the mean over the
-    window [m], nan where unknown; optimum is for resume().
+    the windows to come; mode is where they are most probable, with the curvature there.
+    sinkage (W,) is the mean over the window [m], nan where unknown; optimum is for resume().
     """
 
     belief: Belief
