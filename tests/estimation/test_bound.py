@@ -107,24 +107,36 @@ def test_without_data_the_bound_is_the_prior():
     assert bound.log_covariance == pytest.approx(np.diag(log_std**2))
 
 
-WINDOWS = {2.0: 20, 10.0: 20, 60.0: 6}
+WINDOWS = {2.0: 20, 10.0: 20, 60.0: 16}
 """Of each length and soil; with and without sinkage sensors from the same drives."""
+WINDOWS_OF_ANY_K_C = {2.0: 24, 10.0: 16}
 QUANTITIES = (*PARAMETERS, "bearing_pressure")
 MAX_RMS, LOW, HIGH, CHI2_OFF = 1.15, 0.93, 0.97, 0.03
 CHANCE = 1e-3
 """Probability that a figure just on its target fails here."""
 
 
-@pytest.fixture(scope="module")
-def simulated_windows():
-    """Trials by window length and sensors, of all three soils; k_c is known to 50 %, c and K to 25 %."""
-    config = reference_configuration([*ROUGHLY_KNOWN, "soil.k_c.std=3000"])
+def simulate_windows(counts, *settings):
+    """Trials by window length and sensors, of all three soils; c and K are known to 25 %."""
+    config = reference_configuration([*ROUGHLY_KNOWN, *settings])
     found = {}
-    for duration, n in WINDOWS.items():
+    for duration, n in counts.items():
         pairs = [trials(task) for soil in SOILS for task in tasks_of(config, soil, duration, n, 11)]
         for sinkage_measured, of_cell in zip((True, False), zip(*pairs, strict=True), strict=True):
             found[duration, sinkage_measured] = of_cell
     return found
+
+
+@pytest.fixture(scope="module")
+def simulated_windows():
+    """Those where k_c is known to 50 %."""
+    return simulate_windows(WINDOWS, "soil.k_c.std=3000")
+
+
+@pytest.fixture(scope="module")
+def windows_of_any_k_c():
+    """Those where k_c is told as roughly as by default: no Gaussian of its logarithm describes what they tell of it."""
+    return simulate_windows(WINDOWS_OF_ANY_K_C)
 
 
 CELLS = [(duration, measured) for duration in WINDOWS for measured in (True, False)]
@@ -168,3 +180,20 @@ def test_reduced_chi_square_is_one(duration, measured, simulated_windows):
     chance = 3.3 * np.sqrt(2.0 / rows / len(good))
     assert np.mean(good) == pytest.approx(1.0, abs=CHI2_OFF + chance)
     assert np.std(good) == pytest.approx(np.sqrt(2.0 / rows), rel=3.3 / np.sqrt(2.0 * len(good)) + 0.05)
+
+
+@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize("duration", WINDOWS_OF_ANY_K_C)
+def test_errors_are_as_large_as_they_say_whatever_k_c_may_be(duration, measured, windows_of_any_k_c):
+    good = [t for t in windows_of_any_k_c[duration, measured] if t.converged]
+    n = len(good)
+    assert n >= 0.9 * 3 * WINDOWS_OF_ANY_K_C[duration]
+    score = np.array([t.error / t.std for t in good])
+    rms = np.sqrt((score**2).mean(axis=0))
+    most = MAX_RMS * np.sqrt(chi2.ppf(1.0 - CHANCE, n) / n)
+    # Not k_c: far below what the data can tell, the logarithm of a small k_c may be off without limit.
+    assert (rms[1:] < most).all(), dict(zip(QUANTITIES, rms, strict=True))
+    held = (np.abs(score) < NORMAL_95).sum(axis=0)
+    assert (held >= binom.ppf(CHANCE, n, LOW)).all(), dict(zip(QUANTITIES, held / n, strict=True))
+    # Nor are intervals so wide that they hold anything.
+    assert (rms > np.sqrt(chi2.ppf(CHANCE, n) / n) - 0.15).all()

@@ -103,10 +103,23 @@ def test_two_tyre_widths_separate_k_c_from_k_phi(fits):
         assert 0.86 < (z**2).sum() < 26.2  # chi-square with 8 degrees of freedom: 99.8 %
 
 
+def known_before(told, K_L, width):
+    """Mean and std of log k_c by the prior alone, where k_c / width + k_phi is K_L."""
+    k_c = width * K_L * np.linspace(0.0, 1.0, 20_002)[1:-1]
+    k_phi = K_L - k_c / width
+    off = np.log(np.stack([k_c, k_phi])) - np.log(told[:2])[:, None]
+    weight = np.exp(-0.5 * ((off[0] / PRIOR) ** 2 + off[1] ** 2)) / (k_c * k_phi)  # uniform in k_c
+    mean = np.average(np.log(k_c), weights=weight)
+    return mean, np.sqrt(np.average((np.log(k_c) - mean) ** 2, weights=weight))
+
+
 def test_equal_widths_leave_k_c_at_its_prior(fits):
+    # With its own part in K_L, which is known: the share of k_phi was told beforehand too, if roughly.
     for told, posterior in fits["alike"]:
-        assert np.sqrt(posterior.log_covariance[0, 0]) > 0.95 * PRIOR
-        assert abs(np.log(posterior.soil.k_c / told[0])) < 0.3 * PRIOR
+        mean, std = known_before(told, posterior.soil.k_phi + posterior.soil.k_c / 0.35, 0.35)
+        assert np.sqrt(posterior.log_covariance[0, 0]) == pytest.approx(std, rel=0.06)
+        assert std > 0.9 * PRIOR
+        assert np.log(posterior.soil.k_c) == pytest.approx(mean, abs=0.1 * PRIOR)
         # What the tyres do tell is the pressure under themselves.
         own, narrow = (posterior.bearing_pressure(0.1, width) for width in (0.35, 0.10))
         assert own.std / own.value < 0.03

@@ -45,7 +45,7 @@ def exponents() -> dict[str, Figure]:
                 raise AssertionError(f"no fit of {wheels} wheels and {problem.n} instants")
             sizes.append(wheels * problem.n)
             iterations.append(fit.iterations)
-            works.append(_steps(problem, prior, fit.belief.soil))
+            works.append(_steps(problem, prior, fit.mode.soil))
     size, times = np.array(sizes, float), in_turn(works, ROUNDS) / STEPS
     fixed, each = line(size, times)
     off = float(np.max(np.abs((fixed + each * size) / times - 1.0)))

@@ -94,8 +94,8 @@ def distance(window: Window, ours: Fit | None, peer: Soil) -> float:
     if ours is None or not ours.converged:
         raise AssertionError("our fit failed")
     free = window.prior.free
-    std = np.sqrt(np.diag(ours.belief.covariance)[free])
-    return float(np.max(np.abs(np.log(np.asarray(peer) / ours.belief.soil)[free]) / std))
+    std = np.sqrt(np.diag(ours.mode.covariance)[free])
+    return float(np.max(np.abs(np.log(np.asarray(peer) / ours.mode.soil)[free]) / std))
 
 
 def by_finite_differences(window: Window, least_squares: Any) -> Soil:

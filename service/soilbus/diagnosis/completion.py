@@ -110,7 +110,7 @@ class Completion:
     @property
     def free_at_edge(self) -> tuple[Free, ...] | None:
         """The parameters with those held that would leave their range; None where none would."""
-        pulls = self.fits[-1].belief.gains[self.checks[-1].problem.n_sensors :].tolist()
+        pulls = self.fits[-1].mode.gains[self.checks[-1].problem.n_sensors :].tolist()
         leaves = [f.std > 0.0 and not f.within(u) for f, u in zip(self.free, pulls, strict=True)]
         if not any(leaves):
             return None
@@ -121,7 +121,7 @@ class Completion:
 
     def as_starts(self) -> tuple[Start, ...]:
         """Where these fits ended."""
-        return tuple(Start(fit.belief.soil, fit.belief.gains) for fit in self.fits)
+        return tuple(Start(fit.mode.soil, fit.mode.gains) for fit in self.fits)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -130,7 +130,7 @@ class Completion:
 
     def parameters(self) -> dict[str, dict[str, Estimate]]:
         """Value and std of each parameter by effect, as the last recording leaves them; wheels' own as name_WHEEL."""
-        belief, problem = self.fits[-1].belief, self.checks[-1].problem
+        belief, problem = self.fits[-1].mode, self.checks[-1].problem
         std = np.sqrt(np.diag(belief.covariance))[_SOIL + problem.n_sensors :]
         out: dict[str, dict[str, Estimate]] = {name: {} for name in self.names}
         for free, pull, spread in zip(self.free, belief.gains[problem.n_sensors :].tolist(), std.tolist(), strict=True):
@@ -177,7 +177,7 @@ def _complete(
         fits.append(fit)
         befores.append(before)
         checks.append(check(record.checked.completed(effects, free), prior, fit))
-        known = fit.belief
+        known = fit.mode
     return Completion(tuple(effects), free, tuple(befores), tuple(fits), tuple(checks))
 
 
@@ -198,7 +198,7 @@ def _fitted(problem: CompletedProblem, prior: SoilPrior, before: Belief, start: 
         fit = fit_window(problem, prior, before)
         if fit is None or fit.converged:
             return fit
-        start = Start(fit.belief.soil, fit.belief.gains)
+        start = Start(fit.mode.soil, fit.mode.gains)
     gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
     return continued(problem, prior, before, start.soil, gains, problem.n_sensors)
 
@@ -218,15 +218,15 @@ def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects
 
 def check(problem: CompletedProblem, prior: SoilPrior, fit: Fit) -> Checked:
     """Held-out blocks under a model fitted to the others."""
-    soil, gains = Soil(*fit.belief.soil.tolist()), fit.belief.gains
+    soil, gains = Soil(*fit.mode.soil.tolist()), fit.mode.gains
     latents = problem.carried(problem.start(soil), soil, gains)
-    fitting = Fitting(problem, prior, fit.belief)
+    fitting = Fitting(problem, prior, fit.mode)
     with np.errstate(all="ignore"):
         at = problem.linearise(soil, gains, latents)
         for _ in range(CHECK_ROUNDS - 1):
             latents = problem.updated(at, latents, np.zeros(_SOIL), np.zeros(len(gains)))
             at = problem.linearise(soil, gains, latents)
-        point = fitting.with_before(Place(fit.belief.soil, gains, latents, np.inf, 0), at)
+        point = fitting.with_before(Place(fit.mode.soil, gains, latents, np.inf, 0), at)
         step = None if point is None else point.step()
     if point is None or step is None:
         return Checked(problem, latents, at, np.inf, np.inf)

@@ -86,7 +86,7 @@ def _samples(records: list[Record], completion: Completion, place: int) -> Itera
     for record, fit, check in zip(records, completion.fits, completion.checks, strict=True):
         learned = record.learned.completed(completion.effects, completion.free)
         of_fit = _sample(learned, fit.optimum.at, fit.optimum.latents, fit.optimum.gains, place)
-        yield of_fit, _of_check(check, fit.belief.gains, place)
+        yield of_fit, _of_check(check, fit.mode.gains, place)
 
 
 def _of_check(check: Checked, gains: Array, place: int) -> _Sample:

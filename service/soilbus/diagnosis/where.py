@@ -77,7 +77,7 @@ def channels(wheels: Sequence[str], with_sinkage: bool) -> list[tuple[str, str]]
 
 
 def _looks(check: Checked, completion: Completion, record: int) -> Iterator[_Look]:
-    problem, belief = check.problem, completion.fits[record].belief
+    problem, belief = check.problem, completion.fits[record].mode
     z, by = problem.standardised(check.at, belief.gains)
     by = by * np.concatenate([belief.soil, np.ones(len(belief.gains))])
     raw = check.at.rows[:, 0].reshape(z.shape)
@@ -122,7 +122,7 @@ def _regions(regressors: dict[str, Array], known: NDArray[np.bool_]) -> Iterator
 
 def _gain_looks(completion: Completion) -> Iterator[_Look]:
     """Gain errors that are larger than they may be: a fit hides an effect in them."""
-    problem, belief = completion.checks[-1].problem, completion.fits[-1].belief
+    problem, belief = completion.checks[-1].problem, completion.fits[-1].mode
     for i in range(problem.n_sensors):
         std = float(problem.gain_std[i])
         told = std**2 - float(belief.covariance[_SOIL + i, _SOIL + i])  # what the data moved it by, were it noise

@@ -17,9 +17,10 @@ _SOIL = len(PARAMETERS)
 
 @dataclass(frozen=True, slots=True)
 class Belief:
-    """Most likely soil (6,) in SI and gain errors (G,), with their covariance (6 + G, 6 + G).
+    """Typical soil (6,) in SI and gain errors (G,), with their covariance (6 + G, 6 + G).
 
-    The covariance is that of the soil parameters' logarithms and the gains; what is held
+    Typical by its mean in the coordinates in which a window is nearest to Gaussian (see
+    `moments`).  The covariance is that of the soil parameters' logarithms and the gains; what is held
     has none.  A window tells combinations of soil and gains, so what it leaves behind is
     kept jointly: gains do not change from window to window, and forgetting them would
     count the same ignorance as news each time.

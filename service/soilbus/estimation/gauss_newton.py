@@ -83,14 +83,16 @@ class Fit:
     cost is -2 log posterior up to a constant: chi-square of the residuals and of what was
     known before; evidence is -2 log of the data's likelihood, up to the same.  chi2 is
     cost per residual (reduced: each parameter has its prior as one more residual).
-    sinkage (W,) is the mean over the window [m], nan where unknown; belief holds soil and
-    gains (relative errors, by problem.gain_names) for the windows to come, optimum is for
-    resume(); rival is another optimum that the data leave about as likely, where one was
-    looked for and found; averaged is the mean of the whole posterior, where that was worked
-    out (see `marginal`).
+    belief holds soil and gains (relative errors, by problem.gain_names) by their means, for
+    the windows to come; mode is where they are most probable, with the curvature there.
+    sinkage (W,) is the mean over the window [m], nan where unknown; optimum is for resume();
+    rival is another optimum that the data leave about as likely, where one was looked for
+    and found; averaged is the mean of the whole posterior, where that was worked out (see
+    `marginal`).
     """
 
     belief: Belief
+    mode: Belief
     sinkage: Array
     optimum: Optimum
     cost: float
@@ -367,11 +369,12 @@ def _settle(fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OV
     if best is None:
         return None
     last, point = best
-    belief = fitting.belief(near, point)
-    if belief is None:
+    beliefs = fitting.beliefs(near, point)
+    if beliefs is None:
         return None
     return Fit(
-        belief=belief,
+        belief=beliefs[0],
+        mode=beliefs[1],
         sinkage=fitting.problem.mean_sinkage(near.as_soil(), near.gains, near.latents),
         optimum=Optimum(fitting.problem.t, last.soil, last.gains, last.latents, point.at),
         cost=point.cost - (length if converged else 0.0),

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
-from soilbus.estimation.coordinates import Coordinates
+from soilbus.estimation.coordinates import TYPICAL_DEPTH, Coordinates
 from soilbus.estimation.linearised import Latents, Linearised
+from soilbus.estimation.moments import Moments, moments_along_share
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.terra.wheel import Soil
@@ -20,7 +21,10 @@ Indices = NDArray[np.intp]
 
 LONG_TURN = 0.2
 """Relative change of an entry angle from which the angles are solved again, not extrapolated."""
+WELL_TOLD = 0.5
+"""Sd of the logarithm of K_L at a typical depth from which on k_c and k_phi are each as known before."""
 _SOIL = len(PARAMETERS)
+_K_C, _K_PHI, _N = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,10 +144,14 @@ class Fitting:
 
     def before_at(self, place: Place) -> Known:
         """What was known before, seen from a place."""
-        off = np.concatenate([np.log(place.soil[self.free]), place.gains[self.active]]) - self._mean
+        off = self._off(place)
         by_known = self._by_known(place)
         pull = self._precision @ off
         return Known(by_known.T @ self._precision @ by_known, by_known.T @ pull, float(off @ pull))
+
+    def _off(self, place: Place) -> Array:
+        """How far (F + A,) the free parameters' logarithms and the active gains are from what was known."""
+        return np.asarray(np.concatenate([np.log(place.soil[self.free]), place.gains[self.active]]) - self._mean)
 
     def directions(self, place: Place) -> Array:
         """What a column of Linearised.rows (1 + 6 + G) has of each coordinate and active gain (F + A)."""
@@ -176,18 +184,65 @@ class Fitting:
         """The same place with the entry angles solved anew: linear models in a row may have lost them."""
         return replace(place, latents=self.problem.carried(place.latents, place.as_soil()))
 
-    def belief(self, place: Place, point: Point) -> Belief | None:
-        """What is known at the optimum; None where the information is singular."""
+    def beliefs(self, place: Place, point: Point) -> tuple[Belief, Belief] | None:
+        """What this optimum tells, by its moments and by its curvature; None where the information is singular."""
         inverse = solved(point.information, point.gradient)
-        return None if inverse is None else self.believed(place, inverse[1])
+        if inverse is None:
+            return None
+        covariance = inverse[1]
+        mode = self._belief(place.soil, place.gains, covariance)
+        if not self._with_share or covariance[_K_PHI, _K_PHI] > WELL_TOLD**2:
+            return mode, mode
+        moments = self._moments(place, point)
+        if moments is None:
+            return None
+        free, gains = len(self.free), place.gains.copy()
+        step = self._by_share(place.soil) @ moments.mean
+        soil = self.coordinates.soil_at(self.coordinates.position(place.soil) + step[:free])
+        gains[self.active] += step[free:]
+        by_share = self._by_share(soil)
+        return self._belief(soil, gains, by_share @ moments.covariance @ by_share.T), mode
+
+    def _moments(self, place: Place, point: Point) -> Moments | None:
+        """Moments of the logarithm of k_c's share in K_L, the other coordinates and the gains, about the optimum."""
+        others = np.arange(1, len(point.gradient))
+        by_share = self._by_share(place.soil)
+        by_changes = np.zeros((len(others) + 1, len(others) + 3))  # of what was known: k_c and k_phi have s K_L each
+        by_changes[others, others + 2] = 1.0
+        by_changes[[_K_C, _K_PHI], 3:] = by_share[_K_C, 1:]
+        by_changes[[_K_C, _K_PHI], [1, 2]] = 1.0
+        quadratic = by_changes.T @ self._precision @ by_changes
+        of_data = np.concatenate([[0], others + 2])
+        quadratic[np.ix_(of_data, of_data)] += by_share.T @ (point.information - point.known) @ by_share
+        k_c, k_phi = place.soil[[_K_C, _K_PHI]]
+        share = k_c / (k_c + k_phi * self.coordinates.width)
+        pull = (self._precision @ self._off(place))[[_K_C, _K_PHI]]
+        gradient = np.zeros(len(quadratic))
+        gradient[:3] = pull[1] * share / (1.0 - share) - pull[0], *pull  # the data pull as much the other way
+        return moments_along_share(quadratic, gradient, share)
+
+    @property
+    def _with_share(self) -> bool:
+        return bool(np.isin([_K_C, _K_PHI], self.free).all())
+
+    def _by_share(self, soil: Array) -> Array:
+        """Derivatives (F + A, F + A) of the coordinates, where log k_c is one, by those where that of its share is."""
+        by_share = np.eye(len(self.free) + len(self.active))
+        by_share[_K_C, _K_PHI] = 1.0
+        by_share[_K_C, : len(self.free)] += np.where(self.free == _N, -soil[_N] * np.log(TYPICAL_DEPTH), 0.0)
+        return by_share
+
+    def _belief(self, soil: Array, gains: Array, covariance: Array) -> Belief:
+        """The belief with this covariance (F + A, F + A) of coordinates and active gains."""
+        free = len(self.free)
+        spread = np.zeros((_SOIL + len(gains), free + len(self.active)))
+        spread[:_SOIL, :free] = self._log_directions(soil)
+        spread[_SOIL + self.active, free + np.arange(len(self.active))] = 1.0
+        return Belief(soil, gains, spread @ covariance @ spread.T)
 
     def believed(self, place: Place, covariance: Array) -> Belief:
         """A place with the covariance (F + A, F + A) of its coordinates and active gains."""
-        free, n_gains = len(self.free), len(place.gains)
-        spread = np.zeros((_SOIL + n_gains, free + len(self.active)))
-        spread[:_SOIL, :free] = self._log_directions(place.soil)
-        spread[_SOIL + self.active, free + np.arange(len(self.active))] = 1.0
-        return Belief(place.soil, place.gains, spread @ covariance @ spread.T)
+        return self._belief(place.soil, place.gains, covariance)
 
     def _log_directions(self, soil: Array) -> Array:
         return self.coordinates.log_directions(soil)

@@ -74,7 +74,7 @@ class Derived:
 
 @dataclass(frozen=True, slots=True)
 class Posterior:
-    """Soil at the mode and covariance (6, 6) of the parameters' logarithms (held ones: 0)."""
+    """Typical soil (see Belief) and covariance (6, 6) of the parameters' logarithms (held ones: 0)."""
 
     soil: Soil
     log_covariance: Array
