@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.capability import PullCurve
+from soilbus.capability.assessment import Demand
+from soilbus.capability.wheels import WheelTable
 from soilbus.config import Config
 from soilbus.daemon.intake import WindowTask
 from soilbus.daemon.positions import Position
@@ -19,8 +20,8 @@ from soilbus.estimation.soil_class import SoilClasses, guessed
 from soilbus.estimation.tracker import Ground, Settings, Tracked, Tracker
 from soilbus.estimation.window import Window
 from soilbus.terra.vehicle import GRAVITY
-from soilbus.traversability import Demand, Status, Traversability, judge
 from soilbus.traversability import State as Way
+from soilbus.traversability import Status, Traversability, judge
 
 MIN_NEW_SOIL = 0.2
 """Share of a window that a new soil must fill before its estimate is valid."""
@@ -78,7 +79,7 @@ class WindowEstimator:
         self.config = config
         self.rig, self.prior, self.model = rig_of(config), prior_of(config), model_of(config)
         self._settings = config.estimator
-        self._pull_curve: PullCurve | None = None
+        self._wheels: WheelTable | None = None
         self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
         self._guess = guessed(self.prior, prior_of(Config()))
         settings = config.estimator
@@ -123,9 +124,9 @@ class WindowEstimator:
 
     def decide(self, window: Undecided) -> WindowResult:
         """The result with its traversability; windows in their order, here or in another process."""
-        way, self._pull_curve = judge(
+        way, self._wheels = judge(
             window.result.posterior, window.result.status, window.demand, self.rig, self.model, window.torque_limit,
-            self.config.traversability, None if window.fresh else self._pull_curve,
+            self.config.traversability, None if window.fresh else self._wheels,
         )  # fmt: skip
         if window.stuck:
             way = replace(way, state=Way.NO_GO, probability=0.0, limit="slip")
@@ -160,14 +161,15 @@ class WindowEstimator:
         """
         if self.rig.chassis is None or not len(window.t):
             return None
-        slope = np.where(np.isfinite(window.pitch), np.sin(window.pitch), 0.0)
-        pull = window.draft + self.rig.chassis.mass * GRAVITY * slope
-        recent = pull[window.t > window.t[-1] - self._settings.hop]
-        recent, pull = recent[np.isfinite(recent)], pull[np.isfinite(pull)]
-        if not len(recent):
+        sine = np.where(np.isfinite(window.pitch), np.sin(window.pitch), 0.0)
+        pull = window.draft + self.rig.chassis.mass * GRAVITY * sine
+        known = np.isfinite(pull)
+        recent = known & (window.t > window.t[-1] - self._settings.hop)
+        if not recent.any():
             return None
-        part = recent if recent.mean() >= pull.mean() else pull
-        return Demand(float(part.mean()), float(part.std() / math.sqrt(len(part))))
+        part = recent if pull[recent].mean() >= pull[known].mean() else known
+        std = pull[part].std() / math.sqrt(np.count_nonzero(part))
+        return Demand(float(pull[part].mean()), float(std), float(sine[part].mean()))
 
     def _stuck(self, window: Window) -> bool:
         """Whether the wheels turned but the vehicle stood during most of the last hop."""
