@@ -107,6 +107,11 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--seed", type=_natural, default=1, help="of drives, noise and priors (default 1)")
     sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
 
+    sub = command("decisions", _decisions, "what soilbus foretells, beside what simulated drives then do", "optional")
+    sub.add_argument("--drives", type=_counted, default=60, metavar="N", help="on each soil (default 60)")
+    sub.add_argument("--seed", type=_natural, default=1, help="of soils, drives, noise and priors (default 1)")
+    sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
+
     sub = command("bench", _bench, "every performance figure beside its peer, in one run", "")
     sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
     return parser
@@ -281,6 +286,27 @@ def _montecarlo(args: argparse.Namespace) -> None:
             out.write(json.dumps([as_json(cell) for cell in cells], indent=1) + "\n")
     if str(args.json) != "-":
         print(monte_carlo_report(cells), end="")
+
+
+def _decisions(args: argparse.Namespace) -> None:
+    import json
+
+    from soilbus.report.decisions import as_json, decisions_report
+    from soilbus.simulator.draft_trials import draft_trials
+    from soilbus.simulator.drive import SimulationError
+    from soilbus.simulator.monte_carlo import processes
+
+    config = _configured_or_demo(args)
+    try:
+        with processes(os.cpu_count() or 1) as each:
+            drafts = list(draft_trials(config, args.drives, args.seed, each=each))
+    except SimulationError as error:
+        raise WorkError(str(error)) from None
+    if args.json is not None:
+        with _whole_file(args.json) as out:
+            out.write(json.dumps(as_json(drafts), indent=1) + "\n")
+    if str(args.json) != "-":
+        print(decisions_report(drafts), end="")
 
 
 def _bench(args: argparse.Namespace) -> None:
