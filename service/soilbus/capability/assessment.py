@@ -85,11 +85,12 @@ class Capability:
     """What the vehicle can do on this soil; None where nothing can be said.
 
     max_draft [N] on the level; grades [rad], without draft and with the present one;
-    max_pull [N] on the present slope, of draft and slope together; limit is what ends
-    max_draft.  forecast is None where no slip meets the demand.
+    max_pull [N] on the present slope, of draft and slope together, and max_draft_here of the
+    draft alone; limit is what ends max_draft.  forecast is None where no slip meets the demand.
     """
 
     max_draft: Estimate
+    max_draft_here: Estimate | None
     max_grade: Estimate | None
     max_grade_with_draft: Estimate | None
     max_pull: Estimate | None
@@ -143,8 +144,12 @@ def assess(
     )
     if max_draft is None:
         return None, table
+    max_draft_here = None
+    if demand is not None and max_pull is not None:
+        max_draft_here = Estimate(max_pull.value - table.axles.weight * demand.sine, max_pull.std)
     return Capability(
         max_draft=max_draft,
+        max_draft_here=max_draft_here,
         max_grade=max_grade,
         max_grade_with_draft=max_grade_with_draft,
         max_pull=max_pull,

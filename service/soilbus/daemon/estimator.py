@@ -12,7 +12,7 @@ from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.capability.assessment import Demand
 from soilbus.capability.wheels import WheelTable
 from soilbus.config import Config
-from soilbus.daemon.intake import WindowTask
+from soilbus.daemon.intake import WindowTask, pull_of
 from soilbus.daemon.positions import Position
 from soilbus.estimation.gauss_newton import Fit
 from soilbus.estimation.posterior import Estimate, Posterior
@@ -161,15 +161,15 @@ class WindowEstimator:
         """
         if self.rig.chassis is None or not len(window.t):
             return None
-        sine = np.where(np.isfinite(window.pitch), np.sin(window.pitch), 0.0)
-        pull = window.draft + self.rig.chassis.mass * GRAVITY * sine
+        pull = pull_of(window, self.rig.chassis)
         known = np.isfinite(pull)
         recent = known & (window.t > window.t[-1] - self._settings.hop)
         if not recent.any():
             return None
         part = recent if pull[recent].mean() >= pull[known].mean() else known
         std = pull[part].std() / math.sqrt(np.count_nonzero(part))
-        return Demand(float(pull[part].mean()), float(std), float(sine[part].mean()))
+        slope = float((pull - window.draft)[part].mean())
+        return Demand(float(pull[part].mean()), float(std), slope / (self.rig.chassis.mass * GRAVITY))
 
     def _stuck(self, window: Window) -> bool:
         """Whether the wheels turned but the vehicle stood during most of the last hop."""

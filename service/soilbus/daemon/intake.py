@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from cantools.database.can import Database
@@ -23,7 +24,7 @@ from soilbus.config import Config
 from soilbus.daemon.positions import PositionTrack
 from soilbus.estimation.screening import WILD
 from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, BinStore, Window, forward
-from soilbus.terra.vehicle import slip_ratio
+from soilbus.terra.vehicle import GRAVITY, Chassis, slip_ratio
 
 Array = NDArray[np.float64]
 
@@ -59,6 +60,13 @@ class WindowTask:
     track: PositionTrack
     rejected: dict[str, int]
     fresh: bool
+
+
+class Latest(NamedTuple):
+    """Slip ratio by wheel and pull [N] (draft and slope) of the last moments; None where unknown."""
+
+    slip: dict[str, float | None]
+    pull: float | None
 
 
 @dataclass(slots=True)
@@ -205,12 +213,18 @@ class Intake:
             c.name for c in self.needed if now - self.last_seen.get(c.name, -math.inf) > (c.timeout or DEFAULT_TIMEOUT)
         ]
 
+    def latest(self, now: float) -> Latest:
+        """Slip and pull over the last moments before `now` [s]."""
+        if self._bins is None:
+            return Latest(dict.fromkeys(self.rig.wheels), None)
+        last = math.floor((now - self._bins.origin) / self._settings.bin) * self._settings.bin + self._bins.origin
+        window = self._bins.glimpse(last - SLIP_SPAN, last)
+        pull = None if self.rig.chassis is None else column_means(pull_of(window, self.rig.chassis)[:, None])[0]
+        return Latest(self._slip(window), pull)
+
     def latest_slip(self, now: float) -> dict[str, float | None]:
         """Slip ratio by wheel over the last moments before `now` [s]; None where unknown."""
-        if self._bins is None:
-            return dict.fromkeys(self.rig.wheels)
-        last = math.floor((now - self._bins.origin) / self._settings.bin) * self._settings.bin + self._bins.origin
-        return self._slip(self._bins.glimpse(last - SLIP_SPAN, last))
+        return self.latest(now).slip
 
     def _slip(self, window: Window) -> dict[str, float | None]:
         window = forward(window)
@@ -218,6 +232,12 @@ class Intake:
         slip = slip_ratio(self.rig.radius, window.speed, ground)
         slip = np.where((ground > self._settings.min_speed) & (slip > -1.0), slip, np.nan)
         return dict(zip(self.rig.wheels, column_means(slip), strict=True))
+
+
+def pull_of(window: Window, chassis: Chassis) -> Array:
+    """Pull [N] (N,) asked of the wheels, draft and slope; nan without draft, level where the slope is not known."""
+    sine = np.where(np.isfinite(window.pitch), np.sin(window.pitch), 0.0)
+    return np.asarray(window.draft + chassis.mass * GRAVITY * sine)
 
 
 def _first_time(decoded: Decoded) -> float | None:

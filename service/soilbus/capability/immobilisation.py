@@ -1,0 +1,131 @@
+"""Immobilisation ahead: how long until slip passes the greatest that is allowed, from slip and pull as they come.
+
+Slip itself gives no warning: it grows slowly at first and then runs away.  The pull that
+the ground could give here and now does: it is the pull that is given, and what the last
+window's pull over slip says is still to come from the present slip on.  It does not swing with
+the draft, and falls steadily where the soil softens.  The warning comes when
+it is about to fall below what is asked for, now and then or growing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from soilbus.capability.assessment import OverSlip
+
+MEMORY = 2.0
+"""Time constant [s] of the trends' forgetting."""
+PEAK_MEMORY = 15.0
+"""Time constant [s] with which a peak of the demand is forgotten."""
+LONGEST_GAP = 1.0
+"""Silence [s] after which the trends start anew."""
+SETTLED = 2.0
+"""Age [s] from which a trend is believed."""
+AHEAD = 5.0
+"""Time left [s] from which is warned."""
+MUCH = 0.75
+"""Share of the capacity from which a rise of the demand is carried on: an easy draft comes and goes."""
+CALM = 5.0
+"""The warning ends this long [s] after its last cause."""
+
+
+class Warning(StrEnum):
+    """Is the vehicle about to get stuck?"""
+
+    UNKNOWN = "unknown"
+    NONE = "none"
+    IMMOBILISATION = "immobilisation"
+
+
+class Trend(NamedTuple):
+    """A line through past values with exponential forgetting: sums of 1, x, x^2, y and x y, x [s] counted from now."""
+
+    n: float = 0.0
+    x: float = 0.0
+    xx: float = 0.0
+    y: float = 0.0
+    xy: float = 0.0
+
+    def joined(self, step: float, value: float) -> Trend:
+        """The trend a step [s] later, with one more value."""
+        n, x, xx, y, xy = (math.exp(-step / MEMORY) * s for s in self)
+        return Trend(n + 1.0, x - step * n, xx - 2.0 * step * x + step**2 * n, y + value, xy - step * y)
+
+    def line(self) -> tuple[float, float]:
+        """Value now and slope [1/s]."""
+        spread = self.n * self.xx - self.x**2
+        slope = (self.n * self.xy - self.x * self.y) / spread if spread > 1e-9 * self.n**2 else 0.0
+        return (self.y - slope * self.x) / self.n, slope
+
+
+_NOTHING = Trend()
+
+
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """What is remembered from one moment to the next; `watched` makes the next one.
+
+    t [s] is the last moment with slip and pull, since that of the first; capacity and demand [N]
+    are trends, peak [N] is the greatest demand of late; caused [s] is when there was last a cause to
+    warn.  warning and time_left [s] (None: not foreseeable) are what to tell.
+    """
+
+    t: float = -math.inf
+    since: float = math.inf
+    capacity: Trend = _NOTHING
+    demand: Trend = _NOTHING
+    peak: float = -math.inf
+    caused: float = -math.inf
+    warning: Warning = Warning.UNKNOWN
+    time_left: float | None = None
+
+
+def watched(before: Watch, t: float, slip: Iterable[float | None], pull: float | None, curve: OverSlip | None) -> Watch:
+    """The watch after a look at the wheels' slips and the pull [N] (draft and slope) at the time t [s].
+
+    None is what is not known.  Moments may come at any rate but not go back: then, and
+    after LONGEST_GAP without slip, pull or curve, all is forgotten.  Unknown until the
+    trends have settled.
+    """
+    slips = [s for s in slip if s is not None and math.isfinite(s)]
+    if not slips or pull is None or not math.isfinite(pull) or curve is None:
+        return before if 0.0 <= t - before.t <= LONGEST_GAP else Watch()
+    step = t - before.t
+    if not 0.0 <= step <= LONGEST_GAP:
+        before, step = Watch(since=t), 0.0
+    mean_slip = sum(slips) / len(slips)
+    reserve = _reserve(curve, mean_slip)
+    capacity = before.capacity.joined(step, pull + reserve)
+    demand = before.demand.joined(step, pull)
+    peak = max(pull, pull + (before.peak - pull) * math.exp(-step / PEAK_MEMORY))
+    time_left = None
+    if t - before.since >= SETTLED:
+        time_left = 0.0 if reserve <= 0.0 else _time_left(capacity.line(), demand.line(), peak)
+    caused = t if time_left is not None and time_left < AHEAD else before.caused
+    warning = Warning.UNKNOWN if time_left is None else Warning.NONE
+    if t - caused < CALM:
+        warning = Warning.IMMOBILISATION
+    return Watch(t, before.since, capacity, demand, peak, caused, warning, time_left)
+
+
+def _reserve(curve: OverSlip, slip: float) -> float:
+    """Pull [N] still to come between this slip and the greatest of the curve."""
+    known = np.isfinite(curve.pull)
+    if not known.any() or slip >= curve.slip[-1]:
+        return 0.0
+    pull = curve.pull[known]
+    return float(pull.max() - np.interp(slip, curve.slip[known], pull))
+
+
+def _time_left(capacity: tuple[float, float], demand: tuple[float, float], peak: float) -> float:
+    """Time [s] until the capacity, going on as it does, meets the demand's peak or its rise."""
+    (able, change), (asked, rise) = capacity, demand
+    to_peak = (able - peak) / -change if change < 0.0 else math.inf
+    to_rise = (able - asked) / (rise - change) if rise > change and asked > MUCH * able else math.inf
+    return max(min(to_peak, to_rise), 0.0)
