@@ -27,7 +27,7 @@ LONGEST_GAP = 1.0
 """Silence [s] after which the trends start anew."""
 SETTLED = 2.0
 """Age [s] from which a trend is believed."""
-AHEAD = 5.0
+AHEAD = 7.0
 """Time left [s] from which is warned."""
 MUCH = 0.75
 """Share of the capacity from which a rise of the demand is carried on: an easy draft comes and goes."""
@@ -87,7 +87,7 @@ class Watch:
 
 
 def watched(before: Watch, t: float, slip: Iterable[float | None], pull: float | None, curve: OverSlip | None) -> Watch:
-    """The watch after a look at the wheels' slips and the pull [N] (draft and slope) at the time t [s].
+    """The watch after a look at the wheels' slips and the pull [N] (draft, slope, inertia) at the time t [s].
 
     None is what is not known.  Moments may come at any rate but not go back: then, and
     after LONGEST_GAP without slip, pull or curve, all is forgotten.  Unknown until the
@@ -106,7 +106,7 @@ def watched(before: Watch, t: float, slip: Iterable[float | None], pull: float |
     peak = max(pull, pull + (before.peak - pull) * math.exp(-step / PEAK_MEMORY))
     time_left = None
     if t - before.since >= SETTLED:
-        time_left = 0.0 if reserve <= 0.0 else _time_left(capacity.line(), demand.line(), peak)
+        time_left = 0.0 if reserve <= 0.0 else _time_left(capacity.line(), (pull, demand.line()[1]), peak)
     caused = t if time_left is not None and time_left < AHEAD else before.caused
     warning = Warning.UNKNOWN if time_left is None else Warning.NONE
     if t - caused < CALM:

@@ -12,13 +12,13 @@ from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.capability.assessment import Demand
 from soilbus.capability.wheels import WheelTable
 from soilbus.config import Config
-from soilbus.daemon.intake import WindowTask, pull_of
+from soilbus.daemon.intake import WindowTask
 from soilbus.daemon.positions import Position
 from soilbus.estimation.gauss_newton import Fit
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.soil_class import SoilClasses, guessed
 from soilbus.estimation.tracker import Ground, Settings, Tracked, Tracker
-from soilbus.estimation.window import Window
+from soilbus.estimation.window import Window, pull_asked
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.traversability import State as Way
 from soilbus.traversability import Status, Traversability, judge
@@ -161,7 +161,7 @@ class WindowEstimator:
         """
         if self.rig.chassis is None or not len(window.t):
             return None
-        pull = pull_of(window, self.rig.chassis)
+        pull = pull_asked(window, self.rig.chassis)
         known = np.isfinite(pull)
         recent = known & (window.t > window.t[-1] - self._settings.hop)
         if not recent.any():

@@ -23,8 +23,8 @@ from soilbus.can.mapping import POSITION_ROLES, channels_of
 from soilbus.config import Config
 from soilbus.daemon.positions import PositionTrack
 from soilbus.estimation.screening import WILD
-from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, BinStore, Window, forward
-from soilbus.terra.vehicle import GRAVITY, Chassis, slip_ratio
+from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, BinStore, Window, forward, pull_given
+from soilbus.terra.vehicle import slip_ratio
 
 Array = NDArray[np.float64]
 
@@ -63,7 +63,7 @@ class WindowTask:
 
 
 class Latest(NamedTuple):
-    """Slip ratio by wheel and pull [N] (draft and slope) of the last moments; None where unknown."""
+    """Slip ratio by wheel and pull [N] (draft, slope, inertia) of the last moments; None where unknown."""
 
     slip: dict[str, float | None]
     pull: float | None
@@ -219,7 +219,7 @@ class Intake:
             return Latest(dict.fromkeys(self.rig.wheels), None)
         last = math.floor((now - self._bins.origin) / self._settings.bin) * self._settings.bin + self._bins.origin
         window = self._bins.glimpse(last - SLIP_SPAN, last)
-        pull = None if self.rig.chassis is None else column_means(pull_of(window, self.rig.chassis)[:, None])[0]
+        pull = None if self.rig.chassis is None else column_means(pull_given(window, self.rig.chassis)[:, None])[0]
         return Latest(self._slip(window), pull)
 
     def latest_slip(self, now: float) -> dict[str, float | None]:
@@ -232,12 +232,6 @@ class Intake:
         slip = slip_ratio(self.rig.radius, window.speed, ground)
         slip = np.where((ground > self._settings.min_speed) & (slip > -1.0), slip, np.nan)
         return dict(zip(self.rig.wheels, column_means(slip), strict=True))
-
-
-def pull_of(window: Window, chassis: Chassis) -> Array:
-    """Pull [N] (N,) asked of the wheels, draft and slope; nan without draft, level where the slope is not known."""
-    sine = np.where(np.isfinite(window.pitch), np.sin(window.pitch), 0.0)
-    return np.asarray(window.draft + chassis.mass * GRAVITY * sine)
 
 
 def _first_time(decoded: Decoded) -> float | None:

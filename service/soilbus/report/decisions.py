@@ -6,15 +6,27 @@ import math
 from collections.abc import Iterator, Sequence
 
 from soilbus.report.table import table
+from soilbus.simulator.bogging_trials import ENOUGH_TIME, ENOUGH_WAY, WarningFigures
 from soilbus.simulator.draft_trials import SPREAD, DraftFigures
 
 MAX_ERROR = 0.05
 COVERAGE = (0.90, 0.98)
 
 
-def decisions_report(drafts: Sequence[DraftFigures]) -> str:
+def decisions_report(drafts: Sequence[DraftFigures], warnings: WarningFigures) -> str:
     """All sections."""
-    return "\n".join(_draft_section(drafts)) + "\n"
+    return "\n".join([*_draft_section(drafts), "", *_warning_section(warnings)]) + "\n"
+
+
+def _warning_section(found: WarningFigures) -> Iterator[str]:
+    yield f"Warning of immobilisation at least {ENOUGH_TIME:g} s or {ENOUGH_WAY:g} m before slip passes its limit"
+    yield ""
+    row = (
+        str(found.boggings), f"{found.warned}", f"{found.lead:.1f} s", f"{found.least:.1f} s",
+        f"{found.hours:.2f}", str(found.false),
+    )  # fmt: skip
+    yield table(("boggings", "in time", "median lead", "least", "hours on firm ground", "false"), [row])
+    yield "Targets: all in time; at most one false warning an hour."
 
 
 def _draft_section(drafts: Sequence[DraftFigures]) -> Iterator[str]:
@@ -39,7 +51,7 @@ def _draft_row(of_soil: DraftFigures) -> tuple[str, ...]:
     )
 
 
-def as_json(drafts: Sequence[DraftFigures]) -> dict[str, object]:
+def as_json(drafts: Sequence[DraftFigures], warnings: WarningFigures) -> dict[str, object]:
     """The figures as plain objects; null for what is not a number."""
 
     def number(value: float) -> float | None:
@@ -53,4 +65,8 @@ def as_json(drafts: Sequence[DraftFigures]) -> dict[str, object]:
             }
             for d in drafts
         ],
+        "immobilisation": {
+            "boggings": warnings.boggings, "in_time": warnings.warned, "lead": number(warnings.lead),
+            "least_lead": number(warnings.least), "hours": warnings.hours, "false": warnings.false,
+        },
     }  # fmt: skip

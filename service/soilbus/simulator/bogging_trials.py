@@ -15,13 +15,13 @@ from soilbus.capability.assessment import OverSlip, assess
 from soilbus.capability.immobilisation import Warning, Watch, watched
 from soilbus.config import Config
 from soilbus.estimation.tracker import Settings, Tracker
-from soilbus.estimation.window import BinStore, Rig
+from soilbus.estimation.window import BinStore, Rig, pull_given
 from soilbus.simulator.draft_trials import true_largest_draft
 from soilbus.simulator.monte_carlo import Each
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import soil_named
-from soilbus.terra.vehicle import GRAVITY, slip_ratio
+from soilbus.terra.vehicle import slip_ratio
 from soilbus.terra.wheel import WheelModel
 
 Array = NDArray[np.float64]
@@ -103,23 +103,22 @@ def trial(task: Task) -> WarningTrial:
     recording = simulate(config, scenario_of(task), task.seed)
     truth = recording.truth
     slip = np.mean([truth[f"slip.{wheel}"] for wheel in rig.wheels], axis=0)
-    t, warned = watch(recording, config)
-    passed = np.flatnonzero((slip > config.traversability.max_slip) & (truth["t"] > t[0]))
-    end = float(truth["t"][passed[0]]) if len(passed) else float(truth["t"][-1])
+    start, last = config.estimator.window, float(truth["t"][-1])
+    passed = truth["t"][(slip > config.traversability.max_slip) & (truth["t"] > start)]
+    end = float(passed[0]) if len(passed) else last
+    t, warned = watch(recording, config, end)
     begins = t[1:][warned[1:] & ~warned[:-1]]
-    begins = begins[begins < end]
     lead, way = np.nan, np.nan
-    if len(passed) and end - t[0] > EARLIEST:
-        on = len(begins) > 0 and bool(warned[t < end][-1])
-        lead = end - float(begins[-1]) if on else 0.0
+    if len(passed) and end - start > EARLIEST:
+        lead = end - float(begins[-1]) if len(begins) and warned[-1] else 0.0
         way = float(
             np.interp(end, truth["t"], truth["distance"]) - np.interp(end - lead, truth["t"], truth["distance"])
         )
-    return WarningTrial(task.bogging, end - float(t[0]), len(begins), lead, way)
+    return WarningTrial(task.bogging, end - start, len(begins), lead, way)
 
 
-def watch(recording: Recording, config: Config) -> tuple[Array, NDArray[np.bool_]]:
-    """Times [s] (N,) of the looks from the first window on, and whether each warned."""
+def watch(recording: Recording, config: Config, end: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Times [s] (N,) of the looks from the start to the end [s], and whether each warned."""
     rig, settings = rig_of(config), config.estimator
     tracker = Tracker(
         rig, prior_of(config), model_of(config),
@@ -127,10 +126,9 @@ def watch(recording: Recording, config: Config) -> tuple[Array, NDArray[np.bool_
     )  # fmt: skip
     store = BinStore(rig, LOOK, 0.0)
     store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
-    end = float(recording.truth["t"][-1])
     whole = store.window(0.0, end)
     slips = slip_ratio(rig.radius, whole.speed, whole.ground_speed[:, None])
-    pulls = whole.draft + (0.0 if rig.chassis is None else rig.chassis.mass * GRAVITY) * np.sin(whole.pitch)
+    pulls = pull_given(whole, rig.chassis) if rig.chassis is not None else whole.draft
     state, curve, due, out = Watch(), None, settings.window, []
     for i in range(SPAN, len(whole.t)):
         now = float(whole.t[i - 1])
@@ -139,8 +137,7 @@ def watch(recording: Recording, config: Config) -> tuple[Array, NDArray[np.bool_
             due += settings.hop
         recent = slice(i - SPAN, i)
         state = watched(state, now, np.nanmean(slips[recent], axis=0).tolist(), float(np.nanmean(pulls[recent])), curve)
-        if curve is not None:
-            out.append((now, state.warning is Warning.IMMOBILISATION))
+        out.append((now, state.warning is Warning.IMMOBILISATION))
     t, warned = np.array(out, float).reshape(-1, 2).T
     return t, warned > 0.5
 
