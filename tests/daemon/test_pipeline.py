@@ -169,7 +169,7 @@ def test_stubble_is_known_to_be_misunderstood(whole):
 
 
 KEYS = {"t", "status", "soil", "bearing_pressure", "slip", "sinkage", "traversability", "chi2", "samples", "rejected"}
-MORE = {"window", "reason", "state", "soil_class", "capability"}
+MORE = {"window", "reason", "state", "soil_class", "capability", "warning"}
 CAPABILITY = {"max_draft_here", "max_grade_with_draft", "set_points", "forecast", "over_slip"}
 DECISION = {"state", "probability", "torque_required", "torque_available", "max_draft", "max_grade", "limit"}
 
@@ -188,6 +188,8 @@ def test_json_lines_have_the_keys_of_the_design(name, whole):
         one = json.loads(line, parse_constant=no_constant)
         assert set(one) - MORE == KEYS
         assert set(one["traversability"]) == DECISION
+        assert one["warning"]["state"] in ("unknown", "none", "immobilisation")
+        assert set(one["warning"]) == {"state", "time_left"}
         if one["soil"] is not None:
             able = one["capability"]
             assert set(able) == CAPABILITY

@@ -10,7 +10,7 @@ it is about to fall below what is asked for, now and then or growing.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
@@ -18,6 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.capability.assessment import OverSlip
+from soilbus.estimation.window import Rig, Window, pull_given
+from soilbus.terra.vehicle import slip_ratio
 
 MEMORY = 2.0
 """Time constant [s] of the trends' forgetting."""
@@ -33,6 +35,10 @@ MUCH = 0.75
 """Share of the capacity from which a rise of the demand is carried on: an easy draft comes and goes."""
 CALM = 5.0
 """The warning ends this long [s] after its last cause."""
+
+
+SPAN = 3
+"""Bins of a window over which a moment's slip and pull are averaged."""
 
 
 class Warning(StrEnum):
@@ -112,6 +118,29 @@ def watched(before: Watch, t: float, slip: Iterable[float | None], pull: float |
     if t - caused < CALM:
         warning = Warning.IMMOBILISATION
     return Watch(t, before.since, capacity, demand, peak, caused, warning, time_left)
+
+
+class Moment(NamedTuple):
+    """Time [s], slips of the wheels and pull [N]; nan is what is not known."""
+
+    t: float
+    slip: list[float]
+    pull: float
+
+
+def moments(window: Window, rig: Rig, since: float, min_speed: float) -> Iterator[Moment]:
+    """The moments of a window's bins after `since` [s], none for a rig without a chassis.
+
+    No slip is judged up to min_speed [m/s].
+    """
+    if rig.chassis is None:
+        return
+    ground = window.ground_speed[:, None]
+    slip = np.where(ground > min_speed, slip_ratio(rig.radius, window.speed, ground), np.nan)
+    pull = pull_given(window, rig.chassis)
+    for i in np.flatnonzero(window.t > since).tolist():
+        recent = slice(max(i + 1 - SPAN, 0), i + 1)
+        yield Moment(float(window.t[i]), slip[recent].mean(axis=0).tolist(), float(pull[recent].mean()))
 
 
 def _reserve(curve: OverSlip, slip: float) -> float:

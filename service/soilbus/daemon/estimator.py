@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.capability.assessment import Demand
+from soilbus.capability.assessment import Demand, OverSlip
+from soilbus.capability.immobilisation import Moment, Watch, moments, watched
 from soilbus.capability.wheels import WheelTable
 from soilbus.config import Config
 from soilbus.daemon.intake import WindowTask
@@ -37,7 +38,7 @@ class WindowResult:
     rejected counts refused samples of the window by reason.  posterior is None where
     status is invalid.  soil_class is the probability of each known soil and of `unknown`,
     the largest first.  position is in the middle of the data that count: of the window, or
-    of its part on a new soil.
+    of its part on a new soil.  watch warns of immobilisation.
     """
 
     t: float
@@ -55,6 +56,7 @@ class WindowResult:
     iterations: int = 0
     soil_class: dict[str, float] | None = None
     position: Position | None = None
+    watch: Watch = Watch()  # noqa: RUF009, immutable
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,13 +64,15 @@ class Undecided:
     """A window's estimate with what the decision needs besides; its traversability is still unknown.
 
     demand is None where the draft is not known; torque_limit (W,) [N m]; stuck: the wheels
-    turn on the spot; fresh: nothing of the window before may be carried over.
+    turn on the spot; moments: slips and pulls of the last hop; fresh: nothing of the window before
+    may be carried over.
     """
 
     result: WindowResult
     demand: Demand | None
     torque_limit: NDArray[np.float64]
     stuck: bool
+    moments: list[Moment]
     fresh: bool
 
 
@@ -80,6 +84,8 @@ class WindowEstimator:
         self.rig, self.prior, self.model = rig_of(config), prior_of(config), model_of(config)
         self._settings = config.estimator
         self._wheels: WheelTable | None = None
+        self._watch = Watch()
+        self._curve: OverSlip | None = None
         self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
         self._guess = guessed(self.prior, prior_of(Config()))
         settings = config.estimator
@@ -120,7 +126,8 @@ class WindowEstimator:
             soil_class=self._soil_class(posterior),
             position=task.track.at((tracked.since + task.end) / 2.0),
         )
-        return Undecided(result, self._demand(task.window), task.torque_limit, stuck, task.fresh)
+        last_hop = moments(task.window, self.rig, task.end - self._settings.hop, self._settings.min_speed)
+        return Undecided(result, self._demand(task.window), task.torque_limit, stuck, list(last_hop), task.fresh)
 
     def decide(self, window: Undecided) -> WindowResult:
         """The result with its traversability; windows in their order, here or in another process."""
@@ -130,7 +137,17 @@ class WindowEstimator:
         )  # fmt: skip
         if window.stuck:
             way = replace(way, state=Way.NO_GO, probability=0.0, limit="slip")
-        return replace(window.result, traversability=way)
+        self._look(window)
+        if way.capability is not None:
+            self._curve = way.capability.over_slip
+        return replace(window.result, traversability=way, watch=self._watch)
+
+    def _look(self, window: Undecided) -> None:
+        """Watch the last hop with what was known of the soil before it."""
+        if window.fresh:
+            self._watch, self._curve = Watch(), None
+        for moment in window.moments:
+            self._watch = watched(self._watch, *moment, self._curve)
 
     def _honest(self, tracked: Tracked, fit: Fit) -> Posterior:
         """Posterior with its covariance widened where the residuals are larger than the noise."""

@@ -61,6 +61,7 @@ def json_line(result: WindowResult, config: Config) -> str:
                 "max_grade": _value_std(way.max_grade),
                 "limit": way.limit,
             },
+            "warning": {"state": str(result.watch.warning), "time_left": _finite(result.watch.time_left)},
             "capability": None if way.capability is None else _capability(way.capability),
             "chi2": result.chi2,
             "samples": result.samples,
@@ -88,7 +89,7 @@ def _capability(able: Capability) -> dict[str, Any]:
             "sinkage": {wheel: _value_std(depth) for wheel, depth in forecast.sinkage.items()},
         },
         "over_slip": {
-            column: [x if math.isfinite(x) else None for x in getattr(able.over_slip, column).tolist()]
+            column: [_finite(x) for x in getattr(able.over_slip, column).tolist()]
             for column in ("slip", "pull", "pull_std", "torque", "torque_std")
         },
     }
@@ -157,6 +158,10 @@ def forecast_frame(result: WindowResult | None, watch: Watch) -> tuple[str, dict
         "Window": None if result is None else result.index % WINDOW_MODULUS,
         "Status": None if result is None else str(result.status),
     }
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None
 
 
 def _value(estimate: Estimate | None) -> float | None:

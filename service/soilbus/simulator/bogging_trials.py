@@ -12,16 +12,15 @@ from numpy.typing import NDArray
 
 from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.capability.assessment import OverSlip, assess
-from soilbus.capability.immobilisation import Warning, Watch, watched
+from soilbus.capability.immobilisation import Warning, Watch, moments, watched
 from soilbus.config import Config
 from soilbus.estimation.tracker import Settings, Tracker
-from soilbus.estimation.window import BinStore, Rig, pull_given
+from soilbus.estimation.window import BinStore, Rig
 from soilbus.simulator.draft_trials import true_largest_draft
 from soilbus.simulator.monte_carlo import Each
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import soil_named
-from soilbus.terra.vehicle import slip_ratio
 from soilbus.terra.wheel import WheelModel
 
 Array = NDArray[np.float64]
@@ -30,8 +29,6 @@ FIRM = ("rubicon_sandy_loam_43", "north_gower_clayey_loam_46", "upland_sandy_loa
 SOFT = ("wet_clay", "clayey_soil_38", "lean_clay_32", "heavy_clay_40")
 LOOK = 0.1
 """Time [s] between two looks, as in the service."""
-SPAN = 3
-"""Bins over which slip and pull are averaged."""
 ENOUGH_TIME, ENOUGH_WAY = 3.0, 3.0
 """Warning ahead that is enough: [s] or [m]."""
 EARLIEST = 10.0
@@ -126,18 +123,13 @@ def watch(recording: Recording, config: Config, end: float) -> tuple[Array, NDAr
     )  # fmt: skip
     store = BinStore(rig, LOOK, 0.0)
     store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
-    whole = store.window(0.0, end)
-    slips = slip_ratio(rig.radius, whole.speed, whole.ground_speed[:, None])
-    pulls = pull_given(whole, rig.chassis) if rig.chassis is not None else whole.draft
     state, curve, due, out = Watch(), None, settings.window, []
-    for i in range(SPAN, len(whole.t)):
-        now = float(whole.t[i - 1])
-        if now >= due:
+    for moment in moments(store.window(0.0, end), rig, 0.0, settings.min_speed):
+        if moment.t >= due:
             curve = _curve(tracker, store, due, config, rig) or curve
             due += settings.hop
-        recent = slice(i - SPAN, i)
-        state = watched(state, now, np.nanmean(slips[recent], axis=0).tolist(), float(np.nanmean(pulls[recent])), curve)
-        out.append((now, state.warning is Warning.IMMOBILISATION))
+        state = watched(state, *moment, curve)
+        out.append((moment.t, state.warning is Warning.IMMOBILISATION))
     t, warned = np.array(out, float).reshape(-1, 2).T
     return t, warned > 0.5
 
