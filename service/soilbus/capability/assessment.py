@@ -102,8 +102,9 @@ class Capability:
 
 @cache
 def slip_grid(max_slip: float) -> Array:
-    """Slips at which the wheels are computed."""
-    return np.asarray(np.linspace(np.sqrt(MIN_SLIP), np.sqrt(max_slip), GRID) ** 2)
+    """Slips at which the wheels are computed, closer where forces change fast."""
+    least = min(MIN_SLIP, max_slip / 2.0)
+    return np.asarray(np.linspace(np.sqrt(least), np.sqrt(max_slip), GRID) ** 2)
 
 
 def assess(
@@ -124,7 +125,7 @@ def assess(
     """
     points = SigmaPoints.of(posterior)
     table = wheel_table(points.soils, rig, model, slip_grid(max_slip), last)
-    skids = np.linspace(-MAX_SKID, MIN_SLIP, SKID_GRID)
+    skids = np.linspace(-MAX_SKID, table.slip[0], SKID_GRID)
     skid = cache(lambda: wheel_table(points.soils, rig, model, skids))
     vehicle = _Vehicle(table, Limits.of(table.axles, torque_limit, max_sinkage), skid)
     level = balance(table)
@@ -174,14 +175,16 @@ class _Vehicle:
         Where even the least slip asks for more torque than there is, the pull is that of
         wheels that skid: below zero, as only a push or a slope moves the vehicle.
         """
-        if within(driving, self.limits)[0].any():
-            return largest_pull(driving, self.limits)
+        found = largest_pull(driving, self.limits)
+        if np.isfinite(found.pull[0]):
+            return found
         no_torque = self.limits._replace(torque=np.full_like(self.limits.torque, np.inf))
         if not within(driving, no_torque)[0].any():
             return None
         skidding = balance(self.skid(), duty)
-        if within(skidding, self.limits)[0].any():
-            return largest_pull(skidding, self.limits)._replace(cause="torque")
+        found = largest_pull(skidding, self.limits)
+        if np.isfinite(found.pull[0]):
+            return found._replace(cause="torque")
         if not skidding.known[0].any():
             return None
         least = np.where(skidding.known, skidding.pull, np.inf).argmin(axis=1)
@@ -208,7 +211,7 @@ def _set_points(
         pull, force = (axle_sum(each, axles, kinds) for each in (level.drawbar, level.torque / axles.radius))
         with np.errstate(divide="ignore", invalid="ignore"):
             values += [np.where(force > 0.0, pull * (1.0 - level.slip) / force, -1.0), pull]
-    slips = points.estimates(*slips_of_most(np.stack(values), level, limits, draft.slip))
+    slips = points.estimates(*slips_of_most(np.array(values), level, limits, draft.slip))
     return {name: SetPoint(*slips[2 * i : 2 * i + 2]) for i, name in enumerate(names)}
 
 

@@ -21,10 +21,10 @@ from soilbus.capability.assessment import OverSlip
 from soilbus.estimation.window import Rig, Window, pull_given
 from soilbus.terra.vehicle import slip_ratio
 
-MEMORY = 2.0
+MEMORY = 2.5
 """Time constant [s] of the trends' forgetting."""
-PEAK_MEMORY = 15.0
-"""Time constant [s] with which a peak of the demand is forgotten."""
+HOLD = 300.0
+"""A peak of the demand is remembered this long [s] at least, and at most twice as long."""
 LONGEST_GAP = 1.0
 """Silence [s] after which the trends start anew."""
 SETTLED = 2.0
@@ -32,7 +32,9 @@ SETTLED = 2.0
 AHEAD = 7.0
 """Time left [s] from which is warned."""
 MUCH = 0.75
-"""Share of the capacity from which a rise of the demand is carried on: an easy draft comes and goes."""
+"""Share of the capacity from which a rise of the demand beyond its last peaks is carried on."""
+WEAKENING = 0.008
+"""Loss [1/s], as a share of the capacity, from which the ground is said to weaken."""
 CALM = 5.0
 """The warning ends this long [s] after its last cause."""
 
@@ -70,7 +72,26 @@ class Trend(NamedTuple):
         return (self.y - slope * self.x) / self.n, slope
 
 
-_NOTHING = Trend()
+class Peaks(NamedTuple):
+    """The greatest value since the time `since` [s], and in the HOLD before it."""
+
+    since: float = -math.inf
+    now: float = -math.inf
+    before: float = -math.inf
+
+    def joined(self, t: float, value: float) -> Peaks:
+        """With one more value."""
+        if t - self.since > HOLD:
+            return Peaks(t, value, self.now)
+        return self._replace(now=max(self.now, value))
+
+    @property
+    def greatest(self) -> float:
+        """Of all that is remembered."""
+        return max(self.now, self.before)
+
+
+_NOTHING, _NO_PEAKS = Trend(), Peaks()
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +99,7 @@ class Watch:
     """What is remembered from one moment to the next; `watched` makes the next one.
 
     t [s] is the last moment with slip and pull, since that of the first; capacity and demand [N]
-    are trends, peak [N] is the greatest demand of late; caused [s] is when there was last a cause to
+    are trends, peaks holds the demand's greatest of late; caused [s] is when there was last a cause to
     warn.  warning and time_left [s] (None: not foreseeable) are what to tell.
     """
 
@@ -86,7 +107,7 @@ class Watch:
     since: float = math.inf
     capacity: Trend = _NOTHING
     demand: Trend = _NOTHING
-    peak: float = -math.inf
+    peaks: Peaks = _NO_PEAKS
     caused: float = -math.inf
     warning: Warning = Warning.UNKNOWN
     time_left: float | None = None
@@ -109,15 +130,15 @@ def watched(before: Watch, t: float, slip: Iterable[float | None], pull: float |
     reserve = _reserve(curve, mean_slip)
     capacity = before.capacity.joined(step, pull + reserve)
     demand = before.demand.joined(step, pull)
-    peak = max(pull, pull + (before.peak - pull) * math.exp(-step / PEAK_MEMORY))
+    peaks = before.peaks.joined(t, pull)
     time_left = None
     if t - before.since >= SETTLED:
-        time_left = 0.0 if reserve <= 0.0 else _time_left(capacity.line(), (pull, demand.line()[1]), peak)
+        time_left = 0.0 if reserve <= 0.0 else _time_left(capacity.line(), (pull, demand.line()[1]), peaks.greatest)
     caused = t if time_left is not None and time_left < AHEAD else before.caused
     warning = Warning.UNKNOWN if time_left is None else Warning.NONE
     if t - caused < CALM:
         warning = Warning.IMMOBILISATION
-    return Watch(t, before.since, capacity, demand, peak, caused, warning, time_left)
+    return Watch(t, before.since, capacity, demand, peaks, caused, warning, time_left)
 
 
 class Moment(NamedTuple):
@@ -155,6 +176,7 @@ def _reserve(curve: OverSlip, slip: float) -> float:
 def _time_left(capacity: tuple[float, float], demand: tuple[float, float], peak: float) -> float:
     """Time [s] until the capacity, going on as it does, meets the demand's peak or its rise."""
     (able, change), (asked, rise) = capacity, demand
-    to_peak = (able - peak) / -change if change < 0.0 else math.inf
-    to_rise = (able - asked) / (rise - change) if rise > change and asked > MUCH * able else math.inf
+    weakens, outgrows = -change > WEAKENING * abs(able), asked >= peak and asked > MUCH * able
+    to_peak = (able - peak) / -change if weakens else math.inf
+    to_rise = (able - asked) / (rise - change) if outgrows and rise > change else math.inf
     return max(min(to_peak, to_rise), 0.0)

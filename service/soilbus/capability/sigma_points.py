@@ -58,11 +58,12 @@ class SigmaPoints:
         flat = samples.reshape(len(samples), -1)
         mode, n = flat[0], len(self.weight)
         change = flat[1:] - mode
-        near = change[: n - 1]
-        twin = near[np.arange(n - 1) ^ 1]
-        near = np.where(np.isnan(near), -twin, near)
+        near, linear = change[: n - 1], change[n - 1 :]
+        if np.isnan(change).any():
+            near = np.where(np.isnan(near), -near[np.arange(n - 1) ^ 1], near)
+            linear = np.where(np.isnan(linear), 0.0, linear)
         shift = self.weight[1:] @ near
-        variance = self.weight[1:] @ near**2 - shift**2 + np.nansum(change[n - 1 :] ** 2, axis=0)
+        variance = self.weight[1:] @ near**2 - shift**2 + (linear**2).sum(axis=0)
         shape = samples.shape[1:]
         return (mode + shift).reshape(shape), np.sqrt(np.maximum(variance, 0.0)).reshape(shape)
 
