@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from soilbus.capability.assessment import OverSlip
-from soilbus.capability.immobilisation import AHEAD, CALM, LONGEST_GAP, SETTLED, Warning, Watch, watched
+from soilbus.capability.immobilisation import AHEAD, CALM, LONGEST_GAP, SETTLED, Alert, Watch, watched
 from soilbus.simulator import bogging_trials
 from soilbus.simulator.bogging_trials import Task, WarningTrial, figures, trial
 from soilbus.simulator.reference import reference_configuration
@@ -48,7 +48,7 @@ def drive(demand, lost=lambda t: 0.0, until=60.0, step=0.1):
 
 
 def first_warning(out):
-    return next((t for t, state in out if state.warning is Warning.IMMOBILISATION), math.inf)
+    return next((t for t, state in out if state.warning is Alert.IMMOBILISATION), math.inf)
 
 
 @pytest.mark.parametrize("rate", [50.0, 150.0, 300.0])
@@ -71,7 +71,7 @@ def test_a_draft_that_outgrows_the_ground_is_foreseen(rate):
 
 def test_an_easy_draft_that_comes_and_goes_is_no_cause():
     out = drive(lambda t: 2600.0 + 1200.0 * math.sin(0.6 * t), until=300.0)
-    assert {state.warning for t, state in out if t > SETTLED + 0.1} == {Warning.NONE}
+    assert {state.warning for t, state in out if t > SETTLED + 0.1} == {Alert.NONE}
 
 
 def test_on_weakening_ground_the_next_peak_of_the_draft_counts():
@@ -86,24 +86,35 @@ def test_slip_beyond_the_greatest_warns_whatever_the_trend_says():
     state = Watch()
     for t in np.arange(0.0, 4.0, 0.1):
         state = watched(state, t, [0.65], 1000.0, CURVE)
-    assert (state.warning, state.time_left) == (Warning.IMMOBILISATION, 0.0)
+    assert (state.warning, state.time_left) == (Alert.IMMOBILISATION, 0.0)
 
 
 def test_nothing_is_said_before_a_trend_has_settled_or_without_inputs():
     settled = drive(lambda t: 2000.0, until=10.0)
-    assert all(state.warning is Warning.UNKNOWN for t, state in settled if t < SETTLED - 0.01)
+    assert all(state.warning is Alert.UNKNOWN for t, state in settled if t < SETTLED - 0.01)
     t, state = settled[-1]
-    assert state.warning is Warning.NONE
+    assert state.warning is Alert.NONE
     for slips, pull, curve in (([None, None], 1.0, CURVE), ([0.1], None, CURVE), ([0.1], 1.0, None), ([], 1.0, CURVE)):
         assert watched(state, t + 0.1, slips, pull, curve) == state  # a gap may be short
-        assert watched(state, t + LONGEST_GAP + 0.1, slips, pull, curve) == Watch()
-    assert watched(state, t - 5.0, [0.1], 2000.0, CURVE).warning is Warning.UNKNOWN
-    assert watched(state, t + 5.0, [0.1], 2000.0, CURVE).warning is Warning.UNKNOWN
+        later = watched(state, t + LONGEST_GAP + 0.1, slips, pull, curve)
+        assert later == Watch(peaks=state.peaks)
+        assert later.warning is Alert.UNKNOWN
+    assert watched(state, t - 5.0, [0.1], 2000.0, CURVE).warning is Alert.UNKNOWN
+    assert watched(state, t + 5.0, [0.1], 2000.0, CURVE).warning is Alert.UNKNOWN
+
+
+def test_a_draft_that_was_held_before_is_no_cause_after_a_break():
+    held = drive(lambda t: min(2500.0 + 100.0 * t, 5000.0), until=60.0)
+    t, state = held[-1]
+    for now in np.arange(t + 20.0, t + 40.0, 0.1):  # the implement is lowered anew, fast
+        draft = min(500.0 + 600.0 * (now - t - 20.0), 4950.0)
+        state = watched(state, now, [slip_at(draft)], draft, CURVE)
+        assert state.warning is not Alert.IMMOBILISATION
 
 
 def test_a_warning_stays_a_while():
     out = drive(lambda t: 3000.0 if t < 9.0 else 500.0, lambda t: 250.0 * min(t, 9.0), until=30.0)
-    warned = [t for t, state in out if state.warning is Warning.IMMOBILISATION]
+    warned = [t for t, state in out if state.warning is Alert.IMMOBILISATION]
     assert warned[0] < 9.0
     causes = [t for t, state in out if state.time_left is not None and state.time_left < AHEAD]
     assert max(warned) == pytest.approx(max(causes) + CALM, abs=0.11)
@@ -128,7 +139,7 @@ def test_whatever_comes_there_is_an_answer_and_silence_is_never_all_clear(moment
             state = watched(state, t, slips, pull, CURVE if known else None)
         seen = t if usable else seen
         if not 0.0 <= t - seen <= LONGEST_GAP:
-            assert state.warning is Warning.UNKNOWN
+            assert state.warning is Alert.UNKNOWN
         assert state.time_left is None or state.time_left >= 0.0
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -37,13 +37,11 @@ WEAKENING = 0.008
 """Loss [1/s], as a share of the capacity, from which the ground is said to weaken."""
 CALM = 5.0
 """The warning ends this long [s] after its last cause."""
-
-
 SPAN = 3
 """Bins of a window over which a moment's slip and pull are averaged."""
 
 
-class Warning(StrEnum):
+class Alert(StrEnum):
     """Is the vehicle about to get stuck?"""
 
     UNKNOWN = "unknown"
@@ -109,23 +107,23 @@ class Watch:
     demand: Trend = _NOTHING
     peaks: Peaks = _NO_PEAKS
     caused: float = -math.inf
-    warning: Warning = Warning.UNKNOWN
+    warning: Alert = Alert.UNKNOWN
     time_left: float | None = None
 
 
 def watched(before: Watch, t: float, slip: Iterable[float | None], pull: float | None, curve: OverSlip | None) -> Watch:
     """The watch after a look at the wheels' slips and the pull [N] (draft, slope, inertia) at the time t [s].
 
-    None is what is not known.  Moments may come at any rate but not go back: then, and
-    after LONGEST_GAP without slip, pull or curve, all is forgotten.  Unknown until the
-    trends have settled.
+    None is what is not known.  Moments may come at any rate.  After LONGEST_GAP without
+    slip, pull or curve the trends start anew, and when time goes back the peaks are forgotten
+    too.  Unknown until the trends have settled.
     """
     slips = [s for s in slip if s is not None and math.isfinite(s)]
     if not slips or pull is None or not math.isfinite(pull) or curve is None:
-        return before if 0.0 <= t - before.t <= LONGEST_GAP else Watch()
+        return before if 0.0 <= t - before.t <= LONGEST_GAP else _anew(before, t)
     step = t - before.t
     if not 0.0 <= step <= LONGEST_GAP:
-        before, step = Watch(since=t), 0.0
+        before, step = replace(_anew(before, t), since=t), 0.0
     mean_slip = sum(slips) / len(slips)
     reserve = _reserve(curve, mean_slip)
     capacity = before.capacity.joined(step, pull + reserve)
@@ -135,10 +133,15 @@ def watched(before: Watch, t: float, slip: Iterable[float | None], pull: float |
     if t - before.since >= SETTLED:
         time_left = 0.0 if reserve <= 0.0 else _time_left(capacity.line(), (pull, demand.line()[1]), peaks.greatest)
     caused = t if time_left is not None and time_left < AHEAD else before.caused
-    warning = Warning.UNKNOWN if time_left is None else Warning.NONE
+    warning = Alert.UNKNOWN if time_left is None else Alert.NONE
     if t - caused < CALM:
-        warning = Warning.IMMOBILISATION
+        warning = Alert.IMMOBILISATION
     return Watch(t, before.since, capacity, demand, peaks, caused, warning, time_left)
+
+
+def _anew(before: Watch, t: float) -> Watch:
+    """Nothing remembered but the peaks."""
+    return Watch(peaks=before.peaks) if t >= before.peaks.since else Watch()
 
 
 class Moment(NamedTuple):

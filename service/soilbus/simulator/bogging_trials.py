@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.capability.assessment import OverSlip, assess
-from soilbus.capability.immobilisation import Warning, Watch, moments, watched
+from soilbus.capability.immobilisation import Alert, Watch, moments, watched
 from soilbus.config import Config
 from soilbus.estimation.tracker import Settings, Tracker
 from soilbus.estimation.window import BinStore, Rig
@@ -129,7 +129,7 @@ def watch(recording: Recording, config: Config, end: float) -> tuple[Array, NDAr
             curve = _curve(tracker, store, due, config, rig) or curve
             due += settings.hop
         state = watched(state, *moment, curve)
-        out.append((moment.t, state.warning is Warning.IMMOBILISATION))
+        out.append((moment.t, state.warning is Alert.IMMOBILISATION))
     t, warned = np.array(out, float).reshape(-1, 2).T
     return t, warned > 0.5
 
