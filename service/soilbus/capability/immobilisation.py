@@ -29,7 +29,7 @@ LONGEST_GAP = 1.0
 """Silence [s] after which the trends start anew."""
 SETTLED = 2.0
 """Age [s] from which a trend is believed."""
-AHEAD = 7.0
+AHEAD = 8.0
 """Time left [s] from which is warned."""
 MUCH = 0.75
 """Share of the capacity from which a rise of the demand beyond its last peaks is carried on."""
@@ -168,12 +168,12 @@ def moments(window: Window, rig: Rig, since: float, min_speed: float) -> Iterato
 
 
 def _reserve(curve: OverSlip, slip: float) -> float:
-    """Pull [N] still to come between this slip and the greatest of the curve."""
+    """Pull [N] still to come from this slip on."""
     known = np.isfinite(curve.pull)
-    if not known.any() or slip >= curve.slip[-1]:
+    ahead = curve.pull[known & (curve.slip > slip)]
+    if not len(ahead):
         return 0.0
-    pull = curve.pull[known]
-    return float(pull.max() - np.interp(slip, curve.slip[known], pull))
+    return float(ahead.max() - np.interp(slip, curve.slip[known], curve.pull[known]))
 
 
 def _time_left(capacity: tuple[float, float], demand: tuple[float, float], peak: float) -> float:
