@@ -303,7 +303,7 @@ def _decisions(args: argparse.Namespace) -> None:
     try:
         with processes(os.cpu_count() or 1) as each:
             drafts = list(draft_trials(config, args.drives, args.seed, each=each))
-            firm = round(3600.0 * args.hours / FIRM_DRIVE)
+            firm = math.ceil(3600.0 * args.hours / (FIRM_DRIVE - config.estimator.window))
             warnings = warning_trials(config, args.boggings, firm, args.seed, each=each)
     except SimulationError as error:
         raise WorkError(str(error)) from None

@@ -138,7 +138,7 @@ class WindowEstimator:
         if window.stuck:
             way = replace(way, state=Way.NO_GO, probability=0.0, limit="slip")
         self._look(window)
-        if way.capability is not None:
+        if way.capability is not None and window.result.status is Status.VALID:
             self._curve = way.capability.over_slip
         return replace(window.result, traversability=way, watch=self._watch)
 

@@ -21,6 +21,7 @@ from soilbus.daemon.outputs import WINDOW_MODULUS, forecast_frame, hop_frames, s
 from soilbus.daemon.pipeline import Pipeline, WindowResult
 from soilbus.daemon.states import ServiceState, state_after
 from soilbus.traversability import State as Way
+from soilbus.traversability import Status
 
 log = logging.getLogger(__name__)
 
@@ -35,8 +36,8 @@ POLL = 0.02
 """Longest wait for a frame [s] before the loop looks whether the worker is done."""
 MAX_PENDING = 3
 """Windows that may wait for the worker."""
-LONGEST_CURVE = 30.0
-"""Age [s] up to which a window's pull over slip serves to watch for immobilisation."""
+LONGEST_CURVE = 60.0
+"""Age [s] up to which a valid window's pull over slip serves to watch for immobilisation."""
 LONGEST_SOLVE = 20.0
 """A window that takes longer [s] is a worker that hangs: the watchdog is fed no more."""
 
@@ -148,8 +149,9 @@ class Service:
         while self._result_waits():
             self.result = self._pending.popleft().result()
             self._solved_at = now
-            if self.result.traversability.capability is not None:
-                self._curve = self.result.traversability.capability.over_slip, self.result.t
+            able = self.result.traversability.capability
+            if able is not None and self.result.status is Status.VALID:
+                self._curve = able.over_slip, self.result.t
             for message, values in hop_frames(self.result):
                 self.bus.send(self.publisher.frame(message, values))
             if self.on_window is not None:
@@ -195,7 +197,7 @@ class Service:
         return self.result.traversability.state
 
     def _present_curve(self, now: float) -> OverSlip | None:
-        """Pull over slip of the last window that knew it, while it is young enough to extrapolate from."""
+        """Pull over slip of the last valid window, while it is young enough to extrapolate from."""
         known, t = self._curve
         return known if self.bus_time(now) - t < LONGEST_CURVE else None
 

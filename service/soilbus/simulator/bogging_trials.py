@@ -14,7 +14,7 @@ from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.capability.assessment import OverSlip, assess
 from soilbus.capability.immobilisation import Alert, Watch, moments, watched
 from soilbus.config import Config
-from soilbus.estimation.tracker import Settings, Tracker
+from soilbus.estimation.tracker import Ground, Settings, Tracker
 from soilbus.estimation.window import BinStore, Rig
 from soilbus.simulator.draft_trials import true_largest_draft
 from soilbus.simulator.monte_carlo import Each
@@ -135,8 +135,10 @@ def watch(recording: Recording, config: Config, end: float) -> tuple[Array, NDAr
 
 
 def _curve(tracker: Tracker, store: BinStore, end: float, config: Config, rig: Rig) -> OverSlip | None:
-    fit = tracker.estimate(store.window(end - config.estimator.window, end), end).fit
-    if fit is None:
+    """Pull over slip of one window, None where the service would not call it valid."""
+    tracked = tracker.estimate(store.window(end - config.estimator.window, end), end)
+    fit = tracked.fit
+    if fit is None or tracked.mismatch or not fit.converged or tracked.ground is Ground.CHANGING:
         return None
     way = config.traversability
     limit = np.full(len(rig.radius), np.nan)
