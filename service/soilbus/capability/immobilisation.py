@@ -29,11 +29,11 @@ LONGEST_GAP = 1.0
 """Silence [s] after which the trends start anew."""
 SETTLED = 2.0
 """Age [s] from which a trend is believed."""
-AHEAD = 8.0
+AHEAD = 10.0
 """Time left [s] from which is warned."""
 MUCH = 0.75
 """Share of the capacity from which a rise of the demand beyond its last peaks is carried on."""
-WEAKENING = 0.008
+WEAKENING = 0.006
 """Loss [1/s], as a share of the capacity, from which the ground is said to weaken."""
 CALM = 5.0
 """The warning ends this long [s] after its last cause."""
