@@ -6,6 +6,7 @@ follow the loads; both are solved together by Newton.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -27,6 +28,9 @@ Array = NDArray[np.float64]
 
 TOLERANCE = 1e-3
 """Newton step of pull and load, over the weight, that is the last: it leaves some 1e-6 of the weight."""
+RIDGE = 1e-6
+"""Share of the soils' spread below which a direction tells nothing of how pull and angles change."""
+LEAST = 1e-12
 MAX_ITERATIONS = 12
 TEST_LOAD = 0.9
 
@@ -35,17 +39,18 @@ TEST_LOAD = 0.9
 class Axles:
     """Wheels alike in axle, radius and width count as one of A kinds.
 
-    radius, width [m], front, share (of the axle's load on one wheel) and count have shape
-    (A, 1), as has lever, the change of a wheel's load with a draft; of_wheel (W,) is each
-    wheel's kind.
+    radius, width [m], front and count have shape
+    (A, 1).  A wheel's load is level cos + tilt sin of the slope + lever times the draft, (A, 1)
+    each; of_wheel (W,) is each wheel's kind.
     """
 
     chassis: Chassis
     radius: Array
     width: Array
     front: NDArray[np.bool_]
-    share: Array
     count: Array
+    level: Array
+    tilt: Array
     lever: Array
     of_wheel: NDArray[np.intp]
 
@@ -59,10 +64,12 @@ class Axles:
         radius, width, front = (np.array(column)[:, None] for column in zip(*unlike, strict=True))
         count = np.array([[float(kinds.count(kind))] for kind in unlike])
         share = 1.0 / np.where(front, rig.front.sum(), (~rig.front).sum())
-        free, drawn = (axle_loads(rig.chassis, draft, 0.0, 0.0) for draft in (0.0, 1.0))
-        lever = share * np.where(front, drawn[0] - free[0], drawn[1] - free[1])
+        cases = ((0.0, 0.0), (0.0, math.pi / 2.0), (1.0, 0.0))
+        level, tilt, drawn = (
+            share * np.where(front, *axle_loads(rig.chassis, draft, slope, 0.0)) for draft, slope in cases
+        )
         of_wheel = np.array([unlike.index(kind) for kind in kinds])
-        return cls(rig.chassis, radius, width, front, share, count, lever, of_wheel)
+        return cls(rig.chassis, radius, width, front, count, level, tilt, drawn - level, of_wheel)
 
     @property
     def weight(self) -> float:
@@ -71,13 +78,13 @@ class Axles:
 
     def loads(self, draft: Any, sine: Any) -> Array:
         """Load on each wheel [N] (..., A, S) for a draft [N] and a slope's sine, each (..., S)."""
-        front, rear = axle_loads(self.chassis, draft, np.arcsin(np.clip(sine, -0.99, 0.99)), 0.0)
-        return np.asarray(np.where(self.front, front[..., None, :], rear[..., None, :]) * self.share)
+        draft, sine = (np.atleast_1d(a)[..., None, :] for a in (draft, np.clip(sine, -0.99, 0.99)))
+        return np.asarray(self.level * np.sqrt(1.0 - sine**2) + self.tilt * sine + self.lever * draft)
 
 
 @dataclass(frozen=True, slots=True)
 class WheelTable:
-    """D soils, A kinds of wheels, S slips: wheels at the loads of the steady level pull.
+    """D soils (D, 6), A kinds of wheels, S slips: wheels at the loads of the steady level pull.
 
     pull [N] (D, S) is the whole vehicle's; load [N] (D, A, S); at (3, D, A, S) are drawbar pull [N],
     torque [N m] and entry angle [rad] of one wheel, by_load and by_slip their derivatives
@@ -87,6 +94,7 @@ class WheelTable:
     """
 
     axles: Axles
+    soils: Array
     slip: Array
     pull: Array
     load: Array
@@ -109,9 +117,16 @@ class WheelTable:
 
 
 def wheel_table(
-    soils: Array, rig: Rig, model: WheelModel | CompletedModel, slip: Array, start: WheelTable | None = None
+    soils: Array,
+    rig: Rig,
+    model: WheelModel | CompletedModel,
+    slip: Array,
+    start: WheelTable | None = None,
+    tolerance: float = TOLERANCE,
 ) -> WheelTable:
     """Wheels on soils (D, 6) at slips (S,); `start` is the table of similar soils.
+
+    tolerance: the Newton step of pull and load, over the weight, that is the last.
 
     Raises ValueError for a rig without a chassis.
     """
@@ -119,8 +134,9 @@ def wheel_table(
     n_soils, n_slips = len(soils), len(slip)
     warm = start is not None and start.pull.shape == (n_soils, n_slips) and np.array_equal(start.slip, slip)
     if warm and start is not None:
-        pull = np.where(start.balanced, start.pull, 0.0)
-        angle = np.where(start.balanced[:, None], start.at[2], np.nan)
+        pull, angle = _foreseen(start, soils)
+        pull = np.where(start.balanced, pull, 0.0)
+        angle = np.where(start.balanced[:, None], angle, np.nan).clip(max=MAX_ENTRY_ANGLE)
     else:
         pull, angle = np.zeros((n_soils, n_slips)), np.full((n_soils, len(axles.count), n_slips), np.nan)
     load = np.broadcast_to(axles.loads(pull, 0.0), angle.shape).copy()
@@ -128,11 +144,11 @@ def wheel_table(
     if unknown.any():
         guess = _state(soils[unknown], axles, slip, angle[unknown])
         angle[unknown] = entry_angle_for_load(load[unknown], guess, completed.model, tolerance=1e-2)
-    tolerance = TOLERANCE * axles.weight
+    last_step = tolerance * axles.weight
     with np.errstate(all="ignore"):
         now = _newton_step(soils, axles, completed, slip, pull, load, angle)
         for _ in range(MAX_ITERATIONS - 1):
-            rows = np.flatnonzero((now.miss > tolerance).any(axis=1))
+            rows = np.flatnonzero((now.miss > last_step).any(axis=1))
             if not len(rows):
                 break
             angle[rows] = np.clip(now.at[2, rows], 0.5 * angle[rows], 2.0 * angle[rows]).clip(max=MAX_ENTRY_ANGLE)
@@ -140,9 +156,23 @@ def wheel_table(
             for whole, part in zip(now, _newton_step(*of_rows), strict=True):
                 whole[(slice(None),) * (part.ndim == 4) + (rows,)] = part
     pull, load, at, by_load, by_slip, miss = now
-    balanced = np.isfinite(at[2]).all(axis=1) & (load > 0.0).all(axis=1) & (miss <= tolerance)
+    balanced = np.isfinite(at[2]).all(axis=1) & (load > 0.0).all(axis=1) & (miss <= last_step)
     bend = _bend(soils[:1], axles, completed, slip, load[:1], at[:, :1], by_load[:, :1])
-    return WheelTable(axles, slip, np.where(balanced, pull, np.nan), load, at, by_load, by_slip, bend, balanced)
+    return WheelTable(axles, soils, slip, np.where(balanced, pull, np.nan), load, at, by_load, by_slip, bend, balanced)
+
+
+def _foreseen(start: WheelTable, soils: Array) -> tuple[Array, Array]:
+    """Pull (D, S) and entry angle (D, A, S) on other soils, as those of a table change from its first soil to the rest."""
+    n_soils, n_slips = start.pull.shape
+    logs, other = (np.log(np.maximum(each, LEAST)) for each in (start.soils, soils))
+    with np.errstate(all="ignore"):
+        values = np.concatenate([start.pull, np.log(start.at[2]).reshape(n_soils, -1)], axis=1)
+    apart, change = logs - logs[0], values - values[0]
+    spread = apart.T @ apart
+    ridge = RIDGE * np.trace(spread) + LEAST
+    slopes = np.linalg.solve(spread + ridge * np.eye(len(spread)), apart.T @ np.where(np.isfinite(change), change, 0.0))
+    values = values + (other - logs) @ slopes
+    return values[:, :n_slips], np.exp(values[:, n_slips:]).reshape(start.load.shape)
 
 
 class _Step(NamedTuple):
