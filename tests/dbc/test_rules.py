@@ -88,7 +88,7 @@ def test_no_identifier_is_used_twice():
 def test_fast_frames_are_fast_and_all_results_are_protected():
     messages = {message.name: message for message in load("soilbus").messages}
     fast = {name for name, message in messages.items() if message.cycle_time == 100}
-    assert fast == {"WheelSlip", "WheelSlip2", "Traversability", "TorqueDemand"}
+    assert fast == {"WheelSlip", "WheelSlip2", "Traversability", "TorqueDemand", "DemandForecast"}
     assert all(message.cycle_time == 1000 for name, message in messages.items() if name not in fast)
     for message in messages.values():
         places = {signal.name: (signal.start, signal.length) for signal in message.signals}

@@ -68,3 +68,16 @@ def test_not_available_is_shown_as_nothing(setup):
     publisher, dashboard, _ = setup
     dashboard.receive(message(publisher.frame("WheelSlip", {})))
     assert dashboard.value("WheelSlip", "SlipWheel1") is None
+
+
+def test_the_warning_and_the_best_slips_are_shown(setup):
+    publisher, dashboard, clock = setup
+    dashboard.receive(message(publisher.frame("DemandForecast", {"Warning": "none", "TimeLeft": 25.0})))
+    advice = {"SlipForEfficiencyFront": 0.123, "SlipForEfficiencyRear": 0.105}
+    dashboard.receive(message(publisher.frame("TractionAdvice", advice)))
+    assert "GETTING STUCK" not in shown(dashboard)
+    assert "best slip 0.12/0.10" in shown(dashboard)
+    dashboard.receive(message(publisher.frame("DemandForecast", {"Warning": "immobilisation", "TimeLeft": 4.2})))
+    assert "GETTING STUCK in 4 s" in shown(dashboard)
+    clock.now += 1.0
+    assert "GETTING STUCK" not in shown(dashboard)

@@ -78,6 +78,7 @@ class Dashboard:
                     self._text("Traversability", "Probability", "p = {:.2f}"),
                     self._text("Traversability", "LimitingCause", "limit: {}"),
                     self._pair("DraftCapability", "MaxDraft", "MaxDraftStd", "max. draft {} N"),
+                    self._advice(),
                     self._text("SoilbusStatus", "State", "service: {}"),
                     self._text("SoilbusStatus", "Reason", "({})"),
                 ),
@@ -100,7 +101,18 @@ class Dashboard:
             )
         body = Table.grid(padding=(0, 4))
         body.add_row(soil, wheels)
-        return Panel(Group(head, Text(detail), Text(""), body), title="soilbus", width=76)
+        return Panel(Group(head, self._warning(), Text(detail), Text(""), body), title="soilbus", width=76)
+
+    def _warning(self) -> Text:
+        if self.value("DemandForecast", "Warning") != "immobilisation":
+            return Text("")
+        left = self._text("DemandForecast", "TimeLeft", " in {:.0f} s")
+        return Text(f" GETTING STUCK{left} ", style="bold white on red")
+
+    def _advice(self) -> str:
+        """Slips for best efficiency, front and rear."""
+        slips = (self._text("TractionAdvice", f"SlipForEfficiency{axle}", "{:.2f}") for axle in ("Front", "Rear"))
+        return "best slip " + "/".join(slip or "-" for slip in slips)
 
     def _text(self, message: str, signal: str, form: str) -> str:
         value = self.value(message, signal)
