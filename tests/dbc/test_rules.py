@@ -101,6 +101,15 @@ def test_cleared_or_blank_traversability_never_reads_go():
     assert message.decode(b"\xff" * 8)["State"] == "not_available"
 
 
+def test_every_known_soil_has_its_code_in_the_order_of_the_table():
+    from soilbus.terra.soils import KINDS
+
+    kind = load("soilbus").get_message_by_name("SoilClass").get_signal_by_name("Kind")
+    names = {int(code): str(name) for code, name in kind.choices.items()}
+    assert names == dict(enumerate(("unknown", *KINDS))) | {254: "error", 255: "not_available"}
+    assert kind.maximum == len(KINDS)
+
+
 def test_soil_ranges_hold_every_known_soil():
     from soilbus.terra.soils import SOILS
 

@@ -81,3 +81,16 @@ def test_the_warning_and_the_best_slips_are_shown(setup):
     assert "GETTING STUCK in 4 s" in shown(dashboard)
     clock.now += 1.0
     assert "GETTING STUCK" not in shown(dashboard)
+
+
+def test_the_soil_class_is_shown_while_it_is_fresh(setup):
+    publisher, dashboard, clock = setup
+    dashboard.receive(message(publisher.frame("SoilClass", {})))
+    assert "soil: " not in shown(dashboard)
+    said = {"Kind": "sandy_loam_15", "Probability": 0.93, "UnknownProbability": 0.05}
+    dashboard.receive(message(publisher.frame("SoilClass", said)))
+    assert "soil: sandy_loam_15 (0.93)" in shown(dashboard)
+    clock.now += 4.0
+    assert "sandy_loam" not in shown(dashboard)
+    dashboard.receive(message(publisher.frame("SoilClass", {"Kind": "unknown", "Probability": 0.6})))
+    assert "soil: unknown (0.60)" in shown(dashboard)

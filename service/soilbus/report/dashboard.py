@@ -79,6 +79,7 @@ class Dashboard:
                     self._text("Traversability", "LimitingCause", "limit: {}"),
                     self._pair("DraftCapability", "MaxDraft", "MaxDraftStd", "max. draft {} N"),
                     self._advice(),
+                    self._text("SoilClass", "Kind", "soil: {}") + self._text("SoilClass", "Probability", " ({:.2f})"),
                     self._text("SoilbusStatus", "State", "service: {}"),
                     self._text("SoilbusStatus", "Reason", "({})"),
                 ),
