@@ -85,6 +85,15 @@ def test_no_identifier_is_used_twice():
     assert len(ids) == len(set(ids))
 
 
+def test_generated_struct_members_are_no_words_of_c_or_cpp():
+    words = "and auto bool break case catch char class const continue default delete do double else enum explicit "
+    words += "export extern false float for friend goto if inline int long namespace new not operator or private "
+    words += "protected public register return short signed sizeof static struct switch template this throw true try "
+    words += "typedef typename union unsigned using virtual void volatile while xor"
+    members = {camel_to_snake_case(s.name) for name in FILES for m in load(name).messages for s in m.signals}
+    assert not members & set(words.split())
+
+
 def test_fast_frames_are_fast_and_all_results_are_protected():
     messages = {message.name: message for message in load("soilbus").messages}
     fast = {name for name, message in messages.items() if message.cycle_time == 100}
