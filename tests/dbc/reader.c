@@ -111,7 +111,7 @@ static void forget_the_stale(int64_t now_us)
 static struct stream *stream_of(const char *id_text)
 {
     uint32_t id;
-    if (strlen(id_text) == 8 && sscanf(id_text, "%" SCNx32, &id) == 1) /* 8 digits: a 29-bit id */
+    if (sscanf(id_text, "%" SCNx32, &id) == 1)
         for (size_t i = 0; i < stream_count; i++)
             if (streams[i].id == id)
                 return &streams[i];

@@ -139,28 +139,6 @@ def test_soil_ranges_hold_every_known_soil():
             assert signal.scale <= 0.015 * min(values), name
 
 
-def test_readme_lists_every_frame_with_its_identifier_and_its_example_is_right():
-    text = (DBC / "README.md").read_text(encoding="utf-8")
-    database = load("soilbus")
-    for message in database.messages:
-        assert f"| `{message.name}` | {message.frame_id:08X} |" in text
-    payload = bytes.fromhex(re.search(r"^payload +([0-9A-F ]+)$", text, re.M)[1])
-    covered = bytes.fromhex(re.search(r"^CRC over +(.*)$", text, re.M)[1])
-    frame_id = int(re.search(r"^id +(.*)$", text, re.M)[1], 16)
-    assert covered == frame_id.to_bytes(4, "little") + payload[:7]
-    crc = 0xFF
-    for byte in covered:
-        crc ^= byte
-        for _ in range(8):
-            crc = (crc << 1 ^ 0x1D) & 0xFF if crc & 0x80 else crc << 1
-    assert crc ^ 0xFF == payload[7]
-    decoded = database.decode_message(frame_id, payload)
-    assert decoded["State"] == "go"
-    assert decoded["LimitingCause"] == "slip"
-    assert decoded["Counter"] == 5
-    assert (decoded["Probability"], decoded["Age"], decoded["Window"]) == (pytest.approx(0.97), pytest.approx(0.4), 7)
-
-
 def c_program(name, database, readme):
     """Reads lines `id payload`, prints every signal's value; its checksum comes from the README."""
     cases = []
