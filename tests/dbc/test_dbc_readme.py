@@ -71,6 +71,8 @@ def test_codes_by_width_are_those_of_the_signals():
         table |= dict(zip(map(int, re.findall(r"\d+", widths)), zip(*columns, strict=True), strict=True))
     used = {s.length: s for m in DATABASE.messages for s in m.signals if s.name not in PROTOCOL}
     assert set(used) <= set(table)
+    for length, (highest, error, _) in table.items():
+        assert highest == error - 1 if length < 8 else highest + 1 == 0xFB << length - 8
     for length, signal in used.items():
         codes = value_codes(signal)
         assert codes.highest <= table[length][0]

@@ -64,6 +64,18 @@ def test_a_frame_with_one_bit_wrong_is_not_believed(setup):
     assert dashboard.value("Traversability", "State") is None
 
 
+def test_a_stuck_counter_keeps_nothing_fresh(setup):
+    publisher, dashboard, clock = setup
+    stuck, after = (message(publisher.frame("Traversability", {"State": "go"})) for _ in range(2))
+    for _ in range(10):
+        dashboard.receive(stuck)
+        clock.now += 0.1
+    assert dashboard.bad_frames == 9
+    assert dashboard.value("Traversability", "State") is None
+    dashboard.receive(after)
+    assert dashboard.value("Traversability", "State") == "go"
+
+
 def test_not_available_is_shown_as_nothing(setup):
     publisher, dashboard, _ = setup
     dashboard.receive(message(publisher.frame("WheelSlip", {})))
