@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import itertools
+from dataclasses import replace
 
 import can
 import pytest
@@ -13,6 +14,7 @@ from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
 from soilbus.daemon.notify import Notifier
+from soilbus.daemon.outputs import hop_frames
 from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.service import Service
 from soilbus.simulator.frames import frames
@@ -105,6 +107,20 @@ def test_values_on_the_bus_are_those_of_the_result(recording):
         assert frame["Window"] == result.index % 251
         assert frame["BearingPressure"] == pytest.approx(result.bearing.value / 1e3, abs=0.026)
         assert str(frame["Status"]) == str(result.status)
+
+
+def test_the_soil_class_on_the_bus_is_the_likeliest_of_the_result(recording):
+    bench = Bench(recording)
+    bench.run(DURATION)
+    sent = bench.sent("SoilClass")
+    for result, frame in zip(bench.results, sent, strict=True):
+        share = result.soil_class
+        assert share[str(frame["Kind"])] == max(share.values()) == pytest.approx(frame["Probability"], abs=1.26e-4)
+        assert frame["UnknownProbability"] == pytest.approx(share["unknown"], abs=1.26e-4)
+        assert (frame["Window"], str(frame["Status"])) == (result.index % 251, str(result.status))
+    assert str(sent[-1]["Kind"]) == "sandy_loam_15"  # what the recording drives on
+    nothing = next(values for name, values in hop_frames(replace(result, soil_class=None)) if name == "SoilClass")
+    assert (nothing["Kind"], nothing["Probability"], nothing["UnknownProbability"]) == (None, None, None)
 
 
 def test_advice_limits_and_forecast_are_those_of_the_result(recording):

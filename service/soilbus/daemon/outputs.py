@@ -113,6 +113,7 @@ def hop_frames(result: WindowResult) -> Iterator[tuple[str, dict[str, Any]]]:
         "SoilStrength",
         common | {"Chi2": result.chi2} | _pair("BearingPressure", "BearingPressureStd", bearing, 1e3),
     )
+    yield "SoilClass", common | _kind(result.soil_class)
     parameters = {} if result.posterior is None else result.posterior.parameters()
     for name, (message, unit) in PARAMETER_FRAMES.items():
         yield message, common | _pair("Value", "Std", parameters.get(name), unit)
@@ -128,6 +129,13 @@ def _pair(value: str, std: str, estimate: Estimate | None, unit: float) -> dict[
     if estimate is None:
         return {value: None, std: None}
     return {value: estimate.value / unit, std: estimate.std / unit}
+
+
+def _kind(soil_class: Mapping[str, float] | None) -> dict[str, str | float | None]:
+    if soil_class is None:
+        return {"Kind": None, "Probability": None, "UnknownProbability": None}
+    kind, probability = next(iter(soil_class.items()))
+    return {"Kind": kind, "Probability": probability, "UnknownProbability": soil_class[UNKNOWN]}
 
 
 def _advice(able: Capability | None) -> dict[str, float | None]:
