@@ -296,7 +296,8 @@ def test_priors_of_effects_grow_with_the_wheel_and_only_where_they_have_its_unit
         larger = for_wheel(effect, 2.0 * LOAD, 3.0 * RADIUS)
         assert std(larger) == pytest.approx([factor * s for s in std(effect)])
         assert larger.parameters[0].high == pytest.approx(factor * effect.parameters[0].high)
-    assert for_wheel(CATALOGUE["hardpan"], LOAD, 0.1 * RADIUS).parameters[1].starts[0] == pytest.approx(5e-4)
+    depth = for_wheel(CATALOGUE["hardpan"], LOAD, 0.1 * RADIUS).parameters[1]
+    assert depth.starts[0] == pytest.approx(0.1 * CATALOGUE["hardpan"].parameters[1].starts[0])
 
 
 def test_the_published_table_is_read_with_its_missing_torques(field_recording):

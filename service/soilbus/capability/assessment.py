@@ -34,7 +34,7 @@ GRID = 9
 MAX_SKID = 0.3
 SKID_GRID = 9
 TOLERANCE = 3e-3
-"""Last Newton step over the weight: it leaves less than the interpolation between slips does, some 5e-5 of the weight."""
+"""Last Newton step over the weight: it leaves less than the interpolation between slips does, 5e-5 of the weight."""
 LEVEL_SINE = 1e-3
 """Slopes below this sine change no load worth computing."""
 

@@ -162,7 +162,7 @@ def wheel_table(
 
 
 def _foreseen(start: WheelTable, soils: Array) -> tuple[Array, Array]:
-    """Pull (D, S) and entry angle (D, A, S) on other soils, as those of a table change from its first soil to the rest."""
+    """Pull (D, S) and entry angle (D, A, S) on other soils, as those of a table change from its first soil on."""
     n_soils, n_slips = start.pull.shape
     logs, other = (np.log(np.maximum(each, LEAST)) for each in (start.soils, soils))
     with np.errstate(all="ignore"):
