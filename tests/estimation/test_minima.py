@@ -56,7 +56,7 @@ def test_two_optima_as_likely_are_a_fit_with_a_rival(torn):
     again = descend(problem, prior, rival.belief.posterior.soil)  # it is an optimum indeed
     assert again.converged
     assert minima.apart(again, fit) > 2.0
-    assert again.posterior.distance(rival.belief.posterior.soil) < 0.1
+    assert again.mode.posterior.distance(rival.belief.posterior.soil) < 0.1
     assert rival.share == pytest.approx(1.0 / (1.0 + math.exp(0.5 * (again.evidence - fit.evidence))), abs=0.01)
 
 

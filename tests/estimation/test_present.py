@@ -62,7 +62,7 @@ def test_the_filter_is_the_joint_solution_for_the_soils_of_all_pieces(drift, sim
     problem = case.problem()
     before = Belief.of(case.prior, problem.gain_std)
     fit = fit_window(problem, case.prior, before)
-    now = at_present(Fitting(problem, case.prior, before), fit, 10.0, drift).belief
+    now = at_present(Fitting(problem, case.prior, before), fit, 10.0, drift).mode  # of which the linear window tells
 
     # The same by one dense system: soil of piece 0, 1, ..., then gains.
     fitting = Fitting(problem, case.prior, before)

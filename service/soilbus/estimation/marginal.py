@@ -53,12 +53,12 @@ def with_whole(problem: WindowProblem, prior: SoilPrior, before: Belief, found: 
     That is where k_c, k_phi and n are free and the tyres unlike, and n is badly known or
     there is a rival.
     """
-    spread = math.sqrt(found.belief.covariance[_N, _N])
+    spread = math.sqrt(found.mode.covariance[_N, _N])
     ridge = prior.log_std[[_K_C, _K_PHI, _N]].all() and np.ptp(problem.rig.width) > 0.0
     if not ridge or (spread < WELL_KNOWN and found.rival is None):
         return found
     with np.errstate(all="ignore"):
-        top = _held(problem, prior, before, found, math.log(found.belief.soil[_N]))
+        top = _held(problem, prior, before, found, math.log(found.mode.soil[_N]))
         if top is None:
             return found
         step = min(spread, LONGEST)

@@ -38,8 +38,14 @@ def moments_along_share(quadratic: Array, gradient: Array, share: float) -> Mome
     z' quadratic z + 2 gradient' z, up to a constant, for z (P + 2,) of the changes of s (over
     s), log s and log (1 - s), and o.
     """
+    told = np.diag(quadratic)[3:]
+    if not np.all(told > 0.0):
+        return None
+    scale = 1.0 / np.sqrt(told)
+    scaled = quadratic[3:, 3:] * np.outer(scale, scale)
     try:
-        inverse = np.linalg.inv(quadratic[3:, 3:])
+        np.linalg.cholesky(scaled)  # rounding may have left it without
+        inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
     except np.linalg.LinAlgError:
         return None
     along = -inverse @ quadratic[3:, :3]
