@@ -96,7 +96,6 @@ class Fitting:
         self.active = np.flatnonzero(known)
         self.free = self.coordinates.free
         kept = np.concatenate([self.free, _SOIL + self.active])
-        self._known_variance = np.diag(before.covariance)[kept]
         inverse = solved(before.covariance[np.ix_(kept, kept)], np.zeros(len(kept)))
         if inverse is None:
             raise ValueError("what was known before has no proper covariance")
@@ -205,17 +204,7 @@ class Fitting:
         soil = self.coordinates.soil_at(self.coordinates.position(place.soil) + step[:free])
         gains[self.active] += step[free:]
         by_share = self._by_share(soil)
-        return self._belief(soil, gains, self._no_wider(by_share @ moments.covariance @ by_share.T)), mode
-
-    def _no_wider(self, covariance: Array) -> Array:
-        """The covariance (F + A, F + A) with no coordinate that was known before told less than it was.
-
-        That of k_phi, which is no parameter, is left alone; so is then the pressure that the wheels feel.
-        """
-        known = self._known_variance.copy()
-        known[_K_PHI] = np.inf
-        shrink = np.sqrt(np.minimum(known / np.diag(covariance), 1.0))
-        return covariance * np.outer(shrink, shrink)
+        return self._belief(soil, gains, by_share @ moments.covariance @ by_share.T), mode
 
     def _moments(self, place: Place, point: Point) -> Moments | None:
         """Moments of the logarithm of k_c's share in K_L, the other coordinates and the gains, about the optimum."""
