@@ -10,8 +10,8 @@ import numpy as np
 from soilbus.diagnosis.completion import Completion, Start, complete
 from soilbus.diagnosis.learned import Correction, corrections
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.score import scores
-from soilbus.diagnosis.verdict import PLAUSIBLE, SURE, Verdict, is_real, pays, probabilities
+from soilbus.diagnosis.score import further_starts, scores
+from soilbus.diagnosis.verdict import PAYS, PLAUSIBLE, SURE, Verdict, is_real, pays, probabilities
 from soilbus.diagnosis.where import Disagreement, disagreements
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
@@ -118,16 +118,22 @@ def _promising(
     """The few candidates worth a fit of all data, and where it starts: foreseen by scores, tried on a few instants."""
     foreseen = [s for s in scores(records, prior, present, candidates)[:TRIED] if s.evidence < WORTH_TRYING]
     few = [record.thinned(THINNED) for record in records]
-    before = complete(few, prior, present.effects, present.as_starts()) if foreseen else None
+    before = complete(few, prior, present.effects, present.as_starts())
     if before is None:
         return [(score.effect, score.starts) for score in foreseen[:FITTED]]
     falls: list[tuple[float, Effect, Sequence[Start]]] = []
-    for score in foreseen:
-        completion = complete(few, prior, (*present.effects, score.effect), score.starts)
+    tries: list[tuple[Effect, Sequence[Start]]] = [(score.effect, score.starts) for score in foreseen]
+    tries += [(effect, starts) for effect in candidates for starts in further_starts(effect, before)]
+    for effect, starts in tries:
+        completion = complete(few, prior, (*present.effects, effect), starts)
         if completion is not None:
-            falls.append((before.evidence - completion.evidence, score.effect, completion.as_starts()))
+            falls.append((before.evidence - completion.evidence, effect, completion.as_starts()))
     falls.sort(key=lambda item: -item[0])
-    return [(effect, starts) for fall, effect, starts in falls[:FITTED] if fall > NEAR * falls[0][0]]
+    best: dict[str, tuple[Effect, Sequence[Start]]] = {}
+    for fall, effect, starts in falls:
+        if fall > max(NEAR * falls[0][0], 0.0) and len(best) < FITTED:
+            best.setdefault(effect.name, (effect, starts))
+    return list(best.values())
 
 
 def _reconsidered(
@@ -144,10 +150,13 @@ def _reconsidered(
         if without is None:
             continue
         found = _round(records, prior, without, [e for e in candidates if e.name not in without.names])
-        if found is not None and found[1].evidence < present.evidence + SAME:
+        if found is None and without.evidence < present.evidence + PAYS:
+            present = without
+        elif found is not None and found[1].evidence < present.evidence + SAME:
             chosen[i], present = found
     order = {name: i for i, name in enumerate(present.names)}
-    return sorted(chosen, key=lambda addition: order[addition.effect.name]), present
+    kept = [addition for addition in chosen if addition.effect.name in order]
+    return sorted(kept, key=lambda addition: order[addition.effect.name]), present
 
 
 def _without(records: Sequence[Record], prior: SoilPrior, present: Completion, effect: Effect) -> Completion | None:
@@ -155,8 +164,7 @@ def _without(records: Sequence[Record], prior: SoilPrior, present: Completion, e
     n_sensors = records[0].learned.n_sensors
     kept = [n_sensors + i for i, f in enumerate(present.free) if f.effect != effect.name]
     starts = [
-        Start(fit.mode.soil, np.concatenate([fit.mode.gains[:n_sensors], fit.mode.gains[kept]]))
-        for fit in present.fits
+        Start(fit.mode.soil, np.concatenate([fit.mode.gains[:n_sensors], fit.mode.gains[kept]])) for fit in present.fits
     ]
     return complete(records, prior, [e for e in present.effects if e.name != effect.name], starts)
 

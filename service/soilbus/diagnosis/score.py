@@ -24,6 +24,8 @@ from soilbus.terra.effects.effect import Effect
 
 Array = NDArray[np.float64]
 
+SWITCHED_ON = 0.5
+"""Prior standard deviations of an effect's first parameter in its further starts."""
 MAX_STEP = 2.0
 """Prior standard deviations to which a foreseen parameter is confined: linear is not for ever."""
 
@@ -56,38 +58,32 @@ class _Normal:
 def scores(
     records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect]
 ) -> list[Score]:
-    """The candidates in the order of what they are foreseen to explain, the best first.
-
-    A parameter with further starts is looked at from each of them; the best counts.
-    """
-    found = _scores_at(records, prior, present, candidates, 0)
-    for turn in range(1, 1 + max((len(p.starts) for e in candidates for p in e.parameters), default=0)):
-        again = [e for e in candidates if any(len(p.starts) >= turn for p in e.parameters)]
-        for score in _scores_at(records, prior, present, again, turn):
-            place = [s.effect.name for s in found].index(score.effect.name)
-            if score.evidence < found[place].evidence:
-                found[place] = score
-    return sorted(found, key=lambda score: score.evidence)
-
-
-def _scores_at(
-    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect], turn: int
-) -> list[Score]:
-    """Scores from the neutral values (turn 0), or from the parameters' further starts."""
+    """The candidates in the order of what they are foreseen to explain, the best first."""
     n_wheels = len(records[0].learned.rig.wheels)
     free = [f for effect in candidates for f in parameters_of(effect, n_wheels)]
-    begin = np.array([(_start_value(f, turn) - f.value) / f.std for f in free])
-    normals = [_normal(r, prior, present, i, candidates, free, begin) for i, r in enumerate(records)]
+    normals = [_normal(r, prior, present, i, candidates, free) for i, r in enumerate(records)]
     found = []
     for effect in candidates:
         columns = np.array([i for i, f in enumerate(free) if f.effect == effect.name])
-        found.append(_score(effect, columns, free, normals, begin))
+        found.append(_score(effect, columns, free, normals))
+    return sorted(found, key=lambda score: score.evidence)
+
+
+def further_starts(effect: Effect, present: Completion) -> list[tuple[Start, ...]]:
+    """Where else a fit does well to begin: a parameter's further starts, with the effect's first one switched on.
+
+    The score, taken where the effect is absent, is blind to such a parameter.
+    """
+    first, n_wheels = effect.parameters[0], len(present.checks[0].problem.rig.wheels)
+    found = []
+    for parameter in effect.parameters:
+        for value in parameter.starts:
+            wanted = {parameter.name: value, first.name: first.neutral + SWITCHED_ON * first.std}
+            pulls = [(wanted.get(f.parameter.name, f.value) - f.value) / f.std for f in parameters_of(effect, n_wheels)]
+            found.append(
+                tuple(Start(start.soil, np.concatenate([start.gains, pulls])) for start in present.as_starts())
+            )
     return found
-
-
-def _start_value(free: Free, turn: int) -> float:
-    starts = free.parameter.starts
-    return starts[turn - 1] if 0 < turn <= len(starts) else free.value
 
 
 def _normal(
@@ -97,14 +93,13 @@ def _normal(
     i: int,
     candidates: Sequence[Effect],
     free: Sequence[Free],
-    begin: Array,
 ) -> _Normal:
     problem = record.learned.completed((*present.effects, *candidates), (*present.free, *free))
     fit, before, P = present.fits[i], present.before[i], len(free)
     covariance = np.zeros((len(before.covariance) + P,) * 2)
     covariance[:-P, :-P], covariance[-P:, -P:] = before.covariance, np.eye(P)
     extended = Belief(before.soil, np.concatenate([before.gains, np.zeros(P)]), covariance)
-    gains = np.concatenate([fit.optimum.gains, begin])
+    gains = np.concatenate([fit.optimum.gains, np.zeros(P)])
     place = Place(fit.optimum.soil, gains, fit.optimum.latents, np.inf, 0)
     fitting = Fitting(problem, prior, extended)
     with np.errstate(all="ignore"):
@@ -118,25 +113,23 @@ def _normal(
         raise np.linalg.LinAlgError("the present model's information is singular")
     answer = inverse[1] @ information[base, new]
     left = information[new, new] - np.eye(P) - information[new, base] @ answer
-    by_effects = point.gradient[new] - begin - answer.T @ point.gradient[base]  # of the data alone
+    by_effects = point.gradient[new] - answer.T @ point.gradient[base]
     return _Normal(fitting, place, by_effects, left, answer)
 
 
-def _score(
-    effect: Effect, columns: NDArray[np.intp], free: Sequence[Free], normals: Sequence[_Normal], begin: Array
-) -> Score:
+def _score(effect: Effect, columns: NDArray[np.intp], free: Sequence[Free], normals: Sequence[_Normal]) -> Score:
     """One effect's score over all recordings; with parameters of its own in each where it is of the recording."""
-    block, at = np.ix_(columns, columns), begin[columns]
+    block = np.ix_(columns, columns)
     own = [free[i] for i in columns.tolist()]
     parts = [(n.left[block], n.by_effects[columns]) for n in normals]
     if not effect.of_record:
         left, gradient = (np.sum([part[i] for part in parts], axis=0) for i in (0, 1))
         parts = [(left, gradient)]
-    solutions = [_within(left + np.eye(len(own)), gradient + at, at, own) for left, gradient in parts]
-    fall = sum(solution.fall for solution in solutions) - len(solutions) * float(at @ at)
+    solutions = [_within(left + np.eye(len(own)), gradient, own) for left, gradient in parts]
+    fall = sum(solution.fall for solution in solutions)
     logdet = sum(solution.logdet for solution in solutions)
     steps = [solution.step for solution in solutions] * (1 if effect.of_record else len(normals))
-    starts = tuple(_start(n, columns, at, step) for n, step in zip(normals, steps, strict=True))
+    starts = tuple(_start(n, columns, step) for n, step in zip(normals, steps, strict=True))
     return Score(effect, fall, logdet - fall, starts)
 
 
@@ -148,10 +141,9 @@ class _Solution(NamedTuple):
     logdet: float
 
 
-def _within(information: Array, gradient: Array, begin: Array, free: Sequence[Free]) -> _Solution:
+def _within(information: Array, gradient: Array, free: Sequence[Free]) -> _Solution:
     """Least cost of the parabola with the parameters inside their ranges: those that would leave stay at the edge."""
     low, high = (np.array([(getattr(f.parameter, edge) - f.value) / f.std for f in free]) for edge in ("low", "high"))
-    low, high = low - begin, high - begin
     step = np.zeros(len(free))
     inside = np.ones(len(free), bool)
     for _ in range(len(free) + 1):
@@ -170,7 +162,7 @@ def _within(information: Array, gradient: Array, begin: Array, free: Sequence[Fr
     return _Solution(step, fall, float(np.linalg.slogdet(information[kept])[1]) if inside.any() else 0.0)
 
 
-def _start(normal: _Normal, columns: NDArray[np.intp], begin: Array, step: Array) -> Start:
+def _start(normal: _Normal, columns: NDArray[np.intp], step: Array) -> Start:
     step = step * min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-12))
     follow = -normal.answer[:, columns] @ step
     fitting, place = normal.fitting, normal.place
@@ -178,4 +170,4 @@ def _start(normal: _Normal, columns: NDArray[np.intp], begin: Array, step: Array
     soil = fitting.coordinates.moved(place.soil, follow[:n_free])
     gains = place.gains[:n_known].copy()
     gains[fitting.active[fitting.active < n_known]] += follow[n_free:]
-    return Start(soil, np.concatenate([gains, begin + step]))
+    return Start(soil, np.concatenate([gains, step]))

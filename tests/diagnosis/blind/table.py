@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
@@ -88,7 +89,7 @@ def calibration(trials: Sequence[Trial]) -> Iterator[str]:
         for t in trials
         if t.kind == "single" and t.named and t.visible >= BARELY
     ]
-    for low, high in zip(BINS, BINS[1:], strict=False):
+    for low, high in itertools.pairwise(BINS):
         members = [(p, right) for p, right in told if low <= p < high]
         if members:
             mean = np.mean([p for p, _ in members])

@@ -12,7 +12,7 @@ from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.diagnosis.completion import Completion, complete
 from soilbus.diagnosis.diagnose import Diagnosis, diagnose
 from soilbus.diagnosis.records import Record, record_of
-from soilbus.diagnosis.score import scores
+from soilbus.diagnosis.score import further_starts, scores
 from soilbus.estimation.window import BinStore
 from soilbus.terra.effects.catalogue import CATALOGUE
 
@@ -95,10 +95,12 @@ def _visible(case: Case, record: Record, found: Diagnosis) -> float:
     if not case.hidden:
         return float("nan")
     prior, present = prior_of(case.config), found.base
-    for name in case.hidden:
-        start = scores([record], prior, present, [CATALOGUE[name]])[0].starts
-        more = complete([record], prior, (*present.effects, CATALOGUE[name]), start)
-        present = present if more is None else more
+    for effect in (CATALOGUE[name] for name in case.hidden):
+        starts = [scores([record], prior, present, [effect])[0].starts, *further_starts(effect, present)]
+        tries = [complete([record], prior, (*present.effects, effect), start) for start in starts]
+        present = min((more for more in (present, *tries) if more is not None), key=_cost)
+    if set(found.completed.names) == set(case.hidden):
+        present = min(present, found.completed, key=_cost)
     return _cost(found.base) - _cost(present)
 
 
