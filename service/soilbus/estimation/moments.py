@@ -74,10 +74,10 @@ def _over_share(own: Array, slope: Array, share: float) -> tuple[Array, Array]:
     left = 1.0 - share * np.exp(d)
     changes = np.stack([np.expm1(d), d, np.log(left / (1.0 - share))])
     slopes = np.stack([np.exp(d), np.ones(NODES), 1.0 - 1.0 / left])
-    cost = np.einsum("in,ij,jn->n", changes, own, changes) + 2.0 * slope @ changes
+    cost = (changes * (own @ changes)).sum(0) + 2.0 * slope @ changes
     density = np.cosh(at) * (scale * np.sinh(at) <= d) * np.exp(-0.5 * (cost - cost.min()))
     of_prior = density / left
     mean = changes @ of_prior / of_prior.sum()
-    density *= np.sqrt(np.einsum("in,ij,jn->n", slopes, own, slopes))
+    density *= np.sqrt((slopes * (own @ slopes)).sum(0))
     off = changes - mean[:, None]
     return mean, (off * density / density.sum()) @ off.T

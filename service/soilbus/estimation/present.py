@@ -63,9 +63,9 @@ def at_present(fitting: Fitting, fit: Fit, window: float, drift: float) -> Fit:
         if end > begin:
             rows = slice(begin * m, end * m)
             joint += of_residual.T @ (optimum.at.rows[rows].T @ optimum.at.weighed[rows]) @ of_residual
-    constant = fitting.with_before(place, optimum.at)
+    constant = of_residual.T @ optimum.at.normal @ of_residual[:, 1:]
+    still = solved(constant[1:] + before.information, constant[0] + before.gradient)
     wandering = solved(joint[1:, 1:], joint[1:, 0])
-    still = None if constant is None else solved(constant.information, constant.gradient)
     if wandering is None or still is None:
         return fit
     step, covariance = wandering

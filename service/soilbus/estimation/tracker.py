@@ -281,10 +281,10 @@ class Tracker:
         Without a last fit, or where the first soil is out of the window, the second alone.
         """
         first = self._problem(window.rows(np.flatnonzero(window.t < alarm.t - _SAME_TIME)))
-        old = None
+        ahead = None
         if last is not None and first.n_rows >= MIN_NEW_ROWS:
             ahead = foreseen(first, self._here, last, before)
-            old = self._told(ahead.fitting, resume(ahead))
+        old = None if ahead is None else resume(ahead)
         if self.mismatch(old):
             old = None
         if old is None and not self.mismatch(one):
@@ -306,7 +306,9 @@ class Tracker:
                 return None
             self._crossing, self._here = crossing, there
             return Tracked(self._told(Fitting(second, there, known), new), False, Ground.NEW, crossing.end)
-        return Tracked(old, False, Ground.CHANGING, float(window.t[0])) if old is not None and waits else None
+        if ahead is None or old is None or not waits:
+            return None
+        return Tracked(self._told(ahead.fitting, old), False, Ground.CHANGING, float(window.t[0]))
 
     def _crossings(self, alarm: Alarm, start: float) -> list[Crossing]:
         """Borders of growing length that begin at the alarm; of those over before `start` [s] only the last."""
