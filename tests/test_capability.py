@@ -1,222 +1,353 @@
-"""Pull curves and limits against brute force: nested scipy root finding on the wheel forces."""
+"""Capability against brute force (nested scipy root finding) and against Monte Carlo."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import math
 
 import numpy as np
 import pytest
-from scipy.optimize import brentq
+from scipy.optimize import brentq, minimize_scalar
 
-from soilbus.assembly import rig_of
-from soilbus.capability import PullCurve, largest_pull, pull_curve, slip_for_pull, slip_grid
+from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.capability import assessment
+from soilbus.capability.assessment import Demand, assess, slip_grid
+from soilbus.capability.balance import LEVEL, Duty, balance
+from soilbus.capability.sigma_points import SigmaPoints, cubature
+from soilbus.capability.wheels import WheelTable, wheel_table
+from soilbus.estimation.gauss_newton import fit_window
+from soilbus.estimation.posterior import Estimate, Posterior
+from soilbus.estimation.residuals import WindowProblem
+from soilbus.estimation.window import BinStore
+from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
-from soilbus.terra.wheel import Soil, WheelModel, state_on, wheel_forces
+from soilbus.terra.wheel import Soil
+from statics import MODEL, WEIGHT, WHEELS, brute
 
-RIG = rig_of(reference_configuration())
-MODEL = WheelModel()
-WEIGHT = 2300.0 * 9.80665
+CONFIG = reference_configuration()
+RIG = rig_of(CONFIG)
 NO_LIMIT = np.full(4, np.nan)
 GRID = slip_grid(0.6)
-FRONT_SHARE, REAR_SHARE = 0.95 / 1.95, 1.0 / 1.95
 NAMES = ("loam", "wet_clay", "clayey_soil_38", "dry_sand", "sandy_loam_22")
+DUTIES = {
+    "level": LEVEL,
+    "grade": Duty(0.0, None),
+    "grade with draft": Duty(1500.0, None),
+    "on a slope": Duty(None, 0.08),
+    "down a slope": Duty(None, -0.05),
+}
 
 
-def wheel(soil: Soil, load: float, slip: float, radius: float, width: float) -> np.ndarray:
-    """(load, pull, torque, entry angle) of one wheel that carries a load."""
-
-    def excess(angle: float) -> float:
-        return wheel_forces(state_on(soil, angle, slip, radius, width), MODEL)[0] - load
-
-    angle = brentq(excess, 1e-4, 1.39, xtol=1e-10)
-    return np.append(wheel_forces(state_on(soil, angle, slip, radius, width), MODEL), angle)
+def table_of(*soils: Soil, slip=GRID, start: WheelTable | None = None) -> WheelTable:
+    return wheel_table(np.array(soils), RIG, MODEL, slip, start)
 
 
-def brute(soil: Soil, slip: float, graded: bool) -> tuple[float, np.ndarray]:
-    """Pull at which draft (or grade) and wheels balance, and (4, axle) forces; moments written out."""
-
-    def axles(pull: float) -> np.ndarray:
-        if graded:
-            across = WEIGHT * np.sqrt(1.0 - (pull / WEIGHT) ** 2)
-            front = (across * 0.95 - pull * 0.75) / 1.95
-        else:
-            across = WEIGHT
-            front = across * FRONT_SHARE - pull * 0.45 / 1.95
-        rear = across - front
-        return np.stack([wheel(soil, front / 2, slip, 0.50, 0.26), wheel(soil, rear / 2, slip, 0.62, 0.38)], axis=1)
-
-    pull = brentq(lambda p: 2.0 * axles(p)[1].sum() - p, -0.75 * WEIGHT, 0.6 * WEIGHT, xtol=1e-3)
-    return pull, axles(pull)
+def known_exactly(soil: Soil) -> Posterior:
+    return Posterior(soil, np.zeros((6, 6)))
 
 
-def both(soil: Soil, slip=GRID, start: PullCurve | None = None) -> tuple[PullCurve, PullCurve]:
-    """Level and graded curve."""
-    on_grade = np.arange(2 * len(slip)) >= len(slip)
-    curve = pull_curve(soil, RIG, MODEL, np.tile(slip, 2), on_grade, start)
-    return curve.part(False), curve.part(True)
+def assessed(soil: Soil, limit=NO_LIMIT, demand: Demand | None = None, max_sinkage: float = 1.0):
+    """Capability of a soil that is known exactly."""
+    return assess(known_exactly(soil), RIG, MODEL, demand, limit, 0.6, max_sinkage)[0]
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_pull_curve_equals_brute_force(name):
-    for graded, curve in enumerate(both(SOILS[name])):
-        for i in (0, 5, 9, 13):
-            pull, axles = brute(SOILS[name], curve.slip[i], bool(graded))
-            assert curve.pull[i] == pytest.approx(pull, abs=1e-6 * WEIGHT)
-            assert curve.torque[:, i] == pytest.approx(axles[2, [0, 0, 1, 1]], rel=1e-5)
-            assert curve.entry_angle[:, i] == pytest.approx(axles[3, [0, 0, 1, 1]], rel=1e-5)
+@pytest.mark.parametrize("duty", DUTIES)
+def test_the_balance_equals_brute_force(name, duty):
+    found = balance(table_of(SOILS[name]), DUTIES[duty])
+    exact = 1e-6 if duty == "level" else 5e-5
+    for i, tolerance in ((0, exact), (20, exact), (28, 5e-5), (37, 5e-5), (40, exact)):  # 28 and 37 are interpolated
+        pull, axles = brute(SOILS[name], found.slip[i], *DUTIES[duty])
+        assert found.pull[0, i] == pytest.approx(pull, abs=tolerance * WEIGHT)
+        for row, quantity in ((1, found.drawbar), (2, found.torque), (3, found.angle)):
+            scale = WEIGHT if row == 1 else axles[row].max()
+            assert quantity[0, :, i] == pytest.approx(axles[row], abs=10.0 * tolerance * scale)
 
 
 def test_a_draft_at_the_height_of_the_centre_of_gravity_is_like_a_grade():
     high = dataclasses.replace(RIG, chassis=dataclasses.replace(RIG.chassis, hitch_height=0.75))
-    level, graded = (pull_curve(SOILS["loam"], high, MODEL, GRID, np.full(14, g)).pull for g in (False, True))
+    table = wheel_table(np.array([SOILS["loam"]]), high, MODEL, GRID)
+    level, graded = (balance(table, duty).pull[0] for duty in (LEVEL, Duty(0.0, None)))
     second_order = (level / WEIGHT) ** 2 / 2.0  # the slope presses a little less on the ground
-    assert np.all(np.abs(graded - level) < 2.0 * second_order * WEIGHT)
-    assert np.abs(level - both(SOILS["loam"])[0].pull).max() > 20.0  # at its own height it is not
+    assert np.all(np.abs(graded - level) < 2.0 * second_order * WEIGHT + 1.0)
+    low = balance(table_of(SOILS["loam"])).pull[0]
+    assert np.abs(level - low).max() > 20.0  # at its own height it is not
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_gradients_of_a_curve_equal_finite_differences(name):
-    soil = SOILS[name]
-    slip = GRID[[2, 7, 13]]
-    for graded in (False, True):
-        here = both(soil, slip)[graded]
-        for k, parameter in enumerate(Soil._fields):
-            h = 1e-3 * soil[k]
-            up, down = (both(soil._replace(**{parameter: soil[k] + s * h}), slip)[graded] for s in (1, -1))
-            by_pull, by_torque = (up.pull - down.pull) / 2e-3, (up.torque - down.torque) / 2e-3
-            assert here.pull_by_soil[k] * soil[k] == pytest.approx(by_pull, abs=5e-3 * np.abs(by_pull).max())
-            assert here.torque_by_soil[:, k] * soil[k] == pytest.approx(by_torque, abs=5e-3 * np.abs(by_torque).max())
+def test_many_soils_at_once_are_as_one_by_one():
+    soils = [SOILS[name] for name in NAMES]
+    together = balance(table_of(*soils), Duty(800.0, None))
+    for i, soil in enumerate(soils):
+        alone = balance(table_of(soil), Duty(800.0, None))
+        # The second derivative by load is that of the first soil for all.
+        assert together.pull[i] == pytest.approx(alone.pull[0], abs=2e-3 * WEIGHT)
+        assert table_of(*soils).pull[i] == pytest.approx(table_of(soil).pull[0], abs=1e-6 * WEIGHT)
 
 
 def test_a_warm_start_changes_nothing():
     for name in NAMES:
         soil = SOILS[name]
-        on_grade = np.arange(28) >= 14
-        cold = pull_curve(soil, RIG, MODEL, np.tile(GRID, 2), on_grade)
         near = soil._replace(k_phi=1.2 * soil.k_phi, n=0.95 * soil.n, c=0.8 * soil.c)
-        start = pull_curve(near, RIG, MODEL, np.tile(GRID, 2), on_grade)
-        warm = pull_curve(soil, RIG, MODEL, np.tile(GRID, 2), on_grade, start)
+        cold, warm = table_of(soil), table_of(soil, start=table_of(near))
         assert warm.pull == pytest.approx(cold.pull, abs=1e-6 * WEIGHT)
-        assert warm.torque == pytest.approx(cold.torque, rel=1e-5)
-        by_cold, by_warm = (c.pull_by_soil * np.array(soil)[:, None] for c in (cold, warm))
-        assert by_warm == pytest.approx(by_cold, abs=5e-3 * np.abs(by_cold).max())
-
-
-def total_gradient(soil: Soil, limit: np.ndarray) -> np.ndarray:
-    """Largest pull's change by relative changes of the soil, by central differences."""
-    out = []
-    for k, parameter in enumerate(Soil._fields):
-        h = 2e-3 * soil[k]
-        up, down = (
-            largest_pull(both(s)[0], limit, s, RIG, MODEL).pull
-            for s in (soil._replace(**{parameter: soil[k] + sign * h}) for sign in (1, -1))
-        )
-        out.append((up - down) / 4e-3)
-    return np.array(out)
-
-
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("share", [None, 0.5, 0.8])
-def test_gradient_of_the_largest_pull_equals_finite_differences(name, share):
-    soil = SOILS[name]
-    level = both(soil)[0]
-    limit = NO_LIMIT if share is None else np.full(4, share * level.torque.max())
-    found = largest_pull(level, limit, soil, RIG, MODEL)
-    if share is not None:
-        assert found.limit == "torque"
-    expected = total_gradient(soil, limit)
-    assert found.gradient * np.asarray(soil) == pytest.approx(expected, abs=0.02 * np.abs(expected).max())
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_unlimited_pull_is_the_best_over_slip(name):
-    soil = SOILS[name]
-    for graded in (False, True):
-        found = largest_pull(both(soil)[graded], NO_LIMIT, soil, RIG, MODEL)
-        fine = both(soil, np.linspace(0.02, 0.6, 200))[graded]
-        assert found.pull == pytest.approx(fine.pull.max(), abs=2e-3 * WEIGHT)
-        assert found.limit == ("slip" if np.argmax(fine.pull) == 199 else "traction")
-
-
-@pytest.mark.parametrize("name", ["loam", "wet_clay", "sandy_loam_22"])
-@pytest.mark.parametrize("graded", [False, True])
-def test_torque_limit_is_met_exactly(name, graded):
-    soil = SOILS[name]
-    curve = both(soil)[graded]
-    low, high = curve.torque[:, 0], curve.torque[:, -1]
-    for share in (np.full(4, 0.7), np.array([np.nan, 0.6, 0.9, np.nan])):
-        # A front wheel may need less torque the more the draft lifts it: its limit must not bind at the start.
-        limit = np.where(np.isnan(share), np.nan, np.fmax(low + share * (high - low), 1.001 * low))
-        found = largest_pull(curve, limit, soil, RIG, MODEL)
-        assert found.limit == "torque"
-        known = np.isfinite(limit)
-
-        def usage(slip: float, limit: np.ndarray = limit, known: np.ndarray = known) -> float:
-            return (brute(soil, slip, graded)[1][2, [0, 0, 1, 1]] / limit)[known].max() - 1.0
-
-        slip = brentq(usage, 0.02, 0.6, xtol=1e-5)
-        _, axles = brute(soil, found.slip, graded)
-        assert (axles[2, [0, 0, 1, 1]] / limit)[known].max() < 1.0 + 2e-4
-        assert found.slip == pytest.approx(slip, rel=1e-2)  # torque hardly changes with slip
-        assert found.pull == pytest.approx(brute(soil, slip, graded)[0], abs=1e-5 * WEIGHT)
-
-
-def test_more_torque_never_pulls_less():
-    soil = SOILS["loam"]
-    level = both(soil)[0]
-    top = level.torque.max()
-    pulls = [largest_pull(level, np.full(4, t), soil, RIG, MODEL).pull for t in np.linspace(0.3, 1.2, 19) * top]
-    assert np.all(np.diff(pulls) > -1e-4 * WEIGHT)
-    assert pulls[-1] == largest_pull(level, NO_LIMIT, soil, RIG, MODEL).pull
-
-
-@pytest.mark.parametrize(("name", "share"), [("loam", 0.0), ("wet_clay", 0.9), ("dry_sand", 0.5)])
-def test_motors_too_weak_to_turn_the_wheels_without_a_push(name, share):
-    # The motors give less than the least slip of the curve asks for: only wheels that skid need so little.
-    soil = SOILS[name]
-    level = both(soil)[0]
-    limit = share * level.torque[:, 0].min()
-    found = largest_pull(level, np.full(4, limit), soil, RIG, MODEL)
-    slip = brentq(lambda s: brute(soil, s, False)[1][2].max() - limit, -0.3, 0.02, xtol=1e-5)
-    assert found.limit == "torque"
-    assert found.slip == pytest.approx(slip, abs=1e-3)
-    assert found.pull == pytest.approx(brute(soil, slip, False)[0], abs=1e-4 * WEIGHT)
-    assert found.pull < -1000.0
-    expected = total_gradient(soil, np.full(4, limit))
-    assert found.gradient * np.asarray(soil) == pytest.approx(expected, abs=0.02 * np.abs(expected).max())
-
-
-def test_motors_too_weak_even_for_skid_push_back():
-    soil = SOILS["sandy_loam_22"]
-    level = both(soil)[0]
-    found = largest_pull(level, np.full(4, 1.0), soil, RIG, MODEL)
-    assert found.pull < level.pull.min() - 1000.0
-    assert found.limit == "torque"
+        assert warm.at[1] == pytest.approx(cold.at[1], rel=1e-5)
+        assert warm.by_slip == pytest.approx(cold.by_slip, rel=1e-2, abs=1e-3 * np.abs(cold.by_slip).max())
 
 
 def test_buried_wheels_have_no_capability():
     slush = SOILS["heavy_clay_40"]._replace(k_c=10.0, k_phi=500.0, c=50.0, phi=0.02)
-    level, graded = both(slush)
-    assert np.isnan(level.pull).all()
-    assert largest_pull(level, NO_LIMIT, slush, RIG, MODEL) is None
-    assert largest_pull(graded, NO_LIMIT, slush, RIG, MODEL) is None
-
-
-def test_slip_for_a_pull_lies_on_the_curve():
-    soil = SOILS["loam"]
-    level = both(soil)[0]
-    for part in (0.3, 0.9):
-        wanted = part * level.pull.max()
-        slip, torque = slip_for_pull(level, wanted)
-        exact = brentq(lambda s, wanted=wanted: brute(soil, s, False)[0] - wanted, 0.02, 0.6, xtol=1e-5)
-        assert slip == pytest.approx(exact, rel=0.05)
-        assert torque == pytest.approx(2.0 * brute(soil, exact, False)[1][2].sum(), rel=0.01)
-    assert slip_for_pull(level, 1.01 * level.pull.max()) is None
-    assert slip_for_pull(level, level.pull[0] - 1.0) == pytest.approx((0.02, level.torque[:, 0].sum()))
+    both = table_of(SOILS["loam"], slush)
+    assert both.balanced.tolist() == [[True] * 9, [False] * 9]
+    assert np.isnan(both.pull[1]).all()
+    assert assessed(slush) is None
 
 
 def test_a_rig_without_a_chassis_is_refused():
     bench = dataclasses.replace(RIG, chassis=None)
     with pytest.raises(ValueError, match="mass and geometry"):
-        pull_curve(SOILS["loam"], bench, MODEL, GRID, np.zeros(14, bool))
+        wheel_table(np.array([SOILS["loam"]]), bench, MODEL, GRID)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_unlimited_pull_is_the_best_over_slip(name):
+    soil = SOILS[name]
+    able = assessed(soil)
+    best = minimize_scalar(lambda s: -brute(soil, s)[0], bounds=(0.02, 0.6), method="bounded", options={"xatol": 1e-3})
+    assert able.max_draft.value == pytest.approx(max(-best.fun, brute(soil, 0.6)[0]), abs=2e-4 * WEIGHT)
+    assert able.limit == ("slip" if best.x > 0.59 else "traction")
+    steepest = max(brute(soil, s, 0.0, None)[0] for s in (best.x, 0.6))
+    assert able.max_grade.value == pytest.approx(math.asin(steepest / WEIGHT), abs=3e-4)
+
+
+@pytest.mark.parametrize("name", ["loam", "wet_clay", "sandy_loam_22"])
+@pytest.mark.parametrize("duty", [LEVEL, Duty(0.0, None)], ids=["level", "grade"])
+def test_torque_limit_is_met_exactly(name, duty):
+    soil = SOILS[name]
+    low, high = (brute(soil, s, *duty)[1][2, WHEELS] for s in (0.02, 0.6))
+    for share in (np.full(4, 0.7), np.array([np.nan, 0.6, 0.9, np.nan])):
+        # A front wheel may need less torque the more the draft lifts it: its limit must not bind at the start.
+        limit = np.where(np.isnan(share), np.nan, np.fmax(low + share * (high - low), 1.001 * low))
+        able = assessed(soil, limit)
+        assert able.limit == "torque"
+        known = np.isfinite(limit)
+
+        def usage(slip: float, limit: np.ndarray = limit, known: np.ndarray = known) -> float:
+            return (brute(soil, slip, *duty)[1][2, WHEELS] / limit)[known].max() - 1.0
+
+        pull = brute(soil, brentq(usage, 0.02, 0.6, xtol=1e-5), *duty)[0]
+        found = able.max_draft.value if duty == LEVEL else WEIGHT * math.sin(able.max_grade.value)
+        assert found == pytest.approx(pull, abs=2e-4 * WEIGHT)
+
+
+def test_more_torque_never_pulls_less():
+    soil = SOILS["loam"]
+    top = assessed(soil).over_slip.torque[-1] / 3.0
+    pulls = [assessed(soil, np.full(4, t)).max_draft.value for t in np.linspace(0.3, 1.2, 19) * top]
+    assert np.all(np.diff(pulls) > -1e-4 * WEIGHT)
+    assert pulls[-1] == assessed(soil).max_draft.value
+
+
+@pytest.mark.parametrize(("name", "share"), [("loam", 0.0), ("wet_clay", 0.9), ("dry_sand", 0.5)])
+def test_motors_too_weak_to_turn_the_wheels_without_a_push(name, share):
+    # The motors give less than the least slip asks for: only wheels that skid need so little.
+    soil = SOILS[name]
+    limit = share * brute(soil, 0.02)[1][2].min()
+    able = assessed(soil, np.full(4, limit))
+    slip = brentq(lambda s: brute(soil, s)[1][2].max() - limit, -0.3, 0.02, xtol=1e-5)
+    assert able.limit == "torque"
+    assert able.max_draft.value == pytest.approx(brute(soil, slip)[0], abs=1e-3 * WEIGHT)
+    assert able.max_draft.value < -1000.0
+    assert able.set_points["front"] == assessment.SetPoint(None, None)
+
+
+def test_motors_too_weak_even_for_skid_push_back():
+    able = assessed(SOILS["sandy_loam_22"], np.full(4, 1.0))
+    assert able.max_draft.value < able.over_slip.pull.min() - 1000.0
+    assert able.limit == "torque"
+
+
+def test_a_sinkage_limit_ends_the_pull():
+    assert assessed(SOILS["dry_sand"], max_sinkage=0.05) is None
+    loam = SOILS["loam"]
+    # With its weight behind, the rear wheels sink the more the harder the vehicle pulls.
+    heavy = dataclasses.replace(
+        RIG, chassis=dataclasses.replace(RIG.chassis, cg_ahead_of_rear_axle=0.5, hitch_height=0.8)
+    )
+    driving = balance(wheel_table(np.array([loam]), heavy, MODEL, GRID))
+    depth = 0.62 * (1.0 - np.cos(driving.angle[0, 1]))
+    limit = float(depth[12] + depth[13]) / 2.0
+    assert np.all(np.diff(depth[:20]) > 0.0)
+    able = assess(known_exactly(loam), heavy, MODEL, None, NO_LIMIT, 0.6, limit)[0]
+    assert able.limit == "sinkage"
+    assert able.max_draft.value == pytest.approx(float(driving.pull[0, 12] + driving.pull[0, 13]) / 2.0, rel=2e-3)
+
+
+def test_set_points_are_the_best_slips_of_each_axle():
+    soil = SOILS["loam"]
+    able = assessed(soil)
+    for i, axle in enumerate(("front", "rear")):
+
+        def efficiency(slip: float, i: int = i) -> float:
+            _, pull, torque, _ = brute(soil, slip)[1][:, i]
+            return pull * (1.0 - slip) * (0.50, 0.62)[i] / torque
+
+        best = minimize_scalar(lambda s: -efficiency(s), bounds=(0.02, 0.6), method="bounded", options={"xatol": 1e-4})
+        assert able.set_points[axle].efficiency.value == pytest.approx(best.x, abs=5e-3)
+        assert efficiency(able.set_points[axle].efficiency.value) == pytest.approx(-best.fun, rel=1e-4)
+        assert able.set_points[axle].pull.value == pytest.approx(0.6)
+    held = assessed(soil, np.full(4, 700.0)).set_points["rear"]
+    reached = brentq(lambda s: brute(soil, s)[1][2].max() - 700.0, 0.02, 0.6, xtol=1e-5)
+    assert held.pull.value == pytest.approx(reached, rel=5e-3)
+    assert held.efficiency.value <= held.pull.value + 1e-9
+
+
+@pytest.mark.parametrize("sine", [0.0, 0.05])
+def test_the_forecast_meets_the_demand(sine):
+    soil = SOILS["loam"]
+    for part in (0.3, 0.9):
+        wanted = part * assessed(soil, demand=Demand(0.0, 1.0, sine)).max_pull.value
+        forecast = assessed(soil, demand=Demand(wanted, 1.0, sine)).forecast
+        exact = brentq(lambda s, wanted=wanted: brute(soil, s, None, sine)[0] - wanted, 0.02, 0.6, xtol=1e-5)
+        _, axles = brute(soil, exact, None, sine)
+        assert forecast.slip.value == pytest.approx(exact, rel=2e-3)
+        assert forecast.torque.value == pytest.approx(2.0 * axles[2].sum(), rel=1e-3)
+        depth = np.array([0.50, 0.50, 0.62, 0.62]) * (1.0 - np.cos(axles[3, WHEELS]))
+        assert [e.value for e in forecast.sinkage.values()] == pytest.approx(depth, rel=1e-3)
+        assert forecast.deepest.value == pytest.approx(depth.max(), rel=1e-3)
+    assert assessed(soil, demand=Demand(1e5, 1.0, sine)).forecast is None
+    pushed = assessed(soil, demand=Demand(-1e4, 1.0, sine)).forecast
+    assert pushed.slip.value == pytest.approx(0.02)
+
+
+def test_torque_over_slip_is_that_of_equation_22():
+    able = assessed(SOILS["wet_clay"])
+    for slip, pull, torque in zip(able.over_slip.slip, able.over_slip.pull, able.over_slip.torque, strict=True):
+        exact, axles = brute(SOILS["wet_clay"], slip)
+        assert pull == pytest.approx(exact, abs=1e-5 * WEIGHT)
+        assert torque == pytest.approx(2.0 * axles[2].sum(), rel=1e-5)
+
+
+# --- the posterior's spread ---
+
+
+@pytest.mark.parametrize("n", range(6))
+def test_the_cubature_is_exact_to_degree_five(n):
+    points, weight = cubature(n)
+    moments = {0: 1.0, 1: 0.0, 2: 1.0, 3: 0.0, 4: 3.0, 5: 0.0}
+    for powers in itertools.product(range(6), repeat=n):
+        if sum(powers) <= 5:
+            expected = math.prod(moments[p] for p in powers)
+            assert weight @ np.prod(points**powers, axis=1) == pytest.approx(expected, abs=1e-12)
+    assert np.all(weight > 0.0)
+    assert np.allclose(points[1::2], -points[2::2])
+    assert not points[0].any()
+
+
+def test_sigma_points_have_the_posterior_s_covariance():
+    root = np.random.default_rng(1).normal(0.0, 0.1, (6, 6)) * np.array([1.0, 0.5, 0.1, 0.1, 1.0, 0.0])[:, None]
+    posterior = Posterior(SOILS["loam"]._replace(K=0.0), root @ root.T)
+    points = SigmaPoints.of(posterior)
+    logs = np.log(points.soils[:, :5])
+    mean, std = points.mean_and_std(logs)
+    assert mean == pytest.approx(np.log(posterior.soil[:5]))
+    assert std == pytest.approx(np.sqrt(np.diag(posterior.log_covariance)[:5]))
+    assert not points.soils[:, 5].any()
+
+
+def test_a_point_without_a_value_is_mirrored():
+    points = SigmaPoints.of(Posterior(SOILS["loam"], np.diag([0.04, 0.01, 0.0, 0.0, 0.0, 0.0])))
+    samples = 1000.0 + 100.0 * np.log(points.soils[:, 0])
+    whole = points.estimates(samples)[0]
+    samples[3] = np.nan
+    assert dataclasses.astuple(points.estimates(samples)[0]) == pytest.approx(dataclasses.astuple(whole))
+    samples[0] = np.nan
+    assert points.estimates(samples) == [None]
+
+
+class Draws:
+    """Random soils of a posterior in the place of its sigma points."""
+
+    N = 10_000
+
+    def __init__(self, soils: np.ndarray) -> None:
+        self.soils = soils
+
+    @classmethod
+    def of(cls, posterior: Posterior) -> Draws:
+        rng = np.random.default_rng(7)
+        logs = rng.multivariate_normal(np.zeros(6), posterior.log_covariance, cls.N, method="eigh")
+        return cls(np.asarray(posterior.soil) * np.exp(np.concatenate([np.zeros((1, 6)), logs])))
+
+    def mean_and_std(self, samples):
+        return np.nanmean(samples[1:], axis=0), np.nanstd(samples[1:], axis=0)
+
+    def estimates(self, *samples):
+        return [None if s is None else Estimate(*(float(x) for x in self.mean_and_std(s))) for s in samples]
+
+
+def fitted(name: str, slip: Swing) -> Posterior:
+    """What 10 s of a drive tell of a soil."""
+    recording = simulate(CONFIG, Scenario(10.0, (Patch(0.0, name),), slip=slip), 3)
+    store = BinStore(RIG, 0.1, 0.0)
+    store.add({n: (c.t, c.value) for n in RIG.channels if (c := recording.channels.get(n)) is not None})
+    fit = fit_window(WindowProblem(store.window(0.0, 10.0), RIG, model_of(CONFIG), 0.2), prior_of(CONFIG))
+    assert fit is not None
+    return fit.posterior
+
+
+def figures(able) -> dict[str, Estimate]:
+    """Every estimate of a capability by name; those without any spread (at a limit) are left out."""
+    forecast = able.forecast
+    found = {
+        "max_draft": able.max_draft,
+        "max_grade": able.max_grade,
+        "max_grade_with_draft": able.max_grade_with_draft,
+        "max_pull": able.max_pull,
+        "slip": forecast.slip,
+        "torque": forecast.torque,
+        **{f"sinkage {wheel}": depth for wheel, depth in forecast.sinkage.items()},
+        **{f"efficiency {axle}": point.efficiency for axle, point in able.set_points.items()},
+        **{f"most pull {axle}": point.pull for axle, point in able.set_points.items()},
+    }
+    return {name: e for name, e in found.items() if e is not None and e.std > 1e-9}
+
+
+@pytest.mark.parametrize(
+    ("name", "slip", "limit"),
+    [
+        ("loam", Swing(0.05, 0.40), 2400.0),
+        ("loam", Swing(0.08, 0.15), 1100.0),
+        ("wet_clay", Swing(0.05, 0.40), 2400.0),
+        ("lete_sand", Swing(0.05, 0.40), 1100.0),
+    ],
+)
+def test_means_and_deviations_equal_monte_carlo(name, slip, limit, monkeypatch):
+    posterior = fitted(name, slip)
+    limits, model = np.full(4, limit), model_of(CONFIG)
+    demand = Demand(0.5 * assess(posterior, RIG, model, None, limits, 0.6, 0.25)[0].max_draft.value, 20.0, 0.02)
+    ours = assess(posterior, RIG, model, demand, limits, 0.6, 0.25)[0]
+    monkeypatch.setattr(assessment, "SigmaPoints", Draws)
+    drawn = assess(posterior, RIG, model, demand, limits, 0.6, 0.25)[0]
+    expected = figures(drawn)
+    found = figures(ours)
+    assert set(found) <= set(expected)
+    assert len(found) >= 8
+    for quantity, estimate in found.items():
+        assert estimate.value == pytest.approx(expected[quantity].value, rel=0.02), quantity
+        assert estimate.std == pytest.approx(expected[quantity].std, rel=0.10), quantity
+    for mean, std in (("pull", "pull_std"), ("torque", "torque_std")):
+        of_ours, of_drawn = (getattr(able.over_slip, mean) for able in (ours, drawn))
+        assert of_ours == pytest.approx(of_drawn, rel=0.02, abs=0.005 * np.abs(of_drawn).max())
+        assert getattr(ours.over_slip, std) == pytest.approx(getattr(drawn.over_slip, std), rel=0.10)
+
+
+def test_the_spread_of_the_largest_draft_equals_that_of_brute_force():
+    posterior = fitted("wet_clay", Swing(0.08, 0.15))
+    able = assess(posterior, RIG, MODEL, None, NO_LIMIT, 0.6, 0.25)[0]
+    logs = np.random.default_rng(5).multivariate_normal(np.log(posterior.soil), posterior.log_covariance, 150)
+    drafts = [brute(Soil(*row), 0.6)[0] for row in np.exp(logs)]
+    assert able.max_draft.std == pytest.approx(np.std(drafts), rel=0.2)  # sampling: 6 %
+    assert able.max_draft.value == pytest.approx(np.mean(drafts), abs=0.3 * able.max_draft.std)

@@ -11,13 +11,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from soilbus.assembly import rig_of
-from soilbus.capability import largest_pull, pull_curve, slip_grid
+from soilbus.capability.assessment import Demand, slip_grid
+from soilbus.capability.balance import LEVEL, Duty, balance
+from soilbus.capability.limits import Limits, largest_pull
+from soilbus.capability.wheels import wheel_table
 from soilbus.config import Traversability as Settings
 from soilbus.estimation.posterior import Posterior
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import FAST_NODES, Soil, WheelModel
-from soilbus.traversability import Demand, State, Status, judge
+from soilbus.traversability import State, Status, judge
+from statics import WEIGHT, brute
 
 RIG = rig_of(reference_configuration())
 MODEL = WheelModel(nodes=FAST_NODES)
@@ -50,14 +54,13 @@ def test_an_easy_draft_on_loam_is_a_go():
     assert 0.15 < way.max_grade.value < 0.35
 
 
-def test_max_draft_and_max_grade_are_those_of_the_curve():
-    way = decide()
-    grid = slip_grid(DEFAULTS.max_slip)
-    for graded, estimate in ((False, way.max_draft), (True, way.max_grade)):
-        curve = pull_curve(LOAM.soil, RIG, MODEL, grid, np.full(len(grid), graded))
-        best = largest_pull(curve, STRONG, LOAM.soil, RIG, MODEL).pull
-        value = math.asin(best / (2300.0 * 9.80665)) if graded else best
-        assert estimate.value == pytest.approx(value, rel=1e-4)
+@pytest.mark.parametrize("name", ["loam", "wet_clay"])
+def test_max_draft_and_max_grade_of_a_soil_known_exactly(name):
+    soil = SOILS[name]
+    way = decide(posterior=Posterior(soil, np.zeros((6, 6))))
+    assert way.max_draft.value == pytest.approx(brute(soil, 0.6)[0], rel=1e-4)
+    assert way.max_grade.value == pytest.approx(math.asin(brute(soil, 0.6, 0.0, None)[0] / WEIGHT), rel=1e-4)
+    assert way.max_draft.std == way.max_grade.std == 0.0
 
 
 @pytest.mark.parametrize(
@@ -67,16 +70,13 @@ def test_spread_of_the_capability_equals_monte_carlo(name, limit):
     posterior = posterior_of(SOILS[name], 0.03, 3)
     limit = np.full(4, limit)
     way = decide(posterior, limit=limit)
-    grid = slip_grid(DEFAULTS.max_slip)
-    drafts, grades = [], []
-    logs = np.random.default_rng(1).multivariate_normal(np.log(posterior.soil), posterior.log_covariance, 120)
-    for soil in (Soil(*row) for row in np.exp(logs)):
-        level, graded = (pull_curve(soil, RIG, MODEL, grid, np.full(len(grid), g)) for g in (False, True))
-        drafts.append(largest_pull(level, limit, soil, RIG, MODEL).pull)
-        grades.append(math.asin(largest_pull(graded, limit, soil, RIG, MODEL).pull / (2300.0 * 9.80665)))
-    for estimate, sample in ((way.max_draft, drafts), (way.max_grade, grades)):
-        assert estimate.std == pytest.approx(np.std(sample), rel=0.2)  # sampling: 6.5 %
-        assert estimate.value == pytest.approx(np.mean(sample), abs=0.4 * estimate.std)
+    logs = np.random.default_rng(1).multivariate_normal(np.log(posterior.soil), posterior.log_covariance, 2000)
+    table = wheel_table(np.exp(logs), RIG, MODEL, slip_grid(DEFAULTS.max_slip))
+    limits = Limits.of(table.axles, limit, DEFAULTS.max_sinkage)
+    drafts, pulls = (largest_pull(balance(table, duty), limits).pull for duty in (LEVEL, Duty(0.0, None)))
+    for estimate, sample in ((way.max_draft, drafts), (way.max_grade, np.arcsin(pulls / WEIGHT))):
+        assert estimate.std == pytest.approx(np.std(sample), rel=0.1)  # sampling: 1.6 %
+        assert estimate.value == pytest.approx(np.mean(sample), abs=0.1 * estimate.std)
 
 
 @pytest.mark.parametrize("status", Status)

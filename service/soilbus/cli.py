@@ -122,6 +122,13 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--seed", type=_natural, default=1, help="of drives, noise and priors (default 1)")
     sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
 
+    sub = command("decisions", _decisions, "what soilbus foretells, beside what simulated drives then do", "optional")
+    sub.add_argument("--drives", type=_counted, default=150, metavar="N", help="on each held soil (default 150)")
+    sub.add_argument("--boggings", type=_counted, default=40, metavar="N", help="drives into trouble (default 40)")
+    sub.add_argument("--hours", type=_between(0.0, 100.0), default=1.0, metavar="H", help="on firm ground (default 1)")
+    sub.add_argument("--seed", type=_natural, default=1, help="of soils, drives, noise and priors (default 1)")
+    sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
+
     sub = command("bench", _bench, "every performance figure beside its peer, in one run", "")
     sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
     return parser
@@ -361,6 +368,30 @@ def _montecarlo(args: argparse.Namespace) -> None:
             out.write(json.dumps([as_json(cell) for cell in cells], indent=1) + "\n")
     if str(args.json) != "-":
         print(monte_carlo_report(cells), end="")
+
+
+def _decisions(args: argparse.Namespace) -> None:
+    import json
+
+    from soilbus.report.decisions import as_json, decisions_report
+    from soilbus.simulator.bogging_trials import FIRM_DRIVE, warning_trials
+    from soilbus.simulator.draft_trials import draft_trials
+    from soilbus.simulator.drive import SimulationError
+    from soilbus.simulator.monte_carlo import processes
+
+    config = _configured_or_demo(args)
+    try:
+        with processes(os.cpu_count() or 1) as each:
+            drafts = list(draft_trials(config, args.drives, args.seed, each=each))
+            firm = math.ceil(3600.0 * args.hours / (FIRM_DRIVE - config.estimator.window))
+            warnings = warning_trials(config, args.boggings, firm, args.seed, each=each)
+    except SimulationError as error:
+        raise WorkError(str(error)) from None
+    if args.json is not None:
+        with _whole_file(args.json) as out:
+            out.write(json.dumps(as_json(drafts, warnings), indent=1) + "\n")
+    if str(args.json) != "-":
+        print(decisions_report(drafts, warnings), end="")
 
 
 def _bench(args: argparse.Namespace) -> None:

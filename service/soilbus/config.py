@@ -302,6 +302,8 @@ class Traversability(_Section):
     """When soilbus says go; draft N, slopes rad."""
 
     max_slip: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.6
+    max_sinkage: PositiveFloat = 0.25
+    """Sinkage [m] that no wheel may pass: ground clearance."""
     margin: NonNegativeFloat = 0.15
     """Share of the present demand that must be left over."""
     go: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.95

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.capability import PullCurve, largest_pull, pull_curve, slip_for_pull, slip_grid
+from soilbus.capability.assessment import Capability, Demand, assess
+from soilbus.capability.wheels import WheelTable
 from soilbus.config import Traversability as Settings
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.window import Rig
 from soilbus.terra.effects.steady import CompletedModel
-from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import WheelModel
 
 
@@ -37,19 +37,11 @@ class Status(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Demand:
-    """Pull [N] asked of the wheels now (draft and slope), with its uncertainty."""
-
-    pull: float
-    std: float
-
-
-@dataclass(frozen=True, slots=True)
 class Traversability:
     """The decision and what it rests on; None where nothing can be said.
 
     Torques are sums over the wheels [N m]; max_draft [N] on the level; max_grade [rad]
-    without draft; slip_needed gives the present demand.
+    without draft; slip_needed gives the present demand; capability has all the rest.
     """
 
     state: State = State.UNKNOWN
@@ -60,6 +52,7 @@ class Traversability:
     max_grade: Estimate | None = None
     slip_needed: float | None = None
     limit: str | None = None
+    capability: Capability | None = None
 
 
 def judge(
@@ -70,9 +63,9 @@ def judge(
     model: WheelModel | CompletedModel,
     torque_limit: NDArray[np.float64],
     settings: Settings,
-    last: PullCurve | None = None,
-) -> tuple[Traversability, PullCurve | None]:
-    """Traversability of the ground of one window, and the pull curve to start the next one from.
+    last: WheelTable | None = None,
+) -> tuple[Traversability, WheelTable | None]:
+    """Traversability of the ground of one window, and the wheels' table to start the next one from.
 
     torque_limit (W,) [N m] holds nan where a motor's limit is not known.  Only a valid
     posterior and a known demand can lead to go.
@@ -80,50 +73,57 @@ def judge(
     available = float(torque_limit.sum()) if np.isfinite(torque_limit).all() and len(torque_limit) else None
     if posterior is None or status is Status.INVALID or rig.chassis is None:
         return Traversability(torque_available=available), None
-    grid = slip_grid(settings.max_slip)
-    on_grade = np.arange(2 * len(grid)) >= len(grid)
-    curve = pull_curve(posterior.soil, rig, model, np.tile(grid, 2), on_grade, last)
-    level = curve.part(on_grade=False)
-    draft = largest_pull(level, torque_limit, posterior.soil, rig, model)
-    grade = largest_pull(curve.part(on_grade=True), torque_limit, posterior.soil, rig, model)
-    if draft is None:
+    able, table = assess(
+        posterior, rig, model, demand, torque_limit, settings.max_slip, settings.max_sinkage, last
+    )  # fmt: skip
+    if able is None:
         return Traversability(State.NO_GO, 0.0, torque_available=available, limit="sinkage"), None
-    max_draft = Estimate(draft.pull, posterior.propagate(draft.gradient))
-    weight = rig.chassis.mass * GRAVITY
-    max_grade = None
-    if grade is not None:
-        sine = min(max(grade.pull / weight, -1.0), 1.0)
-        cosine = max(math.sqrt(1.0 - sine**2), 1e-3)
-        max_grade = Estimate(math.asin(sine), posterior.propagate(grade.gradient) / weight / cosine)
-    if demand is None:
-        partial = Traversability(
-            max_draft=max_draft, max_grade=max_grade, torque_available=available, limit=draft.limit
-        )
-        return partial, curve
-    needed = demand.pull + settings.margin * max(demand.pull, 0.0)
-    probability = _above(max_draft.value - needed, math.hypot(max_draft.std, demand.std))
-    slip, torque = slip_for_pull(level, demand.pull) or (None, None)
-    decided = Traversability(
-        state=_state(probability, status, settings),
-        probability=probability,
-        torque_required=torque,
+    way = Traversability(
         torque_available=available,
-        max_draft=max_draft,
-        max_grade=max_grade,
-        slip_needed=slip,
-        limit=draft.limit,
+        max_draft=able.max_draft,
+        max_grade=able.max_grade,
+        limit=able.limit,
+        capability=able,
     )
-    return decided, curve
+    if demand is None:
+        return way, table
+    pull, depth = probability_of_pull(able, demand, settings), probability_of_depth(able, settings)
+    forecast = able.forecast
+    return replace(
+        way,
+        state=state_of(min(pull, depth), status, settings),
+        probability=min(pull, depth),
+        torque_required=None if forecast is None else forecast.torque.value,
+        slip_needed=None if forecast is None else forecast.slip.value,
+        limit=able.limit if pull <= depth else "sinkage",
+    ), table
 
 
-def _above(margin: float, std: float) -> float:
-    """Probability that a Gaussian with this mean and std is above zero."""
-    return 0.5 * math.erfc(-margin / (max(std, 1e-9) * math.sqrt(2.0)))
+def probability_of_pull(able: Capability, demand: Demand, settings: Settings) -> float:
+    """That the wheels give the demand and its margin on the present slope."""
+    if able.max_pull is None:
+        return 0.0
+    needed = demand.pull + settings.margin * max(demand.pull, 0.0)
+    return _above(able.max_pull.value - needed, math.hypot(able.max_pull.std, demand.std))
 
 
-def _state(probability: float, status: Status, settings: Settings) -> State:
+def probability_of_depth(able: Capability, settings: Settings) -> float:
+    """That the deepest wheel stays within the sinkage limit under the demand; 1 where no slip gives the demand."""
+    if able.forecast is None:
+        return 1.0
+    deepest = able.forecast.deepest
+    return _above(settings.max_sinkage - deepest.value, deepest.std)
+
+
+def state_of(probability: float, status: Status, settings: Settings) -> State:
+    """The state that a probability and a status allow."""
     if probability < settings.no_go:
         return State.NO_GO
     if probability >= settings.go and status is Status.VALID:
         return State.GO
     return State.CAUTION
+
+
+def _above(margin: float, std: float) -> float:
+    """Probability that a Gaussian with this mean and std is above zero."""
+    return 0.5 * math.erfc(-margin / (max(std, 1e-9) * math.sqrt(2.0)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import itertools
+from dataclasses import replace
 
 import can
 import pytest
@@ -13,6 +14,7 @@ from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
 from soilbus.daemon.notify import Notifier
+from soilbus.daemon.outputs import hop_frames
 from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.service import Service
 from soilbus.simulator.frames import frames
@@ -70,7 +72,13 @@ class Bench:
 def test_frames_go_out_at_their_cycle_times(recording):
     bench = Bench(recording)
     bench.run(DURATION)
-    for name, cycle in {"WheelSlip": 0.1, "Traversability": 0.1, "TorqueDemand": 0.1, "SoilbusStatus": 1.0}.items():
+    for name, cycle in {
+        "WheelSlip": 0.1,
+        "Traversability": 0.1,
+        "TorqueDemand": 0.1,
+        "DemandForecast": 0.1,
+        "SoilbusStatus": 1.0,
+    }.items():
         times = [f["at"] for f in bench.sent(name)]
         gaps = [b - a for a, b in itertools.pairwise(times)]
         assert len(times) >= DURATION / cycle - 2, name
@@ -99,6 +107,65 @@ def test_values_on_the_bus_are_those_of_the_result(recording):
         assert frame["Window"] == result.index % 251
         assert frame["BearingPressure"] == pytest.approx(result.bearing.value / 1e3, abs=0.026)
         assert str(frame["Status"]) == str(result.status)
+
+
+def test_the_soil_class_on_the_bus_is_the_likeliest_of_the_result(recording):
+    bench = Bench(recording)
+    bench.run(DURATION)
+    sent = bench.sent("SoilClass")
+    for result, frame in zip(bench.results, sent, strict=True):
+        share = result.soil_class
+        assert share[str(frame["Kind"])] == max(share.values()) == pytest.approx(frame["Probability"], abs=1.26e-4)
+        assert frame["UnknownProbability"] == pytest.approx(share["unknown"], abs=1.26e-4)
+        assert (frame["Window"], str(frame["Status"])) == (result.index % 251, str(result.status))
+    assert str(sent[-1]["Kind"]) == "sandy_loam_15"  # what the recording drives on
+    nothing = next(values for name, values in hop_frames(replace(result, soil_class=None)) if name == "SoilClass")
+    assert (nothing["Kind"], nothing["Probability"], nothing["UnknownProbability"]) == (None, None, None)
+
+
+def test_advice_limits_and_forecast_are_those_of_the_result(recording):
+    bench = Bench(recording)
+    bench.run(DURATION)
+    for result, advice, limits in zip(
+        bench.results, bench.sent("TractionAdvice"), bench.sent("TractionLimits"), strict=True
+    ):
+        able = result.traversability.capability
+        for axle, name in (("front", "Front"), ("rear", "Rear")):
+            points = able.set_points[axle]
+            assert advice[f"SlipForEfficiency{name}"] == pytest.approx(points.efficiency.value, abs=5.1e-4)
+            assert advice[f"SlipForPull{name}"] == pytest.approx(points.pull.value, abs=5.1e-4)
+        assert limits["MaxDraft"] == pytest.approx(able.max_draft_here.value, abs=50.1)
+        assert limits["MaxDraftStd"] == pytest.approx(able.max_draft_here.std, abs=10.1)
+        assert limits["MaxGrade"] == pytest.approx(able.max_grade_with_draft.value, abs=1.01e-3)
+        assert limits["MaxGradeStd"] == pytest.approx(able.max_grade_with_draft.std, abs=1.01e-3)
+        assert str(limits["LimitingCause"]) == result.traversability.limit
+        assert advice["Window"] == limits["Window"] == result.index % 251
+        assert str(advice["Status"]) == str(limits["Status"]) == str(result.status)
+    known = [f for f in bench.sent("DemandForecast") if f["Window"] != "not_available"]
+    by_window = {result.index: result.traversability.capability.forecast for result in bench.results}
+    assert {int(f["Window"]) for f in known} == set(by_window)
+    for frame in known:
+        forecast = by_window[int(frame["Window"])]
+        assert frame["Slip"] == pytest.approx(forecast.slip.value, abs=5.1e-4)
+        assert frame["SlipStd"] == pytest.approx(forecast.slip.std, abs=1.01e-3)
+        assert frame["Sinkage"] == pytest.approx(1e3 * forecast.deepest.value, abs=0.251)
+
+
+def test_the_warning_is_unknown_until_soil_and_slip_are_known_and_when_the_bus_falls_silent(recording):
+    bench = Bench(recording)
+    bench.run(DURATION + 4.0)
+    frames = bench.sent("DemandForecast")
+    first = bench.sent("SoilStrength")[0]["at"]
+    silent = bench.clock.now - 4.0
+    assert {str(f["Warning"]) for f in frames if f["at"] < first + 1.8} == {"unknown"}
+    during = [f for f in frames if first + 2.5 < f["at"] < silent]
+    assert {str(f["Warning"]) for f in during} <= {"none", "immobilisation"}
+    assert all(0.0 <= f["TimeLeft"] <= 25.0 for f in during)
+    for frame in (f for f in frames if f["at"] > silent + 2.5):
+        assert str(frame["Warning"]) == "unknown"
+        assert {str(frame[k]) for k in ("Slip", "SlipStd", "Sinkage", "TimeLeft", "Window", "Status")} == {
+            "not_available"
+        }
 
 
 @pytest.mark.parametrize("lost", ["WheelLoads", "GroundBasedSpeedAndDistance", "MotorRL", "Drawbar"])

@@ -169,7 +169,8 @@ def test_stubble_is_known_to_be_misunderstood(whole):
 
 
 KEYS = {"t", "status", "soil", "bearing_pressure", "slip", "sinkage", "traversability", "chi2", "samples", "rejected"}
-MORE = {"window", "reason", "state", "soil_class"}
+MORE = {"window", "reason", "state", "soil_class", "capability", "warning"}
+CAPABILITY = {"max_draft_here", "max_grade_with_draft", "set_points", "forecast", "over_slip"}
 DECISION = {"state", "probability", "torque_required", "torque_available", "max_draft", "max_grade", "limit"}
 
 
@@ -187,6 +188,21 @@ def test_json_lines_have_the_keys_of_the_design(name, whole):
         one = json.loads(line, parse_constant=no_constant)
         assert set(one) - MORE == KEYS
         assert set(one["traversability"]) == DECISION
+        assert one["warning"]["state"] in ("unknown", "none", "immobilisation")
+        assert set(one["warning"]) == {"state", "time_left"}
+        if one["soil"] is not None:
+            able = one["capability"]
+            assert set(able) == CAPABILITY
+            assert set(able["set_points"]) == {"front", "rear"}
+            assert set(able["set_points"]["rear"]) == {"efficiency", "pull"}
+            assert {len(column) for column in able["over_slip"].values()} == {9}
+            forecast = able["forecast"]
+            assert (forecast is None) == (one["traversability"]["torque_required"] is None)
+            if forecast is not None:
+                assert set(forecast["sinkage"]) == {"FL", "FR", "RL", "RR"}
+                assert forecast["torque"]["value"] == one["traversability"]["torque_required"]
+        else:
+            assert one["capability"] is None
         assert set(one["bearing_pressure"]) == {"z_ref", "b_ref", "value", "std"}
         assert one["soil"] is None or {k: set(v) for k, v in one["soil"].items()} == {
             k: {"value", "std"} for k in ("k_c", "k_phi", "n", "phi", "c", "K")
@@ -204,6 +220,8 @@ def test_json_lines_have_the_keys_of_the_design(name, whole):
 
 def flat(value, path: str = ""):
     """Leaves of nested JSON by path."""
+    if isinstance(value, list):
+        value = dict(enumerate(value))
     if isinstance(value, dict):
         return {k: v for key, inner in value.items() for k, v in flat(inner, f"{path}.{key}").items()}
     return {path: value}

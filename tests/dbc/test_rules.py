@@ -85,10 +85,19 @@ def test_no_identifier_is_used_twice():
     assert len(ids) == len(set(ids))
 
 
+def test_generated_struct_members_are_no_words_of_c_or_cpp():
+    words = "and auto bool break case catch char class const continue default delete do double else enum explicit "
+    words += "export extern false float for friend goto if inline int long namespace new not operator or private "
+    words += "protected public register return short signed sizeof static struct switch template this throw true try "
+    words += "typedef typename union unsigned using virtual void volatile while xor"
+    members = {camel_to_snake_case(s.name) for name in FILES for m in load(name).messages for s in m.signals}
+    assert not members & set(words.split())
+
+
 def test_fast_frames_are_fast_and_all_results_are_protected():
     messages = {message.name: message for message in load("soilbus").messages}
     fast = {name for name, message in messages.items() if message.cycle_time == 100}
-    assert fast == {"WheelSlip", "WheelSlip2", "Traversability", "TorqueDemand"}
+    assert fast == {"WheelSlip", "WheelSlip2", "Traversability", "TorqueDemand", "DemandForecast"}
     assert all(message.cycle_time == 1000 for name, message in messages.items() if name not in fast)
     for message in messages.values():
         places = {signal.name: (signal.start, signal.length) for signal in message.signals}
@@ -99,6 +108,15 @@ def test_cleared_or_blank_traversability_never_reads_go():
     message = load("soilbus").get_message_by_name("Traversability")
     assert message.decode(bytes(8))["State"] == "unknown"
     assert message.decode(b"\xff" * 8)["State"] == "not_available"
+
+
+def test_every_known_soil_has_its_code_in_the_order_of_the_table():
+    from soilbus.terra.soils import KINDS
+
+    kind = load("soilbus").get_message_by_name("SoilClass").get_signal_by_name("Kind")
+    names = {int(code): str(name) for code, name in kind.choices.items()}
+    assert names == dict(enumerate(("unknown", *KINDS))) | {254: "error", 255: "not_available"}
+    assert kind.maximum == len(KINDS)
 
 
 def test_soil_ranges_hold_every_known_soil():
@@ -119,28 +137,6 @@ def test_soil_ranges_hold_every_known_soil():
         assert 2.0 * max(values) <= signal.maximum, name
         if name != "SoilCohesiveModulus":  # which is nothing beside k_phi where it is small
             assert signal.scale <= 0.015 * min(values), name
-
-
-def test_readme_lists_every_frame_with_its_identifier_and_its_example_is_right():
-    text = (DBC / "README.md").read_text(encoding="utf-8")
-    database = load("soilbus")
-    for message in database.messages:
-        assert f"| `{message.name}` | {message.frame_id:08X} |" in text
-    payload = bytes.fromhex(re.search(r"^payload +([0-9A-F ]+)$", text, re.M)[1])
-    covered = bytes.fromhex(re.search(r"^CRC over +(.*)$", text, re.M)[1])
-    frame_id = int(re.search(r"^id +(.*)$", text, re.M)[1], 16)
-    assert covered == frame_id.to_bytes(4, "little") + payload[:7]
-    crc = 0xFF
-    for byte in covered:
-        crc ^= byte
-        for _ in range(8):
-            crc = (crc << 1 ^ 0x1D) & 0xFF if crc & 0x80 else crc << 1
-    assert crc ^ 0xFF == payload[7]
-    decoded = database.decode_message(frame_id, payload)
-    assert decoded["State"] == "go"
-    assert decoded["LimitingCause"] == "slip"
-    assert decoded["Counter"] == 5
-    assert (decoded["Probability"], decoded["Age"], decoded["Window"]) == (pytest.approx(0.97), pytest.approx(0.4), 7)
 
 
 def c_program(name, database, readme):

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 
 from soilbus.assembly import completion_of, effects_of, rig_of, with_effects
 from soilbus.can.dbc_files import load_databases
-from soilbus.capability import pull_curve
+from soilbus.capability.assessment import slip_grid
+from soilbus.capability.balance import LEVEL, Duty, balance
+from soilbus.capability.wheels import wheel_table
 from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.replay import fed
 from soilbus.estimation.completed import active_at
@@ -18,7 +22,7 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
 from soilbus.terra.effects.steady import CompletedModel
 from soilbus.terra.soils import SOILS
-from soilbus.terra.wheel import Soil, WheelModel
+from soilbus.terra.wheel import Soil, WheelModel, state_on
 
 CONFIG = reference_configuration()
 SPEED, SLIPS = 1.3, (0.08, 0.2, 0.4)
@@ -32,8 +36,14 @@ def completed(*effects: str) -> CompletedModel:
     return CompletedModel.of(WheelModel(), effects_of(with_effects(CONFIG, effects)), SPEED)
 
 
-def curve(model: CompletedModel, soil: Soil, slips=SLIPS):
-    return pull_curve(soil, rig_of(CONFIG), model, np.array(slips), np.zeros(len(slips), bool))
+class Curve(NamedTuple):
+    pull: np.ndarray
+    torque: np.ndarray  # (W, S)
+
+
+def curve(model: CompletedModel, soil: Soil, slips=SLIPS) -> Curve:
+    table = wheel_table(np.array([soil]), rig_of(CONFIG), model, np.array(slips))
+    return Curve(table.pull[0], table.at[1, 0][table.axles.of_wheel])
 
 
 @pytest.mark.parametrize("effect", ON_WHEELS)
@@ -68,16 +78,21 @@ def test_sensors_and_records_do_not_change_the_pull(effect):
     assert curve(completed(effect), SOILS["loam"]).pull == pytest.approx(plain.pull, abs=1e-3)
 
 
-@pytest.mark.parametrize("effect", ["multipass=0.5", "tyre_deflection=4e-6"])
-def test_gradients_are_those_of_the_curve(effect):
-    model, soil = completed(effect), SOILS["loam"]
-    at = curve(model, soil)
-    for i, name in enumerate(Soil._fields):
-        step = 1e-3 * getattr(soil, name)
-        ends = [curve(model, soil._replace(**{name: getattr(soil, name) + s})).pull for s in (-step, step)]
-        slope = (ends[1] - ends[0]) / (2.0 * step)
-        scale = getattr(soil, name)
-        assert at.pull_by_soil[i] * scale == pytest.approx(slope * scale, rel=0.02, abs=3.0)
+@pytest.mark.parametrize("effect", [*ON_WHEELS, "drivetrain_loss=0.05"])
+@pytest.mark.parametrize("duty", [LEVEL, Duty(0.0, None), Duty(None, 0.08)], ids=["level", "grade", "on a slope"])
+def test_every_duty_is_in_balance_with_effects(effect, duty):
+    model, soil, slips = completed(effect), SOILS["loam"], slip_grid(0.6)
+    table = wheel_table(np.array([soil]), rig_of(CONFIG), model, slips)
+    found, axles = balance(table, duty), table.axles
+    draft, sine = duty.split(found.pull, axles.weight)
+    load = axles.loads(*np.broadcast_arrays(draft, sine))[0]
+    assert (axles.count * found.drawbar[0]).sum(axis=0) == pytest.approx(found.pull[0], abs=2e-4 * axles.weight)
+    state = state_on(soil, found.angle[0], found.slip, axles.radius, axles.width)
+    forces = model.forces(state, ~axles.front, load)
+    for is_, should, tolerance in zip(
+        (load, found.drawbar[0], found.torque[0]), forces, (1e-3, 5e-4, 5e-4), strict=True
+    ):
+        assert is_ == pytest.approx(should, abs=tolerance * axles.weight)
 
 
 def test_the_demand_is_the_draft_without_the_error_of_its_load_cell(tmp_path):

@@ -64,7 +64,45 @@ def test_a_frame_with_one_bit_wrong_is_not_believed(setup):
     assert dashboard.value("Traversability", "State") is None
 
 
+def test_a_stuck_counter_keeps_nothing_fresh(setup):
+    publisher, dashboard, clock = setup
+    stuck, after = (message(publisher.frame("Traversability", {"State": "go"})) for _ in range(2))
+    for _ in range(10):
+        dashboard.receive(stuck)
+        clock.now += 0.1
+    assert dashboard.bad_frames == 9
+    assert dashboard.value("Traversability", "State") is None
+    dashboard.receive(after)
+    assert dashboard.value("Traversability", "State") == "go"
+
+
 def test_not_available_is_shown_as_nothing(setup):
     publisher, dashboard, _ = setup
     dashboard.receive(message(publisher.frame("WheelSlip", {})))
     assert dashboard.value("WheelSlip", "SlipWheel1") is None
+
+
+def test_the_warning_and_the_best_slips_are_shown(setup):
+    publisher, dashboard, clock = setup
+    dashboard.receive(message(publisher.frame("DemandForecast", {"Warning": "none", "TimeLeft": 25.0})))
+    advice = {"SlipForEfficiencyFront": 0.123, "SlipForEfficiencyRear": 0.105}
+    dashboard.receive(message(publisher.frame("TractionAdvice", advice)))
+    assert "GETTING STUCK" not in shown(dashboard)
+    assert "best slip 0.12/0.10" in shown(dashboard)
+    dashboard.receive(message(publisher.frame("DemandForecast", {"Warning": "immobilisation", "TimeLeft": 4.2})))
+    assert "GETTING STUCK in 4 s" in shown(dashboard)
+    clock.now += 1.0
+    assert "GETTING STUCK" not in shown(dashboard)
+
+
+def test_the_soil_class_is_shown_while_it_is_fresh(setup):
+    publisher, dashboard, clock = setup
+    dashboard.receive(message(publisher.frame("SoilClass", {})))
+    assert "soil: " not in shown(dashboard)
+    said = {"Kind": "sandy_loam_15", "Probability": 0.93, "UnknownProbability": 0.05}
+    dashboard.receive(message(publisher.frame("SoilClass", said)))
+    assert "soil: sandy_loam_15 (0.93)" in shown(dashboard)
+    clock.now += 4.0
+    assert "sandy_loam" not in shown(dashboard)
+    dashboard.receive(message(publisher.frame("SoilClass", {"Kind": "unknown", "Probability": 0.6})))
+    assert "soil: unknown (0.60)" in shown(dashboard)

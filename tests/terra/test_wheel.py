@@ -25,6 +25,7 @@ from soilbus.terra.wheel import (
     state_on,
     wheel_forces,
     wheel_forces_and_derivatives,
+    wheel_forces_and_slopes,
 )
 
 R, B = 0.5, 0.3
@@ -322,3 +323,14 @@ def test_good_loads_among_bad_ones():
     assert np.isfinite(found).tolist() == [[True, False, False], [False, False, True]]
     alone = [float(entry_angle_for_load(x, state, WheelModel())) for x in (3000.0, 5000.0)]
     assert found[np.isfinite(found)] == pytest.approx(alone, rel=1e-12)
+
+
+@pytest.mark.parametrize("peak_c2", [0.0, 0.3])
+def test_slopes_are_the_first_columns_of_the_derivatives(peak_c2):
+    slip = np.linspace(-0.2, 0.6, 9)  # skid and drive
+    state = state_on(SOILS["wet_clay"], np.linspace(0.2, 0.6, 9), slip, 0.5, 0.3)
+    model = WheelModel(peak_c2=peak_c2)
+    forces, jacobian = wheel_forces_and_derivatives(state, model)
+    same, slopes = wheel_forces_and_slopes(state, model)
+    assert same == pytest.approx(forces, rel=1e-12)
+    assert slopes == pytest.approx(jacobian[:, :2], rel=1e-9, abs=1e-9 * np.abs(jacobian[:, :2]).max())

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.assembly import completion_of, model_of, prior_of, rig_of
-from soilbus.capability import PullCurve
+from soilbus.capability.assessment import Demand, OverSlip
+from soilbus.capability.immobilisation import Moment, Watch, moments, watched
+from soilbus.capability.wheels import WheelTable
 from soilbus.config import Config
 from soilbus.daemon.intake import WindowTask
 from soilbus.daemon.positions import Position
@@ -19,12 +21,12 @@ from soilbus.estimation.gauss_newton import Fit
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.soil_class import SoilClasses, guessed
 from soilbus.estimation.tracker import MIN_ROWS, Ground, Settings, Tracked, Tracker
-from soilbus.estimation.window import Rig, Window
+from soilbus.estimation.window import Rig, Window, pull_asked
 from soilbus.terra.effects.effect import Active, Surroundings, true_draft
 from soilbus.terra.effects.steady import CompletedModel
 from soilbus.terra.vehicle import GRAVITY
-from soilbus.traversability import Demand, Status, Traversability, judge
 from soilbus.traversability import State as Way
+from soilbus.traversability import Status, Traversability, judge
 
 MIN_NEW_SOIL = 0.2
 """Share of a window that a new soil must fill before its estimate is valid."""
@@ -43,6 +45,7 @@ class WindowResult:
     status is invalid.  soil_class is the probability of each known soil and of `unknown`,
     the largest first.  position is in the middle of the data that count: of the window, or
     of its part on a new soil.  failure is the kind of a solve that failed, None where none did.
+    watch warns of immobilisation.
     """
 
     t: float
@@ -61,6 +64,7 @@ class WindowResult:
     soil_class: dict[str, float] | None = None
     position: Position | None = None
     failure: str | None = None
+    watch: Watch = Watch()  # noqa: RUF009, immutable
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,14 +72,15 @@ class Undecided:
     """A window's estimate with what the decision needs besides; its traversability is still unknown.
 
     demand is None where the draft is not known; torque_limit (W,) [N m]; stuck: the wheels
-    turn on the spot; fresh: nothing of the window before may be carried over; model: with the
-    effects' parameters as the window leaves them.
+    turn on the spot; moments: slips and pulls of the last hop; fresh: nothing of the window before
+    may be carried over; model: with the effects' parameters as the window leaves them.
     """
 
     result: WindowResult
     demand: Demand | None
     torque_limit: NDArray[np.float64]
     stuck: bool
+    moments: list[Moment]
     fresh: bool
     model: CompletedModel
 
@@ -88,7 +93,9 @@ class WindowEstimator:
         self.rig, self.prior, self.model = rig_of(config), prior_of(config), model_of(config)
         self._completion = completion_of(config)
         self._settings = config.estimator
-        self._pull_curve: PullCurve | None = None
+        self._wheels: WheelTable | None = None
+        self._watch = Watch()
+        self._curve: OverSlip | None = None
         self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
         self._guess = guessed(self.prior, prior_of(Config()))
         settings = config.estimator
@@ -136,18 +143,29 @@ class WindowEstimator:
         )
         effects = self._effects(fit)
         model = CompletedModel.of(self.model, effects, self._usual_speed(task.window))
-        demand = self._demand(task.window, effects)
-        return Undecided(result, demand, task.torque_limit, stuck, task.fresh, model)
+        window = _with_true_draft(task.window, effects, self.rig)
+        last_hop = list(moments(window, self.rig, task.end - self._settings.hop, self._settings.min_speed))
+        return Undecided(result, self._demand(window), task.torque_limit, stuck, last_hop, task.fresh, model)
 
     def decide(self, window: Undecided) -> WindowResult:
         """The result with its traversability; windows in their order, here or in another process."""
-        way, self._pull_curve = judge(
+        way, self._wheels = judge(
             window.result.posterior, window.result.status, window.demand, self.rig, window.model, window.torque_limit,
-            self.config.traversability, None if window.fresh else self._pull_curve,
+            self.config.traversability, None if window.fresh else self._wheels,
         )  # fmt: skip
         if window.stuck:
             way = replace(way, state=Way.NO_GO, probability=0.0, limit="slip")
-        return replace(window.result, traversability=way)
+        self._look(window)
+        if way.capability is not None and window.result.status is Status.VALID:
+            self._curve = way.capability.over_slip
+        return replace(window.result, traversability=way, watch=self._watch)
+
+    def _look(self, window: Undecided) -> None:
+        """Watch the last hop with what was known of the soil before it."""
+        if window.fresh:
+            self._watch, self._curve = Watch(), None
+        for moment in window.moments:
+            self._watch = watched(self._watch, *moment, self._curve)
 
     def _effects(self, fit: Fit | None) -> list[Active]:
         """The effects with their parameters as a fit leaves them, else as configured."""
@@ -182,7 +200,7 @@ class WindowEstimator:
         moving = window.ground_speed[window.ground_speed > self._settings.min_speed]
         return float(moving.mean()) if len(moving) else self._settings.min_speed
 
-    def _demand(self, window: Window, effects: Sequence[Active]) -> Demand | None:
+    def _demand(self, window: Window) -> Demand | None:
         """Draft and slope, over the last hop or the whole window, whichever asks for more.
 
         A driver who has just lifted the implement because it was too much still wants it
@@ -190,15 +208,15 @@ class WindowEstimator:
         """
         if self.rig.chassis is None or not len(window.t):
             return None
-        slope = np.where(np.isfinite(window.pitch), np.sin(window.pitch), 0.0)
-        draft = true_draft(effects, window.draft, _surroundings(window, self.rig))
-        pull = draft + self.rig.chassis.mass * GRAVITY * slope
-        recent = pull[window.t > window.t[-1] - self._settings.hop]
-        recent, pull = recent[np.isfinite(recent)], pull[np.isfinite(pull)]
-        if not len(recent):
+        pull = pull_asked(window, self.rig.chassis)
+        known = np.isfinite(pull)
+        recent = known & (window.t > window.t[-1] - self._settings.hop)
+        if not recent.any():
             return None
-        part = recent if recent.mean() >= pull.mean() else pull
-        return Demand(float(part.mean()), float(part.std() / math.sqrt(len(part))))
+        part = recent if pull[recent].mean() >= pull[known].mean() else known
+        std = pull[part].std() / math.sqrt(np.count_nonzero(part))
+        slope = float((pull - window.draft)[part].mean())
+        return Demand(float(pull[part].mean()), float(std), slope / (self.rig.chassis.mass * GRAVITY))
 
     def _stuck(self, window: Window) -> bool:
         """Whether the wheels turned but the vehicle stood during most of the last hop."""
@@ -253,6 +271,13 @@ class WindowEstimator:
         one, other = fit.posterior, fit.rival.belief.posterior
         pairs = ((self._bearing(one), self._bearing(other)), (one.tan_phi(), other.tan_phi()))
         return any(abs(a.value - b.value) > AMBIGUOUS * a.std for a, b in pairs)
+
+
+def _with_true_draft(window: Window, effects: Sequence[Active], rig: Rig) -> Window:
+    """The window without the errors of its load cell at the hitch."""
+    if not any(active.effect.draft for active in effects) or not len(window.t):
+        return window
+    return replace(window, draft=true_draft(effects, window.draft, _surroundings(window, rig)))
 
 
 def _surroundings(window: Window, rig: Rig) -> Surroundings:

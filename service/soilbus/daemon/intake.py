@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from cantools.database.can import Database
@@ -22,7 +23,7 @@ from soilbus.can.mapping import POSITION_ROLES, channels_of
 from soilbus.config import Config
 from soilbus.daemon.positions import PositionTrack
 from soilbus.estimation.screening import WILD
-from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, BinStore, Window, forward
+from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, BinStore, Window, forward, pull_given
 from soilbus.terra.vehicle import slip_ratio
 
 Array = NDArray[np.float64]
@@ -59,6 +60,13 @@ class WindowTask:
     track: PositionTrack
     rejected: dict[str, int]
     fresh: bool
+
+
+class Latest(NamedTuple):
+    """Slip ratio by wheel and pull [N] (draft, slope, inertia) of the last moments; None where unknown."""
+
+    slip: dict[str, float | None]
+    pull: float | None
 
 
 @dataclass(slots=True)
@@ -219,12 +227,18 @@ class Intake:
             c.name for c in self.needed if now - self.last_seen.get(c.name, -math.inf) > (c.timeout or DEFAULT_TIMEOUT)
         ]
 
+    def latest(self, now: float) -> Latest:
+        """Slip and pull over the last moments before `now` [s]."""
+        if self._bins is None:
+            return Latest(dict.fromkeys(self.rig.wheels), None)
+        last = math.floor((now - self._bins.origin) / self._settings.bin) * self._settings.bin + self._bins.origin
+        window = self._bins.glimpse(last - SLIP_SPAN, last)
+        pull = None if self.rig.chassis is None else column_means(pull_given(window, self.rig.chassis)[:, None])[0]
+        return Latest(self._slip(window), pull)
+
     def latest_slip(self, now: float) -> dict[str, float | None]:
         """Slip ratio by wheel over the last moments before `now` [s]; None where unknown."""
-        if self._bins is None:
-            return dict.fromkeys(self.rig.wheels)
-        last = math.floor((now - self._bins.origin) / self._settings.bin) * self._settings.bin + self._bins.origin
-        return self._slip(self._bins.glimpse(last - SLIP_SPAN, last))
+        return self.latest(now).slip
 
     def _slip(self, window: Window) -> dict[str, float | None]:
         window = forward(window)

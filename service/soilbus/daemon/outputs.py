@@ -7,6 +7,8 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from soilbus.capability.assessment import Capability
+from soilbus.capability.immobilisation import Watch
 from soilbus.config import Config
 from soilbus.daemon.pipeline import WindowResult
 from soilbus.daemon.states import state_after
@@ -15,6 +17,9 @@ from soilbus.estimation.soil_class import UNKNOWN
 
 WINDOW_MODULUS = 251
 """The frames' 8-bit window number counts 0..250."""
+
+LONG = 1e6
+"""A time [s] that is longer than any signal holds."""
 
 MOST_CLASSES = 3
 """Known soils that a window names."""
@@ -56,12 +61,38 @@ def json_line(result: WindowResult, config: Config) -> str:
                 "max_grade": _value_std(way.max_grade),
                 "limit": way.limit,
             },
+            "warning": {"state": str(result.watch.warning), "time_left": _finite(result.watch.time_left)},
+            "capability": None if way.capability is None else _capability(way.capability),
             "chi2": result.chi2,
             "samples": result.samples,
             "rejected": result.rejected,
         },
         allow_nan=False,
     )
+
+
+def _capability(able: Capability) -> dict[str, Any]:
+    """What traversability does not say already."""
+    forecast = able.forecast
+    return {
+        "max_draft_here": _value_std(able.max_draft_here),
+        "max_grade_with_draft": _value_std(able.max_grade_with_draft),
+        "set_points": {
+            axle: {"efficiency": _value_std(point.efficiency), "pull": _value_std(point.pull)}
+            for axle, point in able.set_points.items()
+        },
+        "forecast": None
+        if forecast is None
+        else {
+            "slip": _value_std(forecast.slip),
+            "torque": _value_std(forecast.torque),
+            "sinkage": {wheel: _value_std(depth) for wheel, depth in forecast.sinkage.items()},
+        },
+        "over_slip": {
+            column: [_finite(x) for x in getattr(able.over_slip, column).tolist()]
+            for column in ("slip", "pull", "pull_std", "torque", "torque_std")
+        },
+    }
 
 
 def likeliest(soil_class: Mapping[str, float]) -> dict[str, float]:
@@ -82,11 +113,14 @@ def hop_frames(result: WindowResult) -> Iterator[tuple[str, dict[str, Any]]]:
         "SoilStrength",
         common | {"Chi2": result.chi2} | _pair("BearingPressure", "BearingPressureStd", bearing, 1e3),
     )
+    yield "SoilClass", common | _kind(result.soil_class)
     parameters = {} if result.posterior is None else result.posterior.parameters()
     for name, (message, unit) in PARAMETER_FRAMES.items():
         yield message, common | _pair("Value", "Std", parameters.get(name), unit)
     yield "DraftCapability", common | _pair("MaxDraft", "MaxDraftStd", way.max_draft, 1.0)
     yield "GradeCapability", common | _pair("MaxGrade", "MaxGradeStd", way.max_grade, 1.0)
+    yield "TractionAdvice", common | _advice(way.capability)
+    yield "TractionLimits", common | {"LimitingCause": way.limit} | _limits(way.capability)
     for message, values in _by_wheel("WheelSinkage", "SinkageWheel", result.sinkage, 1e-3):
         yield message, common | values
 
@@ -95,6 +129,51 @@ def _pair(value: str, std: str, estimate: Estimate | None, unit: float) -> dict[
     if estimate is None:
         return {value: None, std: None}
     return {value: estimate.value / unit, std: estimate.std / unit}
+
+
+def _kind(soil_class: Mapping[str, float] | None) -> dict[str, str | float | None]:
+    if soil_class is None:
+        return {"Kind": None, "Probability": None, "UnknownProbability": None}
+    kind, probability = next(iter(soil_class.items()))
+    return {"Kind": kind, "Probability": probability, "UnknownProbability": soil_class[UNKNOWN]}
+
+
+def _advice(able: Capability | None) -> dict[str, float | None]:
+    points = {} if able is None else able.set_points
+    values = {}
+    for axle, name in (("front", "Front"), ("rear", "Rear")):
+        point = points.get(axle)
+        values[f"SlipForEfficiency{name}"] = None if point is None else _value(point.efficiency)
+        values[f"SlipForPull{name}"] = None if point is None else _value(point.pull)
+    return values
+
+
+def _limits(able: Capability | None) -> dict[str, float | None]:
+    draft, grade = (None, None) if able is None else (able.max_draft_here, able.max_grade_with_draft)
+    return _pair("MaxDraft", "MaxDraftStd", draft, 1.0) | _pair("MaxGrade", "MaxGradeStd", grade, 1.0)
+
+
+def forecast_frame(result: WindowResult | None, watch: Watch) -> tuple[str, dict[str, Any]]:
+    """(message, values) of the forecast, from a result that may still be trusted (else None), and of the warning."""
+    able = None if result is None else result.traversability.capability
+    forecast = None if able is None else able.forecast
+    return "DemandForecast", {
+        "Slip": None if forecast is None else forecast.slip.value,
+        "SlipStd": None if forecast is None else forecast.slip.std,
+        "Sinkage": None if forecast is None else forecast.deepest.value * 1e3,
+        "TimeLeft": None if watch.time_left is None else min(watch.time_left, LONG),
+        "Warning": str(watch.warning),
+        "Window": None if result is None else result.index % WINDOW_MODULUS,
+        "Status": None if result is None else str(result.status),
+    }
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None
+
+
+def _value(estimate: Estimate | None) -> float | None:
+    return None if estimate is None else estimate.value
 
 
 def slip_frames(slip: Mapping[str, float | None]) -> Iterator[tuple[str, dict[str, Any]]]:

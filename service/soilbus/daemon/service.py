@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable
@@ -11,12 +12,16 @@ from importlib.metadata import PackageNotFoundError, version
 
 from soilbus.can.bus import LiveBus
 from soilbus.can.publish import Publisher
+from soilbus.capability.assessment import OverSlip
+from soilbus.capability.immobilisation import Watch, watched
 from soilbus.config import Config
+from soilbus.daemon.intake import Latest
 from soilbus.daemon.notify import Notifier
-from soilbus.daemon.outputs import WINDOW_MODULUS, hop_frames, slip_frames
+from soilbus.daemon.outputs import WINDOW_MODULUS, forecast_frame, hop_frames, slip_frames
 from soilbus.daemon.pipeline import Pipeline, WindowResult
 from soilbus.daemon.states import ServiceState, state_after
 from soilbus.traversability import State as Way
+from soilbus.traversability import Status
 
 log = logging.getLogger(__name__)
 
@@ -31,6 +36,8 @@ POLL = 0.02
 """Longest wait for a frame [s] before the loop looks whether the worker is done."""
 MAX_PENDING = 3
 """Windows that may wait for the worker."""
+LONGEST_CURVE = 60.0
+"""Age [s] up to which a valid window's pull over slip serves to watch for immobilisation."""
 LONGEST_SOLVE = 20.0
 """A window that takes longer [s] is a worker that hangs: the watchdog is fed no more."""
 
@@ -62,6 +69,8 @@ class Service:
         self.deadline_misses = 0
         self.failures: Counter[str] = Counter()
         """Failed solves by kind, since the start."""
+        self._watch = Watch()
+        self._curve: tuple[OverSlip | None, float] = None, -math.inf
         self._workers = workers
         self._pending: deque[Future[WindowResult]] = deque()
         self._stopping = False
@@ -144,6 +153,9 @@ class Service:
             self._solved_at = now
             if self.result.failure is not None:
                 self.failures[self.result.failure] += 1
+            able = self.result.traversability.capability
+            if able is not None and self.result.status is Status.VALID:
+                self._curve = able.over_slip, self.result.t
             for message, values in hop_frames(self.result):
                 self.bus.send(self.publisher.frame(message, values))
             if self.on_window is not None:
@@ -188,6 +200,11 @@ class Service:
             return Way.UNKNOWN
         return self.result.traversability.state
 
+    def _present_curve(self, now: float) -> OverSlip | None:
+        """Pull over slip of the last valid window, while it is young enough to extrapolate from."""
+        known, t = self._curve
+        return known if self.bus_time(now) - t < LONGEST_CURVE else None
+
     def _age(self, now: float) -> float:
         return self.bus_time(now) - self.result.t if self.result is not None else 1e9
 
@@ -196,9 +213,13 @@ class Service:
         known = way is not Way.UNKNOWN and self.result is not None
         decided = self.result.traversability if known and self.result is not None else None
         window = self.result.index % WINDOW_MODULUS if self.result is not None else None
-        slip = self.intake.latest_slip(self.bus_time(now)) if self.bus.is_open else {}
-        for message, values in slip_frames(slip):
+        latest = self.intake.latest(self.bus_time(now)) if self.bus.is_open else Latest({}, None)
+        for message, values in slip_frames(latest.slip):
             self.bus.send(self.publisher.frame(message, values))
+        self._watch = watched(
+            self._watch, self.bus_time(now), latest.slip.values(), latest.pull, self._present_curve(now)
+        )  # fmt: skip
+        self.bus.send(self.publisher.frame(*forecast_frame(self.result if known else None, self._watch)))
         limit = decided.limit if decided is not None else None
         self.bus.send(
             self.publisher.frame(

@@ -24,6 +24,8 @@ FITTED = 4
 THINNED = 4
 NEAR = 0.2
 """Share of the best one's fall on a few instants below which a candidate is out."""
+CLEAR = 50.0
+"""Fall of -2 log evidence on a few instants that needs no search where the scores are blind."""
 WORTH_TRYING = -2.0
 """Foreseen change of -2 log evidence above which a candidate is not fitted."""
 NOTHING = "none"
@@ -122,12 +124,18 @@ def _promising(
     if before is None:
         return [(score.effect, score.starts) for score in foreseen[:FITTED]]
     falls: list[tuple[float, Effect, Sequence[Start]]] = []
-    tries: list[tuple[Effect, Sequence[Start]]] = [(score.effect, score.starts) for score in foreseen]
-    tries += [(effect, starts) for effect in candidates for starts in further_starts(effect, before)]
-    for effect, starts in tries:
+
+    def attempt(effect: Effect, starts: Sequence[Start]) -> None:
         completion = complete(few, prior, (*present.effects, effect), starts)
         if completion is not None:
             falls.append((before.evidence - completion.evidence, effect, completion.as_starts()))
+
+    for score in foreseen:
+        attempt(score.effect, score.starts)
+    if max((fall for fall, *_ in falls), default=0.0) < CLEAR:
+        for effect in candidates:
+            for further in further_starts(effect, before):
+                attempt(effect, further)
     falls.sort(key=lambda item: -item[0])
     best: dict[str, tuple[Effect, Sequence[Start]]] = {}
     for fall, effect, starts in falls:

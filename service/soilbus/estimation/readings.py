@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from copy import copy
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ Reading = tuple[Array, Array, NDArray[np.bool_]]
 
 MAX_SLIP = 0.98
 MIN_SLIP = -1.0
+BENT = 6.0
+"""Standard deviations by which cubics must differ from lines to be taken."""
 GAIN_QUANTITIES = ("torque", "load", "speed", "ground_speed", "draft")
 
 _BY_INSTANT = (
@@ -162,22 +165,46 @@ def turned(t: Array, speed: Array) -> Array:
 
 
 def differentiated_speed(t: Array, speed: Array, variance: Array, half_width: int = 3) -> tuple[Array, Array]:
-    """Acceleration [m/s^2] and its variance from ground speed by local straight lines.
+    """Acceleration [m/s^2] and its variance from ground speed by local polynomials.
 
-    t [s], speed [m/s] and variance of speed, all (N,).  The misfit of the line adds to
-    the variance, so that harsh driving is not mistaken for a precise reading.
+    t [s], speed [m/s] and variance of speed, all (N,).  Straight lines where the data show
+    no more; cubics, which follow harsh driving and are noisier, where the two differ by
+    more than noise does (lines then flatten every swing, and the vehicle seems lighter
+    than it is).  The misfit adds to the variance, so that harsh driving is not mistaken for
+    a precise reading.
     """
     n = len(t)
-    a, var = np.zeros(n), np.full(n, np.inf)
     if n < 3:
-        return a, np.full(n, 1.0)
+        return np.zeros(n), np.full(n, 1.0 if n else np.inf)
+    reach = half_width + 1
+    near = np.clip(np.arange(n)[:, None] + np.arange(-reach, reach + 1), 0, n - 1)
+    line, cubic = (_slopes(t, speed, variance, reach, width, degree) for width, degree in ((half_width, 1), (reach, 3)))
+    difference = cubic.weights - line.weights
+    noise = float((difference**2 * variance[near]).sum())
+    square = float(((difference * speed[near]).sum(axis=1) ** 2).sum())
+    chosen = cubic if square > noise * (1.0 + BENT * math.sqrt(2.0 * reach / n)) else line
+    return (chosen.weights * speed[near]).sum(axis=1), chosen.variance
+
+
+class _Slopes(NamedTuple):
+    """Slopes at all instants: weights (N, 2 reach + 1) of the speeds within `reach`, and variances."""
+
+    weights: Array
+    variance: Array
+
+
+def _slopes(t: Array, speed: Array, variance: Array, reach: int, half_width: int, degree: int) -> _Slopes:
+    """Slope at each instant of a polynomial through it and its neighbours."""
+    n = len(t)
+    weights, slope_var = np.zeros((n, 2 * reach + 1)), np.zeros(n)
     for i in range(n):
-        part = slice(max(i - half_width, 0), min(i + half_width + 1, n))
-        x = t[part] - t[part].mean()
-        sxx = float(x @ x)
-        y = speed[part] - speed[part].mean()
-        a[i] = (x @ y) / sxx
-        misfit = y - a[i] * x
-        spread = max(float(variance[part].mean()), float(misfit @ misfit) / max(len(x) - 2, 1))
-        var[i] = spread / sxx
-    return a, var
+        first, last = max(i - half_width, 0), min(i + half_width + 1, n)
+        part = slice(first, last)
+        powers = (t[part] - t[i])[:, None] ** np.arange(min(degree, last - first - 1) + 1)
+        fit = np.linalg.pinv(powers)
+        misfit = speed[part] - powers @ (fit @ speed[part])
+        free = max(last - first - powers.shape[1], 1)
+        spread = max(float(variance[part].mean()), float(misfit @ misfit) / free)
+        weights[i, first - i + reach : last - i + reach] = fit[1]
+        slope_var[i] = spread * float(fit[1] @ fit[1])
+    return _Slopes(weights, slope_var)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.screening import SIDE, Samples, joined, judge
-from soilbus.terra.vehicle import Chassis
+from soilbus.terra.vehicle import Chassis, pull_required
 
 Array = NDArray[np.float64]
 
@@ -344,3 +344,13 @@ def window_of_samples(rig: Rig, t: Array, samples: Mapping[str, Array], names: S
             mean[:, i] = samples[name]
     one = np.isfinite(mean).astype(float)
     return _make_window(_NoiseTable.of(rig), np.asarray(t, float), mean, one, one)
+
+
+def pull_asked(window: Window, chassis: Chassis) -> Array:
+    """Pull [N] (N,) that draft and slope ask of the wheels; nan without draft, level where the slope is not known."""
+    return np.asarray(pull_required(chassis, window.draft, np.nan_to_num(window.pitch), 0.0))
+
+
+def pull_given(window: Window, chassis: Chassis) -> Array:
+    """As `pull_asked`, with what the wheels give to speed up where the acceleration is known."""
+    return pull_asked(window, chassis) + chassis.mass * np.nan_to_num(window.acceleration)

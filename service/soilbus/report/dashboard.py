@@ -16,7 +16,7 @@ from rich.text import Text
 
 from soilbus.can.admission import checksum_byte_of
 from soilbus.can.bus import open_bus
-from soilbus.can.checksum import frame_checksum
+from soilbus.can.checksum import COUNTER, frame_checksum
 from soilbus.can.dbc_files import output_database
 from soilbus.config import Config
 
@@ -44,7 +44,7 @@ class Dashboard:
         self.bad_frames = 0
 
     def receive(self, message: can.Message) -> None:
-        """Take one frame; one with a wrong checksum counts as not received."""
+        """Take one frame; one with a wrong checksum or the counter of the one before counts as not received."""
         layout = self._messages.get(message.arbitration_id) if message.is_extended_id else None
         if layout is None or len(message.data) != layout.length:
             return
@@ -53,7 +53,11 @@ class Dashboard:
         if place is not None and data[place] != frame_checksum(message.arbitration_id, data, place):
             self.bad_frames += 1
             return
-        self._values[layout.name] = layout.decode(data)  # type: ignore[assignment]
+        values: dict[str, Any] = layout.decode(data)  # type: ignore[assignment]
+        if COUNTER in values and values[COUNTER] == self._values.get(layout.name, {}).get(COUNTER):
+            self.bad_frames += 1
+            return
+        self._values[layout.name] = values
         self._seen[layout.name] = self._clock()
 
     def value(self, message: str, signal: str) -> float | str | None:
@@ -78,6 +82,8 @@ class Dashboard:
                     self._text("Traversability", "Probability", "p = {:.2f}"),
                     self._text("Traversability", "LimitingCause", "limit: {}"),
                     self._pair("DraftCapability", "MaxDraft", "MaxDraftStd", "max. draft {} N"),
+                    self._advice(),
+                    self._text("SoilClass", "Kind", "soil: {}") + self._text("SoilClass", "Probability", " ({:.2f})"),
                     self._text("SoilbusStatus", "State", "service: {}"),
                     self._text("SoilbusStatus", "Reason", "({})"),
                 ),
@@ -100,7 +106,18 @@ class Dashboard:
             )
         body = Table.grid(padding=(0, 4))
         body.add_row(soil, wheels)
-        return Panel(Group(head, Text(detail), Text(""), body), title="soilbus", width=76)
+        return Panel(Group(head, self._warning(), Text(detail), Text(""), body), title="soilbus", width=76)
+
+    def _warning(self) -> Text:
+        if self.value("DemandForecast", "Warning") != "immobilisation":
+            return Text("")
+        left = self._text("DemandForecast", "TimeLeft", " in {:.0f} s")
+        return Text(f" GETTING STUCK{left} ", style="bold white on red")
+
+    def _advice(self) -> str:
+        """Slips for best efficiency, front and rear."""
+        slips = (self._text("TractionAdvice", f"SlipForEfficiency{axle}", "{:.2f}") for axle in ("Front", "Rear"))
+        return "best slip " + "/".join(slip or "-" for slip in slips)
 
     def _text(self, message: str, signal: str, form: str) -> str:
         value = self.value(message, signal)

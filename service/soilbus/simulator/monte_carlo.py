@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from multiprocessing import get_context
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,7 +103,15 @@ class Cell:
     seconds: float
 
 
-Each = Callable[[Callable[[Task], tuple[Trial, Trial]], Iterable[Task]], Iterable[tuple[Trial, Trial]]]
+_T = TypeVar("_T")
+_R = TypeVar("_R")
+
+
+class Each(Protocol):
+    """Does a work for each task, here or in other processes: the built-in map, or that of `processes`."""
+
+    def __call__(self, work: Callable[[_T], _R], tasks: Iterable[_T], /) -> Iterable[_R]:
+        """The results in the order of the tasks."""
 
 
 def monte_carlo(

@@ -126,6 +126,12 @@ def wheel_forces_and_derivatives(state: WheelState, model: WheelModel) -> tuple[
     return both[:3], both[3:].reshape(3, len(INPUTS), *both.shape[1:])
 
 
+def wheel_forces_and_slopes(state: WheelState, model: WheelModel) -> tuple[Array, Array]:
+    """Forces (3, ...) and their exact derivatives (3, 2, ...) by entry angle and slip; cheaper than by all inputs."""
+    both = _in_chunks(_forces_and_slopes, 9, state, model)
+    return both[:3], both[3:].reshape(3, 2, *both.shape[1:])
+
+
 def sinkage(entry_angle: Any, radius: Any) -> Any:
     """Sinkage [m] of a wheel with this entry angle [rad] (eq. 1)."""
     return radius * (1.0 - np.cos(entry_angle))
@@ -365,6 +371,27 @@ def _forces_and_jacobian(state: WheelState, model: WheelModel, skid: bool) -> Ar
     jacobian = out[3:].reshape(3, len(INPUTS), -1)
     for column, derivative in enumerate(columns):
         np.multiply(unit, derivative, out=jacobian[:, column])
+    return out
+
+
+def _forces_and_slopes(state: WheelState, model: WheelModel, skid: bool) -> Array:
+    """W, DP and T and their derivatives by entry angle and slip (3 + 6, N)."""
+    at = _stress(state, model, skid)
+    tau, mobilising = _shear(at, state)
+    fields = np.empty((5, *at.normal.shape))
+    fields[0], fields[2] = at.normal, tau
+    fields[1], fields[3] = _entering(at, state, tau, mobilising)
+    np.multiply(mobilising, at.rim.travel, out=fields[4])
+    pressing, pressed, rubbing, turned, by_slip = _integrals(fields, 2, at.rim).swapaxes(0, 1)
+    turned[2] += _dot(at.normal, np.broadcast_to(at.share, at.normal.shape))
+    if model.peak_c2:
+        by_slip = by_slip + model.peak_c2 * _by_peak(at, state, model, tau, mobilising)
+    whole, unit = pressing + rubbing, _unit(state)
+    out = np.empty((9, len(state.entry_angle)))
+    np.multiply(unit, whole, out=out[:3])
+    slopes = out[3:].reshape(3, 2, -1)
+    np.multiply(unit, pressed + turned + whole / state.entry_angle, out=slopes[:, 0])
+    np.multiply(unit, by_slip, out=slopes[:, 1])
     return out
 
 

@@ -4,17 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from soilbus.terra.effects.effect import Active, Surroundings, forces_with
 from soilbus.terra.stress import Array
-from soilbus.terra.wheel import INPUTS, WheelModel, WheelState, wheel_forces_and_derivatives
+from soilbus.terra.wheel import WheelModel, WheelState, wheel_forces, wheel_forces_and_slopes
 
 STEP = 1e-6
 """Relative step of the differences."""
 LEAST_STEP = 1e-9
+
+
+class Slopes(NamedTuple):
+    """Derivatives (3, ...) of load, pull and torque by entry angle, by slip, and by the load that effects go by."""
+
+    by_angle: Array
+    by_slip: Array
+    by_load: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,30 +44,45 @@ class CompletedModel:
         acting = [a for a in kept if a.effect.wheel or a.effect.forces or a.effect.torque]
         return cls(model, tuple(acting), ground_speed)
 
-    def forces_and_derivatives(
-        self, state: WheelState, rear: Any, load: Array, draft: Array, mass: float
-    ) -> tuple[Array, Array]:
-        """Load, drawbar pull and the motor's torque at the wheel (3, ...), with derivatives (3, 7, ...) by INPUTS.
+    @classmethod
+    def over(cls, model: WheelModel | CompletedModel) -> CompletedModel:
+        """A wheel-soil model as one without effects; a completed one as it is."""
+        return model if isinstance(model, CompletedModel) else cls(model)
 
-        Exact without effects, by differences with them.  rear tells which wheels are on the
-        rear axle, load [N] what they carry about, draft [N] and mass [kg] are the vehicle's.
+    def forces(self, state: WheelState, rear: Any, load: Array) -> Array:
+        """Load, drawbar pull and the motor's torque at the wheel (3, ...).
+
+        rear tells which wheels are on the rear axle, load [N] what they carry.
         """
         if not self.effects:
-            return wheel_forces_and_derivatives(state, self.model)
-        at = self._forces(state, rear, load, draft, mass)
-        d = np.empty((3, len(INPUTS), *at.shape[1:]))
-        for i, name in enumerate(INPUTS):
-            value = getattr(state, name)
-            step = STEP * np.maximum(np.abs(value), LEAST_STEP / STEP)
-            d[:, i] = (self._forces(state._replace(**{name: value + step}), rear, load, draft, mass) - at) / step
-        return at, d
-
-    def _forces(self, state: WheelState, rear: Any, load: Array, draft: Array, mass: float) -> Array:
-        speed = self.ground_speed / (state.radius * (1.0 - state.slip))
-        now = np.zeros((1, 1))
-        around = Surroundings(now, now, load, self.ground_speed, speed, rear, draft, now, mass, 0.0)
+            return wheel_forces(state, self.model)
+        around = self._around(state, rear, load)
         forces = forces_with(self.effects, state, self.model, around)
         for effect, values in self.effects:
             if effect.torque is not None:
                 forces = np.stack([*forces[:2], effect.torque(forces[2], around, values)])
         return forces
+
+    def forces_and_slopes(self, state: WheelState, rear: Any, load: Array) -> tuple[Array, Slopes]:
+        """As `forces`, with derivatives: exact without effects, by differences with them."""
+        if not self.effects:
+            forces, by = wheel_forces_and_slopes(state, self.model)
+            return forces, Slopes(by[:, 0], by[:, 1], np.zeros_like(forces))
+        at = self.forces(state, rear, load)
+        angle, slip = _step(state.entry_angle), _step(state.slip)
+        more = STEP * np.maximum(load, 1.0)
+        return at, Slopes(
+            (self.forces(state._replace(entry_angle=state.entry_angle + angle), rear, load) - at) / angle,
+            (self.forces(state._replace(slip=state.slip + slip), rear, load) - at) / slip,
+            (self.forces(state, rear, load + more) - at) / more,
+        )
+
+    def _around(self, state: WheelState, rear: Any, load: Array) -> Surroundings:
+        """Steady driving; draft and mass act on a wheel by its load alone."""
+        speed = self.ground_speed / (state.radius * (1.0 - state.slip))
+        now = np.zeros((1, 1))
+        return Surroundings(now, now, load, self.ground_speed, speed, rear, np.nan, now, np.nan, 0.0)
+
+
+def _step(value: Any) -> Any:
+    return np.maximum(STEP * np.abs(value), LEAST_STEP)

@@ -1,0 +1,1 @@
+"""What a soil lets the vehicle do, with standard deviations: pull, grade, slip, sinkage, torque."""

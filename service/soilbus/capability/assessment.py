@@ -1,0 +1,238 @@
+"""Posterior, vehicle and present demand -> what the vehicle can do here, each figure with its standard deviation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.capability.balance import PARTS, Balance, Duty, balance
+from soilbus.capability.limits import (
+    Cause,
+    Largest,
+    Limits,
+    axle_sum,
+    largest_pull,
+    place_of_pull,
+    slips_of_most,
+    within,
+)
+from soilbus.capability.sigma_points import SigmaPoints
+from soilbus.capability.wheels import Axles, WheelTable, wheel_table
+from soilbus.estimation.posterior import Estimate, Posterior
+from soilbus.estimation.window import Rig
+from soilbus.terra.effects.steady import CompletedModel
+from soilbus.terra.wheel import WheelModel, sinkage
+
+Array = NDArray[np.float64]
+
+MIN_SLIP = 0.02
+GRID = 9
+MAX_SKID = 0.3
+SKID_GRID = 9
+TOLERANCE = 3e-3
+"""Last Newton step over the weight: it leaves less than the interpolation between slips does, some 5e-5 of the weight."""
+LEVEL_SINE = 1e-3
+"""Slopes below this sine change no load worth computing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Demand:
+    """Pull [N] asked of the wheels now, draft and slope together, with its uncertainty; sine is that of the slope."""
+
+    pull: float
+    std: float
+    sine: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class OverSlip:
+    """Steady level driving at some slips (S,): pull [N] and the wheels' summed torque [N m].
+
+    Equation 22 and figure 13 of Xi et al. 2024, with load transfer and standard deviations.
+    """
+
+    slip: Array
+    pull: Array
+    pull_std: Array
+    torque: Array
+    torque_std: Array
+
+
+@dataclass(frozen=True, slots=True)
+class SetPoint:
+    """Slips of one axle within the limits: of best traction efficiency, and of most pull.
+
+    None where the axle gives no pull.
+    """
+
+    efficiency: Estimate | None
+    pull: Estimate | None
+
+
+@dataclass(frozen=True, slots=True)
+class Forecast:
+    """The present demand met in steady driving: slip, sinkage [m] by wheel, the deepest, summed torque [N m]."""
+
+    slip: Estimate
+    sinkage: Mapping[str, Estimate]
+    deepest: Estimate
+    torque: Estimate
+
+
+@dataclass(frozen=True, slots=True)
+class Capability:
+    """What the vehicle can do on this soil; None where nothing can be said.
+
+    max_draft [N] on the level; grades [rad], without draft and with the present one;
+    max_pull [N] on the present slope, of draft and slope together, and max_draft_here of the
+    draft alone; limit is what ends max_draft.  forecast is None where no slip meets the demand.
+    """
+
+    max_draft: Estimate
+    max_draft_here: Estimate | None
+    max_grade: Estimate | None
+    max_grade_with_draft: Estimate | None
+    max_pull: Estimate | None
+    limit: Cause
+    set_points: Mapping[str, SetPoint]
+    forecast: Forecast | None
+    over_slip: OverSlip
+
+
+@cache
+def slip_grid(max_slip: float) -> Array:
+    """Slips at which the wheels are computed, closer where forces change fast."""
+    least = min(MIN_SLIP, max_slip / 2.0)
+    return np.asarray(np.linspace(np.sqrt(least), np.sqrt(max_slip), GRID) ** 2)
+
+
+def assess(
+    posterior: Posterior,
+    rig: Rig,
+    model: WheelModel | CompletedModel,
+    demand: Demand | None,
+    torque_limit: Array,
+    max_slip: float,
+    max_sinkage: float,
+    last: WheelTable | None = None,
+) -> tuple[Capability | None, WheelTable]:
+    """Capability on one soil, and the wheels' table to start the next window's from.
+
+    torque_limit (W,) [N m] holds nan where a motor's limit is not known; max_sinkage [m].
+    None where no steady driving within slip and sinkage limits exists.  Raises ValueError
+    for a rig without a chassis.
+    """
+    points = SigmaPoints.of(posterior)
+    table = wheel_table(points.soils, rig, model, slip_grid(max_slip), last, TOLERANCE)
+    skids = np.linspace(-MAX_SKID, table.slip[0], SKID_GRID)
+    skid = cache(lambda: wheel_table(points.soils, rig, model, skids))
+    vehicle = _Vehicle(table, Limits.of(table.axles, torque_limit, max_sinkage), skid)
+    level = balance(table)
+    draft = vehicle.largest(Duty(), level)
+    if draft is None:
+        return None, table
+    with_draft = pull = forecast = None
+    if demand is not None:
+        flat = abs(demand.sine) < LEVEL_SINE
+        duty = Duty(None, demand.sine)
+        present = level if flat else balance(table, duty)
+        pull = draft if flat else vehicle.largest(duty, present)
+        with_draft = vehicle.grade(demand.pull - table.axles.weight * demand.sine)
+        forecast = _forecast(demand, present, table.axles, rig, points)
+    max_draft, max_grade, max_grade_with_draft, max_pull = points.estimates(
+        draft.pull, vehicle.grade(0.0), with_draft, None if pull is None else pull.pull
+    )
+    if max_draft is None:
+        return None, table
+    max_draft_here = None
+    if demand is not None and max_pull is not None:
+        max_draft_here = Estimate(max_pull.value - table.axles.weight * demand.sine, max_pull.std)
+    return Capability(
+        max_draft=max_draft,
+        max_draft_here=max_draft_here,
+        max_grade=max_grade,
+        max_grade_with_draft=max_grade_with_draft,
+        max_pull=max_pull,
+        limit=draft.cause,
+        set_points=_set_points(table.axles, level, vehicle.limits, draft, points),
+        forecast=forecast,
+        over_slip=_over_slip(level, table, points),
+    ), table
+
+
+@dataclass(frozen=True, slots=True)
+class _Vehicle:
+    """The wheels where they drive and, asked for seldom, where they skid."""
+
+    table: WheelTable
+    limits: Limits
+    skid: Callable[[], WheelTable]
+
+    def largest(self, duty: Duty, driving: Balance) -> Largest | None:
+        """Largest pull under a duty; None where nothing is within the limits.
+
+        Where even the least slip asks for more torque than there is, the pull is that of
+        wheels that skid: below zero, as only a push or a slope moves the vehicle.
+        """
+        found = largest_pull(driving, self.limits)
+        if np.isfinite(found.pull[0]):
+            return found
+        no_torque = self.limits._replace(torque=np.full_like(self.limits.torque, np.inf))
+        if not within(driving, no_torque)[0].any():
+            return None
+        skidding = balance(self.skid(), duty)
+        found = largest_pull(skidding, self.limits)
+        if np.isfinite(found.pull[0]):
+            return found._replace(cause="torque")
+        if not skidding.known[0].any():
+            return None
+        least = np.where(skidding.known, skidding.pull, np.inf).argmin(axis=1)
+        pull = np.where(skidding.known.any(axis=1), skidding.pull[np.arange(len(least)), least], np.nan)
+        return Largest(pull, skidding.slip[least], "torque")
+
+    def grade(self, draft: float) -> Array | None:
+        """Steepest slope [rad] (D,) that is climbed with a draft [N]."""
+        duty = Duty(draft, None)
+        found = self.largest(duty, balance(self.table, duty))
+        if found is None:
+            return None
+        return np.asarray(np.arcsin(np.clip((found.pull - draft) / self.table.axles.weight, -1.0, 1.0)))
+
+
+def _set_points(
+    axles: Axles, level: Balance, limits: Limits, draft: Largest, points: SigmaPoints
+) -> dict[str, SetPoint]:
+    """Efficiency is drawbar power over the wheels' power, DP V/(T omega)."""
+    names = {"front": axles.front[:, 0], "rear": ~axles.front[:, 0]}
+    names = {name: kinds for name, kinds in names.items() if kinds.any()}
+    values = []
+    for kinds in names.values():
+        pull, force = (axle_sum(each, axles, kinds) for each in (level.drawbar, level.torque / axles.radius))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            values += [np.where(force > 0.0, pull * (1.0 - level.slip) / force, -1.0), pull]
+    slips = points.estimates(*slips_of_most(np.array(values), level, limits, draft.slip))
+    return {name: SetPoint(*slips[2 * i : 2 * i + 2]) for i, name in enumerate(names)}
+
+
+def _forecast(demand: Demand, present: Balance, axles: Axles, rig: Rig, points: SigmaPoints) -> Forecast | None:
+    place = place_of_pull(present, demand.pull)
+    torque = (place.on(present.torque) * axles.count[:, 0]).sum(axis=1)
+    slip = place.on(np.broadcast_to(present.slip, present.pull.shape))
+    slip_needed, required, *depths = points.estimates(
+        slip, torque, *sinkage(place.on(present.angle), axles.radius[:, 0]).T
+    )
+    if slip_needed is None or required is None:
+        return None
+    by_kind = [depth for depth in depths if depth is not None]
+    by_wheel = {name: by_kind[kind] for name, kind in zip(rig.wheels, axles.of_wheel, strict=True)}
+    return Forecast(slip_needed, by_wheel, max(by_kind, key=lambda depth: depth.value), required)
+
+
+def _over_slip(level: Balance, table: WheelTable, points: SigmaPoints) -> OverSlip:
+    torque = (level.torque[..., ::PARTS] * table.axles.count).sum(axis=1)
+    torque = np.where(table.balanced, torque, np.nan)
+    return OverSlip(table.slip, *points.mean_and_std(table.pull), *points.mean_and_std(torque))

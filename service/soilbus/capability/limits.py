@@ -1,0 +1,129 @@
+"""How far a balance may go: torque, sinkage and slip limits, the largest pull, and the best slips."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.capability.balance import Balance
+from soilbus.capability.wheels import Axles
+from soilbus.terra.wheel import MAX_ENTRY_ANGLE
+
+Array = NDArray[np.float64]
+Cause = Literal["torque", "traction", "sinkage", "slip"]
+
+
+class Limits(NamedTuple):
+    """Greatest torque [N m] and entry angle [rad] of each kind of wheel (A,)."""
+
+    torque: Array
+    angle: Array
+
+    @classmethod
+    def of(cls, axles: Axles, torque_limit: Array, max_sinkage: float) -> Limits:
+        """From the wheels' torque limits (W,) [N m], nan where not known, and a sinkage [m]."""
+        torque = np.full(len(axles.count), np.inf)
+        np.fmin.at(torque, axles.of_wheel, torque_limit)
+        depth = np.minimum(max_sinkage / axles.radius[:, 0], 1.0)
+        return cls(torque, np.minimum(np.arccos(1.0 - depth), MAX_ENTRY_ANGLE))
+
+
+class Largest(NamedTuple):
+    """The largest pull [N] and its slip for each soil (D,), nan where no slip is within the limits; what ends it."""
+
+    pull: Array
+    slip: Array
+    cause: Cause
+
+
+def within(balance: Balance, limits: Limits) -> NDArray[np.bool_]:
+    """Steady states within the limits (D, F)."""
+    low = (balance.torque <= limits.torque[:, None]) & (balance.angle <= limits.angle[:, None])
+    return np.asarray(balance.known & low.all(axis=1))
+
+
+def largest_pull(balance: Balance, limits: Limits) -> Largest:
+    """Largest pull over slip; the cause is that of the first soil."""
+    usable = within(balance, limits)
+    row, last = np.arange(len(usable)), usable.shape[1] - 1
+    best = np.where(usable, balance.pull, -np.inf).argmax(axis=1)
+    after = np.minimum(best + 1, last)
+    pull, slip = balance.pull[row, best], balance.slip[best]
+    more = balance.known[row, after] & (balance.pull[row, after] > pull)
+    by_torque = _share(balance.torque[row, :, best], balance.torque[row, :, after], limits.torque)
+    by_angle = _share(balance.angle[row, :, best], balance.angle[row, :, after], limits.angle)
+    share = np.where(more, np.minimum(by_torque, by_angle), 0.0)
+    pull = pull + share * (balance.pull[row, after] - pull)
+    slip = slip + share * (balance.slip[after] - slip)
+    none = ~usable.any(axis=1)
+    cause: Cause = "traction"
+    if best[0] == last:
+        cause = "slip"
+    elif more[0]:
+        cause = "torque" if by_torque[0] <= by_angle[0] else "sinkage"
+    return Largest(np.where(none, np.nan, pull), np.where(none, np.nan, slip), cause)
+
+
+def _share(here: Array, there: Array, limit: Array) -> Array:
+    """Share of the way from here to there (D, A) at which the first limit (A,) is met, 1 if none is: (D,)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.where(there > limit, (limit - here) / (there - here), 1.0)
+    return np.asarray(share.min(axis=1))
+
+
+class Place(NamedTuple):
+    """A place between the slips of a balance for each soil (D,): the point before it and the share beyond.
+
+    share is nan where there is none.
+    """
+
+    before: NDArray[np.intp]
+    share: Array
+
+    def on(self, values: Array) -> Array:
+        """Values (D, ..., F) at the place: (D, ...)."""
+        row = np.arange(len(values))
+        here, there = values[row, ..., self.before], values[row, ..., self.before + 1]
+        share = self.share.reshape(-1, *(1,) * (here.ndim - 1))
+        return np.asarray(here + share * (there - here))
+
+
+def place_of_pull(balance: Balance, pull: float) -> Place:
+    """Where each soil gives this pull [N]: at the least slip if less would do, nowhere if no slip gives it."""
+    enough = balance.known & (balance.pull >= pull)
+    first = enough.argmax(axis=1)
+    before = np.maximum(first - 1, 0)
+    row = np.arange(len(first))
+    low, high = balance.pull[row, before], balance.pull[row, before + 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.clip((pull - low) / (high - low), 0.0, 1.0)
+    share = np.where(balance.known[row, before], share, 1.0)
+    return Place(before, np.where(enough.any(axis=1), share, np.nan))
+
+
+def slips_of_most(values: Array, balance: Balance, limits: Limits, top: Array) -> Array:
+    """Slips (Q, D) at which values (Q, D, F) are largest within the limits; nan where none is above zero.
+
+    top (D,) is the slip at which the limits end.
+    """
+    slip, last = balance.slip, len(balance.slip) - 1
+    usable = within(balance, limits) & (values > 0.0)
+    best = np.where(usable, values, -np.inf).argmax(axis=-1)[..., None]
+    after = np.minimum(best + 1, last)
+    i = np.clip(best, 1, last - 1) + np.arange(-1, 2)
+    x0, x1, x2 = np.moveaxis(slip[i], -1, 0)
+    y0, y1, y2 = np.moveaxis(np.take_along_axis(values, i, -1), -1, 0)
+    rise, fall = (y1 - y0) / (x1 - x0), (y2 - y1) / (x2 - x1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        vertex = 0.5 * (x0 + x1) + 0.5 * (x2 - x0) * rise / (rise - fall)
+    inside = np.take_along_axis(usable, i, -1).all(axis=-1) & (best[..., 0] == i[..., 1])
+    low, high = slip[best[..., 0]], slip[after[..., 0]]
+    at_end = np.where(np.take_along_axis(usable, after, -1)[..., 0], low, np.clip(top, low, high))
+    return np.where(usable.any(axis=-1), np.where(inside, vertex, at_end), np.nan)
+
+
+def axle_sum(values: Array, axles: Axles, kinds: NDArray[np.bool_]) -> Array:
+    """Sum over the wheels of some kinds (A,), (D, A, F) to (D, F)."""
+    return np.asarray((values * axles.count)[:, kinds].sum(axis=1))

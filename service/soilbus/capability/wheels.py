@@ -1,0 +1,230 @@
+"""The wheels over slip on many soils at once, on the level: forces, and how they change with load and slip.
+
+All wheels turn at the same slip.  Loads follow the pull (load transfer) and entry angles
+follow the loads; both are solved together by Newton.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.estimation.window import Rig
+from soilbus.terra.effects.steady import CompletedModel
+from soilbus.terra.stress import lumped_modulus
+from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads
+from soilbus.terra.wheel import (
+    MAX_ENTRY_ANGLE,
+    WheelModel,
+    WheelState,
+    entry_angle_for_load,
+)
+
+Array = NDArray[np.float64]
+
+TOLERANCE = 1e-3
+"""Newton step of pull and load, over the weight, that is the last: it leaves some 1e-6 of the weight."""
+RIDGE = 1e-6
+"""Share of the soils' spread below which a direction tells nothing of how pull and angles change."""
+LEAST = 1e-12
+MAX_ITERATIONS = 12
+TEST_LOAD = 0.9
+
+
+@dataclass(frozen=True, slots=True)
+class Axles:
+    """Wheels alike in axle, radius and width count as one of A kinds.
+
+    radius, width [m], front and count have shape
+    (A, 1).  A wheel's load is level cos + tilt sin of the slope + lever times the draft, (A, 1)
+    each; of_wheel (W,) is each wheel's kind.
+    """
+
+    chassis: Chassis
+    radius: Array
+    width: Array
+    front: NDArray[np.bool_]
+    count: Array
+    level: Array
+    tilt: Array
+    lever: Array
+    of_wheel: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, rig: Rig) -> Axles:
+        """The kinds of a rig's wheels; ValueError for a rig without a chassis."""
+        if rig.chassis is None:
+            raise ValueError("a capability needs the vehicle's mass and geometry")
+        kinds = list(zip(rig.radius.tolist(), rig.width.tolist(), rig.front.tolist(), strict=True))
+        unlike = list(dict.fromkeys(kinds))
+        radius, width, front = (np.array(column)[:, None] for column in zip(*unlike, strict=True))
+        count = np.array([[float(kinds.count(kind))] for kind in unlike])
+        share = 1.0 / np.where(front, rig.front.sum(), (~rig.front).sum())
+        cases = ((0.0, 0.0), (0.0, math.pi / 2.0), (1.0, 0.0))
+        level, tilt, drawn = (
+            share * np.where(front, *axle_loads(rig.chassis, draft, slope, 0.0)) for draft, slope in cases
+        )
+        of_wheel = np.array([unlike.index(kind) for kind in kinds])
+        return cls(rig.chassis, radius, width, front, count, level, tilt, drawn - level, of_wheel)
+
+    @property
+    def weight(self) -> float:
+        """Of the vehicle [N]."""
+        return self.chassis.mass * GRAVITY
+
+    def loads(self, draft: Any, sine: Any) -> Array:
+        """Load on each wheel [N] (..., A, S) for a draft [N] and a slope's sine, each (..., S)."""
+        draft, sine = (np.atleast_1d(a)[..., None, :] for a in (draft, np.clip(sine, -0.99, 0.99)))
+        return np.asarray(self.level * np.sqrt(1.0 - sine**2) + self.tilt * sine + self.lever * draft)
+
+
+@dataclass(frozen=True, slots=True)
+class WheelTable:
+    """D soils (D, 6), A kinds of wheels, S slips: wheels at the loads of the steady level pull.
+
+    pull [N] (D, S) is the whole vehicle's; load [N] (D, A, S); at (3, D, A, S) are drawbar pull [N],
+    torque [N m] and entry angle [rad] of one wheel, by_load and by_slip their derivatives
+    by its load at constant slip and by slip at constant load; bend (3, 1, A, S) is half the second
+    derivative by load, that of the first soil for all.  balanced (D, S) tells where a
+    steady state was found; elsewhere pull is nan.
+    """
+
+    axles: Axles
+    soils: Array
+    slip: Array
+    pull: Array
+    load: Array
+    at: Array
+    by_load: Array
+    by_slip: Array
+    bend: Array
+    balanced: NDArray[np.bool_]
+
+    def pull_at(self, load: Array) -> Array:
+        """Pull of the vehicle [N] (D, S) with its wheels at other loads (D, A, S)."""
+        change = load - self.load
+        drawbar = self.at[0] + change * (self.by_load[0] + self.bend[0] * change)
+        return np.asarray((self.axles.count * drawbar).sum(axis=1))
+
+    def at_load(self, load: Array) -> Array:
+        """Drawbar pull, torque and entry angle (3, D, A, S) at other loads (D, A, S)."""
+        change = load - self.load
+        return self.at + change * (self.by_load + self.bend * change)
+
+
+def wheel_table(
+    soils: Array,
+    rig: Rig,
+    model: WheelModel | CompletedModel,
+    slip: Array,
+    start: WheelTable | None = None,
+    tolerance: float = TOLERANCE,
+) -> WheelTable:
+    """Wheels on soils (D, 6) at slips (S,); `start` is the table of similar soils.
+
+    tolerance: the Newton step of pull and load, over the weight, that is the last.
+
+    Raises ValueError for a rig without a chassis.
+    """
+    axles, completed = Axles.of(rig), CompletedModel.over(model)
+    n_soils, n_slips = len(soils), len(slip)
+    warm = start is not None and start.pull.shape == (n_soils, n_slips) and np.array_equal(start.slip, slip)
+    if warm and start is not None:
+        pull, angle = _foreseen(start, soils)
+        pull = np.where(start.balanced, pull, 0.0)
+        angle = np.where(start.balanced[:, None], angle, np.nan).clip(max=MAX_ENTRY_ANGLE)
+    else:
+        pull, angle = np.zeros((n_soils, n_slips)), np.full((n_soils, len(axles.count), n_slips), np.nan)
+    load = np.broadcast_to(axles.loads(pull, 0.0), angle.shape).copy()
+    unknown = np.isnan(angle).any(axis=(1, 2))
+    if unknown.any():
+        guess = _state(soils[unknown], axles, slip, angle[unknown])
+        angle[unknown] = entry_angle_for_load(load[unknown], guess, completed.model, tolerance=1e-2)
+    last_step = tolerance * axles.weight
+    with np.errstate(all="ignore"):
+        now = _newton_step(soils, axles, completed, slip, pull, load, angle)
+        for _ in range(MAX_ITERATIONS - 1):
+            rows = np.flatnonzero((now.miss > last_step).any(axis=1))
+            if not len(rows):
+                break
+            angle[rows] = np.clip(now.at[2, rows], 0.5 * angle[rows], 2.0 * angle[rows]).clip(max=MAX_ENTRY_ANGLE)
+            of_rows = soils[rows], axles, completed, slip, now.pull[rows], now.load[rows], angle[rows]
+            for whole, part in zip(now, _newton_step(*of_rows), strict=True):
+                whole[(slice(None),) * (part.ndim == 4) + (rows,)] = part
+    pull, load, at, by_load, by_slip, miss = now
+    balanced = np.isfinite(at[2]).all(axis=1) & (load > 0.0).all(axis=1) & (miss <= last_step)
+    bend = _bend(soils[:1], axles, completed, slip, load[:1], at[:, :1], by_load[:, :1])
+    return WheelTable(axles, soils, slip, np.where(balanced, pull, np.nan), load, at, by_load, by_slip, bend, balanced)
+
+
+def _foreseen(start: WheelTable, soils: Array) -> tuple[Array, Array]:
+    """Pull (D, S) and entry angle (D, A, S) on other soils, as those of a table change from its first soil to the rest."""
+    n_soils, n_slips = start.pull.shape
+    logs, other = (np.log(np.maximum(each, LEAST)) for each in (start.soils, soils))
+    with np.errstate(all="ignore"):
+        values = np.concatenate([start.pull, np.log(start.at[2]).reshape(n_soils, -1)], axis=1)
+    apart, change = logs - logs[0], values - values[0]
+    spread = apart.T @ apart
+    ridge = RIDGE * np.trace(spread) + LEAST
+    slopes = np.linalg.solve(spread + ridge * np.eye(len(spread)), apart.T @ np.where(np.isfinite(change), change, 0.0))
+    values = values + (other - logs) @ slopes
+    return values[:, :n_slips], np.exp(values[:, n_slips:]).reshape(start.load.shape)
+
+
+class _Step(NamedTuple):
+    """Pull, load, at, by_load and by_slip as in WheelTable after a step, and how far it went [N] (D, S)."""
+
+    pull: Array
+    load: Array
+    at: Array
+    by_load: Array
+    by_slip: Array
+    miss: Array
+
+
+def _newton_step(
+    soils: Array, axles: Axles, model: CompletedModel, slip: Array, pull: Array, load: Array, angle: Array
+) -> _Step:
+    """One step towards wheels that carry their loads and a level pull that balances itself."""
+    forces, d = model.forces_and_slopes(_state(soils, axles, slip, angle), ~axles.front, load)
+    by_carried = np.stack([d.by_angle[1], d.by_angle[2], np.ones_like(d.by_angle[0])]) / d.by_angle[0]
+    by_load = by_carried * (1.0 - d.by_load[0])
+    by_load[:2] += d.by_load[1:]
+    off = load - forces[0]
+    gain = (axles.count * axles.lever * by_load[0]).sum(axis=1) - 1.0
+    change = -((axles.count * (forces[1] + by_carried[0] * off)).sum(axis=1) - pull) / gain
+    shift = axles.lever * change[:, None]
+    step = off + shift
+    by_slip = -by_carried * d.by_slip[0]
+    by_slip[:2] += d.by_slip[1:]
+    at = by_carried * off + by_load * shift
+    at[:2] += forces[1:]
+    at[2] += angle
+    miss = np.maximum(np.abs(change), np.abs(step).max(axis=1))
+    return _Step(pull + change, load + shift, at, by_load, by_slip, miss)
+
+
+def _bend(
+    soil: Array, axles: Axles, model: CompletedModel, slip: Array, load: Array, at: Array, by_load: Array
+) -> Array:
+    """Half the second derivative by load, from the wheels under TEST_LOAD times their load."""
+    change = (TEST_LOAD - 1.0) * load
+    linear = at + change * by_load
+    with np.errstate(all="ignore"):
+        forces = model.forces(
+            _state(soil, axles, slip, np.clip(linear[2], 0.0, MAX_ENTRY_ANGLE)), ~axles.front, load + change
+        )
+        exact = np.stack([forces[1], forces[2], linear[2]]) + by_load * (load + change - forces[0])
+        return np.asarray((exact - linear) / change**2)
+
+
+def _state(soils: Array, axles: Axles, slip: Array, angle: Array) -> WheelState:
+    """Every soil under every kind of wheel at every slip, each field of the whole shape."""
+    k_c, k_phi, n, phi, c, K = (column[:, None, None] for column in soils.T)
+    modulus = lumped_modulus(k_c, k_phi, axles.width)
+    fields = np.broadcast_arrays(angle, slip, axles.radius, axles.width, modulus, n, np.tan(phi), c, K)
+    return WheelState(*fields)

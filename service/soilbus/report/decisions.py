@@ -1,0 +1,72 @@
+"""Figures of the decision beside their targets, a section for each question."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+from soilbus.report.table import table
+from soilbus.simulator.bogging_trials import ENOUGH_TIME, ENOUGH_WAY, WarningFigures
+from soilbus.simulator.draft_trials import SPREAD, DraftFigures
+
+MAX_ERROR = 0.05
+COVERAGE = (0.90, 0.98)
+
+
+def decisions_report(drafts: Sequence[DraftFigures], warnings: WarningFigures) -> str:
+    """All sections."""
+    return "\n".join([*_draft_section(drafts), "", *_warning_section(warnings)]) + "\n"
+
+
+def _warning_section(found: WarningFigures) -> Iterator[str]:
+    yield f"Warning of immobilisation at least {ENOUGH_TIME:g} s or {ENOUGH_WAY:g} m before slip passes its limit"
+    yield ""
+    row = (
+        str(found.boggings), f"{found.warned}", f"{found.lead:.1f} s", f"{found.least:.1f} s",
+        f"{found.hours:.2f}", str(found.false),
+    )  # fmt: skip
+    yield table(("boggings", "in time", "median lead", "least", "hours on firm ground", "false"), [row])
+    yield "Targets: all in time; at most one false warning an hour."
+
+
+def _draft_section(drafts: Sequence[DraftFigures]) -> Iterator[str]:
+    low, high = (100.0 * share for share in COVERAGE)
+    yield "Largest draft on the level, foretold from one window of a soil that nothing was tuned on"
+    yield ""
+    head = ("soil", "drives", "failed", "true", "|error|", "bias", "in 95 %")
+    yield table(head, [_draft_row(of_soil) for of_soil in drafts])
+    yield f"Medians; targets: error at most {100.0 * MAX_ERROR:.0f} %, {low:.0f} to {high:.0f} % of 95 % intervals hold"
+    yield f"the truth.  Each drive's soil leaves the named one by {100.0 * SPREAD:.0f} % in every parameter."
+
+
+def _draft_row(of_soil: DraftFigures) -> tuple[str, ...]:
+    return (
+        of_soil.soil,
+        str(of_soil.drives),
+        str(of_soil.failed),
+        f"{of_soil.true:.0f} N",
+        f"{100.0 * of_soil.error:.2f} %",
+        f"{100.0 * of_soil.bias:+.2f} %",
+        f"{100.0 * of_soil.coverage:.1f}",
+    )
+
+
+def as_json(drafts: Sequence[DraftFigures], warnings: WarningFigures) -> dict[str, object]:
+    """The figures as plain objects; null for what is not a number."""
+
+    def number(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    return {
+        "max_draft": [
+            {
+                "soil": d.soil, "drives": d.drives, "failed": d.failed, "error": number(d.error),
+                "bias": number(d.bias), "coverage": number(d.coverage), "true": number(d.true),
+            }
+            for d in drafts
+        ],
+        "immobilisation": {
+            "boggings": warnings.boggings, "in_time": warnings.warned, "lead": number(warnings.lead),
+            "least_lead": number(warnings.least), "hours": warnings.hours, "false": warnings.false,
+        },
+    }  # fmt: skip

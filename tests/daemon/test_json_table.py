@@ -1,0 +1,21 @@
+"""The README's table of JSON keys is the table of the keys that a line has."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+from soilbus.daemon.estimator import WindowResult
+from soilbus.daemon.outputs import json_line
+from soilbus.simulator.reference import reference_configuration
+from soilbus.traversability import Status, Traversability
+
+README = Path(__file__).resolve().parents[2] / "README.md"
+NOTHING = WindowResult(1.0, 0, Status.INVALID, "no_convergence", None, None, {}, {}, Traversability(), None, 0, {})
+
+
+def test_the_readme_names_every_key_of_a_line():
+    table = re.search(r"^\| key \| meaning \|\n.*\n((?:\|.*\n)+)", README.read_text(encoding="utf-8"), re.M)[1]
+    named = [key for row in table.splitlines() for key in re.findall(r"`(\w+)`", row.split("|")[1])]
+    assert sorted(named) == sorted(json.loads(json_line(NOTHING, reference_configuration())))

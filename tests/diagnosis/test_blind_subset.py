@@ -1,0 +1,50 @@
+"""A few cases of the blind test (`python -m tests.diagnosis.blind` runs them all)."""
+
+from __future__ import annotations
+
+import pytest
+
+from .blind.cases import cases
+from .blind.table import in_set
+from .blind.trial import tried
+
+VISIBLE = (
+    "single/multipass:density/medium/", "single/rate_stiffening:penetration/medium/", "single/soil_drift:ramp/medium/",
+    "single/torque_lag:filter/medium/", "single/inertia:flywheel/medium/", "single/hardpan:graded/large/",
+    "single/rolling_radius:one_axle/medium/",
+)  # fmt: skip
+
+
+def the_case(start):
+    return next(case for case in cases(start.partition("/")[0], 1) if case.id.startswith(start))
+
+
+@pytest.mark.parametrize("start", VISIBLE)
+def test_a_hidden_effect_is_named_whatever_its_formula(start):
+    case = the_case(start)
+    trial = tried(case)
+    assert trial.verdict == "named"
+    assert trial.named == case.hidden
+    assert trial.gap_after < 1.1
+    assert abs(trial.bearing_after) < 0.15
+
+
+def test_effects_alike_are_told_as_a_set():
+    case = the_case("single/slip_sinkage:factor/medium/")
+    trial = tried(case)
+    assert trial.verdict == "ambiguous"
+    assert in_set(trial) == {"slip_sinkage", "stress_peak_shift"}
+    assert sum(trial.sets[0].values()) == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("kind", ["plain", "hard"])
+def test_where_nothing_is_missing_nothing_is_named(kind):
+    for _, case in zip(range(3), cases(kind, 1), strict=False):
+        trial = tried(case)
+        assert (trial.verdict, trial.named) == ("none", ()), case.id
+
+
+def test_what_the_catalogue_lacks_is_unknown():
+    trial = tried(the_case("outside/torque_ripple/large/"))
+    assert trial.verdict == "unknown"
+    assert trial.named == ()

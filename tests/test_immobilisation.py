@@ -1,0 +1,170 @@
+"""The watch for immobilisation: made-up ground whose end is known, whatever frames bring, and simulated drives."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from soilbus.capability.assessment import OverSlip
+from soilbus.capability.immobilisation import AHEAD, CALM, LONGEST_GAP, SETTLED, Alert, Watch, watched
+from soilbus.simulator import bogging_trials
+from soilbus.simulator.bogging_trials import Task, WarningTrial, figures, trial
+from soilbus.simulator.reference import reference_configuration
+
+CONFIG = reference_configuration()
+SLIP = np.linspace(0.02, 0.6, 9)
+MOST = 6000.0
+
+
+def pull_at(slip):
+    """Pull over slip of the made-up ground before anything happens to it [N]."""
+    return MOST * (1.0 - np.exp(-slip / 0.15)) / (1.0 - np.exp(-0.6 / 0.15))
+
+
+NONE = np.zeros(9)
+CURVE = OverSlip(SLIP, pull_at(SLIP), NONE, NONE, NONE)
+
+
+def slip_at(pull):
+    """The slip that gives a pull; 0.7 where none does."""
+    fine = np.linspace(0.0, 0.6, 2000)
+    return float(np.interp(pull, np.interp(fine, SLIP, pull_at(SLIP)), fine, left=0.0, right=0.7))
+
+
+def drive(demand, lost=lambda t: 0.0, until=60.0, step=0.1):
+    """(t, watch) of a drive whose demand and lost pull [N] are functions of time; it ends where slip passes."""
+    state, out = Watch(), []
+    for t in np.arange(0.0, until, step):
+        slip = slip_at(demand(t) + lost(t))
+        state = watched(state, t, [slip] * 4, demand(t), CURVE)
+        out.append((t, state))
+        if slip > 0.6:
+            break
+    return out
+
+
+def first_warning(out):
+    return next((t for t, state in out if state.warning is Alert.IMMOBILISATION), math.inf)
+
+
+@pytest.mark.parametrize("rate", [50.0, 150.0, 300.0])
+def test_ground_that_weakens_steadily_is_foreseen_to_the_second(rate):
+    out = drive(lambda t: 3000.0, lambda t: rate * t)
+    end = (MOST - 3000.0) / rate
+    assert out[-1][0] == pytest.approx(end, abs=0.3)
+    assert first_warning(out) == pytest.approx(max(end - AHEAD, SETTLED), abs=0.5)
+    for t, state in out:
+        if t > SETTLED and t < end - 0.2:
+            assert state.time_left == pytest.approx(end - t, rel=0.1, abs=0.3)
+
+
+@pytest.mark.parametrize("rate", [100.0, 200.0])
+def test_a_draft_that_outgrows_the_ground_is_foreseen(rate):
+    out = drive(lambda t: 2500.0 + rate * t)
+    end = (MOST - 2500.0) / rate
+    assert 3.0 < end - first_warning(out) < AHEAD + 1.0
+
+
+def test_an_easy_draft_that_comes_and_goes_is_no_cause():
+    out = drive(lambda t: 2600.0 + 1200.0 * math.sin(0.6 * t), until=300.0)
+    assert {state.warning for t, state in out if t > SETTLED + 0.1} == {Alert.NONE}
+
+
+def test_on_weakening_ground_the_next_peak_of_the_draft_counts():
+    def draft(t):
+        return 2800.0 + 700.0 * math.sin(0.6 * t)
+
+    out = drive(draft, lambda t: 60.0 * t)
+    assert out[-1][0] - first_warning(out) >= 3.0
+
+
+def test_slip_beyond_the_greatest_warns_whatever_the_trend_says():
+    state = Watch()
+    for t in np.arange(0.0, 4.0, 0.1):
+        state = watched(state, t, [0.65], 1000.0, CURVE)
+    assert (state.warning, state.time_left) == (Alert.IMMOBILISATION, 0.0)
+
+
+def test_nothing_is_said_before_a_trend_has_settled_or_without_inputs():
+    settled = drive(lambda t: 2000.0, until=10.0)
+    assert all(state.warning is Alert.UNKNOWN for t, state in settled if t < SETTLED - 0.01)
+    t, state = settled[-1]
+    assert state.warning is Alert.NONE
+    for slips, pull, curve in (([None, None], 1.0, CURVE), ([0.1], None, CURVE), ([0.1], 1.0, None), ([], 1.0, CURVE)):
+        assert watched(state, t + 0.1, slips, pull, curve) == state  # a gap may be short
+        later = watched(state, t + LONGEST_GAP + 0.1, slips, pull, curve)
+        assert later == Watch(peaks=state.peaks)
+        assert later.warning is Alert.UNKNOWN
+    assert watched(state, t - 5.0, [0.1], 2000.0, CURVE).warning is Alert.UNKNOWN
+    assert watched(state, t + 5.0, [0.1], 2000.0, CURVE).warning is Alert.UNKNOWN
+
+
+def test_a_draft_that_was_held_before_is_no_cause_after_a_break():
+    held = drive(lambda t: min(2500.0 + 100.0 * t, 5000.0), until=60.0)
+    t, state = held[-1]
+    for now in np.arange(t + 20.0, t + 40.0, 0.1):  # the implement is lowered anew, fast
+        draft = min(500.0 + 600.0 * (now - t - 20.0), 4950.0)
+        state = watched(state, now, [slip_at(draft)], draft, CURVE)
+        assert state.warning is not Alert.IMMOBILISATION
+
+
+def test_a_warning_stays_a_while():
+    out = drive(lambda t: 3000.0 if t < 9.0 else 500.0, lambda t: 250.0 * min(t, 9.0), until=30.0)
+    warned = [t for t, state in out if state.warning is Alert.IMMOBILISATION]
+    assert warned[0] < 9.0
+    causes = [t for t, state in out if state.time_left is not None and state.time_left < AHEAD]
+    assert max(warned) == pytest.approx(max(causes) + CALM, abs=0.11)
+
+
+MAYBE = st.none() | st.floats(allow_nan=True, allow_infinity=True)
+
+
+@settings(derandomize=True, deadline=None, max_examples=150)
+@given(
+    st.lists(
+        st.tuples(st.floats(-2.0, 3.0), st.lists(MAYBE, max_size=4), MAYBE, st.booleans()), min_size=1, max_size=40
+    )
+)
+def test_whatever_comes_there_is_an_answer_and_silence_is_never_all_clear(moments):
+    state, t, seen = Watch(), 0.0, -math.inf
+    for step, slips, pull, known in moments:
+        t += step
+        usable = known and pull is not None and math.isfinite(pull)
+        usable = usable and any(s is not None and math.isfinite(s) for s in slips)
+        with np.errstate(all="ignore"):
+            state = watched(state, t, slips, pull, CURVE if known else None)
+        seen = t if usable else seen
+        if not 0.0 <= t - seen <= LONGEST_GAP:
+            assert state.warning is Alert.UNKNOWN
+        assert state.time_left is None or state.time_left >= 0.0
+
+
+# --- simulated drives ---
+
+
+@pytest.mark.parametrize("seed", [11, 6], ids=["draft", "soil"])
+def test_a_simulated_bogging_is_foreseen(seed):
+    found = trial(Task(CONFIG, True, seed))
+    assert found.lead >= 3.0
+    assert found.way >= 3.0
+
+
+def test_firm_ground_is_left_in_peace(monkeypatch):
+    monkeypatch.setattr(bogging_trials, "FIRM_DRIVE", 60.0)
+    found = trial(Task(CONFIG, False, 1))
+    assert found.seconds == pytest.approx(50.0, abs=0.2)
+    assert found.warnings == 0
+    assert math.isnan(found.lead)
+
+
+def test_figures_of_trials_that_have_them():
+    early, late, short = (WarningTrial(True, 30.0, 1, *lead) for lead in ((6.0, 9.0), (2.0, 2.5), (2.5, 3.5)))
+    never = WarningTrial(True, 50.0, 1, math.nan, math.nan)
+    firm = [WarningTrial(False, 1800.0, n, math.nan, math.nan) for n in (0, 1)]
+    found = figures([early, late, short, never, *firm])
+    assert (found.boggings, found.warned, found.hours, found.false) == (3, 2, 1.0, 1)
+    assert (found.lead, found.least) == (2.5, 2.0)
