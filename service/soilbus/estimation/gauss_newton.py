@@ -111,7 +111,7 @@ class Fit:
 
     @property
     def whole(self) -> Belief:
-        """Soil and gains to be reported and passed on: more than the top of the posterior, where more is known."""
+        """Soil and gains to be reported and passed on: the average where there is one, else both optima, or belief."""
         if self.averaged is not None:
             return self.averaged
         return self.belief if self.rival is None else self.belief.mixed(self.rival.belief, self.rival.share)
