@@ -113,10 +113,10 @@ def starts(prior: SoilPrior, width: float, count: int, seed: int) -> Iterator[So
 
 
 def apart(fit: Fit, other: Fit) -> float:
-    """Largest deviation of a parameter of one fit from another's, in standard deviations of the other."""
-    std = np.sqrt(np.diag(other.posterior.log_covariance))
+    """Largest deviation of a parameter of one fit's mode from another's, in standard deviations of the other."""
+    std = np.sqrt(np.diag(other.mode.posterior.log_covariance))
     free = std > 0.0
-    off = np.log(np.asarray(fit.posterior.soil) / np.asarray(other.posterior.soil))
+    off = np.log(fit.mode.soil / other.mode.soil)
     return float(np.max(np.abs(off[free] / std[free]), initial=0.0))
 
 

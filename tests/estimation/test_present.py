@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import minima
 import numpy as np
 import pytest
 from drives import errors, tracker_of, windows
@@ -62,7 +65,7 @@ def test_the_filter_is_the_joint_solution_for_the_soils_of_all_pieces(drift, sim
     problem = case.problem()
     before = Belief.of(case.prior, problem.gain_std)
     fit = fit_window(problem, case.prior, before)
-    now = at_present(Fitting(problem, case.prior, before), fit, 10.0, drift).belief
+    now = at_present(Fitting(problem, case.prior, before), fit, 10.0, drift).mode  # of which the linear window tells
 
     # The same by one dense system: soil of piece 0, 1, ..., then gains.
     fitting = Fitting(problem, case.prior, before)
@@ -110,3 +113,36 @@ def test_what_does_not_drift_stays_as_it_was(simulated):
     still = at_present(fitting, fit, 10.0, 1e-5).belief
     np.testing.assert_allclose(np.log(still.soil / fit.belief.soil), 0.0, atol=2e-3)
     np.testing.assert_allclose(np.diag(still.covariance), np.diag(fit.belief.covariance), rtol=0.02)
+
+
+@pytest.mark.parametrize(("overrides", "wheels"), [((), 4), ((), 2), (("soil.k_c.std=0",), 4)])
+def test_all_that_a_fit_says_moves_as_its_mode_does_and_is_less_sure(overrides, wheels):
+    config = reference_configuration(overrides)
+    config = config if wheels == 4 else minima.two_wheels(config)
+    problem, prior = minima.window(config, "wet_clay", seed=3), minima.prior_of(config)
+    before = Belief.of(prior, problem.gain_std)
+    fit = fit_window(problem, prior, before)
+    fit = replace(fit, averaged=fit.mode.mixed(fit.mode, 0.5))
+    fitting = Fitting(problem, prior, before)
+    now = at_present(fitting, fit, 10.0, 0.03)
+    assert (fit.rival is None) == (wheels == 4)
+    assert (fit.belief is fit.mode) == (now.belief is now.mode) == (bool(overrides) or wheels == 2)
+
+    def step(old, new):
+        at = fitting.coordinates.position
+        return np.concatenate([at(new.soil) - at(old.soil), new.gains - old.gains])
+
+    pairs = [(fit.belief, now.belief), (fit.averaged, now.averaged)]
+    if fit.rival is not None:
+        pairs.append((fit.rival.belief, now.rival.belief))
+        assert now.rival.share == fit.rival.share
+    moved = step(fit.mode, now.mode)
+    assert np.abs(moved).max() > 0.01
+    free = np.concatenate([prior.free, 6 + fitting.active])
+    for old, new in pairs:
+        assert step(old, new) == pytest.approx(moved, abs=2e-3)
+        std = np.sqrt(np.diag(new.covariance)[free])
+        added = (new.covariance - old.covariance)[np.ix_(free, free)] / np.outer(std, std)
+        assert old is fit.mode or np.linalg.eigvalsh(added).min() > -1e-9  # the mode's is taken at another soil
+        assert np.diag(added)[: len(prior.free)].min() > 0.0
+    assert (now.cost, now.evidence, now.chi2) == (fit.cost, fit.evidence, fit.chi2)

@@ -70,7 +70,7 @@ SAME_END = 0.02
 
 
 class Rival(NamedTuple):
-    """Another optimum than a fit's, and its share of the probability of both (Laplace)."""
+    """Another optimum than a fit's, by mode and curvature, and its share of the probability of both (Laplace)."""
 
     belief: Belief
     share: float
@@ -83,12 +83,13 @@ class Fit:
     cost is -2 log posterior up to a constant: chi-square of the residuals and of what was
     known before; evidence is -2 log of the data's likelihood, up to the same.  chi2 is
     cost per residual (reduced: each parameter has its prior as one more residual).
-    belief holds soil and gains (relative errors, by problem.gain_names) by their means, for
-    the windows to come; mode is where they are most probable, with the curvature there.
+    mode is where soil and gains (relative errors, by problem.gain_names) are most probable,
+    with the curvature there; belief holds them by their moments along k_c's share (see
+    `moments`), or as the mode does where that does not apply: short of convergence, or with a rival.
     sinkage (W,) is the mean over the window [m], nan where unknown; optimum is for resume();
     rival is another optimum that the data leave about as likely, where one was looked for
     and found; averaged is the mean of the whole posterior, where that was worked out (see
-    `marginal`).
+    `marginal`).  All are of a constant soil until `present` moves them to the window's end.
     """
 
     belief: Belief
@@ -110,7 +111,7 @@ class Fit:
 
     @property
     def whole(self) -> Belief:
-        """Soil and gains to be reported and passed on: more than the top of the posterior, where more is known."""
+        """Soil and gains to be reported and passed on: the average where there is one, else both optima, or belief."""
         if self.averaged is not None:
             return self.averaged
         return self.belief if self.rival is None else self.belief.mixed(self.rival.belief, self.rival.share)
@@ -150,7 +151,7 @@ def fit_window(problem: WindowProblem, prior: SoilPrior, before: Belief | None =
         if best is None or best.chi2 > PLAUSIBLE:
             return best
         if not best.converged:
-            near = _approach(Fitting(problem, prior, before, with_gains=False), best.belief.soil, MAX_ITERATIONS, 0.0)
+            near = _approach(Fitting(problem, prior, before, with_gains=False), best.mode.soil, MAX_ITERATIONS, 0.0)
             best = best if near is None else _settle(fitting, near, MAX_ITERATIONS) or best
         return _with_rival(fitting, thin, best) if best.converged else best
 
@@ -172,23 +173,24 @@ def _with_rival(fitting: Fitting, thin: Fitting, found: Fit) -> Fit:
     """The more likely of an optimum and the one across from it, with the other as its rival.
 
     What was found stays alone where there is no other, or none that is nearly as likely
-    and that its standard deviations exclude.
+    and that its standard deviations exclude.  Optima are compared, and mixed, as each is
+    about its mode: moments along k_c's share would count the other one already.
     """
-    ill_told = math.sqrt(found.posterior.log_covariance[_K_C, _K_C]) > ILL_TOLD
+    ill_told = math.sqrt(found.mode.covariance[_K_C, _K_C]) > ILL_TOLD
     start = (
-        fitting.coordinates.across(found.belief.soil) if ill_told and np.ptp(fitting.problem.rig.width) > 0.0 else None
+        fitting.coordinates.across(found.mode.soil) if ill_told and np.ptp(fitting.problem.rig.width) > 0.0 else None
     )
     end = None if start is None else _approach(thin, start, MAX_APPROACH)
-    if end is None or not _elsewhere(thin, found.belief.soil, end):
+    if end is None or not _elsewhere(thin, found.mode.soil, end):
         return found
     other = _settle(fitting, fitting.start(end.soil), MAX_ITERATIONS)
     if other is None or not other.converged:
         return found
     better, worse = (found, other) if found.evidence <= other.evidence else (other, found)
     share = 1.0 / (1.0 + math.exp(min(0.5 * (worse.evidence - better.evidence), 50.0)))
-    if better.posterior.distance(worse.posterior.soil) < APART:
+    if share < RARE or better.mode.posterior.distance(worse.mode.posterior.soil) < APART:
         return better
-    return better if share < RARE else replace(better, rival=Rival(worse.belief, share))
+    return replace(better, belief=better.mode, rival=Rival(worse.mode, share))
 
 
 def _elsewhere(thin: Fitting, soil: Array, end: Place) -> bool:
@@ -369,11 +371,11 @@ def _settle(fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OV
     if best is None:
         return None
     last, point = best
-    beliefs = fitting.beliefs(near, point)
+    beliefs = fitting.beliefs(near, point, last.soil)
     if beliefs is None:
         return None
     return Fit(
-        belief=beliefs[0],
+        belief=beliefs[0] if converged else beliefs[1],
         mode=beliefs[1],
         sinkage=fitting.problem.mean_sinkage(near.as_soil(), near.gains, near.latents),
         optimum=Optimum(fitting.problem.t, last.soil, last.gains, last.latents, point.at),

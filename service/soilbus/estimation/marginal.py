@@ -51,14 +51,15 @@ def with_whole(problem: WindowProblem, prior: SoilPrior, before: Belief, found: 
     """The fit with mean and covariance of the whole posterior, where its top may not tell them.
 
     That is where k_c, k_phi and n are free and the tyres unlike, and n is badly known or
-    there is a rival.
+    there is a rival.  What is averaged is each held fit's belief, so its moments along k_c's
+    share count; the present soil (`present`) comes after.
     """
-    spread = math.sqrt(found.belief.covariance[_N, _N])
+    spread = math.sqrt(found.mode.covariance[_N, _N])
     ridge = prior.log_std[[_K_C, _K_PHI, _N]].all() and np.ptp(problem.rig.width) > 0.0
     if not ridge or (spread < WELL_KNOWN and found.rival is None):
         return found
     with np.errstate(all="ignore"):
-        top = _held(problem, prior, before, found, math.log(found.belief.soil[_N]))
+        top = _held(problem, prior, before, found, math.log(found.mode.soil[_N]))
         if top is None:
             return found
         step = min(spread, LONGEST)

@@ -38,8 +38,14 @@ def moments_along_share(quadratic: Array, gradient: Array, share: float) -> Mome
     z' quadratic z + 2 gradient' z, up to a constant, for z (P + 2,) of the changes of s (over
     s), log s and log (1 - s), and o.
     """
+    told = np.diag(quadratic)[3:]
+    if not np.all(told > 0.0):
+        return None
+    scale = 1.0 / np.sqrt(told)
+    scaled = quadratic[3:, 3:] * np.outer(scale, scale)
     try:
-        inverse = np.linalg.inv(quadratic[3:, 3:])
+        np.linalg.cholesky(scaled)  # rounding may have left it without
+        inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
     except np.linalg.LinAlgError:
         return None
     along = -inverse @ quadratic[3:, :3]
@@ -68,10 +74,10 @@ def _over_share(own: Array, slope: Array, share: float) -> tuple[Array, Array]:
     left = 1.0 - share * np.exp(d)
     changes = np.stack([np.expm1(d), d, np.log(left / (1.0 - share))])
     slopes = np.stack([np.exp(d), np.ones(NODES), 1.0 - 1.0 / left])
-    cost = np.einsum("in,ij,jn->n", changes, own, changes) + 2.0 * slope @ changes
+    cost = (changes * (own @ changes)).sum(0) + 2.0 * slope @ changes
     density = np.cosh(at) * (scale * np.sinh(at) <= d) * np.exp(-0.5 * (cost - cost.min()))
     of_prior = density / left
     mean = changes @ of_prior / of_prior.sum()
-    density *= np.sqrt(np.einsum("in,ij,jn->n", slopes, own, slopes))
+    density *= np.sqrt((slopes * (own @ slopes)).sum(0))
     off = changes - mean[:, None]
     return mean, (off * density / density.sum()) @ off.T

@@ -184,18 +184,21 @@ class Fitting:
         """The same place with the entry angles solved anew: linear models in a row may have lost them."""
         return replace(place, latents=self.problem.carried(place.latents, place.as_soil()))
 
-    def beliefs(self, place: Place, point: Point) -> tuple[Belief, Belief] | None:
-        """What this optimum tells, by its moments and by its curvature; None where the information is singular."""
+    def beliefs(self, place: Place, point: Point, at: Array) -> tuple[Belief, Belief] | None:
+        """What this optimum tells, by its moments and by its curvature; None where the information is singular.
+
+        The point is of a soil (6,) one step away, `at`.  Without moments that are finite both are the curvature's.
+        """
         inverse = solved(point.information, point.gradient)
         if inverse is None:
             return None
         covariance = inverse[1]
-        mode = self._belief(place.soil, place.gains, covariance)
+        mode = self._belief(place.soil, place.gains, covariance, at)
         if not self._with_share or covariance[_K_PHI, _K_PHI] > WELL_TOLD**2:
             return mode, mode
         moments = self._moments(place, point)
         if moments is None:
-            return None
+            return mode, mode
         free, gains = len(self.free), place.gains.copy()
         step = self._by_share(place.soil) @ moments.mean
         soil = self.coordinates.soil_at(self.coordinates.position(place.soil) + step[:free])
@@ -232,17 +235,24 @@ class Fitting:
         by_share[_K_C, : len(self.free)] += np.where(self.free == _N, -soil[_N] * np.log(TYPICAL_DEPTH), 0.0)
         return by_share
 
-    def _belief(self, soil: Array, gains: Array, covariance: Array) -> Belief:
-        """The belief with this covariance (F + A, F + A) of coordinates and active gains."""
+    def _belief(self, soil: Array, gains: Array, covariance: Array, at: Array | None = None) -> Belief:
+        """The belief with this covariance (F + A, F + A) of coordinates and active gains, there or at a soil nearby."""
         free = len(self.free)
         spread = np.zeros((_SOIL + len(gains), free + len(self.active)))
-        spread[:_SOIL, :free] = self._log_directions(soil)
+        spread[:_SOIL, :free] = self._log_directions(soil if at is None else at)
         spread[_SOIL + self.active, free + np.arange(len(self.active))] = 1.0
         return Belief(soil, gains, spread @ covariance @ spread.T)
 
     def believed(self, place: Place, covariance: Array) -> Belief:
         """A place with the covariance (F + A, F + A) of its coordinates and active gains."""
         return self._belief(place.soil, place.gains, covariance)
+
+    def changed(self, belief: Belief, step: Array, covariance: Array) -> Belief:
+        """A belief after a step (F + A,) that brings as much covariance (F + A, F + A) with it."""
+        free, gains = len(self.free), belief.gains.copy()
+        gains[self.active] += step[free:]
+        added = self._belief(self.coordinates.moved(belief.soil, step[:free]), gains, covariance)
+        return replace(added, covariance=belief.covariance + added.covariance)
 
     def _log_directions(self, soil: Array) -> Array:
         return self.coordinates.log_directions(soil)

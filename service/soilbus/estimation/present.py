@@ -5,6 +5,10 @@ its own soil, a random walk away from that of the piece before, while the sensor
 errors stay what they are: an information filter from piece to piece (e.g. Anderson &
 Moore, Optimal Filtering, 1979, sect. 6.3).  What the last piece has is the present soil;
 a constant one would be late by half a window, and too sure of itself.
+
+The linear window tells the mode.  By as much as the filter moves that, and by what it adds
+to the covariance there (never less than nothing: what may wander is known the worse), all
+else that a fit says moves too: moments, averages and rivals keep their shape.
 """
 
 from __future__ import annotations
@@ -14,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.estimation.belief import Belief
 from soilbus.estimation.gauss_newton import Fit
 from soilbus.estimation.normal_equations import Fitting, Place, solved
 
@@ -25,7 +30,7 @@ _ENDS = np.arange(1.0, PIECES + 1.0) / PIECES
 
 
 def at_present(fitting: Fitting, fit: Fit, window: float, drift: float) -> Fit:
-    """The fit with the belief of a soil that wanders.
+    """The fit with everything it believes of a soil that wanders.
 
     drift: sd by which each coordinate of the soil changes in the time of one window [s].
     The same fit where nothing wanders or the numbers stop being finite.  Cost and evidence
@@ -58,12 +63,25 @@ def at_present(fitting: Fitting, fit: Fit, window: float, drift: float) -> Fit:
         if end > begin:
             rows = slice(begin * m, end * m)
             joint += of_residual.T @ (optimum.at.rows[rows].T @ optimum.at.weighed[rows]) @ of_residual
-    inverse = solved(joint[1:, 1:], joint[1:, 0])
-    if inverse is None:
+    constant = of_residual.T @ optimum.at.normal @ of_residual[:, 1:]
+    still = solved(constant[1:] + before.information, constant[0] + before.gradient)
+    wandering = solved(joint[1:, 1:], joint[1:, 0])
+    if wandering is None or still is None:
         return fit
-    step, covariance = inverse
+    step, covariance = wandering
+    covariance[:free, :free] += np.eye(free) * drift**2 / (3.0 * PIECES)  # the end of the last piece is not its mean
     gains = place.gains.copy()
     gains[fitting.active] -= step[free:]
-    covariance[:free, :free] += np.eye(free) * drift**2 / (3.0 * PIECES)  # the end of the last piece is not its mean
     now = replace(place, soil=fitting.coordinates.moved(place.soil, -step[:free]), gains=gains)
-    return replace(fit, belief=fitting.believed(now, covariance))
+    mode = fitting.believed(now, covariance)
+
+    def moved(belief: Belief) -> Belief:
+        return mode if belief is fit.mode else fitting.changed(belief, still[0] - step, covariance - still[1])
+
+    return replace(
+        fit,
+        mode=mode,
+        belief=moved(fit.belief),
+        rival=None if fit.rival is None else fit.rival._replace(belief=moved(fit.rival.belief)),
+        averaged=None if fit.averaged is None else moved(fit.averaged),
+    )

@@ -161,30 +161,29 @@ class Tracker:
         if problem.n_rows < self.settings.min_rows:
             self._fit = None
             return Tracked(None, False, Ground.SAME, since, *left_out)
+        self._forget_before(start)
         before = self._known_at(since, problem)
         if self._alarm is not None and self._alarm.t <= end - RECENT * self.settings.window:
             self._alarm = None  # another soil would have been found by now
         last = self._fit
         changed = None
         if last is None or last.rival is not None:
-            fit = self._afresh(problem, before)
+            fitting, fit = self._afresh(problem, before)
             if self.mismatch(fit) and self._alarm is not None:
                 changed = self._another_soil(window, self._alarm, fit, before, None)
         else:
             ahead = foreseen(problem, self._here, last, before)
-            fit = self._now(ahead.fitting, resume(ahead))
+            fitting, fit = ahead.fitting, resume(ahead)
             if fit is None or not fit.converged:  # a long valley is no sign of another soil
-                fit = self._fitted(problem, self._here, before)
+                fit = fit_window(problem, self._here, before)
             self._alarm = self._alarm_in(window, ahead, last, fit, end - since)
             if self._alarm is not None:
                 changed = self._another_soil(window, self._alarm, fit, before, last)
             if changed is None and self.mismatch(fit):
-                fit = self._afresh(problem, before)
+                fitting, fit = self._afresh(problem, before)
         if changed is not None:
             return self._remembered(replace(changed, standstill=left_out[0], turning=left_out[1]), end)
-        if fit is not None and not self.mismatch(fit):
-            fit = with_whole(problem, self._here, before, fit)
-        ground = Ground.NEW if new else Ground.SAME
+        fit, ground = self._told(fitting, fit), Ground.NEW if new else Ground.SAME
         return self._remembered(Tracked(fit, self.mismatch(fit), ground, since, *left_out), end)
 
     def _alarm_in(self, window: Window, ahead: Foreseen, last: Fit, fit: Fit | None, filled: float) -> Alarm | None:
@@ -208,27 +207,24 @@ class Tracker:
         near = window.ground_speed[(window.t >= begin - 1.0) & (window.t <= begin)]
         return Alarm(begin, max(float(np.nanmean(near)), self.settings.min_speed))
 
-    def _afresh(self, problem: WindowProblem, before: Belief) -> Fit | None:
+    def _afresh(self, problem: WindowProblem, before: Belief) -> tuple[Fitting, Fit | None]:
         """A fit that starts anywhere; what was known of the soil counts only where it agrees with the data."""
-        fit = self._fitted(problem, self._here, before)
-        if not self.mismatch(fit) or not self._beliefs:
-            return fit
-        there = elsewhere(self.prior)
-        other = self._fitted(problem, there, before.of_another_soil(there))
-        if self.mismatch(other):
-            return fit
-        self._here = there
-        return other
+        fit = fit_window(problem, self._here, before)
+        if self.mismatch(fit) and self._beliefs:
+            there = elsewhere(self.prior)
+            known = before.of_another_soil(there)
+            other = fit_window(problem, there, known)
+            if not self.mismatch(other):
+                self._here = there
+                return Fitting(problem, there, known), other
+        return Fitting(problem, self._here, before), fit
 
-    def _fitted(self, problem: WindowProblem, prior: SoilPrior, before: Belief) -> Fit | None:
-        """A fit that starts anywhere, of the present soil."""
-        fit = fit_window(problem, prior, before)
-        return fit if fit is None else self._now(Fitting(problem, prior, before), fit)
-
-    def _now(self, fitting: Fitting, fit: Fit | None) -> Fit | None:
-        """A fit with the soil as it is at the end of the window."""
+    def _told(self, fitting: Fitting, fit: Fit | None) -> Fit | None:
+        """A fit that is going to be reported: with the whole posterior, of the soil at the window's end."""
         if fit is None or not fit.converged:
             return fit
+        if not self.mismatch(fit):
+            fit = with_whole(fitting.problem, fitting.coordinates.prior, fitting.before, fit)
         return at_present(fitting, fit, self.settings.window, self.settings.drift)
 
     def mismatch(self, fit: Fit | None) -> bool:
@@ -255,16 +251,22 @@ class Tracker:
 
     def _known_at(self, t: float, problem: WindowProblem) -> Belief:
         """What windows that had ended by t [s] tell of the soil from t on."""
-        ended = [i for i, (end, _) in enumerate(self._beliefs) if end <= t + _SAME_TIME]
+        ended = self._ended(t)
         if not ended:
             return Belief.of(self._here, problem.gain_std)
-        self._beliefs = self._beliefs[ended[-1] :]
-        end, belief = self._beliefs[0]
+        end, belief = self._beliefs[ended[-1]]
         elapsed = (t - end) / self.settings.window
         gains = problem.gain_std**2 * min((elapsed + 1.0) / GAIN_MEMORY, 1.0)
         if self._crossing is not None and end <= self._crossing.end:
             return belief.of_another_soil(self._here).drifted(np.zeros((_SOIL, _SOIL)), gains)
         return belief.drifted(self._drift(belief, elapsed), gains)
+
+    def _ended(self, t: float) -> list[int]:
+        return [i for i, (end, _) in enumerate(self._beliefs) if end <= t + _SAME_TIME]
+
+    def _forget_before(self, start: float) -> None:
+        """Only the newest of the beliefs that windows from `start` [s] on may build on is kept, and what follows it."""
+        self._beliefs = self._beliefs[max([0, *self._ended(start)]) :]
 
     def _drift(self, belief: Belief, elapsed: float) -> Array:
         """Covariance (6, 6) by which the soil's logarithms drift in so many windows."""
@@ -279,10 +281,10 @@ class Tracker:
         Without a last fit, or where the first soil is out of the window, the second alone.
         """
         first = self._problem(window.rows(np.flatnonzero(window.t < alarm.t - _SAME_TIME)))
-        old = None
+        ahead = None
         if last is not None and first.n_rows >= MIN_NEW_ROWS:
             ahead = foreseen(first, self._here, last, before)
-            old = self._now(ahead.fitting, resume(ahead))
+        old = None if ahead is None else resume(ahead)
         if self.mismatch(old):
             old = None
         if old is None and not self.mismatch(one):
@@ -297,14 +299,16 @@ class Tracker:
                 break  # after a mismatch the wheels of both axles must agree, and agree with the draft
             waits = self.mismatch(one) and window.t[-1] < alarm.t + PATIENCE * self.settings.window
             known = self._known_at(alarm.t, second).of_another_soil(there)
-            new = self._fitted(second, there, known)
+            new = fit_window(second, there, known)
             if new is None or self.mismatch(new):
                 continue
-            if old is not None and not self._likelier(old, new, self._fitted(self._problem(apart), self._here, before)):
+            if old is not None and not self._likelier(old, new, fit_window(self._problem(apart), self._here, before)):
                 return None
             self._crossing, self._here = crossing, there
-            return Tracked(with_whole(second, there, known, new), False, Ground.NEW, crossing.end)
-        return Tracked(old, False, Ground.CHANGING, float(window.t[0])) if old is not None and waits else None
+            return Tracked(self._told(Fitting(second, there, known), new), False, Ground.NEW, crossing.end)
+        if ahead is None or old is None or not waits:
+            return None
+        return Tracked(self._told(ahead.fitting, old), False, Ground.CHANGING, float(window.t[0]))
 
     def _crossings(self, alarm: Alarm, start: float) -> list[Crossing]:
         """Borders of growing length that begin at the alarm; of those over before `start` [s] only the last."""
