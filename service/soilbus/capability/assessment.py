@@ -34,7 +34,7 @@ GRID = 9
 MAX_SKID = 0.3
 SKID_GRID = 9
 TOLERANCE = 3e-3
-"""Last Newton step over the weight: it leaves less than the interpolation between slips does, some 5e-5 of the weight."""
+"""Last Newton step over the weight: it leaves less than interpolation between slips, some 5e-5 of the weight."""
 LEVEL_SINE = 1e-3
 """Slopes below this sine change no load worth computing."""
 
@@ -130,8 +130,8 @@ def assess(
     table = wheel_table(points.soils, rig, model, slip_grid(max_slip), last, TOLERANCE)
     skids = np.linspace(-MAX_SKID, table.slip[0], SKID_GRID)
     skid = cache(lambda: wheel_table(points.soils, rig, model, skids))
-    vehicle = _Vehicle(table, Limits.of(table.axles, torque_limit, max_sinkage), skid)
     level = balance(table)
+    vehicle = _Vehicle(table, level, Limits.of(table.axles, torque_limit, max_sinkage), skid)
     draft = vehicle.largest(Duty(), level)
     if draft is None:
         return None, table
@@ -139,7 +139,7 @@ def assess(
     if demand is not None:
         flat = abs(demand.sine) < LEVEL_SINE
         duty = Duty(None, demand.sine)
-        present = level if flat else balance(table, duty)
+        present = level if flat else balance(table, duty, level)
         pull = draft if flat else vehicle.largest(duty, present)
         with_draft = vehicle.grade(demand.pull - table.axles.weight * demand.sine)
         forecast = _forecast(demand, present, table.axles, rig, points)
@@ -169,6 +169,7 @@ class _Vehicle:
     """The wheels where they drive and, asked for seldom, where they skid."""
 
     table: WheelTable
+    level: Balance
     limits: Limits
     skid: Callable[[], WheelTable]
 
@@ -197,7 +198,7 @@ class _Vehicle:
     def grade(self, draft: float) -> Array | None:
         """Steepest slope [rad] (D,) that is climbed with a draft [N]."""
         duty = Duty(draft, None)
-        found = self.largest(duty, balance(self.table, duty))
+        found = self.largest(duty, balance(self.table, duty, self.level))
         if found is None:
             return None
         return np.asarray(np.arcsin(np.clip((found.pull - draft) / self.table.axles.weight, -1.0, 1.0)))
