@@ -25,7 +25,7 @@ from soilbus.capability.wheels import Axles, WheelTable, wheel_table
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.window import Rig
 from soilbus.terra.effects.steady import CompletedModel
-from soilbus.terra.wheel import WheelModel, sinkage
+from soilbus.terra.wheel import WheelModel
 
 Array = NDArray[np.float64]
 
@@ -126,12 +126,12 @@ def assess(
     None where no steady driving within slip and sinkage limits exists.  Raises ValueError
     for a rig without a chassis.
     """
-    points = SigmaPoints.of(posterior)
-    table = wheel_table(points.soils, rig, model, slip_grid(max_slip), last, TOLERANCE)
+    points, completed = SigmaPoints.of(posterior), CompletedModel.over(model)
+    table = wheel_table(points.soils, rig, completed, slip_grid(max_slip), last, TOLERANCE)
     skids = np.linspace(-MAX_SKID, table.slip[0], SKID_GRID)
-    skid = cache(lambda: wheel_table(points.soils, rig, model, skids))
+    skid = cache(lambda: wheel_table(points.soils, rig, completed, skids))
     level = balance(table)
-    vehicle = _Vehicle(table, level, Limits.of(table.axles, torque_limit, max_sinkage), skid)
+    vehicle = _Vehicle(table, level, Limits.of(table.axles, torque_limit, max_sinkage, completed), skid)
     draft = vehicle.largest(Duty(), level)
     if draft is None:
         return None, table
@@ -142,7 +142,7 @@ def assess(
         present = level if flat else balance(table, duty, level)
         pull = draft if flat else vehicle.largest(duty, present)
         with_draft = vehicle.grade(demand.pull - table.axles.weight * demand.sine)
-        forecast = _forecast(demand, present, table.axles, rig, points)
+        forecast = _forecast(demand, present, table.axles, rig, completed, points)
     max_draft, max_grade, max_grade_with_draft, max_pull = points.estimates(
         draft.pull, vehicle.grade(0.0), with_draft, None if pull is None else pull.pull
     )
@@ -219,13 +219,15 @@ def _set_points(
     return {name: SetPoint(*slips[2 * i : 2 * i + 2]) for i, name in enumerate(names)}
 
 
-def _forecast(demand: Demand, present: Balance, axles: Axles, rig: Rig, points: SigmaPoints) -> Forecast | None:
+def _forecast(
+    demand: Demand, present: Balance, axles: Axles, rig: Rig, model: CompletedModel, points: SigmaPoints
+) -> Forecast | None:
     place = place_of_pull(present, demand.pull)
     torque = (place.on(present.torque) * axles.count[:, 0]).sum(axis=1)
     slip = place.on(np.broadcast_to(present.slip, present.pull.shape))
-    slip_needed, required, *depths = points.estimates(
-        slip, torque, *sinkage(place.on(present.angle), axles.radius[:, 0]).T
-    )
+    draft, sine = Duty(None, demand.sine).split(place.on(present.pull), axles.weight)
+    wheel = axles.wheel(axles.loads(draft[:, None], sine)[..., 0])
+    slip_needed, required, *depths = points.estimates(slip, torque, *model.sinkage(place.on(present.angle), wheel).T)
     if slip_needed is None or required is None:
         return None
     by_kind = [depth for depth in depths if depth is not None]

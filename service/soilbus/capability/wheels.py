@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.window import Rig
-from soilbus.terra.effects.steady import CompletedModel
+from soilbus.terra.effects.steady import CompletedModel, Wheel
 from soilbus.terra.stress import lumped_modulus
 from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads
 from soilbus.terra.wheel import (
@@ -70,6 +70,10 @@ class Axles:
         )
         of_wheel = np.array([unlike.index(kind) for kind in kinds])
         return cls(rig.chassis, radius, width, front, count, level, tilt, drawn - level, of_wheel)
+
+    def wheel(self, load: Array) -> Wheel:
+        """One wheel of each kind under a load [N] (..., A)."""
+        return Wheel(self.radius[:, 0], self.width[:, 0], ~self.front[:, 0], load)
 
     @property
     def weight(self) -> float:
