@@ -48,7 +48,7 @@ class Demand:
     sine: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class OverSlip:
     """Steady level driving at some slips (S,): pull [N] and the wheels' summed torque [N m].
 
