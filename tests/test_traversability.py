@@ -18,6 +18,7 @@ from soilbus.capability.wheels import wheel_table
 from soilbus.config import Traversability as Settings
 from soilbus.estimation.posterior import Posterior
 from soilbus.simulator.reference import reference_configuration
+from soilbus.terra.effects.steady import CompletedModel
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import FAST_NODES, Soil, WheelModel
 from soilbus.traversability import State, Status, judge
@@ -72,7 +73,7 @@ def test_spread_of_the_capability_equals_monte_carlo(name, limit):
     way = decide(posterior, limit=limit)
     logs = np.random.default_rng(1).multivariate_normal(np.log(posterior.soil), posterior.log_covariance, 2000)
     table = wheel_table(np.exp(logs), RIG, MODEL, slip_grid(DEFAULTS.max_slip))
-    limits = Limits.of(table.axles, limit, DEFAULTS.max_sinkage)
+    limits = Limits.of(table.axles, limit, DEFAULTS.max_sinkage, CompletedModel(MODEL))
     drafts, pulls = (largest_pull(balance(table, duty), limits).pull for duty in (LEVEL, Duty(0.0, None)))
     for estimate, sample in ((way.max_draft, drafts), (way.max_grade, np.arcsin(pulls / WEIGHT))):
         assert estimate.std == pytest.approx(np.std(sample), rel=0.1)  # sampling: 1.6 %

@@ -11,7 +11,7 @@ from soilbus.assembly import completion_of, effects_of, rig_of, with_effects
 from soilbus.can.dbc_files import load_databases
 from soilbus.capability.assessment import slip_grid
 from soilbus.capability.balance import LEVEL, Duty, balance
-from soilbus.capability.wheels import wheel_table
+from soilbus.capability.wheels import Axles, wheel_table
 from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.replay import fed
 from soilbus.estimation.completed import active_at
@@ -38,12 +38,15 @@ def completed(*effects: str) -> CompletedModel:
 
 class Curve(NamedTuple):
     pull: np.ndarray
-    torque: np.ndarray  # (W, S)
+    torque: np.ndarray  # (W, S), as sinkage
+    sinkage: np.ndarray
 
 
 def curve(model: CompletedModel, soil: Soil, slips=SLIPS) -> Curve:
     table = wheel_table(np.array([soil]), rig_of(CONFIG), model, np.array(slips))
-    return Curve(table.pull[0], table.at[1, 0][table.axles.of_wheel])
+    kinds = table.axles.of_wheel
+    sinkage = model.sinkage(table.at[2, 0].T, table.axles.wheel(table.load[0].T)).T
+    return Curve(table.pull[0], table.at[1, 0][kinds], sinkage[kinds])
 
 
 @pytest.mark.parametrize("effect", ON_WHEELS)
@@ -60,7 +63,18 @@ def test_the_pull_is_that_of_a_simulated_drive(effect):
         assert at.pull[i] == pytest.approx(truth["draft"][0], abs=0.5)
         torques = [truth[f"torque.{wheel}"][0] for wheel in ("FL", "FR", "RL", "RR")]
         assert at.torque[:, i] == pytest.approx(torques, abs=0.2)
+        sinkages = [truth[f"sinkage.{wheel}"][0] for wheel in ("FL", "FR", "RL", "RR")]
+        assert at.sinkage[:, i] == pytest.approx(sinkages, abs=1e-5)
     assert np.abs(at.pull - plain).max() > 10.0
+
+
+@pytest.mark.parametrize("effect", ["tyre_deflection=8e-6", "rolling_radius.front=0.05"])
+def test_the_sinkage_limit_is_that_of_the_wheel_with_its_effects(effect):
+    model, axles = completed(effect), Axles.of(rig_of(CONFIG))
+    wheel = axles.wheel(np.array([4000.0, 6000.0]))
+    angle = model.angle_of_sinkage(0.12, wheel)
+    assert model.sinkage(angle, wheel) == pytest.approx([0.12, 0.12], abs=1e-6)
+    assert np.abs(angle - CompletedModel(WheelModel()).angle_of_sinkage(0.12, wheel)).max() > 0.005
 
 
 def test_the_drive_line_asks_more_of_the_motors_for_the_same_pull():

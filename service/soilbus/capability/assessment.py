@@ -25,7 +25,7 @@ from soilbus.capability.wheels import Axles, WheelTable, wheel_table
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.window import Rig
 from soilbus.terra.effects.steady import CompletedModel
-from soilbus.terra.wheel import WheelModel, sinkage
+from soilbus.terra.wheel import WheelModel
 
 Array = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ GRID = 9
 MAX_SKID = 0.3
 SKID_GRID = 9
 TOLERANCE = 3e-3
-"""Last Newton step over the weight: it leaves less than the interpolation between slips does, 5e-5 of the weight."""
+"""Last Newton step over the weight: it leaves less than interpolation between slips, some 5e-5 of the weight."""
 LEVEL_SINE = 1e-3
 """Slopes below this sine change no load worth computing."""
 
@@ -48,7 +48,7 @@ class Demand:
     sine: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class OverSlip:
     """Steady level driving at some slips (S,): pull [N] and the wheels' summed torque [N m].
 
@@ -126,12 +126,12 @@ def assess(
     None where no steady driving within slip and sinkage limits exists.  Raises ValueError
     for a rig without a chassis.
     """
-    points = SigmaPoints.of(posterior)
-    table = wheel_table(points.soils, rig, model, slip_grid(max_slip), last, TOLERANCE)
+    points, completed = SigmaPoints.of(posterior), CompletedModel.over(model)
+    table = wheel_table(points.soils, rig, completed, slip_grid(max_slip), last, TOLERANCE)
     skids = np.linspace(-MAX_SKID, table.slip[0], SKID_GRID)
-    skid = cache(lambda: wheel_table(points.soils, rig, model, skids))
-    vehicle = _Vehicle(table, Limits.of(table.axles, torque_limit, max_sinkage), skid)
+    skid = cache(lambda: wheel_table(points.soils, rig, completed, skids))
     level = balance(table)
+    vehicle = _Vehicle(table, level, Limits.of(table.axles, torque_limit, max_sinkage, completed), skid)
     draft = vehicle.largest(Duty(), level)
     if draft is None:
         return None, table
@@ -139,10 +139,10 @@ def assess(
     if demand is not None:
         flat = abs(demand.sine) < LEVEL_SINE
         duty = Duty(None, demand.sine)
-        present = level if flat else balance(table, duty)
+        present = level if flat else balance(table, duty, level)
         pull = draft if flat else vehicle.largest(duty, present)
         with_draft = vehicle.grade(demand.pull - table.axles.weight * demand.sine)
-        forecast = _forecast(demand, present, table.axles, rig, points)
+        forecast = _forecast(demand, present, table.axles, rig, completed, points)
     max_draft, max_grade, max_grade_with_draft, max_pull = points.estimates(
         draft.pull, vehicle.grade(0.0), with_draft, None if pull is None else pull.pull
     )
@@ -169,6 +169,7 @@ class _Vehicle:
     """The wheels where they drive and, asked for seldom, where they skid."""
 
     table: WheelTable
+    level: Balance
     limits: Limits
     skid: Callable[[], WheelTable]
 
@@ -197,7 +198,7 @@ class _Vehicle:
     def grade(self, draft: float) -> Array | None:
         """Steepest slope [rad] (D,) that is climbed with a draft [N]."""
         duty = Duty(draft, None)
-        found = self.largest(duty, balance(self.table, duty))
+        found = self.largest(duty, balance(self.table, duty, self.level))
         if found is None:
             return None
         return np.asarray(np.arcsin(np.clip((found.pull - draft) / self.table.axles.weight, -1.0, 1.0)))
@@ -218,13 +219,15 @@ def _set_points(
     return {name: SetPoint(*slips[2 * i : 2 * i + 2]) for i, name in enumerate(names)}
 
 
-def _forecast(demand: Demand, present: Balance, axles: Axles, rig: Rig, points: SigmaPoints) -> Forecast | None:
+def _forecast(
+    demand: Demand, present: Balance, axles: Axles, rig: Rig, model: CompletedModel, points: SigmaPoints
+) -> Forecast | None:
     place = place_of_pull(present, demand.pull)
     torque = (place.on(present.torque) * axles.count[:, 0]).sum(axis=1)
     slip = place.on(np.broadcast_to(present.slip, present.pull.shape))
-    slip_needed, required, *depths = points.estimates(
-        slip, torque, *sinkage(place.on(present.angle), axles.radius[:, 0]).T
-    )
+    draft, sine = Duty(None, demand.sine).split(place.on(present.pull), axles.weight)
+    wheel = axles.wheel(axles.loads(draft[:, None], sine)[..., 0])
+    slip_needed, required, *depths = points.estimates(slip, torque, *model.sinkage(place.on(present.angle), wheel).T)
     if slip_needed is None or required is None:
         return None
     by_kind = [depth for depth in depths if depth is not None]

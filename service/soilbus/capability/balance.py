@@ -15,8 +15,6 @@ Array = NDArray[np.float64]
 
 PARTS = 5
 """Points into which each step of the slip grid is divided."""
-SMALL_PULL = 1.0
-"""Pull [N] for the slope of the load transfer."""
 STEPS = 3
 """Of Newton's method with the slope of the start, which is nearly that of the end."""
 MAX_SINE = 0.99
@@ -40,37 +38,66 @@ LEVEL = Duty()
 
 @dataclass(frozen=True, slots=True)
 class Balance:
-    """The steady states of D soils at F slips: pull [N] of the vehicle (D, F), known (D, F) where there is one.
+    """The steady states of D soils at F slips, known (D, F) where there is one.
 
-    drawbar [N], torque [N m] and angle (entry angle [rad]) are one wheel's, (D, A, F).
+    columns (D, 1 + 3 A, F): pull [N] of the vehicle, then by kind of wheel drawbar pull [N], torque [N m]
+    and entry angle [rad] of one.
     """
 
     slip: Array
     known: NDArray[np.bool_]
-    pull: Array
-    drawbar: Array
-    torque: Array
-    angle: Array
+    columns: Array
+
+    @property
+    def pull(self) -> Array:
+        """Of the vehicle [N] (D, F)."""
+        return self.columns[:, 0]
+
+    @property
+    def drawbar(self) -> Array:
+        """Pull of one wheel [N] (D, A, F)."""
+        return self._of_wheels(0)
+
+    @property
+    def torque(self) -> Array:
+        """Of one wheel [N m] (D, A, F)."""
+        return self._of_wheels(1)
+
+    @property
+    def angle(self) -> Array:
+        """Entry angle [rad] (D, A, F)."""
+        return self._of_wheels(2)
+
+    def _of_wheels(self, quantity: int) -> Array:
+        kinds = self.columns.shape[1] // 3
+        return self.columns[:, 1 + quantity * kinds : 1 + (quantity + 1) * kinds]
 
 
-def balance(table: WheelTable, duty: Duty = LEVEL) -> Balance:
+def balance(table: WheelTable, duty: Duty = LEVEL, level: Balance | None = None) -> Balance:
     """Steady states under a duty between the slips of the table, on PARTS times as many slips.
 
-    Cubic Hermite interpolation: the table knows how everything changes with slip.
+    Cubic Hermite interpolation: the table knows how everything changes with slip.  `level` is
+    the table's balance on the level, where that is at hand.
     """
-    slips = tuple(table.slip.tolist())
-    columns, by_slip = _over_slip(table)
-    balanced = table.balanced
-    if duty != LEVEL:
-        other, balanced = _under(table, duty)
-        difference = np.where(np.isfinite(other), other - columns, 0.0)
-        columns, by_slip = columns + difference, by_slip + difference @ _differences(slips)
-    slip, cell, of_values, of_slopes = _refinement(slips)
-    known = (balanced[:, :-1] & balanced[:, 1:])[:, cell]
-    fine = np.where(np.isfinite(columns), columns, 0.0) @ of_values
-    fine += np.where(np.isfinite(by_slip), by_slip, 0.0) @ of_slopes
-    drawbar, torque, angle = np.moveaxis(fine[:, 1:].reshape(len(fine), 3, -1, len(slip)), 1, 0)
-    return Balance(slip, known, fine[:, 0], drawbar, torque, angle)
+    slip, cell, of_values, of_slopes, of_changes = _refinement(tuple(table.slip.tolist()))
+    if level is None:
+        columns = _times(_columns(table.pull, table.at), of_values) + _times(_by_slip(table), of_slopes)
+        level = Balance(slip, _between(table.balanced, cell), columns)
+    if duty == LEVEL:
+        return level
+    change, balanced = _under(table, duty)
+    return Balance(slip, _between(balanced, cell), level.columns + _times(change, of_changes))
+
+
+def _times(columns: Array, matrix: Array) -> Array:
+    """Columns (D, C, S), those not known as zero, times a matrix (S, F): (D, C, F)."""
+    known = np.where(np.isfinite(columns), columns, 0.0)
+    return np.asarray(known.reshape(-1, len(matrix)) @ matrix).reshape(*columns.shape[:2], -1)
+
+
+def _between(balanced: NDArray[np.bool_], cell: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Where both ends of a step of the grid are balanced (D, F)."""
+    return np.asarray((balanced[:, :-1] & balanced[:, 1:])[:, cell])
 
 
 def _columns(pull: Array, at: Array) -> Array:
@@ -78,32 +105,34 @@ def _columns(pull: Array, at: Array) -> Array:
     return np.concatenate([pull[:, None], *at], axis=1)
 
 
-def _over_slip(table: WheelTable) -> tuple[Array, Array]:
-    """Columns of the level table, and their derivatives by slip with the loads following."""
+def _by_slip(table: WheelTable) -> Array:
+    """Derivatives by slip of the columns of the level table, with the loads following."""
     axles = table.axles
     loss = 1.0 - (axles.count * table.by_load[0] * axles.lever).sum(axis=1)
     pull_by_slip = (axles.count * table.by_slip[0]).sum(axis=1) / loss
     by_slip = table.by_slip + table.by_load * (axles.lever * pull_by_slip[:, None])
-    return _columns(table.pull, table.at), _columns(pull_by_slip, by_slip)
+    return _columns(pull_by_slip, by_slip)
 
 
 def _under(table: WheelTable, duty: Duty) -> tuple[Array, NDArray[np.bool_]]:
-    """Columns of the table under another duty, and where they are a steady state (D, S)."""
+    """Change of the table's columns under another duty, and where they are a steady state (D, S)."""
     axles, weight = table.axles, table.axles.weight
-    pull = np.where(table.balanced, table.pull, 0.0)
-    light, heavy = (axles.loads(*duty.split(np.array([p]), weight)) for p in (0.0, SMALL_PULL))
-    slope = (axles.count * table.by_load[0] * (heavy - light)).sum(axis=1) / SMALL_PULL - 1.0
+    level = pull = np.where(table.balanced, table.pull, 0.0)
+    by_pull = axles.lever if duty.draft is None else axles.tilt / weight
+    slope = (axles.count * table.by_load[0] * by_pull).sum(axis=1) - 1.0
     for _ in range(STEPS):
         load = axles.loads(*duty.split(pull, weight))
         pull = pull - (table.pull_at(load) - pull) / slope
     _, sine = duty.split(pull, weight)
     balanced = table.balanced & (load > 0.0).all(axis=1) & (np.abs(sine) < MAX_SINE)
-    return _columns(pull, table.at_load(load)), balanced
+    change = _columns(pull - level, table.change_at(load))
+    return np.where(balanced[:, None], change, np.nan), balanced
 
 
 @cache
-def _refinement(slips: tuple[float, ...]) -> tuple[Array, NDArray[np.intp], Array, Array]:
-    """Finer slips (F,), the grid's step in which each lies, and what values and slopes (S, F) add to it."""
+def _refinement(slips: tuple[float, ...]) -> tuple[Array, NDArray[np.intp], Array, Array, Array]:
+    """Finer slips (F,), the grid's step in which each lies, and what values, slopes and values whose
+    slopes are not known, so taken from differences of second order, (S, F) add to it."""
     slip = np.array(slips)
     step, part = np.divmod(np.arange(PARTS * (len(slip) - 1) + 1), PARTS)
     part = np.where(step == len(slip) - 1, PARTS, part) / PARTS
@@ -115,10 +144,5 @@ def _refinement(slips: tuple[float, ...]) -> tuple[Array, NDArray[np.intp], Arra
     of_values[cell + 1, column] = part**2 * (3.0 - 2.0 * part)
     of_slopes[cell, column] = width * part * (1.0 - part) ** 2
     of_slopes[cell + 1, column] = width * part**2 * (part - 1.0)
-    return slip[cell] + width * part, cell, of_values, of_slopes
-
-
-@cache
-def _differences(slips: tuple[float, ...]) -> Array:
-    """What turns values at the slips (S,) into derivatives by slip (S, S), of second order."""
-    return np.asarray(np.gradient(np.eye(len(slips)), np.array(slips), axis=1))
+    differences = np.gradient(np.eye(len(slip)), slip, axis=1)
+    return slip[cell] + width * part, cell, of_values, of_slopes, of_values + differences @ of_slopes

@@ -10,9 +10,11 @@ it is about to fall below what is asked for, now and then or growing.
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -60,7 +62,9 @@ class Trend(NamedTuple):
 
     def joined(self, step: float, value: float) -> Trend:
         """The trend a step [s] later, with one more value."""
-        n, x, xx, y, xy = (math.exp(-step / MEMORY) * s for s in self)
+        kept = math.exp(-step / MEMORY)
+        n, x, y = kept * self.n, kept * self.x, kept * self.y
+        xx, xy = kept * self.xx, kept * self.xy
         return Trend(n + 1.0, x - step * n, xx - 2.0 * step * x + step**2 * n, y + value, xy - step * y)
 
     def line(self) -> tuple[float, float]:
@@ -169,11 +173,20 @@ def moments(window: Window, rig: Rig, since: float, min_speed: float) -> Iterato
 
 def _reserve(curve: OverSlip, slip: float) -> float:
     """Pull [N] still to come from this slip on."""
-    known = np.isfinite(curve.pull)
-    ahead = curve.pull[known & (curve.slip > slip)]
-    if not len(ahead):
+    slips, pulls, ahead = _known(curve)
+    i = bisect_right(slips, slip)
+    if i == len(slips):
         return 0.0
-    return float(ahead.max() - np.interp(slip, curve.slip[known], curve.pull[known]))
+    share = (slip - slips[i - 1]) / (slips[i] - slips[i - 1]) if i else 1.0
+    return ahead[i] - (pulls[i] - (1.0 - share) * (pulls[i] - pulls[i - 1]))
+
+
+@lru_cache(maxsize=2)
+def _known(curve: OverSlip) -> tuple[list[float], list[float], list[float]]:
+    """Slips and pulls [N] where they are known, and the greatest pull from each on."""
+    known = np.isfinite(curve.pull)
+    pull = curve.pull[known]
+    return curve.slip[known].tolist(), pull.tolist(), np.maximum.accumulate(pull[::-1])[::-1].tolist()
 
 
 def _time_left(capacity: tuple[float, float], demand: tuple[float, float], peak: float) -> float:

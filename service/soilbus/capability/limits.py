@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from soilbus.capability.balance import Balance
 from soilbus.capability.wheels import Axles
+from soilbus.terra.effects.steady import CompletedModel
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE
 
 Array = NDArray[np.float64]
@@ -22,12 +23,12 @@ class Limits(NamedTuple):
     angle: Array
 
     @classmethod
-    def of(cls, axles: Axles, torque_limit: Array, max_sinkage: float) -> Limits:
-        """From the wheels' torque limits (W,) [N m], nan where not known, and a sinkage [m]."""
+    def of(cls, axles: Axles, torque_limit: Array, max_sinkage: float, model: CompletedModel) -> Limits:
+        """From the wheels' torque limits (W,) [N m], nan where not known, and a sinkage [m] of wheels on the level."""
         torque = np.full(len(axles.count), np.inf)
         np.fmin.at(torque, axles.of_wheel, torque_limit)
-        depth = np.minimum(max_sinkage / axles.radius[:, 0], 1.0)
-        return cls(torque, np.minimum(np.arccos(1.0 - depth), MAX_ENTRY_ANGLE))
+        deepest = model.angle_of_sinkage(max_sinkage, axles.wheel(axles.level[:, 0]))
+        return cls(torque, np.minimum(deepest, MAX_ENTRY_ANGLE))
 
 
 class Largest(NamedTuple):

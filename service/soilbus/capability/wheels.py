@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.window import Rig
-from soilbus.terra.effects.steady import CompletedModel
+from soilbus.terra.effects.steady import CompletedModel, Wheel
 from soilbus.terra.stress import lumped_modulus
 from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads
 from soilbus.terra.wheel import (
@@ -71,6 +71,10 @@ class Axles:
         of_wheel = np.array([unlike.index(kind) for kind in kinds])
         return cls(rig.chassis, radius, width, front, count, level, tilt, drawn - level, of_wheel)
 
+    def wheel(self, load: Array) -> Wheel:
+        """One wheel of each kind under a load [N] (..., A)."""
+        return Wheel(self.radius[:, 0], self.width[:, 0], ~self.front[:, 0], load)
+
     @property
     def weight(self) -> float:
         """Of the vehicle [N]."""
@@ -110,10 +114,10 @@ class WheelTable:
         drawbar = self.at[0] + change * (self.by_load[0] + self.bend[0] * change)
         return np.asarray((self.axles.count * drawbar).sum(axis=1))
 
-    def at_load(self, load: Array) -> Array:
-        """Drawbar pull, torque and entry angle (3, D, A, S) at other loads (D, A, S)."""
+    def change_at(self, load: Array) -> Array:
+        """Change of drawbar pull, torque and entry angle (3, D, A, S) at other loads (D, A, S)."""
         change = load - self.load
-        return self.at + change * (self.by_load + self.bend * change)
+        return np.asarray(change * (self.by_load + self.bend * change))
 
 
 def wheel_table(
@@ -124,16 +128,18 @@ def wheel_table(
     start: WheelTable | None = None,
     tolerance: float = TOLERANCE,
 ) -> WheelTable:
-    """Wheels on soils (D, 6) at slips (S,); `start` is the table of similar soils.
+    """Wheels on soils (D, 6) at slips (S,); `start` is the same rig's table of similar soils.
 
     tolerance: the Newton step of pull and load, over the weight, that is the last.
 
     Raises ValueError for a rig without a chassis.
     """
-    axles, completed = Axles.of(rig), CompletedModel.over(model)
+    completed = CompletedModel.over(model)
     n_soils, n_slips = len(soils), len(slip)
-    warm = start is not None and start.pull.shape == (n_soils, n_slips) and np.array_equal(start.slip, slip)
-    if warm and start is not None:
+    if start is not None and not (start.pull.shape == (n_soils, n_slips) and np.array_equal(start.slip, slip)):
+        start = None
+    axles = Axles.of(rig) if start is None else start.axles
+    if start is not None:
         pull, angle = _foreseen(start, soils)
         pull = np.where(start.balanced, pull, 0.0)
         angle = np.where(start.balanced[:, None], angle, np.nan).clip(max=MAX_ENTRY_ANGLE)
@@ -162,7 +168,7 @@ def wheel_table(
 
 
 def _foreseen(start: WheelTable, soils: Array) -> tuple[Array, Array]:
-    """Pull (D, S) and entry angle (D, A, S) on other soils, as those of a table change from its first soil on."""
+    """Pull (D, S) and entry angle (D, A, S) on other soils, as those of a table change from its first to the rest."""
     n_soils, n_slips = start.pull.shape
     logs, other = (np.log(np.maximum(each, LEAST)) for each in (start.soils, soils))
     with np.errstate(all="ignore"):

@@ -36,7 +36,9 @@ FAST_NODES = 8
 
 MIN_ENTRY_ANGLE = 1e-4
 MAX_ENTRY_ANGLE = 1.4
-_CHUNK = 8192
+_CHUNK = 1200
+"""Nodes of a branch that are integrated at once: the fields of more go beyond 128 kB, from where on malloc
+asks the kernel for fresh pages each time, which costs as much as the integration."""
 
 FORCES = ("load", "drawbar_pull", "torque")
 INPUTS = ("entry_angle", "slip", "K_L", "n", "tan_phi", "c", "K")
@@ -195,14 +197,19 @@ def _in_chunks(
         if np.ndim(a) or i < 2 else float(a)  # entry angle and slip always by sample
         for i, a in enumerate(state)
     ))  # fmt: skip
-    skid = rows.slip < 0.0
-    if n_samples <= _CHUNK and not skid.any():
-        return integrate(rows, model, False).reshape(n_rows, *shape)
+    skid, chunk = rows.slip < 0.0, max(_CHUNK // model.nodes, 1)
     out = np.empty((n_rows, n_samples))
+    if not skid.any():
+        if n_samples <= chunk:
+            return integrate(rows, model, False).reshape(n_rows, *shape)
+        for i in range(0, n_samples, chunk):
+            run = slice(i, i + chunk)
+            out[:, run] = integrate(WheelState(*(a[run] if np.ndim(a) else a for a in rows)), model, False)
+        return out.reshape(n_rows, *shape)
     for skidding in (False, True):  # skidding wheels need split panels
         members = np.flatnonzero(skid == skidding)
-        for i in range(0, len(members), _CHUNK):
-            index = members[i : i + _CHUNK]
+        for i in range(0, len(members), chunk):
+            index = members[i : i + chunk]
             part = WheelState(*(a[index] if np.ndim(a) else a for a in rows))
             out[:, index] = integrate(part, model, skidding)
     return out.reshape(n_rows, *shape)

@@ -8,13 +8,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from soilbus.terra.effects.effect import Active, Surroundings, forces_with
+from soilbus.terra.effects.effect import Active, Surroundings, forces_with, wheel_with
 from soilbus.terra.stress import Array
-from soilbus.terra.wheel import WheelModel, WheelState, wheel_forces, wheel_forces_and_slopes
+from soilbus.terra.wheel import WheelModel, WheelState, sinkage, wheel_forces, wheel_forces_and_slopes
 
 STEP = 1e-6
 """Relative step of the differences."""
 LEAST_STEP = 1e-9
+ROUNDS = 12
+"""Fixed-point rounds from a sinkage to an entry angle."""
+
+
+class Wheel(NamedTuple):
+    """Radius and width [m], whether on the rear axle, and load [N]; arrays that broadcast."""
+
+    radius: Array
+    width: Array
+    rear: Any
+    load: Array
 
 
 class Slopes(NamedTuple):
@@ -76,6 +87,22 @@ class CompletedModel:
             (self.forces(state._replace(slip=state.slip + slip), rear, load) - at) / slip,
             (self.forces(state, rear, load + more) - at) / more,
         )
+
+    def sinkage(self, angle: Array, wheel: Wheel) -> Array:
+        """Sinkage [m] at an entry angle [rad]: of the circle that effects make of the wheel."""
+        if not self.effects:
+            return np.asarray(sinkage(angle, wheel.radius))
+        state = WheelState(angle, 0.0, wheel.radius, wheel.width, 1.0, 1.0, 1.0, 1.0, 1.0)  # on any soil
+        now, _ = wheel_with(self.effects, state, self.model, self._around(state, wheel.rear, wheel.load))
+        return np.asarray(sinkage(angle, now.radius))
+
+    def angle_of_sinkage(self, depth: float, wheel: Wheel) -> Array:
+        """Entry angle [rad] at which a wheel has sunk so deep [m], a right angle at most."""
+        angle = np.arccos(1.0 - np.minimum(depth / wheel.radius, 1.0))
+        for _ in range(ROUNDS if self.effects and depth > 0.0 else 0):
+            circle = self.sinkage(angle, wheel) / sinkage(angle, 1.0)
+            angle = np.arccos(1.0 - np.minimum(depth / circle, 1.0))
+        return np.asarray(angle)
 
     def _around(self, state: WheelState, rear: Any, load: Array) -> Surroundings:
         """Steady driving; draft and mass act on a wheel by its load alone."""
