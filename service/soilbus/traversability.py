@@ -40,7 +40,8 @@ class Traversability:
     """The decision and what it rests on; None where nothing can be said.
 
     Torques are sums over the wheels [N m]; max_draft [N] on the level; max_grade [rad]
-    without draft; slip_needed gives the present demand; capability has all the rest.
+    without draft; slip_needed gives the present demand; since_valid is the time [s] since the
+    end of the last valid window; capability has all the rest.
     """
 
     state: State = State.UNKNOWN
@@ -51,6 +52,7 @@ class Traversability:
     max_grade: Estimate | None = None
     slip_needed: float | None = None
     limit: str | None = None
+    since_valid: float | None = None
     capability: Capability | None = None
 
 
