@@ -102,17 +102,17 @@ def judge(
 
 def probability_of_pull(able: Capability, demand: Demand, settings: Settings) -> float:
     """That the wheels give the demand and its margin on the present slope."""
-    if able.max_pull is None:
+    if able.likely_pull is None:
         return 0.0
     needed = demand.pull + settings.margin * max(demand.pull, 0.0)
-    return _above(able.max_pull.value - needed, math.hypot(able.max_pull.std, demand.std))
+    return _above(able.likely_pull.value - needed, math.hypot(able.likely_pull.std, demand.std))
 
 
 def probability_of_depth(able: Capability, settings: Settings) -> float:
     """That the deepest wheel stays within the sinkage limit under the demand; 1 where no slip gives the demand."""
     if able.forecast is None:
         return 1.0
-    deepest = able.forecast.deepest
+    deepest = able.forecast.likely_depth
     return _above(settings.max_sinkage - deepest.value, deepest.std)
 
 

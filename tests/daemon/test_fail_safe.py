@@ -216,6 +216,7 @@ class Drive:
         while self.clock.now < end:
             self.service.step()
             for at, verdict in self.wire.verdicts:
+                self.last = verdict
                 if str(verdict["State"]) == "go":
                     self.go += 1
                     self.faults += [f"go at {at - 1000.0:.2f} s although {why}" for why in self.objections(at, verdict)]
@@ -295,6 +296,27 @@ def test_a_good_drive_is_go_and_comes_back_to_go(moment, tracked):
         drive.run(1.0)
         assert drive.go >= before + 9, story
         assert not drive.faults
+
+
+def test_the_time_since_the_last_valid_posterior_grows_until_there_is_one(moment, tracked):
+    drive = Drive(moment, tracked)
+    drive.run(1.0)
+    assert drive.last["SinceValid"] == "not_available"
+    drive.run(LEAD)
+    assert drive.last["SinceValid"] == drive.last["Age"] < 1.2
+    drive.wire.blind = True
+    drive.run(4.0)
+    assert str(drive.last["State"]) == "caution"
+    assert drive.last["Age"] < 1.2
+    assert drive.last["SinceValid"] == pytest.approx(4.5, abs=0.7)
+    assert drive.result.traversability.since_valid == pytest.approx(4.0, abs=1.1)
+    drive.wire.blind = False
+    drive.run(1.2)
+    assert drive.last["SinceValid"] < 1.2
+    drive.step_clock(-5.0)
+    drive.run(0.5)
+    assert drive.last["SinceValid"] == "not_available"
+    assert not drive.faults
 
 
 @settings(derandomize=True, deadline=None, max_examples=20, suppress_health_check=[HealthCheck.too_slow])

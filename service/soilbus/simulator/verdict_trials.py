@@ -72,7 +72,7 @@ class Ground(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """One call: probability that the demand can be met (nan: none), the state, what limits, and whether it truly can."""
+    """One call: probability that the demand can be met (nan: none), state, what limits, and whether it truly can."""
 
     soil: str
     probability: float
@@ -83,7 +83,7 @@ class Call:
 
 @dataclass(frozen=True, slots=True)
 class Bin:
-    """Calls with a probability of low to high: how many, their mean, and the share that came true in its 95 % interval."""
+    """Calls with a probability of low to high: count, mean, share that came true, and its 95 % interval."""
 
     low: float
     high: float
@@ -116,15 +116,14 @@ class Reliability:
     bins: tuple[Bin, ...]
 
 
-def verdict_trials(config: Config, drives: int, seed: int, each: Each = map) -> tuple[Reliability, list[Call]]:
-    """Figures of so many drives, and their calls; the same seed gives the same drives.
+def verdict_trials(config: Config, drives: int, seed: int, each: Each = map) -> Reliability:
+    """Figures of so many drives; the same seed gives the same drives.
 
     `each` is the built-in map or that of monte_carlo.processes.  Raises SimulationError
     where the vehicle cannot be driven.
     """
     key = np.random.SeedSequence([seed, zlib.crc32(b"verdicts")])
-    calls = list(each(trial, [Task(config, int(s)) for s in key.generate_state(drives)]))
-    return reliability(calls), calls
+    return reliability(list(each(trial, [Task(config, int(s)) for s in key.generate_state(drives)])))
 
 
 def trial(task: Task) -> Call:
@@ -153,7 +152,7 @@ def trial(task: Task) -> Call:
 
 def _margin(way: Traversability, demand: Demand, rng: np.random.Generator) -> float | None:
     """A margin with which the pull suffices with a probability drawn from all; None where no pull does."""
-    if way.capability is None or (most := way.capability.max_pull) is None or demand.pull <= 0.0:
+    if way.capability is None or (most := way.capability.likely_pull) is None or demand.pull <= 0.0:
         return None
     sure = NormalDist().inv_cdf(rng.uniform(LEAST, 1.0 - LEAST))
     return (most.value - sure * math.hypot(most.std, demand.std)) / demand.pull - 1.0
