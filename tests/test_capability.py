@@ -257,6 +257,21 @@ def test_sigma_points_have_the_posterior_s_covariance():
     assert not points.soils[:, 5].any()
 
 
+def test_first_order_is_exact_for_what_is_linear_and_blind_to_what_only_bends():
+    root = np.random.default_rng(2).normal(0.0, 0.1, (6, 6))
+    posterior = Posterior(SOILS["loam"], root @ root.T)
+    points = SigmaPoints.of(posterior)
+    logs = np.log(points.soils / points.soils[0])
+    gradient = np.array([3.0, -1.0, 2.0, 0.5, -4.0, 1.0])
+    value, std = points.first_order(7.0 + logs @ gradient)
+    assert value == 7.0
+    assert std == pytest.approx(math.sqrt(gradient @ posterior.log_covariance @ gradient))
+    bent = points.first_order(7.0 + logs @ gradient + 5.0 * logs[:, 1] ** 2)
+    assert bent == pytest.approx((value, std), rel=0.02)  # what is left is the last two directions
+    mean, _ = points.mean_and_std(7.0 + logs @ gradient + 5.0 * logs[:, 1] ** 2)
+    assert mean > 7.0 + 0.5 * 5.0 * posterior.log_covariance[1, 1]
+
+
 def test_a_point_without_a_value_is_mirrored():
     points = SigmaPoints.of(Posterior(SOILS["loam"], np.diag([0.04, 0.01, 0.0, 0.0, 0.0, 0.0])))
     samples = 1000.0 + 100.0 * np.log(points.soils[:, 0])
@@ -286,6 +301,9 @@ class Draws:
 
     def estimates(self, *samples):
         return [None if s is None else Estimate(*(float(x) for x in self.mean_and_std(s))) for s in samples]
+
+    def likely(self, samples):
+        return self.estimates(samples)[0]
 
 
 def fitted(name: str, slip: Swing) -> Posterior:

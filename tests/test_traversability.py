@@ -100,10 +100,10 @@ def test_probability_falls_with_demand_and_state_follows(status):
 
 
 def test_probability_is_that_of_the_gaussian_margin():
-    free = decide(demand=Demand(0.0, 0.0))
+    likely = decide(demand=Demand(0.0, 0.0)).capability.likely_pull
     for z in (-2.0, -0.5, 0.0, 1.0, 2.5):
-        std = math.hypot(free.max_draft.std, 300.0)
-        pull = (free.max_draft.value - z * std) / (1.0 + DEFAULTS.margin)
+        std = math.hypot(likely.std, 300.0)
+        pull = (likely.value - z * std) / (1.0 + DEFAULTS.margin)
         expected = 0.5 * (1.0 + math.erf(z / math.sqrt(2.0)))
         assert decide(demand=Demand(pull, 300.0)).probability == pytest.approx(expected, abs=1e-6)
 

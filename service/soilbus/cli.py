@@ -124,6 +124,7 @@ def _parser() -> argparse.ArgumentParser:
 
     sub = command("decisions", _decisions, "what soilbus foretells, beside what simulated drives then do", "optional")
     sub.add_argument("--drives", type=_counted, default=150, metavar="N", help="on each held soil (default 150)")
+    sub.add_argument("--calls", type=_counted, default=600, metavar="N", help="of go, caution, no-go (default 600)")
     sub.add_argument("--boggings", type=_counted, default=40, metavar="N", help="drives into trouble (default 40)")
     sub.add_argument("--hours", type=_between(0.0, 100.0), default=1.0, metavar="H", help="on firm ground (default 1)")
     sub.add_argument("--seed", type=_natural, default=1, help="of soils, drives, noise and priors (default 1)")
@@ -378,20 +379,22 @@ def _decisions(args: argparse.Namespace) -> None:
     from soilbus.simulator.draft_trials import draft_trials
     from soilbus.simulator.drive import SimulationError
     from soilbus.simulator.monte_carlo import processes
+    from soilbus.simulator.verdict_trials import verdict_trials
 
     config = _configured_or_demo(args)
     try:
         with processes(os.cpu_count() or 1) as each:
             drafts = list(draft_trials(config, args.drives, args.seed, each=each))
+            calls = verdict_trials(config, args.calls, args.seed, each=each)
             firm = math.ceil(3600.0 * args.hours / (FIRM_DRIVE - config.estimator.window))
             warnings = warning_trials(config, args.boggings, firm, args.seed, each=each)
     except SimulationError as error:
         raise WorkError(str(error)) from None
     if args.json is not None:
         with _whole_file(args.json) as out:
-            out.write(json.dumps(as_json(drafts, warnings), indent=1) + "\n")
+            out.write(json.dumps(as_json(drafts, calls, warnings), indent=1) + "\n")
     if str(args.json) != "-":
-        print(decisions_report(drafts, warnings), end="")
+        print(decisions_report(drafts, calls, warnings), end="")
 
 
 def _bench(args: argparse.Namespace) -> None:

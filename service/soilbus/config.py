@@ -17,6 +17,7 @@ from pydantic import (
     Field,
     NonNegativeFloat,
     PositiveFloat,
+    PositiveInt,
     ValidationError,
     field_validator,
     model_validator,
@@ -310,6 +311,10 @@ class Traversability(_Section):
     """Probability from which the state is go."""
     no_go: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.50
     """Probability below which the state is no_go."""
+    hysteresis: NonNegativeFloat = 0.25
+    """Standard deviations by which a better state must pass its threshold."""
+    hold: PositiveInt = 2
+    """Windows in a row that must speak for a better state."""
     max_age: PositiveFloat = 3.0
     """Seconds after which a posterior no longer supports go."""
 

@@ -41,7 +41,8 @@ class Traversability:
     """The decision and what it rests on; None where nothing can be said.
 
     Torques are sums over the wheels [N m]; max_draft [N] on the level; max_grade [rad]
-    without draft; slip_needed gives the present demand; capability has all the rest.
+    without draft; slip_needed gives the present demand; since_valid is the time [s] since the
+    end of the last valid window; capability has all the rest.
     """
 
     state: State = State.UNKNOWN
@@ -52,6 +53,7 @@ class Traversability:
     max_grade: Estimate | None = None
     slip_needed: float | None = None
     limit: str | None = None
+    since_valid: float | None = None
     capability: Capability | None = None
 
 
@@ -101,17 +103,17 @@ def judge(
 
 def probability_of_pull(able: Capability, demand: Demand, settings: Settings) -> float:
     """That the wheels give the demand and its margin on the present slope."""
-    if able.max_pull is None:
+    if able.likely_pull is None:
         return 0.0
     needed = demand.pull + settings.margin * max(demand.pull, 0.0)
-    return _above(able.max_pull.value - needed, math.hypot(able.max_pull.std, demand.std))
+    return _above(able.likely_pull.value - needed, math.hypot(able.likely_pull.std, demand.std))
 
 
 def probability_of_depth(able: Capability, settings: Settings) -> float:
     """That the deepest wheel stays within the sinkage limit under the demand; 1 where no slip gives the demand."""
     if able.forecast is None:
         return 1.0
-    deepest = able.forecast.deepest
+    deepest = able.forecast.likely_depth
     return _above(settings.max_sinkage - deepest.value, deepest.std)
 
 

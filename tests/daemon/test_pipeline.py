@@ -171,7 +171,16 @@ def test_stubble_is_known_to_be_misunderstood(whole):
 KEYS = {"t", "status", "soil", "bearing_pressure", "slip", "sinkage", "traversability", "chi2", "samples", "rejected"}
 MORE = {"window", "reason", "state", "soil_class", "capability", "warning"}
 CAPABILITY = {"max_draft_here", "max_grade_with_draft", "set_points", "forecast", "over_slip"}
-DECISION = {"state", "probability", "torque_required", "torque_available", "max_draft", "max_grade", "limit"}
+DECISION = {
+    "state",
+    "probability",
+    "torque_required",
+    "torque_available",
+    "max_draft",
+    "max_grade",
+    "limit",
+    "since_valid",
+}
 
 
 @pytest.mark.parametrize("name", ["loam", "clay", "stubble"])

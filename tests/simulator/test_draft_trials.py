@@ -59,17 +59,21 @@ def test_the_largest_draft_is_foretold_on_held_soils():
 
 def test_the_command(tmp_path, capsys):
     out = tmp_path / "out.json"
-    few = ["--drives", "2", "--boggings", "1", "--hours", "0", "--seed", "4"]
+    few = ["--drives", "2", "--calls", "3", "--boggings", "1", "--hours", "0", "--seed", "4"]
     assert main(["decisions", *few, "--json", str(out)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert sum(line.startswith((*SOILS, "all")) for line in lines) == 4
     said = json.loads(out.read_text())
     assert [d["drives"] for d in said["max_draft"]] == [2, 2, 2, 6]
+    assert said["calls"]["drives"] == 3
+    assert sum(b["calls"] for b in said["calls"]["bins"]) == 3 - said["calls"]["failed"]
     assert set(said["immobilisation"]) == {"boggings", "in_time", "lead", "least_lead", "hours", "false"}
     assert (said["immobilisation"]["hours"], said["immobilisation"]["false"]) == (0.0, 0)
 
 
-@pytest.mark.parametrize("wrong", [["--drives", "0"], ["--boggings", "x"], ["--hours", "-1"], ["--seed", "-1"]])
+@pytest.mark.parametrize(
+    "wrong", [["--drives", "0"], ["--calls", "0"], ["--boggings", "x"], ["--hours", "-1"], ["--seed", "-1"]]
+)
 def test_wrong_usage_of_the_command(wrong, capsys):
     with pytest.raises(SystemExit) as stop:
         main(["decisions", *wrong])

@@ -75,12 +75,16 @@ class SetPoint:
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """The present demand met in steady driving: slip, sinkage [m] by wheel, the deepest, summed torque [N m]."""
+    """The present demand met in steady driving: slip, sinkage [m] by wheel, the deepest, summed torque [N m].
+
+    likely_depth is the deepest to first order, for probabilities.
+    """
 
     slip: Estimate
     sinkage: Mapping[str, Estimate]
     deepest: Estimate
     torque: Estimate
+    likely_depth: Estimate
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +93,8 @@ class Capability:
 
     max_draft [N] on the level; grades [rad], without draft and with the present one;
     max_pull [N] on the present slope, of draft and slope together, and max_draft_here of the
-    draft alone; limit is what ends max_draft.  forecast is None where no slip meets the demand.
+    draft alone; likely_pull is max_pull to first order, for probabilities; limit is what ends max_draft.
+    forecast is None where no slip meets the demand.
     """
 
     max_draft: Estimate
@@ -97,6 +102,7 @@ class Capability:
     max_grade: Estimate | None
     max_grade_with_draft: Estimate | None
     max_pull: Estimate | None
+    likely_pull: Estimate | None
     limit: Cause
     set_points: Mapping[str, SetPoint]
     forecast: Forecast | None
@@ -157,6 +163,7 @@ def assess(
         max_grade=max_grade,
         max_grade_with_draft=max_grade_with_draft,
         max_pull=max_pull,
+        likely_pull=None if pull is None else points.likely(pull.pull),
         limit=draft.cause,
         set_points=_set_points(table.axles, level, vehicle.limits, draft, points),
         forecast=forecast,
@@ -227,12 +234,14 @@ def _forecast(
     slip = place.on(np.broadcast_to(present.slip, present.pull.shape))
     draft, sine = Duty(None, demand.sine).split(place.on(present.pull), axles.weight)
     wheel = axles.wheel(axles.loads(draft[:, None], sine)[..., 0])
-    slip_needed, required, *depths = points.estimates(slip, torque, *model.sinkage(place.on(present.angle), wheel).T)
-    if slip_needed is None or required is None:
+    depth = np.asarray(model.sinkage(place.on(present.angle), wheel))
+    slip_needed, required, *depths = points.estimates(slip, torque, *depth.T)
+    likely = points.likely(depth[:, int(np.argmax(depth[0]))])
+    if slip_needed is None or required is None or likely is None:
         return None
     by_kind = [depth for depth in depths if depth is not None]
     by_wheel = {name: by_kind[kind] for name, kind in zip(rig.wheels, axles.of_wheel, strict=True)}
-    return Forecast(slip_needed, by_wheel, max(by_kind, key=lambda depth: depth.value), required)
+    return Forecast(slip_needed, by_wheel, max(by_kind, key=lambda depth: depth.value), required, likely)
 
 
 def _over_slip(level: Balance, table: WheelTable, points: SigmaPoints) -> OverSlip:

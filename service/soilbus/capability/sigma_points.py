@@ -55,6 +55,25 @@ class SigmaPoints:
         A point without a value (nan) gets its mirror image's, mirrored about the mode's;
         where both have none, and wherever the mode has none, the mean is nan.
         """
+        mode, near, linear = self._changes(samples)
+        shift = self.weight[1:] @ near
+        variance = self.weight[1:] @ near**2 - shift**2 + (linear**2).sum(axis=0)
+        shape = samples.shape[1:]
+        return (mode + shift).reshape(shape), np.sqrt(np.maximum(variance, 0.0)).reshape(shape)
+
+    def first_order(self, samples: Array) -> tuple[float, float]:
+        """Value at the mode and standard deviation of what changes sign with the soil, of samples (D,).
+
+        Mean-value first-order reliability (Cornell 1969).  It knows no curvature, and so gives the
+        median of what bends only.  The mean does not: what is hardly known lies along a curved valley
+        of the likelihood, which straight directions leave, and what bends there looks certain to grow.
+        """
+        mode, near, linear = self._changes(samples)
+        odd = 0.5 * (near - near[np.arange(len(near)) ^ 1])
+        return float(mode[0]), math.sqrt(float((self.weight[1:] @ odd**2 + (linear**2).sum(axis=0))[0]))
+
+    def _changes(self, samples: Array) -> tuple[Array, Array, Array]:
+        """Samples (D, ...) at the mode (Q,), and how those under the cubature and in the other directions differ."""
         flat = samples.reshape(len(samples), -1)
         mode, n = flat[0], len(self.weight)
         change = flat[1:] - mode
@@ -62,10 +81,11 @@ class SigmaPoints:
         if np.isnan(change).any():
             near = np.where(np.isnan(near), -near[np.arange(n - 1) ^ 1], near)
             linear = np.where(np.isnan(linear), 0.0, linear)
-        shift = self.weight[1:] @ near
-        variance = self.weight[1:] @ near**2 - shift**2 + (linear**2).sum(axis=0)
-        shape = samples.shape[1:]
-        return (mode + shift).reshape(shape), np.sqrt(np.maximum(variance, 0.0)).reshape(shape)
+        return mode, near, linear
+
+    def likely(self, samples: Array | None) -> Estimate | None:
+        """A scalar's median and spread of first order from its samples (D,); None as `estimates`."""
+        return None if samples is None else _known(*self.first_order(samples))
 
     def estimates(self, *samples: Array | None) -> list[Estimate | None]:
         """Scalars from their samples (D,) each; None where there are none or the mean is not known."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from soilbus.assembly import completion_of, model_of, prior_of, rig_of
 from soilbus.capability.assessment import Demand, OverSlip
+from soilbus.capability.demand import present_demand
 from soilbus.capability.immobilisation import Moment, Watch, moments, watched
 from soilbus.capability.wheels import WheelTable
 from soilbus.config import Config
@@ -21,10 +22,10 @@ from soilbus.estimation.gauss_newton import Fit
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.soil_class import SoilClasses, guessed
 from soilbus.estimation.tracker import MIN_ROWS, Ground, Settings, Tracked, Tracker
-from soilbus.estimation.window import Rig, Window, pull_asked
+from soilbus.estimation.window import Rig, Window
+from soilbus.hysteresis import Held, settled
 from soilbus.terra.effects.effect import Active, Surroundings, true_draft
 from soilbus.terra.effects.steady import CompletedModel
-from soilbus.terra.vehicle import GRAVITY
 from soilbus.traversability import State as Way
 from soilbus.traversability import Status, Traversability, judge
 
@@ -94,6 +95,8 @@ class WindowEstimator:
         self._completion = completion_of(config)
         self._settings = config.estimator
         self._wheels: WheelTable | None = None
+        self._held = Held()
+        self._valid_at: float | None = None
         self._watch = Watch()
         self._curve: OverSlip | None = None
         self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
@@ -145,7 +148,8 @@ class WindowEstimator:
         model = CompletedModel.of(self.model, effects, self._usual_speed(task.window))
         window = _with_true_draft(task.window, effects, self.rig)
         last_hop = list(moments(window, self.rig, task.end - self._settings.hop, self._settings.min_speed))
-        return Undecided(result, self._demand(window), task.torque_limit, stuck, last_hop, task.fresh, model)
+        demand = present_demand(window, self.rig.chassis, self._settings.hop)
+        return Undecided(result, demand, task.torque_limit, stuck, last_hop, task.fresh, model)
 
     def decide(self, window: Undecided) -> WindowResult:
         """The result with its traversability; windows in their order, here or in another process."""
@@ -155,10 +159,23 @@ class WindowEstimator:
         )  # fmt: skip
         if window.stuck:
             way = replace(way, state=Way.NO_GO, probability=0.0, limit="slip")
+        way = self._settle(way, window)
         self._look(window)
         if way.capability is not None and window.result.status is Status.VALID:
             self._curve = way.capability.over_slip
         return replace(window.result, traversability=way, watch=self._watch)
+
+    def _settle(self, way: Traversability, window: Undecided) -> Traversability:
+        """The state that the windows before allow, and how old the last valid one is."""
+        if window.fresh:
+            self._held, self._valid_at = Held(), None
+        result = window.result
+        if result.status is Status.VALID:
+            self._valid_at = result.t
+        self._held = settled(self._held, way.probability, result.status, self.config.traversability)
+        return replace(
+            way, state=self._held.state, since_valid=None if self._valid_at is None else result.t - self._valid_at
+        )
 
     def _look(self, window: Undecided) -> None:
         """Watch the last hop with what was known of the soil before it."""
@@ -199,24 +216,6 @@ class WindowEstimator:
         """Mean ground speed [m/s] while the vehicle moves, the least one where it does not."""
         moving = window.ground_speed[window.ground_speed > self._settings.min_speed]
         return float(moving.mean()) if len(moving) else self._settings.min_speed
-
-    def _demand(self, window: Window) -> Demand | None:
-        """Draft and slope, over the last hop or the whole window, whichever asks for more.
-
-        A driver who has just lifted the implement because it was too much still wants it
-        down.  None where the draft of the last hop is not known.
-        """
-        if self.rig.chassis is None or not len(window.t):
-            return None
-        pull = pull_asked(window, self.rig.chassis)
-        known = np.isfinite(pull)
-        recent = known & (window.t > window.t[-1] - self._settings.hop)
-        if not recent.any():
-            return None
-        part = recent if pull[recent].mean() >= pull[known].mean() else known
-        std = pull[part].std() / math.sqrt(np.count_nonzero(part))
-        slope = float((pull - window.draft)[part].mean())
-        return Demand(float(pull[part].mean()), float(std), slope / (self.rig.chassis.mass * GRAVITY))
 
     def _stuck(self, window: Window) -> bool:
         """Whether the wheels turned but the vehicle stood during most of the last hop."""

@@ -118,6 +118,7 @@ class Intake:
         self._limit = np.full(len(self.rig.wheels), math.nan)
         self._limit_t = np.full(len(self.rig.wheels), -math.inf)
         self._index = 0
+        self.epoch = 0
         self._restart()
 
     def _is_needed(self, channel: Channel) -> bool:
@@ -126,6 +127,7 @@ class Intake:
         return channel.quantity not in POSITION_ROLES
 
     def _restart(self) -> None:
+        self.epoch += 1  # nothing of the one before may be carried over
         self._bins: BinStore | None = None
         self._fresh = True
         self._positions.forget()
@@ -224,7 +226,9 @@ class Intake:
     def stale(self, now: float) -> list[str]:
         """Needed channels without an admitted sample within their time-out before `now` [s]."""
         return [
-            c.name for c in self.needed if now - self.last_seen.get(c.name, -math.inf) > (c.timeout or DEFAULT_TIMEOUT)
+            c.name
+            for c in self.needed
+            if not now - self.last_seen.get(c.name, -math.inf) <= (c.timeout or DEFAULT_TIMEOUT)  # nor nan
         ]
 
     def latest(self, now: float) -> Latest:

@@ -60,6 +60,7 @@ def json_line(result: WindowResult, config: Config) -> str:
                 "max_draft": _value_std(way.max_draft),
                 "max_grade": _value_std(way.max_grade),
                 "limit": way.limit,
+                "since_valid": way.since_valid,
             },
             "warning": {"state": str(result.watch.warning), "time_left": _finite(result.watch.time_left)},
             "capability": None if way.capability is None else _capability(way.capability),

@@ -9,6 +9,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from importlib.metadata import PackageNotFoundError, version
+from typing import NamedTuple
 
 from soilbus.can.bus import LiveBus
 from soilbus.can.publish import Publisher
@@ -40,6 +41,16 @@ LONGEST_CURVE = 60.0
 """Age [s] up to which a valid window's pull over slip serves to watch for immobilisation."""
 LONGEST_SOLVE = 20.0
 """A window that takes longer [s] is a worker that hangs: the watchdog is fed no more."""
+INTERRUPTIONS = frozenset(("bus_down", "no_frames", "input_missing", "input_stale"))
+"""Reasons for which no window handed out before is believed any more."""
+
+
+class Pending(NamedTuple):
+    """A window that the worker has, handed out at a monotonic time [s] in an epoch of the intake."""
+
+    future: Future[WindowResult]
+    at: float
+    epoch: int
 
 
 class Service:
@@ -72,10 +83,13 @@ class Service:
         self._watch = Watch()
         self._curve: tuple[OverSlip | None, float] = None, -math.inf
         self._workers = workers
-        self._pending: deque[Future[WindowResult]] = deque()
+        self._pending: deque[Pending] = deque()
         self._stopping = False
         self._started = clock()
         self._solved_at = self._started
+        self._handed_out = -math.inf  # monotonic time of the present result's window
+        self._interrupted = self._started  # monotonic time at which inputs failed last
+        self._epoch = self.intake.epoch
         self._last_frame = -1e9  # monotonic arrival time
         self._last_stamp = 0.0  # the bus's own time
         self._next_tick = self._started
@@ -130,7 +144,7 @@ class Service:
                 return
 
     def _result_waits(self) -> bool:
-        return bool(self._pending) and self._pending[0].done()
+        return bool(self._pending) and self._pending[0].future.done()
 
     def bus_time(self, now: float) -> float:
         """The bus's own time at the monotonic time `now` [s]."""
@@ -141,30 +155,40 @@ class Service:
         for task in self.intake.due(max(self._last_stamp, self.bus_time(now) - GRACE)):
             if not self._pending:
                 self._solved_at = now
-            self._pending.append(self._workers.submit(self._solve, task))
-            while len(self._pending) > MAX_PENDING and self._pending[1].cancel():
+            self._pending.append(Pending(self._workers.submit(self._solve, task), now, self.intake.epoch))
+            while len(self._pending) > MAX_PENDING and self._pending[1].future.cancel():
                 del self._pending[1]
                 self.deadline_misses += 1
 
     def _collect(self, now: float) -> None:
         """Publish the windows that are solved, in their order; raises what the worker raised."""
         while self._result_waits():
-            self.result = self._pending.popleft().result()
+            pending = self._pending.popleft()
+            result = pending.future.result()
             self._solved_at = now
-            if self.result.failure is not None:
-                self.failures[self.result.failure] += 1
-            able = self.result.traversability.capability
-            if able is not None and self.result.status is Status.VALID:
-                self._curve = able.over_slip, self.result.t
-            for message, values in hop_frames(self.result):
+            if result.failure is not None:
+                self.failures[result.failure] += 1
+            if pending.epoch == self.intake.epoch:
+                self._take(result, pending.at)
+            for message, values in hop_frames(result):
                 self.bus.send(self.publisher.frame(message, values))
             if self.on_window is not None:
-                self.on_window(self.result)
+                self.on_window(result)
+
+    def _take(self, result: WindowResult, handed_out: float) -> None:
+        self.result, self._handed_out = result, handed_out
+        able = result.traversability.capability
+        if able is not None and result.status is Status.VALID:
+            self._curve = able.over_slip, result.t
 
     def _tick(self, now: float) -> None:
         if self.bus.is_open:
             self.intake.ingest()
+        if self.intake.epoch != self._epoch:
+            self._epoch, self.result, self._watch, self._curve = self.intake.epoch, None, Watch(), (None, -math.inf)
         self._state = self._present_state(now)
+        if _kind(self._state[1]) in INTERRUPTIONS:
+            self._interrupted = now
         self._publish_ten_hertz(now)
         for message, due in self._due.items():
             if now >= due:
@@ -191,12 +215,13 @@ class Service:
         return state_after(self.result), self.result.reason
 
     def present_way(self, now: float) -> Way:
-        """go, caution or no_go only while the bus is up, no needed input is stale and the posterior is young."""
-        if self.result is None or self._present_state(now)[1].split()[0] in (
-            "bus_down", "no_frames", "input_missing", "input_stale",
-        ):  # fmt: skip
+        """go, caution or no_go only while the bus is up, no needed input is stale and the posterior is young.
+
+        After an interruption only a window that ended later counts.
+        """
+        if self.result is None or _kind(self._present_state(now)[1]) in INTERRUPTIONS:
             return Way.UNKNOWN
-        if self._age(now) > self.config.traversability.max_age:
+        if self._handed_out <= self._interrupted or not self._age(now) <= self.config.traversability.max_age:  # nor nan
             return Way.UNKNOWN
         return self.result.traversability.state
 
@@ -206,7 +231,16 @@ class Service:
         return known if self.bus_time(now) - t < LONGEST_CURVE else None
 
     def _age(self, now: float) -> float:
-        return self.bus_time(now) - self.result.t if self.result is not None else 1e9
+        """Of the posterior [s], by the bus's time or ours, whichever says more: the stamps' clock may halt."""
+        if self.result is None:
+            return math.inf
+        by_stamps = self.bus_time(now) - self.result.t
+        return by_stamps if math.isnan(by_stamps) else max(by_stamps, now - self._handed_out)
+
+    def _since_valid(self, now: float) -> float | None:
+        """Time [s] since the last valid posterior; None where there was none in this epoch."""
+        before = None if self.result is None else self.result.traversability.since_valid
+        return None if before is None else before + max(self._age(now), 0.0)
 
     def _publish_ten_hertz(self, now: float) -> None:
         way = self.present_way(now)
@@ -229,6 +263,7 @@ class Service:
                     "LimitingCause": limit,
                     "Probability": None if decided is None else decided.probability,
                     "Age": None if self.result is None else max(self._age(now), 0.0),
+                    "SinceValid": self._since_valid(now),
                     "Window": window,
                 },
             )
@@ -260,7 +295,7 @@ class Service:
                 message,
                 {
                     "State": str(state),
-                    "Reason": reason.split()[0],
+                    "Reason": _kind(reason),
                     "RejectedShare": 100.0 * sum(counts.refused.values()) / received if received else None,
                     "DeadlineMisses": self.deadline_misses,
                     "Window": self.result.index % WINDOW_MODULUS if self.result is not None else None,
@@ -275,6 +310,11 @@ class Service:
         if self.failures:
             text += ", failed solves: " + ", ".join(f"{kind} {n}" for kind, n in self.failures.most_common())
         self.notifier.status(text)
+
+
+def _kind(reason: str) -> str:
+    """Of a reason such as "input_stale load.FL", what the value table knows."""
+    return reason.split()[0]
 
 
 def software_version() -> tuple[int, int, int]:

@@ -8,14 +8,40 @@ from collections.abc import Iterator, Sequence
 from soilbus.report.table import table
 from soilbus.simulator.bogging_trials import ENOUGH_TIME, ENOUGH_WAY, WarningFigures
 from soilbus.simulator.draft_trials import SPREAD, DraftFigures
+from soilbus.simulator.verdict_trials import Bin, Reliability
 
 MAX_ERROR = 0.05
 COVERAGE = (0.90, 0.98)
 
 
-def decisions_report(drafts: Sequence[DraftFigures], warnings: WarningFigures) -> str:
+def decisions_report(drafts: Sequence[DraftFigures], calls: Reliability, warnings: WarningFigures) -> str:
     """All sections."""
-    return "\n".join([*_draft_section(drafts), "", *_warning_section(warnings)]) + "\n"
+    return "\n".join([*_draft_section(drafts), "", *_call_section(calls), "", *_warning_section(warnings)]) + "\n"
+
+
+def _call_section(found: Reliability) -> Iterator[str]:
+    yield "Probability that the present demand and its margin can be met, beside how often it truly can"
+    yield ""
+    head = ("probability", "calls", "mean", "came true", "95 % interval", "")
+    yield table(head, [_call_row(of_bin) for of_bin in found.bins if of_bin.calls])
+    yield (
+        f"{found.drives} drives, {found.failed} without a call.  Brier score {found.brier:.4f}, "
+        f"{found.brier_expected:.4f} +- {found.brier_std:.4f} if calibrated;"
+    )
+    yield f"outcomes less probabilities {found.excess:+.1f} standard deviations; go called {found.go} times, wrongly"
+    yield f"{found.wrong_go} times, {found.wrong_go_expected:.2f} expected.  * marks a mean outside its interval."
+
+
+def _call_row(of_bin: Bin) -> tuple[str, ...]:
+    astray = "" if of_bin.least <= of_bin.mean <= of_bin.most else "*"
+    return (
+        f"{of_bin.low:.1f} to {of_bin.high:.1f}",
+        str(of_bin.calls),
+        f"{of_bin.mean:.3f}",
+        f"{of_bin.true:.3f}",
+        f"{of_bin.least:.3f} to {of_bin.most:.3f}",
+        astray,
+    )
 
 
 def _warning_section(found: WarningFigures) -> Iterator[str]:
@@ -51,7 +77,7 @@ def _draft_row(of_soil: DraftFigures) -> tuple[str, ...]:
     )
 
 
-def as_json(drafts: Sequence[DraftFigures], warnings: WarningFigures) -> dict[str, object]:
+def as_json(drafts: Sequence[DraftFigures], calls: Reliability, warnings: WarningFigures) -> dict[str, object]:
     """The figures as plain objects; null for what is not a number."""
 
     def number(value: float) -> float | None:
@@ -65,6 +91,19 @@ def as_json(drafts: Sequence[DraftFigures], warnings: WarningFigures) -> dict[st
             }
             for d in drafts
         ],
+        "calls": {
+            "drives": calls.drives, "failed": calls.failed, "brier": number(calls.brier),
+            "brier_expected": number(calls.brier_expected), "brier_std": calls.brier_std,
+            "excess": number(calls.excess), "go": calls.go, "wrong_go": calls.wrong_go,
+            "wrong_go_expected": calls.wrong_go_expected,
+            "bins": [
+                {
+                    "low": b.low, "high": b.high, "calls": b.calls, "mean": number(b.mean),
+                    "true": number(b.true), "least": b.least, "most": b.most,
+                }
+                for b in calls.bins
+            ],
+        },
         "immobilisation": {
             "boggings": warnings.boggings, "in_time": warnings.warned, "lead": number(warnings.lead),
             "least_lead": number(warnings.least), "hours": warnings.hours, "false": warnings.false,

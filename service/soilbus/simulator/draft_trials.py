@@ -27,7 +27,7 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import soil_named
 from soilbus.terra.vehicle import axle_loads
-from soilbus.terra.wheel import Soil, WheelModel
+from soilbus.terra.wheel import Soil, WheelModel, sinkage
 
 Array = NDArray[np.float64]
 
@@ -111,10 +111,13 @@ def trial(task: Task) -> DraftTrial:
     return DraftTrial(name, able.max_draft.value, able.max_draft.std, truth)
 
 
-def true_largest_draft(soil: Soil, rig: Rig, torque_limit: Array, max_slip: float, model: WheelModel) -> float:
+def true_largest_draft(
+    soil: Soil, rig: Rig, torque_limit: Array, max_slip: float, model: WheelModel, max_sinkage: float = np.inf
+) -> float:
     """Largest draft [N] held steadily on level ground at any slip up to max_slip; nan where there is none.
 
-    torque_limit (W,) [N m], nan where there is none.  Raises ValueError for a rig without a chassis.
+    torque_limit (W,) [N m], nan where there is none; no wheel may sink below max_sinkage [m].
+    Raises ValueError for a rig without a chassis.
     """
     if rig.chassis is None:
         raise ValueError("a draft needs the vehicle's mass and geometry")
@@ -147,7 +150,8 @@ def true_largest_draft(soil: Soil, rig: Rig, torque_limit: Array, max_slip: floa
         ),
         Mechanics(model, ~rig.front, rig.chassis.mass, 0.0, 0.0),
     )
-    return float(np.max(found.draft[found.found], initial=-np.inf)) if found.found.any() else float("nan")
+    usable = found.found & (sinkage(found.entry_angle, rig.radius[:, None]) <= max_sinkage).all(axis=0)
+    return float(found.draft[usable].max()) if usable.any() else float("nan")
 
 
 def figures(soil: str, trials: Sequence[DraftTrial]) -> DraftFigures:

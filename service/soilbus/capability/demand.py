@@ -1,0 +1,30 @@
+"""What the present task asks of the wheels, from the window's own measurements."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from soilbus.capability.assessment import Demand
+from soilbus.estimation.window import Window, pull_asked
+from soilbus.terra.vehicle import GRAVITY, Chassis
+
+
+def present_demand(window: Window, chassis: Chassis | None, hop: float) -> Demand | None:
+    """Draft and slope, over the last hop [s] or the whole window, whichever asks for more.
+
+    A driver who has just lifted the implement because it was too much still wants it
+    down.  None where the draft of the last hop is not known.
+    """
+    if chassis is None or not len(window.t):
+        return None
+    pull = pull_asked(window, chassis)
+    known = np.isfinite(pull)
+    recent = known & (window.t > window.t[-1] - hop)
+    if not recent.any():
+        return None
+    part = recent if pull[recent].mean() >= pull[known].mean() else known
+    std = pull[part].std() / math.sqrt(np.count_nonzero(part))
+    slope = float((pull - window.draft)[part].mean())
+    return Demand(float(pull[part].mean()), float(std), slope / (chassis.mass * GRAVITY))
