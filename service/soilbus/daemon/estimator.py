@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from soilbus.capability.demand import present_demand
 from soilbus.capability.immobilisation import Moment, Watch, moments, watched
 from soilbus.capability.wheels import WheelTable
 from soilbus.config import Config
+from soilbus.daemon.gap import GapWatch, squares
 from soilbus.daemon.intake import WindowTask
 from soilbus.daemon.positions import Position
 from soilbus.estimation.completed import active_at
@@ -46,7 +47,8 @@ class WindowResult:
     status is invalid.  soil_class is the probability of each known soil and of `unknown`,
     the largest first.  position is in the middle of the data that count: of the window, or
     of its part on a new soil.  failure is the kind of a solve that failed, None where none did.
-    watch warns of immobilisation.
+    watch warns of immobilisation.  gaps: reduced chi-square of the channels that have not
+    fitted for minutes, the worst first.
     """
 
     t: float
@@ -65,6 +67,7 @@ class WindowResult:
     soil_class: dict[str, float] | None = None
     position: Position | None = None
     failure: str | None = None
+    gaps: Mapping[str, float] = field(default_factory=dict)
     watch: Watch = Watch()  # noqa: RUF009, immutable
 
 
@@ -95,6 +98,7 @@ class WindowEstimator:
         self._completion = completion_of(config)
         self._settings = config.estimator
         self._wheels: WheelTable | None = None
+        self._gap = GapWatch(config.estimator.window, config.estimator.hop)
         self._held = Held()
         self._valid_at: float | None = None
         self._watch = Watch()
@@ -143,6 +147,7 @@ class WindowEstimator:
             soil_class=self._soil_class(posterior),
             position=task.track.at((tracked.since + task.end) / 2.0),
             failure=self._failure(tracked),
+            gaps=self._watched_gaps(task, fit),
         )
         effects = self._effects(fit)
         model = CompletedModel.of(self.model, effects, self._usual_speed(task.window))
@@ -176,6 +181,14 @@ class WindowEstimator:
         return replace(
             way, state=self._held.state, since_valid=None if self._valid_at is None else result.t - self._valid_at
         )
+
+    def _watched_gaps(self, task: WindowTask, fit: Fit | None) -> Mapping[str, float]:
+        """The channels that have not fitted for minutes; windows with poor inputs have no say."""
+        if task.fresh:
+            self._gap.forget()
+        if fit is not None and not task.missing and not task.poor:
+            self._gap.take(task.end, squares(fit.optimum.at, len(self.rig.wheels)))
+        return self._gap.gaps()
 
     def _look(self, window: Undecided) -> None:
         """Watch the last hop with what was known of the soil before it."""

@@ -62,6 +62,7 @@ def json_line(result: WindowResult, config: Config) -> str:
                 "limit": way.limit,
                 "since_valid": way.since_valid,
             },
+            "gaps": dict(result.gaps),
             "warning": {"state": str(result.watch.warning), "time_left": _finite(result.watch.time_left)},
             "capability": None if way.capability is None else _capability(way.capability),
             "chi2": result.chi2,

@@ -176,6 +176,12 @@ class Service:
                 self.on_window(result)
 
     def _take(self, result: WindowResult, handed_out: float) -> None:
+        if result.gaps and not (self.result is not None and self.result.gaps):
+            told = ", ".join(f"{channel} {chi2:.2f}" for channel, chi2 in result.gaps.items())
+            log.warning(
+                "model_gap: for minutes the model has not described %s (chi-square; 1 is noise); "
+                "record a drive with candump -l and run: soilbus diagnose --config F LOG", told,
+            )  # fmt: skip
         self.result, self._handed_out = result, handed_out
         able = result.traversability.capability
         if able is not None and result.status is Status.VALID:
@@ -212,7 +218,10 @@ class Service:
             return ServiceState.DEGRADED, reason
         if self.result is None:
             return ServiceState.ESTIMATING, "none"
-        return state_after(self.result), self.result.reason
+        reason = self.result.reason
+        if self.result.gaps and reason.split()[0] in ("none", "model_mismatch"):
+            reason = "model_gap " + " ".join(self.result.gaps)
+        return state_after(self.result), reason
 
     def present_way(self, now: float) -> Way:
         """go, caution or no_go only while the bus is up, no needed input is stale and the posterior is young.
