@@ -38,7 +38,7 @@ def test_a_better_state_needs_two_windows_well_above_its_threshold():
     assert states(0.9, above, above) == [CAUTION, CAUTION, GO]
     assert states(0.9, *[SURE_GO - 1e-6] * 9) == [CAUTION] * 10
     assert states(0.9, above, 0.95, above, above) == [CAUTION] * 4 + [GO]
-    assert states(0.4, SURE_CAUTION + 1e-6, 0.99, 0.99, 0.99) == [NO_GO, NO_GO, CAUTION, CAUTION, GO]
+    assert states(0.4, SURE_CAUTION + 1e-6, 0.99, 0.99) == [NO_GO, NO_GO, CAUTION, GO]
     assert states(0.4, 0.99, 0.99) == [NO_GO, NO_GO, GO]
     assert states(0.4, 0.55, 0.55, 0.55) == [NO_GO] * 4
 
@@ -63,19 +63,22 @@ WINDOWS = st.lists(st.tuples(st.none() | st.floats(0.0, 1.0), st.sampled_from(St
 def test_never_better_than_the_window_allows(windows, hold, hysteresis):
     config = Settings(hold=hold, hysteresis=hysteresis)
     found = states(*windows, config=config)
-    last, risen = UNKNOWN, 0
+    last, allowed = UNKNOWN, []
     for (p, status), state in zip(windows, found, strict=True):
         if p is None:
             assert state is UNKNOWN
+            allowed = []
         else:
-            now = state_of(p, status, config)
-            assert ORDER.index(state) <= ORDER.index(now)
+            now = ORDER.index(state_of(p, status, config))
+            allowed.append(now)
+            assert ORDER.index(state) <= now
             if last is not UNKNOWN:
-                risen = risen + 1 if ORDER.index(now) > ORDER.index(last) else 0
-                assert ORDER.index(state) <= ORDER.index(last) or risen >= hold
-                assert ORDER.index(now) > ORDER.index(last) or state is now
-            if state is not last:
-                risen = 0
+                before = ORDER.index(last)
+                assert now > before or ORDER.index(state) == now
+                assert now < before or ORDER.index(state) >= before
+                if ORDER.index(state) > before:
+                    assert len(allowed) >= hold
+                    assert min(allowed[-hold:]) >= ORDER.index(state)
         last = state
 
 

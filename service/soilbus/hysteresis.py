@@ -14,11 +14,10 @@ ORDER = (State.NO_GO, State.CAUTION, State.GO)
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """The state in force; towards is the better one for which the last `windows` windows spoke."""
+    """The state in force, and the states for which the last windows surely spoke."""
 
     state: State = State.UNKNOWN
-    towards: State = State.UNKNOWN
-    windows: int = 0
+    recent: tuple[State, ...] = ()
 
 
 def settled(last: Held, probability: float | None, status: Status, settings: Settings) -> Held:
@@ -26,21 +25,20 @@ def settled(last: Held, probability: float | None, status: Status, settings: Set
 
     Unknown (probability None) and a worse state take effect at once.  A better one does
     when `hold` windows in a row pass its threshold by `hysteresis` standard deviations of
-    the margin; it is then the worst that they spoke for.  Unknown holds nothing back: what
-    follows it counts as a first window does.
+    the margin.  Unknown holds nothing back: what follows it counts as a first window does.
     """
     if probability is None:
         return Held()
-    now = state_of(probability, status, settings)
-    if last.state is State.UNKNOWN or ORDER.index(now) <= ORDER.index(last.state):
-        return Held(now)
-    surely = state_of(probability, status, _raised(settings))
-    if ORDER.index(surely) <= ORDER.index(last.state):
-        return Held(last.state)
-    towards = surely if last.windows == 0 else min(surely, last.towards, key=ORDER.index)
-    if last.windows + 1 >= settings.hold:
-        return Held(towards)
-    return Held(last.state, towards, last.windows + 1)
+    now, surely = (state_of(probability, status, by) for by in (settings, _raised(settings)))
+    recent = (*last.recent, surely)[-settings.hold :]
+    if last.state is State.UNKNOWN or _rank(now) <= _rank(last.state):
+        return Held(now, recent)
+    risen = min(recent, key=_rank) if len(recent) == settings.hold else last.state
+    return Held(max(last.state, risen, key=_rank), recent)
+
+
+def _rank(state: State) -> int:
+    return ORDER.index(state)
 
 
 def _raised(settings: Settings) -> Settings:
