@@ -19,7 +19,7 @@ from soilbus.terra.effects.effect import Effect
 MAX_EFFECTS = 3
 TRIED = 8
 """Candidates of a round that are fitted to a few instants."""
-FITTED = 4
+FITTED = 6
 """Those of them that are fitted to all."""
 THINNED = 4
 NEAR = 0.2

@@ -20,9 +20,9 @@ class Verdict(StrEnum):
     UNKNOWN = "unknown"
 
 
-PAYS = 16.0
+PAYS = 10.0
 """Fall of -2 log evidence from which an effect is added."""
-TEMPERATURE = 3.0
+TEMPERATURE = 6.0
 """By how much evidences are less certain than they say: no effect's formula is the field's."""
 SURE = 0.8
 """Probability from which a name stands alone."""

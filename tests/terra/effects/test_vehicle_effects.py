@@ -29,6 +29,8 @@ def test_a_drive_line_takes_torque_driving_and_braking():
     around = AROUND._replace(wheel_speed=np.array([[2.0, 2.0], [2.0, -2.0]]))
     reading = torque_of("drivetrain_loss", torque, around, share=0.1, drag=15.0)
     assert reading == pytest.approx(np.array([[565.0, -165.0], [565.0, 435.0]]))
+    churned = torque_of("drivetrain_loss", torque, around, viscous=4.0)
+    assert churned == pytest.approx(np.array([[508.0, -192.0], [508.0, 492.0]]))
 
 
 def test_a_constant_slope_holds_back_as_the_weight_along_it():
@@ -79,16 +81,18 @@ def test_too_few_instants_have_no_rate(size):
     around = AROUND._replace(t=T[:size, None], wheel_speed=np.linspace(1.0, 2.0, size)[:, None])
     torque = np.full((size, 1), 300.0)
     assert np.array_equal(torque_of("inertia", torque, around, wheel_inertia=40.0), torque)
-    assert np.array_equal(torque_of("torque_lag", torque, around, delay=0.3), torque)
+    assert torque_of("torque_lag", torque, around, delay=0.3) == pytest.approx(torque, rel=1e-12)
 
 
 @pytest.mark.parametrize("delay", [0.03, 0.1, 0.25, 0.6])
 def test_a_late_torque_is_the_torque_of_an_earlier_moment(delay):
     torque = np.stack([500.0 + 200.0 * np.sin(1.3 * T), 400.0 + 10.0 * T], axis=1)
     late = torque_of("torque_lag", torque, AROUND._replace(t=T[:, None]), delay=delay)
-    for wheel in range(2):
-        assert late[:, wheel] == pytest.approx(np.interp(T - delay, T, torque[:, wheel]), rel=1e-12)
     begun = delay < T
+    before = torque[0] + (T[~begun] - delay)[:, None] * (torque[1] - torque[0]) / (T[1] - T[0])
+    assert late[~begun] == pytest.approx(before, rel=1e-9)  # straight on, beyond the first instant
+    for wheel in range(2):
+        assert late[begun, wheel] == pytest.approx(np.interp(T - delay, T, torque[:, wheel])[begun], rel=1e-12)
     assert late[begun, 0] == pytest.approx(500.0 + 200.0 * np.sin(1.3 * (T[begun] - delay)), abs=0.5)
 
 
@@ -96,7 +100,7 @@ def test_nothing_is_late_or_fast_across_a_gap():
     """Two runs with a minute between: each as if alone."""
     t = np.concatenate([T[:50], T[:50] + 65.0])
     torque, around = np.repeat([200.0, 900.0], 50)[:, None], AROUND._replace(t=t[:, None])
-    assert np.array_equal(torque_of("torque_lag", torque, around, delay=0.4), torque)
+    assert torque_of("torque_lag", torque, around, delay=0.4) == pytest.approx(torque, rel=1e-12)
     around = around._replace(wheel_speed=np.repeat([1.0, 3.0], 50)[:, None])
     assert torque_of("inertia", torque, around, wheel_inertia=30.0) == pytest.approx(torque, rel=1e-12)
 

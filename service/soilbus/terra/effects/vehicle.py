@@ -12,20 +12,22 @@ from soilbus.terra.wheel import WheelModel, WheelState
 
 
 def _drive_line(torque: Array, around: Surroundings, values: Values) -> Array:
-    """At the motor: T + (share |T| + drag) in the direction of rotation."""
-    way = np.where(np.asarray(around.wheel_speed) < 0.0, -1.0, 1.0)
-    return np.asarray(torque + way * (values["share"] * np.abs(torque) + values["drag"]))
+    """At the motor: T + (share |T| + drag + viscous |omega|) in the direction of rotation."""
+    speed = np.asarray(around.wheel_speed)
+    way = np.where(speed < 0.0, -1.0, 1.0)
+    return np.asarray(torque + way * (values["share"] * np.abs(torque) + values["drag"]) + values["viscous"] * speed)
 
 
 DRIVETRAIN_LOSS = Effect(
     name="drivetrain_loss",
     physics="Gears and bearings between motor and wheel take torque that never reaches the ground.",
-    source="loss in proportion to load and a drag without load: Niemann & Winter, Maschinenelemente 2 (2003);"
-    " ISO/TR 14179-1:2001",
+    source="loss in proportion to load, a drag without load, churning with speed: Niemann & Winter,"
+    " Maschinenelemente 2 (2003); ISO/TR 14179-1:2001",
     tells="wheels turning off the ground (the drag alone), or torque cells at the wheels",
     parameters=(
         Parameter("share", "1", 0.0, 0.06, 0.0, 0.4),
         Parameter("drag", "N m", 0.0, 20.0, 0.0, 400.0),
+        Parameter("viscous", "N m s", 0.0, 5.0, 0.0, 200.0),
     ),
     torque=_drive_line,
 )
