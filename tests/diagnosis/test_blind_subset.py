@@ -35,7 +35,9 @@ def test_effects_alike_are_told_as_a_set():
     case = the_case("single/slip_sinkage:factor/medium/")
     trial = tried(case)
     assert trial.verdict == "ambiguous"
-    assert in_set(trial) == {"slip_sinkage", "stress_peak_shift"}
+    likely = {name for name, chance in trial.sets[0].items() if chance > 0.2}
+    assert likely == {"slip_sinkage", "stress_peak_shift"}
+    assert in_set(trial) >= likely
     assert sum(trial.sets[0].values()) == pytest.approx(1.0, abs=0.05)
 
 

@@ -168,7 +168,9 @@ FORMS = (
         by_hooks(torque=_dragging),
         other=False,
     ),
-    Form("drivetrain_loss", "viscous", "churning oil", "N m s", (1.2, 1.2), 50.0, by_hooks(torque=_viscous)),
+    Form(
+        "drivetrain_loss", "viscous", "churning oil", "N m s", (1.2, 1.2), 50.0, by_hooks(torque=_viscous), other=False
+    ),
     Form("torque_lag", "delay", "as from a queue", "s", (0.01, 0.01), 0.4, by_hooks(torque=_delayed), other=False),
     Form("torque_lag", "filter", "first-order low pass", "s", (0.011, 0.011), 0.4, by_hooks(torque=_filtered)),
     Form(
