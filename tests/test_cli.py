@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from soilbus.cli import main
-from soilbus.config import ConfigError, load_config
+from soilbus.config import ConfigError
+from soilbus.config_file import load_config
 
 FIELD = Path(__file__).resolve().parent / "field/field.toml"
 

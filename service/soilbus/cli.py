@@ -11,14 +11,16 @@ import math
 import os
 import signal
 import sys
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 from soilbus.allocator import keep_freed_memory
-from soilbus.config import Config, ConfigError, load_config
+from soilbus.arguments import between, counted, natural
+from soilbus.config import Config, ConfigError
+from soilbus.config_file import load_config
+from soilbus.report.whole_file import NotWritten, whole_file
 
 if TYPE_CHECKING:
     from soilbus.daemon.pipeline import WindowResult
@@ -43,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for fault in error.faults:
             print(f"soilbus: {fault}", file=sys.stderr)
         return WRONG_USAGE
-    except WorkError as error:
+    except (WorkError, NotWritten) as error:
         print(f"soilbus: {error}", file=sys.stderr)
         return FAILED
     except BrokenPipeError:  # the reader of our output has seen enough
@@ -89,7 +91,7 @@ def _parser() -> argparse.ArgumentParser:
         help="an effect on wheels or sensors; NAME.PARAMETER=VALUE for another than its first parameter; repeatable",
     )  # fmt: skip
     sub.add_argument("--duration", type=float, default=120.0, metavar="S")
-    sub.add_argument("--seed", type=_natural, default=1)
+    sub.add_argument("--seed", type=natural, default=1)
     sub.add_argument("--start", nargs=2, type=float, metavar=("LAT", "LON"), help="where it starts [deg]")
     sub.add_argument("--heading", type=float, default=0.0, metavar="DEG", help="clockwise from north (default 0)")
     sub.add_argument(
@@ -112,22 +114,22 @@ def _parser() -> argparse.ArgumentParser:
 
     sub = command("paper", _paper, "the tables of Xi et al. 2024 beside ours, and what holds of its method", "")
     sub.add_argument(
-        "--sinkage", type=_between(0.005, 0.2), default=0.05, metavar="M",
+        "--sinkage", type=between(0.005, 0.2), default=0.05, metavar="M",
         help="of the simulated wheels, 0.005 to 0.2 m; the paper does not print its own (default 0.05)",
     )  # fmt: skip
-    sub.add_argument("--seed", type=_natural, default=1, help="of the noise (default 1)")
+    sub.add_argument("--seed", type=natural, default=1, help="of the noise (default 1)")
 
     sub = command("montecarlo", _montecarlo, "errors of simulated windows beside the Cramér-Rao bound", "optional")
-    sub.add_argument("--windows", type=_counted, default=200, metavar="N", help="of each kind (default 200)")
-    sub.add_argument("--seed", type=_natural, default=1, help="of drives, noise and priors (default 1)")
+    sub.add_argument("--windows", type=counted, default=200, metavar="N", help="of each kind (default 200)")
+    sub.add_argument("--seed", type=natural, default=1, help="of drives, noise and priors (default 1)")
     sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
 
     sub = command("decisions", _decisions, "what soilbus foretells, beside what simulated drives then do", "optional")
-    sub.add_argument("--drives", type=_counted, default=150, metavar="N", help="on each held soil (default 150)")
-    sub.add_argument("--calls", type=_counted, default=600, metavar="N", help="of go, caution, no-go (default 600)")
-    sub.add_argument("--boggings", type=_counted, default=40, metavar="N", help="drives into trouble (default 40)")
-    sub.add_argument("--hours", type=_between(0.0, 100.0), default=1.0, metavar="H", help="on firm ground (default 1)")
-    sub.add_argument("--seed", type=_natural, default=1, help="of soils, drives, noise and priors (default 1)")
+    sub.add_argument("--drives", type=counted, default=150, metavar="N", help="on each held soil (default 150)")
+    sub.add_argument("--calls", type=counted, default=600, metavar="N", help="of go, caution, no-go (default 600)")
+    sub.add_argument("--boggings", type=counted, default=40, metavar="N", help="drives into trouble (default 40)")
+    sub.add_argument("--hours", type=between(0.0, 100.0), default=1.0, metavar="H", help="on firm ground (default 1)")
+    sub.add_argument("--seed", type=natural, default=1, help="of soils, drives, noise and priors (default 1)")
     sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
 
     sub = command("bench", _bench, "every performance figure beside its peer, in one run", "")
@@ -206,7 +208,7 @@ def _replay(args: argparse.Namespace) -> None:
     _write_windows(args, config, results, summary(results, pipeline))
     if args.map is not None:
         text, left_out = soil_map(results)
-        with _whole_file(args.map) as out:
+        with whole_file(args.map) as out:
             out.write(text)
         if left_out:
             print(f"soilbus: {left_out} of {len(results)} windows have no position: not on the map", file=sys.stderr)
@@ -238,11 +240,11 @@ def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[W
     from soilbus.report.windows import html_report
 
     if args.json is not None:
-        with _whole_file(args.json) as out:
+        with whole_file(args.json) as out:
             for result in results:
                 out.write(json_line(result, config) + "\n")
     if args.report is not None:
-        with _whole_file(args.report) as out:
+        with whole_file(args.report) as out:
             out.write(html_report(results, text, args.logs))
 
 
@@ -268,7 +270,7 @@ def _simulate(args: argparse.Namespace) -> None:
 
 
 def _diagnose(args: argparse.Namespace) -> None:
-    from soilbus.config_file import with_effects_text
+    from soilbus.config_edit import with_effects_text
     from soilbus.daemon.diagnose import diagnose_logs
     from soilbus.daemon.replay import LogError
     from soilbus.diagnosis.diagnose import NotFitted
@@ -297,7 +299,7 @@ def _diagnose(args: argparse.Namespace) -> None:
         text = with_effects_text(Path(args.config), args.set, effects, args.model_out.parent, notes)
         texts.append((args.model_out, text))
     for path, text in texts:
-        with _whole_file(path) as out:
+        with whole_file(path) as out:
             out.write(text)
     if all(str(path) != "-" for path, _ in texts):
         print(findings_text(findings), end="")
@@ -314,40 +316,10 @@ def _watch(args: argparse.Namespace) -> None:
         raise WorkError(str(error)) from None
 
 
-def _between(low: float, high: float) -> Callable[[str], float]:
-    """Parser of a number in a range, for argparse."""
-
-    def number(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"{text} is not a number from {low:g} to {high:g}")
-        return value
-
-    return number
-
-
-def _natural(text: str) -> int:
-    """Parser of a whole number that is not negative, for argparse."""
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text} is not a whole number from 0 up")
-    return int(text)
-
-
 def _paper(args: argparse.Namespace) -> None:
     from soilbus.report.paper import paper_report
 
     print(paper_report(args.sinkage, args.seed), end="")
-
-
-def _counted(text: str) -> int:
-    """Parser of a whole number above zero, for argparse."""
-    number = _natural(text)
-    if number == 0:
-        raise argparse.ArgumentTypeError("0 is not enough")
-    return number
 
 
 def _montecarlo(args: argparse.Namespace) -> None:
@@ -365,7 +337,7 @@ def _montecarlo(args: argparse.Namespace) -> None:
     except SimulationError as error:
         raise WorkError(str(error)) from None
     if args.json is not None:
-        with _whole_file(args.json) as out:
+        with whole_file(args.json) as out:
             out.write(json.dumps([as_json(cell) for cell in cells], indent=1) + "\n")
     if str(args.json) != "-":
         print(monte_carlo_report(cells), end="")
@@ -391,7 +363,7 @@ def _decisions(args: argparse.Namespace) -> None:
     except SimulationError as error:
         raise WorkError(str(error)) from None
     if args.json is not None:
-        with _whole_file(args.json) as out:
+        with whole_file(args.json) as out:
             out.write(json.dumps(as_json(drafts, calls, warnings), indent=1) + "\n")
     if str(args.json) != "-":
         print(decisions_report(drafts, calls, warnings), end="")
@@ -403,7 +375,7 @@ def _bench(args: argparse.Namespace) -> None:
     _need("scipy", "peers", "bench")
     from soilbus.bench import bench_report, run_bench
 
-    with nullcontext() if args.json is None else _whole_file(args.json) as out:  # first, for it takes a minute
+    with nullcontext() if args.json is None else whole_file(args.json) as out:  # first, for it takes a minute
         try:
             results = run_bench()
         except (AssertionError, ModuleNotFoundError) as error:
@@ -426,31 +398,6 @@ def _check_folders(*paths: Path | None) -> None:
     for path in paths:
         if path is not None and not path.parent.is_dir():
             raise WorkError(f"{path}: no folder {path.parent}")
-
-
-@contextmanager
-def _whole_file(path: Path) -> Iterator[IO[str]]:
-    """A text file that appears under its name only when it is complete; "-" is stdout."""
-    if str(path) == "-":
-        yield sys.stdout
-        return
-    try:
-        with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=f".{path.name}.", delete=False) as out:
-            try:
-                yield out
-            except BaseException:
-                os.unlink(out.name)
-                raise
-        os.chmod(out.name, 0o666 & ~_umask())
-        os.replace(out.name, path)
-    except OSError as error:
-        raise WorkError(f"{path}: {error.strerror or error}") from None
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ error.  Values are SI; a quantity in another unit says so in its name.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -382,28 +381,6 @@ class Config(_Section):
         return {name: getattr(self.soil, name) for name in SoilPrior.model_fields}
 
 
-def load_config(path: Path | str, overrides: Iterable[str] = ()) -> Config:
-    """Read a TOML file, apply KEY=VALUE overrides (dotted paths), check everything.
-
-    Raises ConfigError with one line for each fault.
-    """
-    path = Path(path)
-    try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError([f"{path}: {error.strerror or error}"]) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError([f"{path}: not TOML: {error}"]) from None
-    return parse_config(overridden(raw, overrides), folder=path.parent, source=str(path))
-
-
-def overridden(raw: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
-    """The nested mappings, changed in place by KEY=VALUE overrides; ConfigError for one that cannot be."""
-    for text in overrides:
-        _override(raw, text)
-    return raw
-
-
 def parse_config(raw: Mapping[str, Any], folder: Path = Path("."), source: str = "configuration") -> Config:
     """Check a configuration given as nested mappings; ConfigError lists every fault."""
     if "folder" in raw:
@@ -422,51 +399,3 @@ def _fault(raw: Mapping[str, Any], error: Any) -> str:
         return f"{where}: missing"
     message = str(error["msg"]).removeprefix("Value error, ")
     return f"{where}: {message}" if where else message
-
-
-def _override(raw: dict[str, Any], text: str) -> None:
-    key, equals, value = text.partition("=")
-    parts = key.strip().split(".")
-    if not equals or not all(parts):
-        raise ConfigError([f"--set {text}: expected KEY=VALUE with a dotted key"])
-    try:
-        parsed = tomllib.loads(f"x = {value}")["x"]
-    except tomllib.TOMLDecodeError:
-        parsed = value.strip()
-    here: Any = raw
-    for i, part in enumerate(parts[:-1]):
-        here = _child(here, part, ".".join(parts[: i + 1]), text)
-    if isinstance(here, list):
-        raise ConfigError([f"--set {text}: {'.'.join(parts[:-1])} is a list"])
-    here[parts[-1]] = parsed
-
-
-def _child(here: Any, part: str, path: str, text: str) -> Any:
-    """The table (or the wheel by name or number) that one step of a dotted key leads to."""
-    if isinstance(here, list):
-        for i, item in enumerate(here):
-            if part in (str(i), item.get("name") if isinstance(item, dict) else None):
-                return item
-        raise ConfigError([f"--set {text}: no {path}"])
-    child = here.setdefault(part, {})
-    if isinstance(child, str):  # "Message.Signal", or the name of a column, grows into its table form
-        here[part] = {"column" if path.startswith("table.") else "signal": child}
-        child = here[part]
-    if not isinstance(child, (dict, list)):
-        raise ConfigError([f"--set {text}: {path} is a value, not a table"])
-    return child
-
-
-def defaults_text(config: Config) -> str:
-    """Every setting with its value in force, one dotted KEY = VALUE a line."""
-    lines: list[str] = []
-
-    def walk(prefix: str, value: Any) -> None:
-        if isinstance(value, Mapping):
-            for k, v in value.items():
-                walk(f"{prefix}.{k}" if prefix else k, v)
-        else:
-            lines.append(f"{prefix} = {value}")
-
-    walk("", config.model_dump(exclude={"wheel", "signals", "folder"}))
-    return "\n".join(lines)

@@ -1,60 +1,65 @@
-"""A configuration file with other effects, everything else as it was, comments included."""
+"""A configuration file and KEY=VALUE overrides -> a checked Config."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Mapping, Sequence
+import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import tomlkit
-
-from soilbus.can.dbc_files import located
-from soilbus.config import load_config, overridden
-
-EffectTable = Mapping[str, Any]
-"""name, and for each parameter {value, std} or, where wheels have their own, such a table for each wheel."""
+from soilbus.config import Config, ConfigError, parse_config
 
 
-def with_effects_text(
-    path: Path, overrides: Iterable[str], effects: Sequence[EffectTable], place: Path, notes: Iterable[str] = ()
-) -> str:
-    """The text of the file at `path` with overrides in force and these effects, to be kept in the folder `place`.
+def load_config(path: Path | str, overrides: Iterable[str] = ()) -> Config:
+    """Read a TOML file, apply KEY=VALUE overrides (dotted paths), check everything.
 
-    DBC files are named so that they are found from there.  `notes` become comments at the
-    effects.  Raises ConfigError as load_config().
+    Raises ConfigError with one line for each fault.
     """
-    config = load_config(path, overrides)
-    document = overridden(tomlkit.parse(path.read_text(encoding="utf-8")), overrides)
-    if "model" not in document:
-        document["model"] = tomlkit.table()
-    document["model"]["effects"] = _array(effects)
-    for note in notes:
-        document["model"].add(tomlkit.comment(note))
-    if config.dbc.input:
-        document["dbc"]["input"] = [_from(place, config.folder, name) for name in config.dbc.input]
-    if (renamed := _from(place, config.folder, config.output.dbc)) != config.output.dbc:
-        document["output"]["dbc"] = renamed
-    return tomlkit.dumps(document)
+    path = Path(path)
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError([f"{path}: {error.strerror or error}"]) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError([f"{path}: not TOML: {error}"]) from None
+    return parse_config(overridden(raw, overrides), folder=path.parent, source=str(path))
 
 
-def _array(effects: Sequence[EffectTable]) -> Any:
-    array = tomlkit.array().multiline(len(effects) > 0)
-    for effect in effects:
-        array.append(_inline(effect))
-    return array
+def overridden(raw: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
+    """The nested mappings, changed in place by KEY=VALUE overrides; ConfigError for one that cannot be."""
+    for text in overrides:
+        _override(raw, text)
+    return raw
 
 
-def _inline(table: Mapping[str, Any]) -> Any:
-    inline = tomlkit.inline_table()
-    for key, value in table.items():
-        inline[key] = _inline(value) if isinstance(value, Mapping) else value
-    return inline
+def _override(raw: dict[str, Any], text: str) -> None:
+    key, equals, value = text.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not all(parts):
+        raise ConfigError([f"--set {text}: expected KEY=VALUE with a dotted key"])
+    try:
+        parsed = tomllib.loads(f"x = {value}")["x"]
+    except tomllib.TOMLDecodeError:
+        parsed = value.strip()
+    here: Any = raw
+    for i, part in enumerate(parts[:-1]):
+        here = _child(here, part, ".".join(parts[: i + 1]), text)
+    if isinstance(here, list):
+        raise ConfigError([f"--set {text}: {'.'.join(parts[:-1])} is a list"])
+    here[parts[-1]] = parsed
 
 
-def _from(place: Path, folder: Path, name: str) -> str:
-    """How a DBC file that a configuration in `folder` calls `name` is called by one in `place`."""
-    file = located(folder, name)
-    if located(place, name).resolve() == file.resolve():
-        return name
-    return os.path.relpath(file.resolve(), place.resolve())
+def _child(here: Any, part: str, path: str, text: str) -> Any:
+    """The table (or the wheel by name or number) that one step of a dotted key leads to."""
+    if isinstance(here, list):
+        for i, item in enumerate(here):
+            if part in (str(i), item.get("name") if isinstance(item, dict) else None):
+                return item
+        raise ConfigError([f"--set {text}: no {path}"])
+    child = here.setdefault(part, {})
+    if isinstance(child, str):  # "Message.Signal", or the name of a column, grows into its table form
+        here[part] = {"column" if path.startswith("table.") else "signal": child}
+        child = here[part]
+    if not isinstance(child, (dict, list)):
+        raise ConfigError([f"--set {text}: {path} is a value, not a table"])
+    return child

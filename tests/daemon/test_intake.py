@@ -10,7 +10,7 @@ import pytest
 
 from soilbus.can.candump import Frame
 from soilbus.can.dbc_files import load_databases
-from soilbus.config import load_config
+from soilbus.config_file import load_config
 from soilbus.daemon.intake import Intake
 from soilbus.daemon.replay import read_frames
 from soilbus.simulator.frames import frames

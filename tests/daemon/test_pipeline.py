@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from soilbus.can.dbc_files import load_databases
-from soilbus.config import load_config
+from soilbus.config_file import load_config
 from soilbus.daemon.outputs import json_line
 from soilbus.daemon.pipeline import Pipeline
 from soilbus.traversability import State, Status

@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from soilbus.assembly import prior_of
-from soilbus.config import Config, load_config
+from soilbus.config import Config
+from soilbus.config_file import load_config
 from soilbus.daemon.tables import candidates, recordings_of_tables
 from soilbus.diagnosis.completion import Completion
 from soilbus.diagnosis.diagnose import Diagnosis, diagnose

@@ -15,7 +15,7 @@ import pytest
 
 from soilbus.can.dbc_files import load_databases, shipped_dbc
 from soilbus.cli import main
-from soilbus.config import load_config
+from soilbus.config_file import load_config
 from soilbus.simulator.reference import TRACTOR
 
 SOIL_KEYS = {"k_c", "k_phi", "n", "phi", "c", "K", "bearing_pressure"}

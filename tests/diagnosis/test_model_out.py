@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from soilbus.assembly import completion_of, model_of, prior_of, rig_of
 from soilbus.can.dbc_files import located, shipped_dbc
-from soilbus.config import ConfigError, load_config
-from soilbus.config_file import with_effects_text
+from soilbus.config import ConfigError
+from soilbus.config_edit import with_effects_text
+from soilbus.config_file import load_config
 from soilbus.diagnosis.completion import complete
 from soilbus.diagnosis.model_out import effect_tables
 from soilbus.diagnosis.records import record_of

@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.config import Config, load_config
+from soilbus.config import Config
+from soilbus.config_file import load_config
 from soilbus.estimation.coordinates import BOUND, Coordinates
 from soilbus.estimation.gauss_newton import Fit, descend, fit_window
 from soilbus.estimation.posterior import SoilPrior

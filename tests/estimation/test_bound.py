@@ -13,9 +13,10 @@ from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import window_of_samples
 from soilbus.simulator.monte_carlo import NORMAL_95, ROUGHLY_KNOWN, SOILS, tasks_of, trials
 from soilbus.simulator.reference import reference_configuration
+from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS as KNOWN
 from soilbus.terra.vehicle import GRAVITY
-from soilbus.terra.wheel import Soil, WheelModel, entry_angle_for_load, sinkage, state_on, wheel_forces
+from soilbus.terra.wheel import Soil, WheelModel, sinkage, state_on, wheel_forces
 
 MODEL = WheelModel()
 LOAD = np.array([5200.0, 4800.0, 6000.0, 5500.0])

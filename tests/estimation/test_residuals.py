@@ -10,9 +10,10 @@ from soilbus.estimation.linearised import Latents
 from soilbus.estimation.readings import GAIN_QUANTITIES, differentiated_speed
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import Rig, Window, window_of_samples
+from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS
 from soilbus.terra.vehicle import GRAVITY
-from soilbus.terra.wheel import Soil, WheelModel, entry_angle_for_load, sinkage, state_on, wheel_forces
+from soilbus.terra.wheel import Soil, WheelModel, sinkage, state_on, wheel_forces
 
 MODEL = WheelModel()
 PARAMETERS = Soil._fields

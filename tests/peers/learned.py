@@ -25,8 +25,9 @@ from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import Rig, SensorNoise, window_of_samples
 from soilbus.simulator.scenario import Swing, realise
+from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.vehicle import axle_loads
-from soilbus.terra.wheel import Soil, entry_angle_for_load, sinkage, state_on, wheel_forces
+from soilbus.terra.wheel import Soil, sinkage, state_on, wheel_forces
 
 from .windows import (
     B_REF,

@@ -12,9 +12,10 @@ from soilbus.assembly import rig_of
 from soilbus.simulator.draft_trials import true_largest_draft
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.verdict_trials import BINS, Call, Task, reliability, trial, verdict_trials, wilson
+from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS
 from soilbus.terra.vehicle import axle_loads
-from soilbus.terra.wheel import WheelModel, entry_angle_for_load, sinkage, state_on
+from soilbus.terra.wheel import WheelModel, sinkage, state_on
 from soilbus.traversability import State
 
 CONFIG = reference_configuration()

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from adaptive import adaptive_forces
+from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import (
     EXACT_NODES,
@@ -20,7 +21,6 @@ from soilbus.terra.wheel import (
     Soil,
     WheelModel,
     WheelState,
-    entry_angle_for_load,
     sinkage,
     state_on,
     wheel_forces,

@@ -24,8 +24,9 @@ from soilbus.estimation.window import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
+from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
-from soilbus.terra.wheel import Soil, entry_angle_for_load, sinkage, state_on, wheel_forces
+from soilbus.terra.wheel import Soil, sinkage, state_on, wheel_forces
 
 Array = NDArray[np.float64]
 

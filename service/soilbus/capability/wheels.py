@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from soilbus.estimation.window import Rig
 from soilbus.terra.effects.steady import CompletedModel, Wheel
+from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.stress import lumped_modulus
 from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads
 from soilbus.terra.wheel import (
     MAX_ENTRY_ANGLE,
     WheelModel,
     WheelState,
-    entry_angle_for_load,
 )
 
 Array = NDArray[np.float64]

@@ -20,7 +20,7 @@ from soilbus.estimation.linearised import Latents
 from soilbus.estimation.residuals import MAX_TURN, Response, WindowProblem
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.effects.along import stretches
-from soilbus.terra.effects.effect import Active, Effect, Parameter, Surroundings, true_draft, wheel_with
+from soilbus.terra.effects.effect import Active, Effect, Parameter, Surroundings, reactions_with, true_draft, wheel_with
 from soilbus.terra.stress import lumped_modulus
 from soilbus.terra.wheel import (
     INPUTS,
@@ -269,9 +269,7 @@ class CompletedProblem(WindowProblem):
         state, around = self._wheels(soil, latents, angle)
         state, model = wheel_with(active, state, self.model, around)
         forces = wheel_forces(state, model) if near is None else near.forces_at(state, model)
-        for effect, values in active:
-            if effect.forces is not None:
-                forces = effect.forces(forces, state, around, values)
+        forces = reactions_with(active, forces, state, around)
         return _Contact(forces, np.broadcast_to(sinkage(angle, state.radius), angle.shape), around)
 
     def _bare(self, soil: Soil, active: Sequence[Active], latents: Latents, angle: Array) -> _Bare:

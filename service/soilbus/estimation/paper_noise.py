@@ -17,8 +17,9 @@ from soilbus.estimation.paper_tables import Trial
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import Rig, SensorNoise, window_of_samples
+from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.stress import Array, lumped_modulus
-from soilbus.terra.wheel import WheelModel, WheelState, entry_angle_for_load, sinkage, wheel_forces
+from soilbus.terra.wheel import WheelModel, WheelState, sinkage, wheel_forces
 
 RIM_SPEED = 1.0
 """Of the window's wheel [m/s]; the ground speed's noise then is that of the slip."""

@@ -176,35 +176,37 @@ def differentiated_speed(t: Array, speed: Array, variance: Array, half_width: in
     n = len(t)
     if n < 3:
         return np.zeros(n), np.full(n, 1.0 if n else np.inf)
-    reach = half_width + 1
-    near = np.clip(np.arange(n)[:, None] + np.arange(-reach, reach + 1), 0, n - 1)
-    line, cubic = (_slopes(t, speed, variance, reach, width, degree) for width, degree in ((half_width, 1), (reach, 3)))
-    difference = cubic.weights - line.weights
-    noise = float((difference**2 * variance[near]).sum())
-    square = float(((difference * speed[near]).sum(axis=1) ** 2).sum())
-    chosen = cubic if square > noise * (1.0 + BENT * math.sqrt(2.0 * reach / n)) else line
-    return (chosen.weights * speed[near]).sum(axis=1), chosen.variance
+    lines = _slopes(t, speed, variance, half_width, 1)
+    if n < 2 * half_width + 3:
+        return lines.value, lines.variance
+    cubics = _slopes(t, speed, variance, half_width + 1, 3)
+    difference = cubics.weights - np.pad(lines.weights, ((0, 0), (1, 1)))
+    noise = float((difference**2 * variance[cubics.near]).sum())
+    square = float(((cubics.value - lines.value) ** 2).sum())
+    bent = square > noise * (1.0 + BENT * math.sqrt(2.0 * (half_width + 1) / n))
+    chosen = cubics if bent else lines
+    return chosen.value, chosen.variance
 
 
 class _Slopes(NamedTuple):
-    """Slopes at all instants: weights (N, 2 reach + 1) of the speeds within `reach`, and variances."""
+    """Slopes at all instants (N,) with their variances; weights (N, 2 half_width + 1) of the speeds at `near`."""
 
-    weights: Array
+    value: Array
     variance: Array
+    weights: Array
+    near: NDArray[np.intp]
 
 
-def _slopes(t: Array, speed: Array, variance: Array, reach: int, half_width: int, degree: int) -> _Slopes:
-    """Slope at each instant of a polynomial through it and its neighbours."""
+def _slopes(t: Array, speed: Array, variance: Array, half_width: int, degree: int) -> _Slopes:
+    """Slope at each instant of a polynomial through it and its neighbours, fewer of them at the ends."""
     n = len(t)
-    weights, slope_var = np.zeros((n, 2 * reach + 1)), np.zeros(n)
-    for i in range(n):
-        first, last = max(i - half_width, 0), min(i + half_width + 1, n)
-        part = slice(first, last)
-        powers = (t[part] - t[i])[:, None] ** np.arange(min(degree, last - first - 1) + 1)
-        fit = np.linalg.pinv(powers)
-        misfit = speed[part] - powers @ (fit @ speed[part])
-        free = max(last - first - powers.shape[1], 1)
-        spread = max(float(variance[part].mean()), float(misfit @ misfit) / free)
-        weights[i, first - i + reach : last - i + reach] = fit[1]
-        slope_var[i] = spread * float(fit[1] @ fit[1])
-    return _Slopes(weights, slope_var)
+    places = np.arange(n)[:, None] + np.arange(-half_width, half_width + 1)
+    there, near = (places >= 0) & (places < n), np.clip(places, 0, n - 1)
+    powers = (t[near] - t[:, None])[:, :, None] ** np.arange(degree + 1) * there[:, :, None]
+    fit = np.linalg.pinv(powers)  # (N, degree + 1, 2 half_width + 1), zero where nobody is
+    values = speed[near]
+    misfit = np.where(there, values - (powers @ (fit @ values[:, :, None]))[:, :, 0], 0.0)
+    count = there.sum(axis=1)
+    spread = np.maximum((variance[near] * there).sum(1) / count, (misfit**2).sum(1) / np.maximum(count - degree - 1, 1))
+    weights = fit[:, 1]
+    return _Slopes((weights * values).sum(1), spread * (weights**2).sum(1), weights, near)

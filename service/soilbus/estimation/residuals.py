@@ -19,6 +19,7 @@ from soilbus.estimation.linearised import Latents, Linearised, Optimum
 from soilbus.estimation.readings import Readings
 from soilbus.estimation.weights import diagonals, inverse_covariance
 from soilbus.estimation.window import Rig, Window
+from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.stress import lumped_modulus
 from soilbus.terra.wheel import (
     MAX_ENTRY_ANGLE,
@@ -26,7 +27,6 @@ from soilbus.terra.wheel import (
     Soil,
     WheelModel,
     WheelState,
-    entry_angle_for_load,
     sinkage,
     wheel_forces_and_derivatives,
 )

@@ -26,8 +26,9 @@ from numpy.typing import NDArray
 from soilbus.estimation.coordinates import Coordinates
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
+from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import KINDS, SOILS
-from soilbus.terra.wheel import Soil, entry_angle_for_load, sinkage, state_on, wheel_forces
+from soilbus.terra.wheel import Soil, sinkage, state_on, wheel_forces
 
 Array = NDArray[np.float64]
 

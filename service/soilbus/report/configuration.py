@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from cantools.database.can import Database
 
 from soilbus.assembly import completion_of, effects_of, rig_of
 from soilbus.can.channels import Channel
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.mapping import channels_of, without_unit
-from soilbus.config import Config, Table, defaults_text
+from soilbus.config import Config, Table
 from soilbus.report.table import table
 
 
@@ -34,6 +37,21 @@ def _report(config: Config, parts: list[str]) -> str:
         parts.append("\nEffects in the model:\n" + "".join(f"{line}\n" for line in effects))
     parts.append("\nSettings in force (defaults included):\n" + defaults_text(config) + "\n")
     return "\n".join(parts[:1]) + "\nWhat these sensors can tell of the soil:\n" + "".join(parts[1:])
+
+
+def defaults_text(config: Config) -> str:
+    """Every setting with its value in force, one dotted KEY = VALUE a line."""
+    lines: list[str] = []
+
+    def walk(prefix: str, value: Any) -> None:
+        if isinstance(value, Mapping):
+            for k, v in value.items():
+                walk(f"{prefix}.{k}" if prefix else k, v)
+        else:
+            lines.append(f"{prefix} = {value}")
+
+    walk("", config.model_dump(exclude={"wheel", "signals", "folder"}))
+    return "\n".join(lines)
 
 
 def effect_lines(config: Config) -> list[str]:

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.terra.effects.effect import Active, Surroundings, forces_with, wheel_with
+from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.stress import Array
 from soilbus.terra.wheel import (
     MAX_ENTRY_ANGLE,
@@ -27,7 +28,6 @@ from soilbus.terra.wheel import (
     Soil,
     WheelModel,
     WheelState,
-    entry_angle_for_load,
     sinkage,
     state_on,
     wheel_forces_and_derivatives,

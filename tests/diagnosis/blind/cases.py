@@ -14,8 +14,9 @@ from soilbus.config import Config, Prior
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
-from soilbus.terra.wheel import Soil, WheelModel, entry_angle_for_load, sinkage, state_on
+from soilbus.terra.wheel import Soil, WheelModel, sinkage, state_on
 
 from . import contact_forms, outside, soil_forms, vehicle_forms
 from .form import SIZES, Form, Hidden, Setting, together

@@ -12,12 +12,12 @@ from adaptive import adaptive_forces
 from soilbus.terra.effects.along import share_of_way, through_knots
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active, forces_with, wheel_with
+from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import (
     INPUTS,
     WheelModel,
     WheelState,
-    entry_angle_for_load,
     sinkage,
     state_on,
     wheel_forces,

@@ -131,7 +131,11 @@ def wheel_with(
 def forces_with(active: Sequence[Active], state: WheelState, model: WheelModel, around: Surroundings) -> Array:
     """Load W [N], drawbar pull DP [N] and torque T [N m] of wheels with these effects: array (3, ...)."""
     state, model = wheel_with(active, state, model, around)
-    forces = wheel_forces(state, model)
+    return reactions_with(active, wheel_forces(state, model), state, around)
+
+
+def reactions_with(active: Sequence[Active], forces: Array, state: WheelState, around: Surroundings) -> Array:
+    """The same from the integrated forces (3, ...) of a state that already has these effects."""
     for effect, values in active:
         if effect.forces is not None:
             forces = effect.forces(forces, state, around, values)

@@ -1,0 +1,64 @@
+"""The entry angle at which the soil carries a wheel's load: the load integral (eq. 20 of Xi et al. 2024) inverted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from soilbus.terra.stress import Array
+from soilbus.terra.wheel import (
+    MAX_ENTRY_ANGLE,
+    MIN_ENTRY_ANGLE,
+    WheelModel,
+    WheelState,
+    in_chunks,
+    load_and_slope,
+)
+
+
+def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolerance: float = 1e-12) -> Array:
+    """Entry angle [rad], in the broadcast shape, at which the soil carries the load [N].
+
+    Newton on logarithms, where the curve is nearly straight, inside a bracket that
+    bisection shrinks whenever Newton leaves it.  state.entry_angle is the first guess
+    where it is finite and positive.  A load that no angle up to MAX_ENTRY_ANGLE carries
+    (wheel buried), or that is not a positive number, gives nan.
+    """
+    load, *fields = (np.asarray(a, float) for a in np.broadcast_arrays(load, *state))
+    shape = load.shape
+    load, *fields = (a.ravel() for a in (load, *fields))
+    guess, rest = fields[0], fields[1:]
+    low = np.full(load.shape, np.log(MIN_ENTRY_ANGLE))
+    high = np.full(load.shape, np.log(MAX_ENTRY_ANGLE))
+    usable = np.isfinite(load) & (load > 0.0)
+    target = np.log(np.where(usable, load, 1.0))
+    with np.errstate(all="ignore"):
+        at = np.where((guess > 0.0) & np.isfinite(guess), np.log(np.abs(guess)), _first_guess(load, *rest[1:5]))
+    at = np.clip(np.where(np.isfinite(at), at, np.log(0.3)), low, high)
+    todo = np.flatnonzero(usable)
+    for _ in range(80):
+        if not len(todo):
+            break
+        part = WheelState(np.exp(at[todo]), *(f[todo] for f in rest))
+        W, slope = in_chunks(load_and_slope, 2, part, model)
+        miss = np.where(W > 0.0, np.log(np.maximum(W, 1e-300)), -690.0) - target[todo]
+        above = miss > 0.0
+        high[todo] = np.where(above, at[todo], high[todo])
+        low[todo] = np.where(above, low[todo], at[todo])
+        with np.errstate(all="ignore"):
+            step = at[todo] - miss / (slope * part.entry_angle / W)
+        inside = (step > low[todo]) & (step < high[todo]) & (W > 0.0)
+        new = np.where(inside, step, (low[todo] + high[todo]) / 2.0)
+        done = (np.abs(miss) < tolerance) | (high[todo] - low[todo] < 1e-14)
+        at[todo] = np.where(np.abs(miss) < tolerance, at[todo], new)
+        todo = todo[~done]
+    angle = np.exp(at)
+    angle[~usable | (at > np.log(MAX_ENTRY_ANGLE) - 1e-9)] = np.nan
+    return angle.reshape(shape)
+
+
+def _first_guess(load: Array, radius: Array, width: Array, K_L: Array, n: Array) -> Array:
+    """log entry angle from the small-angle load K_L b r^(n+1) theta^(2n+1) / (n + 1.5)."""
+    scale = 0.6 * width * K_L * radius ** (n + 1.0)
+    return np.asarray(np.log(load * (n + 1.5) / scale) / (2.0 * n + 1.0))
