@@ -1,0 +1,93 @@
+"""What a soak run is judged by: the service's own counters against the wire's, estimates, memory, deadlines."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from soilbus.can.channels import Reason
+from soilbus.daemon.pipeline import WindowResult
+from soilbus.traversability import Status
+
+PAGE = 4096
+
+
+class Hour(NamedTuple):
+    """One hour of a run: windows and valid ones, relative error (rms) and error over std (rms, worst) of the
+    bearing pressure of the valid ones, resident memory [bytes] at its end."""
+
+    windows: int
+    valid: int
+    error: float
+    rms_z: float
+    worst_z: float
+    memory: int
+
+
+@dataclass
+class Estimates:
+    """Valid windows' bearing pressures since the last look."""
+
+    truth: float
+    windows: int = 0
+    errors: list[tuple[float, float]] = field(default_factory=list)
+
+    def add(self, result: WindowResult) -> None:
+        """Take note of one window."""
+        self.windows += 1
+        if result.status is Status.VALID and result.bearing is not None:
+            off = result.bearing.value - self.truth
+            self.errors.append((off / self.truth, off / result.bearing.std))
+
+    def hour(self) -> Hour:
+        """What was noted, which is forgotten."""
+        relative, z = np.array(self.errors or [(math.nan, math.nan)]).T
+        done = Hour(
+            self.windows, len(self.errors), _rms(relative), _rms(z), float(np.abs(z).max()), resident_memory(),
+        )  # fmt: skip
+        self.windows, self.errors = 0, []
+        return done
+
+
+@dataclass
+class Beat:
+    """When one frame went out: counts those that left the grid of its period [s] since the first one."""
+
+    period: float
+    slack: float
+    first: float | None = None
+    sent: int = 0
+    off: int = 0
+    latest: float = 0.0
+
+    def add(self, t: float) -> None:
+        """Take note of one sending at t [s]."""
+        self.first = t if self.first is None else self.first
+        self.latest = (t - self.first + self.slack / 2) % self.period - self.slack / 2
+        self.sent += 1
+        self.off += self.latest > self.slack
+
+
+def unaccounted(received: Counter, admitted: Counter, refused: Counter[tuple[str, Reason]], delivered: Counter) -> dict:
+    """Frames by message name that were handed over and are neither admitted nor refused for a reason."""
+    names = set(received) | set(delivered)
+    by_name: Counter = Counter()
+    for (name, _), n in refused.items():
+        by_name[name] += n
+    lost = {name: delivered[name] - admitted[name] - by_name[name] for name in sorted(names)}
+    lost |= {f"{name} (counted)": delivered[name] - received[name] for name in sorted(names)}
+    return {name: n for name, n in lost.items() if n}
+
+
+def resident_memory() -> int:
+    """Of this process [bytes]."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE
+
+
+def _rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(x))))

@@ -1,0 +1,59 @@
+"""Endless traffic of one tractor: a truth that repeats, sensors whose noise never does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import can
+import numpy as np
+
+from soilbus.config import Config
+from soilbus.simulator.drive import Drive, drive
+from soilbus.simulator.frames import START, frames
+from soilbus.simulator.recording import Recording
+from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.simulator.sensors import channel_rng, fitted, measure
+
+SOIL = "loam"
+LAP = 160.0
+"""Length of the truth [s]; its frames at 50 Hz are a multiple of 16, so that counters run on."""
+
+
+def traffic(config: Config, seed: int) -> Iterator[can.Message]:
+    """Frames of the configured vehicle under draft on loam, lap after lap, for ever.
+
+    Each sensor has one gain error for good and new noise in each lap.
+    """
+    scenario = Scenario(LAP, (Patch(0.0, SOIL),), draft=Swing(1500.0, 5000.0))
+    told = _with_gains(drive(config, scenario, seed), config, seed)
+    for lap in _laps():
+        recording = Recording(told.columns, measure(told, _without_gains(config), _seed(seed, lap)), seed)
+        yield from frames(recording, config, start=START + lap * LAP)
+
+
+def _laps() -> Iterator[int]:
+    lap = 0
+    while True:
+        yield lap
+        lap += 1
+
+
+def _seed(seed: int, lap: int) -> int:
+    return int(np.random.SeedSequence([seed, lap]).generate_state(1)[0])
+
+
+def _with_gains(driven: Drive, config: Config, seed: int) -> Drive:
+    columns = dict(driven.columns)
+    for quantity, wheel in fitted(config):
+        noise = getattr(config.noise, quantity, None)
+        if noise is not None:
+            name = f"{quantity}.{wheel}" if wheel else quantity
+            columns[name] = columns[name] * (1.0 + noise.gain * channel_rng(seed, f"gain of {name}").standard_normal())
+    return replace(driven, columns=columns)
+
+
+def _without_gains(config: Config) -> Config:
+    noise = {name: getattr(config.noise, name) for name in type(config.noise).model_fields}
+    still = {name: of.model_copy(update={"gain": 0.0}) for name, of in noise.items()}
+    return config.model_copy(update={"noise": config.noise.model_copy(update=still)})
