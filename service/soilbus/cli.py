@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
     args = _parser().parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="soilbus: %(message)s", stream=sys.stderr)
-    logging.getLogger("can").setLevel(logging.ERROR)
+    logging.getLogger("can").setLevel(logging.CRITICAL)  # a bus that is away is ours to tell of, once
     keep_freed_memory()
     try:
         args.work(args)

@@ -18,11 +18,11 @@ import can
 from rich.console import Console
 
 from soilbus.can.bus import BusError, open_bus
-from soilbus.can.dbc_files import output_database
+from soilbus.can.dbc_files import filters_of, output_database
 from soilbus.config import Config
 from soilbus.daemon.pipeline import WindowResult
 from soilbus.daemon.start import start_service
-from soilbus.report.dashboard import Dashboard, filters_of, show
+from soilbus.report.dashboard import Dashboard, show
 from soilbus.report.table import table
 from soilbus.simulator.frames import frames
 from soilbus.simulator.play import send_in_time

@@ -9,7 +9,7 @@ import can
 import pytest
 
 from fakes import FakeClock, ScriptedBus
-from soilbus.can.bus import LONGEST_BACK_OFF, BusError, LiveBus, open_bus
+from soilbus.can.bus import LONGEST_BACK_OFF, RETRY, BusError, LiveBus, open_bus
 from soilbus.can.publish import Frame
 
 FRAME = Frame(0x18FF609A, True, bytes(8))
@@ -114,3 +114,93 @@ def test_a_full_queue_keeps_the_bus_open():
     assert bus.is_open
     assert bus.send(FRAME)
     assert (bus.counts.sent, bus.counts.dropped) == (1, 1)
+
+
+def test_a_frame_that_waits_goes_out_with_the_next_look_and_never_blocks():
+    clock = FakeClock()
+    wire = ScriptedBus(clock)
+    wire.full_until = clock.now + 0.03
+    bus = live(lambda: wire, clock)
+    bus.open()
+    assert not bus.send(FRAME)
+    while not wire.sent:
+        before = clock.now
+        assert bus.receive(1.0) is None
+        assert clock.now - before <= RETRY + 1e-9
+    assert clock.now <= wire.full_until + RETRY
+    assert (bus.counts.sent, bus.counts.dropped) == (1, 0)
+
+
+def test_nothing_that_waited_is_sent_when_the_bus_comes_back():
+    clock = FakeClock()
+    wire = ScriptedBus(clock)
+    wire.full_until = clock.now + 0.05
+    bus = live(lambda: wire, clock)
+    bus.open()
+    bus.send(FRAME)
+    wire.fail_receive.append(OSError(errno.ENODEV, "No such device"))
+    bus.receive(0.0)
+    assert not bus.is_open
+    while not bus.is_open:
+        bus.receive(0.02)
+    bus.receive(0.2)
+    assert wire.sent == []
+    assert (bus.counts.dropped, bus.counts.lost, bus.counts.reopened) == (1, 1, 1)
+
+
+def test_a_bus_that_opens_and_fails_at_once_is_not_tried_all_the_time():
+    clock = FakeClock()
+    tries: list[float] = []
+
+    def opener():
+        tries.append(clock.now)
+        wire = ScriptedBus(clock)
+        wire.fail_receive.append(can.CanOperationError("Network is down", errno.ENETDOWN))
+        return wire
+
+    bus = live(opener, clock)
+    begin = clock.now
+    while clock.now < begin + 20.0:
+        bus.receive(0.02)
+    assert 19 <= len(tries) <= 26
+    assert max(b - a for a, b in itertools.pairwise(tries)) <= LONGEST_BACK_OFF + 0.05
+
+
+OWN = (0x18FF649A, True)
+
+
+@pytest.mark.parametrize(
+    ("message", "foreign"),
+    [
+        (can.Message(timestamp=1.7e9, arbitration_id=OWN[0], data=bytes(8)), 1),
+        (can.Message(timestamp=1.7e9, arbitration_id=OWN[0], data=bytes(8), is_rx=False), 0),  # an echo of ours
+        (can.Message(timestamp=1.7e9, arbitration_id=OWN[0], is_remote_frame=True), 0),  # somebody asks for it
+    ],
+)
+def test_our_own_identifiers_are_never_handed_on(message, foreign):
+    clock = FakeClock()
+    bus = LiveBus(lambda: wire, clock, clock.sleep, own=[OWN])
+    wire = ScriptedBus(clock, [message, can.Message(timestamp=1.7e9, arbitration_id=0x64A)])
+    bus.open()
+    assert bus.receive(0.1) is None
+    assert bus.receive(0.1) is not None
+    assert (bus.counts.foreign, bus.counts.received) == (foreign, 1)
+    assert (bus.last_foreign == clock.now) == bool(foreign)
+
+
+def test_faults_that_last_are_said_once_in_a_while(caplog):
+    clock = FakeClock()
+    stranger = can.Message(timestamp=1.7e9, arbitration_id=OWN[0], data=bytes(8))
+    wire = ScriptedBus(clock, [stranger] * 1000)
+    wire.full_until = clock.now + 1e9
+    bus = LiveBus(lambda: wire, clock, clock.sleep, own=[OWN])
+    bus.open()
+    for _ in range(1000):
+        bus.receive(0.0)
+        bus.send(FRAME)
+        clock.now += 0.1
+    assert bus.counts.foreign == 1000
+    assert bus.counts.dropped == 999
+    texts = [r.getMessage() for r in caplog.records]
+    assert sum("another node" in t for t in texts) == sum("queue full" in t for t in texts) == 2
+    assert len(texts) == 4

@@ -41,7 +41,8 @@ class Bench:
         self.away = False
         database = output_database(self.config)
         self.database = database
-        self.bus = LiveBus(self._open, self.clock, self.clock.sleep)
+        own = [(message.frame_id, message.is_extended_frame) for message in database.messages]
+        self.bus = LiveBus(self._open, self.clock, self.clock.sleep, own)
         pipeline = Pipeline(self.config, load_databases(self.config))
         self.results = []
         self.service = Service(
@@ -215,14 +216,99 @@ def test_a_bus_that_goes_and_comes_back(recording):
     assert str(first["State"]) == "unknown"
 
 
-def test_a_full_send_queue_drops_frames_and_counts_them(recording):
+def test_a_full_send_queue_keeps_the_newest_frames_and_counts_the_others(recording):
     bench = Bench(recording)
     bench.run(1.0)
-    bench.wire.fail_send += [can.CanOperationError("No buffer space", errno.ENOBUFS)] * 3
-    bench.run(1.0)
-    assert bench.bus.counts.dropped == 3
+    room = bench.wire.full_until = bench.clock.now + 1.37
+    bench.run(2.0)
     assert bench.bus.is_open
-    assert bench.sent("WheelSlip", since=bench.clock.now - 0.5)
+    lost = 0
+    for name in bench.service.publisher.schedule:
+        frames = bench.sent(name)
+        lost += sum((b["Counter"] - a["Counter"] - 1) % 16 for a, b in itertools.pairwise(frames))
+    assert bench.bus.counts.dropped == lost > 50
+    for name in ("WheelSlip", "Traversability", "TorqueDemand", "DemandForecast"):
+        first, second = bench.sent(name, since=room)[:2]
+        assert first["at"] < room + 0.02  # at once
+        assert 0.0 < second["at"] - first["at"] < 0.1  # and made less than a cycle ago
+
+
+def test_an_outage_between_two_beats_ends_go_too(recording):
+    bench = Bench(recording)
+    bench.run(13.5)
+    assert str(bench.sent("Traversability")[-1]["State"]) == "go"
+    gone = bench.clock.now
+    bench.wire.fail_receive.append(can.CanOperationError("Network is down", errno.ENETDOWN))
+    bench.service._next_tick = gone + 0.15  # the bus is back before anybody has looked
+    bench.run(0.45)
+    assert bench.bus.counts.lost == 1
+    states = [str(f["State"]) for f in bench.sent("Traversability", since=gone + 0.01)]
+    assert states
+    assert set(states) == {"unknown"}
+    bench.run(2.0)
+    assert str(bench.sent("Traversability")[-1]["State"]) == "go"
+
+
+def error_frame(t: float, error_class: int, *data: int) -> can.Message:
+    return can.Message(timestamp=t, arbitration_id=error_class, is_error_frame=True, data=bytes(data).ljust(8, b"\0"))
+
+
+def test_bus_off_ends_go_until_the_controller_is_back(recording):
+    begin = recording[0].timestamp
+    off, back = error_frame(begin + 13.0, 0x040), error_frame(begin + 14.5, 0x100)
+    passed = [m for m in recording if not begin + 13.0 <= m.timestamp < begin + 14.5]
+    bench = Bench(sorted([*passed, off, back], key=lambda m: m.timestamp))
+    start = bench.clock.now
+    bench.run(DURATION)
+    during = bench.sent("SoilbusStatus", since=start + 13.05)[0]
+    assert (str(during["State"]), str(during["Reason"])) == ("waiting", "bus_error")
+    assert {str(f["State"]) for f in bench.sent("Traversability", since=start + 13.1)[:14]} == {"unknown"}
+    assert str(bench.sent("BusHealth", since=start + 13.05)[0]["BusState"]) == "bus_off"
+    last = bench.sent("BusHealth")[-1]
+    assert (str(last["BusState"]), last["ErrorFrames"]) == ("error_active", 2)
+    assert str(bench.sent("SoilbusStatus")[-1]["Reason"]) not in ("bus_error", "bus_down")
+
+
+def test_an_error_passive_controller_is_told_of_beside_a_valid_state(recording):
+    passive = error_frame(recording[0].timestamp + 12.5, 0x004, 0, 0x20)
+    bench = Bench(sorted([*recording, passive], key=lambda m: m.timestamp))
+    bench.run(DURATION)
+    status = bench.sent("SoilbusStatus")[-1]
+    assert (str(status["State"]), str(status["Reason"])) == ("valid", "bus_error")
+    assert str(bench.sent("Traversability")[-1]["State"]) == "go"
+
+
+def test_a_second_sender_under_our_identifiers_is_told_of_and_never_believed(recording):
+    begin = recording[0].timestamp
+    ours = Publisher(output_database(reference_configuration()))
+    forged = []
+    for i in range(5):
+        frame = ours.frame("Traversability", {"State": "go"})
+        forged.append(
+            can.Message(timestamp=begin + 2.0 + 0.1 * i, arbitration_id=frame.arbitration_id, data=frame.data)
+        )
+    bench = Bench(sorted([*recording, *forged], key=lambda m: m.timestamp))
+    start = bench.clock.now
+    bench.run(DURATION)
+    health = bench.sent("BusHealth")[-1]
+    assert (health["ForeignFrames"], bench.bus.counts.foreign) == (5, 5)
+    assert bench.service.intake.admission.counts.unknown == 0
+    assert health["Received"] == bench.bus.counts.received % 4016 > 0
+    reasons = {round(f["at"] - start, 1): str(f["Reason"]) for f in bench.sent("SoilbusStatus")}
+    told = [t for t, reason in reasons.items() if reason == "foreign_sender"]
+    assert told
+    assert 2.0 <= min(told) <= max(told) <= 2.4 + 3.0 + 0.1
+    assert str(bench.sent("Traversability")[-1]["State"]) == "go"
+
+
+def test_a_second_sender_ends_go(recording):
+    forged = can.Message(timestamp=recording[0].timestamp + 13.0, arbitration_id=0x18FF649A, data=bytes(8))
+    bench = Bench(sorted([*recording, forged], key=lambda m: m.timestamp))
+    start = bench.clock.now
+    bench.run(DURATION)
+    verdicts = bench.sent("Traversability")
+    assert str(next(f for f in reversed(verdicts) if f["at"] < start + 12.9)["State"]) == "go"
+    assert {str(f["State"]) for f in verdicts if f["at"] > start + 13.05} == {"unknown"}
 
 
 def test_counters_never_repeat_and_checksums_are_right(recording):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor, Future
 from typing import Any
@@ -37,7 +38,8 @@ class InlineExecutor(Executor):
 class ScriptedBus:
     """Hands out messages when the clock has reached their stamps (counted from `start`); keeps what is sent.
 
-    `fail_receive` and `fail_send` hold exceptions to raise instead, once each.
+    `fail_receive` and `fail_send` hold exceptions to raise instead, once each; until `full_until`
+    there is no room for a frame.
     """
 
     def __init__(self, clock: FakeClock, messages: Iterable[can.Message] = (), start: float = 1.7e9) -> None:
@@ -45,6 +47,7 @@ class ScriptedBus:
         self.sent: list[tuple[float, can.Message]] = []
         self.fail_receive: list[Exception] = []
         self.fail_send: list[Exception] = []
+        self.full_until = 0.0
         self.closed = False
         self.next = 0
 
@@ -62,6 +65,8 @@ class ScriptedBus:
     def send(self, message: can.Message, timeout: float | None = None) -> None:
         if self.fail_send:
             raise self.fail_send.pop(0)
+        if self.clock.now < self.full_until:
+            raise can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS)
         self.sent.append((self.clock.now, message))
 
     def shutdown(self) -> None:

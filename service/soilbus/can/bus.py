@@ -1,17 +1,22 @@
-"""python-can, made to survive: filters, reopening with back-off, full queues, error frames."""
+"""A bus that may go and come back: opening, reopening with back-off, full queues, error frames, strangers."""
 
 from __future__ import annotations
 
 import errno
 import logging
+import math
+import os
 import socket
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import can
 
+from soilbus.can.bus_state import BusState, state_told, tells_overflow
+from soilbus.can.outbox import Outbox
 from soilbus.can.publish import Frame
+from soilbus.can.wire import Received, Wire, error_number, wire_of
 
 log = logging.getLogger(__name__)
 
@@ -20,6 +25,12 @@ LONGEST_BACK_OFF = 1.0
 """Reopening is tried at least this often [s], so that a bus that is back is found in time."""
 
 RECEIVE_BUFFER = 4 * 2**20
+RETRY = 0.005
+"""Longest wait for a frame [s] while frames of ours wait for room."""
+SAY_AGAIN = 60.0
+"""A fault that lasts is said in the journal this often [s]."""
+
+_NO_ROOM = {errno.ENOBUFS, errno.EAGAIN, errno.EWOULDBLOCK}
 
 _KERNEL_WITHOUT_CAN = {errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT, errno.ESOCKTNOSUPPORT}
 
@@ -32,16 +43,6 @@ class BusError(Exception):
         self.may_come = may_come
 
 
-@dataclass(slots=True)
-class BusCounts:
-    """What happened on the bus since the start."""
-
-    sent: int = 0
-    dropped: int = 0
-    error_frames: int = 0
-    reopened: int = 0
-
-
 def open_bus(settings: Mapping[str, Any], filters: Sequence[dict[str, Any]] | None = None) -> can.BusABC:
     """The bus that the section [bus] describes, with kernel filters where it has a kernel.
 
@@ -50,7 +51,7 @@ def open_bus(settings: Mapping[str, Any], filters: Sequence[dict[str, Any]] | No
     name = f"{settings.get('interface')}:{settings.get('channel')}"
     try:
         bus = can.Bus(**dict(settings), can_filters=list(filters) if filters is not None else None)
-        _enlarge_buffer(bus)
+        _prepare(bus)
         return bus
     except can.CanInterfaceNotImplementedError as error:
         raise BusError(f"bus {name}: {_one_line(error)}", may_come=False) from None
@@ -63,21 +64,46 @@ def open_bus(settings: Mapping[str, Any], filters: Sequence[dict[str, Any]] | No
         raise BusError(f"bus {name}: {_one_line(error)}", may_come=False) from None
 
 
-def _enlarge_buffer(bus: can.BusABC) -> None:
-    """As much receive buffer as the kernel lets us have (net.core.rmem_max)."""
-    if isinstance(getattr(bus, "socket", None), socket.socket):
-        bus.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)  # type: ignore[attr-defined]
+def _prepare(bus: can.BusABC) -> None:
+    """As much receive buffer as the kernel lets us have (net.core.rmem_max).
+
+    Raises OSError for an interface that is down: the kernel binds to it all the same.
+    """
+    own = getattr(bus, "socket", None)
+    if not isinstance(own, socket.socket):
+        return
+    own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+    if number := own.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
+        bus.shutdown()
+        raise OSError(number, os.strerror(number))
 
 
 def _one_line(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
+@dataclass(slots=True)
+class BusCounts:
+    """What happened on the bus since the start; dropped frames are ours, overruns the others'."""
+
+    received: int = 0
+    sent: int = 0
+    dropped: int = 0
+    overruns: int = 0
+    error_frames: int = 0
+    foreign: int = 0
+    """Frames of others under our identifiers."""
+    lost: int = 0
+    """How often the bus went away."""
+    reopened: int = 0
+
+
 class LiveBus:
     """A bus that may go and come back.
 
     Nothing in here blocks longer than asked.  While the bus is away `receive` returns
-    nothing and `send` drops.  `clock` is monotonic.
+    nothing and `send` drops.  `clock` is monotonic.  `own` are the identifiers that we send
+    (with: is it extended); a data frame that comes with one of them is somebody else's and is not handed on.
     """
 
     def __init__(
@@ -85,24 +111,44 @@ class LiveBus:
         opener: Callable[[], can.BusABC],
         clock: Callable[[], float],
         sleep: Callable[[float], None],
+        own: Collection[tuple[int, bool]] = (),
     ) -> None:
-        self.counts = BusCounts()
         self.fault = "not opened yet"
-        self._opener, self._clock, self._sleep = opener, clock, sleep
-        self._bus: can.BusABC | None = None
+        self.state = BusState.UNKNOWN
+        self.last_foreign = -math.inf
+        """When the last foreign frame came, by `clock` [s]."""
+        self._opener, self._clock, self._sleep, self._own = opener, clock, sleep, frozenset(own)
+        self._counts = BusCounts()
+        self._wire: Wire | None = None
+        self._outbox = Outbox()
+        self._overruns_before = 0  # of wires that are closed, and what the controller told
+        self._refused_while_away = 0
         self._next_try = -1.0
         self._back_off = FIRST_BACK_OFF
-        self._full = False
+        self._said: dict[str, float] = {}
 
     @property
     def is_open(self) -> bool:
         """Whether frames can come and go now."""
-        return self._bus is not None
+        return self._wire is not None
+
+    @property
+    def counts(self) -> BusCounts:
+        """What happened so far."""
+        counts = self._counts
+        counts.dropped = self._outbox.dropped + self._refused_while_away
+        counts.overruns = self._overruns_before + (self._wire.overruns if self._wire is not None else 0)
+        return counts
 
     def open(self) -> None:
         """Open now; raises BusError."""
-        self._bus = self._opener()
-        self.fault, self._back_off = "", FIRST_BACK_OFF
+        bus = self._opener()
+        try:
+            self._wire = wire_of(bus)
+        except OSError as error:
+            bus.shutdown()
+            raise BusError(f"bus: {_one_line(error)}", may_come=True) from None
+        self.state, self.fault = BusState.UNKNOWN, ""
 
     def _reopen(self) -> bool:
         now = self._clock()
@@ -114,65 +160,107 @@ class LiveBus:
             if str(error) != self.fault:
                 log.warning("%s", error)
             self.fault = str(error)
-            self._next_try = now + self._back_off
-            self._back_off = min(2.0 * self._back_off, LONGEST_BACK_OFF)
+            self._wait()
             return False
-        self.counts.reopened += 1
+        self._counts.reopened += 1
         log.info("bus is open")
         return True
 
     def _lost(self, error: Exception) -> None:
         log.warning("bus lost: %s", _one_line(error))
         self.fault = _one_line(error)
+        self._counts.lost += 1
         self.close()
-        self._next_try = self._clock() + self._back_off
+        self._wait()
 
-    def receive(self, timeout: float) -> can.Message | None:
-        """The next data or remote frame, or None after `timeout` [s] or when the bus is away."""
-        if self._bus is None and not self._reopen():
+    def _wait(self) -> None:
+        """No try for a while, and longer each time until a frame has come."""
+        self._next_try = self._clock() + self._back_off
+        self._back_off = min(2.0 * self._back_off, LONGEST_BACK_OFF)
+
+    def receive(self, timeout: float) -> Received | can.Message | None:
+        """The next frame for us; None after `timeout` [s], when the bus is away, or for a frame that is not ours."""
+        if self._wire is None and not self._reopen():
             self._sleep(min(timeout, max(self._next_try - self._clock(), 0.0)))
             return None
+        if self._outbox:
+            self._flush()
+            timeout = min(timeout, RETRY)
+        if self._wire is None:
+            return None
         try:
-            message = self._bus.recv(timeout)  # type: ignore[union-attr]
+            message = self._wire.recv(timeout)
         except (can.CanError, OSError) as error:
             self._lost(error)
             return None
-        if message is not None and message.is_error_frame:
-            self.counts.error_frames += 1
+        if message is None:
             return None
+        if message.is_error_frame:
+            self._note_error(message)
+            return None
+        if (message.arbitration_id, message.is_extended_id) in self._own:
+            if message.is_rx and not message.is_remote_frame:
+                self._note_foreign(message)
+            return None
+        if self.state is BusState.OFF:  # not any more: nothing is heard in bus-off
+            self.state = BusState.UNKNOWN
+        self._counts.received += 1
+        self._back_off = FIRST_BACK_OFF
         return message
 
+    def _note_error(self, message: Received | can.Message) -> None:
+        self._counts.error_frames += 1
+        self._overruns_before += tells_overflow(message.arbitration_id, message.data)
+        before, self.state = self.state, state_told(self.state, message.arbitration_id, message.data)
+        if self.state is not before:
+            log.warning("controller: %s", self.state)
+
+    def _note_foreign(self, message: Received | can.Message) -> None:
+        self._counts.foreign += 1
+        self.last_foreign = self._clock()
+        self._say(f"another node sends our frame {message.arbitration_id:08X}")
+
     def send(self, frame: Frame) -> bool:
-        """Send at once or drop: a late result is worth less than the next one."""
-        if self._bus is None:
-            self.counts.dropped += 1
+        """Send, or keep for a moment if there is no room; whether nothing waits any more.
+
+        A frame is dropped when a newer one of its identifier comes before there is room, when
+        it is late, or when the bus is away.
+        """
+        if self._wire is None:
+            self._refused_while_away += 1
             return False
-        try:
-            self._bus.send(
-                can.Message(arbitration_id=frame.arbitration_id, is_extended_id=frame.extended, data=frame.data)
-            )
-        except can.CanOperationError as error:
-            self.counts.dropped += 1
-            if error.error_code in (errno.ENOBUFS, errno.EAGAIN, errno.EWOULDBLOCK) or error.error_code is None:
-                if not self._full:
-                    log.warning("send queue full: %s", _one_line(error))
-                self._full = True
+        self._outbox.put(frame, self._clock())
+        return self._flush()
+
+    def _flush(self) -> bool:
+        """Send what waits, as far as there is room."""
+        while self._wire is not None and (frame := self._outbox.first(self._clock())) is not None:
+            try:
+                self._wire.send(frame)
+            except (can.CanError, OSError) as error:
+                if error_number(error) not in _NO_ROOM:
+                    self._lost(error)
+                else:
+                    self._say(f"send queue full: {_one_line(error)}")
                 return False
-            self._lost(error)
-            return False
-        except OSError as error:
-            self.counts.dropped += 1
-            self._lost(error)
-            return False
-        self._full = False
-        self.counts.sent += 1
-        return True
+            self._outbox.done(frame)
+            self._counts.sent += 1
+        return self._wire is not None
+
+    def _say(self, text: str) -> None:
+        """Into the journal, the same text once in a while."""
+        now = self._clock()
+        if now - self._said.get(text, -math.inf) >= SAY_AGAIN:
+            self._said[text] = now
+            log.warning("%s", text)
 
     def close(self) -> None:
         """Let go of the bus."""
-        bus, self._bus = self._bus, None
-        if bus is not None:
+        wire, self._wire = self._wire, None
+        self._outbox.clear()
+        if wire is not None:
+            self._overruns_before += wire.overruns
             try:
-                bus.shutdown()
+                wire.shutdown()
             except (can.CanError, OSError) as error:
                 log.debug("closing: %s", error)

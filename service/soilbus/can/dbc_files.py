@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from cantools.database.can import Database, Message
 
@@ -89,6 +90,11 @@ def output_database(config: Config) -> Database:
     if missing:
         raise ConfigError([f"output.dbc: {name}: no message {', '.join(missing)}"])
     return database
+
+
+def filters_of(database: Database) -> list[dict[str, Any]]:
+    """Filters for python-can that pass the messages of a database only."""
+    return [{"can_id": m.frame_id, "can_mask": 0x1FFFFFFF, "extended": m.is_extended_frame} for m in database.messages]
 
 
 def _is_shipped(path: Path) -> bool:

@@ -12,10 +12,12 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import NamedTuple
 
 from soilbus.can.bus import LiveBus
+from soilbus.can.bus_state import BusState
 from soilbus.can.publish import Publisher
 from soilbus.capability.assessment import OverSlip
 from soilbus.capability.immobilisation import Watch, watched
 from soilbus.config import Config
+from soilbus.daemon.bus_health import health_frame, health_text
 from soilbus.daemon.intake import Latest
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.outputs import WINDOW_MODULUS, forecast_frame, hop_frames, slip_frames
@@ -41,8 +43,10 @@ LONGEST_CURVE = 60.0
 """Age [s] up to which a valid window's pull over slip serves to watch for immobilisation."""
 LONGEST_SOLVE = 20.0
 """A window that takes longer [s] is a worker that hangs: the watchdog is fed no more."""
-INTERRUPTIONS = frozenset(("bus_down", "no_frames", "input_missing", "input_stale"))
-"""Reasons for which no window handed out before is believed any more."""
+FOREIGN_HOLD = 3.0
+"""Seconds for which another sender under our identifiers is told of: until every reader has seen it."""
+INTERRUPTIONS = frozenset(("bus_down", "no_frames", "input_missing", "input_stale", "foreign_sender"))
+"""Reasons, beside a bus-off, for which no window handed out before is believed any more."""
 
 
 class Pending(NamedTuple):
@@ -93,7 +97,8 @@ class Service:
         self._last_frame = -1e9  # monotonic arrival time
         self._last_stamp = 0.0  # the bus's own time
         self._next_tick = self._started
-        self._due = dict.fromkeys(("SoilbusStatus", "SoilbusIdentity"), self._started)
+        self._due = dict.fromkeys(("SoilbusStatus", "SoilbusIdentity", "BusHealth"), self._started)
+        self._lost = bus.counts.lost
         self._next_watchdog = self._started
         self._state: tuple[ServiceState, str] = (ServiceState.STARTING, "none")
 
@@ -193,8 +198,8 @@ class Service:
         if self.intake.epoch != self._epoch:
             self._epoch, self.result, self._watch, self._curve = self.intake.epoch, None, Watch(), (None, -math.inf)
         self._state = self._present_state(now)
-        if _kind(self._state[1]) in INTERRUPTIONS:
-            self._interrupted = now
+        if _interrupts(self._state) or self.bus.counts.lost != self._lost:
+            self._interrupted, self._lost = now, self.bus.counts.lost
         self._publish_ten_hertz(now)
         for message, due in self._due.items():
             if now >= due:
@@ -209,6 +214,8 @@ class Service:
     def _present_state(self, now: float) -> tuple[ServiceState, str]:
         if not self.bus.is_open:
             return ServiceState.WAITING, "bus_down"
+        if self.bus.state is BusState.OFF:
+            return ServiceState.WAITING, f"bus_error {self.bus.state}"
         if now - self._last_frame > SILENCE:
             return ServiceState.LISTENING, "no_frames"
         stale = self.intake.stale(self.bus_time(now))
@@ -216,11 +223,15 @@ class Service:
             never = [name for name in stale if name not in self.intake.last_seen]
             reason = "input_missing " + " ".join(never) if never else "input_stale " + " ".join(stale)
             return ServiceState.DEGRADED, reason
+        if now - self.bus.last_foreign < FOREIGN_HOLD:
+            return ServiceState.DEGRADED, "foreign_sender"
         if self.result is None:
             return ServiceState.ESTIMATING, "none"
         reason = self.result.reason
         if self.result.gaps and reason.split()[0] in ("none", "model_mismatch"):
             reason = "model_gap " + " ".join(self.result.gaps)
+        if reason == "none" and self.bus.state is BusState.PASSIVE:
+            reason = f"bus_error {self.bus.state}"
         return state_after(self.result), reason
 
     def present_way(self, now: float) -> Way:
@@ -228,7 +239,7 @@ class Service:
 
         After an interruption only a window that ended later counts.
         """
-        if self.result is None or _kind(self._present_state(now)[1]) in INTERRUPTIONS:
+        if self.result is None or _interrupts(self._present_state(now)):
             return Way.UNKNOWN
         if self._handed_out <= self._interrupted or not self._age(now) <= self.config.traversability.max_age:  # nor nan
             return Way.UNKNOWN
@@ -297,6 +308,9 @@ class Service:
             }  # fmt: skip
             self.bus.send(self.publisher.frame(message, values))
             return
+        if message == "BusHealth":
+            self.bus.send(self.publisher.frame(*health_frame(self.bus.state, self.bus.counts)))
+            return
         counts = self.intake.admission.counts
         received = sum(counts.received.values())
         self.bus.send(
@@ -318,7 +332,13 @@ class Service:
             text += f", {self.present_way(now)}"
         if self.failures:
             text += ", failed solves: " + ", ".join(f"{kind} {n}" for kind, n in self.failures.most_common())
+        if health := health_text(self.bus.state, self.bus.counts):
+            text += f"; bus: {health}"
         self.notifier.status(text)
+
+
+def _interrupts(state: tuple[ServiceState, str]) -> bool:
+    return state[0] is ServiceState.WAITING or _kind(state[1]) in INTERRUPTIONS
 
 
 def _kind(reason: str) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 from soilbus.can.bus import BusError, LiveBus, open_bus
-from soilbus.can.dbc_files import load_databases, output_database
+from soilbus.can.dbc_files import filters_of, load_databases, output_database
 from soilbus.can.publish import Publisher
 from soilbus.config import Config
 from soilbus.daemon.notify import Notifier
@@ -25,10 +25,12 @@ def start_service(config: Config, wait: bool, on_window: Callable[[WindowResult]
     cannot be opened.
     """
     pipeline = Pipeline(config, load_databases(config))
-    publisher = Publisher(output_database(config))
+    ours = output_database(config)
+    publisher = Publisher(ours)
     settings = config.bus.model_dump()
-    filters = pipeline.admission.can_filters()
-    bus = LiveBus(lambda: open_bus(settings, filters), time.monotonic, time.sleep)
+    filters = pipeline.admission.can_filters() + filters_of(ours)
+    own = [(message.frame_id, message.is_extended_frame) for message in ours.messages]
+    bus = LiveBus(lambda: open_bus(settings, filters), time.monotonic, time.sleep, own)
     try:
         bus.open()
     except BusError as error:

@@ -17,7 +17,7 @@ from rich.text import Text
 from soilbus.can.admission import checksum_byte_of
 from soilbus.can.bus import open_bus
 from soilbus.can.checksum import COUNTER, frame_checksum
-from soilbus.can.dbc_files import output_database
+from soilbus.can.dbc_files import filters_of, output_database
 from soilbus.config import Config
 
 CYCLES_UNTIL_STALE = 3
@@ -133,11 +133,6 @@ def watch(config: Config, seconds: float | None = None) -> None:
     database = output_database(config)
     with open_bus(config.bus.model_dump(), filters_of(database)) as bus:
         show(Dashboard(database), bus, Console(), until=None if seconds is None else time.monotonic() + seconds)
-
-
-def filters_of(database: Database) -> list[dict[str, Any]]:
-    """Filters for python-can that pass the messages of a database only."""
-    return [{"can_id": m.frame_id, "can_mask": 0x1FFFFFFF, "extended": m.is_extended_frame} for m in database.messages]
 
 
 def show(

@@ -1,0 +1,43 @@
+"""Frames that the kernel has no room for yet: the newest of each identifier, and none for long."""
+
+from __future__ import annotations
+
+from soilbus.can.publish import Frame
+
+LATE = 0.1
+"""Age [s] at which a frame that did not get out is dropped: its successor says more, or silence does."""
+
+
+class Outbox:
+    """One slot for each identifier.  A newer frame takes the place of the one that waits, and its turn."""
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        """Frames that were given up since the start."""
+        self._waiting: dict[int, tuple[Frame, float]] = {}
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def put(self, frame: Frame, now: float) -> None:
+        """A frame made at the monotonic time `now` [s]."""
+        self.dropped += frame.arbitration_id in self._waiting
+        self._waiting[frame.arbitration_id] = frame, now
+
+    def first(self, now: float) -> Frame | None:
+        """The frame whose turn it is; those that are late by now are dropped."""
+        for identifier, (frame, made) in list(self._waiting.items()):
+            if now - made <= LATE:
+                return frame
+            del self._waiting[identifier]
+            self.dropped += 1
+        return None
+
+    def done(self, frame: Frame) -> None:
+        """It is out."""
+        del self._waiting[frame.arbitration_id]
+
+    def clear(self) -> None:
+        """The bus is gone; what waits now would be stale when it is back."""
+        self.dropped += len(self._waiting)
+        self._waiting.clear()

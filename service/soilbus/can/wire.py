@@ -1,0 +1,151 @@
+"""One open bus: frames in, frames out, frames that the kernel had to drop.
+
+python-can opens every bus.  On SocketCAN we read its socket ourselves, for it can neither count
+overruns (its reader takes one control message a frame) nor send without a select beside each frame.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+import select
+import socket
+import struct
+from typing import NamedTuple, Protocol
+
+import can
+
+from soilbus.can.publish import Frame
+
+SMALL_SEND_BUFFER = 1
+"""The kernel makes its least of it, about six frames: no more than these can go stale in a stuck queue."""
+
+_SO_RXQ_OVFL, _SO_TIMESTAMPNS = 40, 35  # asm-generic/socket.h
+_MSG_CONFIRM = 0x800  # the frame is one of this very socket
+_EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29  # flags of can_id
+_IDENTIFIER = (1 << 29) - 1
+_HEAD = struct.Struct("=IB3x")  # can_id, length; the same in struct can_frame and canfd_frame
+_FRAME = struct.Struct("=IB3x8s")
+_LONGEST = 72
+_STAMP = struct.Struct("@ll")
+_COUNT = struct.Struct("@I")
+_ANCILLARY = socket.CMSG_SPACE(_STAMP.size) + socket.CMSG_SPACE(_COUNT.size)
+
+
+class Received(NamedTuple):
+    """What the daemon reads of python-can's Message, without the price of one.  timestamp [s] is the kernel's."""
+
+    timestamp: float
+    arbitration_id: int
+    is_extended_id: bool
+    is_remote_frame: bool
+    is_error_frame: bool
+    data: bytes
+    is_rx: bool = True
+
+
+class Wire(Protocol):
+    """An open bus.  All raise OSError or can.CanError; errno ENOBUFS and EAGAIN mean: no room at present."""
+
+    overruns: int
+    """Frames that came and were dropped for want of room since it was opened."""
+
+    def recv(self, timeout: float) -> Received | can.Message | None:
+        """The next frame, or None after `timeout` [s]."""
+
+    def send(self, frame: Frame) -> None:
+        """Hand one frame to the driver, never waiting."""
+
+    def shutdown(self) -> None:
+        """Let go of it."""
+
+
+def wire_of(bus: can.BusABC) -> Wire:
+    """The bus that python-can has opened, by its socket where it is the kernel's."""
+    own = getattr(bus, "socket", None)
+    if isinstance(own, socket.socket) and own.family == socket.AF_CAN:
+        return SocketWire(bus, own)
+    return MessageWire(bus)
+
+
+class SocketWire:
+    """A raw CAN socket of the kernel."""
+
+    def __init__(self, bus: can.BusABC, own: socket.socket) -> None:
+        self.overruns = 0
+        self._bus, self._socket = bus, own
+        self._dropped = 0  # the kernel's count, modulo 2**32
+        own.setblocking(False)
+        own.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
+        own.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SMALL_SEND_BUFFER)
+        self._poll = select.poll()
+        self._poll.register(own, select.POLLIN)
+
+    def recv(self, timeout: float) -> Received | None:
+        """As Wire; frames of this socket itself, which [bus] may ask for, are passed over."""
+        try:
+            return self._next()
+        except BlockingIOError:
+            if timeout <= 0.0 or not self._poll.poll(1e3 * timeout):
+                return None
+        try:
+            return self._next()
+        except BlockingIOError:
+            return None
+
+    def _next(self) -> Received | None:
+        raw, ancillary, flags, _ = self._socket.recvmsg(_LONGEST, _ANCILLARY)
+        t = math.nan
+        for _, kind, data in ancillary:
+            if kind == _SO_TIMESTAMPNS:
+                seconds, nanoseconds = _STAMP.unpack(data)
+                t = seconds + 1e-9 * nanoseconds
+            elif kind == _SO_RXQ_OVFL:
+                (dropped,) = _COUNT.unpack(data)
+                self.overruns += (dropped - self._dropped) % 2**32
+                self._dropped = dropped
+        if flags & _MSG_CONFIRM:
+            return None
+        word, length = _HEAD.unpack_from(raw)
+        return Received(
+            t, word & _IDENTIFIER, word & _EXTENDED != 0, word & _REMOTE != 0, word & _ERROR != 0, raw[8 : 8 + length]
+        )  # fmt: skip
+
+    def send(self, frame: Frame) -> None:
+        """As Wire."""
+        word = frame.arbitration_id | _EXTENDED if frame.extended else frame.arbitration_id
+        self._socket.send(_FRAME.pack(word, len(frame.data), frame.data))
+
+    def shutdown(self) -> None:
+        """As Wire."""
+        self._bus.shutdown()
+
+
+class MessageWire:
+    """Any other interface of python-can."""
+
+    overruns = 0  # none of them can tell
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self._bus = bus
+
+    def recv(self, timeout: float) -> can.Message | None:
+        """As Wire."""
+        return self._bus.recv(timeout)
+
+    def send(self, frame: Frame) -> None:
+        """As Wire."""
+        message = can.Message(arbitration_id=frame.arbitration_id, is_extended_id=frame.extended, data=frame.data)
+        self._bus.send(message)
+
+    def shutdown(self) -> None:
+        """As Wire."""
+        self._bus.shutdown()
+
+
+def error_number(error: Exception) -> int | None:
+    """errno of what a bus raised; EAGAIN for python-can's own full buffer, which has none."""
+    if isinstance(error, OSError):
+        return error.errno
+    number = getattr(error, "error_code", None)
+    return errno.EAGAIN if number is None and isinstance(error, can.CanOperationError) else number

@@ -1,0 +1,40 @@
+"""How the bus does: the frame BusHealth, a few words for systemd's STATUS line."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from soilbus.can.bus import BusCounts
+from soilbus.can.bus_state import BusState
+
+RECEIVED_MODULUS = 4016
+"""The 12-bit count of received frames is 0..4015."""
+
+_WORDS = {
+    "overruns": "received frames lost for want of room",
+    "dropped": "frames of ours not sent",
+    "error_frames": "error frames",
+    "foreign": "frames of another sender under our identifiers",
+    "reopened": "times reopened",
+}
+
+
+def health_frame(state: BusState, counts: BusCounts) -> tuple[str, dict[str, Any]]:
+    """Message and values; the counts since the start stay at the top of their range."""
+    return "BusHealth", {
+        "BusState": str(state),
+        "Reopened": counts.reopened,
+        "Overruns": counts.overruns,
+        "Dropped": counts.dropped,
+        "ForeignFrames": counts.foreign,
+        "ErrorFrames": counts.error_frames,
+        "Received": counts.received % RECEIVED_MODULUS,
+    }
+
+
+def health_text(state: BusState, counts: BusCounts) -> str:
+    """What is not as it should be, such as "3 error frames, controller error_passive"; nothing if all is well."""
+    found = [f"{n} {words}" for name, words in _WORDS.items() if (n := getattr(counts, name))]
+    if state not in (BusState.UNKNOWN, BusState.ACTIVE):
+        found.append(f"controller {state}")
+    return ", ".join(found)
