@@ -377,7 +377,7 @@ def _bench(args: argparse.Namespace) -> None:
     import json
 
     from soilbus.bench import as_results, bench_report, run_bench
-    from soilbus.bench.bus import NotQuiet, bus_figures
+    from soilbus.bench.bus import NotMeasured, bus_figures
     from soilbus.can.bus import BusError
 
     if args.bus is None:
@@ -385,7 +385,7 @@ def _bench(args: argparse.Namespace) -> None:
     with nullcontext() if args.json is None else whole_file(args.json) as out:  # first, for it takes a minute
         try:
             results = run_bench() if args.bus is None else as_results(bus_figures(args.bus, args.seconds))
-        except (AssertionError, BusError, ModuleNotFoundError, NotQuiet) as error:
+        except (AssertionError, BusError, ModuleNotFoundError, NotMeasured) as error:
             raise WorkError(f"bench: {error}") from None
         if out is not None:
             out.write(json.dumps(results, indent=1) + "\n")

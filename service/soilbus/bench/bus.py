@@ -24,7 +24,7 @@ import numpy as np
 from soilbus.bench.bus_ear import Ear
 from soilbus.bench.bus_load import FULL, Traffic, others
 from soilbus.bench.figure import Figure
-from soilbus.can.bus import BusError, open_bus
+from soilbus.can.bus import open_bus
 from soilbus.simulator.reference import TRACTOR
 
 STARTS = 3
@@ -47,14 +47,15 @@ with can.Bus(interface="socketcan", channel=sys.argv[1]) as bus:
 """
 
 
-class NotQuiet(Exception):
-    """Others are on the bus, or there is none; one line."""
+class NotMeasured(Exception):
+    """The bus is not ours alone, or the daemon did not do its work there; one line."""
 
 
 def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
     """All figures, from `seconds` of a full bus and half as many with a bare python-can loop beside.
 
-    Raises NotQuiet; BusError for a channel that cannot be opened.
+    A window whose result never came counts as late as the run is long.  Raises NotMeasured;
+    BusError for a channel that cannot be opened.
     """
     _check_quiet(channel)
     ready = [_time_to_ready(channel) for _ in range(STARTS)]
@@ -69,6 +70,9 @@ def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
         time.sleep(SETTLED)
         ear.stop()
         memory = _peak_memory(daemon)
+    if not len(late):
+        raise NotMeasured(f"{channel}: no window was estimated in {seconds:g} s")
+    late = 1e3 * np.sort(np.minimum(late, seconds))
     received, overruns = ear.books()
     return {
         "bus_lost": Figure(
@@ -77,8 +81,7 @@ def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
             at_most=True, digits=0,
         ),
         "bus_latency_ms": Figure(
-            1e3 * float(np.sort(late)[math.ceil(0.99 * len(late)) - 1]) if len(late) else math.inf, 50.0,
-            f"median {1e3 * np.median(late):.1f} ms" if len(late) else "no window",
+            float(late[math.ceil(0.99 * len(late)) - 1]), 50.0, f"median {np.median(late):.1f} ms",
             f"from a window's last frame to its SoilStrength, 99 % of {len(late)} windows", at_most=True,
         ),
         "bus_processor_ratio": shares,
@@ -95,7 +98,7 @@ def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
 def _check_quiet(channel: str) -> None:
     with open_bus({"interface": "socketcan", "channel": channel}) as bus:
         if bus.recv(QUIET) is not None:
-            raise NotQuiet(f"{channel}: others are on this bus; the bench would fill it up")
+            raise NotMeasured(f"{channel}: others are on this bus; the bench would fill it up")
 
 
 @contextmanager
@@ -114,7 +117,7 @@ def _daemon(channel: str, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
             threading.Thread(target=_swallow, args=(notify, process), daemon=True).start()
             yield process
         except TimeoutError:
-            raise BusError(f"the daemon on {channel} does not become ready", may_come=False) from None
+            raise NotMeasured(f"{channel}: the daemon does not become ready") from None
         finally:
             process.send_signal(signal.SIGTERM)
             process.wait(20.0)

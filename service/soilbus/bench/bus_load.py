@@ -23,7 +23,7 @@ FULL = 7350.0
 OURS = 0.1
 """Share of them that is mapped."""
 
-_GROUND_SPEED = 0xFE49
+_POSITION = 0xFEF3
 _OTHERS_PERIOD = 0.01
 _OTHERS = 0x18EE0000  # address claims, which nothing is mapped to
 
@@ -31,8 +31,8 @@ _OTHERS = 0x18EE0000  # address claims, which nothing is mapped to
 class Traffic:
     """Plays a simulated drive onto a channel in real time, from `start` on; `sent` counts its frames.
 
-    All of them are mapped.  The drive alone is less than a tenth of a full bus, so its ground
-    speed is said more often.
+    All of them are mapped.  The drive alone is less than a tenth of a full bus, so its position
+    is said more often: that tells the estimate nothing.
     """
 
     def __init__(self, channel: str, seconds: float) -> None:
@@ -64,14 +64,14 @@ class Traffic:
 
 
 def _thickened(drive: Sequence[can.Message], rate: float) -> list[tuple[float, Frame]]:
-    """The drive's frames with their times [s], with copies of the ground speed to make up the rate [1/s]."""
+    """The drive's frames with their times [s], with copies of the position to make up the rate [1/s]."""
     span = drive[-1].timestamp - drive[0].timestamp
-    spoken = sum(pgn_of(m.arbitration_id) == _GROUND_SPEED for m in drive)
+    spoken = sum(pgn_of(m.arbitration_id) == _POSITION for m in drive)
     copies = max(0, round((rate * span - len(drive)) / spoken))
     return [
         (message.timestamp, Frame(message.arbitration_id, message.is_extended_id, bytes(message.data)))
         for message in drive
-        for _ in range(1 + (copies if pgn_of(message.arbitration_id) == _GROUND_SPEED else 0))
+        for _ in range(1 + (copies if pgn_of(message.arbitration_id) == _POSITION else 0))
     ]
 
 
