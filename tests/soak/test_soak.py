@@ -30,7 +30,7 @@ def test_all_faults_came(told):
 
 def test_frames_keep_their_beat(told):
     assert told.deadline_misses == 0
-    assert told.off_beat == 0
+    assert told.off_beat <= told.faults["full"]  # once each: the newest frame goes out as soon as there is room
     assert told.sent > 0.8 * 3000
 
 
