@@ -19,7 +19,7 @@ from soilbus.terra.wheel import WheelModel
 Array = NDArray[np.float64]
 
 PERSISTENCE = 86400.0
-"""Time [s] in which a gain error forgets all but 1/e of what it was: amplifiers drift, tyres wear, cells are rezeroed."""
+"""Time [s] in which a gain error forgets all but 1/e of what it was: amplifiers drift, tyres wear."""
 _SOIL = len(PARAMETERS)
 
 

@@ -274,7 +274,7 @@ class Tracker:
         return belief.drifted(self._drift(belief, elapsed), gains)
 
     def _known_at_first(self, problem: WindowProblem) -> Belief:
-        """What is known before any window: the prior, and the gains of another run unless the data speak against them."""
+        """Before any window: the prior, and the gains of another run unless the data speak against them."""
         if self._recalled is not None:
             known = recalled(self._recalled[0], self._here, problem.gain_std, self._recalled[1])
             if is_borne_out(problem, self._here, known):
