@@ -43,7 +43,9 @@ def belief_with(seed: int) -> Belief:
 
 def state_with(belief: Belief | None, **changed) -> State:
     stored = None if belief is None else stored_belief(belief, 1.7e9, OWNER)
-    return State(**{"at": 1.7e9, "starts": 3, "belief": stored, "totals": {"windows": 5, "failed.internal": 2}} | changed)
+    return State(
+        **{"at": 1.7e9, "starts": 3, "belief": stored, "totals": {"windows": 5, "failed.internal": 2}} | changed
+    )
 
 
 CONTENT = dumped(state_with(belief_with(1)), OWNER)
@@ -73,9 +75,10 @@ def test_what_comes_back_is_bit_for_bit_what_was_stored(seed):
 def test_one_wrong_byte_or_a_cut_is_noticed(place, byte, cut):
     spoilt = CONTENT[:place] if cut else CONTENT[:place] + bytes([byte]) + CONTENT[place + 1 :]
     try:
-        assert loaded(spoilt, OWNER) == loaded(CONTENT, OWNER)  # a space, or the same byte
-    except StateError as error:
-        assert re.fullmatch(r"\S.+", str(error))
+        found = loaded(spoilt, OWNER)
+    except StateError:
+        return
+    assert found == loaded(CONTENT, OWNER)  # a space, or the same byte
 
 
 JSON = st.recursive(
@@ -239,10 +242,11 @@ def test_a_full_disk_leaves_the_old_file_and_no_other(step, tmp_path: Path, monk
 
 
 def test_two_hundred_kills_lose_nothing_that_was_stored(tmp_path: Path):
-    here = Path(__file__)
+    killer = Path(__file__).with_name("killed.py")
+    environment = {**os.environ, "PYTHONPATH": str(killer.parents[2] / "service")}
     done = subprocess.run(
-        [sys.executable, here.with_name("killed.py"), tmp_path / "state.json", "200", "1"],
-        capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(here.parents[2] / "service")}, timeout=120.0,
+        [sys.executable, killer, tmp_path / "state.json", "200", "1"],
+        capture_output=True, text=True, env=environment, timeout=120.0,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     told = json.loads(done.stdout)
