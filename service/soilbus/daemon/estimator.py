@@ -115,6 +115,11 @@ class WindowEstimator:
             *self._completion,
         )  # fmt: skip
 
+    @property
+    def tracker(self) -> Tracker:
+        """What carries soil and gains from window to window."""
+        return self._tracker
+
     def solve(self, task: WindowTask) -> WindowResult:
         """Estimate and decision of one window."""
         return self.decide(self.estimate(task))

@@ -26,6 +26,7 @@ from soilbus.estimation.marginal import with_whole
 from soilbus.estimation.normal_equations import Fitting
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.present import at_present
+from soilbus.estimation.recall import is_borne_out, recalled
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.soil_change import Crossing, suspicion, without_crossing
 from soilbus.estimation.window import Rig, Window
@@ -133,12 +134,23 @@ class Tracker:
     ) -> None:
         self.rig, self.prior, self.model, self.settings = rig, prior, model, settings
         self.effects, self.free = tuple(effects), tuple(free)
+        self._recalled: tuple[Belief, float] | None = None
         self.forget()
 
     @property
     def here(self) -> SoilPrior:
         """Prior of the present soil: the configured one, or a wider one after the soil has changed."""
         return self._here
+
+    @property
+    def newest(self) -> Belief | None:
+        """What the newest window told that later ones build on; None before there is one."""
+        beliefs = self._beliefs  # asked from another thread
+        return beliefs[-1][1] if beliefs else None
+
+    def recall(self, belief: Belief, elapsed: float) -> None:
+        """Begin, now and whenever anew, with what another run knew of the gains so many seconds ago."""
+        self._recalled = belief, elapsed
 
     def forget(self) -> None:
         """Begin anew."""
@@ -253,13 +265,22 @@ class Tracker:
         """What windows that had ended by t [s] tell of the soil from t on."""
         ended = self._ended(t)
         if not ended:
-            return Belief.of(self._here, problem.gain_std)
+            return self._known_at_first(problem)
         end, belief = self._beliefs[ended[-1]]
         elapsed = (t - end) / self.settings.window
         gains = problem.gain_std**2 * min((elapsed + 1.0) / GAIN_MEMORY, 1.0)
         if self._crossing is not None and end <= self._crossing.end:
             return belief.of_another_soil(self._here).drifted(np.zeros((_SOIL, _SOIL)), gains)
         return belief.drifted(self._drift(belief, elapsed), gains)
+
+    def _known_at_first(self, problem: WindowProblem) -> Belief:
+        """Before any window: the prior, and the gains of another run unless the data speak against them."""
+        if self._recalled is not None:
+            known = recalled(self._recalled[0], self._here, problem.gain_std, self._recalled[1])
+            if is_borne_out(problem, self._here, known):
+                return known
+            self._recalled = None
+        return Belief.of(self._here, problem.gain_std)
 
     def _ended(self, t: float) -> list[int]:
         return [i for i, (end, _) in enumerate(self._beliefs) if end <= t + _SAME_TIME]
