@@ -22,5 +22,6 @@ note restarted
 kill $! 2>/dev/null || true
 systemctl stop $unit
 note stopped
+cp /var/lib/soilbus/vcan1/state.json "$out/"
 kill $candump
 journalctl --no-pager -u $unit -u soilbus-link@vcan1 >"$out/journal"

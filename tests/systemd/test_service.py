@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -92,3 +93,10 @@ def test_it_stops_cleanly_on_sigterm(out: Path) -> None:
     stopping = (out / "journal").read_text().rpartition(": Stopping ")[2]
     assert "Deactivated successfully" in stopping
     assert [word for word in ("Main process exited", "timed out", "Failed") if word in stopping] == []
+
+
+@pytest.mark.systemd
+def test_its_state_outlives_sigkill(out: Path) -> None:
+    state = json.loads((out / "state.json").read_text())["state"]
+    assert state["starts"] == 2
+    assert state["totals"]["frames"] > 0
