@@ -266,12 +266,9 @@ class Service:
         """
         if self.result is None or _kind(self._present_state(now)[1]) in INTERRUPTIONS:
             return Way.UNKNOWN
-        if (
-            self._fault
-            or self._solver.in_fault
-            or self._handed_out <= self._interrupted
-            or not self._age(now) <= self.config.traversability.max_age
-        ):  # nor nan
+        if self._fault or self._solver.in_fault:
+            return Way.UNKNOWN
+        if self._handed_out <= self._interrupted or not self._age(now) <= self.config.traversability.max_age:  # nor nan
             return Way.UNKNOWN
         return self.result.traversability.state
 
