@@ -51,6 +51,8 @@ class Dbc(_Section):
     """DBC files that describe the vehicle's frames, beside the configuration or ours by name."""
 
     input: list[str] = Field(default_factory=list)
+    checked: list[str] = Field(default_factory=list)
+    """Messages of the vehicle's own DBC that are believed only with a right Counter and Checksum (dbc/README.md)."""
 
 
 class Vehicle(_Section):

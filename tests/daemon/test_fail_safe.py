@@ -1,7 +1,5 @@
 """No path to GO: arbitrary sequences of good, stale, refused and missing frames, clock steps, lost buses, restarts.
 
-A service that was stopped or killed leaves a state behind, and the next one begins with it.
-
 A wire plays one moment of a good drive over and over, at 10 Hz, and spoils it as told.
 What it knows of its own deliveries judges every Traversability frame that the service
 sends.  The soil comes from a tracker that is always content with its fit unless it is
@@ -188,6 +186,7 @@ class Drive:
         self.start()
 
     def start(self) -> None:
+        """A service that begins with the state that the one before has left behind."""
         config: Config = CONFIG
         pipeline = Pipeline(config, IN)
         self.content(pipeline.estimator)

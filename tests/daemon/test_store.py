@@ -150,6 +150,7 @@ def _indefinite(state):
         (sealed(lambda s: s["belief"]["gains"].update({"torque.FL": float("inf")})), "torque.FL"),
         (sealed(lambda s: _covariance(s, 2, 2, 0.0)), "positive definite"),
         (sealed(lambda s: _covariance(s, 2, 2, -1.0)), "positive definite"),
+        (sealed(lambda s: _covariance(s, 2, 2, 5e-324)), "positive definite"),
         (sealed(lambda s: _covariance(s, 2, 2, 1e300)), "out of bounds"),
         (sealed(lambda s: _scaled(s, 9, 1.5)), "not symmetric"),
         (sealed(_indefinite), "positive definite"),

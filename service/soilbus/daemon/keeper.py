@@ -95,11 +95,10 @@ class Keeper:
         try:
             content = dumped(State(at=at, starts=starts, belief=self._stored, totals=dict(totals)), self._owner)
             write_whole(self._path, content)
-        except (OSError, ValueError) as error:
+        except Exception as error:  # whatever it is, a thread's error would be told to nobody
             if not self._fails:
-                log.warning(
-                    "state cannot be stored in %s: %s", self._path.parent, getattr(error, "strerror", 0) or error
-                )
+                why = " ".join(str(getattr(error, "strerror", None) or error).split())
+                log.warning("state cannot be stored in %s: %s", self._path.parent, why)
             self._fails = True
             return
         self._fails = False

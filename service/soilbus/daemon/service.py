@@ -275,7 +275,7 @@ class Service:
 
         After an interruption only a window that ended later counts.
         """
-        if self.result is None or _interrupts(self._present_state(now)):
+        if self.result is None or _interrupts(self._present_state(now)) or self._fault or self._solver.in_fault:
             return Way.UNKNOWN
         if self._handed_out <= self._interrupted or not self._age(now) <= self.config.traversability.max_age:  # nor nan
             return Way.UNKNOWN

@@ -9,8 +9,6 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from cantools.database.can import Database
-
 from soilbus.can.bus import BusError, LiveBus, open_bus
 from soilbus.can.dbc_files import filters_of, load_databases, output_database
 from soilbus.can.publish import Publisher
@@ -30,8 +28,7 @@ def start_service(config: Config, wait: bool, on_window: Callable[[WindowResult]
     Raises ConfigError for a configuration that cannot work, BusError for a bus that
     cannot be opened.
     """
-    database, ours = load_databases(config), output_database(config)
-    pipeline = Pipeline(config, database)
+    pipeline, ours = Pipeline(config, load_databases(config)), output_database(config)
     publisher = Publisher(ours)
     settings = config.bus.model_dump()
     filters = pipeline.admission.can_filters() + filters_of(ours)
@@ -45,16 +42,16 @@ def start_service(config: Config, wait: bool, on_window: Callable[[WindowResult]
     # The loop must get its turn between the estimator's steps, or the socket overflows.
     sys.setswitchinterval(SWITCH_INTERVAL)
     workers = ThreadPoolExecutor(max_workers=1, thread_name_prefix="estimate")
-    keeper = _keeper(config, pipeline, database, os.environ)
+    keeper = _keeper(pipeline, os.environ)
     return Service(
         config, pipeline, bus, publisher, Notifier.from_environment(), workers, on_window=on_window, keeper=keeper
     )
 
 
-def _keeper(config: Config, pipeline: Pipeline, database: Database, environ: Mapping[str, str]) -> Keeper | None:
+def _keeper(pipeline: Pipeline, environ: Mapping[str, str]) -> Keeper | None:
     """Keeps the state in the folder that systemd made for it; None where there is none."""
     folder = environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if not folder:
         return None
     writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="store")
-    return Keeper(Path(folder), Owner.of(config, pipeline.intake.channels, database), writer)
+    return Keeper(Path(folder), Owner.of(pipeline.config, pipeline.intake.channels, pipeline.database), writer)

@@ -145,10 +145,13 @@ def _check(belief: Belief, owner: Owner) -> None:
     if (variance > (FAR * owner.std) ** 2).any():
         raise StateError("the belief's covariance is out of bounds")
     scale = np.sqrt(variance[~held])
-    correlation = covariance[np.ix_(~held, ~held)] / np.outer(scale, scale)
+    with np.errstate(over="ignore"):
+        correlation = covariance[np.ix_(~held, ~held)] / np.outer(scale, scale)
     if not np.allclose(correlation, correlation.T, rtol=0.0, atol=1e-9):
         raise StateError("the belief's covariance is not symmetric")
     try:
+        if not (np.abs(correlation) < 1.0 + 1e-9).all():
+            raise np.linalg.LinAlgError
         np.linalg.cholesky(correlation)
     except np.linalg.LinAlgError:
         raise StateError("the belief's covariance is not positive definite") from None

@@ -9,7 +9,7 @@ from cantools.database.can import Database
 
 from soilbus.assembly import completion_of, effects_of, rig_of
 from soilbus.can.channels import Channel
-from soilbus.can.dbc_files import load_databases, output_database
+from soilbus.can.dbc_files import checked_messages, load_databases, output_database
 from soilbus.can.mapping import channels_of, without_unit
 from soilbus.config import Config, Table
 from soilbus.report.table import table
@@ -25,7 +25,8 @@ def configuration_report(config: Config) -> str:
     channels = channels_of(config, database)
     output_database(config)
     assumed = {c.name for c in without_unit(channels, database)}
-    rows = [_row(channel, database, channel.name in assumed) for channel in channels]
+    checked = checked_messages(config)
+    rows = [_row(channel, database, channel.name in assumed, channel.message in checked) for channel in channels]
     head = ("role", "signal", "unit", "factor to SI", "plausible", "every", "status")
     return _report(config, [table(head, rows)])
 
@@ -71,12 +72,14 @@ def effect_lines(config: Config) -> list[str]:
     return lines
 
 
-def _row(channel: Channel, database: Database, unit_assumed: bool) -> tuple[str, ...]:
+def _row(channel: Channel, database: Database, unit_assumed: bool, checked: bool) -> tuple[str, ...]:
     message = database.get_message_by_name(channel.message)
     signal = message.get_signal_by_name(channel.signal)
     status = "SI assumed: the DBC tells no unit" if unit_assumed else "ok"
     if channel.valid_signal:
         status += f", valid while {channel.valid_signal} is {'/'.join(map(str, channel.valid_values))}"
+    if checked:
+        status += ", counter and CRC required"
     every = f"{message.cycle_time} ms" if message.cycle_time else "not told"
     return (
         channel.name,
