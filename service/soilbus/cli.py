@@ -133,6 +133,10 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
 
     sub = command("bench", _bench, "every performance figure beside its peer, in one run", "")
+    sub.add_argument("--bus", metavar="CHANNEL", help="the service on this bus, filled up: a vcan, never a vehicle's")
+    sub.add_argument(
+        "--seconds", type=between(15.0, 200.0), default=40.0, metavar="S", help="of a full bus (default 40)"
+    )
     sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
     return parser
 
@@ -372,13 +376,16 @@ def _decisions(args: argparse.Namespace) -> None:
 def _bench(args: argparse.Namespace) -> None:
     import json
 
-    _need("scipy", "peers", "bench")
-    from soilbus.bench import bench_report, run_bench
+    from soilbus.bench import as_results, bench_report, run_bench
+    from soilbus.bench.bus import NotMeasured, bus_figures
+    from soilbus.can.bus import BusError
 
+    if args.bus is None:
+        _need("scipy", "peers", "bench")
     with nullcontext() if args.json is None else whole_file(args.json) as out:  # first, for it takes a minute
         try:
-            results = run_bench()
-        except (AssertionError, ModuleNotFoundError) as error:
+            results = run_bench() if args.bus is None else as_results(bus_figures(args.bus, args.seconds))
+        except (AssertionError, BusError, ModuleNotFoundError, NotMeasured) as error:
             raise WorkError(f"bench: {error}") from None
         if out is not None:
             out.write(json.dumps(results, indent=1) + "\n")

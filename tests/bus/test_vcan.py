@@ -110,15 +110,16 @@ def _filters(lists: str) -> list[tuple[int, int]]:
 
 
 @pytest.mark.vcan
-def test_the_kernel_passes_mapped_frames_only(live: Run) -> None:
+def test_the_kernel_passes_mapped_frames_and_our_identifiers_only(live: Run) -> None:
     def passes(i: int) -> bool:
         return any(i & mask == wanted & mask for wanted, mask in live.filters)
 
     extended = 1 << 31
-    mapped = [0x510, 0x520, 0x530, 0x540, 0x550, *(extended | i for i in (0x18FF2210, 0x18FF2213, 0x18FE4997))]
+    ours = [extended | message.frame_id for message in live.database.messages]  # of a second sender
+    mapped = [*ours, 0x510, 0x520, 0x530, 0x540, 0x550, *(extended | i for i in (0x18FF2210, 0x18FF2213, 0x18FE4997))]
     assert [hex(i) for i in mapped if not passes(i)] == []
-    ours = [extended | message.frame_id for message in live.database.messages]
-    assert [hex(i) for i in (0x123, 0x7FF, extended | 0x18FF2214, extended | 0x18FEF197, *ours) if passes(i)] == []
+    beside = [i + 0x100 for i in ours[-1:]] + [i ^ 1 for i in ours] + [i & 0x7FF for i in ours]
+    assert [hex(i) for i in (0x123, 0x7FF, extended | 0x18FF2214, extended | 0x18FEF197, *beside) if passes(i)] == []
 
 
 @pytest.mark.vcan

@@ -49,6 +49,11 @@ def run_bench() -> dict[str, Any]:
         write_log(frames(simulate(config, excited("loam", RECORDING), seed=1), config, load_databases(config)), log)
         for measure in _with_progress(MEASUREMENTS):
             figures |= measure(log)
+    return as_results(figures)
+
+
+def as_results(figures: Mapping[str, Figure]) -> dict[str, Any]:
+    """Value by figure's name, beside "details" of each and the "machine"."""
     details = {name: asdict(figure) | {"met": figure.met} for name, figure in figures.items()}
     machine = {"python": platform.python_version(), "numpy": np.__version__, "machine": platform.machine()}
     return {name: figure.value for name, figure in figures.items()} | {"details": details, "machine": machine}

@@ -11,12 +11,15 @@ import math
 import select
 import socket
 import struct
+import time
 from typing import NamedTuple, Protocol
 
 import can
 
 from soilbus.can.publish import Frame
 
+GATHER = 0.005
+"""Pause [s] in which frames gather: the kernel has stamped them, and one waking for several is cheaper."""
 SMALL_SEND_BUFFER = 1
 """The kernel makes its least of it, about six frames: no more than these can go stale in a stuck queue."""
 
@@ -83,18 +86,19 @@ class SocketWire:
 
     def recv(self, timeout: float) -> Received | None:
         """As Wire; frames of this socket itself, which [bus] may ask for, are passed over."""
-        try:
-            return self._next()
-        except BlockingIOError:
-            if timeout <= 0.0 or not self._poll.poll(1e3 * timeout):
-                return None
-        try:
-            return self._next()
-        except BlockingIOError:
-            return None
+        frame = self._next()
+        if frame is None and timeout > 0.0:
+            time.sleep(min(timeout, GATHER))
+            frame = self._next()
+            if frame is None and timeout > GATHER and self._poll.poll(1e3 * (timeout - GATHER)):
+                frame = self._next()
+        return frame
 
     def _next(self) -> Received | None:
-        raw, ancillary, flags, _ = self._socket.recvmsg(_LONGEST, _ANCILLARY)
+        try:
+            raw, ancillary, flags, _ = self._socket.recvmsg(_LONGEST, _ANCILLARY)
+        except BlockingIOError:
+            return None
         t = math.nan
         for _, kind, data in ancillary:
             if kind == _SO_TIMESTAMPNS:

@@ -41,8 +41,8 @@ GRACE = 0.2
 """A window that no later frame has closed is closed this long after its end [s]."""
 MAX_DRAIN = 4000
 """Frames taken in one go before the loop looks at its clock again."""
-POLL = 0.02
-"""Longest wait for a frame [s] before the loop looks whether the worker is done."""
+POLL, PROMPT = 0.02, 0.003
+"""Longest wait for a frame [s], and while the worker has a window: then its result may come any moment."""
 MAX_PENDING = 3
 """Windows that may wait for the worker."""
 LONGEST_CURVE = 60.0
@@ -147,8 +147,9 @@ class Service:
 
     def _receive(self) -> None:
         feed = self.intake.admission.feed
+        longest = PROMPT if self._pending else POLL
         for _ in range(MAX_DRAIN):
-            message = self.bus.receive(max(0.0, min(self._next_tick - self.clock(), POLL)))
+            message = self.bus.receive(max(0.0, min(self._next_tick - self.clock(), longest)))
             if message is None:
                 return
             self._last_stamp = message.timestamp

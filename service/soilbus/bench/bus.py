@@ -1,0 +1,169 @@
+"""The daemon itself on a fully loaded bus of the kernel: losses, latency, processor, memory, start.
+
+The channel must be one of our own, such as a vcan: it is filled to the brim.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from soilbus.bench.bus_ear import Ear
+from soilbus.bench.bus_load import FULL, Traffic, others
+from soilbus.bench.figure import Figure
+from soilbus.can.bus import open_bus
+from soilbus.simulator.reference import TRACTOR
+
+STARTS = 3
+QUIET = 1.0
+SETTLED = 2.5
+"""Seconds after the last frame until its count is on the bus."""
+
+_BARE = """
+import socket, sys
+import can
+with can.Bus(interface="socketcan", channel=sys.argv[1]) as bus:
+    bus.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
+    n = 0
+    try:
+        print("ready", flush=True)
+        while True:
+            n += bus.recv() is not None
+    except KeyboardInterrupt:
+        print(n, flush=True)
+"""
+
+
+class NotMeasured(Exception):
+    """The bus is not ours alone, or the daemon did not do its work there; one line."""
+
+
+def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
+    """All figures, from `seconds` of a full bus and half as many with a bare python-can loop beside.
+
+    A window whose result never came counts as late as the run is long.  Raises NotMeasured;
+    BusError for a channel that cannot be opened.
+    """
+    _check_quiet(channel)
+    ready = [_time_to_ready(channel) for _ in range(STARTS)]
+    with TemporaryDirectory() as folder, _daemon(channel, Path(folder)) as daemon, others(channel):
+        ear, traffic = Ear(channel), Traffic(channel, 1.5 * seconds)
+        ear.start()
+        traffic.start()
+        time.sleep(seconds)
+        late = ear.latencies()
+        shares = _shares(daemon, channel, 0.5 * seconds)
+        traffic.wait()
+        time.sleep(SETTLED)
+        ear.stop()
+        memory = _peak_memory(daemon)
+    if not len(late):
+        raise NotMeasured(f"{channel}: no window was estimated in {seconds:g} s")
+    late = 1e3 * np.sort(np.minimum(late, seconds))
+    received, overruns = ear.books()
+    return {
+        "bus_lost": Figure(
+            traffic.sent - received, 0.0, f"kernel's drop counter: {overruns}",
+            f"of {traffic.sent} frames at our filters, {traffic.sent / (1.5 * seconds):.0f} of {FULL:.0f} a second",
+            at_most=True, digits=0,
+        ),
+        "bus_latency_ms": Figure(
+            float(late[math.ceil(0.99 * len(late)) - 1]), 50.0, f"median {np.median(late):.1f} ms",
+            f"from a window's last frame to its SoilStrength, 99 % of {len(late)} windows", at_most=True,
+        ),
+        "bus_processor_ratio": shares,
+        "bus_memory_mb": Figure(memory / 1e6, 90.0, "", "most resident memory of the daemon", at_most=True),
+        "bus_ready_s": Figure(
+            float(np.median([wall for wall, _ in ready])), 1.5,
+            "processor " + ", ".join(f"{used:.2f}" for _, used in ready) + " s",
+            f"from start to READY=1, median of {STARTS}: " + ", ".join(f"{wall:.2f}" for wall, _ in ready) + " s",
+            at_most=True, digits=2,
+        ),
+    }  # fmt: skip
+
+
+def _check_quiet(channel: str) -> None:
+    with open_bus({"interface": "socketcan", "channel": channel}) as bus:
+        if bus.recv(QUIET) is not None:
+            raise NotMeasured(f"{channel}: others are on this bus; the bench would fill it up")
+
+
+@contextmanager
+def _daemon(channel: str, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """`soilbus run` on the channel, ready."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
+        notify.bind(str(folder / "notify"))
+        run = ["run", "--config", str(TRACTOR), "--set", "bus.interface=socketcan", "--set", f"bus.channel={channel}"]
+        process = subprocess.Popen(
+            [sys.executable, "-m", "soilbus.cli", *run], env={**os.environ, "NOTIFY_SOCKET": str(folder / "notify")}
+        )
+        try:
+            notify.settimeout(60.0)
+            while b"READY=1" not in notify.recv(4096):
+                pass
+            threading.Thread(target=_swallow, args=(notify, process), daemon=True).start()
+            yield process
+        except TimeoutError:
+            raise NotMeasured(f"{channel}: the daemon does not become ready") from None
+        finally:
+            process.send_signal(signal.SIGTERM)
+            process.wait(20.0)
+
+
+def _swallow(notify: socket.socket, process: subprocess.Popen[bytes]) -> None:
+    """Read what systemd would, or the daemon's messages would pile up."""
+    while process.poll() is None:
+        if select.select([notify], [], [], 0.5)[0]:
+            notify.recv(4096)
+
+
+def _time_to_ready(channel: str) -> tuple[float, float]:
+    """Wall and processor time [s] from start to READY=1."""
+    with TemporaryDirectory() as folder:
+        begin = time.perf_counter()
+        with _daemon(channel, Path(folder)) as process:
+            return time.perf_counter() - begin, _processor(process)
+
+
+def _processor(process: subprocess.Popen[bytes]) -> float:
+    """Processor time [s] of a process so far, user and system."""
+    fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _peak_memory(process: subprocess.Popen[bytes]) -> int:
+    """Most resident memory of a process so far [bytes]."""
+    lines = Path(f"/proc/{process.pid}/status").read_text().splitlines()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
+
+
+def _shares(daemon: subprocess.Popen[bytes], channel: str, seconds: float) -> Figure:
+    """The daemon's processor share over that of a bare loop which receives the whole bus, in the same seconds."""
+    with subprocess.Popen([sys.executable, "-c", _BARE, channel], stdout=subprocess.PIPE) as bare:
+        assert bare.stdout is not None
+        bare.stdout.readline()
+        before = np.array([_processor(daemon), _processor(bare)])
+        begin = time.perf_counter()
+        time.sleep(seconds)
+        used = np.array([_processor(daemon), _processor(bare)]) - before
+        span = time.perf_counter() - begin
+        bare.send_signal(signal.SIGINT)
+        heard = int(bare.stdout.readline()) / span
+    ours, theirs = 100.0 * used / span
+    return Figure(
+        float(ours / theirs), 2.0, f"bare loop: {theirs:.1f} % for {heard:.0f} frames/s",
+        f"daemon: {ours:.1f} % of a processor, estimates included", at_most=True, digits=2,
+    )  # fmt: skip
