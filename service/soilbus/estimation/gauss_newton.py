@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ MAX_ITERATIONS = 30
 MAX_RESUMED = 10
 CONVERGED = 1e-6
 """Squared length of a step in posterior standard deviations that ends the fit."""
-LEFT_OVER, LEFT_OVER_RESUMED = 1e-7, 1e-3
+LEFT_OVER, LEFT_OVER_RESUMED = 2e-8, 1e-3
 """The same for what a full step leaves behind, foreseen from how fast the steps shrink."""
 SETTLING = 1.0
 """The same, below which the latents and gains join in."""
@@ -65,6 +65,8 @@ FAR = 10.0
 """Standard deviations on a few instants beyond which an end is not the optimum looked at."""
 FAR_ABOVE = 1.5
 """Ratio of costs on a few instants beyond which an end is no rival."""
+MEETS = 5.0
+"""Standard deviations on a few instants within which a descent is foreseen to end where another one did."""
 SAME_END = 0.02
 """Relative difference in cost of two descents that are taken to have met at one optimum."""
 
@@ -210,7 +212,7 @@ def _promising(thin: Fitting) -> list[Place]:
     """
     ends: list[Place] = []
     for start in starting_soils(thin.problem, thin.coordinates.prior, thin.before):
-        end = _approach(thin, np.asarray(start), MAX_APPROACH)
+        end = _approach(thin, np.asarray(start), MAX_APPROACH, known=ends)
         if end is None:
             continue
         met = any(abs(end.cost - other.cost) < SAME_END * other.cost for other in ends)
@@ -224,8 +226,10 @@ def _promising(thin: Fitting) -> list[Place]:
 def starting_soils(problem: WindowProblem, prior: SoilPrior, before: Belief | None = None) -> Iterator[Soil]:
     """What is believed (else the prior median), loam, and the known soils that foretell the window best."""
     yield Soil(*(prior.median if before is None else before.soil).tolist())
+    likeliest, *others = foretelling(problem, [near(prior, SOILS[kind]) for kind in KINDS])
+    yield likeliest
     yield near(prior, SOILS["loam"])
-    yield from foretelling(problem, [near(prior, SOILS[kind]) for kind in KINDS])[:MAX_KINDS]
+    yield from others[: MAX_KINDS - 1]
 
 
 def near(prior: SoilPrior, soil: Soil) -> Soil:
@@ -294,9 +298,17 @@ def settled(fitting: Fitting, near: Place) -> Fit | None:
 
 
 def _approach(
-    fitting: Fitting, soil: Array, most: int, least: float = ENOUGH, gains: Array | None = None
+    fitting: Fitting,
+    soil: Array,
+    most: int,
+    least: float = ENOUGH,
+    gains: Array | None = None,
+    known: Sequence[Place] = (),
 ) -> Place | None:
-    """Levenberg-damped steps of the soil and the active gains, latents as measured, until they are short."""
+    """Levenberg-damped steps of the soil and the active gains, latents as measured, until they are short.
+
+    A descent that is foreseen to end at one of the `known` places ends there at once.
+    """
     place = fitting.start(soil, gains=gains)
     point = fitting.point(place)
     damping, trials = 1e-3, 1
@@ -306,7 +318,10 @@ def _approach(
             return None
         if point.length(step) < SETTLING or trials >= most or damping > 1e6:
             return replace(place, cost=point.cost, trials=trials)
-        new_place = fitting.restarted(place, step)
+        for end in known:
+            if _leads_to(fitting, place, point, step, end):
+                return replace(end, trials=trials)
+        new_place = fitting.restarted(place, point, step)
         new = fitting.point(new_place)
         trials += 1
         if new is None or new.cost >= point.cost:
@@ -317,6 +332,12 @@ def _approach(
         if enough:
             return replace(place, cost=point.cost, trials=trials)
     return None
+
+
+def _leads_to(fitting: Fitting, place: Place, point: Point, step: Array, end: Place) -> bool:
+    """Whether a step of the soil comes so near to where another descent ended that this one will end there too."""
+    off = fitting.coordinates.position(end.soil) - fitting.coordinates.position(place.soil) - step
+    return point.length(off) < MEETS**2
 
 
 def _stride(point: Point, last: Array, share: float, step: Array) -> float:

@@ -111,12 +111,13 @@ class Fitting:
         gains = self.before.gains if gains is None else gains
         return Place(soil, gains, self.problem.start(Soil(*soil.tolist()), guess, gains), np.inf, 0)
 
-    def restarted(self, place: Place, step: Array) -> Place:
-        """The place after a step (F + A,) with latents as measured."""
+    def restarted(self, place: Place, point: Point, step: Array) -> Place:
+        """The place after a step (F + A,) with latents as measured, as they are at this place already."""
         free, gains = len(self.free), place.gains.copy()
         gains[self.active] += step[free:]
-        soil = self.coordinates.moved(place.soil, step[:free])
-        return self.start(soil, place.latents.entry_angle, self.problem.allowed(gains))
+        soil, gains = self.coordinates.moved(place.soil, step[:free]), self.problem.allowed(gains)
+        angle = self.problem.turned(point.at, place.latents.entry_angle, soil - place.soil, gains - place.gains)
+        return self._reached(place, point, soil, gains, replace(place.latents, entry_angle=angle))
 
     def point(self, place: Place) -> Point | None:
         """The normal equations at a place; None where the model is not finite."""
@@ -174,7 +175,10 @@ class Fitting:
         gain_step = np.zeros(len(place.gains))
         gain_step[self.active] = step[free:]
         latents = self.problem.updated(point.at, place.latents, soil - place.soil, gain_step)
-        gains = place.gains + gain_step
+        return self._reached(place, point, soil, place.gains + gain_step, latents)
+
+    def _reached(self, place: Place, point: Point, soil: Array, gains: Array, latents: Latents) -> Place:
+        """Soil (6,), gains (G,) and foreseen latents as a place, with the entry angles solved where they turn far."""
         turn = np.max(np.abs(latents.entry_angle / place.latents.entry_angle - 1.0), initial=0.0)
         if turn > LONG_TURN or len(point.at.load_by_effects):  # effects may bend where the soil alone does not
             latents = self.problem.carried(latents, Soil(*soil.tolist()), gains)

@@ -10,7 +10,7 @@ sect. 4.8).  The entry angle of each wheel follows from its load.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -292,10 +292,17 @@ class WindowProblem(Readings):
         new = at.corrected - at.variance * (left @ at.by_latents)[:, 0] - at.by_gain * gain_step[W : self.n_sensors - 1]
         load, speed, ground = new[:, :W], new[:, W : 2 * W], new[:, 2 * W]
         slip_change = (latents.ground_speed[:, None] / latents.speed - ground[:, None] / speed) / self.rig.radius
-        change = load - latents.load + at.off - at.load_by_slip * slip_change
-        change -= (soil_step @ at.load_by_soil.reshape(6, -1)).reshape(N, W)
+        more = load - latents.load - at.load_by_slip * slip_change
+        return Latents(load, speed, ground, self.turned(at, latents.entry_angle, soil_step, gain_step, more))
+
+    def turned(self, at: Linearised, angle: Array, soil_step: Array, gain_step: Array, more_load: Any = 0.0) -> Array:
+        """Entry angles (N, W) after a step (6,) of the soil and (G,) of the gains, by the linear model.
+
+        more_load (N, W) [N] is what wheels then carry besides, short of what a change of slip carries.
+        """
+        N, W = self.n, self.n_wheels
+        change = more_load + at.off - (soil_step @ at.load_by_soil.reshape(6, -1)).reshape(N, W)
         if len(at.load_by_effects):
             change -= np.tensordot(gain_step[self.n_sensors :], at.load_by_effects, 1)
-        low, high = latents.entry_angle * 0.6, np.minimum(latents.entry_angle * 1.6, MAX_ENTRY_ANGLE)
-        angle = np.clip(latents.entry_angle + change / at.load_slope, low, high)
-        return Latents(load, speed, ground, angle)
+        low, high = angle * 0.6, np.minimum(angle * 1.6, MAX_ENTRY_ANGLE)
+        return np.asarray(np.clip(angle + change / at.load_slope, low, high))
