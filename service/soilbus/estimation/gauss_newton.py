@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
+from soilbus.estimation.coordinates import MAX_STEP
 from soilbus.estimation.linearised import Linearised, Optimum
 from soilbus.estimation.normal_equations import Fitting, Place, Point
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
@@ -65,8 +66,6 @@ FAR = 10.0
 """Standard deviations on a few instants beyond which an end is not the optimum looked at."""
 FAR_ABOVE = 1.5
 """Ratio of costs on a few instants beyond which an end is no rival."""
-MEETS = 5.0
-"""Standard deviations on a few instants within which a descent is foreseen to end where another one did."""
 SAME_END = 0.02
 """Relative difference in cost of two descents that are taken to have met at one optimum."""
 
@@ -179,11 +178,11 @@ def _with_rival(fitting: Fitting, thin: Fitting, found: Fit) -> Fit:
     about its mode: moments along k_c's share would count the other one already.
     """
     ill_told = math.sqrt(found.mode.covariance[_K_C, _K_C]) > ILL_TOLD
-    start = (
-        fitting.coordinates.across(found.mode.soil) if ill_told and np.ptp(fitting.problem.rig.width) > 0.0 else None
-    )
-    end = None if start is None else _approach(thin, start, MAX_APPROACH)
-    if end is None or not _elsewhere(thin, found.mode.soil, end):
+    if not ill_told or np.ptp(fitting.problem.rig.width) == 0.0:
+        return found
+    start, here = fitting.coordinates.across(found.mode.soil), thin.start(found.mode.soil)
+    end = None if start is None else _approach(thin, start, MAX_APPROACH, known=[here])
+    if end is None or not _elsewhere(thin, here, end):
         return found
     other = _settle(fitting, fitting.start(end.soil), MAX_ITERATIONS)
     if other is None or not other.converged:
@@ -195,12 +194,12 @@ def _with_rival(fitting: Fitting, thin: Fitting, found: Fit) -> Fit:
     return replace(better, belief=better.mode, rival=Rival(worse.mode, share))
 
 
-def _elsewhere(thin: Fitting, soil: Array, end: Place) -> bool:
-    """Whether a descent on a few instants ended about as low as where a soil is, and far from it."""
-    point = thin.point(thin.start(soil))
+def _elsewhere(thin: Fitting, here: Place, end: Place) -> bool:
+    """Whether a descent on a few instants ended about as low as another place is, and far from it."""
+    point = thin.point(here)
     if point is None or end.cost > FAR_ABOVE * point.cost:
         return False
-    off = thin.coordinates.position(end.soil) - thin.coordinates.position(soil)
+    off = thin.coordinates.position(end.soil) - thin.coordinates.position(here.soil)
     return point.length(off) > FAR**2
 
 
@@ -335,9 +334,14 @@ def _approach(
 
 
 def _leads_to(fitting: Fitting, place: Place, point: Point, step: Array, end: Place) -> bool:
-    """Whether a step of the soil comes so near to where another descent ended that this one will end there too."""
+    """Whether a step of the soil comes so near to where another descent ended that this one will end there too.
+
+    Only a short step is trusted to tell.
+    """
+    if np.abs(step).max() > MAX_STEP:
+        return False
     off = fitting.coordinates.position(end.soil) - fitting.coordinates.position(place.soil) - step
-    return point.length(off) < MEETS**2
+    return point.length(off) < FAR**2
 
 
 def _stride(point: Point, last: Array, share: float, step: Array) -> float:

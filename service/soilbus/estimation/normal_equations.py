@@ -95,6 +95,7 @@ class Fitting:
         known[:first] = False
         self.active = np.flatnonzero(known)
         self.free = self.coordinates.free
+        self._by_sensors = with_gains and first == 0
         kept = np.concatenate([self.free, _SOIL + self.active])
         inverse = solved(before.covariance[np.ix_(kept, kept)], np.zeros(len(kept)))
         if inverse is None:
@@ -121,12 +122,15 @@ class Fitting:
 
     def point(self, place: Place) -> Point | None:
         """The normal equations at a place; None where the model is not finite."""
-        return self.with_before(place, self.problem.linearise(place.as_soil(), place.gains, place.latents))
+        at = self.problem.linearise(place.as_soil(), place.gains, place.latents, self._by_sensors)
+        return self.with_before(place, at)
 
     def with_before(self, place: Place, at: Linearised) -> Point | None:
         """Those of residuals linearised already."""
         free = len(self.free)
         directions = self.directions(place)
+        if not self._by_sensors:
+            directions = np.delete(directions, slice(7, 7 + self.problem.n_sensors), axis=0)
         gradient = directions.T @ at.normal[:, 0]
         known = self.before_at(place)
         bend = np.zeros((len(gradient), len(gradient)))

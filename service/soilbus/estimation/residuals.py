@@ -156,8 +156,11 @@ class WindowProblem(Readings):
             angle.ravel(), slip.ravel(), self._radius, self._width, K_L, soil.n, np.tan(soil.phi), soil.c, soil.K
         )
 
-    def linearise(self, soil: Soil, gains: Array, latents: Latents) -> Linearised:
-        """Whitened residuals and derivatives at a soil, gains (G,) and latents."""
+    def linearise(self, soil: Soil, gains: Array, latents: Latents, by_sensors: bool = True) -> Linearised:
+        """Whitened residuals and derivatives at a soil, gains (G,) and latents; by_sensors: also by the sensors' gains.
+
+        Without those derivatives it serves to move the soil and the effects only.
+        """
         W = self.n_wheels
         at = self._response(soil, gains, latents)
         A = self._by_latents(at)
@@ -165,9 +168,9 @@ class WindowProblem(Readings):
         of_torque, of_latents, of_draft, corrected, variance, row_var = self._corrected(gains)
         draft, draft_var = self.draft * of_draft, self.draft_var * of_draft**2
 
-        rows = np.zeros((*A.shape[:2], 7 + len(gains)))
-        residual, by_soil, by_gain = rows[:, :, 0], rows[:, :, 1:7], rows[:, :, 7 : 7 + self.n_sensors]
-        by_effects = rows[:, :, 7 + self.n_sensors :]
+        first_effect = 7 + (self.n_sensors if by_sensors else 0)
+        rows = np.zeros((*A.shape[:2], first_effect + len(gains) - self.n_sensors))
+        residual, by_soil, by_effects = rows[:, :, 0], rows[:, :, 1:7], rows[:, :, first_effect:]
         residual[:, :W] = self.torque * of_torque - at.value[1]
         residual[:, W] = self.demand - self.draft + draft + at.pull - at.value[0].sum(1)
         by_soil[:, :W] = -at.by_soil[1].transpose(1, 2, 0)
@@ -180,9 +183,11 @@ class WindowProblem(Readings):
             by_effects[:, W + 1 :] = -at.by_effects[2].transpose(1, 2, 0)
         now = np.concatenate([latents.load, latents.speed, latents.ground_speed[:, None]], axis=1)
         latent_by_gain = now * of_latents
-        diagonals(by_gain[:, :W, :W])[:] = -of_torque * at.value[1]
-        np.multiply(A, -latent_by_gain[:, None, :], out=by_gain[:, :, W:-1])
-        by_gain[:, W, -1] = -of_draft * (draft - residual[:, W] * draft_var / row_var[:, W])
+        if by_sensors:
+            by_gain = rows[:, :, 7:first_effect]
+            diagonals(by_gain[:, :W, :W])[:] = -of_torque * at.value[1]
+            np.multiply(A, -latent_by_gain[:, None, :], out=by_gain[:, :, W:-1])
+            by_gain[:, W, -1] = -of_draft * (draft - residual[:, W] * draft_var / row_var[:, W])
         residual += (A @ (corrected - now)[:, :, None])[:, :, 0]
         if self._missing is not None:
             A[self._missing] = 0.0
