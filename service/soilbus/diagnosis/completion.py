@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from soilbus.diagnosis.records import Record
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.completed import CompletedProblem, Free, parameters_of
-from soilbus.estimation.gauss_newton import Fit, continued, fit_window
+from soilbus.estimation.gauss_newton import Fit, continued, fit_window, settled
 from soilbus.estimation.linearised import Latents, Linearised
 from soilbus.estimation.normal_equations import Fitting, Place
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
@@ -33,10 +33,14 @@ CHECK_ROUNDS = 3
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Where the fit of one recording may begin: soil (6,), sensors' gains and effects' parameters (G,)."""
+    """Where the fit of one recording may begin: soil (6,), sensors' gains and effects' parameters (G,).
+
+    near: a fit of the same model, be it to fewer instants, ended there.
+    """
 
     soil: Array
     gains: Array
+    near: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +125,7 @@ class Completion:
 
     def as_starts(self) -> tuple[Start, ...]:
         """Where these fits ended."""
-        return tuple(Start(fit.mode.soil, fit.mode.gains) for fit in self.fits)
+        return tuple(Start(fit.mode.soil, fit.mode.gains, near=fit.converged) for fit in self.fits)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -200,6 +204,12 @@ def _fitted(problem: CompletedProblem, prior: SoilPrior, before: Belief, start: 
             return fit
         start = Start(fit.mode.soil, fit.mode.gains)
     gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
+    if start.near:
+        fitting = Fitting(problem, prior, before)
+        with np.errstate(all="ignore"):
+            fit = settled(fitting, fitting.start(start.soil, gains=gains))
+        if fit is not None and fit.converged:
+            return fit
     return continued(problem, prior, before, start.soil, gains, problem.n_sensors)
 
 

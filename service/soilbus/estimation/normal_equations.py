@@ -190,7 +190,7 @@ class Fitting:
 
     def carried(self, place: Place) -> Place:
         """The same place with the entry angles solved anew: linear models in a row may have lost them."""
-        return replace(place, latents=self.problem.carried(place.latents, place.as_soil()))
+        return replace(place, latents=self.problem.carried(place.latents, place.as_soil(), place.gains))
 
     def beliefs(self, place: Place, point: Point, at: Array) -> tuple[Belief, Belief] | None:
         """What this optimum tells, by its moments and by its curvature; None where the information is singular.
