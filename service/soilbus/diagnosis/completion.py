@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from soilbus.diagnosis.records import Record
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.completed import CompletedProblem, Free, parameters_of
-from soilbus.estimation.gauss_newton import Fit, continued, fit_window, settled
+from soilbus.estimation.gauss_newton import MAX_ITERATIONS, Fit, Start, continued, fit_window
 from soilbus.estimation.linearised import Latents, Linearised
 from soilbus.estimation.normal_equations import Fitting, Place
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
@@ -29,18 +29,6 @@ Array = NDArray[np.float64]
 _SOIL = len(PARAMETERS)
 CHECK_ROUNDS = 3
 """Linearisations that bring the latents of held-out blocks to their values under a model."""
-
-
-@dataclass(frozen=True, slots=True)
-class Start:
-    """Where the fit of one recording may begin: soil (6,), sensors' gains and effects' parameters (G,).
-
-    near: a fit of the same model, be it to fewer instants, ended there.
-    """
-
-    soil: Array
-    gains: Array
-    near: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,9 +132,13 @@ class Completion:
 
 
 def complete(
-    records: Sequence[Record], prior: SoilPrior, effects: Sequence[Effect], starts: Sequence[Start] | None = None
+    records: Sequence[Record],
+    prior: SoilPrior,
+    effects: Sequence[Effect],
+    starts: Sequence[Start] | None = None,
+    most: int = MAX_ITERATIONS,
 ) -> Completion | None:
-    """A model with these effects fitted to all recordings; None where a fit fails.
+    """A model with these effects fitted to all recordings, in at most so many steps; None where a fit fails.
 
     Parameters of effects that the records' model has already keep the prior they have
     there; one that would leave its range is held at the edge.
@@ -155,7 +147,7 @@ def complete(
     known = {e.name: [f for f in present.free if f.effect == e.name] for e in present.effects}
     free = tuple(f for effect in effects for f in known.get(effect.name) or parameters_of(effect, present.n_wheels))
     for _ in range(len(free) + 1):
-        completion = _complete(records, prior, effects, free, starts)
+        completion = _complete(records, prior, effects, free, starts, most)
         if completion is None or completion.free_at_edge is None:
             break
         free = completion.free_at_edge
@@ -169,13 +161,14 @@ def _complete(
     effects: Sequence[Effect],
     free: tuple[Free, ...],
     starts: Sequence[Start] | None,
+    most: int,
 ) -> Completion | None:
     fits, checks, befores = [], [], []
     known: Belief | None = None
     for i, record in enumerate(records):
         problem = record.learned.completed(effects, free)
         before = _of_first(record, prior, problem) if known is None else _of_next(known, prior, problem, effects)
-        fit = _fitted(problem, prior, before, None if starts is None else starts[i])
+        fit = _fitted(problem, prior, before, None if starts is None else starts[i], most)
         if fit is None:
             return None
         fits.append(fit)
@@ -196,21 +189,16 @@ def _of_first(record: Record, prior: SoilPrior, problem: CompletedProblem) -> Be
     return Belief(record.known.soil, gains, covariance)
 
 
-def _fitted(problem: CompletedProblem, prior: SoilPrior, before: Belief, start: Start | None) -> Fit | None:
+def _fitted(
+    problem: CompletedProblem, prior: SoilPrior, before: Belief, start: Start | None, most: int
+) -> Fit | None:
     """From the given start, or from anywhere; a fit that has not converged goes on from where it is."""
     if start is None:
         fit = fit_window(problem, prior, before)
         if fit is None or fit.converged:
             return fit
         start = Start(fit.mode.soil, fit.mode.gains)
-    gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
-    if start.near:
-        fitting = Fitting(problem, prior, before)
-        with np.errstate(all="ignore"):
-            fit = settled(fitting, fitting.start(start.soil, gains=gains))
-        if fit is not None and fit.converged:
-            return fit
-    return continued(problem, prior, before, start.soil, gains, problem.n_sensors)
+    return continued(problem, prior, before, start, problem.n_sensors, most)
 
 
 def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects: Sequence[Effect]) -> Belief:

@@ -14,10 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.diagnosis.completion import Completion, Start
+from soilbus.diagnosis.completion import Completion
 from soilbus.diagnosis.records import Record
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.completed import Free, parameters_of
+from soilbus.estimation.gauss_newton import Start
 from soilbus.estimation.normal_equations import Fitting, Place, solved
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect

@@ -70,6 +70,17 @@ SAME_END = 0.02
 """Relative difference in cost of two descents that are taken to have met at one optimum."""
 
 
+class Start(NamedTuple):
+    """Where a fit may begin: soil (6,), sensors' gains and effects' parameters (G,).
+
+    near: a fit of the same model, be it to fewer instants, ended there.
+    """
+
+    soil: Array
+    gains: Array
+    near: bool = False
+
+
 class Rival(NamedTuple):
     """Another optimum than a fit's, by mode and curvature, and its share of the probability of both (Laplace)."""
 
@@ -252,13 +263,22 @@ def descend(problem: WindowProblem, prior: SoilPrior, start: Soil, before: Belie
 
 
 def continued(
-    problem: WindowProblem, prior: SoilPrior, before: Belief, soil: Array, gains: Array, first: int
+    problem: WindowProblem, prior: SoilPrior, before: Belief, start: Start, first: int, most: int = MAX_ITERATIONS
 ) -> Fit | None:
-    """Descent from a soil (6,) and gains (G,), of which those from the `first` on move with the soil from the start."""
+    """Descent from a start, of whose gains those from the `first` on move with the soil from the beginning.
+
+    Where a fit of the same model ended is near the optimum: everything moves from there.
+    At most so many steps of either kind.
+    """
+    fitting = Fitting(problem, prior, before)
+    gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
     with np.errstate(all="ignore"):
+        fit = _settle(fitting, fitting.start(start.soil, gains=gains), MAX_RESUMED) if start.near else None
+        if fit is not None and fit.converged:
+            return fit
         moving = Fitting(problem, prior, before, first=first)
-        near = _approach(moving, soil, MAX_ITERATIONS, LITTLE, gains)
-        return None if near is None else _settle(Fitting(problem, prior, before), near, MAX_ITERATIONS)
+        near = _approach(moving, start.soil, most, LITTLE, gains)
+        return None if near is None else _settle(fitting, near, most)
 
 
 @dataclass(frozen=True, slots=True)
