@@ -8,6 +8,7 @@ of the whole, as do those of the blocks learned from and of the blocks held out.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -137,8 +138,11 @@ def complete(
     effects: Sequence[Effect],
     starts: Sequence[Start] | None = None,
     most: int = MAX_ITERATIONS,
+    hopeless: float = math.inf,
 ) -> Completion | None:
-    """A model with these effects fitted to all recordings, in at most so many steps; None where a fit fails.
+    """A model with these effects fitted to all recordings; None where a fit fails.
+
+    Each fit has at most so many steps, and is given up where it will not cost less than `hopeless`.
 
     Parameters of effects that the records' model has already keep the prior they have
     there; one that would leave its range is held at the edge.
@@ -147,7 +151,7 @@ def complete(
     known = {e.name: [f for f in present.free if f.effect == e.name] for e in present.effects}
     free = tuple(f for effect in effects for f in known.get(effect.name) or parameters_of(effect, present.n_wheels))
     for _ in range(len(free) + 1):
-        completion = _complete(records, prior, effects, free, starts, most)
+        completion = _complete(records, prior, effects, free, starts, most, hopeless)
         if completion is None or completion.free_at_edge is None:
             break
         free = completion.free_at_edge
@@ -162,13 +166,14 @@ def _complete(
     free: tuple[Free, ...],
     starts: Sequence[Start] | None,
     most: int,
+    hopeless: float,
 ) -> Completion | None:
     fits, checks, befores = [], [], []
     known: Belief | None = None
     for i, record in enumerate(records):
         problem = record.learned.completed(effects, free)
         before = _of_first(record, prior, problem) if known is None else _of_next(known, prior, problem, effects)
-        fit = _fitted(problem, prior, before, None if starts is None else starts[i], most)
+        fit = _fitted(problem, prior, before, None if starts is None else starts[i], most, hopeless)
         if fit is None:
             return None
         fits.append(fit)
@@ -190,7 +195,7 @@ def _of_first(record: Record, prior: SoilPrior, problem: CompletedProblem) -> Be
 
 
 def _fitted(
-    problem: CompletedProblem, prior: SoilPrior, before: Belief, start: Start | None, most: int
+    problem: CompletedProblem, prior: SoilPrior, before: Belief, start: Start | None, most: int, hopeless: float
 ) -> Fit | None:
     """From the given start, or from anywhere; a fit that has not converged goes on from where it is."""
     if start is None:
@@ -198,7 +203,7 @@ def _fitted(
         if fit is None or fit.converged:
             return fit
         start = Start(fit.mode.soil, fit.mode.gains)
-    return continued(problem, prior, before, start, problem.n_sensors, most)
+    return continued(problem, prior, before, start, problem.n_sensors, most, hopeless)
 
 
 def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects: Sequence[Effect]) -> Belief:

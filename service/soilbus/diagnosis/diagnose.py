@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -136,13 +137,14 @@ def _promising(
     """The few candidates worth a fit of all data, and where it starts: foreseen by scores, tried on a few instants."""
     foreseen = [s for s in scores(records, prior, present, candidates)[:TRIED] if s.evidence < WORTH_TRYING]
     few = [record.thinned(THINNED) for record in records]
-    before = complete(few, prior, present.effects, present.as_starts())
+    before = complete(few, prior, present.effects, present.as_starts(), STEPS)
     if before is None:
         return [(score.effect, score.starts) for score in foreseen[:FITTED]]
     tried: list[tuple[float, Effect, Completion]] = []
 
     def attempt(effect: Effect, starts: Sequence[Start]) -> None:
-        completion = complete(few, prior, (*present.effects, effect), starts, STEPS)
+        hopeless = min((c.cost for *_, c in tried), default=math.inf) + BEHIND_UNSETTLED
+        completion = complete(few, prior, (*present.effects, effect), starts, STEPS, hopeless)
         if completion is not None:
             tried.append((before.evidence - completion.evidence, effect, completion))
 
@@ -191,7 +193,7 @@ def _without(records: Sequence[Record], prior: SoilPrior, present: Completion, e
     starts = [
         Start(fit.mode.soil, np.concatenate([fit.mode.gains[:n_sensors], fit.mode.gains[kept]])) for fit in present.fits
     ]
-    return complete(records, prior, [e for e in present.effects if e.name != effect.name], starts)
+    return complete(records, prior, [e for e in present.effects if e.name != effect.name], starts, STEPS)
 
 
 def _verdict(base: Completion, completed: Completion, additions: Sequence[Addition]) -> Verdict:

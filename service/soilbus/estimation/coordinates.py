@@ -23,6 +23,8 @@ MAX_STEP = 0.7
 """Longest step of a coordinate."""
 BOUND = 4.0
 """Prior standard deviations of the logarithm to which a free parameter is confined."""
+EDGE = 1e-9
+"""Relative distance from a bound that is none."""
 LITTLE, MUCH = 0.03, 0.4
 """Shares of k_c in the modulus under a mean tyre, on either side of what most windows can tell from none."""
 MAX_PHI = 1.2
@@ -109,6 +111,20 @@ class Coordinates:
         low, high = self._bounds
         soil[self.free] = np.minimum(np.maximum(soil[self.free], low), high)
         return soil
+
+    def reach(self, soil: Array, step: Array) -> float:
+        """Share of a step (F,) from a soil (6,) that is no longer than steps may be and stays within the bounds."""
+        free = self.free != _K_PHI  # whose coordinate is the pressure
+        room = np.log(np.where(step > 0.0, self._bounds[1], self._bounds[0]) / soil[self.free])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.where(free & (step != 0.0), room / step, np.inf)
+        return min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-12), float(share.min(initial=1.0)))
+
+    def edges(self, soil: Array) -> Array:
+        """Which way (F,) a coordinate of a soil (6,) cannot go: -1 or 1 where its parameter is at a bound, else 0."""
+        low, high = self._bounds
+        free = soil[self.free]
+        return np.subtract(free >= high * (1.0 - EDGE), free <= low * (1.0 + EDGE), dtype=float)
 
     @cached_property
     def _column(self) -> dict[int, int]:

@@ -263,22 +263,30 @@ def descend(problem: WindowProblem, prior: SoilPrior, start: Soil, before: Belie
 
 
 def continued(
-    problem: WindowProblem, prior: SoilPrior, before: Belief, start: Start, first: int, most: int = MAX_ITERATIONS
+    problem: WindowProblem,
+    prior: SoilPrior,
+    before: Belief,
+    start: Start,
+    first: int,
+    most: int = MAX_ITERATIONS,
+    hopeless: float = np.inf,
 ) -> Fit | None:
     """Descent from a start, of whose gains those from the `first` on move with the soil from the beginning.
 
-    Where a fit of the same model ended is near the optimum: everything moves from there.
-    At most so many steps of either kind.
+    Where a fit of the same model ended is near the optimum: everything moves from there,
+    unless that goes wrong.  At most so many steps of either kind, and no more than it
+    takes to see that the cost will stay above `hopeless`.
     """
     fitting = Fitting(problem, prior, before)
     gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
     with np.errstate(all="ignore"):
-        fit = _settle(fitting, fitting.start(start.soil, gains=gains), MAX_RESUMED) if start.near else None
-        if fit is not None and fit.converged:
-            return fit
+        if start.near:
+            fit = _settle(fitting, fitting.start(start.soil, gains=gains), MAX_RESUMED, refusals=1, hopeless=hopeless)
+            if fit is not None and fit.converged:
+                return fit
         moving = Fitting(problem, prior, before, first=first)
         near = _approach(moving, start.soil, most, LITTLE, gains)
-        return None if near is None else _settle(fitting, near, most)
+        return None if near is None else _settle(fitting, near, most, hopeless=hopeless)
 
 
 @dataclass(frozen=True, slots=True)
@@ -373,10 +381,19 @@ def _stride(point: Point, last: Array, share: float, step: Array) -> float:
     return min(1.0 / max(1.0 - left, 1.0 / MAX_STRIDE), MAX_STRIDE) if abs(left) > SLOWLY else 1.0
 
 
-def _settle(fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OVER, before: float = 0.0) -> Fit | None:
+def _settle(
+    fitting: Fitting,
+    near: Place,
+    most: int,
+    left_over: float = LEFT_OVER,
+    before: float = 0.0,
+    refusals: int = MAX_REFUSED,
+    hopeless: float = np.inf,
+) -> Fit | None:
     """Steps of soil, gains and latents together from a place near the optimum.
 
     `before` is the squared length of the step that led there, if it was one of these.
+    Given up after more `refusals` in a row, and where the foreseen cost is above `hopeless`.
     A step that makes things worse is taken back and tried again shorter: damping would
     hold back just the weak directions, along which the steps overshoot.
     """
@@ -396,7 +413,7 @@ def _settle(fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OV
             share = 0.4 * min(share, 1.0)
             before, last_step = 0.0, None  # nothing can be foreseen after a refused step
             refused += 1
-            if refused > MAX_REFUSED:
+            if refused > refusals:
                 break
         else:
             share, refused = min(2.0 * share, 1.0), 0
@@ -411,7 +428,7 @@ def _settle(fitting: Fitting, near: Place, most: int, left_over: float = LEFT_OV
         last_step, last_share = full, share
         converged = length < CONVERGED or (share == 1.0 and length * length < left_over * before)
         before = length if share == 1.0 else 0.0
-        if converged:
+        if converged or point.cost - length > hopeless:
             break
     if best is None:
         return None

@@ -21,6 +21,8 @@ Indices = NDArray[np.intp]
 
 LONG_TURN = 0.2
 """Relative change of an entry angle from which the angles are solved again, not extrapolated."""
+LONG_TURN_WITH_EFFECTS = 0.03
+"""The same where effects have a part in the load: they may bend where the soil alone does not."""
 WELL_TOLD = 0.5
 """Sd of the logarithm of K_L at a typical depth from which on k_c and k_phi are each as known before."""
 _SOIL = len(PARAMETERS)
@@ -48,7 +50,8 @@ class Point:
 
     information (F + A, F + A) is Gauss-Newton's, of which `known` is what was known
     before; bend, which comes on top for a step, is the curvature of the coordinates.
-    cost is -2 log posterior up to a constant.
+    cost is -2 log posterior up to a constant.  edges (F + A,) is 1 or -1 where a coordinate
+    cannot go up or down, else 0.
     """
 
     information: Array
@@ -56,13 +59,27 @@ class Point:
     bend: Array
     gradient: Array
     cost: float
+    edges: Array
     at: Linearised
 
     def step(self, damping: float = 0.0) -> Array | None:
-        """Step (F + A,) to the minimum, held back in proportion to the diagonal; None where there is none."""
+        """Step (F + A,) to the minimum, held back in proportion to the diagonal; None where there is none.
+
+        What is at an edge and would go beyond stays, and the others go where they then do best.
+        """
         curved = self.information + self.bend
-        solution = solved(curved + damping * np.diag(np.diag(curved)), self.gradient)
-        return None if solution is None else -solution[0]
+        curved[np.diag_indices_from(curved)] *= 1.0 + damping
+        moving = np.ones(len(self.gradient), bool)
+        while True:
+            solution = solved(curved[np.ix_(moving, moving)], self.gradient[moving])
+            if solution is None:
+                return None
+            step = np.zeros(len(moving))
+            step[moving] = -solution[0]
+            beyond = step * self.edges > 0.0
+            if not beyond.any():
+                return step
+            moving &= ~beyond
 
     @property
     def evidence(self) -> float:
@@ -115,6 +132,7 @@ class Fitting:
     def restarted(self, place: Place, point: Point, step: Array) -> Place:
         """The place after a step (F + A,) with latents as measured, as they are at this place already."""
         free, gains = len(self.free), place.gains.copy()
+        step = self.coordinates.reach(place.soil, step[:free]) * step
         gains[self.active] += step[free:]
         soil, gains = self.coordinates.moved(place.soil, step[:free]), self.problem.allowed(gains)
         angle = self.problem.turned(point.at, place.latents.entry_angle, soil - place.soil, gains - place.gains)
@@ -135,6 +153,8 @@ class Fitting:
         known = self.before_at(place)
         bend = np.zeros((len(gradient), len(gradient)))
         bend[:free, :free] = self.coordinates.bend(gradient[:free])
+        edges = np.zeros(len(gradient))
+        edges[:free] = self.coordinates.edges(place.soil)
         cost = at.chi2 + known.cost
         if not np.isfinite(cost):
             return None
@@ -144,6 +164,7 @@ class Fitting:
             bend=bend,
             gradient=gradient + known.gradient,
             cost=cost,
+            edges=edges,
             at=at,
         )
 
@@ -175,6 +196,7 @@ class Fitting:
     def moved(self, place: Place, point: Point, step: Array) -> Place:
         """The place after a step (F + A,), with the latents that the linear model foresees."""
         free = len(self.free)
+        step = self.coordinates.reach(place.soil, step[:free]) * step
         soil = self.coordinates.moved(place.soil, step[:free])
         gain_step = np.zeros(len(place.gains))
         gain_step[self.active] = step[free:]
@@ -184,7 +206,7 @@ class Fitting:
     def _reached(self, place: Place, point: Point, soil: Array, gains: Array, latents: Latents) -> Place:
         """Soil (6,), gains (G,) and foreseen latents as a place, with the entry angles solved where they turn far."""
         turn = np.max(np.abs(latents.entry_angle / place.latents.entry_angle - 1.0), initial=0.0)
-        if turn > LONG_TURN or len(point.at.load_by_effects):  # effects may bend where the soil alone does not
+        if turn > (LONG_TURN_WITH_EFFECTS if len(point.at.load_by_effects) else LONG_TURN):
             latents = self.problem.carried(latents, Soil(*soil.tolist()), gains)
         return Place(soil, gains, latents, point.cost, place.trials)
 
