@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from soilbus.diagnosis.records import Record
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.completed import CompletedProblem, Free, parameters_of
+from soilbus.estimation.coordinates import at_edges
 from soilbus.estimation.gauss_newton import MAX_ITERATIONS, Fit, Start, continued, fit_window
 from soilbus.estimation.linearised import Latents, Linearised
 from soilbus.estimation.normal_equations import Fitting, Place
@@ -103,8 +104,10 @@ class Completion:
     @property
     def free_at_edge(self) -> tuple[Free, ...] | None:
         """The parameters with those held that would leave their range; None where none would."""
-        pulls = self.fits[-1].mode.gains[self.checks[-1].problem.n_sensors :].tolist()
-        leaves = [f.std > 0.0 and not f.within(u) for f, u in zip(self.free, pulls, strict=True)]
+        problem, gains = self.checks[-1].problem, self.fits[-1].mode.gains
+        pulls = gains[problem.n_sensors :].tolist()
+        edges = at_edges(gains, *problem.gain_bounds())[problem.n_sensors :].tolist()
+        leaves = [f.std > 0.0 and edge != 0.0 for f, edge in zip(self.free, edges, strict=True)]
         if not any(leaves):
             return None
         return tuple(

@@ -184,6 +184,14 @@ class CompletedProblem(WindowProblem):
         inside = [f.allowed(u) for f, u in zip(self.free, gains[self.n_sensors :].tolist(), strict=True)]
         return np.concatenate([gains[: self.n_sensors], inside])
 
+    def gain_bounds(self) -> tuple[Array, Array]:
+        """As WindowProblem; the effects' parameters stay inside their ranges."""
+        low, high = super().gain_bounds()
+        for i, f in enumerate(self.free, self.n_sensors):
+            if f.std > 0.0:
+                low[i], high[i] = (f.parameter.low - f.value) / f.std, (f.parameter.high - f.value) / f.std
+        return low, high
+
     def carried(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
         """As WindowProblem; without gains the effects' parameters are at their prior values."""
         solved = np.isfinite(latents.entry_angle).all() and bool(self.effects)

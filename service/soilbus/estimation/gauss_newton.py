@@ -159,19 +159,21 @@ def fit_window(problem: WindowProblem, prior: SoilPrior, before: Belief | None =
     fitting = Fitting(problem, prior, before)
     thin = Fitting(problem.thinned(THINNED), prior, before, with_gains=False)
     with np.errstate(all="ignore"):
-        best = _best(fitting, thin)
+        ends = _ends(thin)
+        best = _best(fitting, thin, ends)
         if best is None or best.chi2 > PLAUSIBLE:
             return best
         if not best.converged:
             near = _approach(Fitting(problem, prior, before, with_gains=False), best.mode.soil, MAX_ITERATIONS, 0.0)
             best = best if near is None else _settle(fitting, near, MAX_ITERATIONS) or best
-        return _with_rival(fitting, thin, best) if best.converged else best
+        return _with_rival(fitting, thin, best, ends) if best.converged else best
 
 
-def _best(fitting: Fitting, thin: Fitting) -> Fit | None:
-    """The first of the optima on a few instants that leads to one of all."""
+def _best(fitting: Fitting, thin: Fitting, ends: Sequence[Place]) -> Fit | None:
+    """The first of the optima on a few instants, the best first, that leads to one of all."""
+    unlike = [end for i, end in enumerate(ends) if i == 0 or end.cost > ends[i - 1].cost * (1.0 + SAME_END)]
     best: Fit | None = None
-    for end in _promising(thin)[:MAX_SETTLED]:
+    for end in unlike[:MAX_SETTLED]:
         most = MAX_ITERATIONS if end.cost < HOPELESS * THINNED else MAX_HOPELESS
         fit = _settle(fitting, replace(fitting.start(end.soil), trials=end.trials), most)
         if fit is not None and (best is None or (fit.converged, -fit.cost) > (best.converged, -best.cost)):
@@ -181,19 +183,16 @@ def _best(fitting: Fitting, thin: Fitting) -> Fit | None:
     return best
 
 
-def _with_rival(fitting: Fitting, thin: Fitting, found: Fit) -> Fit:
-    """The more likely of an optimum and the one across from it, with the other as its rival.
+def _with_rival(fitting: Fitting, thin: Fitting, found: Fit, ends: Sequence[Place]) -> Fit:
+    """The more likely of an optimum and another one, with the other as its rival.
 
-    What was found stays alone where there is no other, or none that is nearly as likely
-    and that its standard deviations exclude.  Optima are compared, and mixed, as each is
-    about its mode: moments along k_c's share would count the other one already.
+    The other is one of the ends on a few instants, or the one across from what was found.
+    That stays alone where there is no other, or none that is nearly as likely and that its
+    standard deviations exclude.  Optima are compared, and mixed, as each is about its mode:
+    moments along k_c's share would count the other one already.
     """
-    ill_told = math.sqrt(found.mode.covariance[_K_C, _K_C]) > ILL_TOLD
-    if not ill_told or np.ptp(fitting.problem.rig.width) == 0.0:
-        return found
-    start, here = fitting.coordinates.across(found.mode.soil), thin.start(found.mode.soil)
-    end = None if start is None else _approach(thin, start, MAX_APPROACH, known=[here])
-    if end is None or not _elsewhere(thin, here, end):
+    end = _other_end(fitting, thin, found, ends) if np.ptp(fitting.problem.rig.width) > 0.0 else None
+    if end is None:
         return found
     other = _settle(fitting, fitting.start(end.soil), MAX_ITERATIONS)
     if other is None or not other.converged:
@@ -205,16 +204,31 @@ def _with_rival(fitting: Fitting, thin: Fitting, found: Fit) -> Fit:
     return replace(better, belief=better.mode, rival=Rival(worse.mode, share))
 
 
-def _elsewhere(thin: Fitting, here: Place, end: Place) -> bool:
-    """Whether a descent on a few instants ended about as low as another place is, and far from it."""
-    point = thin.point(here)
-    if point is None or end.cost > FAR_ABOVE * point.cost:
-        return False
-    off = thin.coordinates.position(end.soil) - thin.coordinates.position(here.soil)
-    return point.length(off) > FAR**2
+def _other_end(fitting: Fitting, thin: Fitting, found: Fit, ends: Sequence[Place]) -> Place | None:
+    """Where a descent on a few instants ended about as low as at what was found, and far from it."""
+    ill_told = math.sqrt(found.mode.covariance[_K_C, _K_C]) > ILL_TOLD
+    apart = len({end.soil.tobytes() for end in ends}) > 1
+    here = thin.point(thin.start(found.mode.soil)) if apart or ill_told else None
+    if here is None:
+        return None
+    position = thin.coordinates.position(found.mode.soil)
+
+    def off(end: Place) -> float:
+        return here.length(thin.coordinates.position(end.soil) - position)
+
+    def is_elsewhere(end: Place) -> bool:
+        return end.cost < FAR_ABOVE * here.cost and off(end) > FAR**2
+
+    own = min(ends, key=off)  # which led to what was found
+    known = next((end for end in ends if is_elsewhere(end) and off(end) > off(own)), None)
+    start = fitting.coordinates.across(found.mode.soil) if ill_told and known is None else None
+    if start is None:
+        return known
+    end = _approach(thin, start, MAX_APPROACH)
+    return end if end is not None and is_elsewhere(end) else None
 
 
-def _promising(thin: Fitting) -> list[Place]:
+def _ends(thin: Fitting) -> list[Place]:
     """Optima on a few instants of the window, the best first.
 
     Descents from unlike soils that meet at a plausible cost are proof enough; otherwise
@@ -229,8 +243,7 @@ def _promising(thin: Fitting) -> list[Place]:
         ends.append(end)
         if met and end.cost < PLAUSIBLE * thin.problem.n_rows:
             break
-    ends.sort(key=lambda end: end.cost)
-    return [end for i, end in enumerate(ends) if i == 0 or end.cost > ends[i - 1].cost * (1.0 + SAME_END)]
+    return sorted(ends, key=lambda end: end.cost)
 
 
 def starting_soils(problem: WindowProblem, prior: SoilPrior, before: Belief | None = None) -> Iterator[Soil]:

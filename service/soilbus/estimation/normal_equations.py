@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
-from soilbus.estimation.coordinates import TYPICAL_DEPTH, Coordinates
+from soilbus.estimation.coordinates import TYPICAL_DEPTH, Coordinates, at_edges, share_of_step
 from soilbus.estimation.linearised import Latents, Linearised
 from soilbus.estimation.moments import Moments, moments_along_share
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
@@ -68,18 +68,15 @@ class Point:
         What is at an edge and would go beyond stays, and the others go where they then do best.
         """
         curved = self.information + self.bend
-        curved[np.diag_indices_from(curved)] *= 1.0 + damping
+        curved.flat[:: len(curved) + 1] *= 1.0 + damping
+        step = _solution(curved, self.gradient)
         moving = np.ones(len(self.gradient), bool)
-        while True:
-            solution = solved(curved[np.ix_(moving, moving)], self.gradient[moving])
-            if solution is None:
-                return None
-            step = np.zeros(len(moving))
-            step[moving] = -solution[0]
-            beyond = step * self.edges > 0.0
-            if not beyond.any():
-                return step
+        while step is not None and (beyond := step * self.edges > 0.0).any():
             moving &= ~beyond
+            rest = _solution(curved[np.ix_(moving, moving)], self.gradient[moving])
+            step = np.zeros(len(moving))
+            step[moving] = np.nan if rest is None else rest
+        return step if step is not None and np.isfinite(step).all() else None
 
     @property
     def evidence(self) -> float:
@@ -111,6 +108,7 @@ class Fitting:
         known = np.diag(before.covariance)[_SOIL:] > 0.0 if with_gains else np.zeros(len(before.gains), bool)
         known[:first] = False
         self.active = np.flatnonzero(known)
+        self._gain_bounds = tuple(bound[self.active] for bound in problem.gain_bounds())
         self.free = self.coordinates.free
         self._by_sensors = with_gains and first == 0
         kept = np.concatenate([self.free, _SOIL + self.active])
@@ -132,7 +130,7 @@ class Fitting:
     def restarted(self, place: Place, point: Point, step: Array) -> Place:
         """The place after a step (F + A,) with latents as measured, as they are at this place already."""
         free, gains = len(self.free), place.gains.copy()
-        step = self.coordinates.reach(place.soil, step[:free]) * step
+        step = self._reach(place, step) * step
         gains[self.active] += step[free:]
         soil, gains = self.coordinates.moved(place.soil, step[:free]), self.problem.allowed(gains)
         angle = self.problem.turned(point.at, place.latents.entry_angle, soil - place.soil, gains - place.gains)
@@ -155,6 +153,7 @@ class Fitting:
         bend[:free, :free] = self.coordinates.bend(gradient[:free])
         edges = np.zeros(len(gradient))
         edges[:free] = self.coordinates.edges(place.soil)
+        edges[free:] = at_edges(place.gains[self.active], *self._gain_bounds)
         cost = at.chi2 + known.cost
         if not np.isfinite(cost):
             return None
@@ -196,12 +195,19 @@ class Fitting:
     def moved(self, place: Place, point: Point, step: Array) -> Place:
         """The place after a step (F + A,), with the latents that the linear model foresees."""
         free = len(self.free)
-        step = self.coordinates.reach(place.soil, step[:free]) * step
+        step = self._reach(place, step) * step
         soil = self.coordinates.moved(place.soil, step[:free])
         gain_step = np.zeros(len(place.gains))
         gain_step[self.active] = step[free:]
         latents = self.problem.updated(point.at, place.latents, soil - place.soil, gain_step)
         return self._reached(place, point, soil, place.gains + gain_step, latents)
+
+    def _reach(self, place: Place, step: Array) -> float:
+        """Share of a step (F + A,) that can be taken."""
+        free = len(self.free)
+        low, high = self._gain_bounds
+        room = np.where(step[free:] > 0.0, high, low) - place.gains[self.active]
+        return min(self.coordinates.reach(place.soil, step[:free]), share_of_step(room, step[free:]))
 
     def _reached(self, place: Place, point: Point, soil: Array, gains: Array, latents: Latents) -> Place:
         """Soil (6,), gains (G,) and foreseen latents as a place, with the entry angles solved where they turn far."""
@@ -286,6 +292,15 @@ class Fitting:
 
     def _log_directions(self, soil: Array) -> Array:
         return self.coordinates.log_directions(soil)
+
+
+def _solution(information: Array, gradient: Array) -> Array | None:
+    """-information^-1 gradient (F,); None where the information is singular."""
+    scale = 1.0 / np.sqrt(information.diagonal())
+    try:
+        return np.asarray(np.linalg.solve(information * scale[:, None] * scale, gradient * scale) * -scale)
+    except np.linalg.LinAlgError:
+        return None
 
 
 def solved(information: Array, gradient: Array) -> tuple[Array, Array] | None:

@@ -80,6 +80,10 @@ class WindowProblem(Readings):
         """Gains (G,) with what has a range kept inside it."""
         return gains
 
+    def gain_bounds(self) -> tuple[Array, Array]:
+        """Least and greatest gains (G,), infinite where any will do."""
+        return np.full(len(self.gain_std), -np.inf), np.full(len(self.gain_std), np.inf)
+
     def thinned(self, most: int) -> WindowProblem:
         """The same window with at most so many of its usable instants, evenly spread."""
         if self.n <= most:
