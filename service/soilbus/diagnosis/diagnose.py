@@ -28,7 +28,7 @@ NEAR = 0.2
 """Share of the best one's fall on a few instants below which a candidate is out."""
 CLEAR = 50.0
 """Fall of -2 log evidence on a few instants that needs no search where the scores are blind."""
-BEHIND, BEHIND_UNSETTLED = 60.0, 300.0
+BEHIND, BEHIND_UNSETTLED = 30.0, 150.0
 """Fall of -2 log evidence on a few instants less than the best one's from which a candidate is out, and the same
 where its fit has not converged.  On all instants it would be some four times as much, and 50 leave no probability."""
 STEPS = 12

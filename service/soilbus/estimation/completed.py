@@ -321,7 +321,8 @@ class CompletedProblem(WindowProblem):
         """
         (load, pull, torque), depth, around = contact
         late = self._from_other_instants(active, torque, around) if late is None else late
-        error, missing = 0.0, np.zeros(self.n)
+        error: Any = 0.0
+        missing = np.zeros(self.n)
         for effect, values in active:
             if effect.torque is not None and not effect.mixes_instants:
                 torque = effect.torque(torque, around, values)

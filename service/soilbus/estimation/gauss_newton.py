@@ -46,6 +46,8 @@ THINNED = 24
 MAX_KINDS = 2
 """Known soils that the search starts from where the first starts did not agree."""
 MAX_APPROACH = 10
+AS_MEASURED = 4.0
+"""How many times the cost of an optimum that with the latents as measured may be, at the most."""
 MAX_SETTLED = 2
 MAX_HOPELESS = 5
 HOPELESS = 60.0
@@ -298,7 +300,7 @@ def continued(
             if fit is not None and fit.converged:
                 return fit
         moving = Fitting(problem, prior, before, first=first)
-        near = _approach(moving, start.soil, most, LITTLE, gains)
+        near = _approach(moving, start.soil, most, LITTLE, gains, hopeless=AS_MEASURED * hopeless)
         return None if near is None else _settle(fitting, near, most, hopeless=hopeless)
 
 
@@ -344,10 +346,12 @@ def _approach(
     least: float = ENOUGH,
     gains: Array | None = None,
     known: Sequence[Place] = (),
+    hopeless: float = np.inf,
 ) -> Place | None:
     """Levenberg-damped steps of the soil and the active gains, latents as measured, until they are short.
 
-    A descent that is foreseen to end at one of the `known` places ends there at once.
+    A descent that is foreseen to end at one of the `known` places ends there at once, one
+    that is foreseen to cost more than `hopeless` where it is.
     """
     place = fitting.start(soil, gains=gains)
     point = fitting.point(place)
@@ -356,7 +360,8 @@ def _approach(
         step = point.step(damping)
         if step is None:
             return None
-        if point.length(step) < SETTLING or trials >= most or damping > 1e6:
+        length = point.length(step)
+        if length < SETTLING or trials >= most or damping > 1e6 or point.cost - length > hopeless:
             return replace(place, cost=point.cost, trials=trials)
         for end in known:
             if _leads_to(fitting, place, point, step, end):
