@@ -155,7 +155,7 @@ def complete(
     free = tuple(f for effect in effects for f in known.get(effect.name) or parameters_of(effect, present.n_wheels))
     for _ in range(len(free) + 1):
         completion = _complete(records, prior, effects, free, starts, most, hopeless)
-        if completion is None or completion.free_at_edge is None or completion.cost > hopeless:
+        if completion is None or not completion.converged or completion.free_at_edge is None:
             break
         free = completion.free_at_edge
         starts = completion.as_starts()
