@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from soilbus.diagnosis.completion import Completion, Start, complete
+from soilbus.diagnosis.completion import Completion, complete
 from soilbus.diagnosis.learned import Correction, corrections
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.score import further_starts, scores
 from soilbus.diagnosis.verdict import PAYS, PLAUSIBLE, SURE, Verdict, is_real, pays, probabilities
 from soilbus.diagnosis.where import Disagreement, disagreements
+from soilbus.estimation.gauss_newton import Start
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
 
@@ -26,6 +28,11 @@ NEAR = 0.2
 """Share of the best one's fall on a few instants below which a candidate is out."""
 CLEAR = 50.0
 """Fall of -2 log evidence on a few instants that needs no search where the scores are blind."""
+BEHIND, BEHIND_UNSETTLED = 30.0, 150.0
+"""Fall of -2 log evidence on a few instants less than the best one's from which a candidate is out, and the same
+where its fit has not converged.  On all instants it would be some four times as much, and 50 leave no probability."""
+STEPS = 12
+"""Steps of the soil, and then of everything, in which a candidate that explains much is fitted."""
 WORTH_TRYING = -2.0
 """Foreseen change of -2 log evidence above which a candidate is not fitted."""
 NOTHING = "none"
@@ -99,11 +106,13 @@ def _round(
     """The best effect to add to the present model; None where none pays."""
     tried: dict[str, tuple[Effect, Completion]] = {}
     for effect, starts in _promising(records, prior, present, candidates):
-        completion = complete(records, prior, (*present.effects, effect), starts)
+        completion = complete(records, prior, (*present.effects, effect), starts, STEPS)
         if completion is not None:
             tried[effect.name] = effect, completion
     if not tried:
         return None
+    best = min(tried, key=lambda name: tried[name][1].evidence)
+    tried[best] = tried[best][0], _converged(records, prior, tried[best][1])
     falls = {name: present.evidence - completion.evidence for name, (_, completion) in tried.items()}
     best = max(falls, key=lambda name: falls[name])
     if not pays(falls[best], present.gap, present.checked_rows, present.rows):
@@ -114,33 +123,43 @@ def _round(
     return Addition(effect, chances[best], others, falls), completion
 
 
+def _converged(records: Sequence[Record], prior: SoilPrior, completion: Completion) -> Completion:
+    """The same, or where further steps from there lead if they were too few."""
+    if completion.converged:
+        return completion
+    further = complete(records, prior, completion.effects, completion.as_starts())
+    return completion if further is None or further.evidence > completion.evidence else further
+
+
 def _promising(
     records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect]
 ) -> list[tuple[Effect, Sequence[Start]]]:
     """The few candidates worth a fit of all data, and where it starts: foreseen by scores, tried on a few instants."""
     foreseen = [s for s in scores(records, prior, present, candidates)[:TRIED] if s.evidence < WORTH_TRYING]
     few = [record.thinned(THINNED) for record in records]
-    before = complete(few, prior, present.effects, present.as_starts())
+    before = complete(few, prior, present.effects, present.as_starts(), STEPS)
     if before is None:
         return [(score.effect, score.starts) for score in foreseen[:FITTED]]
-    falls: list[tuple[float, Effect, Sequence[Start]]] = []
+    tried: list[tuple[float, Effect, Completion]] = []
 
     def attempt(effect: Effect, starts: Sequence[Start]) -> None:
-        completion = complete(few, prior, (*present.effects, effect), starts)
+        hopeless = min((c.cost for *_, c in tried), default=math.inf) + BEHIND_UNSETTLED
+        completion = complete(few, prior, (*present.effects, effect), starts, STEPS, hopeless)
         if completion is not None:
-            falls.append((before.evidence - completion.evidence, effect, completion.as_starts()))
+            tried.append((before.evidence - completion.evidence, effect, completion))
 
     for score in foreseen:
         attempt(score.effect, score.starts)
-    if max((fall for fall, *_ in falls), default=0.0) < CLEAR:
+    if max((fall for fall, *_ in tried), default=0.0) < CLEAR:
         for effect in candidates:
             for further in further_starts(effect, before):
                 attempt(effect, further)
-    falls.sort(key=lambda item: -item[0])
+    tried.sort(key=lambda trial: -trial[0])
     best: dict[str, tuple[Effect, Sequence[Start]]] = {}
-    for fall, effect, starts in falls:
-        if fall > max(NEAR * falls[0][0], 0.0) and len(best) < FITTED:
-            best.setdefault(effect.name, (effect, starts))
+    for fall, effect, completion in tried:
+        behind = BEHIND if completion.converged and tried[0][2].converged else BEHIND_UNSETTLED
+        if fall > max(NEAR * tried[0][0], tried[0][0] - behind, 0.0) and len(best) < FITTED:
+            best.setdefault(effect.name, (effect, completion.as_starts()))
     return list(best.values())
 
 
@@ -174,7 +193,7 @@ def _without(records: Sequence[Record], prior: SoilPrior, present: Completion, e
     starts = [
         Start(fit.mode.soil, np.concatenate([fit.mode.gains[:n_sensors], fit.mode.gains[kept]])) for fit in present.fits
     ]
-    return complete(records, prior, [e for e in present.effects if e.name != effect.name], starts)
+    return complete(records, prior, [e for e in present.effects if e.name != effect.name], starts, STEPS)
 
 
 def _verdict(base: Completion, completed: Completion, additions: Sequence[Addition]) -> Verdict:
