@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.diagnosis.descent import descended
 from soilbus.diagnosis.records import Record
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.completed import CompletedProblem, Free, parameters_of
@@ -193,14 +194,19 @@ def _of_first(record: Record, prior: SoilPrior, problem: CompletedProblem) -> Be
 
 
 def _fitted(problem: CompletedProblem, prior: SoilPrior, before: Belief, start: Start | None) -> Fit | None:
-    """From the given start, or from anywhere; a fit that has not converged goes on from where it is."""
+    """From the given start, or from anywhere; a fit that has not converged goes on from where it is, slowly."""
     if start is None:
         fit = fit_window(problem, prior, before)
         if fit is None or fit.converged:
             return fit
         start = Start(fit.mode.soil, fit.mode.gains)
     gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
-    return continued(problem, prior, before, start.soil, gains, problem.n_sensors)
+    fit = continued(problem, prior, before, start.soil, gains, problem.n_sensors)
+    if fit is None or fit.converged:
+        return fit
+    fitting = Fitting(problem, prior, before)
+    ends = (start.soil, gains), (fit.optimum.soil, problem.allowed(fit.optimum.gains))
+    return descended(fitting, [fitting.start(soil, gains=g) for soil, g in ends]) or fit
 
 
 def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects: Sequence[Effect]) -> Belief:

@@ -10,22 +10,18 @@ import numpy as np
 from soilbus.diagnosis.completion import Completion, Start, complete
 from soilbus.diagnosis.learned import Correction, corrections
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.score import further_starts, scores
-from soilbus.diagnosis.verdict import PAYS, PLAUSIBLE, SURE, Verdict, is_real, pays, probabilities
+from soilbus.diagnosis.score import further_scores, scores
+from soilbus.diagnosis.verdict import PAYS, PLAUSIBLE, SURE, Verdict, hopeless, is_real, pays, probabilities
 from soilbus.diagnosis.where import Disagreement, disagreements
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
 
 MAX_EFFECTS = 3
 TRIED = 8
-"""Candidates of a round that are fitted to a few instants."""
+"""Candidates of a round, those of further starts besides, that are fitted to a few instants."""
 FITTED = 6
 """Those of them that are fitted to all."""
 THINNED = 4
-NEAR = 0.2
-"""Share of the best one's fall on a few instants below which a candidate is out."""
-CLEAR = 50.0
-"""Fall of -2 log evidence on a few instants that needs no search where the scores are blind."""
 WORTH_TRYING = -2.0
 """Foreseen change of -2 log evidence above which a candidate is not fitted."""
 NOTHING = "none"
@@ -81,24 +77,24 @@ def diagnose(
     while len(additions) < MAX_EFFECTS:
         progress(f"looking for effect {len(additions) + 1}")
         left = [effect for effect in candidates if effect.name not in present.names]
-        found = _round(records, prior, present, left)
+        found = _round(records, prior, present, left, base.evidence - present.evidence)
         if found is None:
             break
         addition, present = found
         additions.append(addition)
         if len(additions) > 1:
-            additions, present = _reconsidered(records, prior, present, additions, candidates)
+            additions, present = _reconsidered(records, prior, base, present, additions, candidates)
     verdict = _verdict(base, present, additions)
     learned = corrections(list(records), present) if verdict is Verdict.UNKNOWN else []
     return Diagnosis(verdict, tuple(where), tuple(additions), base, present, tuple(learned))
 
 
 def _round(
-    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect]
+    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect], explained: float
 ) -> tuple[Addition, Completion] | None:
-    """The best effect to add to the present model; None where none pays."""
+    """The best effect to add to the present model, which explains so much; None where none pays."""
     tried: dict[str, tuple[Effect, Completion]] = {}
-    for effect, starts in _promising(records, prior, present, candidates):
+    for effect, starts in _promising(records, prior, present, candidates, explained):
         completion = complete(records, prior, (*present.effects, effect), starts)
         if completion is not None:
             tried[effect.name] = effect, completion
@@ -106,16 +102,16 @@ def _round(
         return None
     falls = {name: present.evidence - completion.evidence for name, (_, completion) in tried.items()}
     best = max(falls, key=lambda name: falls[name])
-    if not pays(falls[best], present.gap, present.checked_rows, present.rows):
+    if not pays(falls[best], explained, present.gap, present.checked_rows, present.rows):
         return None
-    chances = probabilities({NOTHING: 0.0} | {name: -fall for name, fall in falls.items()})
+    chances = probabilities({NOTHING: 0.0} | {name: -fall for name, fall in falls.items()}, explained + falls[best])
     others = {n: p for n, p in chances.items() if n not in (best, NOTHING) and p >= PLAUSIBLE}
     effect, completion = tried[best]
     return Addition(effect, chances[best], others, falls), completion
 
 
 def _promising(
-    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect]
+    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect], explained: float
 ) -> list[tuple[Effect, Sequence[Start]]]:
     """The few candidates worth a fit of all data, and where it starts: foreseen by scores, tried on a few instants."""
     foreseen = [s for s in scores(records, prior, present, candidates)[:TRIED] if s.evidence < WORTH_TRYING]
@@ -123,23 +119,18 @@ def _promising(
     before = complete(few, prior, present.effects, present.as_starts())
     if before is None:
         return [(score.effect, score.starts) for score in foreseen[:FITTED]]
+    foreseen += [s for e in candidates for s in further_scores(few, prior, before, e)[:1] if s.evidence < WORTH_TRYING]
     falls: list[tuple[float, Effect, Sequence[Start]]] = []
-
-    def attempt(effect: Effect, starts: Sequence[Start]) -> None:
-        completion = complete(few, prior, (*present.effects, effect), starts)
-        if completion is not None:
-            falls.append((before.evidence - completion.evidence, effect, completion.as_starts()))
-
     for score in foreseen:
-        attempt(score.effect, score.starts)
-    if max((fall for fall, *_ in falls), default=0.0) < CLEAR:
-        for effect in candidates:
-            for further in further_starts(effect, before):
-                attempt(effect, further)
+        completion = complete(few, prior, (*present.effects, score.effect), score.starts)
+        if completion is not None:
+            falls.append((before.evidence - completion.evidence, score.effect, completion.as_starts()))
     falls.sort(key=lambda item: -item[0])
+    share = before.rows / present.rows
     best: dict[str, tuple[Effect, Sequence[Start]]] = {}
     for fall, effect, starts in falls:
-        if fall > max(NEAR * falls[0][0], 0.0) and len(best) < FITTED:
+        behind = (falls[0][0] - fall) / share
+        if fall > 0.0 and not hopeless(behind, explained + falls[0][0] / share) and len(best) < FITTED:
             best.setdefault(effect.name, (effect, starts))
     return list(best.values())
 
@@ -147,6 +138,7 @@ def _promising(
 def _reconsidered(
     records: Sequence[Record],
     prior: SoilPrior,
+    base: Completion,
     present: Completion,
     additions: Sequence[Addition],
     candidates: Sequence[Effect],
@@ -157,7 +149,8 @@ def _reconsidered(
         without = _without(records, prior, present, chosen[i].effect)
         if without is None:
             continue
-        found = _round(records, prior, without, [e for e in candidates if e.name not in without.names])
+        left = [effect for effect in candidates if effect.name not in without.names]
+        found = _round(records, prior, without, left, base.evidence - without.evidence)
         if found is None and without.evidence < present.evidence + PAYS:
             present = without
         elif found is not None and found[1].evidence < present.evidence + SAME:

@@ -13,7 +13,7 @@ from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.diagnosis.completion import Completion, complete
 from soilbus.diagnosis.diagnose import Diagnosis, diagnose
 from soilbus.diagnosis.records import Record, record_of
-from soilbus.diagnosis.score import further_starts, scores
+from soilbus.diagnosis.score import further_scores, scores
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.window import BinStore
 from soilbus.terra.effects.catalogue import CATALOGUE
@@ -120,8 +120,8 @@ def _with(hidden: Sequence[str], left_out: str, record: Record, prior: SoilPrior
 
 def _added(effect: Effect, record: Record, prior: SoilPrior, present: Completion) -> Completion:
     """The model with one effect more, from every start; itself where that fits worse."""
-    starts = [scores([record], prior, present, [effect])[0].starts, *further_starts(effect, present)]
-    tries = [complete([record], prior, (*present.effects, effect), start) for start in starts]
+    scored = [*scores([record], prior, present, [effect]), *further_scores([record], prior, present, effect)[:1]]
+    tries = [complete([record], prior, (*present.effects, effect), score.starts) for score in scored]
     return min((more for more in (present, *tries) if more is not None), key=_cost)
 
 
