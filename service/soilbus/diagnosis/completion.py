@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from soilbus.diagnosis.descent import descended
 from soilbus.diagnosis.records import Record
+from soilbus.diagnosis.sizes import correction
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.completed import CompletedProblem, Free, parameters_of
 from soilbus.estimation.gauss_newton import Fit, continued, fit_window
@@ -64,7 +65,8 @@ class Checked:
 class Completion:
     """A model with effects as fitted: one Fit and one Checked for each recording.
 
-    before holds what was known when each recording's turn came.
+    before holds what was known when each recording's turn came; sizes what it changes of the
+    evidence that nobody knows how great effects are (see `sizes`).
     """
 
     effects: tuple[Effect, ...]
@@ -72,11 +74,12 @@ class Completion:
     before: tuple[Belief, ...]
     fits: tuple[Fit, ...]
     checks: tuple[Checked, ...]
+    sizes: float = 0.0
 
     @property
     def evidence(self) -> float:
         """-2 log of the likelihood of all data, whatever soils, gains and parameters may be, up to a constant."""
-        return sum(fit.evidence for fit in self.fits) + self.predicted
+        return sum(fit.evidence for fit in self.fits) + self.predicted + self.sizes
 
     @property
     def predicted(self) -> float:
@@ -179,7 +182,22 @@ def _complete(
         befores.append(before)
         checks.append(check(record.checked.completed(effects, free), prior, fit))
         known = fit.mode
-    return Completion(tuple(effects), free, tuple(befores), tuple(fits), tuple(checks))
+    added = [effect for effect in effects if effect not in records[0].learned.effects]
+    sizes = sum(_sizes(effect, free, fits, checks) for effect in added)
+    return Completion(tuple(effects), free, tuple(befores), tuple(fits), tuple(checks), sizes)
+
+
+def _sizes(effect: Effect, free: Sequence[Free], fits: Sequence[Fit], checks: Sequence[Checked]) -> float:
+    """Correction of the evidence for one effect of unknown size: once, or for each recording where it is its own."""
+    members = [i for i, f in enumerate(free) if f.effect == effect.name and f.std > 0.0]
+    if not members:
+        return 0.0
+    gains = checks[0].problem.n_sensors + np.array(members)
+    told = [fit.mode for fit in (fits if effect.of_record else fits[-1:])]
+    return sum(
+        correction(mode.gains[gains], mode.covariance[np.ix_(_SOIL + gains, _SOIL + gains)], [free[i] for i in members])
+        for mode in told
+    )
 
 
 def _of_first(record: Record, prior: SoilPrior, problem: CompletedProblem) -> Belief:

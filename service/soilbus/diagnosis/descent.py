@@ -14,12 +14,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from soilbus.estimation.gauss_newton import Fit, fit_at
+from soilbus.estimation.gauss_newton import Fit
+from soilbus.estimation.linearised import Optimum
 from soilbus.estimation.normal_equations import Fitting, Place, Point
 
-MAX_STEPS = 10
-ENOUGH = 0.05
+MAX_STEPS = 15
+ENOUGH = 0.1
 """Fall of the cost that ends the descent."""
+EASED, HELD_BACK = 0.3, 10.0
+"""What a step that lowers the cost, and one that does not, makes of the damping."""
 MOST_DAMPING = 1e4
 
 
@@ -30,31 +33,42 @@ def descended(fitting: Fitting, starts: Sequence[Place]) -> Fit | None:
         if not found:
             return None
         here = min(found, key=lambda place: place[1].cost)
-        damping, falling = 1e-3, np.inf
-        for _ in range(MAX_STEPS):
+        damping, falling, steps = 1e-2, np.inf, 0
+        while falling > ENOUGH and damping < MOST_DAMPING and steps < MAX_STEPS:
             step = here[1].step(damping)
-            if step is None:
-                break
-            moved = fitting.moved(*here, step)
-            there = _relaxed(fitting, replace(moved, gains=fitting.problem.allowed(moved.gains)))
+            there = None if step is None else _relaxed(fitting, fitting.moved(*here, step))
+            steps += 1
             if there is None or there[1].cost >= here[1].cost:
-                damping *= 10.0
-                if damping > MOST_DAMPING:
-                    break
-                continue
-            falling = here[1].cost - there[1].cost
-            here, damping = there, damping * 0.1
-            if falling < ENOUGH:
-                break
-        fit = fit_at(fitting, here[0])
-        return None if fit is None else replace(fit, converged=falling < ENOUGH or damping > MOST_DAMPING)
+                damping *= HELD_BACK
+            else:
+                falling, damping = here[1].cost - there[1].cost, damping * EASED
+                here = there
+        return _fit(fitting, *here, steps, converged=steps < MAX_STEPS)
 
 
 def _relaxed(fitting: Fitting, place: Place) -> tuple[Place, Point] | None:
-    """The place with its latents where they fit best, and the normal equations there."""
+    """The place, inside the parameters' ranges, with latents where they fit best, and the normal equations there."""
+    place = replace(place, gains=fitting.problem.allowed(place.gains))
     point = fitting.point(place)
     if point is None:
         return None
     place = fitting.moved(place, point, np.zeros(len(point.gradient)))
     point = fitting.point(place)
     return None if point is None else (place, point)
+
+
+def _fit(fitting: Fitting, place: Place, point: Point, steps: int, converged: bool) -> Fit | None:
+    beliefs = fitting.beliefs(place, point, place.soil)
+    if beliefs is None:
+        return None
+    return Fit(
+        belief=beliefs[1],
+        mode=beliefs[1],
+        sinkage=fitting.problem.mean_sinkage(place.as_soil(), place.gains, place.latents),
+        optimum=Optimum(fitting.problem.t, place.soil, place.gains, place.latents, point.at),
+        cost=point.cost,
+        evidence=point.evidence,
+        rows=fitting.problem.n_rows,
+        iterations=steps,
+        converged=converged,
+    )

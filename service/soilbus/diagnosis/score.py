@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from soilbus.diagnosis.completion import Completion, Start
 from soilbus.diagnosis.records import Record
+from soilbus.diagnosis.sizes import evidence_of_any_size
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.completed import Free, parameters_of
 from soilbus.estimation.normal_equations import Fitting, Place, solved
@@ -133,18 +134,18 @@ def _score(effect: Effect, columns: NDArray[np.intp], free: Sequence[Free], norm
         parts = [(left, gradient)]
     solutions = [_within(left + np.eye(len(own)), gradient, own) for left, gradient in parts]
     fall = sum(solution.fall for solution in solutions)
-    logdet = sum(solution.logdet for solution in solutions)
+    evidence = sum(solution.evidence for solution in solutions)
     steps = [solution.step for solution in solutions] * (1 if effect.of_record else len(normals))
     starts = tuple(_start(n, columns, step) for n, step in zip(normals, steps, strict=True))
-    return Score(effect, fall, logdet - fall, starts)
+    return Score(effect, fall, evidence, starts)
 
 
 class _Solution(NamedTuple):
-    """Step of the parameters (P,) in prior std, by how much the cost falls, and log determinant of the information."""
+    """Step of the parameters (P,) in prior std, by how much the cost falls, and change of -2 log evidence."""
 
     step: Array
     fall: float
-    logdet: float
+    evidence: float
 
 
 def _within(information: Array, gradient: Array, free: Sequence[Free]) -> _Solution:
@@ -164,8 +165,12 @@ def _within(information: Array, gradient: Array, free: Sequence[Free]) -> _Solut
         step = np.clip(step, low, high)
         inside &= ~leaving
     fall = float(-2.0 * gradient @ step - step @ information @ step)
+    if not inside.any():
+        return _Solution(step, fall, -fall)
     kept = np.ix_(inside, inside)
-    return _Solution(step, fall, float(np.linalg.slogdet(information[kept])[1]) if inside.any() else 0.0)
+    left, pull = information[kept] - np.eye(int(inside.sum())), information[kept] @ step[inside]
+    there = evidence_of_any_size(left, pull, [f for f, free_still in zip(free, inside, strict=True) if free_still])
+    return _Solution(step, fall, there + float(step[inside] @ pull) - fall)
 
 
 def _start(normal: _Normal, columns: NDArray[np.intp], step: Array) -> Start:

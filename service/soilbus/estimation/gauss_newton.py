@@ -293,11 +293,6 @@ def settled(fitting: Fitting, near: Place) -> Fit | None:
     return _settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED)
 
 
-def fit_at(fitting: Fitting, place: Place) -> Fit | None:
-    """What the data tell about a place that is an optimum already."""
-    return _settle(fitting, place, 1)
-
-
 def _approach(
     fitting: Fitting, soil: Array, most: int, least: float = ENOUGH, gains: Array | None = None
 ) -> Place | None:
