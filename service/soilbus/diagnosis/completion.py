@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.diagnosis.descent import descended
+from soilbus.diagnosis.descent import descended, leaves
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.sizes import correction
 from soilbus.estimation.belief import Belief
@@ -220,11 +220,12 @@ def _fitted(problem: CompletedProblem, prior: SoilPrior, before: Belief, start: 
         start = Start(fit.mode.soil, fit.mode.gains)
     gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
     fit = continued(problem, prior, before, start.soil, gains, problem.n_sensors)
-    if fit is None or fit.converged:
+    if fit is None or fit.converged or leaves(problem, fit.mode.gains):
         return fit
     fitting = Fitting(problem, prior, before)
     ends = (start.soil, gains), (fit.optimum.soil, problem.allowed(fit.optimum.gains))
-    return descended(fitting, [fitting.start(soil, gains=g) for soil, g in ends]) or fit
+    slow = descended(fitting, [fitting.start(soil, gains=g) for soil, g in ends])
+    return fit if slow is None or fit.cost < slow.cost else slow
 
 
 def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects: Sequence[Effect]) -> Belief:
