@@ -47,6 +47,7 @@ class Addition:
 class Diagnosis:
     """What was found; base is the present model, completed the one with the effects added.
 
+    additions are in the order of what they explain beside each other, the most first.
     learned describes what is left where the verdict is unknown.
     """
 
@@ -84,6 +85,7 @@ def diagnose(
         additions.append(addition)
         if len(additions) > 1:
             additions, present = _reconsidered(records, prior, base, present, additions, candidates)
+    additions.sort(key=lambda addition: -addition.falls[addition.effect.name])
     verdict = _verdict(base, present, additions)
     learned = corrections(list(records), present) if verdict is Verdict.UNKNOWN else []
     return Diagnosis(verdict, tuple(where), tuple(additions), base, present, tuple(learned))

@@ -20,11 +20,11 @@ class Verdict(StrEnum):
     UNKNOWN = "unknown"
 
 
-PAYS = 10.0
-"""Fall of -2 log evidence from which an effect is added."""
+PAYS, PAYS_BESIDE = 12.0, 30.0
+"""Fall of -2 log evidence from which an effect is added, alone and beside others: they leave more than noise."""
 TEMPERATURE = 6.0
 """By how much evidences are less certain than they say, where little is to be explained."""
-FORM_ERROR = 0.003
+FORM_ERROR = 0.001
 """By how much less besides, for each unit that is explained: no effect's formula is the field's, and a formula
 that is off by a share e of the effect leaves e^2 of what there was to explain."""
 SURE = 0.8
@@ -74,7 +74,8 @@ def pays(fall: float, explained: float, gap: float, checked_rows: int, rows: int
     gap is the present one, on so many residuals.
     """
     excess = (gap - 1.0) * rows if gap > gap_limit(checked_rows) else 0.0
-    return fall > max(PAYS, ADDS * explained, WORTH * excess)
+    least = PAYS_BESIDE if explained > 0.0 else PAYS
+    return fall > max(least, ADDS * explained, WORTH * excess)
 
 
 def is_real(before: float, after: float, checked_rows: int) -> bool:

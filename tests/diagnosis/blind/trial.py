@@ -72,7 +72,6 @@ def tried(case: Case) -> Trial:
     begin = time.process_time()
     found = diagnose([record], prior, list(CATALOGUE.values()))
     seconds = time.process_time() - begin
-    order = sorted(found.additions, key=lambda a: -a.falls[a.effect.name])
     return Trial(
         id=case.id,
         kind=case.kind,
@@ -81,9 +80,9 @@ def tried(case: Case) -> Trial:
         size=case.size,
         imitable=case.imitable,
         verdict=str(found.verdict),
-        named=tuple(a.effect.name for a in order),
-        sets=tuple({a.effect.name: a.probability} | a.alternatives for a in order),
-        falls=tuple(a.falls for a in order),
+        named=tuple(a.effect.name for a in found.additions),
+        sets=tuple({a.effect.name: a.probability} | a.alternatives for a in found.additions),
+        falls=tuple(a.falls for a in found.additions),
         visible=_visible(case, record, found),
         gap_before=found.base.gap,
         gap_after=found.completed.gap,
