@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,9 +22,10 @@ TRIED = 8
 FITTED = 6
 """Those of them that are fitted to all."""
 THINNED = 4
+CLEAR = 100.0
+"""Foreseen fall of -2 log evidence from which a few instants tell which candidates to fit."""
 WORTH_TRYING = -2.0
 """Foreseen change of -2 log evidence above which a candidate is not fitted."""
-NOTHING = "none"
 SAME = 1.0
 """Difference of -2 log evidence that is none."""
 
@@ -106,8 +107,8 @@ def _round(
     best = max(falls, key=lambda name: falls[name])
     if not pays(falls[best], explained, present.gap, present.checked_rows, present.rows):
         return None
-    chances = probabilities({NOTHING: 0.0} | {name: -fall for name, fall in falls.items()}, explained + falls[best])
-    others = {n: p for n, p in chances.items() if n not in (best, NOTHING) and p >= PLAUSIBLE}
+    chances = probabilities(falls, explained)
+    others = {n: p for n, p in chances.items() if n != best and p >= PLAUSIBLE}
     effect, completion = tried[best]
     return Addition(effect, chances[best], others, falls), completion
 
@@ -115,26 +116,42 @@ def _round(
 def _promising(
     records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect], explained: float
 ) -> list[tuple[Effect, Sequence[Start]]]:
-    """The few candidates worth a fit of all data, and where it starts: foreseen by scores, tried on a few instants."""
-    foreseen = [s for s in scores(records, prior, present, candidates)[:TRIED] if s.evidence < WORTH_TRYING]
+    """The few candidates worth a fit of all data, and where it starts: foreseen by scores, tried on a few instants.
+
+    Where little is foreseen a few instants tell nothing, and scores are as good as fits.
+    """
     few = [record.thinned(THINNED) for record in records]
     before = complete(few, prior, present.effects, present.as_starts())
-    if before is None:
-        return [(score.effect, score.starts) for score in foreseen[:FITTED]]
-    foreseen += [s for e in candidates for s in further_scores(few, prior, before, e)[:1] if s.evidence < WORTH_TRYING]
-    falls: list[tuple[float, Effect, Sequence[Start]]] = []
-    for score in foreseen:
+    foreseen = scores(records, prior, present, candidates)
+    further = [] if before is None else [s for e in candidates for s in further_scores(few, prior, before, e)[:1]]
+    share = 1.0 if before is None else before.rows / present.rows
+    most = max(-score.evidence / part for part, of in ((1.0, foreseen), (share, further)) for score in of)
+    if before is None or most < CLEAR:
+        foreseen += [s for e in candidates for s in further_scores(records, prior, present, e)[:1]]
+        return _first_of_each(
+            (s.effect, s.starts)
+            for s in sorted(foreseen, key=lambda score: score.evidence)
+            if s.evidence < WORTH_TRYING
+        )
+    tried: list[tuple[float, Effect, Sequence[Start]]] = []
+    for score in [s for s in (*foreseen[:TRIED], *further) if s.evidence < WORTH_TRYING]:
         completion = complete(few, prior, (*present.effects, score.effect), score.starts)
         if completion is not None:
-            falls.append((before.evidence - completion.evidence, score.effect, completion.as_starts()))
-    falls.sort(key=lambda item: -item[0])
-    share = before.rows / present.rows
+            tried.append((before.evidence - completion.evidence, score.effect, completion.as_starts()))
+    tried.sort(key=lambda item: -item[0])
+    best = tried[0][0] / share if tried else 0.0
+    return _first_of_each(
+        (effect, starts) for fall, effect, starts in tried
+        if fall > 0.0 and not hopeless(best - fall / share, explained + best)
+    )  # fmt: skip
+
+
+def _first_of_each(promising: Iterable[tuple[Effect, Sequence[Start]]]) -> list[tuple[Effect, Sequence[Start]]]:
+    """No effect twice, and no more than FITTED."""
     best: dict[str, tuple[Effect, Sequence[Start]]] = {}
-    for fall, effect, starts in falls:
-        behind = (falls[0][0] - fall) / share
-        if fall > 0.0 and not hopeless(behind, explained + falls[0][0] / share) and len(best) < FITTED:
-            best.setdefault(effect.name, (effect, starts))
-    return list(best.values())
+    for effect, starts in promising:
+        best.setdefault(effect.name, (effect, starts))
+    return list(best.values())[:FITTED]
 
 
 def _reconsidered(

@@ -31,6 +31,8 @@ SURE = 0.8
 """Probability from which a name stands alone."""
 PLAUSIBLE = 0.02
 """Probability from which a name belongs to the set."""
+FORM_LEFT = 0.02
+"""The same for whether there is a further effect at all: share of what is explained that its formula may leave."""
 HOPELESS = 30.0
 """Temperatures behind the best from which a name that a few instants speak of is fitted to all no more."""
 ADDS = 0.001
@@ -50,12 +52,17 @@ def temperature(explained: float) -> float:
     return TEMPERATURE + FORM_ERROR * max(explained, 0.0)
 
 
-def probabilities(evidence: Mapping[str, float], explained: float) -> dict[str, float]:
-    """Probability of each name from its -2 log evidence, the largest first; so much is explained in all."""
-    least, heat = min(evidence.values()), 2.0 * temperature(explained)
-    weights = {name: math.exp(-(e - least) / heat) for name, e in evidence.items()}
+def probabilities(falls: Mapping[str, float], explained: float) -> dict[str, float]:
+    """Probability of each name from its fall of -2 log evidence, the largest first, where others explain so much.
+
+    What is left to one is the probability that nothing more is missing.
+    """
+    most = max(falls.values())
+    heat = 2.0 * temperature(explained + most)
+    weights = {name: math.exp((fall - most) / heat) for name, fall in falls.items()}
+    something = 1.0 / (1.0 + math.exp(-most / (2.0 * (TEMPERATURE + FORM_LEFT * max(explained, 0.0)))))
     total = sum(weights.values())
-    return dict(sorted(((n, w / total) for n, w in weights.items()), key=lambda item: -item[1]))
+    return dict(sorted(((n, something * w / total) for n, w in weights.items()), key=lambda item: -item[1]))
 
 
 def hopeless(behind: float, explained: float) -> bool:

@@ -115,7 +115,7 @@ LUGS = Effect(
     tells="cohesive soil, and draft beside torque; on cohesionless soil they are a greater tan phi and no data tell",
     parameters=(
         Parameter("height", "m", 0.0, 0.03, 0.0, 0.12),
-        Parameter("share", "1", 0.5, 0.25, 0.0, 1.0),
+        Parameter("share", "1", 0.5, 0.25, 0.0, 1.0, starts=(0.0,)),
     ),
     wheel=_lugged_soil,
     forces=_lugged_arm,
