@@ -8,18 +8,20 @@ of the whole, as do those of the blocks learned from and of the blocks held out.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.diagnosis.descent import descended, leaves
+from soilbus.diagnosis.descent import descended
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.sizes import correction
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.completed import CompletedProblem, Free, parameters_of
-from soilbus.estimation.gauss_newton import Fit, continued, fit_window
+from soilbus.estimation.coordinates import at_edges
+from soilbus.estimation.gauss_newton import MAX_ITERATIONS, Fit, Start, continued, fit_window
 from soilbus.estimation.linearised import Latents, Linearised
 from soilbus.estimation.normal_equations import Fitting, Place
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
@@ -31,14 +33,6 @@ Array = NDArray[np.float64]
 _SOIL = len(PARAMETERS)
 CHECK_ROUNDS = 3
 """Linearisations that bring the latents of held-out blocks to their values under a model."""
-
-
-@dataclass(frozen=True, slots=True)
-class Start:
-    """Where the fit of one recording may begin: soil (6,), sensors' gains and effects' parameters (G,)."""
-
-    soil: Array
-    gains: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,8 +108,10 @@ class Completion:
     @property
     def free_at_edge(self) -> tuple[Free, ...] | None:
         """The parameters with those held that would leave their range; None where none would."""
-        pulls = self.fits[-1].mode.gains[self.checks[-1].problem.n_sensors :].tolist()
-        leaves = [f.std > 0.0 and not f.within(u) for f, u in zip(self.free, pulls, strict=True)]
+        problem, gains = self.checks[-1].problem, self.fits[-1].mode.gains
+        pulls = gains[problem.n_sensors :].tolist()
+        edges = at_edges(gains, *problem.gain_bounds())[problem.n_sensors :].tolist()
+        leaves = [f.std > 0.0 and edge != 0.0 for f, edge in zip(self.free, edges, strict=True)]
         if not any(leaves):
             return None
         return tuple(
@@ -125,7 +121,7 @@ class Completion:
 
     def as_starts(self) -> tuple[Start, ...]:
         """Where these fits ended."""
-        return tuple(Start(fit.mode.soil, fit.mode.gains) for fit in self.fits)
+        return tuple(Start(fit.mode.soil, fit.mode.gains, near=fit.converged) for fit in self.fits)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -144,9 +140,16 @@ class Completion:
 
 
 def complete(
-    records: Sequence[Record], prior: SoilPrior, effects: Sequence[Effect], starts: Sequence[Start] | None = None
+    records: Sequence[Record],
+    prior: SoilPrior,
+    effects: Sequence[Effect],
+    starts: Sequence[Start] | None = None,
+    most: int = MAX_ITERATIONS,
+    hopeless: float = math.inf,
 ) -> Completion | None:
     """A model with these effects fitted to all recordings; None where a fit fails.
+
+    Each fit has at most so many steps, and is given up where it will not cost less than `hopeless`.
 
     Parameters of effects that the records' model has already keep the prior they have
     there; one that would leave its range is held at the edge.
@@ -155,7 +158,7 @@ def complete(
     known = {e.name: [f for f in present.free if f.effect == e.name] for e in present.effects}
     free = tuple(f for effect in effects for f in known.get(effect.name) or parameters_of(effect, present.n_wheels))
     for _ in range(len(free) + 1):
-        completion = _complete(records, prior, effects, free, starts)
+        completion = _complete(records, prior, effects, free, starts, most, hopeless)
         if completion is None or completion.free_at_edge is None:
             break
         free = completion.free_at_edge
@@ -169,13 +172,15 @@ def _complete(
     effects: Sequence[Effect],
     free: tuple[Free, ...],
     starts: Sequence[Start] | None,
+    most: int,
+    hopeless: float,
 ) -> Completion | None:
     fits, checks, befores = [], [], []
     known: Belief | None = None
     for i, record in enumerate(records):
         problem = record.learned.completed(effects, free)
         before = _of_first(record, prior, problem) if known is None else _of_next(known, prior, problem, effects)
-        fit = _fitted(problem, prior, before, None if starts is None else starts[i])
+        fit = _fitted(problem, prior, before, None if starts is None else starts[i], most, hopeless)
         if fit is None:
             return None
         fits.append(fit)
@@ -211,19 +216,20 @@ def _of_first(record: Record, prior: SoilPrior, problem: CompletedProblem) -> Be
     return Belief(record.known.soil, gains, covariance)
 
 
-def _fitted(problem: CompletedProblem, prior: SoilPrior, before: Belief, start: Start | None) -> Fit | None:
+def _fitted(
+    problem: CompletedProblem, prior: SoilPrior, before: Belief, start: Start | None, most: int, hopeless: float
+) -> Fit | None:
     """From the given start, or from anywhere; a fit that has not converged goes on from where it is, slowly."""
     if start is None:
         fit = fit_window(problem, prior, before)
         if fit is None or fit.converged:
             return fit
         start = Start(fit.mode.soil, fit.mode.gains)
-    gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
-    fit = continued(problem, prior, before, start.soil, gains, problem.n_sensors)
-    if fit is None or fit.converged or leaves(problem, fit.mode.gains):
+    fit = continued(problem, prior, before, start, problem.n_sensors, most, hopeless)
+    if fit is None or fit.converged or fit.cost > hopeless:
         return fit
-    fitting = Fitting(problem, prior, before)
-    ends = (start.soil, gains), (fit.optimum.soil, problem.allowed(fit.optimum.gains))
+    fitting, gains = Fitting(problem, prior, before), np.where(problem.gain_std > 0.0, start.gains, 0.0)
+    ends = (start.soil, problem.allowed(gains)), (fit.optimum.soil, problem.allowed(fit.optimum.gains))
     slow = descended(fitting, [fitting.start(soil, gains=g) for soil, g in ends])
     return fit if slow is None or fit.cost < slow.cost else slow
 

@@ -12,14 +12,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from soilbus.estimation.gauss_newton import Fit
 from soilbus.estimation.linearised import Optimum
 from soilbus.estimation.normal_equations import Fitting, Place, Point
-from soilbus.estimation.residuals import WindowProblem
-
-Array = NDArray[np.float64]
 
 MAX_STEPS = 15
 ENOUGH = 0.1
@@ -30,10 +26,7 @@ MOST_DAMPING = 1e4
 
 
 def descended(fitting: Fitting, starts: Sequence[Place]) -> Fit | None:
-    """The optimum below the best of some places, or where a parameter leaves its range on the way there.
-
-    None where the numbers are not finite.
-    """
+    """The optimum below the best of some places; None where the numbers are not finite."""
     with np.errstate(all="ignore"):
         found = [place for place in (_relaxed(fitting, start) for start in starts) if place is not None]
         if not found:
@@ -49,14 +42,7 @@ def descended(fitting: Fitting, starts: Sequence[Place]) -> Fit | None:
             else:
                 falling, damping = here[1].cost - there[1].cost, damping * EASED
                 here = there
-                if leaves(fitting.problem, here[0].gains):
-                    break
         return _fit(fitting, *here, steps, converged=steps < MAX_STEPS)
-
-
-def leaves(problem: WindowProblem, gains: Array) -> bool:
-    """Whether a parameter of an effect is outside its range."""
-    return not np.allclose(problem.allowed(gains), gains)
 
 
 def _relaxed(fitting: Fitting, place: Place) -> tuple[Place, Point] | None:

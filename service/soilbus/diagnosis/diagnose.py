@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from soilbus.diagnosis.completion import Completion, Start, complete
+from soilbus.diagnosis.completion import Completion, complete
 from soilbus.diagnosis.learned import Correction, corrections
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.score import further_scores, scores
 from soilbus.diagnosis.verdict import PAYS, PLAUSIBLE, SURE, Verdict, hopeless, is_real, pays, probabilities
 from soilbus.diagnosis.where import Disagreement, disagreements
+from soilbus.estimation.gauss_newton import Start
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
 
@@ -24,6 +26,10 @@ FITTED = 6
 THINNED = 4
 CLEAR = 100.0
 """Foreseen fall of -2 log evidence from which a few instants tell which candidates to fit."""
+BEHIND_UNSETTLED = 300.0
+"""Cost on a few instants above the least one's from which a candidate is given up, converged or not."""
+STEPS = 12
+"""Steps of the soil, and then of everything, in which a candidate that explains much is fitted."""
 WORTH_TRYING = -2.0
 """Foreseen change of -2 log evidence above which a candidate is not fitted."""
 SAME = 1.0
@@ -98,11 +104,13 @@ def _round(
     """The best effect to add to the present model, which explains so much; None where none pays."""
     tried: dict[str, tuple[Effect, Completion]] = {}
     for effect, starts in _promising(records, prior, present, candidates, explained):
-        completion = complete(records, prior, (*present.effects, effect), starts)
+        completion = complete(records, prior, (*present.effects, effect), starts, STEPS)
         if completion is not None:
             tried[effect.name] = effect, completion
     if not tried:
         return None
+    best = min(tried, key=lambda name: tried[name][1].evidence)
+    tried[best] = tried[best][0], _converged(records, prior, tried[best][1])
     falls = {name: present.evidence - completion.evidence for name, (_, completion) in tried.items()}
     best = max(falls, key=lambda name: falls[name])
     if not pays(falls[best], explained, present.gap, present.checked_rows, present.rows):
@@ -113,6 +121,14 @@ def _round(
     return Addition(effect, chances[best], others, falls), completion
 
 
+def _converged(records: Sequence[Record], prior: SoilPrior, completion: Completion) -> Completion:
+    """The same, or where further steps from there lead if they were too few."""
+    if completion.converged:
+        return completion
+    further = complete(records, prior, completion.effects, completion.as_starts())
+    return completion if further is None or further.evidence > completion.evidence else further
+
+
 def _promising(
     records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect], explained: float
 ) -> list[tuple[Effect, Sequence[Start]]]:
@@ -121,7 +137,7 @@ def _promising(
     Where little is foreseen a few instants tell nothing, and scores are as good as fits.
     """
     few = [record.thinned(THINNED) for record in records]
-    before = complete(few, prior, present.effects, present.as_starts())
+    before = complete(few, prior, present.effects, present.as_starts(), STEPS)
     foreseen = scores(records, prior, present, candidates)
     further = [] if before is None else [s for e in candidates for s in further_scores(few, prior, before, e)[:1]]
     share = 1.0 if before is None else before.rows / present.rows
@@ -134,10 +150,13 @@ def _promising(
             if s.evidence < WORTH_TRYING
         )
     tried: list[tuple[float, Effect, Sequence[Start]]] = []
+    least = math.inf
     for score in [s for s in (*foreseen[:TRIED], *further) if s.evidence < WORTH_TRYING]:
-        completion = complete(few, prior, (*present.effects, score.effect), score.starts)
+        with_it = (*present.effects, score.effect)
+        completion = complete(few, prior, with_it, score.starts, STEPS, least + BEHIND_UNSETTLED)
         if completion is not None:
             tried.append((before.evidence - completion.evidence, score.effect, completion.as_starts()))
+            least = min(least, completion.cost)
     tried.sort(key=lambda item: -item[0])
     best = tried[0][0] / share if tried else 0.0
     return _first_of_each(
@@ -186,7 +205,7 @@ def _without(records: Sequence[Record], prior: SoilPrior, present: Completion, e
     starts = [
         Start(fit.mode.soil, np.concatenate([fit.mode.gains[:n_sensors], fit.mode.gains[kept]])) for fit in present.fits
     ]
-    return complete(records, prior, [e for e in present.effects if e.name != effect.name], starts)
+    return complete(records, prior, [e for e in present.effects if e.name != effect.name], starts, STEPS)
 
 
 def _verdict(base: Completion, completed: Completion, additions: Sequence[Addition]) -> Verdict:

@@ -14,11 +14,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.diagnosis.completion import Completion, Start
+from soilbus.diagnosis.completion import Completion
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.sizes import evidence_of_any_size
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.completed import Free, parameters_of
+from soilbus.estimation.gauss_newton import Start
 from soilbus.estimation.normal_equations import Fitting, Place, solved
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
@@ -174,11 +175,12 @@ def _within(information: Array, gradient: Array, free: Sequence[Free]) -> _Solut
 
 
 def _start(normal: _Normal, columns: NDArray[np.intp], step: Array) -> Start:
-    step = step * min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-12))
+    share = min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-12))
+    step = share * step
     follow = -normal.answer[:, columns] @ step
     fitting, place = normal.fitting, normal.place
     n_free, n_known = len(fitting.free), len(place.gains) - len(normal.left)
     soil = fitting.coordinates.moved(place.soil, follow[:n_free])
     gains = place.gains[:n_known].copy()
     gains[fitting.active[fitting.active < n_known]] += follow[n_free:]
-    return Start(soil, np.concatenate([gains, step]))
+    return Start(soil, np.concatenate([gains, step]), near=share == 1.0)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soilbus.terra.rim import (
     Quadrature,
@@ -145,10 +146,11 @@ def in_chunks(
     """(n_rows, ...) of an integrator of samples, which gets the state as rows (N,) or floats, and whether they skid."""
     shape = np.broadcast(*state).shape
     n_samples = math.prod(shape)
+    fields = [np.asarray(a, float) for a in state]
     rows = WheelState(*(
-        (np.asarray(a) if np.shape(a) == shape else np.broadcast_to(a, shape)).reshape(n_samples)
-        if np.ndim(a) or i < 2 else float(a)  # entry angle and slip always by sample
-        for i, a in enumerate(state)
+        (a if a.shape == shape else np.broadcast_to(a, shape)).reshape(n_samples)
+        if a.ndim or i < 2 else float(a)  # entry angle and slip always by sample
+        for i, a in enumerate(fields)
     ))  # fmt: skip
     skid, chunk = rows.slip < 0.0, max(_CHUNK // model.nodes, 1)
     out = np.empty((n_rows, n_samples))
@@ -157,15 +159,19 @@ def in_chunks(
             return integrate(rows, model, False).reshape(n_rows, *shape)
         for i in range(0, n_samples, chunk):
             run = slice(i, i + chunk)
-            out[:, run] = integrate(WheelState(*(a[run] if np.ndim(a) else a for a in rows)), model, False)
+            out[:, run] = integrate(_samples(rows, run), model, False)
         return out.reshape(n_rows, *shape)
     for skidding in (False, True):  # skidding wheels need split panels
         members = np.flatnonzero(skid == skidding)
         for i in range(0, len(members), chunk):
             index = members[i : i + chunk]
-            part = WheelState(*(a[index] if np.ndim(a) else a for a in rows))
-            out[:, index] = integrate(part, model, skidding)
+            out[:, index] = integrate(_samples(rows, index), model, skidding)
     return out.reshape(n_rows, *shape)
+
+
+def _samples(rows: WheelState, chosen: slice | NDArray[np.intp]) -> WheelState:
+    """Some samples of fields that are (N,) or floats."""
+    return WheelState(*(a if isinstance(a, float) else a[chosen] for a in rows))
 
 
 class _Stress(NamedTuple):
