@@ -15,7 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.diagnosis.descent import descended
 from soilbus.diagnosis.records import Record
+from soilbus.diagnosis.sizes import correction
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.completed import CompletedProblem, Free, parameters_of
 from soilbus.estimation.coordinates import at_edges
@@ -57,7 +59,8 @@ class Checked:
 class Completion:
     """A model with effects as fitted: one Fit and one Checked for each recording.
 
-    before holds what was known when each recording's turn came.
+    before holds what was known when each recording's turn came; sizes what it changes of the
+    evidence that nobody knows how great effects are (see `sizes`).
     """
 
     effects: tuple[Effect, ...]
@@ -65,11 +68,12 @@ class Completion:
     before: tuple[Belief, ...]
     fits: tuple[Fit, ...]
     checks: tuple[Checked, ...]
+    sizes: float = 0.0
 
     @property
     def evidence(self) -> float:
         """-2 log of the likelihood of all data, whatever soils, gains and parameters may be, up to a constant."""
-        return sum(fit.evidence for fit in self.fits) + self.predicted
+        return sum(fit.evidence for fit in self.fits) + self.predicted + self.sizes
 
     @property
     def predicted(self) -> float:
@@ -183,7 +187,22 @@ def _complete(
         befores.append(before)
         checks.append(check(record.checked.completed(effects, free), prior, fit))
         known = fit.mode
-    return Completion(tuple(effects), free, tuple(befores), tuple(fits), tuple(checks))
+    added = [effect for effect in effects if effect not in records[0].learned.effects]
+    sizes = sum(_sizes(effect, free, fits, checks) for effect in added)
+    return Completion(tuple(effects), free, tuple(befores), tuple(fits), tuple(checks), sizes)
+
+
+def _sizes(effect: Effect, free: Sequence[Free], fits: Sequence[Fit], checks: Sequence[Checked]) -> float:
+    """Correction of the evidence for one effect of unknown size: once, or for each recording where it is its own."""
+    members = [i for i, f in enumerate(free) if f.effect == effect.name and f.std > 0.0]
+    if not members:
+        return 0.0
+    gains = checks[0].problem.n_sensors + np.array(members)
+    told = [fit.mode for fit in (fits if effect.of_record else fits[-1:])]
+    return sum(
+        correction(mode.gains[gains], mode.covariance[np.ix_(_SOIL + gains, _SOIL + gains)], [free[i] for i in members])
+        for mode in told
+    )
 
 
 def _of_first(record: Record, prior: SoilPrior, problem: CompletedProblem) -> Belief:
@@ -200,13 +219,19 @@ def _of_first(record: Record, prior: SoilPrior, problem: CompletedProblem) -> Be
 def _fitted(
     problem: CompletedProblem, prior: SoilPrior, before: Belief, start: Start | None, most: int, hopeless: float
 ) -> Fit | None:
-    """From the given start, or from anywhere; a fit that has not converged goes on from where it is."""
+    """From the given start, or from anywhere; a fit that has not converged goes on from where it is, slowly."""
     if start is None:
         fit = fit_window(problem, prior, before)
         if fit is None or fit.converged:
             return fit
         start = Start(fit.mode.soil, fit.mode.gains)
-    return continued(problem, prior, before, start, problem.n_sensors, most, hopeless)
+    fit = continued(problem, prior, before, start, problem.n_sensors, most, hopeless)
+    if fit is None or fit.converged or fit.cost > hopeless:
+        return fit
+    fitting, gains = Fitting(problem, prior, before), np.where(problem.gain_std > 0.0, start.gains, 0.0)
+    ends = (start.soil, problem.allowed(gains)), (fit.optimum.soil, problem.allowed(fit.optimum.gains))
+    slow = descended(fitting, [fitting.start(soil, gains=g) for soil, g in ends])
+    return fit if slow is None or fit.cost < slow.cost else slow
 
 
 def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects: Sequence[Effect]) -> Belief:
