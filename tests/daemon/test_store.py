@@ -162,6 +162,22 @@ def test_each_fault_is_told_in_one_line(content, why):
     assert "\n" not in str(caught.value)
 
 
+def test_what_is_held_and_what_effects_have_is_stored_too():
+    effect = 'model.effects=[{name="slip_sinkage", softening={value=0.3, std=0.1}}]'
+    owner = owner_of([effect, "soil.k_c.value=0.0", "soil.k_c.std=0.0"])
+    held = owner.std == 0.0
+    assert np.flatnonzero(held)[0] == 0
+    assert len(owner.gains) > len(OWNER.gains)
+    std = np.where(held, 0.0, 0.1 * owner.std)
+    gains = np.where(np.arange(len(owner.gains)) >= len(OWNER.gains), -3.0, 0.0) * owner.std[6:]  # pulls of parameters
+    belief = Belief(owner.median[:6], gains, np.diag(std**2))
+    state = State(at=0.0, starts=1, belief=stored_belief(belief, 0.0, owner), totals={})
+    assert np.array_equal(belief_of(loaded(dumped(state, owner), owner).belief, owner).gains, gains)
+    other = Belief(belief.soil + np.eye(6)[0], belief.gains, belief.covariance)
+    with pytest.raises(StateError, match="physical"):
+        stored_belief(other, 0.0, owner)
+
+
 def test_a_belief_that_could_not_be_read_back_is_not_stored():
     belief = belief_with(2)
     for spoilt in (
