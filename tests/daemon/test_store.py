@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 import json
+import math
+import operator
 import os
 import re
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -85,8 +89,7 @@ JSON = st.recursive(
     st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
     lambda x: st.lists(x) | st.dictionaries(st.text(max_size=5), x),
     max_leaves=8,
-)  # fmt: skip
-KEYS = ["at", "starts", "belief", "totals"]
+)
 
 
 @settings(deadline=None, derandomize=True, max_examples=50)
@@ -96,14 +99,32 @@ def test_no_bytes_are_a_traceback(content):
         loaded(content, OWNER)
 
 
-@settings(deadline=None, derandomize=True, max_examples=50)
-@given(st.sampled_from(KEYS), JSON)
-def test_nothing_that_is_sealed_well_is_a_traceback(key, value):
+def places(value, path=()):
+    """The way to everything in a JSON value."""
+    yield path
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, member in items:
+        yield from places(member, (*path, key))
+
+
+PLACES = list(places(json.loads(CONTENT)["state"]))[1:]
+STRANGE = [None, True, 0, -1, 1e308, -1e308, 5e-324, -0.0, math.nan, math.inf, 2**63, 10**400, "", "1", [], {}, [[]]]
+
+
+@pytest.mark.filterwarnings("error")
+@settings(deadline=None, derandomize=True, max_examples=200)
+@given(st.lists(st.tuples(st.sampled_from(PLACES), st.sampled_from(STRANGE) | JSON), min_size=1, max_size=3))
+def test_nothing_that_is_sealed_well_is_a_traceback(edits):
+    def edit(state):
+        for (*way, last), value in edits:
+            with suppress(KeyError, IndexError, TypeError):  # another edit has taken it away
+                functools.reduce(operator.getitem, way, state)[last] = value
+
     try:
-        state = loaded(sealed(lambda s: s.update({key: value})), OWNER)
+        state = loaded(sealed(edit), OWNER)
     except StateError:
         return
-    dumped(state, OWNER)  # what is taken can be stored again
+    assert loaded(dumped(state, OWNER), OWNER) == state
 
 
 def _scaled(state, row, factor):
