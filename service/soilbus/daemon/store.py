@@ -16,7 +16,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from cantools.database.can import Database
@@ -73,8 +73,8 @@ class State(_Model):
 class _File(_Model):
     """The envelope; `checksum` is the SHA-256 of the state's canonical JSON."""
 
-    format: Literal["soilbus state"]
-    version: Literal[1]
+    format: str
+    version: int
     key: str
     checksum: str
     state: dict[str, Any]
