@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 import json
+import math
+import operator
 import os
 import re
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -85,8 +89,7 @@ JSON = st.recursive(
     st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
     lambda x: st.lists(x) | st.dictionaries(st.text(max_size=5), x),
     max_leaves=8,
-)  # fmt: skip
-KEYS = ["at", "starts", "belief", "totals"]
+)
 
 
 @settings(deadline=None, derandomize=True, max_examples=50)
@@ -96,14 +99,32 @@ def test_no_bytes_are_a_traceback(content):
         loaded(content, OWNER)
 
 
-@settings(deadline=None, derandomize=True, max_examples=50)
-@given(st.sampled_from(KEYS), JSON)
-def test_nothing_that_is_sealed_well_is_a_traceback(key, value):
+def places(value, path=()):
+    """The way to everything in a JSON value."""
+    yield path
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, member in items:
+        yield from places(member, (*path, key))
+
+
+PLACES = list(places(json.loads(CONTENT)["state"]))[1:]
+STRANGE = [None, True, 0, -1, 1e308, -1e308, 5e-324, -0.0, math.nan, math.inf, 2**63, 10**400, "", "1", [], {}, [[]]]
+
+
+@pytest.mark.filterwarnings("error")
+@settings(deadline=None, derandomize=True, max_examples=200)
+@given(st.lists(st.tuples(st.sampled_from(PLACES), st.sampled_from(STRANGE) | JSON), min_size=1, max_size=3))
+def test_nothing_that_is_sealed_well_is_a_traceback(edits):
+    def edit(state):
+        for (*way, last), value in edits:
+            with suppress(KeyError, IndexError, TypeError):  # another edit has taken it away
+                functools.reduce(operator.getitem, way, state)[last] = value
+
     try:
-        state = loaded(sealed(lambda s: s.update({key: value})), OWNER)
+        state = loaded(sealed(edit), OWNER)
     except StateError:
         return
-    dumped(state, OWNER)  # what is taken can be stored again
+    assert loaded(dumped(state, OWNER), OWNER) == state
 
 
 def _scaled(state, row, factor):
@@ -160,6 +181,22 @@ def test_each_fault_is_told_in_one_line(content, why):
     with pytest.raises(StateError, match=re.escape(why)) as caught:
         loaded(content, OWNER)
     assert "\n" not in str(caught.value)
+
+
+def test_what_is_held_and_what_effects_have_is_stored_too():
+    effect = 'model.effects=[{name="slip_sinkage", softening={value=0.3, std=0.1}}]'
+    owner = owner_of([effect, "soil.k_c.value=0.0", "soil.k_c.std=0.0"])
+    held = owner.std == 0.0
+    assert np.flatnonzero(held)[0] == 0
+    assert len(owner.gains) > len(OWNER.gains)
+    std = np.where(held, 0.0, 0.1 * owner.std)
+    gains = np.where(np.arange(len(owner.gains)) >= len(OWNER.gains), -3.0, 0.0) * owner.std[6:]  # pulls of parameters
+    belief = Belief(owner.median[:6], gains, np.diag(std**2))
+    state = State(at=0.0, starts=1, belief=stored_belief(belief, 0.0, owner), totals={})
+    assert np.array_equal(belief_of(loaded(dumped(state, owner), owner).belief, owner).gains, gains)
+    other = Belief(belief.soil + np.eye(6)[0], belief.gains, belief.covariance)
+    with pytest.raises(StateError, match="physical"):
+        stored_belief(other, 0.0, owner)
 
 
 def test_a_belief_that_could_not_be_read_back_is_not_stored():

@@ -8,7 +8,9 @@ out=$1
 
 systemctl start $unit || { note failed; journalctl --no-pager -n 50; exit 1; }
 note started
-cat "/proc/$(systemctl show -P MainPID $unit)/status" >"$out/process"
+process=/proc/$(systemctl show -P MainPID $unit)
+cat "$process/status" >"$out/process"
+cat "$process/mountinfo" >"$out/mounts"
 ip -details link show vcan1 >"$out/link"
 candump -L -r 4194304 vcan1 >"$out/bus.log" &
 candump=$!

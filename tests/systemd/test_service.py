@@ -53,6 +53,17 @@ def test_the_running_process_is_confined(out: Path) -> None:
 
 
 @pytest.mark.systemd
+def test_the_running_process_can_write_its_state_and_nothing_that_stays(out: Path) -> None:
+    mounts = [line.split() for line in (out / "mounts").read_text().splitlines()]
+    writable = {fields[4] for fields in mounts if "rw" in fields[5].split(",")}
+    passing = ("proc", "tmpfs", "devpts", "mqueue", "hostfs")  # hostfs is the guest's own, see guest-init
+    kernels = {fields[4] for fields in mounts if fields[fields.index("-") + 1] in passing}
+    assert "/var/lib/soilbus/vcan1" in writable
+    private = {"/tmp", "/var/tmp"}  # gone with the service
+    assert writable - kernels <= {"/var/lib/soilbus/vcan1", *private}
+
+
+@pytest.mark.systemd
 @pytest.mark.parametrize(
     ("when", "states"), [("started", STATES - {"fault", "valid"}), ("playing", {"estimating", "valid", "degraded"})]
 )

@@ -16,7 +16,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from cantools.database.can import Database
@@ -73,8 +73,8 @@ class State(_Model):
 class _File(_Model):
     """The envelope; `checksum` is the SHA-256 of the state's canonical JSON."""
 
-    format: Literal["soilbus state"]
-    version: Literal[1]
+    format: str
+    version: int
     key: str
     checksum: str
     state: dict[str, Any]
@@ -129,20 +129,27 @@ def belief_of(stored: StoredBelief, owner: Owner) -> Belief:
 
 
 def _check(belief: Belief, owner: Owner) -> None:
-    """Raises StateError unless the belief is finite, physical, and its covariance symmetric and positive definite."""
-    held, covariance = owner.std == 0.0, belief.covariance
-    if not all(np.isfinite(part).all() for part in (belief.soil, belief.gains, covariance)):
+    """Raises StateError unless the belief is finite, physical, and has a proper covariance."""
+    if not all(np.isfinite(part).all() for part in (belief.soil, belief.gains, belief.covariance)):
         raise StateError("the belief is not finite")
-    with np.errstate(all="ignore"):
-        soil = np.where(held[: len(PARAMETERS)] & (belief.soil == 0.0), 0.0, np.log(belief.soil))
-        median = np.where(owner.median[: len(PARAMETERS)] > 0.0, np.log(owner.median[: len(PARAMETERS)]), 0.0)
-        off = np.abs(np.concatenate([soil - median, belief.gains]))
-    if not (off <= FAR * owner.std + 1e-9).all() or belief.soil[_PHI] > MAX_PHI or (belief.gains <= -1.0).any():
+    n_soil = len(PARAMETERS)
+    free, median = owner.std[:n_soil] > 0.0, owner.median[:n_soil]
+    physical = (belief.soil[free] > 0.0).all() and belief.soil[_PHI] <= max(MAX_PHI, median[_PHI])
+    if physical:
+        off = np.concatenate([np.log(belief.soil[free]) - np.log(median[free]), belief.gains])
+        std = np.concatenate([owner.std[:n_soil][free], owner.std[n_soil:]])
+        physical = (np.abs(off) <= FAR * std).all() and np.allclose(belief.soil[~free], median[~free])
+    if not physical:
         raise StateError("the belief is out of physical bounds")
-    variance = np.diag(covariance)
+    _check_covariance(belief.covariance, owner.std)
+
+
+def _check_covariance(covariance: Array, std: Array) -> None:
+    """Raises StateError unless it (N, N) is symmetric and positive definite, and zero for what is held (std (N,) 0)."""
+    held, variance = std == 0.0, np.diag(covariance)
     if covariance[held].any() or covariance[:, held].any() or not (variance[~held] > 0.0).all():
         raise StateError("the belief's covariance is not positive definite")
-    if (variance > (FAR * owner.std) ** 2).any():
+    if (variance > (FAR * std) ** 2).any():
         raise StateError("the belief's covariance is out of bounds")
     scale = np.sqrt(variance[~held])
     with np.errstate(over="ignore"):

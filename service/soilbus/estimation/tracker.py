@@ -273,6 +273,9 @@ class Tracker:
             return belief.of_another_soil(self._here).drifted(np.zeros((_SOIL, _SOIL)), gains)
         return belief.drifted(self._drift(belief, elapsed), gains)
 
+    def _ended(self, t: float) -> list[int]:
+        return [i for i, (end, _) in enumerate(self._beliefs) if end <= t + _SAME_TIME]
+
     def _known_at_first(self, problem: WindowProblem) -> Belief:
         """Before any window: the prior, and the gains of another run unless the data speak against them."""
         if self._recalled is not None:
@@ -281,9 +284,6 @@ class Tracker:
                 return known
             self._recalled = None
         return Belief.of(self._here, problem.gain_std)
-
-    def _ended(self, t: float) -> list[int]:
-        return [i for i, (end, _) in enumerate(self._beliefs) if end <= t + _SAME_TIME]
 
     def _forget_before(self, start: float) -> None:
         """Only the newest of the beliefs that windows from `start` [s] on may build on is kept, and what follows it."""
