@@ -28,7 +28,7 @@ BABBLE = 2.0
 
 
 class Bus:
-    """Plays a recording, over and over, on whatever CHANNEL is; writes everything down."""
+    """Plays a recording, over and over, on whatever CHANNEL is; writes down what comes under our identifiers."""
 
     def __init__(self, recording: str, out: Path) -> None:
         self.frames = [parsed(line) for line in Path(recording).read_text().splitlines()]
@@ -40,6 +40,8 @@ class Bus:
         self._ear = socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         self._ear.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
         self._ear.setsockopt(socket.SOL_SOCKET, 35, 1)  # SO_TIMESTAMPNS
+        ours = struct.pack("=II", EXTENDED | 0x18FF009A, EXTENDED | 0x1FFF00FF)
+        self._ear.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, ours)
         self._ear.bind(("",))  # every interface, also those to come
         for work in (self._listen, self._play):
             threading.Thread(target=work, daemon=True).start()
@@ -143,7 +145,10 @@ def steps(bus: Bus, service: "subprocess.Popen[bytes]") -> None:
     time.sleep(1.5)
     comes()
     bus.mark("comes")
-    time.sleep(7.0)  # a window, and a verdict that lasts
+    bus.until("valid", 30.0)  # a window, and a verdict that lasts
+    time.sleep(1.0)
+    full(bus)
+    bus.until("valid", 30.0)
     ip("set", CHANNEL, "down")
     bus.mark("down")
     time.sleep(0.7)
@@ -158,7 +163,6 @@ def steps(bus: Bus, service: "subprocess.Popen[bytes]") -> None:
     ip("set", CHANNEL, "up")
     bus.mark("created")
     time.sleep(2.3)
-    full(bus)
     for step, error_class, controller, said in (
         ("passive", 0x004, 0x20, "1 error frames"), ("off", 0x040, 0, "2 error frames"),
         ("restarted", 0x100, 0, "3 error frames"),
@@ -174,6 +178,7 @@ def steps(bus: Bus, service: "subprocess.Popen[bytes]") -> None:
     bus.mark("foreign")
     bus.send(EXTENDED | 0x18FF649A, bytes.fromhex("3328FF0404075F5D"))  # dbc/README.md's example: go
     bus.until("foreign_sender")
+    time.sleep(0.5)
     bus.mark("end")
 
 
@@ -183,13 +188,14 @@ def full(bus: Bus) -> None:
     subprocess.run([*tc, "add", "dev", CHANNEL, "root", "pfifo", "limit", "0"], check=True)
     bus.mark("full")
     time.sleep(0.8)
-    bus.mark("room")
     subprocess.run([*tc, "del", "dev", CHANNEL, "root"], check=True)
-    time.sleep(1.3)
+    bus.mark("room")
+    time.sleep(1.5)
 
 
 def overrun(bus: Bus, service: "subprocess.Popen[bytes]") -> None:
     """More frames of an input than the receive buffer holds, while nobody reads."""
+    time.sleep(1.3)  # what came before is counted
     burst = BEYOND + 2 * min(int(Path("/proc/sys/net/core/rmem_max").read_text()), 4 << 20) // 768
     bus.mark("overrun")
     service.send_signal(signal.SIGSTOP)
@@ -209,13 +215,14 @@ def overrun(bus: Bus, service: "subprocess.Popen[bytes]") -> None:
 def babble(bus: Bus) -> None:
     """Somebody who sends the highest priority and one of our inputs all the time, beside the traffic."""
     bus.playing.set()
-    time.sleep(0.5)
+    bus.mark("calm")
+    time.sleep(BABBLE)
     bus.mark("babble")
     data = bus.frames[0][2]
     with can.Bus(interface="socketcan", channel=CHANNEL) as kernel:  # by the kernel's timers
         mapped = can.Message(arbitration_id=bus.frames[0][1] & 0x1FFFFFFF, is_extended_id=True, data=data)
         other = can.Message(arbitration_id=0, is_extended_id=False, data=data)
-        tasks = [kernel.send_periodic(mapped, 0.001)] + [kernel.send_periodic(other, 0.001) for _ in range(4)]
+        tasks = [kernel.send_periodic(message, 0.01) for message in [mapped] * 10 + [other] * 40]
         time.sleep(BABBLE)
         for task in tasks:
             task.stop()

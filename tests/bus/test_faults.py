@@ -43,6 +43,11 @@ def run(vcan_run, tool, field_recording, tmp_path_factory: pytest.TempPathFactor
         (out / "played.log").write_text("".join(itertools.islice(lines, RECORDED)))
     done = vcan_run([sys.executable, FAULTS, CONFIG, out / "played.log", out], rw=[out], timeout=120.0)
     assert done.returncode == 0, done.stdout  # the service's: it lived through all of it
+    return read(out)
+
+
+def read(out: Path) -> Run:
+    """What faults.py left."""
     names = {m.frame_id: m for m in cantools.database.load_file(REPO / "dbc/soilbus.dbc").messages}
     frames = defaultdict(list)
     for line in (out / "bus.log").read_text().splitlines():
@@ -59,16 +64,15 @@ def run(vcan_run, tool, field_recording, tmp_path_factory: pytest.TempPathFactor
 
 @pytest.mark.vcan
 def test_a_missing_interface_is_waited_for_and_found(run: Run) -> None:
-    waiting = {text.split(";")[0] for t, text in run.status if run.at["missing"] + 0.5 < t < run.at["comes"]}
+    waiting = {text.split(",")[0] for t, text in run.status if run.at["missing"] + 0.5 < t < run.at["comes"]}
     assert waiting == {"waiting: bus_down"}
     assert run.frames["Traversability"][0]["at"] - run.at["comes"] < RETURN
 
 
 @pytest.mark.vcan
-@pytest.mark.parametrize(("gone", "back", "end"), [("down", "up", "removed"), ("removed", "created", "full")])
+@pytest.mark.parametrize(("gone", "back", "end"), [("down", "up", "removed"), ("removed", "created", "passive")])
 def test_after_an_outage_the_first_frames_say_what_holds_now(run: Run, gone: str, back: str, end: str) -> None:
-    before = [str(f["State"]) for f in run.within("Traversability", "comes", "down")][-5:]
-    assert not set(before) & {"unknown"}  # there was a verdict to be stale
+    assert str(run.within("Traversability", "comes", "down")[-1]["State"]) != "unknown"  # that could be stale
     assert run.within("Traversability", gone, back) == []
     verdicts = run.within("Traversability", back, end)
     assert verdicts[0]["at"] - run.at[back] < RETURN
@@ -82,16 +86,15 @@ def test_after_an_outage_the_first_frames_say_what_holds_now(run: Run, gone: str
 
 @pytest.mark.vcan
 def test_without_room_only_the_newest_frame_is_kept_and_the_others_are_counted(run: Run) -> None:
-    assert run.within("Traversability", "full", "room") == []
-    sent = run.within("Traversability", "room", "passive")
-    assert sent[0]["at"] - run.at["room"] < 0.5  # tc takes its time
-    counters = [f["Counter"] for f in run.frames["Traversability"] if f["at"] < sent[0]["at"]]
-    gap = sent[0]["at"] - max(f["at"] for f in run.frames["Traversability"] if f["at"] < run.at["room"])
-    lost = (sent[0]["Counter"] - counters[-1] - 1) % 16
-    assert lost == pytest.approx(gap / 0.1 - 1.0, abs=2.0)
-    assert gap < 1.6  # else the counter has gone round
+    assert run.within("Traversability", "full", "room")[5:] == []  # tc itself takes its time
+    assert run.within("Traversability", "room", "down")[0]["at"] - run.at["room"] < 0.5
+    health = run.within("BusHealth", "comes", "down")
+    lost = 0
+    for name in run.frames:
+        frames = [f for f in run.frames[name] if health[0]["at"] <= f["at"] <= health[-1]["at"]]
+        lost += sum((b["Counter"] - a["Counter"] - 1) % 16 for a, b in itertools.pairwise(frames))
+    assert health[-1]["Dropped"] - health[0]["Dropped"] == lost > 10
     assert any("send queue full" in line for line in run.journal)
-    assert all((b["Counter"] - a["Counter"]) % 16 == 1 for a, b in itertools.pairwise(sent))
 
 
 @pytest.mark.vcan
@@ -108,11 +111,11 @@ def test_error_frames_and_bus_off_are_reported(run: Run) -> None:
 @pytest.mark.vcan
 def test_overruns_are_counted_by_the_kernel_to_the_frame(run: Run) -> None:
     before = run.within("BusHealth", "restarted", "overrun")[-1]
-    after = run.within("BusHealth", "read", "babble")[-1]
+    after = run.within("BusHealth", "read", "calm")[-1]
     (lost,) = {
         int(m[1])
         for t, text in run.status
-        if run.at["read"] + 1.2 < t < run.at["babble"] and (m := re.search(r"(\d+) received frames lost", text))
+        if run.at["read"] + 1.2 < t < run.at["calm"] and (m := re.search(r"(\d+) received frames lost", text))
     }
     lost -= before["Overruns"]  # none, unless the machine itself stood still
     assert lost > 0
@@ -122,10 +125,9 @@ def test_overruns_are_counted_by_the_kernel_to_the_frame(run: Run) -> None:
 
 @pytest.mark.vcan
 def test_a_babbling_node_does_not_stop_the_beat(run: Run) -> None:
-    sent = run.within("Traversability", "babble", "quiet")
-    span = run.at["quiet"] - run.at["babble"]
-    assert len(sent) >= 0.8 * span / 0.1
-    assert max(b["at"] - a["at"] for a, b in itertools.pairwise(sent)) < 0.3
+    """As many beats as without it, on whatever machine: 4000 frames/s beside the traffic and 1000 of our input."""
+    calm, loud = run.within("Traversability", "calm", "babble"), run.within("Traversability", "babble", "quiet")
+    assert len(loud) / (run.at["quiet"] - run.at["babble"]) > 0.7 * len(calm) / (run.at["babble"] - run.at["calm"])
 
 
 @pytest.mark.vcan
@@ -133,7 +135,8 @@ def test_a_second_sender_under_our_identifiers_is_told_of(run: Run) -> None:
     status = run.within("SoilbusStatus", "foreign", "end")
     assert (str(status[-1]["State"]), str(status[-1]["Reason"])) == ("degraded", "foreign_sender")
     assert run.within("BusHealth", "foreign", "end")[-1]["ForeignFrames"] == 1
-    assert {str(f["State"]) for f in run.within("Traversability", "foreign", "end")} == {"unknown"}
+    told = next(f["at"] for f in status if str(f["Reason"]) == "foreign_sender")
+    assert {str(f["State"]) for f in run.within("Traversability", "foreign", "end") if f["at"] > told} == {"unknown"}
     assert sum("another node sends our frame 18FF649A" in line for line in run.journal) == 1
 
 

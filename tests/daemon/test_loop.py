@@ -345,3 +345,22 @@ def test_the_output_dbc_decides_the_identifiers(recording, tmp_path):
     bench.run(1.0)
     assert 0x18FF909A in {m.arbitration_id for _, m in bench.wire.sent}
     assert ours not in {m.arbitration_id for _, m in bench.wire.sent}
+
+
+def test_a_window_that_ended_before_the_bus_came_back_says_nothing_of_the_present(recording):
+    begin = recording[0].timestamp
+    bench = Bench([m for m in recording if not 12.9 <= m.timestamp - begin < 13.25])
+    start = bench.clock.now
+    bench.run(12.85)
+    gone = bench.clock.now
+    assert str(bench.sent("Traversability")[-1]["State"]) == "go"
+    bench.away = True
+    bench.wire.fail_receive.append(can.CanOperationError("Network is down", errno.ENETDOWN))
+    bench.run(start + 13.2 - gone)  # a window ends meanwhile, and hardly a half second of it is missing
+    bench.away = False
+    bench.run(start + 13.95 - bench.clock.now)
+    assert bench.bus.is_open
+    assert 3 in [result.index for result in bench.results]
+    since = [str(f["State"]) for f in bench.sent("Traversability", since=gone + 0.01)]
+    assert len(since) >= 4
+    assert set(since) == {"unknown"}

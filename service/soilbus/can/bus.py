@@ -184,7 +184,7 @@ class LiveBus:
             self._sleep(min(timeout, max(self._next_try - self._clock(), 0.0)))
             return None
         if self._outbox:
-            self._flush()
+            self._flush(self._clock())
             timeout = min(timeout, RETRY)
         if self._wire is None:
             return None
@@ -229,12 +229,13 @@ class LiveBus:
         if self._wire is None:
             self._refused_while_away += 1
             return False
-        self._outbox.put(frame, self._clock())
-        return self._flush()
+        now = self._clock()
+        self._outbox.put(frame, now)
+        return self._flush(now)
 
-    def _flush(self) -> bool:
-        """Send what waits, as far as there is room."""
-        while self._wire is not None and (frame := self._outbox.first(self._clock())) is not None:
+    def _flush(self, now: float) -> bool:
+        """Send what waits and is not late at `now`, as far as there is room; whether all of it is out."""
+        while self._wire is not None and (frame := self._outbox.first(now)) is not None:
             try:
                 self._wire.send(frame)
             except (can.CanError, OSError) as error:

@@ -50,11 +50,11 @@ LONGEST_CURVE = 60.0
 FOREIGN_HOLD = 3.0
 """Seconds for which another sender under our identifiers is told of: until every reader has seen it."""
 INTERRUPTIONS = frozenset(("bus_down", "no_frames", "input_missing", "input_stale", "foreign_sender"))
-"""Reasons, beside a bus-off and a fault, for which no window handed out before is believed any more."""
+"""Reasons, beside a bus-off and a fault, for which no window that ended before is believed any more."""
 
 
 class Pending(NamedTuple):
-    """A window that the worker has, handed out at a monotonic time [s] in an epoch of the intake."""
+    """A window that the worker has, ended at a monotonic time [s] in an epoch of the intake."""
 
     future: Future[WindowResult]
     at: float
@@ -103,7 +103,7 @@ class Service:
         self._stopping = False
         self._started = clock()
         self._solved_at = self._started
-        self._handed_out = -math.inf  # monotonic time of the present result's window
+        self._ended = -math.inf  # monotonic time of the end of the present result's window
         self._interrupted = self._started  # monotonic time at which inputs failed last
         self._epoch = self.intake.epoch
         self._last_frame = -1e9  # monotonic arrival time
@@ -176,7 +176,8 @@ class Service:
         for task in self.intake.due(max(self._last_stamp, self.bus_time(now) - GRACE)):
             if not self._pending:
                 self._solved_at = now
-            self._pending.append(Pending(self._workers.submit(self._solver.solve, task), now, self.intake.epoch))
+            ended = now - max(0.0, self.bus_time(now) - task.end)
+            self._pending.append(Pending(self._workers.submit(self._solver.solve, task), ended, self.intake.epoch))
             while len(self._pending) > MAX_PENDING and self._pending[1].future.cancel():
                 del self._pending[1]
                 self.deadline_misses += 1
@@ -197,14 +198,14 @@ class Service:
             if self.on_window is not None:
                 self.on_window(result)
 
-    def _take(self, result: WindowResult, handed_out: float) -> None:
+    def _take(self, result: WindowResult, ended: float) -> None:
         if result.gaps and not (self.result is not None and self.result.gaps):
             told = ", ".join(f"{channel} {chi2:.2f}" for channel, chi2 in result.gaps.items())
             log.warning(
                 "model_gap: for minutes the model has not described %s (chi-square; 1 is noise); "
                 "record a drive with candump -l and run: soilbus diagnose --config F LOG", told,
             )  # fmt: skip
-        self.result, self._handed_out = result, handed_out
+        self.result, self._ended = result, ended
         able = result.traversability.capability
         if able is not None and result.status is Status.VALID:
             self._curve = able.over_slip, result.t
@@ -278,7 +279,7 @@ class Service:
         """
         if self.result is None or _interrupts(self._present_state(now)) or self._fault or self._solver.in_fault:
             return Way.UNKNOWN
-        if self._handed_out <= self._interrupted or not self._age(now) <= self.config.traversability.max_age:  # nor nan
+        if self._ended <= self._interrupted or not self._age(now) <= self.config.traversability.max_age:  # nor nan
             return Way.UNKNOWN
         return self.result.traversability.state
 
@@ -292,7 +293,7 @@ class Service:
         if self.result is None:
             return math.inf
         by_stamps = self.bus_time(now) - self.result.t
-        return by_stamps if math.isnan(by_stamps) else max(by_stamps, now - self._handed_out)
+        return by_stamps if math.isnan(by_stamps) else max(by_stamps, now - self._ended)
 
     def _since_valid(self, now: float) -> float | None:
         """Time [s] since the last valid posterior; None where there was none in this epoch."""
@@ -372,7 +373,7 @@ class Service:
         if self.failures:
             text += ", failed solves: " + ", ".join(f"{kind} {n}" for kind, n in self.failures.most_common())
         if health := health_text(self.bus.state, self.bus.counts):
-            text += f"; bus: {health}"
+            text += f", bus: {health}"
         self.notifier.status(text)
 
 
