@@ -12,12 +12,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.window import Rig, SensorNoise, Window, pull_given, turning
+from soilbus.estimation.window import (
+    VEHICLE_QUANTITIES,
+    WHEEL_QUANTITIES,
+    Rig,
+    SensorNoise,
+    Window,
+    pull_given,
+    turning,
+)
 from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads, slip_ratio
 
 Array = NDArray[np.float64]
@@ -27,6 +35,8 @@ SUSTAINED = 1.0
 """Seconds for which a contradiction must last."""
 DEVIATIONS = 5.0
 """Standard deviations by which a change must stand out of the noise to count as one."""
+SAME = 1e-12
+"""Relative difference of means of equal readings: rounding."""
 CHANCE = 1e-12
 """Chance, by the noise that the sensor is said to have, below which a run of equal readings is a frozen sensor."""
 STILL_SHARE = 0.1
@@ -53,9 +63,11 @@ LAG = 1.0
 """Seconds over which changes are compared."""
 OPPOSITE = 0.85
 """Share of significant changes that go the wrong way."""
-LEAST_OPPOSITE = 2.0
-"""Seconds of significant changes that there must be."""
 CORRELATION = -0.9
+"""Their correlation, at most."""
+LEAST_SLOWING, LEAST_PULLING = 2.0, 4.0
+"""Seconds of significant changes, one after the other, that there must be of speed and of pull: at the border of a
+soft soil a driver who lifts the implement may pull less and drive more for a moment."""
 LEAST_FORCE, LEAST_SPEED = 0.01, 0.05
 """Changes of force, as a share of the weight, and of speed [m/s] below which none is significant."""
 
@@ -125,7 +137,8 @@ def without(window: Window, rig: Rig, channels: set[str]) -> Window:
         quantity, _, wheel = name.partition(".")
         values.setdefault(quantity, getattr(window, quantity).copy())
         values[quantity][..., rig.wheels.index(wheel) if wheel else slice(None)] = np.nan
-    return replace(window, **values) if values else window
+    changed: dict[str, Any] = values
+    return replace(window, **changed) if changed else window
 
 
 def scene_of(
@@ -149,19 +162,19 @@ def scene_of(
 def frozen(scene: Scene) -> Iterator[str]:
     """Channels that read the very same for longer than their noise allows, while the vehicle drives."""
     window, rig = scene.window, scene.rig
-    for name in rig.channels:
-        quantity, _, wheel = name.partition(".")
-        place = (slice(None), rig.wheels.index(wheel)) if wheel else (slice(None),)
-        value, variance = getattr(window, quantity)[place], window.variance[quantity][place]
-        resolution, noise = scene.resolution.get(name, Resolution(0.0, False)), rig.noise[quantity]
-        with np.errstate(invalid="ignore"):
-            same = np.abs(np.diff(value)) <= 1e-6 * resolution.step + 1e-12 * np.abs(value[1:])
-        for first, last in runs(same & scene.driving[1:]):
-            if last - first >= scene.sustained and _stuck(
-                float(value[last]), variance[first : last + 1], noise, resolution
-            ):
-                yield name
-                break
+    value, variance = (
+        np.column_stack([of[q] for q in (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)])
+        for of in ({q: getattr(window, q) for q in window.variance}, window.variance)
+    )
+    with np.errstate(invalid="ignore"):
+        same = np.abs(np.diff(value, axis=0)) <= SAME * np.abs(value[1:])
+    same &= scene.driving[1:, None]
+    for i in np.flatnonzero(same.sum(axis=0) >= scene.sustained).tolist():
+        name = rig.channels[i]
+        noise, resolution = rig.noise[name.partition(".")[0]], scene.resolution.get(name, Resolution(0.0, False))
+        stretches = ((first, last + 1) for first, last in runs(same[:, i]) if last - first >= scene.sustained)
+        if any(_stuck(float(value[first, i]), variance[first:end, i], noise, resolution) for first, end in stretches):
+            yield name
 
 
 def _stuck(value: float, variance: Array, noise: SensorNoise, resolution: Resolution) -> bool:
@@ -186,7 +199,7 @@ def not_turning(scene: Scene) -> Iterator[str]:
         still = scene.driving[:, None] & (rig.radius * window.speed < STILL_SHARE * ground)
         braked = scene.traction < -BRAKED
         idle = np.abs(scene.traction) < NO_TRACTION
-    if lasts((still & idle).all(axis=1), scene.sustained):
+    if lasts(np.logical_and.reduce(still & idle, axis=1), scene.sustained):
         yield "ground_speed"
         return
     for i, wheel in enumerate(rig.wheels):
@@ -244,7 +257,8 @@ def _axle_excess(window: Window, rig: Rig, chassis: Chassis) -> Array:
     """By how much [N] the loads on front and rear axle exceed those of mass, draft, slope and inertia, (N, 2)."""
     draft, pitch, acceleration = (np.nan_to_num(a) for a in (window.draft, window.pitch, window.acceleration))
     due = np.stack(axle_loads(chassis, draft, pitch, acceleration), axis=1)
-    return np.stack([window.load[:, rig.front].sum(axis=1), window.load[:, ~rig.front].sum(axis=1)], axis=1) - due
+    told = np.stack([window.load[:, rig.front].sum(axis=1), window.load[:, ~rig.front].sum(axis=1)], axis=1)
+    return np.asarray(told - due)
 
 
 def traction(scene: Scene) -> Iterator[str]:
@@ -258,7 +272,7 @@ def traction(scene: Scene) -> Iterator[str]:
     if 2 * len(drags) > len(rig.wheels):
         yield "ground_speed"
         return
-    if len(idles) == len(rig.wheels) > 1 and not _pulls(scene, idle.all(axis=1)):
+    if len(idles) == len(rig.wheels) > 1 and not _pulls(scene, np.logical_and.reduce(idle, axis=1)):
         yield "ground_speed"
         return
     yield from (f"torque.{rig.wheels[i]}" for i in idles)
@@ -286,37 +300,58 @@ def accelerated(scene: Scene) -> Iterator[str]:
     told = scene.bin * _moving_sum(window.acceleration, lag)
     noise = np.sqrt(_change_variance(window.variance["ground_speed"], lag) / 3.0)
     told_noise = scene.bin * np.sqrt(_moving_sum(window.variance["acceleration"], lag))
-    if _opposite(scene, gained, noise, LEAST_SPEED, told, told_noise, LEAST_SPEED):
+    if _opposite(scene, gained, noise, LEAST_SPEED, told, told_noise, LEAST_SPEED, LEAST_SLOWING):
         yield "acceleration"
 
 
 def pulling(scene: Scene) -> Iterator[str]:
-    """The draft, where the vehicle pulls less whenever its wheels drive more."""
-    window, rig = scene.window, scene.rig
-    if rig.chassis is None:
+    """The draft, where the vehicle pulls less whenever its wheels drive more; told only with slope and inertia."""
+    window, rig, chassis = scene.window, scene.rig, scene.rig.chassis
+    if chassis is None:
         return
-    lag, least = max(round(LAG / scene.bin), 1), LEAST_FORCE * rig.chassis.mass * GRAVITY
+    lag, weight, variance = max(round(LAG / scene.bin), 1), chassis.mass * GRAVITY, window.variance
     driven = _change((window.torque / rig.radius).sum(axis=1), lag)
-    noise = np.sqrt(_change_variance((window.variance["torque"] / rig.radius**2).sum(axis=1), lag))
-    pull = _change(window.draft, lag)
-    pull_noise = np.sqrt(_change_variance(window.variance["draft"], lag))
-    if _opposite(scene, driven, noise, least, pull, pull_noise, least):
+    noise = np.sqrt(_change_variance((variance["torque"] / rig.radius**2).sum(axis=1), lag))
+    known = np.isfinite(window.pitch) & np.isfinite(window.acceleration)
+    pull = _change(np.where(known, pull_given(window, chassis), np.nan), lag)
+    of_pull = variance["draft"] + weight**2 * variance["pitch"] + chassis.mass**2 * variance["acceleration"]
+    pull_noise = np.sqrt(_change_variance(of_pull, lag))
+    least = LEAST_FORCE * weight
+    if _opposite(scene, driven, noise, least, pull, pull_noise, least, LEAST_PULLING):
         yield "draft"
 
 
 def _opposite(
-    scene: Scene, one: Array, one_noise: Array, one_least: float, other: Array, other_noise: Array, other_least: float
+    scene: Scene,
+    one: Array,
+    one_noise: Array,
+    one_least: float,
+    other: Array,
+    other_noise: Array,
+    other_least: float,
+    seconds: float,
 ) -> bool:
-    """Whether the significant changes (M,) of two quantities that go together go against each other."""
+    """Whether changes (M,) of two quantities that go together go against each other for so long.
+
+    Only changes count that are significant, of both: beyond their noise and at least so great.
+    """
     with np.errstate(invalid="ignore"):
-        both = (np.abs(one) > np.maximum(DEVIATIONS * one_noise, one_least)) & (
-            np.abs(other) > np.maximum(DEVIATIONS * other_noise, other_least)
-        )
+        both = np.abs(one) > np.maximum(DEVIATIONS * one_noise, one_least)
+        both &= np.abs(other) > np.maximum(DEVIATIONS * other_noise, other_least)
     both &= scene.driving[len(scene.driving) - len(both) :]
     a, b = one[both], other[both]
-    if len(a) < LEAST_OPPOSITE / scene.bin or np.mean(a * b < 0.0) < OPPOSITE:
+    product, n = a * b, max(round(seconds / scene.bin), 1)
+    if len(a) < n:
         return False
-    return bool((a * b).sum() < CORRELATION * math.sqrt((a * a).sum() * (b * b).sum()))
+    opposite, of_both, of_one, of_other = (_running_sum(x, n) for x in (product < 0.0, product, a * a, b * b))
+    return bool(((opposite >= OPPOSITE * n) & (of_both < CORRELATION * np.sqrt(of_one * of_other))).any())
+
+
+def _running_sum(values: NDArray[Any], n: int) -> Array:
+    """Sums of each n neighbours of (N,), (N - n + 1,); none where there are fewer."""
+    if len(values) < n:
+        return np.zeros(0)
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(values, n).sum(axis=1))
 
 
 def _change(values: Array, lag: int) -> Array:
@@ -335,10 +370,7 @@ def _smooth(values: Array) -> Array:
 
 def _moving_sum(values: Array, lag: int) -> Array:
     """Sums (N - lag,) from each bin's middle to that of the one `lag` later."""
-    middles = (values[1:] + values[:-1]) / 2.0
-    if len(middles) < lag:
-        return np.zeros(0)
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(middles, lag).sum(axis=1))
+    return _running_sum((values[1:] + values[:-1]) / 2.0, lag)
 
 
 def _median(values: Array) -> float:
