@@ -16,6 +16,7 @@ class Reason(StrEnum):
     WRONG_SOURCE = "wrong_source"
     BAD_CHECKSUM = "bad_checksum"
     BAD_COUNTER = "bad_counter"
+    DUPLICATE = "duplicate"
     REMOTE_FRAME = "remote_frame"
     TIME_BACKWARDS = "time_backwards"
     NOT_AVAILABLE = "not_available"

@@ -45,6 +45,8 @@ BRAKED = 0.2
 """Braking torque over load and radius from which a wheel may be locked."""
 GEAR_SLACK = 0.03
 """Relative difference of motor and wheel speed that gear and radius of the wheel's sensor may have."""
+LEAST_TURN = 0.02
+"""Difference [rad/s] of the two that resolution and phase may make besides."""
 FALSE_SLIP = 0.12
 """Slip that a wrong rolling radius may feign: four of its standard deviations in `terra.effects`."""
 NO_TRACTION, TRACTION = 0.01, 0.15
@@ -208,20 +210,26 @@ def not_turning(scene: Scene) -> Iterator[str]:
 
 
 def geared(scene: Scene) -> Iterator[str]:
-    """Of a wheel and its motor, whose speeds do not go together, the one farther from the other wheels'."""
+    """Of a wheel and its motor, whose speeds do not go together, the one farther from the other wheels'.
+
+    Both, where this is so of most wheels: the gear ratio may be wrong, and the torques with it.
+    """
     window, rig, motor = scene.window, scene.rig, scene.motor_speed
     with np.errstate(invalid="ignore"):
         noise = np.sqrt(2.0 * window.variance["speed"])
-        apart = np.abs(motor - window.speed) > GEAR_SLACK * np.abs(window.speed) + DEVIATIONS * noise + 0.02
-    wrong = [i for i in range(len(rig.wheels)) if lasts(apart[:, i] & scene.driving, scene.sustained)]
+        apart = np.abs(motor - window.speed) > GEAR_SLACK * np.abs(window.speed) + DEVIATIONS * noise + LEAST_TURN
+    apart &= scene.driving[:, None]
+    wrong = [i for i in range(len(rig.wheels)) if lasts(apart[:, i], scene.sustained)]
     good = [i for i in range(len(rig.wheels)) if i not in wrong]
     for i in wrong:
-        where = apart[:, i] & scene.driving
-        rim = (rig.radius * window.speed)[where]
-        usual = _median(rim[:, good] if good else np.delete(rim, i, axis=1))
-        of_motor, of_wheel = (_median(rig.radius[i] * s[where, i]) for s in (motor, window.speed))
-        motor_is_odd = math.isfinite(usual) and abs(of_motor - usual) > abs(of_wheel - usual)
-        yield f"{'motor_speed' if motor_is_odd else 'speed'}.{rig.wheels[i]}"
+        if len(wrong) > len(good):
+            yield f"speed.{rig.wheels[i]}"
+            yield f"motor_speed.{rig.wheels[i]}"
+            continue
+        where = apart[:, i]
+        usual = _median((rig.radius * window.speed)[where][:, good])
+        of_motor, of_wheel = (abs(_median(rig.radius[i] * s[where, i]) - usual) for s in (motor, window.speed))
+        yield f"{'motor_speed' if of_motor > of_wheel else 'speed'}.{rig.wheels[i]}"
 
 
 def loads(scene: Scene) -> Iterator[str]:
@@ -272,9 +280,8 @@ def traction(scene: Scene) -> Iterator[str]:
     if 2 * len(drags) > len(rig.wheels):
         yield "ground_speed"
         return
-    if len(idles) == len(rig.wheels) > 1 and not _pulls(scene, np.logical_and.reduce(idle, axis=1)):
-        yield "ground_speed"
-        return
+    if len(idles) == len(rig.wheels) and not _pulls(scene, np.logical_and.reduce(idle, axis=1)):
+        yield "ground_speed"  # or the torques: coasting at a ground speed that is told too low looks the same
     yield from (f"torque.{rig.wheels[i]}" for i in idles)
     others = [i for i in range(len(rig.wheels)) if i not in {*idles, *drags}]
     for i in drags:
