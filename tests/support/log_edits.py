@@ -8,7 +8,6 @@ a message that has ours is made right again unless the edit is to break it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from copy import copy
 
 import numpy as np
 from cantools.database import Database
@@ -37,6 +36,10 @@ class Stream:
 
     def raw(self, name: str) -> NDArray[np.int64]:
         return np.asarray(ColumnDecoder(self.message, [name]).raw(self.payload)[name], np.int64)
+
+    def before(self, t: float) -> Stream:
+        """The frames before t [s]."""
+        return Stream(self.message, self.t[self.t < t], self.payload[self.t < t])
 
     def with_values(self, name: str, values: Array, where: Since) -> Stream:
         codes = value_codes(self.message.get_signal_by_name(name)).column(values)
@@ -87,6 +90,12 @@ class Log:
                 payload = np.frombuffer(b"".join(bytes(f[3]) for f in found), np.uint8)
                 self.streams[message.name] = Stream(message, t, payload.reshape(len(t), -1))
 
+    @classmethod
+    def of(cls, streams: dict[str, Stream]) -> Log:
+        new = cls.__new__(cls)
+        new.streams = streams
+        return new
+
     def frames(self) -> list[Frame]:
         """In the order of their stamps."""
         out: list[Frame] = []
@@ -100,14 +109,9 @@ class Log:
 
     def changed(self, name: str, edit: Callable[[Stream], Stream | None]) -> Log:
         """With one message's stream edited, or taken out (None)."""
-        new = copy(self)
-        new.streams = dict(self.streams)
         stream = edit(self.streams[name])
-        if stream is None:
-            del new.streams[name]
-        else:
-            new.streams[name] = stream
-        return new
+        others = {n: s for n, s in self.streams.items() if n != name}
+        return Log.of(others if stream is None else others | {name: stream})
 
 
 Edit = Callable[[Log, float], Log]
@@ -121,9 +125,7 @@ def split(path: str) -> tuple[str, str]:
 
 def cut(message: str) -> Edit:
     """Nothing follows."""
-    return lambda log, t: log.changed(
-        message, lambda s: Stream(s.message, s.t[s.t < t], s.payload[s.t < t]) if (s.t < t).any() else None
-    )
+    return lambda log, t: log.changed(message, lambda s: s.before(t) if (s.t < t).any() else None)
 
 
 def mapped(*paths: str, by: Callable[[Array], Array]) -> Edit:
