@@ -25,6 +25,8 @@ from soilbus.can.validity import REASONS, CodeRule, in_si, judge_codes, judge_va
 
 CLOCK_STEP = 1.0
 """Backward jump [s] above which the clock was set and the new time is believed."""
+LAST_TIME = 1e10
+"""Stamps [s] beyond it, either way, are no times: a clock that ticks in seconds would not move any more."""
 TWICE = 0.002
 """Seconds within which a frame that equals the one before it is that frame once more: cycles are longer."""
 MAX_LISTED_UNKNOWN = 1024
@@ -145,12 +147,14 @@ class Admission:
             inbox = self._inbox_of_group(arbitration_id, extended)
             if inbox is None:
                 return
+        if t > LAST_TIME or t < -LAST_TIME:
+            self._refuse_unheard(inbox, Reason.BAD_TIME)
+            return
         if t < self._step_below:
             self._step_clock()
         self._step_below = t - CLOCK_STEP
         if remote:
-            self.counts.received[inbox.message.name] += 1
-            self.counts.refused[inbox.message.name, Reason.REMOTE_FRAME] += 1
+            self._refuse_unheard(inbox, Reason.REMOTE_FRAME)
         else:
             inbox.frames.append((t, arbitration_id, data))
 
@@ -168,7 +172,7 @@ class Admission:
 
         Every channel has a column, perhaps empty; times do not decrease within it.  A refused
         frame counts as a refused sample of each of its channels, except frames of a source that
-        is not listened to and remote frames, which are in `counts` only.
+        is not listened to, remote frames and those without a time, which are in `counts` only.
         """
         out = Decoded()
         for inbox in self._inboxes:
@@ -273,6 +277,11 @@ class Admission:
         self.counts.refused[inbox.message.name, reason] += len(t)
         for channel in inbox.channels:
             out.refused[channel.name, reason] = t
+
+    def _refuse_unheard(self, inbox: _Inbox, reason: Reason) -> None:
+        """One frame that is not even filed."""
+        self.counts.received[inbox.message.name] += 1
+        self.counts.refused[inbox.message.name, reason] += 1
 
     def _count_wrong_source(self, inbox: _Inbox, n: int) -> None:
         if n:

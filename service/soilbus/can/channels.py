@@ -19,6 +19,7 @@ class Reason(StrEnum):
     DUPLICATE = "duplicate"
     REMOTE_FRAME = "remote_frame"
     TIME_BACKWARDS = "time_backwards"
+    BAD_TIME = "bad_time"
     NOT_AVAILABLE = "not_available"
     ERROR = "error"
     RESERVED = "reserved"

@@ -243,7 +243,8 @@ class Intake:
 
     def latest(self, now: float) -> Latest:
         """Slip and pull over the last moments before `now` [s]."""
-        if self._bins is None:
+        silent = now - max(self.last_seen.values(), default=-math.inf)
+        if self._bins is None or not silent <= LONGEST_GAP:  # nor nan; there are no bins for years of silence
             return Latest(dict.fromkeys(self.rig.wheels), None)
         last = math.floor((now - self._bins.origin) / self._settings.bin) * self._settings.bin + self._bins.origin
         window = without(self._bins.glimpse(last - SLIP_SPAN, last), self.rig, set(self._lying))
