@@ -111,6 +111,8 @@ class Wheel(_Section):
     load: Signal | None = None
     sinkage: Signal | None = None
     torque_limit: Signal | None = None
+    motor_speed: Signal | None = None
+    """Only to find out a speed sensor that lies."""
 
     @model_validator(mode="after")
     def _can_be_used(self) -> Wheel:

@@ -135,13 +135,27 @@ def test_remote_error_and_unknown_frames_are_counted_only() -> None:
 
 def test_time_may_stand_still_but_not_go_back() -> None:
     a = admission(LEFT)
-    for t in (1.0, 1.0, 0.9, 1.1, math.nan, 1.05):
-        a.feed(t, 256, False, bytes(4))
+    for i, t in enumerate((1.0, 1.0, 0.9, 1.1, math.nan, 1.05)):
+        a.feed(t, 256, False, bytes([i, 0, 0, 0]))
     out = a.take()
     assert out.columns["Left"].t.tolist() == [1.0, 1.0, 1.1]
     assert np.isnan(out.refused["Left", Reason.TIME_BACKWARDS]).sum() == 1
     a.feed(1.0, 256, False, bytes(4))  # also across batches
     assert refused(a.take()) == {("Left", "time_backwards"): [1.0]}
+
+
+def test_a_frame_that_comes_once_more_is_refused() -> None:
+    a = admission(LEFT)
+    for t, data in ((1.0, 1), (1.0004, 1), (1.0008, 2), (1.0012, 1), (1.0213, 1), (1.0214, 1)):
+        a.feed(t, 256, False, bytes([data, 0, 0, 0]))
+    out = a.take()
+    assert out.columns["Left"].t.tolist() == [1.0, 1.0008, 1.0012, 1.0213]
+    assert refused(out) == {("Left", "duplicate"): [1.0004, 1.0214]}
+    a.feed(1.0216, 256, False, bytes([1, 0, 0, 0]))  # also across batches
+    a.feed(1.0416, 256, False, bytes([1, 0, 0, 0]))
+    out = a.take()
+    assert (out.columns["Left"].t.tolist(), refused(out)) == ([1.0416], {("Left", "duplicate"): [1.0216]})
+    assert a.counts.received["Loads"] == a.counts.admitted["Loads"] + sum(a.counts.refused.values())
 
 
 def test_a_clock_set_back_starts_afresh() -> None:

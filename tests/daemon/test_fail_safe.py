@@ -1,6 +1,6 @@
 """No path to GO: arbitrary sequences of good, stale, refused and missing frames, clock steps, lost buses, restarts.
 
-A wire plays one moment of a good drive over and over, at 10 Hz, and spoils it as told.
+A wire plays the last moments of a good drive over and over, at 10 Hz, and spoils them as told.
 What it knows of its own deliveries judges every Traversability frame that the service
 sends.  The soil comes from a tracker that is always content with its fit unless it is
 told to fail: GO then hangs on the inputs alone, as often as the loop lets it.
@@ -56,15 +56,20 @@ TIMEOUT, MAX_AGE = 1.0, 2.0
 SLACK = TICK + 0.06
 """The service looks at its inputs each tick; a window is handed out somewhat after its end."""
 CLOCK_STEP = 1.0
+MOMENTS = 4
+"""Frames of each message that are repeated: a sensor that always says the same is not believed."""
 LEAD = 6.5
 """Seconds of good frames after which go is due."""
 
 
 @pytest.fixture(scope="module")
-def moment() -> dict[int, can.Message]:
-    """The last frame of each message in a good drive."""
+def moment() -> dict[int, list[can.Message]]:
+    """The last frames of each message in a good drive."""
     recording = simulate(reference_configuration(), excited("loam", 10.0), seed=3)
-    return {m.arbitration_id: m for m in frames(recording, reference_configuration())}
+    found: dict[int, list[can.Message]] = {}
+    for message in frames(recording, reference_configuration()):
+        found.setdefault(message.arbitration_id, []).append(message)
+    return {i: messages[-MOMENTS:] for i, messages in found.items()}
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +92,7 @@ class Wire:
     """A bus with a vehicle on it; deaf, spoilt and repeated name messages, blind tells the tracker to fail."""
 
     clock: FakeClock
-    moment: dict[int, can.Message]
+    moment: dict[int, list[can.Message]]
     offset: float = 1.7e9 - 1000.0
     deaf: frozenset[str] = frozenset()
     spoilt: frozenset[str] = frozenset()
@@ -120,7 +125,8 @@ class Wire:
             self.next += 1
             self.counter = cycle % 16
             self.clock.now = max(self.clock.now, due)
-            name, message = self.known[row]
+            name, messages = self.known[row]
+            message = messages[cycle % MOMENTS]
             if name not in self.deaf:
                 return self.frame(name, message)
             if self.noisy:

@@ -245,6 +245,12 @@ class WindowEstimator:
         return bool(standing.sum() > 0.5 * max(int(known.sum()), 1))
 
     def _status(self, task: WindowTask, tracked: Tracked) -> tuple[Status, str]:
+        """Status and its reason; a sensor that lies is the reason of all that may follow from it."""
+        status, reason = self._status_of_the_rest(task, tracked)
+        follows = reason.split()[0] in ("none", "input_stale", "model_mismatch", "no_convergence")
+        return status, " ".join(["implausible", *task.implausible]) if task.implausible and follows else reason
+
+    def _status_of_the_rest(self, task: WindowTask, tracked: Tracked) -> tuple[Status, str]:
         fit = tracked.fit
         if task.missing:
             return Status.INVALID, "input_missing " + " ".join(task.missing)
