@@ -21,6 +21,7 @@ from soilbus.capability.limits import (
     within,
 )
 from soilbus.capability.sigma_points import SigmaPoints
+from soilbus.capability.uncertain_model import ModelOfRows, UncertainModel
 from soilbus.capability.wheels import Axles, WheelTable, wheel_table
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.window import Rig
@@ -119,7 +120,7 @@ def slip_grid(max_slip: float) -> Array:
 def assess(
     posterior: Posterior,
     rig: Rig,
-    model: WheelModel | CompletedModel,
+    model: WheelModel | CompletedModel | UncertainModel,
     demand: Demand | None,
     torque_limit: Array,
     max_slip: float,
@@ -132,10 +133,12 @@ def assess(
     None where no steady driving within slip and sinkage limits exists.  Raises ValueError
     for a rig without a chassis.
     """
-    points, completed = SigmaPoints.of(posterior), CompletedModel.over(model)
-    table = wheel_table(points.soils, rig, completed, slip_grid(max_slip), last, TOLERANCE)
+    uncertain = UncertainModel.over(model)
+    points = SigmaPoints.of(posterior, uncertain.shifts)
+    completed = uncertain.of_rows(len(points.soils))
+    table = wheel_table(points.soils, rig, uncertain, slip_grid(max_slip), last, TOLERANCE)
     skids = np.linspace(-MAX_SKID, table.slip[0], SKID_GRID)
-    skid = cache(lambda: wheel_table(points.soils, rig, completed, skids))
+    skid = cache(lambda: wheel_table(points.soils, rig, uncertain, skids))
     level = balance(table)
     vehicle = _Vehicle(table, level, Limits.of(table.axles, torque_limit, max_sinkage, completed), skid)
     draft = vehicle.largest(Duty(), level)
@@ -227,7 +230,7 @@ def _set_points(
 
 
 def _forecast(
-    demand: Demand, present: Balance, axles: Axles, rig: Rig, model: CompletedModel, points: SigmaPoints
+    demand: Demand, present: Balance, axles: Axles, rig: Rig, model: ModelOfRows, points: SigmaPoints
 ) -> Forecast | None:
     place = place_of_pull(present, demand.pull)
     torque = (place.on(present.torque) * axles.count[:, 0]).sum(axis=1)
