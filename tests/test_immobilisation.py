@@ -121,6 +121,65 @@ def test_a_warning_stays_a_while():
     assert max(warned) == pytest.approx(max(causes) + CALM, abs=0.11)
 
 
+def test_a_new_curve_is_no_new_ground():
+    other = OverSlip(SLIP, 0.8 * pull_at(SLIP), NONE, NONE, NONE)
+    state, t = Watch(), 0.0
+    for i in range(300):
+        t, slip = 0.1 * i, 0.1 + 0.02 * math.sin(0.05 * i)
+        state = watched(state, t, [slip], pull_at(slip), (CURVE, other)[i // 10 % 2])
+        assert state.warning in (Alert.UNKNOWN, Alert.NONE)
+        assert i < 30 or abs(state.capacity.long.line().slope) < 0.01 * MOST
+
+
+def test_along_a_new_curve_the_trend_is_that_of_all_moments_along_it():
+    rng = np.random.default_rng(1)
+    other = OverSlip(SLIP, 0.8 * pull_at(SLIP), NONE, NONE, NONE)
+    states = [Watch(), Watch()]
+    for i in range(90):
+        slip, pull = rng.uniform(0.0, 0.62), rng.uniform(2000.0, 4000.0)
+        for which, curve in enumerate((other, other if i > 80 else CURVE)):
+            states[which] = watched(states[which], 0.1 * i, [slip], pull, curve)
+    one, changed = (state.capacity for state in states)
+    for name in ("long", "short", "told", "scatter"):
+        assert getattr(changed, name) == pytest.approx(getattr(one, name), rel=1e-9, abs=1e-6)
+
+
+def test_scattering_ground_must_surely_weaken():
+    rng = np.random.default_rng(2)
+    noise = np.repeat(rng.normal(0.0, 250.0, 250), 4)  # patches of half a metre
+
+    def warned(lost):
+        state, alerts = Watch(), set()
+        for i in range(1000):
+            pull = 2500.0 + noise[i]
+            state = watched(state, 0.1 * i, [slip_at(2500.0 + lost(0.1 * i))], pull, CURVE)
+            alerts.add(state.warning)
+        return Alert.IMMOBILISATION in alerts
+
+    assert not warned(lambda t: 0.0)
+    assert warned(lambda t: 100.0 * max(t - 20.0, 0.0))
+
+
+def test_slip_that_creeps_under_a_steady_draft_is_foreseen_where_pull_hardly_depends_on_it():
+    flat = OverSlip(SLIP, 3000.0 + 10.0 * SLIP, NONE, NONE, NONE)
+    state, first = Watch(), math.inf
+    for i in range(1000):
+        t, slip = 0.1 * i, 0.2 + 0.02 * max(0.1 * i - 5.0, 0.0)
+        state = watched(state, t, [slip], 3000.0 + 10.0 * slip, flat)
+        if state.warning is Alert.IMMOBILISATION:
+            first = t
+            break
+    assert 25.0 - first == pytest.approx(AHEAD, abs=1.0)  # slip passes 0.6 at 25 s
+
+
+def test_wheels_that_all_but_roll_tell_nothing_of_the_ground():
+    state = Watch()
+    for i in range(400):
+        slip = 0.05 * max(math.sin(0.1 * i), 0.0)
+        state = watched(state, 0.1 * i, [slip], pull_at(0.05) * math.sin(0.1 * i), CURVE)
+        assert state.warning is not Alert.IMMOBILISATION
+
+
 MAYBE = st.none() | st.floats(allow_nan=True, allow_infinity=True)
 
 

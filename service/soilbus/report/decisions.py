@@ -50,8 +50,8 @@ def _warning_section(warnings: Sequence[WarningFigures]) -> Iterator[str]:
     boggings = [found for found in warnings if found.boggings or found.sudden]
     head = ("boggings", "foreseeable", "in time", "median lead", "least", "too sudden")
     yield table(head, [_bogging_row(found) for found in boggings])
-    yield f"Too sudden: less than {ENOUGH_TIME:g} s and {ENOUGH_WAY:g} m, and {REACTION:g} s to react, from where the ground has"
-    yield f"lost {100.0 * FELT:.0f} % of the largest draft until slip passes.  Target: all that can be foreseen in time."
+    yield "Target: all that can be foreseen in time.  Too sudden: from where the ground has lost"
+    yield f"{100.0 * FELT:.0f} % of the largest draft, slip passes in less than that and {REACTION:g} s to react."
     yield ""
     of_firm = ("without a bogging", "hours", "false warnings")
     yield table(of_firm, [(f.kind, f"{f.hours:.2f}", str(f.false)) for f in warnings if f.hours])
