@@ -12,6 +12,7 @@ from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
 from soilbus.config import Config
 from soilbus.daemon.notify import Notifier
+from soilbus.daemon.outputs import check_cycle_times
 from soilbus.daemon.pipeline import Pipeline, WindowResult
 from soilbus.daemon.service import Service
 
@@ -25,7 +26,9 @@ def start_service(config: Config, wait: bool, on_window: Callable[[WindowResult]
     cannot be opened.
     """
     pipeline = Pipeline(config, load_databases(config))
-    publisher = Publisher(output_database(config))
+    output = output_database(config)
+    check_cycle_times(config, output)
+    publisher = Publisher(output)
     settings = config.bus.model_dump()
     filters = pipeline.admission.can_filters()
     bus = LiveBus(lambda: open_bus(settings, filters), time.monotonic, time.sleep)

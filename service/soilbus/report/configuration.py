@@ -12,6 +12,7 @@ from soilbus.can.channels import Channel
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.mapping import channels_of, without_unit
 from soilbus.config import Config, Table
+from soilbus.daemon.outputs import check_cycle_times
 from soilbus.report.table import table
 
 
@@ -23,7 +24,7 @@ def configuration_report(config: Config) -> str:
         return _report(config, [table(("role", "column", "factor to SI"), columns)])
     database = load_databases(config)
     channels = channels_of(config, database)
-    output_database(config)
+    check_cycle_times(config, output_database(config))
     assumed = {c.name for c in without_unit(channels, database)}
     rows = [_row(channel, database, channel.name in assumed) for channel in channels]
     head = ("role", "signal", "unit", "factor to SI", "plausible", "every", "status")
