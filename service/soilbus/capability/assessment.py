@@ -190,20 +190,27 @@ class _Vehicle:
         wheels that skid: below zero, as only a push or a slope moves the vehicle.
         """
         found = largest_pull(driving, self.limits)
-        if np.isfinite(found.pull[0]):
+        lost = ~np.isfinite(found.pull)
+        if not lost.any():
             return found
         no_torque = self.limits._replace(torque=np.full_like(self.limits.torque, np.inf))
-        if not within(driving, no_torque)[0].any():
+        weak = lost & within(driving, no_torque).any(axis=1)
+        if not weak.any():
+            return None if lost[0] else found
+        of_skid = self._skidding(duty)
+        pull, slip = (np.where(weak, *each) for each in ((of_skid.pull, found.pull), (of_skid.slip, found.slip)))
+        if not np.isfinite(pull[0]):
             return None
+        return Largest(pull, slip, "torque" if weak[0] else found.cause)
+
+    def _skidding(self, duty: Duty) -> Largest:
+        """Largest pull of wheels that skid; the least where even that asks for too much torque."""
         skidding = balance(self.skid(), duty)
         found = largest_pull(skidding, self.limits)
-        if np.isfinite(found.pull[0]):
-            return found._replace(cause="torque")
-        if not skidding.known[0].any():
-            return None
         least = np.where(skidding.known, skidding.pull, np.inf).argmin(axis=1)
         pull = np.where(skidding.known.any(axis=1), skidding.pull[np.arange(len(least)), least], np.nan)
-        return Largest(pull, skidding.slip[least], "torque")
+        none = ~np.isfinite(found.pull)
+        return Largest(np.where(none, pull, found.pull), np.where(none, skidding.slip[least], found.slip), "torque")
 
     def grade(self, draft: float) -> Array | None:
         """Steepest slope [rad] (D,) that is climbed with a draft [N]."""

@@ -131,21 +131,24 @@ def observed(task: Task) -> Observation:
     passed = truth["t"][(slip > config.traversability.max_slip) & (truth["t"] > start)]
     end = float(passed[0]) if len(passed) else float(truth["t"][-1])
     looks, curves = _looks(recording, config, end)
-    felt = _felt(task, trouble) if len(passed) else end
+    felt = _felt(task, trouble, end) if len(passed) else end
     return Observation(
         looks, curves, start, end, len(passed) > 0, truth["t"], truth["distance"], felt
     )  # fmt: skip
 
 
-def _felt(task: Task, trouble: Trouble) -> float:
-    """When [s] the largest draft that the way truly holds has fallen by FELT since the start; 0 where it never does."""
+def _felt(task: Task, trouble: Trouble, end: float) -> float:
+    """From when on, until the end [s], the largest draft that the way truly holds is less by FELT than at the start.
+
+    0 where it is not: then the demand is what grows.
+    """
     limit = task.config.traversability.max_slip
-    pulled = replace(trouble.scenario, draft=None, slip=Swing(limit, limit), slip_spread=0.0)
-    truth = drive(task.config, pulled, task.seed, trouble.effects).columns
+    even = replace(trouble.scenario, draft=None, slip=Swing(limit, limit), slip_spread=0.0, side_shift=Swing(0.0, 0.0))
+    truth = drive(task.config, even, task.seed, trouble.effects).columns
     mass = task.config.vehicle.mass if task.config.vehicle else 0.0
-    held = truth["draft"] + mass * truth["acceleration"]
-    fallen = truth["t"][held < (1.0 - FELT) * held[0]]
-    return float(fallen[0]) if len(fallen) else 0.0
+    held, t = truth["draft"] + mass * truth["acceleration"], truth["t"]
+    firm = t[(held >= (1.0 - FELT) * held[0]) & (t <= end)]
+    return float(firm[-1]) if len(firm) and firm[-1] < t[t <= end][-1] else 0.0
 
 
 def judged(kind: str, seen: Observation) -> WarningTrial:

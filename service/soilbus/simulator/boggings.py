@@ -51,8 +51,10 @@ def bogging(config: Config, kind: str, rng: np.random.Generator) -> Trouble:
         draft = _about(rng.uniform(0.35, 0.55), most)
         return Trouble(Scenario(BOGGING, soils, draft=draft, lift_slip=NO_LIFT, transition=length))
     if kind == "draft":
-        draft = Swing(0.3 * most, rng.uniform(1.1, 1.3) * most, slowest=0.008, fastest=0.02)
-        return Trouble(Scenario(BOGGING, (Patch(0.0, firm),), draft=draft, lift_slip=NO_LIFT))
+        begin = rng.uniform(12.0, 20.0)
+        shares = rng.uniform((0.3, 1.1), (0.5, 1.3))
+        draft_of = Profile((begin, begin + rng.uniform(20.0, 40.0)), (shares * most).tolist())
+        return Trouble(Scenario(BOGGING, (Patch(0.0, firm),), draft=draft_of, lift_slip=NO_LIFT))
     if kind == "grade":
         share, length = rng.uniform(0.35, 0.55), rng.uniform(15.0, 40.0)
         weight = GRAVITY * config.vehicle.mass if config.vehicle else np.inf
