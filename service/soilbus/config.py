@@ -247,8 +247,9 @@ class Prior(_Section):
 
 
 class SoilPrior(_Section):
-    """Prior of each soil parameter (SI, phi in rad), wide enough for Wong's table of soils.
+    """Prior of each soil parameter (SI, phi in rad), for tilled soils of all textures.
 
+    `soilbus check` names the known soils outside of it: stiff clays of 69 kPa, for one.
     A free parameter's prior is log-normal with median `value`; std/value is its
     coefficient of variation.
     """

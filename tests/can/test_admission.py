@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import can
@@ -283,6 +284,24 @@ def test_lock_never_mixes_sources_within_its_silence(steps: list[tuple[int, int]
         else:
             assert source != heard[0]
             assert source != 1
+
+
+def test_a_source_that_comes_every_5_s_is_not_lost_between_two_frames() -> None:
+    lock = SourceLock.at_cycle(own=1, cycle_time=5.0)
+    said = [(0.0, 7), (2.5, 9), (5.0, 7), (7.5, 9), (10.0, 7), (24.9, 9), (25.1, 9), (26.0, 7), (27.0, 1), (28.0, 9)]
+    assert [source for t, source in said if lock.admits(t, source)] == [7, 7, 7, 9, 1]
+    assert SourceLock.at_cycle(own=1, cycle_time=0.1).patience == SourceLock(own=1).patience == 2.0
+
+
+def test_of_two_receivers_one_counts_though_positions_come_every_5_s() -> None:
+    database = Database()
+    database.add_dbc_file(Path(__file__).resolve().parents[2] / "dbc" / "iso11783.dbc")
+    channel = Channel("latitude", "", "VehiclePosition", "Latitude", **COMMON)
+    a = Admission([channel], database)
+    place = database.get_message_by_name("VehiclePosition").frame_id & ~0xFF
+    for i in range(8):
+        a.feed(2.5 * i, place | (0x40, 0x41)[i % 2], True, bytes.fromhex("00752B7D00752B7D"))
+    assert a.take().columns["latitude"].t.tolist() == [0.0, 5.0, 10.0, 15.0]
 
 
 def test_groups_of_both_formats() -> None:

@@ -323,7 +323,7 @@ def _inbox(message: Message, channels: Sequence[Channel], is_open: bool, checked
         rules=rules,
         decoder=decoder,
         plain=plain_plan(message, channels, rules, decoder),
-        lock=SourceLock(source_of(message.frame_id)) if is_open else None,
+        lock=SourceLock.at_cycle(source_of(message.frame_id), (message.cycle_time or 0) / 1e3) if is_open else None,
         checksum_byte=checksum_byte,
     )
 

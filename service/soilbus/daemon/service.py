@@ -23,7 +23,7 @@ from soilbus.daemon.health import Health
 from soilbus.daemon.intake import Latest
 from soilbus.daemon.keeper import Keeper
 from soilbus.daemon.notify import Notifier
-from soilbus.daemon.outputs import WINDOW_MODULUS, forecast_frame, hop_frames, slip_frames
+from soilbus.daemon.outputs import TICK, WINDOW_MODULUS, forecast_frame, hop_frames, slip_frames
 from soilbus.daemon.pipeline import Pipeline, WindowResult
 from soilbus.daemon.solver import INTERNAL, Solver
 from soilbus.daemon.states import ServiceState, state_after
@@ -34,7 +34,6 @@ from soilbus.traversability import Status
 
 log = logging.getLogger(__name__)
 
-TICK = 0.1
 SILENCE = 1.0
 """Seconds without any frame after which the bus counts as silent."""
 GRACE = 0.2

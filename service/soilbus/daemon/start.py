@@ -15,6 +15,7 @@ from soilbus.can.publish import Publisher
 from soilbus.config import Config
 from soilbus.daemon.keeper import Keeper
 from soilbus.daemon.notify import Notifier
+from soilbus.daemon.outputs import check_cycle_times
 from soilbus.daemon.pipeline import Pipeline, WindowResult
 from soilbus.daemon.service import Service
 from soilbus.daemon.store import Owner
@@ -29,6 +30,7 @@ def start_service(config: Config, wait: bool, on_window: Callable[[WindowResult]
     cannot be opened.
     """
     pipeline, ours = Pipeline(config, load_databases(config)), output_database(config)
+    check_cycle_times(config, ours)
     publisher = Publisher(ours)
     settings = config.bus.model_dump()
     filters = pipeline.admission.can_filters() + filters_of(ours)

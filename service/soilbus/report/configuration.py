@@ -12,6 +12,8 @@ from soilbus.can.channels import Channel
 from soilbus.can.dbc_files import checked_messages, load_databases, output_database
 from soilbus.can.mapping import channels_of, without_unit
 from soilbus.config import Config, Table
+from soilbus.daemon.outputs import check_cycle_times
+from soilbus.report.soil_prior import prior_text
 from soilbus.report.table import table
 
 
@@ -23,7 +25,7 @@ def configuration_report(config: Config) -> str:
         return _report(config, [table(("role", "column", "factor to SI"), columns)])
     database = load_databases(config)
     channels = channels_of(config, database)
-    output_database(config)
+    check_cycle_times(config, output_database(config))
     assumed = {c.name for c in without_unit(channels, database)}
     checked = checked_messages(config)
     rows = [_row(channel, database, channel.name in assumed, channel.message in checked) for channel in channels]
@@ -36,6 +38,7 @@ def _report(config: Config, parts: list[str]) -> str:
     parts += [f"{name:<8} {verdict}\n" for name, verdict in identifiable(config)]
     if effects:
         parts.append("\nEffects in the model:\n" + "".join(f"{line}\n" for line in effects))
+    parts.append("\nWhat is assumed of the soil before any data:\n" + prior_text(config) + "\n")
     parts.append("\nSettings in force (defaults included):\n" + defaults_text(config) + "\n")
     return "\n".join(parts[:1]) + "\nWhat these sensors can tell of the soil:\n" + "".join(parts[1:])
 
