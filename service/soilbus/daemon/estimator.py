@@ -271,7 +271,8 @@ class WindowEstimator:
             return status, "model_mismatch" if failure == "model_mismatch" else "no_convergence"
         if task.poor:
             return Status.DEGRADED, "input_stale " + " ".join(task.poor)
-        if tracked.ground is Ground.CHANGING or tracked.since > task.end - MIN_NEW_SOIL * self._settings.window:
+        unknown = tracked.ground in (Ground.CHANGING, Ground.SETTLING)
+        if unknown or tracked.since > task.end - MIN_NEW_SOIL * self._settings.window:
             return Status.NOT_EXCITED, "not_excited new_soil"
         if self._ambiguous(fit):
             return Status.NOT_EXCITED, "ambiguous"
