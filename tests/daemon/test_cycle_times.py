@@ -59,4 +59,4 @@ def test_the_frames_of_each_cycle_are_all_that_there_are():
     fast = [*slip_frames(nothing.slip), forecast_frame(None, Watch())]
     assert {message for message, _ in fast} < set(FAST_FRAMES)
     everything = {message.name for message in output_database(reference_configuration()).messages}
-    assert everything == {*HOP_FRAMES, *FAST_FRAMES, "SoilbusStatus", "SoilbusIdentity"}
+    assert everything == {*HOP_FRAMES, *FAST_FRAMES, "SoilbusStatus", "SoilbusIdentity", "BusHealth"}
