@@ -291,7 +291,8 @@ class Draws:
         self.soils = soils
 
     @classmethod
-    def of(cls, posterior: Posterior) -> Draws:
+    def of(cls, posterior: Posterior, shifts: np.ndarray) -> Draws:
+        assert not len(shifts)
         rng = np.random.default_rng(7)
         logs = rng.multivariate_normal(np.zeros(6), posterior.log_covariance, cls.N, method="eigh")
         return cls(np.asarray(posterior.soil) * np.exp(np.concatenate([np.zeros((1, 6)), logs])))

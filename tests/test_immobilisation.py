@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from soilbus.capability.assessment import OverSlip
 from soilbus.capability.immobilisation import AHEAD, CALM, LONGEST_GAP, SETTLED, Alert, Watch, watched
-from soilbus.simulator import bogging_trials
-from soilbus.simulator.bogging_trials import Task, WarningTrial, figures, trial
+from soilbus.simulator import boggings
+from soilbus.simulator.bogging_trials import REACTION, Task, WarningTrial, figures, trial
+from soilbus.simulator.drive import drive as driven
 from soilbus.simulator.reference import reference_configuration
 
 CONFIG = reference_configuration()
@@ -120,6 +121,65 @@ def test_a_warning_stays_a_while():
     assert max(warned) == pytest.approx(max(causes) + CALM, abs=0.11)
 
 
+def test_a_new_curve_is_no_new_ground():
+    other = OverSlip(SLIP, 0.8 * pull_at(SLIP), NONE, NONE, NONE)
+    state, t = Watch(), 0.0
+    for i in range(300):
+        t, slip = 0.1 * i, 0.1 + 0.02 * math.sin(0.05 * i)
+        state = watched(state, t, [slip], pull_at(slip), (CURVE, other)[i // 10 % 2])
+        assert state.warning in (Alert.UNKNOWN, Alert.NONE)
+        assert i < 30 or abs(state.capacity.long.line().slope) < 0.01 * MOST
+
+
+def test_along_a_new_curve_the_trend_is_that_of_all_moments_along_it():
+    rng = np.random.default_rng(1)
+    other = OverSlip(SLIP, 0.8 * pull_at(SLIP), NONE, NONE, NONE)
+    states = [Watch(), Watch()]
+    for i in range(90):
+        slip, pull = rng.uniform(0.0, 0.62), rng.uniform(2000.0, 4000.0)
+        for which, curve in enumerate((other, other if i > 80 else CURVE)):
+            states[which] = watched(states[which], 0.1 * i, [slip], pull, curve)
+    one, changed = (state.capacity for state in states)
+    for name in ("long", "short", "told", "scatter"):
+        assert getattr(changed, name) == pytest.approx(getattr(one, name), rel=1e-9, abs=1e-6)
+
+
+def test_scattering_ground_must_surely_weaken():
+    rng = np.random.default_rng(2)
+    noise = np.repeat(rng.normal(0.0, 250.0, 250), 4)  # patches of half a metre
+
+    def warned(lost):
+        state, alerts = Watch(), set()
+        for i in range(1000):
+            pull = 2500.0 + noise[i]
+            state = watched(state, 0.1 * i, [slip_at(2500.0 + lost(0.1 * i))], pull, CURVE)
+            alerts.add(state.warning)
+        return Alert.IMMOBILISATION in alerts
+
+    assert not warned(lambda t: 0.0)
+    assert warned(lambda t: 100.0 * max(t - 20.0, 0.0))
+
+
+def test_slip_that_creeps_under_a_steady_draft_is_foreseen_where_pull_hardly_depends_on_it():
+    flat = OverSlip(SLIP, 3000.0 + 10.0 * SLIP, NONE, NONE, NONE)
+    state, first = Watch(), math.inf
+    for i in range(1000):
+        t, slip = 0.1 * i, 0.2 + 0.02 * max(0.1 * i - 5.0, 0.0)
+        state = watched(state, t, [slip], 3000.0 + 10.0 * slip, flat)
+        if state.warning is Alert.IMMOBILISATION:
+            first = t
+            break
+    assert 25.0 - first == pytest.approx(AHEAD, abs=1.0)  # slip passes 0.6 at 25 s
+
+
+def test_wheels_that_all_but_roll_tell_nothing_of_the_ground():
+    state = Watch()
+    for i in range(400):
+        slip = 0.05 * max(math.sin(0.1 * i), 0.0)
+        state = watched(state, 0.1 * i, [slip], pull_at(0.05) * math.sin(0.1 * i), CURVE)
+        assert state.warning is not Alert.IMMOBILISATION
+
+
 MAYBE = st.none() | st.floats(allow_nan=True, allow_infinity=True)
 
 
@@ -146,25 +206,51 @@ def test_whatever_comes_there_is_an_answer_and_silence_is_never_all_clear(moment
 # --- simulated drives ---
 
 
-@pytest.mark.parametrize("seed", [11, 6], ids=["draft", "soil"])
-def test_a_simulated_bogging_is_foreseen(seed):
-    found = trial(Task(CONFIG, True, seed))
+@pytest.mark.parametrize(("kind", "seed"), [("draft", 11), ("softening", 6), ("grade", 2), ("digging", 3)])
+def test_a_simulated_bogging_is_foreseen(kind, seed):
+    found = trial(Task(CONFIG, kind, seed))
     assert found.lead >= 3.0
     assert found.way >= 3.0
+    assert found.possible > found.lead - 1.0
 
 
-def test_firm_ground_is_left_in_peace(monkeypatch):
-    monkeypatch.setattr(bogging_trials, "FIRM_DRIVE", 60.0)
-    found = trial(Task(CONFIG, False, 1))
+def test_at_the_edge_of_a_soft_patch_the_warning_comes_as_soon_as_it_can_be_felt():
+    found = trial(Task(CONFIG, "patch", 4))
+    assert found.lead > found.possible - REACTION
+    assert found.warnings == 1
+
+
+@pytest.mark.parametrize("kind", ["firm", "harsh"])
+def test_firm_ground_is_left_in_peace(kind, monkeypatch):
+    monkeypatch.setattr(boggings, "FIRM_DRIVE", 60.0)
+    found = trial(Task(CONFIG, kind, 1))
     assert found.seconds == pytest.approx(50.0, abs=0.2)
     assert found.warnings == 0
     assert math.isnan(found.lead)
 
 
+def test_at_constant_throttle_the_rims_keep_their_speed_while_the_ground_speed_falls():
+    trouble = boggings.bogging(CONFIG, "digging", np.random.default_rng(5))
+    truth = driven(CONFIG, trouble.scenario, 5, trouble.effects).columns
+    slip = np.mean([truth[f"slip.{wheel.name}"] for wheel in CONFIG.wheel], axis=0)
+    usual = slip < 0.5
+    rim = truth["ground_speed"] / (1.0 - slip)
+    assert rim[usual] == pytest.approx(np.median(rim), rel=0.1)
+    assert truth["ground_speed"][usual].min() < 0.75 * truth["ground_speed"].max()
+
+
+def test_no_other_kind_of_bogging_is_known():
+    with pytest.raises(ValueError, match="no kind of bogging is called fog; known: softening"):
+        boggings.bogging(CONFIG, "fog", np.random.default_rng(0))
+
+
 def test_figures_of_trials_that_have_them():
-    early, late, short = (WarningTrial(True, 30.0, 1, *lead) for lead in ((6.0, 9.0), (2.0, 2.5), (2.5, 3.5)))
-    never = WarningTrial(True, 50.0, 1, math.nan, math.nan)
-    firm = [WarningTrial(False, 1800.0, n, math.nan, math.nan) for n in (0, 1)]
-    found = figures([early, late, short, never, *firm])
-    assert (found.boggings, found.warned, found.hours, found.false) == (3, 2, 1.0, 1)
+    early, late, short = (WarningTrial("draft", 30.0, 1, *lead) for lead in ((6.0, 9.0), (2.0, 2.5), (2.5, 3.5)))
+    never = WarningTrial("draft", 50.0, 1, math.nan, math.nan)
+    sudden = WarningTrial("draft", 20.0, 1, 1.5, 2.0, 2.2, 3.0)
+    found = figures("draft", [early, late, short, never, sudden])
+    assert (found.boggings, found.warned, found.sudden, found.hours) == (3, 2, 1, 0.0)
     assert (found.lead, found.least) == (2.5, 2.0)
+    assert WarningTrial("draft", 20.0, 1, 1.5, 2.0, 4.5, 3.0).sudden is False  # time enough to react and to warn
+    firm = figures("firm", [WarningTrial("firm", 1800.0, n, math.nan, math.nan) for n in (0, 1)])
+    assert (firm.boggings, firm.hours, firm.false) == (0, 1.0, 1)

@@ -214,3 +214,18 @@ def test_go_only_when_everything_speaks_for_it(soil, size, status, demand, limit
 @pytest.mark.parametrize("status", BAD_STATUS)
 def test_a_status_that_is_not_valid_is_never_a_go(status):
     assert decide(status=status, demand=Demand(0.0, 1.0)).state in (State.CAUTION, State.UNKNOWN)
+
+
+def test_a_torque_limit_at_the_least_slip_is_a_limit_like_any_other():
+    """About half of the posterior's soils turn the wheels at the least slip, the rest only where they skid."""
+    posterior = Posterior(SOILS["sandy_loam_22"], np.diag([0.01, 0.0004, 0.0004, 0.0004, 0.01, 0.01]))
+    deep = DEFAULTS.model_copy(update={"max_sinkage": 0.4})
+    needed = brute(SOILS["sandy_loam_22"], 0.02)[1][2].max()
+    above, below = (
+        decide(posterior=posterior, limit=np.full(4, share * needed), demand=Demand(0.0, 20.0), config=deep)
+        for share in (1.01, 0.99)
+    )
+    assert above.limit == below.limit == "torque"
+    assert above.max_draft.value > below.max_draft.value
+    assert above.max_draft.std == pytest.approx(below.max_draft.std, rel=0.3)
+    assert min(above.probability, below.probability) > 0.99  # of no pull at all

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import math
 import os
 import signal
 import sys
@@ -351,7 +350,7 @@ def _decisions(args: argparse.Namespace) -> None:
     import json
 
     from soilbus.report.decisions import as_json, decisions_report
-    from soilbus.simulator.bogging_trials import FIRM_DRIVE, warning_trials
+    from soilbus.simulator.bogging_trials import warning_trials
     from soilbus.simulator.draft_trials import draft_trials
     from soilbus.simulator.drive import SimulationError
     from soilbus.simulator.monte_carlo import processes
@@ -362,8 +361,7 @@ def _decisions(args: argparse.Namespace) -> None:
         with processes(os.cpu_count() or 1) as each:
             drafts = list(draft_trials(config, args.drives, args.seed, each=each))
             calls = verdict_trials(config, args.calls, args.seed, each=each)
-            firm = math.ceil(3600.0 * args.hours / (FIRM_DRIVE - config.estimator.window))
-            warnings = warning_trials(config, args.boggings, firm, args.seed, each=each)
+            warnings = warning_trials(config, args.boggings, args.hours, args.seed, each=each)
     except SimulationError as error:
         raise WorkError(str(error)) from None
     if args.json is not None:

@@ -51,6 +51,8 @@ class Dbc(_Section):
     """DBC files that describe the vehicle's frames, beside the configuration or ours by name."""
 
     input: list[str] = Field(default_factory=list)
+    checked: list[str] = Field(default_factory=list)
+    """Messages of the vehicle's own DBC that are believed only with a right Counter and Checksum (dbc/README.md)."""
 
 
 class Vehicle(_Section):
@@ -109,6 +111,8 @@ class Wheel(_Section):
     load: Signal | None = None
     sinkage: Signal | None = None
     torque_limit: Signal | None = None
+    motor_speed: Signal | None = None
+    """Only to find out a speed sensor that lies."""
 
     @model_validator(mode="after")
     def _can_be_used(self) -> Wheel:
@@ -243,8 +247,9 @@ class Prior(_Section):
 
 
 class SoilPrior(_Section):
-    """Prior of each soil parameter (SI, phi in rad), wide enough for Wong's table of soils.
+    """Prior of each soil parameter (SI, phi in rad), for tilled soils of all textures.
 
+    `soilbus check` names the known soils outside of it: stiff clays of 69 kPa, for one.
     A free parameter's prior is log-normal with median `value`; std/value is its
     coefficient of variation.
     """

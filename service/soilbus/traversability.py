@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.capability.assessment import Capability, Demand, assess
+from soilbus.capability.uncertain_model import UncertainModel
 from soilbus.capability.wheels import WheelTable
 from soilbus.config import Traversability as Settings
 from soilbus.estimation.posterior import Estimate, Posterior
@@ -62,7 +63,7 @@ def judge(
     status: Status,
     demand: Demand | None,
     rig: Rig,
-    model: WheelModel | CompletedModel,
+    model: WheelModel | CompletedModel | UncertainModel,
     torque_limit: NDArray[np.float64],
     settings: Settings,
     last: WheelTable | None = None,

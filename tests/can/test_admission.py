@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import can
@@ -135,13 +136,27 @@ def test_remote_error_and_unknown_frames_are_counted_only() -> None:
 
 def test_time_may_stand_still_but_not_go_back() -> None:
     a = admission(LEFT)
-    for t in (1.0, 1.0, 0.9, 1.1, math.nan, 1.05):
-        a.feed(t, 256, False, bytes(4))
+    for i, t in enumerate((1.0, 1.0, 0.9, 1.1, math.nan, 1.05)):
+        a.feed(t, 256, False, bytes([i, 0, 0, 0]))
     out = a.take()
     assert out.columns["Left"].t.tolist() == [1.0, 1.0, 1.1]
     assert np.isnan(out.refused["Left", Reason.TIME_BACKWARDS]).sum() == 1
     a.feed(1.0, 256, False, bytes(4))  # also across batches
     assert refused(a.take()) == {("Left", "time_backwards"): [1.0]}
+
+
+def test_a_frame_that_comes_once_more_is_refused() -> None:
+    a = admission(LEFT)
+    for t, data in ((1.0, 1), (1.0004, 1), (1.0008, 2), (1.0012, 1), (1.0213, 1), (1.0214, 1)):
+        a.feed(t, 256, False, bytes([data, 0, 0, 0]))
+    out = a.take()
+    assert out.columns["Left"].t.tolist() == [1.0, 1.0008, 1.0012, 1.0213]
+    assert refused(out) == {("Left", "duplicate"): [1.0004, 1.0214]}
+    a.feed(1.0216, 256, False, bytes([1, 0, 0, 0]))  # also across batches
+    a.feed(1.0416, 256, False, bytes([1, 0, 0, 0]))
+    out = a.take()
+    assert (out.columns["Left"].t.tolist(), refused(out)) == ([1.0416], {("Left", "duplicate"): [1.0216]})
+    assert a.counts.received["Loads"] == a.counts.admitted["Loads"] + sum(a.counts.refused.values())
 
 
 def test_a_clock_set_back_starts_afresh() -> None:
@@ -269,6 +284,24 @@ def test_lock_never_mixes_sources_within_its_silence(steps: list[tuple[int, int]
         else:
             assert source != heard[0]
             assert source != 1
+
+
+def test_a_source_that_comes_every_5_s_is_not_lost_between_two_frames() -> None:
+    lock = SourceLock.at_cycle(own=1, cycle_time=5.0)
+    said = [(0.0, 7), (2.5, 9), (5.0, 7), (7.5, 9), (10.0, 7), (24.9, 9), (25.1, 9), (26.0, 7), (27.0, 1), (28.0, 9)]
+    assert [source for t, source in said if lock.admits(t, source)] == [7, 7, 7, 9, 1]
+    assert SourceLock.at_cycle(own=1, cycle_time=0.1).patience == SourceLock(own=1).patience == 2.0
+
+
+def test_of_two_receivers_one_counts_though_positions_come_every_5_s() -> None:
+    database = Database()
+    database.add_dbc_file(Path(__file__).resolve().parents[2] / "dbc" / "iso11783.dbc")
+    channel = Channel("latitude", "", "VehiclePosition", "Latitude", **COMMON)
+    a = Admission([channel], database)
+    place = database.get_message_by_name("VehiclePosition").frame_id & ~0xFF
+    for i in range(8):
+        a.feed(2.5 * i, place | (0x40, 0x41)[i % 2], True, bytes.fromhex("00752B7D00752B7D"))
+    assert a.take().columns["latitude"].t.tolist() == [0.0, 5.0, 10.0, 15.0]
 
 
 def test_groups_of_both_formats() -> None:

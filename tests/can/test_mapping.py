@@ -11,9 +11,11 @@ import pytest
 from field_data import field_config, needs_field
 from soilbus.can import dbc_files
 from soilbus.can.admission import Admission
+from soilbus.can.checksum import frame_checksum
 from soilbus.can.mapping import channels_of, checked_messages, load_databases, shipped_dbc, without_unit
 from soilbus.can.units import unit_of
 from soilbus.config import Config, ConfigError, parse_config
+from soilbus.report.configuration import configuration_report
 
 G = 9.80665
 DBC = """VERSION ""
@@ -295,3 +297,46 @@ def test_no_unit(text: str | None) -> None:
 def test_units_that_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"\w"):
         unit_of(text)
+
+
+GUARDED = """VERSION ""
+BU_: X
+BO_ 256 Wheel: 8 X
+ SG_ Load : 0|16@1+ (1,0) [0|60000] "N" X
+ SG_ Counter : 52|4@1+ (1,0) [0|15] "" X
+ SG_ Checksum : 56|8@1+ (1,0) [0|255] "" X
+"""
+
+
+def guarded(folder: Path, checked: list[str]) -> Config:
+    (folder / "own.dbc").write_text(GUARDED, encoding="utf-8")
+    (folder / "a.dbc").write_text(DBC.replace(" 256 ", " 260 ").replace(" 257 Wheel", " 261 Wheels"), encoding="utf-8")
+    wheel = WHEEL | {"load": "Wheel.Load"}
+    raw = {"dbc": {"input": ["own.dbc", "a.dbc"], "checked": checked}, "wheel": [wheel], "vehicle": VEHICLE}
+    return parse_config(raw, folder=folder)
+
+
+def test_a_makers_own_message_can_be_required_to_carry_counter_and_checksum(tmp_path: Path) -> None:
+    good = bytes((0x10, 0x27, 0, 0, 0, 0, 0x00))
+    frames = [
+        (1.0, good + bytes((frame_checksum(256, good + b"\0", 7),))),
+        (1.1, good + b"\x00"),
+        (1.2, good + b"\x01"),
+    ]
+    for checked, admitted in (([], [1.0, 1.1, 1.2]), (["Wheel"], [1.0])):
+        c = guarded(tmp_path, checked)
+        database = load_databases(c)
+        admission = Admission(channels_of(c, database), database, checked_messages(c))
+        for t, data in frames:
+            admission.feed(t, 256, False, data)
+        assert admission.take().columns["load.W"].t.tolist() == admitted
+        assert ("counter and CRC required" in configuration_report(c)) == bool(checked)
+
+
+def test_what_cannot_be_checked_is_a_fault(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as error:
+        checked_messages(guarded(tmp_path, ["Wheel", "Motor", "Moto"]))
+    assert error.value.faults == [
+        "dbc.checked: no message Moto in the DBC",
+        "dbc.checked: Motor has no Counter and byte-aligned 8-bit Checksum",
+    ]

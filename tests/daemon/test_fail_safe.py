@@ -1,6 +1,6 @@
 """No path to GO: arbitrary sequences of good, stale, refused and missing frames, clock steps, lost buses, restarts.
 
-A wire plays one moment of a good drive over and over, at 10 Hz, and spoils it as told.
+A wire plays the last moments of a good drive over and over, at 10 Hz, and spoils them as told.
 What it knows of its own deliveries judges every Traversability frame that the service
 sends.  The soil comes from a tracker that is always content with its fit unless it is
 told to fail: GO then hangs on the inputs alone, as often as the loop lets it.
@@ -13,6 +13,8 @@ import errno
 import math
 from concurrent.futures import Future
 from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import can
 import pytest
@@ -28,13 +30,17 @@ from soilbus.can.publish import Publisher
 from soilbus.config import Config
 from soilbus.daemon.estimator import WindowEstimator
 from soilbus.daemon.intake import Intake
+from soilbus.daemon.keeper import Keeper
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.service import Service
+from soilbus.daemon.states import ServiceState
+from soilbus.daemon.store import Owner
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
+from soilbus.traversability import State as Way
 from soilbus.traversability import Status
 
 CONFIG = reference_configuration(["estimator.window=4.0", "traversability.max_age=2.0"])
@@ -50,15 +56,20 @@ TIMEOUT, MAX_AGE = 1.0, 2.0
 SLACK = TICK + 0.06
 """The service looks at its inputs each tick; a window is handed out somewhat after its end."""
 CLOCK_STEP = 1.0
+MOMENTS = 4
+"""Frames of each message that are repeated: a sensor that always says the same is not believed."""
 LEAD = 6.5
 """Seconds of good frames after which go is due."""
 
 
 @pytest.fixture(scope="module")
-def moment() -> dict[int, can.Message]:
-    """The last frame of each message in a good drive."""
+def moment() -> dict[int, list[can.Message]]:
+    """The last frames of each message in a good drive."""
     recording = simulate(reference_configuration(), excited("loam", 10.0), seed=3)
-    return {m.arbitration_id: m for m in frames(recording, reference_configuration())}
+    found: dict[int, list[can.Message]] = {}
+    for message in frames(recording, reference_configuration()):
+        found.setdefault(message.arbitration_id, []).append(message)
+    return {i: messages[-MOMENTS:] for i, messages in found.items()}
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +92,7 @@ class Wire:
     """A bus with a vehicle on it; deaf, spoilt and repeated name messages, blind tells the tracker to fail."""
 
     clock: FakeClock
-    moment: dict[int, can.Message]
+    moment: dict[int, list[can.Message]]
     offset: float = 1.7e9 - 1000.0
     deaf: frozenset[str] = frozenset()
     spoilt: frozenset[str] = frozenset()
@@ -114,7 +125,8 @@ class Wire:
             self.next += 1
             self.counter = cycle % 16
             self.clock.now = max(self.clock.now, due)
-            name, message = self.known[row]
+            name, messages = self.known[row]
+            message = messages[cycle % MOMENTS]
             if name not in self.deaf:
                 return self.frame(name, message)
             if self.noisy:
@@ -174,25 +186,34 @@ class Drive:
     def __init__(self, moment, tracked) -> None:
         self.clock, self.tracked = FakeClock(), tracked
         self.wire = Wire(self.clock, moment)
+        self.folder = TemporaryDirectory()
         self.faults: list[str] = []
         self.go = 0
         self.start()
 
     def start(self) -> None:
+        """A service that begins with the state that the one before has left behind."""
         config: Config = CONFIG
         pipeline = Pipeline(config, IN)
         self.content(pipeline.estimator)
+        owner = Owner.of(config, pipeline.intake.channels, IN)
+        keeper = Keeper(Path(self.folder.name), owner, InlineExecutor(), lambda: self.clock.now + self.wire.offset)
         bus = LiveBus(self.open, self.clock, self.clock.sleep)
         self.result = None
         self.came = -math.inf
         self.worker = Worker()
         self.wire.good, self.wire.stamps = {}, {}
         self.service = Service(
-            config, pipeline, bus, Publisher(OUT), Notifier(), self.worker, self.clock, self.take
+            config, pipeline, bus, Publisher(OUT), Notifier(), self.worker, self.clock, self.take, keeper
         )  # fmt: skip
+
+    def stop(self) -> None:
+        self.service.stop()
+        self.service.run()
 
     def content(self, estimator: WindowEstimator) -> None:
         def estimate(window, end):
+            estimator.tracker._beliefs = [(end, self.tracked.fit.whole)]
             return dataclasses.replace(self.tracked, since=end - CONFIG.estimator.window, mismatch=self.wire.blind)
 
         estimator._tracker.estimate = estimate
@@ -248,7 +269,7 @@ EVENTS = st.one_of(
     st.tuples(st.sampled_from(["blind", "hangs"]), st.none(), st.floats(0.2, 5.0)),
     st.tuples(st.just("down"), st.none(), SECONDS),
     st.tuples(st.just("clock"), st.sampled_from([-3600.0, -5.0, -1.5, -0.6, 0.4, 2.0, 70.0, 3600.0]), SECONDS),
-    st.tuples(st.just("restart"), st.none(), SECONDS),
+    st.tuples(st.sampled_from(["restart", "killed"]), st.none(), SECONDS),
 )
 STORIES = st.lists(EVENTS, min_size=1, max_size=5)
 
@@ -277,6 +298,9 @@ def told(story, moment, tracked) -> Drive:
             case "clock":
                 drive.step_clock(what)
             case "restart":
+                drive.stop()
+                drive.start()
+            case "killed":
                 drive.start()
         drive.run(seconds)
         wire.deaf = wire.spoilt = wire.repeated = frozenset()
@@ -320,6 +344,8 @@ def test_the_time_since_the_last_valid_posterior_grows_until_there_is_one(moment
 
 
 @settings(derandomize=True, deadline=None, max_examples=20, suppress_health_check=[HealthCheck.too_slow])
+@example(story=[("restart", None, 1.0)])
+@example(story=[("restart", None, 0.5), ("down", None, 0.4), ("restart", None, 3.0)])
 @example(story=[("clock", -5.0, 3.0)])
 @example(story=[("clock", -1.5, 3.0)])
 @example(story=[("deaf", frozenset(["WheelLoads"]), 1.6), ("down", None, 0.4)])
@@ -344,12 +370,37 @@ def with_any_status(monkeypatch):
     monkeypatch.setattr("soilbus.hysteresis.state_of", lambda p, status, settings: "go")
 
 
+def with_the_verdict_of_the_run_before(monkeypatch):
+    """What was known when the service was stopped is taken for known now, as soon as the inputs are there."""
+    usual = Service.present_way
+
+    def present_way(self, now):
+        knows = self.result is None and self._keeper.recalled is not None
+        return Way.GO if knows and self._state[0] is ServiceState.ESTIMATING else usual(self, now)
+
+    monkeypatch.setattr(Service, "present_way", present_way)
+
+
+def test_a_state_is_left_behind_and_recalled(moment, tracked):
+    drive = Drive(moment, tracked)
+    drive.run(LEAD)
+    drive.stop()
+    drive.start()
+    known, elapsed = drive.service._solver.estimator.tracker._recalled
+    assert known.gains.tolist() == tracked.fit.whole.gains.tolist()
+    assert 0.0 <= elapsed < 1.0
+    drive.run(CONFIG.estimator.window - 0.2)  # all inputs good, but no whole window yet
+    assert str(drive.last["State"]) == "unknown"
+    assert not drive.faults
+
+
 @pytest.mark.parametrize(
     ("mutation", "stories"),
     [
         (without_stale_check, st.lists(st.tuples(st.just("deaf"), SOME, SECONDS), min_size=1, max_size=2)),
         (without_age_check, st.lists(st.tuples(st.just("hangs"), st.none(), st.floats(1.0, 5.0)), min_size=1)),
         (without_memory_of_epochs, st.lists(st.tuples(st.just("clock"), st.just(-5.0), SECONDS), min_size=1)),
+        (with_the_verdict_of_the_run_before, st.lists(st.tuples(st.just("restart"), st.none(), SECONDS), min_size=1)),
         (with_any_status, st.lists(st.tuples(st.just("blind"), st.none(), SECONDS), min_size=1)),
     ],
 )

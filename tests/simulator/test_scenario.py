@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from soilbus.simulator.scenario import Patch, Scenario, Swing, realise, soil_along, soil_names
+from soilbus.simulator.scenario import Patch, Profile, Scenario, Swing, realise, soil_along, soil_names
 from soilbus.terra.soils import soil_named
 
 
@@ -20,6 +20,15 @@ def test_waves_stay_in_range_with_exact_rate_and_integral(seed, low, span, durat
     area = np.concatenate([[0.0], np.cumsum((wave.value[1:] + wave.value[:-1]) / 2.0) * step])
     assert np.abs(wave.integral - area).max() <= 1e-3 * (abs(low) + span)
     assert np.abs(np.gradient(wave.value, t) - wave.rate)[1:-1].max() <= 1e-3 * span + 1e-9
+
+
+def test_a_profile_is_as_given_with_its_rate_and_integral():
+    t = np.linspace(0.0, 10.0, 2001)
+    wave = realise(Profile((2.0, 6.0), (1.0, 3.0)), t, np.random.default_rng(0))
+    assert wave.value[[0, 400, 800, 1200, 2000]].tolist() == pytest.approx([1.0, 1.0, 2.0, 3.0, 3.0])
+    assert wave.rate[[100, 800, 1900]].tolist() == pytest.approx([0.0, 0.5, 0.0])
+    assert wave.integral[-1] == pytest.approx(2.0 + 8.0 + 12.0)
+    assert Profile((2.0, 6.0), (1.0, 3.0)).low == 1.0
 
 
 def test_a_long_wave_sweeps_its_whole_range_slowly():

@@ -23,6 +23,8 @@ MEAN_CALM = 180.0
 MEAN_FAULT = 8.0
 CLOCK_STEP = 3600.0
 STRANGER = 0x123
+CROWDED = 0.15
+"""Seconds after a full queue in which frames that waited for room go out late, rightly."""
 
 
 @dataclass
@@ -39,7 +41,7 @@ class Wire:
     """Hands out the traffic when the clock has reached it, spoilt as the seed will have it.
 
     `clock` is a FakeClock, moved by waiting.  `delivered` counts what was handed over by identifier;
-    `error_frames` the bus's own; `gone` tells faults by kind.
+    `error_frames` the bus's own; `gone` tells faults by kind.  `on_send` hears of frames that had room.
     """
 
     def __init__(self, clock, messages: Iterator[can.Message], seed: int) -> None:
@@ -53,6 +55,7 @@ class Wire:
         self._next = next(messages)
         self._lag = clock.now - self._next.timestamp
         self._stepped = 0.0
+        self._crowded = -CROWDED
         self._coming: list[str] = []
         self._extra: list[can.Message] = []
         self._last: dict[int, can.Message] = {}
@@ -85,8 +88,10 @@ class Wire:
         if self._on and self._fault.kind == "no_bus":
             raise can.CanOperationError("Network is down", errno.ENETDOWN)
         if self._on and self._fault.kind == "full":
+            self._crowded = self.clock.now
             raise can.CanOperationError("No buffer space available", errno.ENOBUFS)
-        self.on_send(self.clock.now, message)
+        if self.clock.now - self._crowded > CROWDED:
+            self.on_send(self.clock.now, message)
 
     def shutdown(self) -> None:
         """Nothing to let go of."""

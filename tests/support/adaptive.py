@@ -10,7 +10,7 @@ import numpy as np
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from soilbus.terra.wheel import WheelModel, WheelState
+from soilbus.terra.wheel import LONGEST, WheelModel, WheelState
 
 EXACT = {"epsabs": 0.0, "epsrel": 1e-11, "limit": 200}
 
@@ -38,7 +38,7 @@ def adaptive_forces(
     """
     theta1, slip, r, b, K_L, n, tan_phi, c, K = (float(v) for v in state)
     theta_m = (model.peak_c1 + model.peak_c2 * slip) * theta1  # eq. 4
-    theta2 = model.exit_ratio * theta1
+    theta2 = max(model.exit_ratio * theta1 + model.exit_angle, -LONGEST * theta1)
     share = mobilised or (exponential if model.shear_law == "exponential" else rational)
 
     def sigma(theta: float) -> float:

@@ -1,25 +1,16 @@
 #!/bin/sh
 # Runs under systemd in the guest: drive.sh OUT, OUT/soilbus is the command, OUT/config its
 # configuration, OUT/dropin.conf what a checkout needs, OUT/played.log the recording.
-# Everything the test judges is left in OUT. The interface is vcan1: the link unit must make it.
+# Everything the test judges is left in OUT.
 set -eu
-out=$1 unit=soilbus@vcan1
-note() { # what systemd says of the unit now
-    systemctl status --no-pager --lines=20 $unit >"$out/$1.status" 2>&1 || true
-    systemctl show $unit -p ActiveState,SubState,StatusText,MainPID,NRestarts,Result,ExecMainCode,ExecMainStatus >"$out/$1.show"
-}
-
-systemd-sysusers "$PWD/systemd/soilbus.sysusers"
-mkdir -p /opt/soilbus/bin /etc/soilbus "/run/systemd/system/soilbus@.service.d"
-cp "$out/soilbus" /opt/soilbus/bin/
-cp "$out"/config/* /etc/soilbus/
-mv /etc/soilbus/field.toml /etc/soilbus/vcan1.toml
-cp "$out/dropin.conf" "/run/systemd/system/soilbus@.service.d/"
-systemctl daemon-reload
+out=$1
+. tests/systemd/install.sh
 
 systemctl start $unit || { note failed; journalctl --no-pager -n 50; exit 1; }
 note started
-cat "/proc/$(systemctl show -P MainPID $unit)/status" >"$out/process"
+process=/proc/$(systemctl show -P MainPID $unit)
+cat "$process/status" >"$out/process"
+cat "$process/mountinfo" >"$out/mounts"
 ip -details link show vcan1 >"$out/link"
 candump -L -r 4194304 vcan1 >"$out/bus.log" &
 candump=$!
@@ -33,5 +24,6 @@ note restarted
 kill $! 2>/dev/null || true
 systemctl stop $unit
 note stopped
+cp /var/lib/soilbus/vcan1/state.json "$out/"
 kill $candump
 journalctl --no-pager -u $unit -u soilbus-link@vcan1 >"$out/journal"

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import gzip
-import itertools
-import os
+import json
 import re
-import shutil
-import sys
 from pathlib import Path
 
 import can
 import cantools
 import pytest
+from installation import REPO, prepare, properties
 
-REPO = Path(__file__).resolve().parents[2]
 STATES = {"starting", "waiting", "listening", "estimating", "valid", "degraded", "fault"}
-PER_SECOND = 475  # frames of the recording
 UNTIL_WINDOW = 13  # s; the first window is full after 10 s
 PLAYED = 40  # s; the player still plays while the service restarts
 
@@ -27,16 +22,8 @@ def out(vcan_run, tool, field_recording, tmp_path_factory: pytest.TempPathFactor
     for name in ("candump", "canplayer", "systemctl", "systemd-sysusers"):
         tool(name)
     folder = tmp_path_factory.mktemp("service")
-    with gzip.open(field_recording("loam.log.gz"), "rt") as lines:
-        (folder / "played.log").write_text("".join(itertools.islice(lines, PER_SECOND * PLAYED)))
+    prepare(folder, field_recording("loam.log.gz"), PLAYED)
     (folder / "frames-until-window").write_text(str(50 * UNTIL_WINDOW))
-    shutil.copytree(REPO / "tests/field", folder / "config", ignore=shutil.ignore_patterns("*.py", "__pycache__"))
-    (folder / "soilbus").write_text(
-        f"#!/bin/sh\nexec env PYTHONPATH={_python_path()} {sys.executable} -c "
-        f"'import sys; from soilbus.cli import main; sys.exit(main())' \"$@\"\n"
-    )
-    (folder / "soilbus").chmod(0o755)
-    (folder / "dropin.conf").write_text(_dropin())
     done = vcan_run(
         ["sh", REPO / "tests/systemd/drive.sh", folder],
         rw=[folder],
@@ -47,24 +34,9 @@ def out(vcan_run, tool, field_recording, tmp_path_factory: pytest.TempPathFactor
     return folder
 
 
-def _python_path() -> str:
-    return os.pathsep.join(os.path.abspath(p) for p in os.environ.get("PYTHONPATH", "").split(os.pathsep) if p)
-
-
-def _dropin() -> str:
-    """Lets the sandbox see this checkout and its Python, wherever they are."""
-    places = {REPO, Path(sys.prefix), Path(sys.base_prefix), *map(Path, filter(None, _python_path().split(os.pathsep)))}
-    hidden = [str(p) for p in sorted(places) if p.is_relative_to("/root") or p.parts[1] in ("home", "tmp", "var")]
-    return "[Service]\nProtectHome=tmpfs\n" + "".join(f"BindReadOnlyPaths={p}\n" for p in hidden)
-
-
-def _shown(out: Path, when: str) -> dict[str, str]:
-    return dict(line.split("=", 1) for line in (out / f"{when}.show").read_text().splitlines())
-
-
 @pytest.mark.systemd
 def test_it_becomes_active_on_the_link_that_the_link_unit_made(out: Path) -> None:
-    shown = _shown(out, "started")
+    shown = properties(out, "started")
     assert (shown["ActiveState"], shown["SubState"]) == ("active", "running")
     assert "vcan" in (out / "link").read_text()
     assert "UP" in (out / "link").read_text()
@@ -81,11 +53,22 @@ def test_the_running_process_is_confined(out: Path) -> None:
 
 
 @pytest.mark.systemd
+def test_the_running_process_can_write_its_state_and_nothing_that_stays(out: Path) -> None:
+    mounts = [line.split() for line in (out / "mounts").read_text().splitlines()]
+    writable = {fields[4] for fields in mounts if "rw" in fields[5].split(",")}
+    passing = ("proc", "tmpfs", "devpts", "mqueue", "hostfs")  # hostfs is the guest's own, see guest-init
+    kernels = {fields[4] for fields in mounts if fields[fields.index("-") + 1] in passing}
+    assert "/var/lib/soilbus/vcan1" in writable
+    private = {"/tmp", "/var/tmp"}  # gone with the service
+    assert writable - kernels <= {"/var/lib/soilbus/vcan1", *private}
+
+
+@pytest.mark.systemd
 @pytest.mark.parametrize(
     ("when", "states"), [("started", STATES - {"fault", "valid"}), ("playing", {"estimating", "valid", "degraded"})]
 )
 def test_status_shows_state_and_reason(out: Path, when: str, states: set[str]) -> None:
-    text = _shown(out, when)["StatusText"]
+    text = properties(out, when)["StatusText"]
     state, reason = re.fullmatch(r"(\w+)(?:: (\S.*?))?(?:, .*)?", text).groups()
     assert state in states
     assert reason or state not in {"waiting", "listening", "degraded", "fault"}  # these say why
@@ -108,7 +91,7 @@ def test_it_broadcasts(out: Path) -> None:
 
 @pytest.mark.systemd
 def test_it_comes_back_after_sigkill(out: Path) -> None:
-    before, after = _shown(out, "playing"), _shown(out, "restarted")
+    before, after = properties(out, "playing"), properties(out, "restarted")
     assert (before["NRestarts"], after["NRestarts"]) == ("0", "1")
     assert after["ActiveState"] == "active"
     assert after["MainPID"] != before["MainPID"]
@@ -116,8 +99,15 @@ def test_it_comes_back_after_sigkill(out: Path) -> None:
 
 @pytest.mark.systemd
 def test_it_stops_cleanly_on_sigterm(out: Path) -> None:
-    assert _shown(out, "stopped")["ActiveState"] == "inactive"
+    assert properties(out, "stopped")["ActiveState"] == "inactive"
     # systemd forgets the exit status of a stopped instance, its journal does not
     stopping = (out / "journal").read_text().rpartition(": Stopping ")[2]
     assert "Deactivated successfully" in stopping
     assert [word for word in ("Main process exited", "timed out", "Failed") if word in stopping] == []
+
+
+@pytest.mark.systemd
+def test_its_state_outlives_sigkill(out: Path) -> None:
+    state = json.loads((out / "state.json").read_text())["state"]
+    assert state["starts"] == 2
+    assert state["totals"]["frames"] > 0

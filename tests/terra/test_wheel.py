@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -57,6 +58,7 @@ MODELS = {
     "peak shift": WheelModel(peak_c1=0.35, peak_c2=0.3),
     "rut recovery": WheelModel(exit_ratio=-0.4),
     "everything": WheelModel("rational", 0.25, 0.35, -0.25),
+    "exit angle": WheelModel("rational", 0.4, 0.2, -0.1, exit_angle=-0.1),
 }
 
 
@@ -80,7 +82,7 @@ def error(state: WheelState, model: WheelModel, nodes: int) -> np.ndarray:
 
     In skid T passes through zero, as DP does wherever motion resistance eats the thrust.
     """
-    ours = wheel_forces(state, WheelModel(model.shear_law, model.peak_c1, model.peak_c2, model.exit_ratio, nodes))
+    ours = wheel_forces(state, replace(model, nodes=nodes))
     worst = np.zeros(3)
     for i in range(len(state.slip)):
         part = one(state, i)

@@ -25,10 +25,15 @@ from soilbus.can.validity import REASONS, CodeRule, in_si, judge_codes, judge_va
 
 CLOCK_STEP = 1.0
 """Backward jump [s] above which the clock was set and the new time is believed."""
+LAST_TIME = 1e10
+"""Stamps [s] beyond it, either way, are no times: a clock that ticks in seconds would not move any more."""
+TWICE = 0.002
+"""Seconds within which a frame that equals the one before it is that frame once more: cycles are longer."""
 MAX_LISTED_UNKNOWN = 1024
 
 _EXTENDED = 1 << 31
 _NONE: NDArray[np.float64] = np.empty(0)
+_NO_FRAME = (-math.inf, -1, b"")
 
 Data = bytes | bytearray
 Frame = tuple[float, int, Data]
@@ -90,10 +95,11 @@ class _Inbox:
     last_t: float = -math.inf
     last_id: int = -1
     last_counter: int = -1
+    last_frame: tuple[float, int, bytes] = _NO_FRAME
 
     def forget(self) -> None:
         self.frames.clear()
-        self.last_t, self.last_id, self.last_counter = -math.inf, -1, -1
+        self.last_t, self.last_id, self.last_counter, self.last_frame = -math.inf, -1, -1, _NO_FRAME
         if self.lock is not None:
             self.lock.release()
 
@@ -141,12 +147,14 @@ class Admission:
             inbox = self._inbox_of_group(arbitration_id, extended)
             if inbox is None:
                 return
+        if t > LAST_TIME or t < -LAST_TIME:
+            self._refuse_unheard(inbox, Reason.BAD_TIME)
+            return
         if t < self._step_below:
             self._step_clock()
         self._step_below = t - CLOCK_STEP
         if remote:
-            self.counts.received[inbox.message.name] += 1
-            self.counts.refused[inbox.message.name, Reason.REMOTE_FRAME] += 1
+            self._refuse_unheard(inbox, Reason.REMOTE_FRAME)
         else:
             inbox.frames.append((t, arbitration_id, data))
 
@@ -164,7 +172,7 @@ class Admission:
 
         Every channel has a column, perhaps empty; times do not decrease within it.  A refused
         frame counts as a refused sample of each of its channels, except frames of a source that
-        is not listened to and remote frames, which are in `counts` only.
+        is not listened to, remote frames and those without a time, which are in `counts` only.
         """
         out = Decoded()
         for inbox in self._inboxes:
@@ -246,6 +254,7 @@ class Admission:
             (_checksum_right, Reason.BAD_CHECKSUM),
             (_time_forward, Reason.TIME_BACKWARDS),
             (_counter_moved, Reason.BAD_COUNTER),
+            (_not_twice, Reason.DUPLICATE),
         ):
             batch = self._passed(inbox, batch, check, reason, out)
         return batch
@@ -268,6 +277,11 @@ class Admission:
         self.counts.refused[inbox.message.name, reason] += len(t)
         for channel in inbox.channels:
             out.refused[channel.name, reason] = t
+
+    def _refuse_unheard(self, inbox: _Inbox, reason: Reason) -> None:
+        """One frame that is not even filed."""
+        self.counts.received[inbox.message.name] += 1
+        self.counts.refused[inbox.message.name, reason] += 1
 
     def _count_wrong_source(self, inbox: _Inbox, n: int) -> None:
         if n:
@@ -309,7 +323,7 @@ def _inbox(message: Message, channels: Sequence[Channel], is_open: bool, checked
         rules=rules,
         decoder=decoder,
         plain=plain_plan(message, channels, rules, decoder),
-        lock=SourceLock(source_of(message.frame_id)) if is_open else None,
+        lock=SourceLock.at_cycle(source_of(message.frame_id), (message.cycle_time or 0) / 1e3) if is_open else None,
         checksum_byte=checksum_byte,
     )
 
@@ -363,6 +377,20 @@ def _counter_moved(inbox: _Inbox, batch: _Batch) -> Mask | None:
     inbox.last_counter, inbox.last_id = int(counter[-1]), int(batch.ids[-1])
     moved: Mask = (counter != before) | (batch.ids != id_before)
     return moved
+
+
+def _not_twice(inbox: _Inbox, batch: _Batch) -> Mask | None:
+    """False where a frame comes once more: counted twice, its noise would seem smaller than it is."""
+    t_before, id_before, data_before = inbox.last_frame
+    inbox.last_frame = float(batch.t[-1]), int(batch.ids[-1]), batch.payload[-1].tobytes()
+    close = np.diff(batch.t, prepend=t_before) < TWICE
+    if not close.any():
+        return None
+    length = batch.payload.shape[1]
+    first = np.frombuffer(data_before.ljust(length, b"\0"), np.uint8).reshape(1, length)
+    same = (batch.payload == np.concatenate([first, batch.payload[:-1]])).all(axis=1)
+    once: Mask = ~(close & same & (batch.ids == np.concatenate([[id_before], batch.ids[:-1]])))
+    return once
 
 
 def _judge(

@@ -8,7 +8,7 @@ from __future__ import annotations
 from enum import StrEnum
 
 _CONTROLLER, _BUS_OFF, _RESTARTED = 0x004, 0x040, 0x100  # error classes, in the identifier
-_OVERFLOW, _WARNING, _PASSIVE, _ACTIVE = 0x03, 0x0C, 0x30, 0x40  # of the controller, in data[1]
+_RX_OVERFLOW, _WARNING, _PASSIVE, _ACTIVE = 0x01, 0x0C, 0x30, 0x40  # of the controller, in data[1]
 
 
 class BusState(StrEnum):
@@ -36,4 +36,4 @@ def state_told(before: BusState, error_class: int, data: bytes | bytearray) -> B
 
 def tells_overflow(error_class: int, data: bytes | bytearray) -> bool:
     """Whether the controller lost a frame because nobody fetched it in time."""
-    return bool(error_class & _CONTROLLER and len(data) > 1 and data[1] & _OVERFLOW & 0x01)
+    return bool(error_class & _CONTROLLER and len(data) > 1 and data[1] & _RX_OVERFLOW)

@@ -9,6 +9,7 @@ from typing import Any
 from cantools.database.can import Database, Message
 
 from soilbus.can.admission import checksum_byte_of
+from soilbus.can.checksum import CHECKSUM, COUNTER
 from soilbus.config import Config, ConfigError
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -63,14 +64,26 @@ def load_databases(config: Config) -> Database:
 
 
 def checked_messages(config: Config) -> frozenset[str]:
-    """Names of the messages whose Counter and Checksum follow our own convention.
+    """Names of the messages that must carry a right Counter and Checksum.
 
-    Those are messages with both signals in DBC files that soilbus ships; what another maker's
-    Checksum means is not known.
+    Those are messages with both signals in DBC files that soilbus ships, and what
+    `dbc.checked` names; what another maker's Checksum means is not known.  Raises ConfigError
+    with a line for each name that is in no DBC or cannot be checked.
     """
     ours = [path for name in config.dbc.input if _is_shipped(path := located(config.folder, name))]
-    found = (m for path in ours for m in _read(path).messages)
-    return frozenset(m.name for m in found if checksum_byte_of(m) is not None)
+    found = {m.name for path in ours for m in _read(path).messages if checksum_byte_of(m) is not None}
+    if not config.dbc.checked:
+        return frozenset(found)
+    known = {m.name: m for m in load_databases(config).messages}
+    faults = [f"dbc.checked: no message {name} in the DBC" for name in config.dbc.checked if name not in known]
+    faults += [
+        f"dbc.checked: {name} has no {COUNTER} and byte-aligned 8-bit {CHECKSUM}"
+        for name in config.dbc.checked
+        if name in known and checksum_byte_of(known[name]) is None
+    ]
+    if faults:
+        raise ConfigError(faults)
+    return frozenset(found | set(config.dbc.checked))
 
 
 def output_database(config: Config) -> Database:

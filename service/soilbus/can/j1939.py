@@ -9,8 +9,9 @@ GROUND_BASED_SPEED = 65097
 STANDARD_PGNS = frozenset({65093, 65094, 65096, GROUND_BASED_SPEED, 65265, 65267, 129025})
 """Groups whose meaning the standards fix (hitch, speed, position), whoever sends them."""
 
-LOCK_RELEASE = 2.0
-"""Silence [s] of a locked source after which another may take its place."""
+LOCK_RELEASE, LOCK_CYCLES = 2.0, 3.0
+"""Silence [s] of a locked source after which another may take its place, and the same in cycles of the message:
+positions (PGN 65267) may come every 5 s."""
 
 _PDU2 = 0xF0
 _PDU1_MASK = 0x03FF0000
@@ -40,17 +41,23 @@ def source_of(arbitration_id: int) -> int:
 class SourceLock:
     """Keeps to one source of a parameter group.
 
-    The first source heard counts until it is silent for LOCK_RELEASE; `own`, the address that
+    The first source heard counts until it is silent for `patience` [s]; `own`, the address that
     the DBC names, takes over whenever it talks.
     """
 
     own: int
+    patience: float = LOCK_RELEASE
     source: int | None = field(default=None, init=False)
     heard: float = field(default=-math.inf, init=False)
 
+    @classmethod
+    def at_cycle(cls, own: int, cycle_time: float) -> SourceLock:
+        """With patience for a message that comes every `cycle_time` [s] (0: not told)."""
+        return cls(own, max(LOCK_RELEASE, LOCK_CYCLES * cycle_time))
+
     def admits(self, t: float, source: int) -> bool:
         """Whether a frame of `source` at t [s] counts; moves the lock where it must."""
-        if source != self.source and source != self.own and t - self.heard <= LOCK_RELEASE:
+        if source != self.source and source != self.own and t - self.heard <= self.patience:
             return False
         self.source = source
         self.heard = max(self.heard, t)

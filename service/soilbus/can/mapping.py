@@ -16,7 +16,7 @@ from soilbus.can.units import SI, STANDARD_GRAVITY, unit_of
 from soilbus.config import Config, ConfigError, Wheel
 from soilbus.config import Signal as Mapped
 
-WHEEL_ROLES = ("torque", "speed", "load", "sinkage", "torque_limit")
+WHEEL_ROLES = ("torque", "speed", "load", "sinkage", "torque_limit", "motor_speed")
 POSITION_ROLES = ("latitude", "longitude")
 VEHICLE_ROLES = ("ground_speed", "draft", "pitch", "acceleration", *POSITION_ROLES)
 
@@ -28,6 +28,7 @@ _HEAVY = 5.0e4  # kg, stands for the mass when there is no [vehicle]
 _DIMENSIONS: dict[str, tuple[str, ...]] = {
     "torque": ("torque",),
     "torque_limit": ("torque",),
+    "motor_speed": ("rotation",),
     "speed": ("rotation", "speed"),
     "load": ("force", "mass"),
     "sinkage": ("length",),
@@ -38,8 +39,8 @@ _DIMENSIONS: dict[str, tuple[str, ...]] = {
     "latitude": ("angle",),
     "longitude": ("angle",),
 }
-_SHAFT_BY_DEFAULT = frozenset({"torque", "torque_limit"})
-_HAS_SIDE = frozenset({"torque", "torque_limit", "speed"})
+_SHAFT_BY_DEFAULT = frozenset({"torque", "torque_limit", "motor_speed"})
+_HAS_SIDE = _SHAFT_BY_DEFAULT | {"speed"}
 
 
 class _Fault(Exception):
@@ -210,7 +211,7 @@ def plausible(config: Config, quantity: str, wheel: Wheel | None) -> tuple[float
     match quantity:
         case "torque" | "torque_limit":
             return -2.0 * weight * radius, 2.0 * weight * radius
-        case "speed":
+        case "speed" | "motor_speed":
             return -MAX_SPEED / radius, MAX_SPEED / radius
         case "load":
             return -0.02 * weight, 5.0 * weight  # a lifted wheel reads about zero

@@ -21,6 +21,7 @@ from soilbus.capability.limits import (
     within,
 )
 from soilbus.capability.sigma_points import SigmaPoints
+from soilbus.capability.uncertain_model import ModelOfRows, UncertainModel
 from soilbus.capability.wheels import Axles, WheelTable, wheel_table
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.window import Rig
@@ -119,7 +120,7 @@ def slip_grid(max_slip: float) -> Array:
 def assess(
     posterior: Posterior,
     rig: Rig,
-    model: WheelModel | CompletedModel,
+    model: WheelModel | CompletedModel | UncertainModel,
     demand: Demand | None,
     torque_limit: Array,
     max_slip: float,
@@ -132,10 +133,12 @@ def assess(
     None where no steady driving within slip and sinkage limits exists.  Raises ValueError
     for a rig without a chassis.
     """
-    points, completed = SigmaPoints.of(posterior), CompletedModel.over(model)
-    table = wheel_table(points.soils, rig, completed, slip_grid(max_slip), last, TOLERANCE)
+    uncertain = UncertainModel.over(model)
+    points = SigmaPoints.of(posterior, uncertain.shifts)
+    completed = uncertain.of_rows(len(points.soils))
+    table = wheel_table(points.soils, rig, uncertain, slip_grid(max_slip), last, TOLERANCE)
     skids = np.linspace(-MAX_SKID, table.slip[0], SKID_GRID)
-    skid = cache(lambda: wheel_table(points.soils, rig, completed, skids))
+    skid = cache(lambda: wheel_table(points.soils, rig, uncertain, skids))
     level = balance(table)
     vehicle = _Vehicle(table, level, Limits.of(table.axles, torque_limit, max_sinkage, completed), skid)
     draft = vehicle.largest(Duty(), level)
@@ -187,20 +190,27 @@ class _Vehicle:
         wheels that skid: below zero, as only a push or a slope moves the vehicle.
         """
         found = largest_pull(driving, self.limits)
-        if np.isfinite(found.pull[0]):
+        lost = ~np.isfinite(found.pull)
+        if not lost.any():
             return found
         no_torque = self.limits._replace(torque=np.full_like(self.limits.torque, np.inf))
-        if not within(driving, no_torque)[0].any():
+        weak = lost & within(driving, no_torque).any(axis=1)
+        if not weak.any():
+            return None if lost[0] else found
+        of_skid = self._skidding(duty)
+        pull, slip = (np.where(weak, *each) for each in ((of_skid.pull, found.pull), (of_skid.slip, found.slip)))
+        if not np.isfinite(pull[0]):
             return None
+        return Largest(pull, slip, "torque" if weak[0] else found.cause)
+
+    def _skidding(self, duty: Duty) -> Largest:
+        """Largest pull of wheels that skid; the least where even that asks for too much torque."""
         skidding = balance(self.skid(), duty)
         found = largest_pull(skidding, self.limits)
-        if np.isfinite(found.pull[0]):
-            return found._replace(cause="torque")
-        if not skidding.known[0].any():
-            return None
         least = np.where(skidding.known, skidding.pull, np.inf).argmin(axis=1)
         pull = np.where(skidding.known.any(axis=1), skidding.pull[np.arange(len(least)), least], np.nan)
-        return Largest(pull, skidding.slip[least], "torque")
+        none = ~np.isfinite(found.pull)
+        return Largest(np.where(none, pull, found.pull), np.where(none, skidding.slip[least], found.slip), "torque")
 
     def grade(self, draft: float) -> Array | None:
         """Steepest slope [rad] (D,) that is climbed with a draft [N]."""
@@ -227,7 +237,7 @@ def _set_points(
 
 
 def _forecast(
-    demand: Demand, present: Balance, axles: Axles, rig: Rig, model: CompletedModel, points: SigmaPoints
+    demand: Demand, present: Balance, axles: Axles, rig: Rig, model: ModelOfRows, points: SigmaPoints
 ) -> Forecast | None:
     place = place_of_pull(present, demand.pull)
     torque = (place.on(present.torque) * axles.count[:, 0]).sum(axis=1)

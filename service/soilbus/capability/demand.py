@@ -15,7 +15,8 @@ def present_demand(window: Window, chassis: Chassis | None, hop: float) -> Deman
     """Draft and slope, over the last hop [s] or the whole window, whichever asks for more.
 
     A driver who has just lifted the implement because it was too much still wants it
-    down.  None where the draft of the last hop is not known.
+    down.  The std is that of the sensors: what the demand will do next is the margin's business.
+    None where the draft of the last hop is not known.
     """
     if chassis is None or not len(window.t):
         return None
@@ -25,6 +26,9 @@ def present_demand(window: Window, chassis: Chassis | None, hop: float) -> Deman
     if not recent.any():
         return None
     part = recent if pull[recent].mean() >= pull[known].mean() else known
-    std = pull[part].std() / math.sqrt(np.count_nonzero(part))
+    weight = chassis.mass * GRAVITY
+    of_slope = np.where(np.isfinite(window.pitch), window.variance["pitch"], 0.0)
+    variance = window.variance["draft"] + weight**2 * of_slope
+    std = math.sqrt(float(variance[part].sum())) / np.count_nonzero(part)
     slope = float((pull - window.draft)[part].mean())
-    return Demand(float(pull[part].mean()), float(std), slope / (chassis.mass * GRAVITY))
+    return Demand(float(pull[part].mean()), std, slope / weight)

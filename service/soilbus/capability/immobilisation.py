@@ -5,13 +5,16 @@ the ground could give here and now does: it is the pull that is given, and what 
 window's pull over slip says is still to come from the present slip on.  It does not swing with
 the draft, and falls steadily where the soil softens.  The warning comes when
 it is about to fall below what is asked for, now and then or growing.
+
+Every window brings another curve, and with it another capacity on the same ground: that is no
+change of the ground.  So the trend is that along the newest curve, of the last moments too.
 """
 
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
-from collections.abc import Iterable, Iterator
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import lru_cache
@@ -20,23 +23,30 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.capability.assessment import OverSlip
+from soilbus.capability.trend import LAG, Capacity, Line, Peaks, Trend
 from soilbus.estimation.window import Rig, Window, pull_given
 from soilbus.terra.vehicle import slip_ratio
 
-MEMORY = 2.5
-"""Time constant [s] of the trends' forgetting."""
+DEMAND_MEMORY = 4.0
+"""Time constant [s] of forgetting the demand, which swings and for the most part comes back."""
 HOLD = 300.0
 """A peak of the demand is remembered this long [s] at least, and at most twice as long."""
 LONGEST_GAP = 1.0
 """Silence [s] after which the trends start anew."""
+REMEMBERED = 10.0
+"""Age [s] up to which moments are kept for the next curve."""
 SETTLED = 2.0
 """Age [s] from which a trend is believed."""
 AHEAD = 10.0
 """Time left [s] from which is warned."""
-MUCH = 0.75
+MUCH = 0.78
 """Share of the capacity from which a rise of the demand beyond its last peaks is carried on."""
-WEAKENING = 0.006
-"""Loss [1/s], as a share of the capacity, from which the ground is said to weaken."""
+WEAKENING, SHORT_WEAKENING = 0.006, 0.03
+"""Loss [1/s], as a share of the capacity, from which the ground is said to weaken, by the long and the short memory."""
+SURE = 2.5
+"""Standard deviations by which such a loss must differ from none."""
+STEADY = 0.003
+"""Rise of the demand [1/s], as a share of the capacity, up to which growing slip is the ground's doing."""
 CALM = 5.0
 """The warning ends this long [s] after its last cause."""
 SPAN = 3
@@ -51,64 +61,26 @@ class Alert(StrEnum):
     IMMOBILISATION = "immobilisation"
 
 
-class Trend(NamedTuple):
-    """A line through past values with exponential forgetting: sums of 1, x, x^2, y and x y, x [s] counted from now."""
-
-    n: float = 0.0
-    x: float = 0.0
-    xx: float = 0.0
-    y: float = 0.0
-    xy: float = 0.0
-
-    def joined(self, step: float, value: float) -> Trend:
-        """The trend a step [s] later, with one more value."""
-        kept = math.exp(-step / MEMORY)
-        n, x, y = kept * self.n, kept * self.x, kept * self.y
-        xx, xy = kept * self.xx, kept * self.xy
-        return Trend(n + 1.0, x - step * n, xx - 2.0 * step * x + step**2 * n, y + value, xy - step * y)
-
-    def line(self) -> tuple[float, float]:
-        """Value now and slope [1/s]."""
-        spread = self.n * self.xx - self.x**2
-        slope = (self.n * self.xy - self.x * self.y) / spread if spread > 1e-9 * self.n**2 else 0.0
-        return (self.y - slope * self.x) / self.n, slope
-
-
-class Peaks(NamedTuple):
-    """The greatest value since the time `since` [s], and in the HOLD before it."""
-
-    since: float = -math.inf
-    now: float = -math.inf
-    before: float = -math.inf
-
-    def joined(self, t: float, value: float) -> Peaks:
-        """With one more value."""
-        if t - self.since > HOLD:
-            return Peaks(t, value, self.now)
-        return self._replace(now=max(self.now, value))
-
-    @property
-    def greatest(self) -> float:
-        """Of all that is remembered."""
-        return max(self.now, self.before)
-
-
-_NOTHING, _NO_PEAKS = Trend(), Peaks()
+_NO_TREND, _NO_CAPACITY, _NO_PEAKS = Trend(), Capacity(), Peaks()
 
 
 @dataclass(frozen=True, slots=True)
 class Watch:
     """What is remembered from one moment to the next; `watched` makes the next one.
 
-    t [s] is the last moment with slip and pull, since that of the first; capacity and demand [N]
-    are trends, peaks holds the demand's greatest of late; caused [s] is when there was last a cause to
+    t [s] is the last moment with slip and pull, since that of the first; recent are the last of them as
+    (t, mean slip, pull) and curve is what the trend of the capacity rests on; capacity and demand [N] and the
+    mean slip are trends, peaks holds the demand's greatest of late; caused [s] is when there was last a cause to
     warn.  warning and time_left [s] (None: not foreseeable) are what to tell.
     """
 
     t: float = -math.inf
     since: float = math.inf
-    capacity: Trend = _NOTHING
-    demand: Trend = _NOTHING
+    recent: tuple[tuple[float, float, float], ...] = ()
+    curve: OverSlip | None = None
+    capacity: Capacity = _NO_CAPACITY
+    demand: Trend = _NO_TREND
+    slip: Trend = _NO_TREND
     peaks: Peaks = _NO_PEAKS
     caused: float = -math.inf
     warning: Alert = Alert.UNKNOWN
@@ -130,17 +102,46 @@ def watched(before: Watch, t: float, slip: Iterable[float | None], pull: float |
         before, step = replace(_anew(before, t), since=t), 0.0
     mean_slip = sum(slips) / len(slips)
     reserve = _reserve(curve, mean_slip)
-    capacity = before.capacity.joined(step, pull + reserve)
-    demand = before.demand.joined(step, pull)
-    peaks = before.peaks.joined(t, pull)
+    kept = before.recent[bool(before.recent and t - before.recent[0][0] > REMEMBERED) :]
+    trend = before.capacity if curve is before.curve else _along(curve, kept)
+    capacity = trend.joined(step, _able(curve, mean_slip, pull), _earlier(curve, t, kept))
+    demand = before.demand.joined(step, pull, DEMAND_MEMORY)
+    peaks = before.peaks.joined(t, pull, HOLD)
+    creep = before.slip.joined(step, mean_slip, DEMAND_MEMORY)
     time_left = None
     if t - before.since >= SETTLED:
-        time_left = 0.0 if reserve <= 0.0 else _time_left(capacity.line(), (pull, demand.line()[1]), peaks.greatest)
+        time_left = 0.0
+        if reserve > 0.0:
+            rise = demand.line().slope
+            to_limit = _time_of_creep(creep, float(curve.slip[-1]), rise / (pull + reserve))
+            time_left = min(_time_left(capacity, pull, rise, peaks.greatest), to_limit)
     caused = t if time_left is not None and time_left < AHEAD else before.caused
     warning = Alert.UNKNOWN if time_left is None else Alert.NONE
     if t - caused < CALM:
         warning = Alert.IMMOBILISATION
-    return Watch(t, before.since, capacity, demand, peaks, caused, warning, time_left)
+    recent = (*kept, (t, mean_slip, pull))
+    return Watch(t, before.since, recent, curve, capacity, demand, creep, peaks, caused, warning, time_left)
+
+
+def _along(curve: OverSlip, recent: Sequence[tuple[float, float, float]]) -> Capacity:
+    """The capacity at the last moments by a curve."""
+    t, slip, pull = np.array(recent, float).reshape(-1, 3).T
+    known = np.isfinite(curve.pull)
+    slips, pulls = curve.slip[known], curve.pull[known]
+    ahead = np.append(np.maximum.accumulate(pulls[::-1])[::-1], pulls[-1:])[np.searchsorted(slips, slip, "right")]
+    able = pull + np.where(slip >= slips[-1], 0.0, ahead - np.interp(slip, slips, pulls))
+    return Capacity.through(t, np.where(slip >= curve.slip[0], able, np.nan))
+
+
+def _able(curve: OverSlip, slip: float, pull: float) -> float | None:
+    """Pull [N] that the ground could give; None from wheels that all but roll, for these ask nothing of it."""
+    return pull + _reserve(curve, slip) if slip >= curve.slip[0] else None
+
+
+def _earlier(curve: OverSlip, t: float, recent: Sequence[tuple[float, float, float]]) -> float | None:
+    """The capacity at the first moment that is no more than LAG before the time t [s]; None where it is not known."""
+    place = bisect_left(recent, t - LAG, key=lambda moment: moment[0])
+    return _able(curve, *recent[place][1:]) if place < len(recent) else None
 
 
 def _anew(before: Watch, t: float) -> Watch:
@@ -189,10 +190,27 @@ def _known(curve: OverSlip) -> tuple[list[float], list[float], list[float]]:
     return curve.slip[known].tolist(), pull.tolist(), np.maximum.accumulate(pull[::-1])[::-1].tolist()
 
 
-def _time_left(capacity: tuple[float, float], demand: tuple[float, float], peak: float) -> float:
+def _time_left(capacity: Capacity, asked: float, rise: float, peak: float) -> float:
     """Time [s] until the capacity, going on as it does, meets the demand's peak or its rise."""
-    (able, change), (asked, rise) = capacity, demand
-    weakens, outgrows = -change > WEAKENING * abs(able), asked >= peak and asked > MUCH * able
-    to_peak = (able - peak) / -change if weakens else math.inf
-    to_rise = (able - asked) / (rise - change) if outgrows and rise > change else math.inf
-    return max(min(to_peak, to_rise), 0.0)
+    if not capacity.is_told:
+        return math.inf
+    able = capacity.long.line()
+    outgrows = asked >= peak and asked > MUCH * able.value and rise > able.slope
+    to_rise = (able.value - asked) / (rise - able.slope) if outgrows else math.inf
+    weakening = (
+        _time_of_weakening(capacity, able, WEAKENING, peak),
+        _time_of_weakening(capacity, capacity.short.line(), SHORT_WEAKENING, peak),
+    )
+    return max(min(to_rise, *weakening), 0.0)
+
+
+def _time_of_weakening(capacity: Capacity, line: Line, least: float, peak: float) -> float:
+    """Time [s] until one of the capacity's lines falls to the demand's peak, inf where it does not surely fall."""
+    surely = -line.slope > max(least * abs(line.value), SURE * capacity.slope_std(line))
+    return (line.value - peak) / -line.slope if surely else math.inf
+
+
+def _time_of_creep(slip: Trend, limit: float, rise: float) -> float:
+    """Time [s] until slip, growing under a demand that hardly rises (rise [1/s]), passes the limit."""
+    line = slip.line()
+    return max(limit - line.value, 0.0) / line.slope if line.slope > 0.0 and abs(rise) < STEADY else math.inf

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.capability.balance import Balance
+from soilbus.capability.uncertain_model import ModelOfRows
 from soilbus.capability.wheels import Axles
-from soilbus.terra.effects.steady import CompletedModel
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE
 
 Array = NDArray[np.float64]
@@ -17,13 +17,13 @@ Cause = Literal["torque", "traction", "sinkage", "slip"]
 
 
 class Limits(NamedTuple):
-    """Greatest torque [N m] and entry angle [rad] of each kind of wheel (A,)."""
+    """Of each kind of wheel the greatest torque [N m] (A,), and for each soil the greatest entry angle [rad] (D, A)."""
 
     torque: Array
     angle: Array
 
     @classmethod
-    def of(cls, axles: Axles, torque_limit: Array, max_sinkage: float, model: CompletedModel) -> Limits:
+    def of(cls, axles: Axles, torque_limit: Array, max_sinkage: float, model: ModelOfRows) -> Limits:
         """From the wheels' torque limits (W,) [N m], nan where not known, and a sinkage [m] of wheels on the level."""
         torque = np.full(len(axles.count), np.inf)
         np.fmin.at(torque, axles.of_wheel, torque_limit)
@@ -41,7 +41,7 @@ class Largest(NamedTuple):
 
 def within(balance: Balance, limits: Limits) -> NDArray[np.bool_]:
     """Steady states within the limits (D, F)."""
-    low = (balance.torque <= limits.torque[:, None]) & (balance.angle <= limits.angle[:, None])
+    low = (balance.torque <= limits.torque[:, None]) & (balance.angle <= limits.angle[..., None])
     return np.asarray(balance.known & low.all(axis=1))
 
 
@@ -68,7 +68,7 @@ def largest_pull(balance: Balance, limits: Limits) -> Largest:
 
 
 def _share(here: Array, there: Array, limit: Array) -> Array:
-    """Share of the way from here to there (D, A) at which the first limit (A,) is met, 1 if none is: (D,)."""
+    """Share of the way from here to there (D, A) at which the first limit (A,) or (D, A) is met, 1 if none is: (D,)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.where(there > limit, (limit - here) / (there - here), 1.0)
     return np.asarray(share.min(axis=1))

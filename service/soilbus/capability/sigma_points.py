@@ -31,20 +31,28 @@ _PHI = Soil._fields.index("phi")
 
 @dataclass(frozen=True, slots=True)
 class SigmaPoints:
-    """Soils (D, 6), the mode first; weight (P,) of the first P: the mode, then pairs that mirror each other."""
+    """Soils (D, 6), the mode first; weight (P,) of the first P: the mode, then pairs that mirror each other.
+
+    The rest are single points, one standard deviation away along a direction that is independent of all others.
+    """
 
     soils: Array
     weight: Array
 
     @classmethod
-    def of(cls, posterior: Posterior) -> SigmaPoints:
-        """The points of a posterior; similar posteriors have similar ones, in the same order."""
-        variance, directions = np.linalg.eigh(posterior.log_covariance)
+    def of(cls, posterior: Posterior, shifts: Array | None = None) -> SigmaPoints:
+        """The points of a posterior; similar posteriors have similar ones, in the same order.
+
+        Each of the shifts (Q, 6), of the logarithms, is part of the posterior's covariance and goes with
+        something else that is uncertain, one standard deviation of it: they are the last points.
+        """
+        along = np.zeros((0, len(posterior.soil))) if shifts is None else shifts
+        variance, directions = np.linalg.eigh(posterior.log_covariance - along.T @ along)
         free = np.flatnonzero(variance > _LEAST * max(variance[-1], 0.0))[::-1]
         axes = directions[:, free] * np.sqrt(variance[free])
         axes = axes * np.sign(axes[np.abs(axes).argmax(axis=0), np.arange(len(free))])
         points, weight = cubature(min(len(free), LEADING))
-        steps = np.concatenate([points @ axes[:, :LEADING].T, axes[:, LEADING:].T])
+        steps = np.concatenate([points @ axes[:, :LEADING].T, axes[:, LEADING:].T, along])
         soils = np.asarray(posterior.soil) * np.exp(steps)
         soils[1:, _PHI] = np.minimum(soils[1:, _PHI], max(MAX_PHI, posterior.soil.phi))
         return cls(soils, weight)

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.capability.uncertain_model import ModelOfRows, UncertainModel
 from soilbus.estimation.window import Rig
 from soilbus.terra.effects.steady import CompletedModel, Wheel
 from soilbus.terra.entry_angle import entry_angle_for_load
@@ -123,19 +124,20 @@ class WheelTable:
 def wheel_table(
     soils: Array,
     rig: Rig,
-    model: WheelModel | CompletedModel,
+    model: WheelModel | CompletedModel | UncertainModel,
     slip: Array,
     start: WheelTable | None = None,
     tolerance: float = TOLERANCE,
 ) -> WheelTable:
     """Wheels on soils (D, 6) at slips (S,); `start` is the same rig's table of similar soils.
 
-    tolerance: the Newton step of pull and load, over the weight, that is the last.
+    The last of the soils are those of the model's doubts, where it has any.  tolerance: the Newton
+    step of pull and load, over the weight, that is the last.
 
     Raises ValueError for a rig without a chassis.
     """
-    completed = CompletedModel.over(model)
     n_soils, n_slips = len(soils), len(slip)
+    completed = UncertainModel.over(model).of_rows(n_soils)
     if start is not None and not (start.pull.shape == (n_soils, n_slips) and np.array_equal(start.slip, slip)):
         start = None
     axles = Axles.of(rig) if start is None else start.axles
@@ -149,7 +151,7 @@ def wheel_table(
     unknown = np.isnan(angle).any(axis=(1, 2))
     if unknown.any():
         guess = _state(soils[unknown], axles, slip, angle[unknown])
-        angle[unknown] = entry_angle_for_load(load[unknown], guess, completed.model, tolerance=1e-2)
+        angle[unknown] = entry_angle_for_load(load[unknown], guess, completed.first.model, tolerance=1e-2)
     last_step = tolerance * axles.weight
     with np.errstate(all="ignore"):
         now = _newton_step(soils, axles, completed, slip, pull, load, angle)
@@ -158,12 +160,12 @@ def wheel_table(
             if not len(rows):
                 break
             angle[rows] = np.clip(now.at[2, rows], 0.5 * angle[rows], 2.0 * angle[rows]).clip(max=MAX_ENTRY_ANGLE)
-            of_rows = soils[rows], axles, completed, slip, now.pull[rows], now.load[rows], angle[rows]
+            of_rows = soils[rows], axles, completed.of(rows), slip, now.pull[rows], now.load[rows], angle[rows]
             for whole, part in zip(now, _newton_step(*of_rows), strict=True):
                 whole[(slice(None),) * (part.ndim == 4) + (rows,)] = part
     pull, load, at, by_load, by_slip, miss = now
     balanced = np.isfinite(at[2]).all(axis=1) & (load > 0.0).all(axis=1) & (miss <= last_step)
-    bend = _bend(soils[:1], axles, completed, slip, load[:1], at[:, :1], by_load[:, :1])
+    bend = _bend(soils[:1], axles, completed.first, slip, load[:1], at[:, :1], by_load[:, :1])
     return WheelTable(axles, soils, slip, np.where(balanced, pull, np.nan), load, at, by_load, by_slip, bend, balanced)
 
 
@@ -193,7 +195,7 @@ class _Step(NamedTuple):
 
 
 def _newton_step(
-    soils: Array, axles: Axles, model: CompletedModel, slip: Array, pull: Array, load: Array, angle: Array
+    soils: Array, axles: Axles, model: ModelOfRows, slip: Array, pull: Array, load: Array, angle: Array
 ) -> _Step:
     """One step towards wheels that carry their loads and a level pull that balances itself."""
     forces, d = model.forces_and_slopes(_state(soils, axles, slip, angle), ~axles.front, load)

@@ -13,6 +13,7 @@ from soilbus.assembly import completion_of, model_of, prior_of, rig_of
 from soilbus.capability.assessment import Demand, OverSlip
 from soilbus.capability.demand import present_demand
 from soilbus.capability.immobilisation import Moment, Watch, moments, watched
+from soilbus.capability.uncertain_model import UncertainModel
 from soilbus.capability.wheels import WheelTable
 from soilbus.config import Config
 from soilbus.daemon.gap import GapWatch, squares
@@ -77,7 +78,7 @@ class Undecided:
 
     demand is None where the draft is not known; torque_limit (W,) [N m]; stuck: the wheels
     turn on the spot; moments: slips and pulls of the last hop; fresh: nothing of the window before
-    may be carried over; model: with the effects' parameters as the window leaves them.
+    may be carried over; model: with what the window leaves known of the effects' parameters.
     """
 
     result: WindowResult
@@ -86,7 +87,7 @@ class Undecided:
     stuck: bool
     moments: list[Moment]
     fresh: bool
-    model: CompletedModel
+    model: UncertainModel
 
 
 class WindowEstimator:
@@ -114,6 +115,11 @@ class WindowEstimator:
             ),
             *self._completion,
         )  # fmt: skip
+
+    @property
+    def tracker(self) -> Tracker:
+        """What carries soil and gains from window to window."""
+        return self._tracker
 
     def solve(self, task: WindowTask) -> WindowResult:
         """Estimate and decision of one window."""
@@ -150,7 +156,7 @@ class WindowEstimator:
             gaps=self._watched_gaps(task, fit),
         )
         effects = self._effects(fit)
-        model = CompletedModel.of(self.model, effects, self._usual_speed(task.window))
+        model = self._present_model(task.window, tracked, effects)
         window = _with_true_draft(task.window, effects, self.rig)
         last_hop = list(moments(window, self.rig, task.end - self._settings.hop, self._settings.min_speed))
         demand = present_demand(window, self.rig.chassis, self._settings.hop)
@@ -203,12 +209,18 @@ class WindowEstimator:
         pulls = np.zeros(len(free)) if fit is None else fit.gains[len(fit.gains) - len(free) :]
         return active_at(effects, free, pulls, len(self.rig.wheels))
 
+    def _present_model(self, window: Window, tracked: Tracked, effects: Sequence[Active]) -> UncertainModel:
+        """The model for the decision, at the window's usual speed."""
+        speed, fit = self._usual_speed(window), tracked.fit
+        if fit is None:
+            return UncertainModel.over(CompletedModel.of(self.model, effects, speed))
+        widening = _widening(tracked, fit)
+        return UncertainModel.of(self.model, *self._completion, fit.whole, len(self.rig.wheels), speed, widening)
+
     def _honest(self, tracked: Tracked, fit: Fit) -> Posterior:
         """Posterior, of both optima where there are two, widened where the residuals are larger than the noise."""
         posterior = fit.whole.posterior
-        if not tracked.mismatch:
-            return posterior
-        return Posterior(posterior.soil, posterior.log_covariance * max(fit.chi2, 1.0))
+        return Posterior(posterior.soil, posterior.log_covariance * _widening(tracked, fit))
 
     def _bearing(self, posterior: Posterior) -> Estimate:
         return posterior.bearing_pressure(self._settings.z_ref, self._settings.b_ref)
@@ -240,6 +252,12 @@ class WindowEstimator:
         return bool(standing.sum() > 0.5 * max(int(known.sum()), 1))
 
     def _status(self, task: WindowTask, tracked: Tracked) -> tuple[Status, str]:
+        """Status and its reason; a sensor that lies is the reason of all that may follow from it."""
+        status, reason = self._status_of_the_rest(task, tracked)
+        follows = reason.split()[0] in ("none", "input_stale", "model_mismatch", "no_convergence")
+        return status, " ".join(["implausible", *task.implausible]) if task.implausible and follows else reason
+
+    def _status_of_the_rest(self, task: WindowTask, tracked: Tracked) -> tuple[Status, str]:
         fit = tracked.fit
         if task.missing:
             return Status.INVALID, "input_missing " + " ".join(task.missing)
@@ -253,7 +271,8 @@ class WindowEstimator:
             return status, "model_mismatch" if failure == "model_mismatch" else "no_convergence"
         if task.poor:
             return Status.DEGRADED, "input_stale " + " ".join(task.poor)
-        if tracked.ground is Ground.CHANGING or tracked.since > task.end - MIN_NEW_SOIL * self._settings.window:
+        unknown = tracked.ground in (Ground.CHANGING, Ground.SETTLING)
+        if unknown or tracked.since > task.end - MIN_NEW_SOIL * self._settings.window:
             return Status.NOT_EXCITED, "not_excited new_soil"
         if self._ambiguous(fit):
             return Status.NOT_EXCITED, "ambiguous"
@@ -283,6 +302,11 @@ class WindowEstimator:
         one, other = fit.posterior, fit.rival.belief.posterior
         pairs = ((self._bearing(one), self._bearing(other)), (one.tan_phi(), other.tan_phi()))
         return any(abs(a.value - b.value) > AMBIGUOUS * a.std for a, b in pairs)
+
+
+def _widening(tracked: Tracked, fit: Fit) -> float:
+    """Factor of the covariance of a fit that leaves more than noise."""
+    return max(fit.chi2, 1.0) if tracked.mismatch else 1.0
 
 
 def _with_true_draft(window: Window, effects: Sequence[Active], rig: Rig) -> Window:

@@ -21,7 +21,9 @@ from soilbus.can.channels import Channel, Decoded
 from soilbus.can.dbc_files import checked_messages
 from soilbus.can.mapping import POSITION_ROLES, channels_of
 from soilbus.config import Config
+from soilbus.daemon.plausibility import Plausibility
 from soilbus.daemon.positions import PositionTrack
+from soilbus.estimation.plausibility import without
 from soilbus.estimation.screening import WILD
 from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, BinStore, Window, forward, pull_given
 from soilbus.terra.vehicle import slip_ratio
@@ -45,6 +47,7 @@ class WindowTask:
 
     index counts windows since the start; start and end [s]; missing are needed channels
     never seen, poor those that are stale at the end or covered the window badly;
+    implausible are channels that lie, and are not in the window;
     torque_limit (W,) [N m], nan where unknown; track knows the positions from the window's
     middle on; fresh: nothing of the window before may be carried over.
     """
@@ -60,6 +63,7 @@ class WindowTask:
     track: PositionTrack
     rejected: dict[str, int]
     fresh: bool
+    implausible: tuple[str, ...] = ()
 
 
 class Latest(NamedTuple):
@@ -111,6 +115,7 @@ class Intake:
         self._positions = PositionTrack(
             {c.name: c.timeout or DEFAULT_TIMEOUT for c in self.channels if c.quantity in POSITION_ROLES}
         )
+        self._plausibility = Plausibility(self.rig, self.channels, database, config.estimator)
         self._settings = config.estimator
         self._binned = frozenset(self.rig.channels)
         limits = {w.name: w.max_torque for w in config.wheel}
@@ -131,6 +136,8 @@ class Intake:
         self._bins: BinStore | None = None
         self._fresh = True
         self._positions.forget()
+        self._plausibility.forget()
+        self._lying: tuple[str, ...] = ()
         self.next_end = math.inf
         self.last_seen: dict[str, float] = {}
         self._clock_steps = self.admission.counts.clock_steps
@@ -151,6 +158,7 @@ class Intake:
             if name.startswith("torque_limit."):
                 self._note_limit(name.removeprefix("torque_limit."), t, value)
         self._positions.add(heard)
+        self._plausibility.add(heard)
         if self._bins is not None:
             self._bins.add({name: samples for name, samples in heard.items() if name in self._binned})
 
@@ -197,7 +205,7 @@ class Intake:
 
     def _task(self, bins: BinStore, end: float) -> WindowTask:
         start = end - self._settings.window
-        window = forward(bins.window(start, end))
+        window, self._lying = self._plausibility.screened(forward(bins.window(start, end)))
         self.refusals.note(WILD, bins.new_wild())
         missing = tuple(c.name for c in self.needed if c.name not in self.last_seen)
         covered = dict(zip(self.rig.channels, coverage(window).tolist(), strict=True))
@@ -216,11 +224,13 @@ class Intake:
             track=self._positions.copy(),
             rejected=self.refusals.within(start, end),
             fresh=self._fresh,
+            implausible=self._lying,
         )
         self._fresh = False
         self._index += 1
         bins.drop_before(start + self._settings.hop)
         self._positions.drop_before((start + end) / 2.0 + self._settings.hop)
+        self._plausibility.drop_before(start + self._settings.hop)
         return task
 
     def stale(self, now: float) -> list[str]:
@@ -233,10 +243,11 @@ class Intake:
 
     def latest(self, now: float) -> Latest:
         """Slip and pull over the last moments before `now` [s]."""
-        if self._bins is None:
+        silent = now - max(self.last_seen.values(), default=-math.inf)
+        if self._bins is None or not silent <= LONGEST_GAP:  # nor nan; there are no bins for years of silence
             return Latest(dict.fromkeys(self.rig.wheels), None)
         last = math.floor((now - self._bins.origin) / self._settings.bin) * self._settings.bin + self._bins.origin
-        window = self._bins.glimpse(last - SLIP_SPAN, last)
+        window = without(self._bins.glimpse(last - SLIP_SPAN, last), self.rig, set(self._lying))
         pull = None if self.rig.chassis is None else column_means(pull_given(window, self.rig.chassis)[:, None])[0]
         return Latest(self._slip(window), pull)
 

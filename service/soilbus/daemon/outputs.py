@@ -7,9 +7,11 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from cantools.database.can import Database
+
 from soilbus.capability.assessment import Capability
 from soilbus.capability.immobilisation import Watch
-from soilbus.config import Config
+from soilbus.config import Config, ConfigError
 from soilbus.daemon.pipeline import WindowResult
 from soilbus.daemon.states import state_after
 from soilbus.estimation.posterior import Estimate
@@ -17,6 +19,10 @@ from soilbus.estimation.soil_class import UNKNOWN
 
 WINDOW_MODULUS = 251
 """The frames' 8-bit window number counts 0..250."""
+
+TICK = 0.1
+"""Cycle [s] of the frames that others act on."""
+FAST_FRAMES = ("WheelSlip", "WheelSlip2", "Traversability", "TorqueDemand", "DemandForecast")
 
 LONG = 1e6
 """A time [s] that is longer than any signal holds."""
@@ -33,6 +39,31 @@ PARAMETER_FRAMES = {
     "c": ("SoilCohesion", 1e3),
     "K": ("SoilShearModulus", 1e-3),
 }
+
+
+HOP_FRAMES = (
+    "SoilStrength", "SoilClass", *(message for message, _ in PARAMETER_FRAMES.values()), "DraftCapability",
+    "GradeCapability", "TractionAdvice", "TractionLimits", "WheelSinkage", "WheelSinkage2",
+)  # fmt: skip
+"""Go out once each window."""
+
+
+def check_cycle_times(config: Config, database: Database) -> None:
+    """Raises ConfigError where frames would come less often than the DBC tells their readers (GenMsgCycleTime).
+
+    Readers judge silence by it, and would take each pause for the end of soilbus.
+    """
+    told = {m.name: (m.cycle_time or math.inf) / 1e3 for m in database.messages}
+    faults = []
+    for frames, every in ((FAST_FRAMES, TICK), (HOP_FRAMES, config.estimator.hop)):
+        if late := [name for name in frames if told[name] < every * (1.0 - 1e-9)]:
+            faults.append(
+                f"output.dbc: {config.output.dbc} promises {', '.join(late)} every {1e3 * told[late[0]]:g} ms, but"
+                f" soilbus sends every {1e3 * every:g} ms: set GenMsgCycleTime in a copy of the DBC that both sides use"
+                + (", or a shorter estimator.hop" if frames is HOP_FRAMES else "")
+            )
+    if faults:
+        raise ConfigError(faults)
 
 
 def json_line(result: WindowResult, config: Config) -> str:

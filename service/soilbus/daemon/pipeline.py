@@ -22,7 +22,7 @@ class Pipeline:
     """
 
     def __init__(self, config: Config, database: Database) -> None:
-        self.config = config
+        self.config, self.database = config, database
         self.intake = Intake(config, database)
         self.estimator = WindowEstimator(config)
         self.admission = self.intake.admission

@@ -18,17 +18,22 @@ from soilbus.capability.assessment import OverSlip
 from soilbus.capability.immobilisation import Watch, watched
 from soilbus.config import Config
 from soilbus.daemon.bus_health import health_frame, health_text
+from soilbus.daemon.estimator import WindowEstimator
+from soilbus.daemon.health import Health
 from soilbus.daemon.intake import Latest
+from soilbus.daemon.keeper import Keeper
 from soilbus.daemon.notify import Notifier
-from soilbus.daemon.outputs import WINDOW_MODULUS, forecast_frame, hop_frames, slip_frames
+from soilbus.daemon.outputs import TICK, WINDOW_MODULUS, forecast_frame, hop_frames, slip_frames
 from soilbus.daemon.pipeline import Pipeline, WindowResult
+from soilbus.daemon.solver import INTERNAL, Solver
 from soilbus.daemon.states import ServiceState, state_after
+from soilbus.daemon.totals import totals
+from soilbus.estimation.belief import Belief
 from soilbus.traversability import State as Way
 from soilbus.traversability import Status
 
 log = logging.getLogger(__name__)
 
-TICK = 0.1
 SILENCE = 1.0
 """Seconds without any frame after which the bus counts as silent."""
 GRACE = 0.2
@@ -41,12 +46,10 @@ MAX_PENDING = 3
 """Windows that may wait for the worker."""
 LONGEST_CURVE = 60.0
 """Age [s] up to which a valid window's pull over slip serves to watch for immobilisation."""
-LONGEST_SOLVE = 20.0
-"""A window that takes longer [s] is a worker that hangs: the watchdog is fed no more."""
 FOREIGN_HOLD = 3.0
 """Seconds for which another sender under our identifiers is told of: until every reader has seen it."""
 INTERRUPTIONS = frozenset(("bus_down", "no_frames", "input_missing", "input_stale", "foreign_sender"))
-"""Reasons, beside a bus-off, for which no window that ended before is believed any more."""
+"""Reasons, beside a bus-off and a fault, for which no window that ended before is believed any more."""
 
 
 class Pending(NamedTuple):
@@ -63,7 +66,8 @@ class Service:
     The loop receives and publishes; `workers` (one thread) estimates beside it, so that a
     hard window neither delays a frame nor loses one.  `clock` is monotonic [s]; frame
     stamps only space the samples.  `step` makes one round and returns; `run` repeats it
-    until `stop`.
+    until `stop`.  A keeper begins with what another run knew of the sensors, and keeps what
+    this one knows.
     """
 
     def __init__(
@@ -76,14 +80,21 @@ class Service:
         workers: Executor,
         clock: Callable[[], float] = time.monotonic,
         on_window: Callable[[WindowResult], None] | None = None,
+        keeper: Keeper | None = None,
     ) -> None:
         self.config, self.bus, self.publisher = config, bus, publisher
-        self.intake, self._solve = pipeline.intake, pipeline.estimator.solve
+        self.intake = pipeline.intake
+        self._solver = Solver(pipeline.estimator, lambda: WindowEstimator(config))
+        self._keeper = keeper
+        if keeper is not None and keeper.recalled is not None:
+            pipeline.estimator.tracker.recall(*keeper.recalled)
         self.notifier, self.clock, self.on_window = notifier, clock, on_window
         self.result: WindowResult | None = None
         self.deadline_misses = 0
         self.failures: Counter[str] = Counter()
         """Failed solves by kind, since the start."""
+        self.windows = 0
+        """Windows solved since the start."""
         self._watch = Watch()
         self._curve: tuple[OverSlip | None, float] = None, -math.inf
         self._workers = workers
@@ -100,6 +111,7 @@ class Service:
         self._due = dict.fromkeys(("SoilbusStatus", "SoilbusIdentity", "BusHealth"), self._started)
         self._lost = bus.counts.lost
         self._next_watchdog = self._started
+        self._health, self._fault = Health(self._started), ""
         self._state: tuple[ServiceState, str] = (ServiceState.STARTING, "none")
 
     def stop(self) -> None:
@@ -116,6 +128,8 @@ class Service:
         self._publish_ten_hertz(self.clock())
         self._workers.shutdown(wait=False, cancel_futures=True)
         self.bus.close()
+        if self._keeper is not None:
+            self._keeper.close(self._newest(), self._totals())
 
     def step(self) -> None:
         """Receive until the next tick, then hand out, collect and publish what is due."""
@@ -162,17 +176,18 @@ class Service:
             if not self._pending:
                 self._solved_at = now
             ended = now - max(0.0, self.bus_time(now) - task.end)
-            self._pending.append(Pending(self._workers.submit(self._solve, task), ended, self.intake.epoch))
+            self._pending.append(Pending(self._workers.submit(self._solver.solve, task), ended, self.intake.epoch))
             while len(self._pending) > MAX_PENDING and self._pending[1].future.cancel():
                 del self._pending[1]
                 self.deadline_misses += 1
 
     def _collect(self, now: float) -> None:
-        """Publish the windows that are solved, in their order; raises what the worker raised."""
+        """Publish the windows that are solved, in their order."""
         while self._result_waits():
             pending = self._pending.popleft()
             result = pending.future.result()
             self._solved_at = now
+            self.windows += 1
             if result.failure is not None:
                 self.failures[result.failure] += 1
             if pending.epoch == self.intake.epoch:
@@ -199,6 +214,7 @@ class Service:
             self.intake.ingest()
         if self.intake.epoch != self._epoch:
             self._epoch, self.result, self._watch, self._curve = self.intake.epoch, None, Watch(), (None, -math.inf)
+        self._look_after_health(now)
         self._state = self._present_state(now)
         if _interrupts(self._state) or self.bus.counts.lost != self._lost:
             self._interrupted, self._lost = now, self.bus.counts.lost
@@ -208,10 +224,27 @@ class Service:
                 self._due[message] = max(due + self.publisher.schedule[message], now)
                 self._publish_slow(message, now)
         interval = self.notifier.watchdog_interval
-        worker_hangs = bool(self._pending) and now - self._solved_at > LONGEST_SOLVE
-        if interval is not None and now >= self._next_watchdog and not worker_hangs:
+        if interval is not None and now >= self._next_watchdog and not self._fault:
             self._next_watchdog = now + interval
             self.notifier.watchdog()
+        if self._keeper is not None:
+            self._keeper.tick(now, self._newest(), self._totals)
+
+    def _look_after_health(self, now: float) -> None:
+        solving_since = self._solved_at if self._pending else None
+        hears = self.bus.is_open and now - self._last_frame <= SILENCE
+        fault = self._health.fault(now, solving_since, hears, self.bus.counts.sent) or ""
+        if fault and fault != self._fault:
+            log.error("fault: %s; systemd is not told any more that all is well", fault)
+        self._fault = fault
+
+    def _newest(self) -> Belief | None:
+        return self._solver.estimator.tracker.newest
+
+    def _totals(self) -> dict[str, int]:
+        return totals(
+            self.windows, self.deadline_misses, self.failures, self.bus.counts, self.intake.admission.counts
+        )  # fmt: skip
 
     def _present_state(self, now: float) -> tuple[ServiceState, str]:
         if not self.bus.is_open:
@@ -225,6 +258,8 @@ class Service:
             never = [name for name in stale if name not in self.intake.last_seen]
             reason = "input_missing " + " ".join(never) if never else "input_stale " + " ".join(stale)
             return ServiceState.DEGRADED, reason
+        if self._fault or self._solver.in_fault:
+            return ServiceState.FAULT, self._fault or INTERNAL
         if now - self.bus.last_foreign < FOREIGN_HOLD:
             return ServiceState.DEGRADED, "foreign_sender"
         if self.result is None:
@@ -237,11 +272,11 @@ class Service:
         return state_after(self.result), reason
 
     def present_way(self, now: float) -> Way:
-        """go, caution or no_go only while the bus is up, no needed input is stale and the posterior is young.
+        """go, caution or no_go only while all works, no needed input is stale and the posterior is young.
 
         After an interruption only a window that ended later counts.
         """
-        if self.result is None or _interrupts(self._present_state(now)):
+        if self.result is None or _interrupts(self._present_state(now)) or self._fault or self._solver.in_fault:
             return Way.UNKNOWN
         if self._ended <= self._interrupted or not self._age(now) <= self.config.traversability.max_age:  # nor nan
             return Way.UNKNOWN
@@ -332,6 +367,8 @@ class Service:
             bearing = self.result.bearing
             text += f", bearing pressure {bearing.value / 1e3:.1f} +- {bearing.std / 1e3:.1f} kPa"
             text += f", {self.present_way(now)}"
+        if self.deadline_misses:
+            text += f", deadline misses {self.deadline_misses}"
         if self.failures:
             text += ", failed solves: " + ", ".join(f"{kind} {n}" for kind, n in self.failures.most_common())
         if health := health_text(self.bus.state, self.bus.counts):
@@ -340,7 +377,7 @@ class Service:
 
 
 def _interrupts(state: tuple[ServiceState, str]) -> bool:
-    return state[0] is ServiceState.WAITING or _kind(state[1]) in INTERRUPTIONS
+    return state[0] in (ServiceState.WAITING, ServiceState.FAULT) or _kind(state[1]) in INTERRUPTIONS
 
 
 def _kind(reason: str) -> str:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 from soilbus.can.bus import BusError, LiveBus, open_bus
 from soilbus.can.dbc_files import filters_of, load_databases, output_database
 from soilbus.can.publish import Publisher
 from soilbus.config import Config
+from soilbus.daemon.keeper import Keeper
 from soilbus.daemon.notify import Notifier
+from soilbus.daemon.outputs import check_cycle_times
 from soilbus.daemon.pipeline import Pipeline, WindowResult
 from soilbus.daemon.service import Service
+from soilbus.daemon.store import Owner
 
 SWITCH_INTERVAL = 0.0005
 
@@ -24,8 +29,8 @@ def start_service(config: Config, wait: bool, on_window: Callable[[WindowResult]
     Raises ConfigError for a configuration that cannot work, BusError for a bus that
     cannot be opened.
     """
-    pipeline = Pipeline(config, load_databases(config))
-    ours = output_database(config)
+    pipeline, ours = Pipeline(config, load_databases(config)), output_database(config)
+    check_cycle_times(config, ours)
     publisher = Publisher(ours)
     settings = config.bus.model_dump()
     filters = pipeline.admission.can_filters() + filters_of(ours)
@@ -39,4 +44,16 @@ def start_service(config: Config, wait: bool, on_window: Callable[[WindowResult]
     # The loop must get its turn between the estimator's steps, or the socket overflows.
     sys.setswitchinterval(SWITCH_INTERVAL)
     workers = ThreadPoolExecutor(max_workers=1, thread_name_prefix="estimate")
-    return Service(config, pipeline, bus, publisher, Notifier.from_environment(), workers, on_window=on_window)
+    keeper = _keeper(pipeline, os.environ)
+    return Service(
+        config, pipeline, bus, publisher, Notifier.from_environment(), workers, on_window=on_window, keeper=keeper
+    )
+
+
+def _keeper(pipeline: Pipeline, environ: Mapping[str, str]) -> Keeper | None:
+    """Keeps the state in the folder that systemd made for it; None where there is none."""
+    folder = environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    if not folder:
+        return None
+    writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="store")
+    return Keeper(Path(folder), Owner.of(pipeline.config, pipeline.intake.channels, pipeline.database), writer)

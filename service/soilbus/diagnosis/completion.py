@@ -8,16 +8,20 @@ of the whole, as do those of the blocks learned from and of the blocks held out.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.diagnosis.descent import descended
 from soilbus.diagnosis.records import Record
+from soilbus.diagnosis.sizes import correction
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.completed import CompletedProblem, Free, parameters_of
-from soilbus.estimation.gauss_newton import Fit, continued, fit_window
+from soilbus.estimation.coordinates import at_edges
+from soilbus.estimation.gauss_newton import MAX_ITERATIONS, Fit, Start, continued, fit_window
 from soilbus.estimation.linearised import Latents, Linearised
 from soilbus.estimation.normal_equations import Fitting, Place
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
@@ -29,14 +33,6 @@ Array = NDArray[np.float64]
 _SOIL = len(PARAMETERS)
 CHECK_ROUNDS = 3
 """Linearisations that bring the latents of held-out blocks to their values under a model."""
-
-
-@dataclass(frozen=True, slots=True)
-class Start:
-    """Where the fit of one recording may begin: soil (6,), sensors' gains and effects' parameters (G,)."""
-
-    soil: Array
-    gains: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +59,8 @@ class Checked:
 class Completion:
     """A model with effects as fitted: one Fit and one Checked for each recording.
 
-    before holds what was known when each recording's turn came.
+    before holds what was known when each recording's turn came; sizes what it changes of the
+    evidence that nobody knows how great effects are (see `sizes`).
     """
 
     effects: tuple[Effect, ...]
@@ -71,11 +68,12 @@ class Completion:
     before: tuple[Belief, ...]
     fits: tuple[Fit, ...]
     checks: tuple[Checked, ...]
+    sizes: float = 0.0
 
     @property
     def evidence(self) -> float:
         """-2 log of the likelihood of all data, whatever soils, gains and parameters may be, up to a constant."""
-        return sum(fit.evidence for fit in self.fits) + self.predicted
+        return sum(fit.evidence for fit in self.fits) + self.predicted + self.sizes
 
     @property
     def predicted(self) -> float:
@@ -110,8 +108,10 @@ class Completion:
     @property
     def free_at_edge(self) -> tuple[Free, ...] | None:
         """The parameters with those held that would leave their range; None where none would."""
-        pulls = self.fits[-1].mode.gains[self.checks[-1].problem.n_sensors :].tolist()
-        leaves = [f.std > 0.0 and not f.within(u) for f, u in zip(self.free, pulls, strict=True)]
+        problem, gains = self.checks[-1].problem, self.fits[-1].mode.gains
+        pulls = gains[problem.n_sensors :].tolist()
+        edges = at_edges(gains, *problem.gain_bounds())[problem.n_sensors :].tolist()
+        leaves = [f.std > 0.0 and edge != 0.0 for f, edge in zip(self.free, edges, strict=True)]
         if not any(leaves):
             return None
         return tuple(
@@ -121,7 +121,7 @@ class Completion:
 
     def as_starts(self) -> tuple[Start, ...]:
         """Where these fits ended."""
-        return tuple(Start(fit.mode.soil, fit.mode.gains) for fit in self.fits)
+        return tuple(Start(fit.mode.soil, fit.mode.gains, near=fit.converged) for fit in self.fits)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -140,9 +140,16 @@ class Completion:
 
 
 def complete(
-    records: Sequence[Record], prior: SoilPrior, effects: Sequence[Effect], starts: Sequence[Start] | None = None
+    records: Sequence[Record],
+    prior: SoilPrior,
+    effects: Sequence[Effect],
+    starts: Sequence[Start] | None = None,
+    most: int = MAX_ITERATIONS,
+    hopeless: float = math.inf,
 ) -> Completion | None:
     """A model with these effects fitted to all recordings; None where a fit fails.
+
+    Each fit has at most so many steps, and is given up where it will not cost less than `hopeless`.
 
     Parameters of effects that the records' model has already keep the prior they have
     there; one that would leave its range is held at the edge.
@@ -151,8 +158,8 @@ def complete(
     known = {e.name: [f for f in present.free if f.effect == e.name] for e in present.effects}
     free = tuple(f for effect in effects for f in known.get(effect.name) or parameters_of(effect, present.n_wheels))
     for _ in range(len(free) + 1):
-        completion = _complete(records, prior, effects, free, starts)
-        if completion is None or completion.free_at_edge is None:
+        completion = _complete(records, prior, effects, free, starts, most, hopeless)
+        if completion is None or not completion.converged or completion.free_at_edge is None:
             break
         free = completion.free_at_edge
         starts = completion.as_starts()
@@ -165,20 +172,37 @@ def _complete(
     effects: Sequence[Effect],
     free: tuple[Free, ...],
     starts: Sequence[Start] | None,
+    most: int,
+    hopeless: float,
 ) -> Completion | None:
     fits, checks, befores = [], [], []
     known: Belief | None = None
     for i, record in enumerate(records):
         problem = record.learned.completed(effects, free)
         before = _of_first(record, prior, problem) if known is None else _of_next(known, prior, problem, effects)
-        fit = _fitted(problem, prior, before, None if starts is None else starts[i])
+        fit = _fitted(problem, prior, before, None if starts is None else starts[i], most, hopeless)
         if fit is None:
             return None
         fits.append(fit)
         befores.append(before)
         checks.append(check(record.checked.completed(effects, free), prior, fit))
         known = fit.mode
-    return Completion(tuple(effects), free, tuple(befores), tuple(fits), tuple(checks))
+    added = [effect for effect in effects if effect not in records[0].learned.effects]
+    sizes = sum(_sizes(effect, free, fits, checks) for effect in added)
+    return Completion(tuple(effects), free, tuple(befores), tuple(fits), tuple(checks), sizes)
+
+
+def _sizes(effect: Effect, free: Sequence[Free], fits: Sequence[Fit], checks: Sequence[Checked]) -> float:
+    """Correction of the evidence for one effect of unknown size: once, or for each recording where it is its own."""
+    members = [i for i, f in enumerate(free) if f.effect == effect.name and f.std > 0.0]
+    if not members:
+        return 0.0
+    gains = checks[0].problem.n_sensors + np.array(members)
+    told = [fit.mode for fit in (fits if effect.of_record else fits[-1:])]
+    return sum(
+        correction(mode.gains[gains], mode.covariance[np.ix_(_SOIL + gains, _SOIL + gains)], [free[i] for i in members])
+        for mode in told
+    )
 
 
 def _of_first(record: Record, prior: SoilPrior, problem: CompletedProblem) -> Belief:
@@ -192,15 +216,22 @@ def _of_first(record: Record, prior: SoilPrior, problem: CompletedProblem) -> Be
     return Belief(record.known.soil, gains, covariance)
 
 
-def _fitted(problem: CompletedProblem, prior: SoilPrior, before: Belief, start: Start | None) -> Fit | None:
-    """From the given start, or from anywhere; a fit that has not converged goes on from where it is."""
+def _fitted(
+    problem: CompletedProblem, prior: SoilPrior, before: Belief, start: Start | None, most: int, hopeless: float
+) -> Fit | None:
+    """From the given start, or from anywhere; a fit that has not converged goes on from where it is, slowly."""
     if start is None:
         fit = fit_window(problem, prior, before)
         if fit is None or fit.converged:
             return fit
         start = Start(fit.mode.soil, fit.mode.gains)
-    gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
-    return continued(problem, prior, before, start.soil, gains, problem.n_sensors)
+    fit = continued(problem, prior, before, start, problem.n_sensors, most, hopeless)
+    if fit is None or fit.converged or fit.cost > hopeless:
+        return fit
+    fitting, gains = Fitting(problem, prior, before), np.where(problem.gain_std > 0.0, start.gains, 0.0)
+    ends = (start.soil, problem.allowed(gains)), (fit.optimum.soil, problem.allowed(fit.optimum.gains))
+    slow = descended(fitting, [fitting.start(soil, gains=g) for soil, g in ends])
+    return fit if slow is None or fit.cost < slow.cost else slow
 
 
 def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects: Sequence[Effect]) -> Belief:

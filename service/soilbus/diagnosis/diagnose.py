@@ -2,33 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from soilbus.diagnosis.completion import Completion, Start, complete
+from soilbus.diagnosis.completion import Completion, complete
 from soilbus.diagnosis.learned import Correction, corrections
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.score import further_starts, scores
-from soilbus.diagnosis.verdict import PAYS, PLAUSIBLE, SURE, Verdict, is_real, pays, probabilities
+from soilbus.diagnosis.score import further_scores, scores
+from soilbus.diagnosis.verdict import PAYS, PLAUSIBLE, SURE, Verdict, hopeless, is_real, pays, probabilities
 from soilbus.diagnosis.where import Disagreement, disagreements
+from soilbus.estimation.gauss_newton import Start
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
 
 MAX_EFFECTS = 3
 TRIED = 8
-"""Candidates of a round that are fitted to a few instants."""
+"""Candidates of a round, those of further starts besides, that are fitted to a few instants."""
 FITTED = 6
 """Those of them that are fitted to all."""
 THINNED = 4
-NEAR = 0.2
-"""Share of the best one's fall on a few instants below which a candidate is out."""
-CLEAR = 50.0
-"""Fall of -2 log evidence on a few instants that needs no search where the scores are blind."""
+CLEAR = 100.0
+"""Foreseen fall of -2 log evidence from which a few instants tell which candidates to fit."""
+BEHIND_UNSETTLED = 300.0
+"""Cost on a few instants above the least one's from which a candidate is given up, converged or not."""
+STEPS = 12
+"""Steps of the soil, and then of everything, in which a candidate that explains much is fitted."""
 WORTH_TRYING = -2.0
 """Foreseen change of -2 log evidence above which a candidate is not fitted."""
-NOTHING = "none"
 SAME = 1.0
 """Difference of -2 log evidence that is none."""
 
@@ -51,6 +54,7 @@ class Addition:
 class Diagnosis:
     """What was found; base is the present model, completed the one with the effects added.
 
+    additions are in the order of what they explain beside each other, the most first.
     learned describes what is left where the verdict is unknown.
     """
 
@@ -81,72 +85,98 @@ def diagnose(
     while len(additions) < MAX_EFFECTS:
         progress(f"looking for effect {len(additions) + 1}")
         left = [effect for effect in candidates if effect.name not in present.names]
-        found = _round(records, prior, present, left)
+        found = _round(records, prior, present, left, base.evidence - present.evidence)
         if found is None:
             break
         addition, present = found
         additions.append(addition)
         if len(additions) > 1:
-            additions, present = _reconsidered(records, prior, present, additions, candidates)
+            additions, present = _reconsidered(records, prior, base, present, additions, candidates)
+    additions.sort(key=lambda addition: -addition.falls[addition.effect.name])
     verdict = _verdict(base, present, additions)
     learned = corrections(list(records), present) if verdict is Verdict.UNKNOWN else []
     return Diagnosis(verdict, tuple(where), tuple(additions), base, present, tuple(learned))
 
 
 def _round(
-    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect]
+    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect], explained: float
 ) -> tuple[Addition, Completion] | None:
-    """The best effect to add to the present model; None where none pays."""
+    """The best effect to add to the present model, which explains so much; None where none pays."""
     tried: dict[str, tuple[Effect, Completion]] = {}
-    for effect, starts in _promising(records, prior, present, candidates):
-        completion = complete(records, prior, (*present.effects, effect), starts)
+    for effect, starts in _promising(records, prior, present, candidates, explained):
+        completion = complete(records, prior, (*present.effects, effect), starts, STEPS)
         if completion is not None:
             tried[effect.name] = effect, completion
     if not tried:
         return None
+    best = min(tried, key=lambda name: tried[name][1].evidence)
+    tried[best] = tried[best][0], _converged(records, prior, tried[best][1])
     falls = {name: present.evidence - completion.evidence for name, (_, completion) in tried.items()}
     best = max(falls, key=lambda name: falls[name])
-    if not pays(falls[best], present.gap, present.checked_rows, present.rows):
+    if not pays(falls[best], explained, present.gap, present.checked_rows, present.rows):
         return None
-    chances = probabilities({NOTHING: 0.0} | {name: -fall for name, fall in falls.items()})
-    others = {n: p for n, p in chances.items() if n not in (best, NOTHING) and p >= PLAUSIBLE}
+    chances = probabilities(falls, explained)
+    others = {n: p for n, p in chances.items() if n != best and p >= PLAUSIBLE}
     effect, completion = tried[best]
     return Addition(effect, chances[best], others, falls), completion
 
 
+def _converged(records: Sequence[Record], prior: SoilPrior, completion: Completion) -> Completion:
+    """The same, or where further steps from there lead if they were too few."""
+    if completion.converged:
+        return completion
+    further = complete(records, prior, completion.effects, completion.as_starts())
+    return completion if further is None or further.evidence > completion.evidence else further
+
+
 def _promising(
-    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect]
+    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect], explained: float
 ) -> list[tuple[Effect, Sequence[Start]]]:
-    """The few candidates worth a fit of all data, and where it starts: foreseen by scores, tried on a few instants."""
-    foreseen = [s for s in scores(records, prior, present, candidates)[:TRIED] if s.evidence < WORTH_TRYING]
+    """The few candidates worth a fit of all data, and where it starts: foreseen by scores, tried on a few instants.
+
+    Where little is foreseen a few instants tell nothing, and scores are as good as fits.
+    """
     few = [record.thinned(THINNED) for record in records]
-    before = complete(few, prior, present.effects, present.as_starts())
-    if before is None:
-        return [(score.effect, score.starts) for score in foreseen[:FITTED]]
-    falls: list[tuple[float, Effect, Sequence[Start]]] = []
-
-    def attempt(effect: Effect, starts: Sequence[Start]) -> None:
-        completion = complete(few, prior, (*present.effects, effect), starts)
+    before = complete(few, prior, present.effects, present.as_starts(), STEPS)
+    foreseen = scores(records, prior, present, candidates)
+    further = [] if before is None else [s for e in candidates for s in further_scores(few, prior, before, e)[:1]]
+    share = 1.0 if before is None else before.rows / present.rows
+    most = max(-score.evidence / part for part, of in ((1.0, foreseen), (share, further)) for score in of)
+    if before is None or most < CLEAR:
+        foreseen += [s for e in candidates for s in further_scores(records, prior, present, e)[:1]]
+        return _first_of_each(
+            (s.effect, s.starts)
+            for s in sorted(foreseen, key=lambda score: score.evidence)
+            if s.evidence < WORTH_TRYING
+        )
+    tried: list[tuple[float, Effect, Sequence[Start]]] = []
+    least = math.inf
+    for score in [s for s in (*foreseen[:TRIED], *further) if s.evidence < WORTH_TRYING]:
+        with_it = (*present.effects, score.effect)
+        completion = complete(few, prior, with_it, score.starts, STEPS, least + BEHIND_UNSETTLED)
         if completion is not None:
-            falls.append((before.evidence - completion.evidence, effect, completion.as_starts()))
+            tried.append((before.evidence - completion.evidence, score.effect, completion.as_starts()))
+            least = min(least, completion.cost)
+    tried.sort(key=lambda item: -item[0])
+    best = tried[0][0] / share if tried else 0.0
+    return _first_of_each(
+        (effect, starts) for fall, effect, starts in tried
+        if fall > 0.0 and not hopeless(best - fall / share, explained + best)
+    )  # fmt: skip
 
-    for score in foreseen:
-        attempt(score.effect, score.starts)
-    if max((fall for fall, *_ in falls), default=0.0) < CLEAR:
-        for effect in candidates:
-            for further in further_starts(effect, before):
-                attempt(effect, further)
-    falls.sort(key=lambda item: -item[0])
+
+def _first_of_each(promising: Iterable[tuple[Effect, Sequence[Start]]]) -> list[tuple[Effect, Sequence[Start]]]:
+    """No effect twice, and no more than FITTED."""
     best: dict[str, tuple[Effect, Sequence[Start]]] = {}
-    for fall, effect, starts in falls:
-        if fall > max(NEAR * falls[0][0], 0.0) and len(best) < FITTED:
-            best.setdefault(effect.name, (effect, starts))
-    return list(best.values())
+    for effect, starts in promising:
+        best.setdefault(effect.name, (effect, starts))
+    return list(best.values())[:FITTED]
 
 
 def _reconsidered(
     records: Sequence[Record],
     prior: SoilPrior,
+    base: Completion,
     present: Completion,
     additions: Sequence[Addition],
     candidates: Sequence[Effect],
@@ -157,7 +187,8 @@ def _reconsidered(
         without = _without(records, prior, present, chosen[i].effect)
         if without is None:
             continue
-        found = _round(records, prior, without, [e for e in candidates if e.name not in without.names])
+        left = [effect for effect in candidates if effect.name not in without.names]
+        found = _round(records, prior, without, left, base.evidence - without.evidence)
         if found is None and without.evidence < present.evidence + PAYS:
             present = without
         elif found is not None and found[1].evidence < present.evidence + SAME:
@@ -174,7 +205,7 @@ def _without(records: Sequence[Record], prior: SoilPrior, present: Completion, e
     starts = [
         Start(fit.mode.soil, np.concatenate([fit.mode.gains[:n_sensors], fit.mode.gains[kept]])) for fit in present.fits
     ]
-    return complete(records, prior, [e for e in present.effects if e.name != effect.name], starts)
+    return complete(records, prior, [e for e in present.effects if e.name != effect.name], starts, STEPS)
 
 
 def _verdict(base: Completion, completed: Completion, additions: Sequence[Addition]) -> Verdict:

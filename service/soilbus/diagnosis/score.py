@@ -8,24 +8,24 @@ would fall if the effect were added (Rao's score test, Bayesian with the prior's
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.diagnosis.completion import Completion, Start
+from soilbus.diagnosis.completion import Completion
 from soilbus.diagnosis.records import Record
+from soilbus.diagnosis.sizes import evidence_of_any_size
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.completed import Free, parameters_of
+from soilbus.estimation.gauss_newton import Start
 from soilbus.estimation.normal_equations import Fitting, Place, solved
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
 
 Array = NDArray[np.float64]
 
-SWITCHED_ON = 0.5
-"""Prior standard deviations of an effect's first parameter in its further starts."""
 MAX_STEP = 2.0
 """Prior standard deviations to which a foreseen parameter is confined: linear is not for ever."""
 
@@ -69,21 +69,29 @@ def scores(
     return sorted(found, key=lambda score: score.evidence)
 
 
-def further_starts(effect: Effect, present: Completion) -> list[tuple[Start, ...]]:
-    """Where else a fit does well to begin: a parameter's further starts, with the effect's first one switched on.
+def further_scores(records: Sequence[Record], prior: SoilPrior, present: Completion, effect: Effect) -> list[Score]:
+    """Scores of an effect from where its parameters may start besides, the best first.
 
-    The score, taken where the effect is absent, is blind to such a parameter.
+    Where the effect is absent nothing depends on such a parameter (the depth of a pan), and
+    the score is blind to it: so it is taken at each of several values (Davies 1977,
+    Biometrika 64:247).
     """
-    first, n_wheels = effect.parameters[0], len(present.checks[0].problem.rig.wheels)
     found = []
     for parameter in effect.parameters:
         for value in parameter.starts:
-            wanted = {parameter.name: value, first.name: first.neutral + SWITCHED_ON * first.std}
-            pulls = [(wanted.get(f.parameter.name, f.value) - f.value) / f.std for f in parameters_of(effect, n_wheels)]
-            found.append(
-                tuple(Start(start.soil, np.concatenate([start.gains, pulls])) for start in present.as_starts())
+            moved = tuple(replace(p, neutral=value) if p is parameter else p for p in effect.parameters)
+            (score,) = scores(records, prior, present, [replace(effect, parameters=moved)])
+            offsets = [
+                (value - parameter.neutral) / parameter.std if p is parameter else 0.0 for p in effect.parameters
+            ]
+            starts = tuple(
+                Start(
+                    start.soil, np.concatenate([start.gains[: -len(offsets)], start.gains[-len(offsets) :] + offsets])
+                )
+                for start in score.starts
             )
-    return found
+            found.append(replace(score, effect=effect, starts=starts))
+    return sorted(found, key=lambda score: score.evidence)
 
 
 def _normal(
@@ -127,18 +135,18 @@ def _score(effect: Effect, columns: NDArray[np.intp], free: Sequence[Free], norm
         parts = [(left, gradient)]
     solutions = [_within(left + np.eye(len(own)), gradient, own) for left, gradient in parts]
     fall = sum(solution.fall for solution in solutions)
-    logdet = sum(solution.logdet for solution in solutions)
+    evidence = sum(solution.evidence for solution in solutions)
     steps = [solution.step for solution in solutions] * (1 if effect.of_record else len(normals))
     starts = tuple(_start(n, columns, step) for n, step in zip(normals, steps, strict=True))
-    return Score(effect, fall, logdet - fall, starts)
+    return Score(effect, fall, evidence, starts)
 
 
 class _Solution(NamedTuple):
-    """Step of the parameters (P,) in prior std, by how much the cost falls, and log determinant of the information."""
+    """Step of the parameters (P,) in prior std, by how much the cost falls, and change of -2 log evidence."""
 
     step: Array
     fall: float
-    logdet: float
+    evidence: float
 
 
 def _within(information: Array, gradient: Array, free: Sequence[Free]) -> _Solution:
@@ -158,16 +166,21 @@ def _within(information: Array, gradient: Array, free: Sequence[Free]) -> _Solut
         step = np.clip(step, low, high)
         inside &= ~leaving
     fall = float(-2.0 * gradient @ step - step @ information @ step)
+    if not inside.any():
+        return _Solution(step, fall, -fall)
     kept = np.ix_(inside, inside)
-    return _Solution(step, fall, float(np.linalg.slogdet(information[kept])[1]) if inside.any() else 0.0)
+    left, pull = information[kept] - np.eye(int(inside.sum())), information[kept] @ step[inside]
+    there = evidence_of_any_size(left, pull, [f for f, free_still in zip(free, inside, strict=True) if free_still])
+    return _Solution(step, fall, there + float(step[inside] @ pull) - fall)
 
 
 def _start(normal: _Normal, columns: NDArray[np.intp], step: Array) -> Start:
-    step = step * min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-12))
+    share = min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-12))
+    step = share * step
     follow = -normal.answer[:, columns] @ step
     fitting, place = normal.fitting, normal.place
     n_free, n_known = len(fitting.free), len(place.gains) - len(normal.left)
     soil = fitting.coordinates.moved(place.soil, follow[:n_free])
     gains = place.gains[:n_known].copy()
     gains[fitting.active[fitting.active < n_known]] += follow[n_free:]
-    return Start(soil, np.concatenate([gains, step]))
+    return Start(soil, np.concatenate([gains, step]), near=share == 1.0)

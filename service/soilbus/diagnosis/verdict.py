@@ -20,14 +20,23 @@ class Verdict(StrEnum):
     UNKNOWN = "unknown"
 
 
-PAYS = 10.0
-"""Fall of -2 log evidence from which an effect is added."""
+PAYS, PAYS_BESIDE = 12.0, 30.0
+"""Fall of -2 log evidence from which an effect is added, alone and beside others: they leave more than noise."""
 TEMPERATURE = 6.0
-"""By how much evidences are less certain than they say: no effect's formula is the field's."""
+"""By how much evidences are less certain than they say, where little is to be explained."""
+FORM_ERROR = 0.001
+"""By how much less besides, for each unit that is explained: no effect's formula is the field's, and a formula
+that is off by a share e of the effect leaves e^2 of what there was to explain."""
 SURE = 0.8
 """Probability from which a name stands alone."""
 PLAUSIBLE = 0.02
 """Probability from which a name belongs to the set."""
+FORM_LEFT = 0.02
+"""The same for whether there is a further effect at all: share of what is explained that its formula may leave."""
+HOPELESS = 30.0
+"""Temperatures behind the best from which a name that a few instants speak of is fitted to all no more."""
+ADDS = 0.001
+"""Share of what is explained already that a further effect must explain: less than that formulas are off."""
 WORTH = 0.25
 """Share of a real gap's excess over noise that an effect must explain to be added."""
 UNEXPLAINED = 0.35
@@ -38,12 +47,27 @@ LEAST_GAP = 1.04
 """Reduced chi-square up to which no gap is told, however many residuals: noise is not known better."""
 
 
-def probabilities(evidence: Mapping[str, float]) -> dict[str, float]:
-    """Probability of each name from its -2 log evidence, the largest first."""
-    least = min(evidence.values())
-    weights = {name: math.exp(-(e - least) / (2.0 * TEMPERATURE)) for name, e in evidence.items()}
+def temperature(explained: float) -> float:
+    """What differences of -2 log evidence are to be divided by, where so much of it is explained in all."""
+    return TEMPERATURE + FORM_ERROR * max(explained, 0.0)
+
+
+def probabilities(falls: Mapping[str, float], explained: float) -> dict[str, float]:
+    """Probability of each name from its fall of -2 log evidence, the largest first, where others explain so much.
+
+    What is left to one is the probability that nothing more is missing.
+    """
+    most = max(falls.values())
+    heat = 2.0 * temperature(explained + most)
+    weights = {name: math.exp((fall - most) / heat) for name, fall in falls.items()}
+    something = 1.0 / (1.0 + math.exp(-most / (2.0 * (TEMPERATURE + FORM_LEFT * max(explained, 0.0)))))
     total = sum(weights.values())
-    return dict(sorted(((n, w / total) for n, w in weights.items()), key=lambda item: -item[1]))
+    return dict(sorted(((n, something * w / total) for n, w in weights.items()), key=lambda item: -item[1]))
+
+
+def hopeless(behind: float, explained: float) -> bool:
+    """Whether a name so far behind the best one in -2 log evidence cannot get into the set."""
+    return behind > HOPELESS * temperature(explained)
 
 
 def gap_limit(rows: int) -> float:
@@ -51,10 +75,14 @@ def gap_limit(rows: int) -> float:
     return max(LEAST_GAP, 1.0 + REAL_GAP * math.sqrt(2.0 / max(rows, 1)))
 
 
-def pays(fall: float, gap: float, checked_rows: int, rows: int) -> bool:
-    """Whether an effect is worth adding that lowers -2 log evidence so far, at a present gap on so many residuals."""
+def pays(fall: float, explained: float, gap: float, checked_rows: int, rows: int) -> bool:
+    """Whether an effect is worth adding that lowers -2 log evidence so far, where others explain so much already.
+
+    gap is the present one, on so many residuals.
+    """
     excess = (gap - 1.0) * rows if gap > gap_limit(checked_rows) else 0.0
-    return fall > max(PAYS, WORTH * excess)
+    least = PAYS_BESIDE if explained > 0.0 else PAYS
+    return fall > max(least, ADDS * explained, WORTH * excess)
 
 
 def is_real(before: float, after: float, checked_rows: int) -> bool:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -110,22 +111,40 @@ class _Contact(NamedTuple):
 
 
 class _Bare(NamedTuple):
-    """Wheels as the effects' hooks leave them, with forces (3, N, W) and derivatives (3, 7, N, W) by INPUTS."""
+    """Wheels as the effects' hooks leave them, with forces (3, N, W) and derivatives (3, 7, N, W) by INPUTS.
+
+    depth (N, W) is their sinkage.
+    """
 
     state: WheelState
     model: WheelModel
+    depth: Array
     forces: Array
     by_inputs: Array
 
+    def depth_at(self, state: WheelState) -> Array:
+        """Sinkage (N, W) of other wheels."""
+        same = state.entry_angle is self.state.entry_angle and _same(state.radius, self.state.radius)
+        return self.depth if same else _sunk(state)
+
     def forces_at(self, state: WheelState, model: WheelModel) -> Array:
         """Forces (3, N, W) of other wheels: along the tangent, which is all that a difference sees, where it holds."""
-        same_wheel = np.array_equal(state.radius, self.state.radius) and np.array_equal(state.width, self.state.width)
-        if model != self.model or not same_wheel:
+        if model != self.model or not (_same(state.radius, self.state.radius) and _same(state.width, self.state.width)):
             return wheel_forces(state, model)
-        change = np.empty(self.by_inputs.shape[1:])
+        forces = self.forces.copy()
         for i, name in enumerate(INPUTS):
-            change[i] = getattr(state, name) - getattr(self.state, name)
-        return np.asarray(self.forces + np.einsum("fi...,i...->f...", self.by_inputs, change))
+            value, here = getattr(state, name), getattr(self.state, name)
+            if not _same(value, here):
+                forces += self.by_inputs[:, i] * (value - here)
+        return forces
+
+
+def _sunk(state: WheelState) -> Array:
+    return np.broadcast_to(sinkage(state.entry_angle, state.radius), np.shape(state.entry_angle))
+
+
+def _same(one: Any, other: Any) -> bool:
+    return one is other or (np.shape(one) == np.shape(other) and bool(np.all(one == other)))
 
 
 class CompletedProblem(WindowProblem):
@@ -164,6 +183,14 @@ class CompletedProblem(WindowProblem):
         """Gains with the effects' parameters inside their ranges."""
         inside = [f.allowed(u) for f, u in zip(self.free, gains[self.n_sensors :].tolist(), strict=True)]
         return np.concatenate([gains[: self.n_sensors], inside])
+
+    def gain_bounds(self) -> tuple[Array, Array]:
+        """As WindowProblem; the effects' parameters stay inside their ranges."""
+        low, high = super().gain_bounds()
+        for i, f in enumerate(self.free, self.n_sensors):
+            if f.std > 0.0:
+                low[i], high[i] = (f.parameter.low - f.value) / f.std, (f.parameter.high - f.value) / f.std
+        return low, high
 
     def carried(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
         """As WindowProblem; without gains the effects' parameters are at their prior values."""
@@ -269,14 +296,14 @@ class CompletedProblem(WindowProblem):
         state, around = self._wheels(soil, latents, angle)
         state, model = wheel_with(active, state, self.model, around)
         forces = wheel_forces(state, model) if near is None else near.forces_at(state, model)
-        forces = reactions_with(active, forces, state, around)
-        return _Contact(forces, np.broadcast_to(sinkage(angle, state.radius), angle.shape), around)
+        depth = _sunk(state) if near is None else near.depth_at(state)
+        return _Contact(reactions_with(active, forces, state, around), depth, around)
 
     def _bare(self, soil: Soil, active: Sequence[Active], latents: Latents, angle: Array) -> _Bare:
         """The wheels at given entry angles, with derivatives."""
         state, around = self._wheels(soil, latents, angle)
         state, model = wheel_with(active, state, self.model, around)
-        return _Bare(state, model, *wheel_forces_and_derivatives(state, model))
+        return _Bare(state, model, _sunk(state), *wheel_forces_and_derivatives(state, model))
 
     def _wheels(self, soil: Soil, latents: Latents, angle: Array) -> tuple[WheelState, Surroundings]:
         """The wheels before any effect, and what effects depend on."""
@@ -294,7 +321,8 @@ class CompletedProblem(WindowProblem):
         """
         (load, pull, torque), depth, around = contact
         late = self._from_other_instants(active, torque, around) if late is None else late
-        error, missing = np.zeros_like(load), np.zeros(self.n)
+        error: Any = 0.0
+        missing = np.zeros(self.n)
         for effect, values in active:
             if effect.torque is not None and not effect.mixes_instants:
                 torque = effect.torque(torque, around, values)
@@ -303,14 +331,20 @@ class CompletedProblem(WindowProblem):
             if effect.resistance is not None:
                 missing = missing + effect.resistance(around, values)
         draft = true_draft(active, self.draft, around)
-        excess = load - (latents.load - error)
-        return _Outcome(np.stack([excess, pull, torque + late, depth]), missing + draft - self.draft, late)
+        wheels = np.empty((4, *load.shape))
+        np.subtract(load, latents.load, out=wheels[0])
+        wheels[0] += error
+        wheels[1], wheels[3] = pull, depth
+        np.add(torque, late, out=wheels[2])
+        return _Outcome(wheels, missing + draft - self.draft, late)
 
     def _from_other_instants(self, active: Sequence[Active], torque: Array, around: Surroundings) -> Array:
         """What effects that mix instants add to the torque readings (N, W)."""
-        mixing = [(e, v) for e, v in active if e.torque is not None and e.mixes_instants]
-        smooth = smoothed(self.t, torque) if mixing else torque
         late = np.zeros_like(torque)
+        mixing = [(e, v) for e, v in active if e.torque is not None and e.mixes_instants]
+        if not mixing:
+            return late
+        smooth = smoothed(self.t, torque)
         for effect, values in mixing:
             if effect.torque is not None:
                 late += effect.torque(smooth, around, values) - smooth
@@ -339,18 +373,25 @@ def smoothed(t: Array, values: Array) -> Array:
     Savitzky & Golay 1964 (Anal. Chem. 36:1627); shorter stretches stay as they are.
     """
     out = np.array(values, float)
-    half = SMOOTHED // 2
-    powers = np.arange(SMOOTHED)[:, None] - half
-    fit = np.linalg.pinv(powers ** np.arange(3))  # (3, SMOOTHED)
-    through = (powers ** np.arange(3)) @ fit  # row i: the parabola's value at place i
+    half, through = SMOOTHED // 2, _parabolas()
     for run in stretches(t):
         if len(run) < SMOOTHED:
             continue
-        windows = np.lib.stride_tricks.sliding_window_view(values[run], SMOOTHED, axis=0)  # (n, W, SMOOTHED)
-        out[run[half : len(run) - half]] = windows @ through[half]
-        out[run[:half]] = through[:half] @ values[run[:SMOOTHED]]
-        out[run[len(run) - half :]] = through[half + 1 :] @ values[run[-SMOOTHED:]]
+        first, last = run[0], run[-1] + 1  # runs have no holes
+        middle = out[first + half : last - half]
+        middle[:] = 0.0
+        for place, weight in enumerate(through[half].tolist()):
+            middle += weight * values[first + place : last - 2 * half + place]
+        out[first : first + half] = through[:half] @ values[first : first + SMOOTHED]
+        out[last - half : last] = through[half + 1 :] @ values[last - SMOOTHED : last]
     return out
+
+
+@cache
+def _parabolas() -> Array:
+    """What makes a least-squares parabola through SMOOTHED equal steps from the values there (SMOOTHED, SMOOTHED)."""
+    powers = (np.arange(SMOOTHED)[:, None] - SMOOTHED // 2) ** np.arange(3)
+    return np.asarray(powers @ np.linalg.pinv(powers))
 
 
 def _of_instant(step: Any) -> Any:

@@ -23,6 +23,8 @@ MAX_STEP = 0.7
 """Longest step of a coordinate."""
 BOUND = 4.0
 """Prior standard deviations of the logarithm to which a free parameter is confined."""
+EDGE = 1e-9
+"""Distance from a bound that is none, of a logarithm or of a gain."""
 LITTLE, MUCH = 0.03, 0.4
 """Shares of k_c in the modulus under a mean tyre, on either side of what most windows can tell from none."""
 MAX_PHI = 1.2
@@ -110,6 +112,23 @@ class Coordinates:
         soil[self.free] = np.minimum(np.maximum(soil[self.free], low), high)
         return soil
 
+    def reach(self, soil: Array, step: Array) -> float:
+        """Share of a step (F,) from a soil (6,) that is no longer than steps may be and stays within the bounds."""
+        low, high = self._log_bounds
+        room = np.where(step > 0.0, high, low) - np.log(soil[self.free])
+        room[self.free == _K_PHI] = np.inf  # whose coordinate is the pressure
+        longest = MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-12)
+        return min(1.0, longest, share_of_step(room, step))
+
+    def edges(self, soil: Array) -> Array:
+        """Which way (F,) a coordinate of a soil (6,) cannot go: -1 or 1 where its parameter is at a bound, else 0."""
+        return at_edges(np.log(soil[self.free]), *self._log_bounds)
+
+    @cached_property
+    def _log_bounds(self) -> tuple[Array, Array]:
+        low, high = self._bounds
+        return np.log(low), np.log(high)
+
     @cached_property
     def _column(self) -> dict[int, int]:
         """Place among the coordinates of each free parameter."""
@@ -125,3 +144,14 @@ class Coordinates:
         """The soil (6,) after a step (F,) of the coordinates, shortened where it is long."""
         step = step * min(1.0, MAX_STEP / max(float(np.max(np.abs(step), initial=0.0)), 1e-12))
         return self.soil_at(self.position(soil) + step)
+
+
+def at_edges(place: Array, low: Array, high: Array) -> Array:
+    """1 or -1 (M,) where a place (M,) is at its upper or lower bound (M,), else 0."""
+    return np.subtract(place >= high - EDGE, place <= low + EDGE, dtype=float)
+
+
+def share_of_step(room: Array, step: Array) -> float:
+    """Share of a step (M,), 1 at most, that leaves everything within the room (M,) there is; inf: no end of it."""
+    cramped = (step != 0.0) & np.isfinite(room)
+    return float((room[cramped] / step[cramped]).min(initial=1.0))

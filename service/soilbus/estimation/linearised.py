@@ -34,7 +34,8 @@ class Linearised:
     """Residuals and derivatives at one point, with what an update of the latents needs.
 
     The columns of `rows` and `weighed` (R, 1 + 6 + G) are the residual and its derivatives
-    by the soil parameters (SI) and the gains; `weighed` is `rows` times the inverse
+    by the soil parameters (SI) and the gains (of the effects alone where the sensors' were
+    not asked for); `weighed` is `rows` times the inverse
     covariance of its instant, so that `normal`, rows' weighed, holds chi-square and the
     normal equations.  Rows of missing data are zero.
     """

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
-from soilbus.estimation.coordinates import TYPICAL_DEPTH, Coordinates
+from soilbus.estimation.coordinates import TYPICAL_DEPTH, Coordinates, at_edges, share_of_step
 from soilbus.estimation.linearised import Latents, Linearised
 from soilbus.estimation.moments import Moments, moments_along_share
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
@@ -21,6 +21,8 @@ Indices = NDArray[np.intp]
 
 LONG_TURN = 0.2
 """Relative change of an entry angle from which the angles are solved again, not extrapolated."""
+LONG_TURN_WITH_EFFECTS = 0.03
+"""The same where effects have a part in the load: they may bend where the soil alone does not."""
 WELL_TOLD = 0.5
 """Sd of the logarithm of K_L at a typical depth from which on k_c and k_phi are each as known before."""
 _SOIL = len(PARAMETERS)
@@ -48,7 +50,8 @@ class Point:
 
     information (F + A, F + A) is Gauss-Newton's, of which `known` is what was known
     before; bend, which comes on top for a step, is the curvature of the coordinates.
-    cost is -2 log posterior up to a constant.
+    cost is -2 log posterior up to a constant.  edges (F + A,) is 1 or -1 where a coordinate
+    cannot go up or down, else 0.
     """
 
     information: Array
@@ -56,13 +59,24 @@ class Point:
     bend: Array
     gradient: Array
     cost: float
+    edges: Array
     at: Linearised
 
     def step(self, damping: float = 0.0) -> Array | None:
-        """Step (F + A,) to the minimum, held back in proportion to the diagonal; None where there is none."""
+        """Step (F + A,) to the minimum, held back in proportion to the diagonal; None where there is none.
+
+        What is at an edge and would go beyond stays, and the others go where they then do best.
+        """
         curved = self.information + self.bend
-        solution = solved(curved + damping * np.diag(np.diag(curved)), self.gradient)
-        return None if solution is None else -solution[0]
+        curved.flat[:: len(curved) + 1] *= 1.0 + damping
+        step = _solution(curved, self.gradient)
+        moving = np.ones(len(self.gradient), bool)
+        while step is not None and (beyond := step * self.edges > 0.0).any():
+            moving &= ~beyond
+            rest = _solution(curved[np.ix_(moving, moving)], self.gradient[moving])
+            step = np.zeros(len(moving))
+            step[moving] = np.nan if rest is None else rest
+        return step if step is not None and np.isfinite(step).all() else None
 
     @property
     def evidence(self) -> float:
@@ -94,7 +108,9 @@ class Fitting:
         known = np.diag(before.covariance)[_SOIL:] > 0.0 if with_gains else np.zeros(len(before.gains), bool)
         known[:first] = False
         self.active = np.flatnonzero(known)
+        self._gain_bounds = tuple(bound[self.active] for bound in problem.gain_bounds())
         self.free = self.coordinates.free
+        self._by_sensors = with_gains and first == 0
         kept = np.concatenate([self.free, _SOIL + self.active])
         inverse = solved(before.covariance[np.ix_(kept, kept)], np.zeros(len(kept)))
         if inverse is None:
@@ -111,25 +127,33 @@ class Fitting:
         gains = self.before.gains if gains is None else gains
         return Place(soil, gains, self.problem.start(Soil(*soil.tolist()), guess, gains), np.inf, 0)
 
-    def restarted(self, place: Place, step: Array) -> Place:
-        """The place after a step (F + A,) with latents as measured."""
+    def restarted(self, place: Place, point: Point, step: Array) -> Place:
+        """The place after a step (F + A,) with latents as measured, as they are at this place already."""
         free, gains = len(self.free), place.gains.copy()
+        step = self._reach(place, step) * step
         gains[self.active] += step[free:]
-        soil = self.coordinates.moved(place.soil, step[:free])
-        return self.start(soil, place.latents.entry_angle, self.problem.allowed(gains))
+        soil, gains = self.coordinates.moved(place.soil, step[:free]), self.problem.allowed(gains)
+        angle = self.problem.turned(point.at, place.latents.entry_angle, soil - place.soil, gains - place.gains)
+        return self._reached(place, point, soil, gains, replace(place.latents, entry_angle=angle))
 
     def point(self, place: Place) -> Point | None:
         """The normal equations at a place; None where the model is not finite."""
-        return self.with_before(place, self.problem.linearise(place.as_soil(), place.gains, place.latents))
+        at = self.problem.linearise(place.as_soil(), place.gains, place.latents, self._by_sensors)
+        return self.with_before(place, at)
 
     def with_before(self, place: Place, at: Linearised) -> Point | None:
         """Those of residuals linearised already."""
         free = len(self.free)
         directions = self.directions(place)
+        if not self._by_sensors:
+            directions = np.delete(directions, slice(7, 7 + self.problem.n_sensors), axis=0)
         gradient = directions.T @ at.normal[:, 0]
         known = self.before_at(place)
         bend = np.zeros((len(gradient), len(gradient)))
         bend[:free, :free] = self.coordinates.bend(gradient[:free])
+        edges = np.zeros(len(gradient))
+        edges[:free] = self.coordinates.edges(place.soil)
+        edges[free:] = at_edges(place.gains[self.active], *self._gain_bounds)
         cost = at.chi2 + known.cost
         if not np.isfinite(cost):
             return None
@@ -139,6 +163,7 @@ class Fitting:
             bend=bend,
             gradient=gradient + known.gradient,
             cost=cost,
+            edges=edges,
             at=at,
         )
 
@@ -170,19 +195,30 @@ class Fitting:
     def moved(self, place: Place, point: Point, step: Array) -> Place:
         """The place after a step (F + A,), with the latents that the linear model foresees."""
         free = len(self.free)
+        step = self._reach(place, step) * step
         soil = self.coordinates.moved(place.soil, step[:free])
         gain_step = np.zeros(len(place.gains))
         gain_step[self.active] = step[free:]
         latents = self.problem.updated(point.at, place.latents, soil - place.soil, gain_step)
-        gains = place.gains + gain_step
+        return self._reached(place, point, soil, place.gains + gain_step, latents)
+
+    def _reach(self, place: Place, step: Array) -> float:
+        """Share of a step (F + A,) that can be taken."""
+        free = len(self.free)
+        low, high = self._gain_bounds
+        room = np.where(step[free:] > 0.0, high, low) - place.gains[self.active]
+        return min(self.coordinates.reach(place.soil, step[:free]), share_of_step(room, step[free:]))
+
+    def _reached(self, place: Place, point: Point, soil: Array, gains: Array, latents: Latents) -> Place:
+        """Soil (6,), gains (G,) and foreseen latents as a place, with the entry angles solved where they turn far."""
         turn = np.max(np.abs(latents.entry_angle / place.latents.entry_angle - 1.0), initial=0.0)
-        if turn > LONG_TURN or len(point.at.load_by_effects):  # effects may bend where the soil alone does not
+        if turn > (LONG_TURN_WITH_EFFECTS if len(point.at.load_by_effects) else LONG_TURN):
             latents = self.problem.carried(latents, Soil(*soil.tolist()), gains)
         return Place(soil, gains, latents, point.cost, place.trials)
 
     def carried(self, place: Place) -> Place:
         """The same place with the entry angles solved anew: linear models in a row may have lost them."""
-        return replace(place, latents=self.problem.carried(place.latents, place.as_soil()))
+        return replace(place, latents=self.problem.carried(place.latents, place.as_soil(), place.gains))
 
     def beliefs(self, place: Place, point: Point, at: Array) -> tuple[Belief, Belief] | None:
         """What this optimum tells, by its moments and by its curvature; None where the information is singular.
@@ -256,6 +292,15 @@ class Fitting:
 
     def _log_directions(self, soil: Array) -> Array:
         return self.coordinates.log_directions(soil)
+
+
+def _solution(information: Array, gradient: Array) -> Array | None:
+    """-information^-1 gradient (F,); None where the information is singular."""
+    scale = 1.0 / np.sqrt(information.diagonal())
+    try:
+        return np.asarray(np.linalg.solve(information * scale[:, None] * scale, gradient * scale) * -scale)
+    except np.linalg.LinAlgError:
+        return None
 
 
 def solved(information: Array, gradient: Array) -> tuple[Array, Array] | None:

@@ -10,7 +10,7 @@ sect. 4.8).  The entry angle of each wheel follows from its load.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +79,10 @@ class WindowProblem(Readings):
     def allowed(self, gains: Array) -> Array:
         """Gains (G,) with what has a range kept inside it."""
         return gains
+
+    def gain_bounds(self) -> tuple[Array, Array]:
+        """Least and greatest gains (G,), infinite where any will do."""
+        return np.full(len(self.gain_std), -np.inf), np.full(len(self.gain_std), np.inf)
 
     def thinned(self, most: int) -> WindowProblem:
         """The same window with at most so many of its usable instants, evenly spread."""
@@ -156,8 +160,11 @@ class WindowProblem(Readings):
             angle.ravel(), slip.ravel(), self._radius, self._width, K_L, soil.n, np.tan(soil.phi), soil.c, soil.K
         )
 
-    def linearise(self, soil: Soil, gains: Array, latents: Latents) -> Linearised:
-        """Whitened residuals and derivatives at a soil, gains (G,) and latents."""
+    def linearise(self, soil: Soil, gains: Array, latents: Latents, by_sensors: bool = True) -> Linearised:
+        """Whitened residuals and derivatives at a soil, gains (G,) and latents; by_sensors: also by the sensors' gains.
+
+        Without those derivatives it serves to move the soil and the effects only.
+        """
         W = self.n_wheels
         at = self._response(soil, gains, latents)
         A = self._by_latents(at)
@@ -165,9 +172,9 @@ class WindowProblem(Readings):
         of_torque, of_latents, of_draft, corrected, variance, row_var = self._corrected(gains)
         draft, draft_var = self.draft * of_draft, self.draft_var * of_draft**2
 
-        rows = np.zeros((*A.shape[:2], 7 + len(gains)))
-        residual, by_soil, by_gain = rows[:, :, 0], rows[:, :, 1:7], rows[:, :, 7 : 7 + self.n_sensors]
-        by_effects = rows[:, :, 7 + self.n_sensors :]
+        first_effect = 7 + (self.n_sensors if by_sensors else 0)
+        rows = np.zeros((*A.shape[:2], first_effect + len(gains) - self.n_sensors))
+        residual, by_soil, by_effects = rows[:, :, 0], rows[:, :, 1:7], rows[:, :, first_effect:]
         residual[:, :W] = self.torque * of_torque - at.value[1]
         residual[:, W] = self.demand - self.draft + draft + at.pull - at.value[0].sum(1)
         by_soil[:, :W] = -at.by_soil[1].transpose(1, 2, 0)
@@ -180,9 +187,11 @@ class WindowProblem(Readings):
             by_effects[:, W + 1 :] = -at.by_effects[2].transpose(1, 2, 0)
         now = np.concatenate([latents.load, latents.speed, latents.ground_speed[:, None]], axis=1)
         latent_by_gain = now * of_latents
-        diagonals(by_gain[:, :W, :W])[:] = -of_torque * at.value[1]
-        np.multiply(A, -latent_by_gain[:, None, :], out=by_gain[:, :, W:-1])
-        by_gain[:, W, -1] = -of_draft * (draft - residual[:, W] * draft_var / row_var[:, W])
+        if by_sensors:
+            by_gain = rows[:, :, 7:first_effect]
+            diagonals(by_gain[:, :W, :W])[:] = -of_torque * at.value[1]
+            np.multiply(A, -latent_by_gain[:, None, :], out=by_gain[:, :, W:-1])
+            by_gain[:, W, -1] = -of_draft * (draft - residual[:, W] * draft_var / row_var[:, W])
         residual += (A @ (corrected - now)[:, :, None])[:, :, 0]
         if self._missing is not None:
             A[self._missing] = 0.0
@@ -292,10 +301,17 @@ class WindowProblem(Readings):
         new = at.corrected - at.variance * (left @ at.by_latents)[:, 0] - at.by_gain * gain_step[W : self.n_sensors - 1]
         load, speed, ground = new[:, :W], new[:, W : 2 * W], new[:, 2 * W]
         slip_change = (latents.ground_speed[:, None] / latents.speed - ground[:, None] / speed) / self.rig.radius
-        change = load - latents.load + at.off - at.load_by_slip * slip_change
-        change -= (soil_step @ at.load_by_soil.reshape(6, -1)).reshape(N, W)
+        more = load - latents.load - at.load_by_slip * slip_change
+        return Latents(load, speed, ground, self.turned(at, latents.entry_angle, soil_step, gain_step, more))
+
+    def turned(self, at: Linearised, angle: Array, soil_step: Array, gain_step: Array, more_load: Any = 0.0) -> Array:
+        """Entry angles (N, W) after a step (6,) of the soil and (G,) of the gains, by the linear model.
+
+        more_load (N, W) [N] is what wheels then carry besides, short of what a change of slip carries.
+        """
+        N, W = self.n, self.n_wheels
+        change = more_load + at.off - (soil_step @ at.load_by_soil.reshape(6, -1)).reshape(N, W)
         if len(at.load_by_effects):
             change -= np.tensordot(gain_step[self.n_sensors :], at.load_by_effects, 1)
-        low, high = latents.entry_angle * 0.6, np.minimum(latents.entry_angle * 1.6, MAX_ENTRY_ANGLE)
-        angle = np.clip(latents.entry_angle + change / at.load_slope, low, high)
-        return Latents(load, speed, ground, angle)
+        low, high = angle * 0.6, np.minimum(angle * 1.6, MAX_ENTRY_ANGLE)
+        return np.asarray(np.clip(angle + change / at.load_slope, low, high))

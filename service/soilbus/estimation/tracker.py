@@ -21,11 +21,13 @@ from numpy.typing import NDArray
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.completed import CompletedProblem, Free
 from soilbus.estimation.coordinates import Coordinates
+from soilbus.estimation.curve import with_curve
 from soilbus.estimation.gauss_newton import Fit, Foreseen, fit_window, foreseen, resume
 from soilbus.estimation.marginal import with_whole
 from soilbus.estimation.normal_equations import Fitting
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-from soilbus.estimation.present import at_present
+from soilbus.estimation.present import Drifts, present_and_drifts
+from soilbus.estimation.recall import is_borne_out, recalled
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.soil_change import Crossing, suspicion, without_crossing
 from soilbus.estimation.window import Rig, Window
@@ -43,6 +45,10 @@ CHANGED = 20.0
 """Fall of -2 log evidence from which it is believed."""
 TRUST, TRUST_AGAIN = 3.5, 0.0
 """Standard deviations of chi-square that a window may have above the allowed: always, and after a mismatch."""
+SETTLED = 1.5
+"""The same just after a border: what is left of it in the window misleads long before it is a mismatch."""
+AS_LONG = 0.4
+"""Share of a window for which a new soil must last after a border of that length; after a shorter one less."""
 LOOK_BACK = 0.2
 """Share of a window before the end of the last fit's data from which on a change is looked for."""
 RECENT = 2.0
@@ -57,6 +63,10 @@ LEARNED = 0.5
 """Share of a window that its data must fill for later windows to build on it: the posterior of less is not Gaussian."""
 BORDERS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.5, 10.5)
 """Lengths after the first sign of another soil that may be of neither, in wheelbases: borders are sharp or gradual."""
+LONGER = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0)
+"""Wheelbases by which a border may turn out to be longer than it seemed at first."""
+OF_BORDER = 25.0
+"""Fall of the cost, beyond that of as many residuals of noise, from which data are of the border after all."""
 GAIN_MEMORY = 60.0
 """Windows in which a sensor's gain error may change by its whole uncertainty."""
 WHEELBASE = 2.0
@@ -73,6 +83,8 @@ class Ground(StrEnum):
     """Another soil than before, since less than a window: only its own data count."""
     CHANGING = "changing"
     """Too little of another soil is in to tell it; the estimate is of the one before."""
+    SETTLING = "settling"
+    """Another soil than before, whose border may go on: its data do not agree, or are of too little time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +118,14 @@ class Tracked:
     turning: int = 0
 
 
+class Learned(NamedTuple):
+    """What a window that ended at `end` [s] leaves for those that begin later."""
+
+    end: float
+    belief: Belief
+    drifts: Drifts
+
+
 class Alarm(NamedTuple):
     """When the data first disagreed with the soil known [s], and how fast the vehicle then was [m/s]."""
 
@@ -133,12 +153,23 @@ class Tracker:
     ) -> None:
         self.rig, self.prior, self.model, self.settings = rig, prior, model, settings
         self.effects, self.free = tuple(effects), tuple(free)
+        self._recalled: tuple[Belief, float] | None = None
         self.forget()
 
     @property
     def here(self) -> SoilPrior:
         """Prior of the present soil: the configured one, or a wider one after the soil has changed."""
         return self._here
+
+    @property
+    def newest(self) -> Belief | None:
+        """What the newest window told that later ones build on; None before there is one."""
+        beliefs = self._beliefs  # asked from another thread
+        return beliefs[-1][1] if beliefs else None
+
+    def recall(self, belief: Belief, elapsed: float) -> None:
+        """Begin, now and whenever anew, with what another run knew of the gains so many seconds ago."""
+        self._recalled = belief, elapsed
 
     def forget(self) -> None:
         """Begin anew."""
@@ -148,7 +179,8 @@ class Tracker:
         self._good_until = -math.inf
         self._alarm: Alarm | None = None
         self._crossing: Crossing | None = None
-        self._beliefs: list[tuple[float, Belief]] = []
+        self._drifts = Drifts.about(self.settings.drift)  # as the last fit that was told leaves them
+        self._beliefs: list[Learned] = []
 
     def estimate(self, window: Window, end: float) -> Tracked:
         """One window that ends at `end` [s]; windows in their order."""
@@ -183,7 +215,12 @@ class Tracker:
                 fitting, fit = self._afresh(problem, before)
         if changed is not None:
             return self._remembered(replace(changed, standstill=left_out[0], turning=left_out[1]), end)
-        fit, ground = self._told(fitting, fit), Ground.NEW if new else Ground.SAME
+        ground = self._ground(self._crossing, end) if new and self._crossing else Ground.SAME
+        if new and fit is not None and self._unsettled(fit):
+            fitting, fit = self._past_the_border(window, fitting, fit)
+            ground = Ground.SETTLING
+            since = self._crossing.end if self._crossing else since
+        fit = self._told(fitting, fit, since)
         return self._remembered(Tracked(fit, self.mismatch(fit), ground, since, *left_out), end)
 
     def _alarm_in(self, window: Window, ahead: Foreseen, last: Fit, fit: Fit | None, filled: float) -> Alarm | None:
@@ -215,17 +252,19 @@ class Tracker:
             known = before.of_another_soil(there)
             other = fit_window(problem, there, known)
             if not self.mismatch(other):
-                self._here = there
+                begin = float(problem.t[0])
+                self._crossing, self._here = Crossing(begin, begin, 0.0), there
                 return Fitting(problem, there, known), other
         return Fitting(problem, self._here, before), fit
 
-    def _told(self, fitting: Fitting, fit: Fit | None) -> Fit | None:
+    def _told(self, fitting: Fitting, fit: Fit | None, since: float) -> Fit | None:
         """A fit that is going to be reported: with the whole posterior, of the soil at the window's end."""
         if fit is None or not fit.converged:
             return fit
         if not self.mismatch(fit):
             fit = with_whole(fitting.problem, fitting.coordinates.prior, fitting.before, fit)
-        return at_present(fitting, fit, self.settings.window, self.settings.drift)
+        present, self._drifts = present_and_drifts(fitting, fit, self.settings.window, self._drifts_at(since))
+        return present
 
     def mismatch(self, fit: Fit | None) -> bool:
         """Whether a fit failed or leaves more than noise."""
@@ -245,24 +284,46 @@ class Tracker:
         if fit is not None and not tracked.mismatch:
             self._good_until = end
             learned = end - tracked.since >= LEARNED * self.settings.window and fit.is_gaussian
-            if learned and tracked.ground is not Ground.CHANGING:
-                self._beliefs.append((end, fit.whole))
+            if learned and tracked.ground in (Ground.SAME, Ground.NEW):
+                self._beliefs.append(Learned(end, fit.whole, self._drifts))
         return tracked
 
     def _known_at(self, t: float, problem: WindowProblem) -> Belief:
-        """What windows that had ended by t [s] tell of the soil from t on."""
+        """What windows that had ended by t [s] tell of the soil from t on, and of the sensors on whatever curve."""
+        return with_curve(self._told_by(t, problem), problem)
+
+    def _told_by(self, t: float, problem: WindowProblem) -> Belief:
         ended = self._ended(t)
         if not ended:
-            return Belief.of(self._here, problem.gain_std)
-        end, belief = self._beliefs[ended[-1]]
+            return self._known_at_first(problem)
+        end, belief, _ = self._beliefs[ended[-1]]
         elapsed = (t - end) / self.settings.window
         gains = problem.gain_std**2 * min((elapsed + 1.0) / GAIN_MEMORY, 1.0)
         if self._crossing is not None and end <= self._crossing.end:
             return belief.of_another_soil(self._here).drifted(np.zeros((_SOIL, _SOIL)), gains)
         return belief.drifted(self._drift(belief, elapsed), gains)
 
+    def _drifts_at(self, t: float) -> Drifts:
+        """How fast the soil may drift from t [s] on, by what windows that had ended by then tell."""
+        ended = self._ended(t)
+        if not ended:
+            return Drifts.about(self.settings.drift, self._crossing is not None)
+        end, _, drifts = self._beliefs[ended[-1]]
+        if self._crossing is not None and end <= self._crossing.end:
+            return Drifts.about(self.settings.drift, border=True)
+        return drifts.later((t - end) / self.settings.window + 1.0)
+
     def _ended(self, t: float) -> list[int]:
-        return [i for i, (end, _) in enumerate(self._beliefs) if end <= t + _SAME_TIME]
+        return [i for i, known in enumerate(self._beliefs) if known.end <= t + _SAME_TIME]
+
+    def _known_at_first(self, problem: WindowProblem) -> Belief:
+        """Before any window: the prior, and the gains of another run unless the data speak against them."""
+        if self._recalled is not None:
+            known = recalled(self._recalled[0], self._here, problem.gain_std, self._recalled[1])
+            if is_borne_out(problem, self._here, known):
+                return known
+            self._recalled = None
+        return Belief.of(self._here, problem.gain_std)
 
     def _forget_before(self, start: float) -> None:
         """Only the newest of the beliefs that windows from `start` [s] on may build on is kept, and what follows it."""
@@ -305,10 +366,39 @@ class Tracker:
             if old is not None and not self._likelier(old, new, fit_window(self._problem(apart), self._here, before)):
                 return None
             self._crossing, self._here = crossing, there
-            return Tracked(self._told(Fitting(second, there, known), new), False, Ground.NEW, crossing.end)
+            ground = self._ground(crossing, float(window.t[-1]))
+            return Tracked(self._told(Fitting(second, there, known), new, crossing.end), False, ground, crossing.end)
         if ahead is None or old is None or not waits:
             return None
-        return Tracked(self._told(ahead.fitting, old), False, Ground.CHANGING, float(window.t[0]))
+        return Tracked(self._told(ahead.fitting, old, float(window.t[0])), False, Ground.CHANGING, float(window.t[0]))
+
+    def _ground(self, crossing: Crossing, end: float) -> Ground:
+        """What a window that ends at `end` [s] has of the soil after a crossing: a long border may go on."""
+        needed = min(crossing.end - crossing.begin, AS_LONG * self.settings.window)
+        return Ground.NEW if end - crossing.end >= needed else Ground.SETTLING
+
+    def _unsettled(self, fit: Fit) -> bool:
+        """Whether a fit of a new soil leaves more than noise alone mostly does."""
+        return not fit.converged or fit.chi2 > self.settings.max_chi2 + SETTLED * math.sqrt(2.0 / max(fit.rows, 1))
+
+    def _past_the_border(self, window: Window, fitting: Fitting, fit: Fit) -> tuple[Fitting, Fit]:
+        """The fit of the data after a border longer than was thought, if those left out are why they do not agree."""
+        crossing = self._crossing
+        assert crossing is not None  # else there is no border
+        for longer in (crossing._replace(end=crossing.end + share * crossing.lag) for share in LONGER):
+            apart = without_crossing(window, longer, self.rig.front)
+            problem = self._problem(apart.rows(np.flatnonzero(apart.t >= longer.end)))
+            if problem.n_rows < 2 * MIN_NEW_ROWS:
+                break
+            known = fitting.before
+            later = fit_window(problem, self._here, known)
+            if later is None or self._unsettled(later):
+                continue
+            fall, noise = fit.cost - later.cost, fit.rows - later.rows
+            if fall > noise + OF_BORDER:
+                self._crossing = longer
+                return Fitting(problem, self._here, known), later
+        return fitting, fit
 
     def _crossings(self, alarm: Alarm, start: float) -> list[Crossing]:
         """Borders of growing length that begin at the alarm; of those over before `start` [s] only the last."""

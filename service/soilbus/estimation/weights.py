@@ -62,5 +62,6 @@ def inverse_covariance(A: Array, latent_var: Array, row_var: Array, n_wheels: in
 
 def diagonals(blocks: Array) -> Array:
     """The diagonals (N, W) of blocks (N, W, W), writeable."""
-    diagonal: Array = np.einsum("nii->ni", blocks)
-    return diagonal
+    view = blocks.diagonal(axis1=1, axis2=2)
+    view.flags.writeable = True  # numpy gives a view, for reading only
+    return view

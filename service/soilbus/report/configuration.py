@@ -9,9 +9,11 @@ from cantools.database.can import Database
 
 from soilbus.assembly import completion_of, effects_of, rig_of
 from soilbus.can.channels import Channel
-from soilbus.can.dbc_files import load_databases, output_database
+from soilbus.can.dbc_files import checked_messages, load_databases, output_database
 from soilbus.can.mapping import channels_of, without_unit
 from soilbus.config import Config, Table
+from soilbus.daemon.outputs import check_cycle_times
+from soilbus.report.soil_prior import prior_text
 from soilbus.report.table import table
 
 
@@ -23,9 +25,10 @@ def configuration_report(config: Config) -> str:
         return _report(config, [table(("role", "column", "factor to SI"), columns)])
     database = load_databases(config)
     channels = channels_of(config, database)
-    output_database(config)
+    check_cycle_times(config, output_database(config))
     assumed = {c.name for c in without_unit(channels, database)}
-    rows = [_row(channel, database, channel.name in assumed) for channel in channels]
+    checked = checked_messages(config)
+    rows = [_row(channel, database, channel.name in assumed, channel.message in checked) for channel in channels]
     head = ("role", "signal", "unit", "factor to SI", "plausible", "every", "status")
     return _report(config, [table(head, rows)])
 
@@ -35,6 +38,7 @@ def _report(config: Config, parts: list[str]) -> str:
     parts += [f"{name:<8} {verdict}\n" for name, verdict in identifiable(config)]
     if effects:
         parts.append("\nEffects in the model:\n" + "".join(f"{line}\n" for line in effects))
+    parts.append("\nWhat is assumed of the soil before any data:\n" + prior_text(config) + "\n")
     parts.append("\nSettings in force (defaults included):\n" + defaults_text(config) + "\n")
     return "\n".join(parts[:1]) + "\nWhat these sensors can tell of the soil:\n" + "".join(parts[1:])
 
@@ -71,12 +75,14 @@ def effect_lines(config: Config) -> list[str]:
     return lines
 
 
-def _row(channel: Channel, database: Database, unit_assumed: bool) -> tuple[str, ...]:
+def _row(channel: Channel, database: Database, unit_assumed: bool, checked: bool) -> tuple[str, ...]:
     message = database.get_message_by_name(channel.message)
     signal = message.get_signal_by_name(channel.signal)
     status = "SI assumed: the DBC tells no unit" if unit_assumed else "ok"
     if channel.valid_signal:
         status += f", valid while {channel.valid_signal} is {'/'.join(map(str, channel.valid_values))}"
+    if checked:
+        status += ", counter and CRC required"
     every = f"{message.cycle_time} ms" if message.cycle_time else "not told"
     return (
         channel.name,

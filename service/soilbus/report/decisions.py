@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 from soilbus.report.table import table
-from soilbus.simulator.bogging_trials import ENOUGH_TIME, ENOUGH_WAY, WarningFigures
+from soilbus.simulator.bogging_trials import ENOUGH_TIME, ENOUGH_WAY, FELT, REACTION, WarningFigures
 from soilbus.simulator.draft_trials import SPREAD, DraftFigures
 from soilbus.simulator.verdict_trials import Bin, Reliability
 
@@ -14,7 +14,7 @@ MAX_ERROR = 0.05
 COVERAGE = (0.90, 0.98)
 
 
-def decisions_report(drafts: Sequence[DraftFigures], calls: Reliability, warnings: WarningFigures) -> str:
+def decisions_report(drafts: Sequence[DraftFigures], calls: Reliability, warnings: Sequence[WarningFigures]) -> str:
     """All sections."""
     return "\n".join([*_draft_section(drafts), "", *_call_section(calls), "", *_warning_section(warnings)]) + "\n"
 
@@ -44,15 +44,25 @@ def _call_row(of_bin: Bin) -> tuple[str, ...]:
     )
 
 
-def _warning_section(found: WarningFigures) -> Iterator[str]:
+def _warning_section(warnings: Sequence[WarningFigures]) -> Iterator[str]:
     yield f"Warning of immobilisation at least {ENOUGH_TIME:g} s or {ENOUGH_WAY:g} m before slip passes its limit"
     yield ""
-    row = (
-        str(found.boggings), f"{found.warned}", f"{found.lead:.1f} s", f"{found.least:.1f} s",
-        f"{found.hours:.2f}", str(found.false),
+    boggings = [found for found in warnings if found.boggings or found.sudden]
+    head = ("boggings", "foreseeable", "in time", "median lead", "least", "too sudden")
+    yield table(head, [_bogging_row(found) for found in boggings])
+    yield "Target: all that can be foreseen in time.  Too sudden: from where the ground has lost"
+    yield f"{100.0 * FELT:.0f} % of the largest draft, slip passes in less than that and {REACTION:g} s to react."
+    yield ""
+    of_firm = ("without a bogging", "hours", "false warnings")
+    yield table(of_firm, [(f.kind, f"{f.hours:.2f}", str(f.false)) for f in warnings if f.hours])
+    yield "Target: at most one false warning an hour."
+
+
+def _bogging_row(found: WarningFigures) -> tuple[str, ...]:
+    return (
+        found.kind, str(found.boggings), str(found.warned), f"{found.lead:.1f} s", f"{found.least:.1f} s",
+        str(found.sudden),
     )  # fmt: skip
-    yield table(("boggings", "in time", "median lead", "least", "hours on firm ground", "false"), [row])
-    yield "Targets: all in time; at most one false warning an hour."
 
 
 def _draft_section(drafts: Sequence[DraftFigures]) -> Iterator[str]:
@@ -77,7 +87,9 @@ def _draft_row(of_soil: DraftFigures) -> tuple[str, ...]:
     )
 
 
-def as_json(drafts: Sequence[DraftFigures], calls: Reliability, warnings: WarningFigures) -> dict[str, object]:
+def as_json(
+    drafts: Sequence[DraftFigures], calls: Reliability, warnings: Sequence[WarningFigures]
+) -> dict[str, object]:
     """The figures as plain objects; null for what is not a number."""
 
     def number(value: float) -> float | None:
@@ -105,7 +117,10 @@ def as_json(drafts: Sequence[DraftFigures], calls: Reliability, warnings: Warnin
             ],
         },
         "immobilisation": {
-            "boggings": warnings.boggings, "in_time": warnings.warned, "lead": number(warnings.lead),
-            "least_lead": number(warnings.least), "hours": warnings.hours, "false": warnings.false,
+            w.kind: {
+                "boggings": w.boggings, "in_time": w.warned, "lead": number(w.lead), "least_lead": number(w.least),
+                "sudden": w.sudden, "hours": w.hours, "false": w.false,
+            }
+            for w in warnings
         },
     }  # fmt: skip

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,38 +13,37 @@ from numpy.typing import NDArray
 
 from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.capability.assessment import OverSlip, assess
-from soilbus.capability.immobilisation import Alert, Watch, moments, watched
+from soilbus.capability.immobilisation import Alert, Moment, Watch, moments, watched
 from soilbus.config import Config
 from soilbus.estimation.tracker import Ground, Settings, Tracker
 from soilbus.estimation.window import BinStore, Rig
-from soilbus.simulator.draft_trials import true_largest_draft
+from soilbus.simulator.boggings import FIRM_DRIVE, KINDS, Trouble, bogging, firm_ground
+from soilbus.simulator.drive import drive
 from soilbus.simulator.monte_carlo import Each
 from soilbus.simulator.recording import Recording, simulate
-from soilbus.simulator.scenario import Patch, Scenario, Swing
-from soilbus.terra.soils import soil_named
-from soilbus.terra.wheel import WheelModel
+from soilbus.simulator.scenario import Swing
 
 Array = NDArray[np.float64]
 
-FIRM = ("rubicon_sandy_loam_43", "north_gower_clayey_loam_46", "upland_sandy_loam_51", "loam")
-SOFT = ("wet_clay", "clayey_soil_38", "lean_clay_32", "heavy_clay_40")
+FIRM, HARSH = "firm", "harsh"
+"""Drives without a bogging: easy, and hard on every trend."""
 LOOK = 0.1
 """Time [s] between two looks, as in the service."""
 ENOUGH_TIME, ENOUGH_WAY = 3.0, 3.0
 """Warning ahead that is enough: [s] or [m]."""
-EARLIEST = 10.0
+REACTION = 1.0
+"""Time [s] without which no change is told from noise."""
+FELT = 0.05
+"""Loss, as a share of the largest draft, that slip and pull can tell from their noise."""
+EARLIEST = 5.0
 """Slip that passes within this time [s] of the first window cannot be foreseen: no drive to judge by."""
-BOGGING, FIRM_DRIVE = 60.0, 300.0
-"""Length of a drive [s]."""
-EASY = (0.2, 0.65)
-"""Draft on firm ground, in units of the largest."""
 
 
 class Task(NamedTuple):
-    """One drive; a bogging or on firm ground."""
+    """One drive: a kind of boggings.KINDS, or FIRM or HARSH."""
 
     config: Config
-    bogging: bool
+    kind: str
     seed: int
 
 
@@ -52,70 +52,138 @@ class WarningTrial:
     """One drive: seconds watched, warnings begun before slip passed, and where it did the lead of the last one.
 
     lead [s] and way [m] are nan where slip never passed, or at once (EARLIEST), and 0 where
-    it passed unwarned.
+    it passed unwarned.  possible and possible_way are what went by from when the ground could be felt
+    to give way (FELT), or the first window, until slip passed: nobody can warn earlier.
     """
 
-    bogging: bool
+    kind: str
     seconds: float
     warnings: int
     lead: float
     way: float
+    possible: float = np.inf
+    possible_way: float = np.inf
+
+    @property
+    def in_time(self) -> bool:
+        """Whether the warning was early enough."""
+        return self.lead >= ENOUGH_TIME or self.way >= ENOUGH_WAY
+
+    @property
+    def sudden(self) -> bool:
+        """Whether slip passed too soon after the first sign for any warning to be early enough."""
+        speed = self.possible_way / self.possible if 0.0 < self.possible < np.inf else 0.0
+        return self.possible < ENOUGH_TIME + REACTION and self.possible_way < ENOUGH_WAY + REACTION * speed
 
 
 @dataclass(frozen=True, slots=True)
 class WarningFigures:
-    """Boggings: how many, warned early enough, median and least lead [s]; firm ground: hours and false warnings."""
+    """One kind.
 
+    Boggings: how many that could be foreseen in time, how many of these were, median and
+    least lead [s], and how many were too sudden.  Firm ground: hours and false warnings.
+    """
+
+    kind: str
     boggings: int
     warned: int
     lead: float
     least: float
+    sudden: int
     hours: float
     false: int
 
 
-def scenario_of(task: Task) -> Scenario:
-    """Firm soil that turns soft, or a draft that outgrows firm soil; or firm soil and an easy draft."""
-    rng = np.random.default_rng([task.seed, 3])
-    rig, settings = rig_of(task.config), task.config.traversability
-    firm = str(rng.choice(FIRM))
-    limit = np.full(len(rig.radius), np.nan)
-    most = true_largest_draft(soil_named(firm), rig, limit, settings.max_slip, WheelModel())
-    if not task.bogging:
-        low, high = (share * most for share in EASY)
-        return Scenario(FIRM_DRIVE, (Patch(0.0, firm),), draft=Swing(low, high), lift_slip=Swing(0.9, 0.9))
-    if rng.random() < 0.5:
-        length, start = rng.uniform(15.0, 40.0), rng.uniform(15.0, 25.0)
-        soils = (Patch(0.0, firm), Patch(start, str(rng.choice(SOFT))))
-        share = rng.uniform(0.35, 0.55)
-        draft = Swing((share - 0.05) * most, (share + 0.05) * most)
-        return Scenario(BOGGING, soils, draft=draft, lift_slip=Swing(0.9, 0.9), transition=length)
-    draft = Swing(0.3 * most, rng.uniform(1.1, 1.3) * most, slowest=0.008, fastest=0.02)
-    return Scenario(BOGGING, (Patch(0.0, firm),), draft=draft, lift_slip=Swing(0.9, 0.9))
+class Observation(NamedTuple):
+    """One drive as the watch sees it: moments, and pull over slip from the times [s] on at which it is known.
+
+    end [s] is when slip passed its limit (passed) or the drive ended, felt [s] when the ground could first
+    be felt to give way; way is the distance [m] driven at times t [s] (both (N,)).
+    """
+
+    moments: list[Moment]
+    curves: list[tuple[float, OverSlip]]
+    start: float
+    end: float
+    passed: bool
+    t: Array
+    way: Array
+    felt: float
 
 
 def trial(task: Task) -> WarningTrial:
     """Drive, estimate every hop as the service does, and watch."""
+    return judged(task.kind, observed(task))
+
+
+def observed(task: Task) -> Observation:
+    """Drive and estimate."""
     config, rig = task.config, rig_of(task.config)
-    recording = simulate(config, scenario_of(task), task.seed)
+    rng = np.random.default_rng([task.seed, 3])
+    if task.kind in (FIRM, HARSH):
+        trouble = Trouble(firm_ground(config, task.kind == HARSH, rng))
+    else:
+        trouble = bogging(config, task.kind, rng)
+    recording = simulate(config, trouble.scenario, task.seed, trouble.effects)
     truth = recording.truth
     slip = np.mean([truth[f"slip.{wheel}"] for wheel in rig.wheels], axis=0)
-    start, last = config.estimator.window, float(truth["t"][-1])
+    start = config.estimator.window
     passed = truth["t"][(slip > config.traversability.max_slip) & (truth["t"] > start)]
-    end = float(passed[0]) if len(passed) else last
-    t, warned = watch(recording, config, end)
+    end = float(passed[0]) if len(passed) else float(truth["t"][-1])
+    looks, curves = _looks(recording, config, end)
+    felt = _felt(task, trouble, end) if len(passed) else end
+    return Observation(
+        looks, curves, start, end, len(passed) > 0, truth["t"], truth["distance"], felt
+    )  # fmt: skip
+
+
+def _felt(task: Task, trouble: Trouble, end: float) -> float:
+    """From when on, until the end [s], the largest draft that the way truly holds is less by FELT than at the start.
+
+    0 where it is not: then the demand is what grows.
+    """
+    limit = task.config.traversability.max_slip
+    even = replace(trouble.scenario, draft=None, slip=Swing(limit, limit), slip_spread=0.0, side_shift=Swing(0.0, 0.0))
+    truth = drive(task.config, even, task.seed, trouble.effects).columns
+    mass = task.config.vehicle.mass if task.config.vehicle else 0.0
+    held, t = truth["draft"] + mass * truth["acceleration"], truth["t"]
+    firm = t[(held >= (1.0 - FELT) * held[0]) & (t <= end)]
+    return float(firm[-1]) if len(firm) and firm[-1] < t[t <= end][-1] else 0.0
+
+
+def judged(kind: str, seen: Observation) -> WarningTrial:
+    """What the watch makes of a drive."""
+    t, warned = watch(seen)
     begins = t[1:][warned[1:] & ~warned[:-1]]
-    lead, way = np.nan, np.nan
-    if len(passed) and end - start > EARLIEST:
-        lead = end - float(begins[-1]) if len(begins) and warned[-1] else 0.0
-        way = float(
-            np.interp(end, truth["t"], truth["distance"]) - np.interp(end - lead, truth["t"], truth["distance"])
-        )
-    return WarningTrial(task.bogging, end - start, len(begins), lead, way)
+    seconds = seen.end - seen.start
+    if not seen.passed or seconds <= EARLIEST:
+        return WarningTrial(kind, seconds, len(begins), np.nan, np.nan)
+    lead = seen.end - float(begins[-1]) if len(begins) and warned[-1] else 0.0
+    possible = seen.end - min(max(seen.felt, seen.start), seen.end)
+    way, possible_way = (_way(seen, seen.end - s) for s in (lead, possible))
+    return WarningTrial(kind, seconds, len(begins), lead, way, possible, possible_way)
 
 
-def watch(recording: Recording, config: Config, end: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Times [s] (N,) of the looks from the start to the end [s], and whether each warned."""
+def _way(seen: Observation, since: float) -> float:
+    """Distance [m] driven from a time [s] until the end."""
+    return float(np.interp(seen.end, seen.t, seen.way) - np.interp(since, seen.t, seen.way))
+
+
+def watch(seen: Observation) -> tuple[Array, NDArray[np.bool_]]:
+    """Times [s] (N,) of the looks, and whether each warned."""
+    state, curve, curves, out = Watch(), None, iter(seen.curves), []
+    due = next(curves, None)
+    for moment in seen.moments:
+        while due is not None and moment.t >= due[0]:
+            curve, due = due[1], next(curves, None)
+        state = watched(state, *moment, curve)
+        out.append((moment.t, state.warning is Alert.IMMOBILISATION))
+    t, warned = np.array(out, float).reshape(-1, 2).T
+    return t, warned > 0.5
+
+
+def _looks(recording: Recording, config: Config, end: float) -> tuple[list[Moment], list[tuple[float, OverSlip]]]:
+    """The moments until the end [s], and the curves from their times on."""
     rig, settings = rig_of(config), config.estimator
     tracker = Tracker(
         rig, prior_of(config), model_of(config),
@@ -123,15 +191,12 @@ def watch(recording: Recording, config: Config, end: float) -> tuple[Array, NDAr
     )  # fmt: skip
     store = BinStore(rig, LOOK, 0.0)
     store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
-    state, curve, due, out = Watch(), None, settings.window, []
-    for moment in moments(store.window(0.0, end), rig, 0.0, settings.min_speed):
-        if moment.t >= due:
-            curve = _curve(tracker, store, due, config, rig) or curve
-            due += settings.hop
-        state = watched(state, *moment, curve)
-        out.append((moment.t, state.warning is Alert.IMMOBILISATION))
-    t, warned = np.array(out, float).reshape(-1, 2).T
-    return t, warned > 0.5
+    curves = []
+    for due in np.arange(settings.window, end, settings.hop).tolist():
+        curve = _curve(tracker, store, due, config, rig)
+        if curve is not None:
+            curves.append((due, curve))
+    return list(moments(store.window(0.0, end), rig, 0.0, settings.min_speed)), curves
 
 
 def _curve(tracker: Tracker, store: BinStore, end: float, config: Config, rig: Rig) -> OverSlip | None:
@@ -146,27 +211,38 @@ def _curve(tracker: Tracker, store: BinStore, end: float, config: Config, rig: R
     return None if able is None else able.over_slip
 
 
-def warning_trials(config: Config, boggings: int, firm: int, seed: int, each: Each = map) -> WarningFigures:
-    """Figures of so many boggings and drives on firm ground (FIRM_DRIVE each); the same seed gives the same drives.
+def warning_trials(
+    config: Config, boggings: int, hours: float, seed: int, each: Each = map
+) -> tuple[WarningFigures, ...]:
+    """Figures of so many boggings, evenly of all kinds, and of so many hours on firm ground, half of them harsh.
 
-    Raises SimulationError where the vehicle cannot be driven.
+    The same seed gives the same drives.  Raises SimulationError where the vehicle cannot be driven.
     """
+    firm = math.ceil(3600.0 * hours / (FIRM_DRIVE - config.estimator.window))
+    kinds = [KINDS[i % len(KINDS)] for i in range(boggings)] + [(FIRM, HARSH)[i % 2] for i in range(firm)]
     key = np.random.SeedSequence([seed, zlib.crc32(b"warnings")])
-    seeds = iter(key.generate_state(boggings + firm).tolist())
-    tasks = [Task(config, i < boggings, next(seeds)) for i in range(boggings + firm)]
-    return figures(list(each(trial, tasks)))
+    seeds = key.generate_state(len(kinds)).tolist()
+    trials = list(each(trial, [Task(config, kind, s) for kind, s in zip(kinds, seeds, strict=True)]))
+    return tuple(
+        figures(kind, found)
+        for kind in (*KINDS, FIRM, HARSH)
+        if (found := [t for t in trials if t.kind == kind])
+    )  # fmt: skip
 
 
-def figures(trials: Sequence[WarningTrial]) -> WarningFigures:
-    """The figures of some trials: boggings are those whose slip passed."""
+def figures(kind: str, trials: Sequence[WarningTrial]) -> WarningFigures:
+    """The figures of some trials of one kind: boggings are those whose slip passed."""
     bogged = [t for t in trials if np.isfinite(t.lead)]
-    rest = [t for t in trials if not t.bogging]
-    leads = np.array([t.lead for t in bogged])
+    asked = [t for t in bogged if not t.sudden]
+    rest = [t for t in trials if t.kind in (FIRM, HARSH)]
+    leads = np.array([t.lead for t in asked])
     return WarningFigures(
-        boggings=len(bogged),
-        warned=sum(t.lead >= ENOUGH_TIME or t.way >= ENOUGH_WAY for t in bogged),
-        lead=float(np.median(leads)) if len(bogged) else float("nan"),
-        least=float(leads.min()) if len(bogged) else float("nan"),
+        kind=kind,
+        boggings=len(asked),
+        warned=sum(t.in_time for t in asked),
+        lead=float(np.median(leads)) if len(asked) else float("nan"),
+        least=float(leads.min()) if len(asked) else float("nan"),
+        sudden=len(bogged) - len(asked),
         hours=sum(t.seconds for t in rest) / 3600.0,
         false=sum(t.warnings for t in rest),
     )

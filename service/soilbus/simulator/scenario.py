@@ -36,16 +36,33 @@ class Swing:
     fastest: float = 0.12
 
 
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """A quantity with given values at times t [s], ascending; straight lines between them, constant outside."""
+
+    t: Sequence[float]
+    value: Sequence[float]
+
+    @property
+    def low(self) -> float:
+        """The least value."""
+        return min(self.value)
+
+
 class Wave(NamedTuple):
-    """One realisation of a swing: value, rate of change [1/s], integral from the start [s]; each (N,)."""
+    """One realisation of a swing or a profile: value, rate of change [1/s], integral from the start [s]; each (N,)."""
 
     value: Array
     rate: Array
     integral: Array
 
 
-def realise(swing: Swing, t: Array, rng: np.random.Generator) -> Wave:
-    """A random wave at the times t [s] (N,), ascending from 0; it never leaves low..high."""
+def realise(swing: Swing | Profile, t: Array, rng: np.random.Generator) -> Wave:
+    """A random wave at the times t [s] (N,), ascending from 0; it never leaves low..high.  Profiles are as given."""
+    if isinstance(swing, Profile):
+        value = np.interp(t, swing.t, swing.value)
+        area = np.cumsum((value[1:] + value[:-1]) / 2.0 * np.diff(t))
+        return Wave(value, np.gradient(value, t), np.concatenate([[0.0], area]))
     edges = np.linspace(swing.slowest, swing.fastest, _N_SINES + 1)
     omega = 2.0 * np.pi * rng.uniform(edges[:-1], edges[1:])
     phase = rng.uniform(0.0, 2.0 * np.pi, _N_SINES)
@@ -95,8 +112,8 @@ class Scenario:
 
     duration: float
     soils: Sequence[Patch]
-    speed: Swing = Swing(1.0, 1.8)
-    draft: Swing | None = None
+    speed: Swing | Profile = Swing(1.0, 1.8)
+    draft: Swing | Profile | None = None
     slip: Swing | None = None
     lift_slip: Swing = Swing(0.45, 0.45)
     slip_spread: float = 0.015

@@ -20,6 +20,8 @@ _DIVIDERS = {"ground_speed": 2, "latitude": 5, "longitude": 5}
 """Radars give 25 Hz, receivers of positions 10 Hz; all other sensors every sample of the truth."""
 POSITION_NOISE = 0.02
 """Sd of a fix, north and east [m]: a receiver with real-time corrections."""
+_SAME_TRUTH = {"motor_speed": "speed"}
+"""Quantities that another sensor tells too; its noise is theirs."""
 _EXACT = frozenset({"torque_limit"})  # told by the motor controller, not measured
 
 
@@ -31,7 +33,7 @@ def channel_rng(seed: int, name: str) -> np.random.Generator:
 def fitted(config: Config) -> Iterator[tuple[str, str]]:
     """(quantity, wheel or "") of every channel that the configuration maps."""
     for wheel in config.wheel:
-        for quantity in ("torque", "speed", "load", "sinkage", "torque_limit"):
+        for quantity in ("torque", "speed", "load", "sinkage", "torque_limit", "motor_speed"):
             if getattr(wheel, quantity) is not None:
                 yield quantity, wheel.name
     for quantity in ("ground_speed", "draft", "pitch", "acceleration", "latitude", "longitude"):
@@ -50,12 +52,13 @@ def measure(drive: Drive, config: Config, seed: int) -> dict[str, Column]:
     for quantity, wheel in fitted(config):
         name = f"{quantity}.{wheel}" if wheel else quantity
         every = slice(None, None, _DIVIDERS.get(quantity, 1))
-        truth, rng = told[name], channel_rng(seed, name)
+        measured = _SAME_TRUTH.get(quantity, quantity)
+        truth, rng = told[f"{measured}.{wheel}" if wheel else measured], channel_rng(seed, name)
         if quantity in ("latitude", "longitude"):
             parallel = 1.0 if quantity == "latitude" else np.cos(drive.columns["latitude"])
             truth = wrapped(truth + POSITION_NOISE / (SEMI_MAJOR_AXIS * parallel) * rng.standard_normal(len(t)))
         elif quantity not in _EXACT:
-            truth = disturbed(truth, getattr(config.noise, quantity), config.estimator.window, rng)
+            truth = disturbed(truth, getattr(config.noise, measured), config.estimator.window, rng)
         columns[name] = Column(t[every].copy(), truth[every].copy())
     return columns
 

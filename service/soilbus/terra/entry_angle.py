@@ -21,16 +21,18 @@ def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolera
     """Entry angle [rad], in the broadcast shape, at which the soil carries the load [N].
 
     Newton on logarithms, where the curve is nearly straight, inside a bracket that
-    bisection shrinks whenever Newton leaves it.  state.entry_angle is the first guess
-    where it is finite and positive.  A load that no angle up to MAX_ENTRY_ANGLE carries
-    (wheel buried), or that is not a positive number, gives nan.
+    bisection shrinks whenever Newton leaves it; where it leads beyond MAX_ENTRY_ANGLE, that
+    is tried first.  state.entry_angle is the first guess where it is finite and positive.
+    A load that MAX_ENTRY_ANGLE does not carry (wheel buried), or that is not a positive
+    number, gives nan.
     """
     load, *fields = (np.asarray(a, float) for a in np.broadcast_arrays(load, *state))
     shape = load.shape
     load, *fields = (a.ravel() for a in (load, *fields))
     guess, rest = fields[0], fields[1:]
     low = np.full(load.shape, np.log(MIN_ENTRY_ANGLE))
-    high = np.full(load.shape, np.log(MAX_ENTRY_ANGLE))
+    top = np.log(MAX_ENTRY_ANGLE)
+    high = np.full(load.shape, top)
     usable = np.isfinite(load) & (load > 0.0)
     target = np.log(np.where(usable, load, 1.0))
     with np.errstate(all="ignore"):
@@ -49,12 +51,13 @@ def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolera
         with np.errstate(all="ignore"):
             step = at[todo] - miss / (slope * part.entry_angle / W)
         inside = (step > low[todo]) & (step < high[todo]) & (W > 0.0)
-        new = np.where(inside, step, (low[todo] + high[todo]) / 2.0)
+        untried = (step >= top) & (high[todo] == top) & (at[todo] < top)
+        new = np.where(inside, step, np.where(untried, top, (low[todo] + high[todo]) / 2.0))
         done = (np.abs(miss) < tolerance) | (high[todo] - low[todo] < 1e-14)
         at[todo] = np.where(np.abs(miss) < tolerance, at[todo], new)
         todo = todo[~done]
     angle = np.exp(at)
-    angle[~usable | (at > np.log(MAX_ENTRY_ANGLE) - 1e-9)] = np.nan
+    angle[~usable | (at > top - 1e-9)] = np.nan
     return angle.reshape(shape)
 
 

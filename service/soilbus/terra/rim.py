@@ -31,7 +31,7 @@ class Quadrature(NamedTuple):
     nodes: int
     power: int
     peak: float
-    exit: float
+    exit: Any
 
 
 class Rim(NamedTuple):
@@ -61,8 +61,9 @@ def gauss(nodes: int, power: int) -> tuple[Array, Array]:
     return u**power, w * power * u ** (power - 1)
 
 
-def on_branches(x: Array, w: Array, peak: Any, leave: float) -> tuple[Array, Array]:
+def on_branches(x: Array, w: Array, peak: Any, leave: Any) -> tuple[Array, Array]:
     """Nodes as shares of the entry angle and weights (2, M, ...) from x and weights on 0..1 (M, ...)."""
+    peak = peak + np.zeros_like(leave)
     return np.stack([1.0 - (1.0 - peak) * x, leave + (peak - leave) * x]), np.stack(
         [(1.0 - peak) * w, (peak - leave) * w]
     )
@@ -102,7 +103,7 @@ def place_of_depth(theta: Array, depth: Any, peak: Any) -> Array:
     return np.asarray(np.clip((theta - angle) / (theta * (1.0 - peak)), 0.0, 1.0))
 
 
-def _turning_angle(entry: Array, slip: Array, exit_ratio: float) -> Array:
+def _turning_angle(entry: Array, slip: Array, exit_ratio: Any) -> Array:
     """Angle where the shear displacement of a skidding wheel is back at zero; nan if nowhere."""
     carry = 1.0 - slip
 
@@ -117,7 +118,7 @@ def _turning_angle(entry: Array, slip: Array, exit_ratio: float) -> Array:
         middle = (low + high) / 2.0
         negative = displacement(middle) < 0.0
         low, high = np.where(negative, middle, low), np.where(negative, high, middle)
-    return (low + high) / 2.0
+    return np.asarray((low + high) / 2.0)
 
 
 def rim_at(theta: Array, share: Array, r_K: Any) -> Rim:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soilbus.terra.rim import (
     Quadrature,
@@ -40,6 +41,9 @@ _CHUNK = 16384
 """Nodes of a branch that are integrated at once: all fields of so many stay in the processor's cache.  Short
 of it small chunks cost twice as much, given that the allocator keeps its memory (soilbus.allocator)."""
 
+LONGEST = 0.95
+"""Share of the entry angle that the exit angle never exceeds behind the axle: no rut comes up all the way."""
+
 FORCES = ("load", "drawbar_pull", "torque")
 INPUTS = ("entry_angle", "slip", "K_L", "n", "tan_phi", "c", "K")
 
@@ -49,8 +53,9 @@ class WheelModel:
     """The choices that make a wheel-soil model.
 
     The angle of greatest stress is (peak_c1 + peak_c2 slip) times the entry angle (eq. 4),
-    the exit angle exit_ratio times it (0: the rut does not recover; behind the axle it is
-    negative).  exponential_share of the shear strength is mobilised by the exponential law
+    the exit angle exit_ratio times it and exit_angle [rad] more (0: the rut does not recover;
+    behind the axle both are negative), but no farther behind than LONGEST times the entry
+    angle.  exponential_share of the shear strength is mobilised by the exponential law
     whatever shear_law says.  From the depth pan_depth [m] on the pressure grows by
     pan_stiffness times what the soil alone would add (0: no hard pan).  one_off: a model
     whose shape no other call will share, so that nothing of it is kept.
@@ -64,6 +69,7 @@ class WheelModel:
     exponential_share: float = 0.0
     pan_depth: float = 0.0
     pan_stiffness: float = 0.0
+    exit_angle: float = 0.0
     one_off: bool = False
 
     @property
@@ -145,10 +151,11 @@ def in_chunks(
     """(n_rows, ...) of an integrator of samples, which gets the state as rows (N,) or floats, and whether they skid."""
     shape = np.broadcast(*state).shape
     n_samples = math.prod(shape)
+    fields = [np.asarray(a, float) for a in state]
     rows = WheelState(*(
-        (np.asarray(a) if np.shape(a) == shape else np.broadcast_to(a, shape)).reshape(n_samples)
-        if np.ndim(a) or i < 2 else float(a)  # entry angle and slip always by sample
-        for i, a in enumerate(state)
+        (a if a.shape == shape else np.broadcast_to(a, shape)).reshape(n_samples)
+        if a.ndim or i < 2 else float(a)  # entry angle and slip always by sample
+        for i, a in enumerate(fields)
     ))  # fmt: skip
     skid, chunk = rows.slip < 0.0, max(_CHUNK // model.nodes, 1)
     out = np.empty((n_rows, n_samples))
@@ -157,15 +164,19 @@ def in_chunks(
             return integrate(rows, model, False).reshape(n_rows, *shape)
         for i in range(0, n_samples, chunk):
             run = slice(i, i + chunk)
-            out[:, run] = integrate(WheelState(*(a[run] if np.ndim(a) else a for a in rows)), model, False)
+            out[:, run] = integrate(_samples(rows, run), model, False)
         return out.reshape(n_rows, *shape)
     for skidding in (False, True):  # skidding wheels need split panels
         members = np.flatnonzero(skid == skidding)
         for i in range(0, len(members), chunk):
             index = members[i : i + chunk]
-            part = WheelState(*(a[index] if np.ndim(a) else a for a in rows))
-            out[:, index] = integrate(part, model, skidding)
+            out[:, index] = integrate(_samples(rows, index), model, skidding)
     return out.reshape(n_rows, *shape)
+
+
+def _samples(rows: WheelState, chosen: slice | NDArray[np.intp]) -> WheelState:
+    """Some samples of fields that are (N,) or floats."""
+    return WheelState(*(a if isinstance(a, float) else a[chosen] for a in rows))
 
 
 class _Stress(NamedTuple):
@@ -179,6 +190,7 @@ class _Stress(NamedTuple):
     """
 
     rim: Rim
+    leave: Any
     share: Array
     weight: Array
     log_z: Array  # (M, N)
@@ -195,6 +207,8 @@ class _Stress(NamedTuple):
 def _stress(state: WheelState, model: WheelModel, skid: bool) -> _Stress:
     theta, slip, r, _, K_L, n, _, _, K = state
     q = model.quadrature
+    if model.exit_angle:
+        q = q._replace(exit=_leave(theta, model))
     if skid or model.peak_c2 or model.pan_stiffness or model.one_off:
         peak = np.asarray(model.peak_c1 + model.peak_c2 * slip)
         splits = [place_of_turn(theta, slip, peak, q)] if skid else []
@@ -219,7 +233,17 @@ def _stress(state: WheelState, model: WheelModel, skid: bool) -> _Stress:
     j_K = slip * rim.travel
     j_K += rim.creep
     g, dg = _mobilised(j_K, model)
-    return _Stress(rim, share, weight, log_z, normal, steep, by_sill, normal * g, weight * g, g, dg, j_K)
+    return _Stress(rim, q.exit, share, weight, log_z, normal, steep, by_sill, normal * g, weight * g, g, dg, j_K)
+
+
+def _leave(theta: Array, model: WheelModel) -> Array:
+    """Exit angle over entry angle (N,)."""
+    return np.maximum(model.exit_ratio + model.exit_angle / theta, -LONGEST)
+
+
+def _leaving(theta: Array, model: WheelModel) -> Array:
+    """Its derivative (N,) by the entry angle."""
+    return np.where(_leave(theta, model) > -LONGEST, -model.exit_angle / theta**2, 0.0)
 
 
 def _mobilised(j_K: Array, model: WheelModel) -> tuple[Any, Any]:
@@ -272,6 +296,8 @@ def load_and_slope(state: WheelState, model: WheelModel, skid: bool) -> Array:
     sin, cos = at.rim.sin, at.rim.cos
     load = _dot(at.normal, cos) + _dot(tau, sin)
     slope = _dot(normal, cos) + _dot(shear, sin) + load / state.entry_angle
+    if model.exit_angle:
+        slope = slope + _leaving(state.entry_angle, model) * _by_leave(at, state, model, tau, mobilising)[0]
     return np.asarray(np.stack([load, slope]) * (state.radius * state.width * state.entry_angle))
 
 
@@ -316,6 +342,8 @@ def _forces_and_jacobian(state: WheelState, model: WheelModel, skid: bool) -> Ar
     turned[2] += _dot(at.normal, np.broadcast_to(at.share, at.normal.shape))
     if model.peak_c2:
         by_slip = by_slip + model.peak_c2 * _by_peak(at, state, model, tau, mobilising)
+    if model.exit_angle:
+        turned += _leaving(state.entry_angle, model) * _by_leave(at, state, model, tau, mobilising)
     whole, unit = _whole(parts, state), _unit(state)
     columns = (
         pressed + turned + whole / state.entry_angle,
@@ -346,6 +374,8 @@ def _forces_and_slopes(state: WheelState, model: WheelModel, skid: bool) -> Arra
     turned[2] += _dot(at.normal, np.broadcast_to(at.share, at.normal.shape))
     if model.peak_c2:
         by_slip = by_slip + model.peak_c2 * _by_peak(at, state, model, tau, mobilising)
+    if model.exit_angle:
+        turned += _leaving(state.entry_angle, model) * _by_leave(at, state, model, tau, mobilising)
     whole, unit = pressing + rubbing, _unit(state)
     out = np.empty((9, len(state.entry_angle)))
     np.multiply(unit, whole, out=out[:3])
@@ -359,7 +389,7 @@ def _by_peak(at: _Stress, state: WheelState, model: WheelModel, tau: Array, mobi
     """Derivatives (3, N) of the integrals by the ratio of the angle of greatest stress to the entry angle."""
     rim, peak = at.rim, model.peak_c1 + model.peak_c2 * state.slip
     turn = state.entry_angle * (1.0 - at.share[0]) / (1.0 - peak)
-    spread = np.stack([-1.0 / (1.0 - peak), 1.0 / (peak - model.exit_ratio)])[:, None]
+    spread = np.stack([-1.0 / (1.0 - peak), np.broadcast_to(1.0 / (peak - at.leave), np.shape(peak))])[:, None]
     shallower = state.n * rim.sin[0] * turn / rim.depth
     normal = at.normal * spread - at.steep * shallower
     glide = state.radius / state.K * ((1.0 - state.slip) * rim.cos - 1.0)
@@ -369,3 +399,16 @@ def _by_peak(at: _Stress, state: WheelState, model: WheelModel, tau: Array, mobi
     shear = shear - turn * at.normal
     load = _dot(normal, rim.cos) + _dot(shear, rim.sin)
     return np.stack([load, _dot(shear, rim.cos) - _dot(normal, rim.sin), around])
+
+
+def _by_leave(at: _Stress, state: WheelState, model: WheelModel, tau: Array, mobilising: Array) -> Array:
+    """Derivatives (3, N) of the integrals by the ratio of the exit angle to the entry angle: of the rear branch."""
+    sin, cos = at.rim.sin[1], at.rim.cos[1]
+    length = model.peak_c1 + model.peak_c2 * state.slip - at.leave
+    turn = state.entry_angle * (at.leave + length - at.share[1]) / length
+    glide = state.radius / state.K * ((1.0 - state.slip) * cos - 1.0)
+    normal = -at.normal[1] / length
+    shear = mobilising[1] * glide * turn - tau[1] / length
+    around = shear.sum(0)
+    normal, shear = normal + turn * tau[1], shear - turn * at.normal[1]
+    return np.stack([(normal * cos + shear * sin).sum(0), (shear * cos - normal * sin).sum(0), around])

@@ -12,6 +12,8 @@ from .trial import Trial
 
 VISIBLE, BARELY = 100.0, 20.0
 BINS = (0.0, 0.2, 0.5, 0.8, 0.95, 1.001)
+UNTOLD = 0.005
+"""Probability that a name outside the set is taken to be given."""
 
 
 def report(trials: Sequence[Trial]) -> str:
@@ -22,7 +24,7 @@ def report(trials: Sequence[Trial]) -> str:
         parts.append(f"== {half} half: {len(chosen)} cases")
         parts += [f"  {line}" for line in shares(chosen)]
     parts += ["", "== confusion, visible single effects (rows: hidden; columns: named first)", confusion(trials)]
-    parts += ["", "== calibration: first probability told, cases, share that was right", *calibration(trials)]
+    parts += ["", "== calibration: probability told of a name, names, share that was right", *calibration(trials)]
     return "\n".join(parts) + "\n"
 
 
@@ -42,7 +44,7 @@ def shares(trials: Sequence[Trial]) -> Iterator[str]:
     yield _share(
         "outside the catalogue, not imitable, gap > 1.1: unknown", [t.verdict == "unknown" for t in outside], ">= 90 %"
     )
-    pairs = [t for t in trials if t.kind == "pair" and t.visible >= 2.0 * VISIBLE]
+    pairs = [t for t in trials if t.kind == "pair" and t.visible >= VISIBLE]
     yield _share("pairs: both named", [set(t.hidden) <= set(t.named) for t in pairs], "")
     yield _share("pairs: both in the sets", [set(t.hidden) <= in_set(t) for t in pairs], ">= 80 %")
     done = [t for t in visible if t.named]
@@ -83,17 +85,24 @@ def confusion(trials: Sequence[Trial]) -> str:
 
 
 def calibration(trials: Sequence[Trial]) -> Iterator[str]:
-    """Of visible and barely visible single effects."""
-    told = [
-        (t.sets[0][t.named[0]], t.named[0] == t.hidden[0])
-        for t in trials
-        if t.kind == "single" and t.named and t.visible >= BARELY
-    ]
+    """Every name of the first sets of visible and barely visible single effects: told, cases, share that was right.
+
+    Then the expected calibration error, over these bins, and the mean logarithmic score of
+    what was told of the truth (Gneiting & Raftery 2007, J. Am. Stat. Assoc. 102:359); a
+    name that is not told of shares UNTOLD.
+    """
+    chosen = [t for t in trials if t.kind == "single" and t.named and t.visible >= BARELY]
+    told = [(p, name == t.hidden[0]) for t in chosen for name, p in t.sets[0].items()]
+    error = 0.0
     for low, high in itertools.pairwise(BINS):
         members = [(p, right) for p, right in told if low <= p < high]
         if members:
-            mean = np.mean([p for p, _ in members])
-            yield f"  {mean:.2f}  {len(members):4}  {np.mean([r for _, r in members]):.2f}"
+            mean, share = (float(np.mean(column)) for column in zip(*members, strict=True))
+            error += abs(mean - share) * len(members) / len(told)
+            yield f"  {mean:.2f}  {len(members):4}  {share:.2f}"
+    if chosen:
+        score = float(np.mean([-np.log(t.sets[0].get(t.hidden[0], UNTOLD)) for t in chosen]))
+        yield f"  expected calibration error {error:.3f}, logarithmic score {score:.3f} of {len(chosen)} cases"
 
 
 def _share(what: str, right: Sequence[bool], target: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -12,9 +13,11 @@ from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.diagnosis.completion import Completion, complete
 from soilbus.diagnosis.diagnose import Diagnosis, diagnose
 from soilbus.diagnosis.records import Record, record_of
-from soilbus.diagnosis.score import further_starts, scores
+from soilbus.diagnosis.score import further_scores, scores
+from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.window import BinStore
 from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.effects.effect import Effect
 
 from .cases import Case
 
@@ -24,8 +27,9 @@ class Trial:
     """A case's truth beside the diagnosis.
 
     named: names added, the one that explains most first; sets: for each of them all names
-    with probabilities.  visible: by how much the true effects lower the penalised cost (nan
-    for what the catalogue lacks).  bearing_*: relative errors of the bearing pressure.
+    with probabilities.  visible: by how much the true effect lowers the penalised cost, of
+    two effects the less visible one beside the other (nan for what the catalogue lacks).
+    bearing_*: relative errors of the bearing pressure.
     """
 
     id: str
@@ -68,7 +72,6 @@ def tried(case: Case) -> Trial:
     begin = time.process_time()
     found = diagnose([record], prior, list(CATALOGUE.values()))
     seconds = time.process_time() - begin
-    order = sorted(found.additions, key=lambda a: -a.falls[a.effect.name])
     return Trial(
         id=case.id,
         kind=case.kind,
@@ -77,9 +80,9 @@ def tried(case: Case) -> Trial:
         size=case.size,
         imitable=case.imitable,
         verdict=str(found.verdict),
-        named=tuple(a.effect.name for a in order),
-        sets=tuple({a.effect.name: a.probability} | a.alternatives for a in order),
-        falls=tuple(a.falls for a in order),
+        named=tuple(a.effect.name for a in found.additions),
+        sets=tuple({a.effect.name: a.probability} | a.alternatives for a in found.additions),
+        falls=tuple(a.falls for a in found.additions),
         visible=_visible(case, record, found),
         gap_before=found.base.gap,
         gap_after=found.completed.gap,
@@ -91,17 +94,34 @@ def tried(case: Case) -> Trial:
 
 
 def _visible(case: Case, record: Record, found: Diagnosis) -> float:
-    """Fall of -2 log posterior, learned and held-out blocks, when the true effects are added to the present model."""
+    """Fall of -2 log posterior, learned and held-out blocks, when the true effect is added to the present model.
+
+    Of two effects the smaller fall: that of each one beside the other.
+    """
     if not case.hidden:
         return float("nan")
-    prior, present = prior_of(case.config), found.base
-    for effect in (CATALOGUE[name] for name in case.hidden):
-        starts = [scores([record], prior, present, [effect])[0].starts, *further_starts(effect, present)]
-        tries = [complete([record], prior, (*present.effects, effect), start) for start in starts]
-        present = min((more for more in (present, *tries) if more is not None), key=_cost)
+    prior = prior_of(case.config)
+    without = {name: _with([*case.hidden], name, record, prior, found) for name in case.hidden}
+    whole = min((_added(CATALOGUE[name], record, prior, without[name]) for name in case.hidden), key=_cost)
     if set(found.completed.names) == set(case.hidden):
-        present = min(present, found.completed, key=_cost)
-    return _cost(found.base) - _cost(present)
+        whole = min(whole, found.completed, key=_cost)
+    return min(map(_cost, without.values())) - _cost(whole)
+
+
+def _with(hidden: Sequence[str], left_out: str, record: Record, prior: SoilPrior, found: Diagnosis) -> Completion:
+    """The present model with all the true effects but one."""
+    present = found.base
+    for name in hidden:
+        if name != left_out:
+            present = _added(CATALOGUE[name], record, prior, present)
+    return present
+
+
+def _added(effect: Effect, record: Record, prior: SoilPrior, present: Completion) -> Completion:
+    """The model with one effect more, from every start; itself where that fits worse."""
+    scored = [*scores([record], prior, present, [effect]), *further_scores([record], prior, present, effect)[:1]]
+    tries = [complete([record], prior, (*present.effects, effect), score.starts) for score in scored]
+    return min((more for more in (present, *tries) if more is not None), key=_cost)
 
 
 def _cost(completion: Completion) -> float:

@@ -52,6 +52,13 @@ def test_a_rut_that_recovers_carries_behind_the_axle(state):
 
 
 @EACH_WHEEL
+@pytest.mark.parametrize("angle", [0.05, 0.3])
+def test_a_rut_may_come_up_by_an_angle_of_its_own(state, angle):
+    true = adaptive_forces(state, WheelModel("rational", exit_ratio=-0.1, exit_angle=-angle))
+    same(with_effect("rut_recovery", state, recovery=0.1, angle=angle), true)
+
+
+@EACH_WHEEL
 @pytest.mark.parametrize("share", [0.3, 1.0])
 def test_a_share_of_the_exponential_law(state, share):
     true = adaptive_forces(state, MODEL, mobilised=lambda x: share * exponential(x) + (1.0 - share) * rational(x))

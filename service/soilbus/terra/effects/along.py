@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -57,10 +57,17 @@ def instants(values: Any) -> Array:
     return array[:, 0] if array.ndim == 2 else array
 
 
-def stretches(t: Array) -> list[NDArray[np.intp]]:
+def stretches(t: Array) -> tuple[NDArray[np.intp], ...]:
     """Indices of times [s] (N,) in runs that go forward without a gap."""
+    return _stretches(np.asarray(t, float).tobytes())
+
+
+@lru_cache(maxsize=16)
+def _stretches(times: bytes) -> tuple[NDArray[np.intp], ...]:
+    """As stretches(), of times as bytes: a fit asks for those of the same few records a thousand times."""
+    t = np.frombuffer(times)
     step = np.diff(t)
     forward = step[step > 0.0]
     usual = float(np.median(forward)) if len(forward) else 0.0
     cuts: NDArray[np.intp] = np.flatnonzero((step <= 0.0) | (step > _GAP * usual)) + 1
-    return np.split(np.arange(len(t)), cuts.tolist())
+    return tuple(np.split(np.arange(len(t)), cuts.tolist()))

@@ -36,8 +36,9 @@ STRESS_PEAK_SHIFT = Effect(
 def _rut_recovery(
     state: WheelState, model: WheelModel, around: Surroundings, values: Values
 ) -> tuple[WheelState, WheelModel]:
-    """theta_2 = -recovery theta_1."""
-    return state, replace(model, exit_ratio=model.exit_ratio - values["recovery"], one_off=True)
+    """theta_2 = -(recovery theta_1 + angle)."""
+    ratio, angle = model.exit_ratio - values["recovery"], model.exit_angle - values["angle"]
+    return state, replace(model, exit_ratio=ratio, exit_angle=angle, one_off=True)
 
 
 RUT_RECOVERY = Effect(
@@ -46,7 +47,10 @@ RUT_RECOVERY = Effect(
     source="exit angle behind the axle: Wong & Reece 1967 (J. Terramechanics 4:81); Ishigami et al. 2007"
     " (J. Field Robotics 24:233)",
     tells="rut depth behind the wheel against sinkage under it; loads from light to heavy",
-    parameters=(Parameter("recovery", "1", 0.0, 0.2, 0.0, 0.6),),
+    parameters=(
+        Parameter("recovery", "1", 0.0, 0.2, 0.0, 0.6),
+        Parameter("angle", "rad", 0.0, 0.08, 0.0, 0.3),
+    ),
     wheel=_rut_recovery,
 )
 
@@ -115,7 +119,7 @@ LUGS = Effect(
     tells="cohesive soil, and draft beside torque; on cohesionless soil they are a greater tan phi and no data tell",
     parameters=(
         Parameter("height", "m", 0.0, 0.03, 0.0, 0.12),
-        Parameter("share", "1", 0.5, 0.25, 0.0, 1.0),
+        Parameter("share", "1", 0.5, 0.25, 0.0, 1.0, starts=(0.02,)),
     ),
     wheel=_lugged_soil,
     forces=_lugged_arm,

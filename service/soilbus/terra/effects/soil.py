@@ -98,7 +98,7 @@ HARDPAN = Effect(
     tells="loads from light to heavy, a sinkage sensor",
     parameters=(
         Parameter("stiffness", "1", 0.0, 5.0, 0.0, 50.0),
-        Parameter("depth", "m", 0.04, 0.04, 0.002, 0.3, starts=(0.01, 0.02, 0.08)),
+        Parameter("depth", "m", 0.04, 0.04, 0.002, 0.3, starts=(0.01, 0.02, 0.03, 0.06)),
     ),
     wheel=_hardpan,
 )

@@ -1,0 +1,136 @@
+"""Lines through what was just seen, with exponential forgetting: where a quantity is and where it goes."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+LONG, SHORT = 2.5, 0.8
+"""Time constants [s] of forgetting a capacity: of ground that softens over many metres, and of a soft patch's edge."""
+SCATTER = 10.0
+"""Time constant [s] of forgetting how much a capacity scatters."""
+LAG = 0.5
+"""Time [s] after which a capacity's scatter is another: neither the same samples nor the same metre of ground."""
+ENOUGH = 0.4
+"""Share of the last moments that must tell the capacity for its trend to be believed."""
+
+
+class Line(NamedTuple):
+    """Value now, slope [1/s], and sum of squares [s^2] by which the moments lie apart."""
+
+    value: float
+    slope: float
+    spread: float
+
+
+class Trend(NamedTuple):
+    """A line through past values with exponential forgetting: sums of 1, x, x^2, y and x y, x [s] counted from now."""
+
+    n: float = 0.0
+    x: float = 0.0
+    xx: float = 0.0
+    y: float = 0.0
+    xy: float = 0.0
+
+    @classmethod
+    def through(cls, x: Array, y: Array, memory: float) -> Trend:
+        """The trend of values (N,) at times [s] counted from now; nan is none."""
+        known = np.isfinite(y)
+        weight = np.exp(x / memory) * known
+        y = np.where(known, y, 0.0)
+        wx = weight * x
+        return cls(*(float(a) for a in (weight.sum(), wx.sum(), wx @ x, weight @ y, wx @ y)))
+
+    def joined(self, step: float, value: float | None, memory: float) -> Trend:
+        """The trend a step [s] later, with one more value or none; memory is the time constant [s] of forgetting."""
+        kept = math.exp(-step / memory)
+        n, x, y = kept * self.n, kept * self.x, kept * self.y
+        xx, xy = kept * self.xx, kept * self.xy
+        later = Trend(n, x - step * n, xx - 2.0 * step * x + step**2 * n, y, xy - step * y)
+        return later if value is None else later._replace(n=n + 1.0, y=y + value)
+
+    def line(self) -> Line:
+        """The line; it lies flat where all values are of one time."""
+        spread = self.n * self.xx - self.x**2
+        slope = (self.n * self.xy - self.x * self.y) / spread if spread > 1e-9 * self.n**2 else 0.0
+        return Line((self.y - slope * self.x) / self.n, slope, spread / self.n)
+
+    @property
+    def mean(self) -> float:
+        """Of the values, the last ones counting most; 0 where there are none."""
+        return self.y / self.n if self.n > 0.0 else 0.0
+
+
+class Capacity(NamedTuple):
+    """Trends of the capacity [N] with the long and the short memory, and what they are worth.
+
+    told: which moments tell it (1 or 0); scatter: square of its change within LAG [N^2].
+    """
+
+    long: Trend = Trend()
+    short: Trend = Trend()
+    told: Trend = Trend()
+    scatter: Trend = Trend()
+
+    @classmethod
+    def through(cls, t: Array, values: Array) -> Capacity:
+        """Of values [N] at times t [s], both (N,); nan is none."""
+        if not len(t):
+            return cls()
+        x = t - t[-1]
+        change = (values - values[np.searchsorted(t, t - LAG)]) ** 2
+        change[0] = np.nan
+        return cls(
+            Trend.through(x, values, LONG),
+            Trend.through(x, values, SHORT),
+            Trend.through(x, np.isfinite(values).astype(float), SHORT),
+            Trend.through(x, change, SCATTER),
+        )
+
+    def joined(self, step: float, value: float | None, earlier: float | None) -> Capacity:
+        """A step [s] later, with one more value or none; earlier is that of LAG before."""
+        change = None if value is None or earlier is None else (value - earlier) ** 2
+        return Capacity(
+            self.long.joined(step, value, LONG),
+            self.short.joined(step, value, SHORT),
+            self.told.joined(step, float(value is not None), SHORT),
+            self.scatter.joined(step, change, SCATTER),
+        )
+
+    @property
+    def is_told(self) -> bool:
+        """Whether enough of the last moments tell it."""
+        return self.told.y > ENOUGH * self.told.n
+
+    def slope_std(self, line: Line) -> float:
+        """Of one of the two lines' slopes [N/s], at most: old moments are forgotten, but count as if they were not.
+
+        Changes within LAG, twice the variance of the scatter, hold little of a slow change of the ground.
+        """
+        moments_in_lag = LAG / SHORT * self.told.n
+        variance = self.scatter.mean / 2.0
+        return math.sqrt(moments_in_lag * variance / line.spread) if line.spread > 0.0 else math.inf
+
+
+class Peaks(NamedTuple):
+    """The greatest value since the time `since` [s], and in the `hold` [s] before it."""
+
+    since: float = -math.inf
+    now: float = -math.inf
+    before: float = -math.inf
+
+    def joined(self, t: float, value: float, hold: float) -> Peaks:
+        """With one more value."""
+        if t - self.since > hold:
+            return Peaks(t, value, self.now)
+        return self._replace(now=max(self.now, value))
+
+    @property
+    def greatest(self) -> float:
+        """Of all that is remembered."""
+        return max(self.now, self.before)

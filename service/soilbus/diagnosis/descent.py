@@ -1,0 +1,72 @@
+"""A slower descent for models that are far from the truth, where the fast one goes astray.
+
+The cost of a soil with gains and effects depends on where the latents are, and one linear
+step does not bring them to their best where residuals are many standard deviations: then
+the fast descent refuses good steps and creeps.  Here the latents follow at every place
+before its cost counts, and no step is taken that does not lower it (Levenberg-Marquardt on
+what is left: variable projection, Golub & Pereyra 1973, SIAM J. Numer. Anal. 10:413).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from soilbus.estimation.gauss_newton import Fit
+from soilbus.estimation.linearised import Optimum
+from soilbus.estimation.normal_equations import Fitting, Place, Point
+
+MAX_STEPS = 15
+ENOUGH = 0.1
+"""Fall of the cost that ends the descent."""
+EASED, HELD_BACK = 0.3, 10.0
+"""What a step that lowers the cost, and one that does not, makes of the damping."""
+MOST_DAMPING = 1e4
+
+
+def descended(fitting: Fitting, starts: Sequence[Place]) -> Fit | None:
+    """The optimum below the best of some places; None where the numbers are not finite."""
+    with np.errstate(all="ignore"):
+        found = [place for place in (_relaxed(fitting, start) for start in starts) if place is not None]
+        if not found:
+            return None
+        here = min(found, key=lambda place: place[1].cost)
+        damping, falling, steps = 1e-2, np.inf, 0
+        while falling > ENOUGH and damping < MOST_DAMPING and steps < MAX_STEPS:
+            step = here[1].step(damping)
+            there = None if step is None else _relaxed(fitting, fitting.moved(*here, step))
+            steps += 1
+            if there is None or there[1].cost >= here[1].cost:
+                damping *= HELD_BACK
+            else:
+                falling, damping = here[1].cost - there[1].cost, damping * EASED
+                here = there
+        return _fit(fitting, *here, steps, converged=steps < MAX_STEPS)
+
+
+def _relaxed(fitting: Fitting, place: Place) -> tuple[Place, Point] | None:
+    """The place with latents where they fit best, and the normal equations there."""
+    point = fitting.point(place)
+    if point is None:
+        return None
+    place = fitting.moved(place, point, np.zeros(len(point.gradient)))
+    point = fitting.point(place)
+    return None if point is None else (place, point)
+
+
+def _fit(fitting: Fitting, place: Place, point: Point, steps: int, converged: bool) -> Fit | None:
+    beliefs = fitting.beliefs(place, point, place.soil)
+    if beliefs is None:
+        return None
+    return Fit(
+        belief=beliefs[1],
+        mode=beliefs[1],
+        sinkage=fitting.problem.mean_sinkage(place.as_soil(), place.gains, place.latents),
+        optimum=Optimum(fitting.problem.t, place.soil, place.gains, place.latents, point.at),
+        cost=point.cost,
+        evidence=point.evidence,
+        rows=fitting.problem.n_rows,
+        iterations=steps,
+        converged=converged,
+    )

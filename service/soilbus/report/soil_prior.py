@@ -1,0 +1,45 @@
+"""What the configuration takes for granted of the soil, beside the soils that are known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from soilbus.assembly import prior_of
+from soilbus.config import Config
+from soilbus.estimation.posterior import PARAMETERS
+from soilbus.report.table import table
+from soilbus.terra.soils import KINDS, SOILS
+
+NORMAL_95 = 1.96
+SHOWN = {
+    # unit, and its value in SI
+    "k_c": ("kN/m^(n+1)", 1e3), "k_phi": ("kN/m^(n+2)", 1e3), "n": ("", 1.0), "phi": ("deg", math.pi / 180.0),
+    "c": ("kPa", 1e3), "K": ("mm", 1e-3),
+}  # fmt: skip
+MOST_NAMED = 3
+
+
+def prior_text(config: Config) -> str:
+    """The 95 % interval of each parameter before any data, and the known soils that lie outside of it."""
+    head = ("parameter", "assumed", "95 % from", "to", "unit", "known soils outside")
+    return (
+        table(head, list(_rows(config)))
+        + "\nOn a soil outside, what the sensors tell badly stays near what is assumed, with a deviation too small; set"
+        "\n[soil] there.  Bearing pressure, drafts and slopes follow from what the sensors tell well."
+    )
+
+
+def _rows(config: Config) -> Iterator[tuple[str, ...]]:
+    prior = prior_of(config)
+    for name, median, log_std in zip(PARAMETERS, prior.median.tolist(), prior.log_std.tolist(), strict=True):
+        unit, size = SHOWN[name]
+        low, high = (median * math.exp(way * NORMAL_95 * log_std) for way in (-1.0, 1.0))
+        if log_std == 0.0:
+            yield name, f"{median / size:.3g}", "held", "", unit, ""
+            continue
+        values = {kind: getattr(SOILS[kind], name) for kind in KINDS}
+        outside = sorted((kind for kind, v in values.items() if not low <= v <= high), key=lambda kind: -values[kind])
+        named = ", ".join(f"{kind} ({values[kind] / size:.3g})" for kind in outside[:MOST_NAMED])
+        more = f" and {len(outside) - MOST_NAMED} more" if len(outside) > MOST_NAMED else ""
+        yield name, f"{median / size:.3g}", f"{low / size:.3g}", f"{high / size:.3g}", unit, named + more or "none"

@@ -1,0 +1,62 @@
+"""Readers judge silence by the DBC's cycle times: soilbus sends no frame less often than its DBC promises."""
+
+from __future__ import annotations
+
+import pytest
+
+from soilbus.can.dbc_files import output_database, shipped_dbc
+from soilbus.capability.immobilisation import Watch
+from soilbus.cli import main
+from soilbus.config import ConfigError
+from soilbus.daemon.estimator import WindowResult
+from soilbus.daemon.outputs import FAST_FRAMES, HOP_FRAMES, check_cycle_times, forecast_frame, hop_frames, slip_frames
+from soilbus.simulator.reference import TRACTOR, reference_configuration
+from soilbus.traversability import Status, Traversability
+
+
+def checked(*overrides: str) -> None:
+    config = reference_configuration(overrides)
+    check_cycle_times(config, output_database(config))
+
+
+def test_frames_may_come_as_often_as_told_or_more_often():
+    checked()
+    checked("estimator.hop=0.5")
+
+
+def test_a_hop_longer_than_the_dbc_tells_is_refused():
+    with pytest.raises(ConfigError) as refused:
+        checked("estimator.hop=2.0")
+    (fault,) = refused.value.faults
+    assert "SoilStrength" in fault
+    assert "every 1000 ms, but soilbus sends every 2000 ms" in fault
+
+
+def test_a_dbc_that_tells_the_longer_hop_is_accepted_and_one_with_too_fast_fast_frames_is_not(tmp_path):
+    text = shipped_dbc("soilbus.dbc").read_text(encoding="utf-8")
+    toml = (tmp_path / "tractor.toml", TRACTOR.read_text(encoding="utf-8"))
+    toml[0].write_text(toml[1] + '\n[output]\ndbc = "ours.dbc"\n[estimator]\nhop = 2.0\n', encoding="utf-8")
+    (tmp_path / "ours.dbc").write_text(text.replace(" 1000;", " 2000;"), encoding="utf-8")
+    assert main(["check", "--config", str(toml[0])]) == 0
+    (tmp_path / "ours.dbc").write_text(text.replace(" 1000;", " 2000;").replace(" 100;", " 20;"), encoding="utf-8")
+    assert main(["check", "--config", str(toml[0])]) == 2
+
+
+def test_run_and_check_say_it_in_one_line(capsys):
+    for command in ("check", "run"):
+        assert main([command, "--config", str(TRACTOR), "--set", "estimator.hop=5"]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "GenMsgCycleTime" in line
+
+
+def test_the_frames_of_each_cycle_are_all_that_there_are():
+    nothing = WindowResult(
+        t=0.0, index=0, status=Status.INVALID, reason="none", posterior=None, bearing=None,
+        slip=dict.fromkeys("abcdef"), sinkage=dict.fromkeys("abcdef"), traversability=Traversability(), chi2=None,
+        samples=0, rejected={},
+    )  # fmt: skip
+    assert {message for message, _ in hop_frames(nothing)} == set(HOP_FRAMES)
+    fast = [*slip_frames(nothing.slip), forecast_frame(None, Watch())]
+    assert {message for message, _ in fast} < set(FAST_FRAMES)
+    everything = {message.name for message in output_database(reference_configuration()).messages}
+    assert everything == {*HOP_FRAMES, *FAST_FRAMES, "SoilbusStatus", "SoilbusIdentity", "BusHealth"}

@@ -1,0 +1,262 @@
+"""What systemd's watchdog hears: that the service works, and nothing while it does not."""
+
+from __future__ import annotations
+
+import errno
+import itertools
+import logging
+import re
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass, field
+
+import can
+import pytest
+
+from fakes import FakeClock, InlineExecutor, ScriptedBus
+from soilbus.can.bus import BusError, LiveBus
+from soilbus.can.dbc_files import load_databases, output_database
+from soilbus.can.publish import Publisher
+from soilbus.daemon.health import LONGEST_MUTE, LONGEST_SOLVE, Health
+from soilbus.daemon.pipeline import Pipeline
+from soilbus.daemon.service import Service
+from soilbus.daemon.solver import REPEATED
+from soilbus.simulator.frames import frames
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import excited
+
+WINDOW = 8.0
+CONFIG = reference_configuration([f"estimator.window={WINDOW}"])
+DATABASE = load_databases(CONFIG)
+OUT = output_database(CONFIG)
+WATCHDOG = 10.0
+
+
+@dataclass
+class Systemd:
+    """The notifier's place, with a clock: when it was told that all is well, and what the status was."""
+
+    clock: FakeClock
+    watchdog_interval: float = WATCHDOG / 2.0
+    fed: list[float] = field(default_factory=list)
+    texts: list[str] = field(default_factory=list)
+
+    def watchdog(self) -> None:
+        self.fed.append(self.clock())
+
+    def status(self, text: str) -> None:
+        self.texts.append(text)
+
+    def would_restart(self, since: float) -> bool:
+        """Whether it was left alone for longer than WatchdogSec."""
+        fed = [since, *(t for t in self.fed if t > since), self.clock()]
+        return max(b - a for a, b in itertools.pairwise(fed)) > WATCHDOG
+
+
+class Worker(InlineExecutor):
+    """Does the work at once, or never."""
+
+    hangs = False
+
+    def submit(self, fn, /, *args, **kwargs):
+        return Future() if self.hangs else super().submit(fn, *args, **kwargs)
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """Frames of a good drive."""
+    return list(frames(simulate(CONFIG, excited("loam", 16.0), seed=3), CONFIG))
+
+
+@pytest.fixture(scope="module")
+def moments(drive):
+    """A few of them, as often as a needed input must be heard."""
+    return [m for m in drive if m.timestamp < drive[0].timestamp + 4.0]
+
+
+class Bench:
+    """A service with these frames, or with them over and over for so many seconds."""
+
+    def __init__(self, moments, seconds: float = 0.0, worker: Executor | None = None) -> None:
+        self.clock, self.away = FakeClock(), False
+        self.systemd = Systemd(self.clock)
+        self.wire = ScriptedBus(self.clock, list(over_and_over(moments, seconds)) if seconds else moments)
+        pipeline = Pipeline(CONFIG, DATABASE)
+        self.estimator = pipeline.estimator
+        bus = LiveBus(self.open, self.clock, self.clock.sleep)
+        self.service = Service(
+            CONFIG, pipeline, bus, Publisher(OUT), self.systemd, worker or InlineExecutor(), self.clock
+        )  # fmt: skip
+
+    def open(self):
+        if self.away:
+            raise BusError("bus can0: no such device", may_come=True)
+        return self.wire
+
+    def run(self, seconds: float) -> float:
+        """Works on; the time at which that began."""
+        began = self.clock.now
+        while self.clock.now < began + seconds:
+            self.service.step()
+        return began
+
+    def sent(self, name: str, since: float = 0.0) -> list[dict]:
+        wanted = OUT.get_message_by_name(name)
+        return [
+            wanted.decode(bytes(m.data))
+            for t, m in self.wire.sent
+            if m.arbitration_id == wanted.frame_id and t >= since
+        ]
+
+
+def over_and_over(moments, seconds: float):
+    """The same seconds again and again with time going on; few frames, for what matters is that there are some."""
+    length = moments[-1].timestamp - moments[0].timestamp + 0.02
+    for i in range(int(seconds / length)):
+        for m in moments[:: 1 if i < 2 else 7]:
+            yield can.Message(
+                timestamp=m.timestamp + i * length, arbitration_id=m.arbitration_id, is_extended_id=m.is_extended_id,
+                data=m.data,
+            )  # fmt: skip
+
+
+def test_a_good_service_is_left_alone(moments):
+    bench = Bench(moments, 20.0)
+    began = bench.run(20.0)
+    assert not bench.systemd.would_restart(began)
+
+
+def test_silence_is_no_reason_to_restart(moments):
+    bench = Bench(moments, 5.0)
+    began = bench.run(120.0)
+    assert not bench.systemd.would_restart(began)
+    assert bench.systemd.texts[-1].startswith("listening: no_frames")
+
+
+@pytest.mark.parametrize("at_start", [True, False])
+def test_nor_is_a_bus_that_is_down(moments, at_start):
+    bench = Bench(moments, 5.0)
+    bench.away = at_start
+    began = bench.run(5.0)
+    bench.away = True
+    bench.wire.fail_receive.append(can.CanOperationError("Network is down", errno.ENETDOWN))
+    bench.run(120.0)
+    assert not bench.systemd.would_restart(began)
+    assert bench.systemd.texts[-1].startswith("waiting: bus_down")
+
+
+def test_nor_is_a_bus_on_which_nobody_else_is(moments, caplog):
+    """Without anybody to acknowledge them, our frames fill the queue."""
+    bench = Bench([])
+    bench.wire.fail_send += [can.CanOperationError("No buffer space", errno.ENOBUFS)] * 100_000
+    began = bench.run(120.0)
+    assert bench.service.bus.counts.sent == 0
+    assert not bench.systemd.would_restart(began)
+
+
+def test_an_estimator_that_hangs_is_restarted(moments, caplog):
+    worker = Worker()
+    bench = Bench(moments, 60.0, worker)
+    began = bench.run(6.0)
+    assert not bench.systemd.would_restart(began)
+    worker.hangs = True
+    hung = bench.run(LONGEST_SOLVE - 2.0)
+    assert not bench.systemd.would_restart(hung)
+    bench.run(WATCHDOG + 4.0)
+    assert bench.systemd.would_restart(hung)
+    assert bench.service.deadline_misses > 3  # windows that found no worker
+    last = bench.sent("SoilbusStatus")[-1]
+    assert (str(last["State"]), str(last["Reason"])) == ("fault", "overload")
+    assert last["DeadlineMisses"] == pytest.approx(bench.service.deadline_misses, abs=1)
+    told = re.search(r"deadline misses (\d+)", bench.systemd.texts[-1])
+    assert int(told[1]) == last["DeadlineMisses"]
+    assert {str(f["State"]) for f in bench.sent("Traversability", hung + 4.0)} == {"unknown"}
+    assert [r.levelname for r in caplog.records] == ["ERROR"]
+
+
+def test_a_sender_that_hangs_on_a_living_bus_is_restarted(moments, caplog):
+    bench = Bench(moments, 60.0)
+    bench.run(5.0)
+    bench.wire.fail_send += [can.CanOperationError("No buffer space", errno.ENOBUFS)] * 100_000
+    mute = bench.run(LONGEST_MUTE - 2.0)
+    assert not bench.systemd.would_restart(mute)
+    bench.run(WATCHDOG + 4.0)
+    assert bench.systemd.would_restart(mute)
+    assert bench.systemd.texts[-1].startswith("fault: internal nothing can be sent")
+    assert sum(r.levelname == "ERROR" for r in caplog.records) == 1
+    bench.wire.fail_send.clear()
+    healed = bench.run(8.0)
+    assert any(t > healed for t in bench.systemd.fed)
+    assert not bench.systemd.texts[-1].startswith("fault")
+
+
+def test_health_by_the_second():
+    health = Health(0.0)
+    assert health.fault(LONGEST_SOLVE, 0.0, True, 1) is None
+    assert health.fault(LONGEST_SOLVE + 0.1, 0.0, True, 1).startswith("overload")
+    assert health.fault(LONGEST_SOLVE + LONGEST_MUTE, None, True, 1) is None
+    assert health.fault(LONGEST_SOLVE + LONGEST_MUTE + 0.1, None, True, 1).startswith("internal")
+    assert health.fault(LONGEST_SOLVE + LONGEST_MUTE + 0.2, None, False, 1) is None
+    assert health.fault(LONGEST_SOLVE + 2 * LONGEST_MUTE, None, True, 1) is None
+
+
+def broken(estimator, windows: range):
+    """Has the estimator raise at these windows."""
+    usual = estimator.solve
+
+    def solve(task):
+        if task.index in windows:
+            raise ZeroDivisionError("what nobody\nthought of")
+        return usual(task)
+
+    estimator.solve = solve
+
+
+def test_one_defect_costs_one_window(drive, caplog):
+    bench = Bench(drive)
+    broken(bench.estimator, range(6, 7))
+    bench.run(WINDOW + 5.5)
+    known = bench.estimator.tracker.newest
+    assert known is not None
+    assert bench.service.windows == 6
+    bench.run(1.0)
+    assert bench.estimator.tracker.newest is known
+    assert bench.service.failures["internal"] == 1
+    assert bench.sent("Traversability")[-1]["State"] == "unknown"
+    assert str(bench.sent("SoilStrength")[-1]["Status"]) == "invalid"
+    bench.run(1.0)
+    assert "failed solves: internal 1" in bench.systemd.texts[-1]
+    assert bench.estimator.tracker.newest is not known
+    assert bench.sent("Traversability")[-1]["State"] == "go"
+    assert bench.service.failures["internal"] == 1
+    assert all(f["State"] != "fault" for f in bench.sent("SoilbusStatus"))
+    (record,) = [r for r in caplog.records if r.levelno >= logging.ERROR]
+    assert record.exc_info is None
+    assert "\n" not in record.getMessage()
+    assert "window 6 failed: ZeroDivisionError: what nobody thought of (test_health.py:" in record.getMessage()
+
+
+def test_a_defect_in_every_window_is_a_fault_until_an_estimator_that_knows_nothing_heals_it(drive, caplog):
+    bench = Bench(drive)
+    broken(bench.estimator, range(1, 100))
+    bench.run(WINDOW + REPEATED)
+    assert "fault" not in {str(f["State"]) for f in bench.sent("SoilbusStatus")}
+    bench.run(1.2)
+    last = bench.sent("SoilbusStatus")[-1]
+    assert (str(last["State"]), str(last["Reason"])) == ("fault", "internal")
+    assert bench.service._solver.estimator is not bench.estimator
+    bench.run(1.9)
+    assert bench.sent("SoilbusStatus")[-1]["State"] == "valid"
+    assert bench.service.failures["internal"] == REPEATED
+    assert len([r for r in caplog.records if r.levelno >= logging.ERROR]) == REPEATED
+
+
+def test_a_fault_that_stays_is_not_logged_window_by_window(drive, caplog):
+    bench = Bench(drive)
+    bench.service._solver._anew = lambda: bench.estimator
+    broken(bench.estimator, range(100))
+    bench.run(16.0)
+    assert bench.service.failures["internal"] > 2 * REPEATED
+    assert len([r for r in caplog.records if r.levelno >= logging.ERROR]) == REPEATED
+    assert bench.sent("SoilbusStatus")[-1]["State"] == "fault"
+    assert {str(f["State"]) for f in bench.sent("Traversability")} == {"unknown"}

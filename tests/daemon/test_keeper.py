@@ -1,0 +1,215 @@
+"""When the state is stored, what it costs the loop, and what the next run makes of it."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections import Counter
+from concurrent.futures import Executor, Future
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fakes import FakeClock, InlineExecutor, ScriptedBus
+from soilbus.can.bus import LiveBus
+from soilbus.can.dbc_files import load_databases, output_database
+from soilbus.can.publish import Publisher
+from soilbus.daemon.keeper import FILE, PERIOD, Keeper
+from soilbus.daemon.notify import Notifier
+from soilbus.daemon.pipeline import Pipeline
+from soilbus.daemon.service import TICK, Service
+from soilbus.daemon.store import Owner, read
+from soilbus.estimation.belief import Belief
+from soilbus.estimation.recall import PERSISTENCE
+from soilbus.simulator.frames import frames
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import excited
+
+CONFIG = reference_configuration()
+DATABASE = load_databases(CONFIG)
+OWNER = Owner.of(CONFIG, Pipeline(CONFIG, DATABASE).intake.channels, DATABASE)
+BELIEF = Belief(OWNER.median[:6], OWNER.median[6:], np.diag(OWNER.std**2))
+DURATION = 14.0
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return list(frames(simulate(CONFIG, excited("loam", DURATION), seed=3), CONFIG))
+
+
+class Hung(Executor):
+    """A disk that never answers."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def submit(self, fn, /, *args, **kwargs):
+        self.asked += 1
+        return Future()
+
+
+def keeper_in(folder: Path, clock, writer: Executor | None = None) -> Keeper:
+    return Keeper(folder, OWNER, writer or InlineExecutor(), lambda: 1.7e9 + clock())
+
+
+def stored(folder: Path):
+    state = read(folder / FILE, OWNER)
+    assert state is not None
+    return state
+
+
+def service_with(keeper: Keeper | None, clock: FakeClock, messages=()) -> tuple[Service, ScriptedBus]:
+    wire = ScriptedBus(clock, messages)
+    bus = LiveBus(lambda: wire, clock, clock.sleep)
+    pipeline = Pipeline(CONFIG, DATABASE)
+    publisher = Publisher(output_database(CONFIG))
+    return Service(CONFIG, pipeline, bus, publisher, Notifier(), InlineExecutor(), clock, keeper=keeper), wire
+
+
+def run(service: Service, clock: FakeClock, seconds: float) -> None:
+    end = clock.now + seconds
+    while clock.now < end:
+        service.step()
+
+
+def test_whenever_it_is_killed_the_state_is_no_older_than_a_minute(tmp_path: Path):
+    clock = FakeClock()
+    service, _ = service_with(keeper_in(tmp_path, clock), clock)
+    oldest, writings = 0.0, set()
+    for _ in range(1900):  # a killed service leaves what is there now
+        run(service, clock, TICK)
+        at = stored(tmp_path).at
+        writings.add(at)
+        oldest = max(oldest, 1.7e9 + clock() - at)
+    assert oldest <= PERIOD + 2.0 * TICK
+    assert len(writings) == 4  # once a minute and not oftener
+
+
+def test_a_disk_that_hangs_costs_the_loop_nothing(tmp_path: Path):
+    clock, writer = FakeClock(), Hung()
+    service, _ = service_with(keeper_in(tmp_path, clock, writer), clock)
+    run(service, clock, 300.0)
+    assert service.deadline_misses == 0
+    assert writer.asked == 1
+
+
+@pytest.mark.parametrize(
+    ("content", "why"), [(b"{}", "not a state of soilbus"), (b"\x00" * 50, "not JSON"), (None, "Is a directory")]
+)
+def test_a_state_that_cannot_be_used_is_one_warning_and_a_fresh_start(content, why, tmp_path: Path, caplog):
+    if content is None:
+        (tmp_path / FILE).mkdir()
+    else:
+        (tmp_path / FILE).write_bytes(content)
+    clock = FakeClock()
+    with caplog.at_level(logging.INFO):
+        keeper = keeper_in(tmp_path, clock)
+    assert keeper.recalled is None
+    assert [r.levelname for r in caplog.records] == ["WARNING"]
+    if content is not None:
+        assert why in caplog.text
+        keeper.tick(clock(), None, dict)
+        assert stored(tmp_path).starts == 1
+
+
+def test_a_folder_that_cannot_be_written_is_one_warning_until_it_can(tmp_path: Path, caplog):
+    clock, folder = FakeClock(), tmp_path / "gone"
+    keeper = keeper_in(folder, clock)
+
+    def minutes(n: int) -> None:
+        for _ in range(n):
+            keeper.tick(clock(), BELIEF, dict)
+            clock.now += PERIOD
+
+    minutes(10)
+    assert [r.levelname for r in caplog.records] == ["WARNING"]
+    assert "No such file or directory" in caplog.text
+    folder.mkdir()
+    minutes(2)
+    assert len(caplog.records) == 1
+    assert stored(folder).belief is not None
+    (folder / FILE).unlink()
+    folder.rmdir()
+    minutes(3)
+    assert len(caplog.records) == 2
+
+
+def test_counters_add_up_over_the_runs(tmp_path: Path):
+    clock = FakeClock()
+    for number in range(1, 4):
+        keeper = keeper_in(tmp_path, clock)
+        keeper.tick(clock(), None, lambda: {"windows": 7})
+        keeper.close(None, {"windows": 10, f"failed.{number}": 1})
+        state = stored(tmp_path)
+        assert state.starts == number
+        assert state.totals == Counter({"windows": 10 * number} | {f"failed.{i}": 1 for i in range(1, number + 1)})
+
+
+def test_a_belief_keeps_its_age_until_there_is_a_new_one(tmp_path: Path):
+    clock = FakeClock()
+    first = keeper_in(tmp_path, clock)
+    first.close(BELIEF, {})
+    began = stored(tmp_path).belief.at
+    clock.now += 500.0
+    second = keeper_in(tmp_path, clock)
+    assert second.recalled.elapsed == 500.0
+    assert np.array_equal(second.recalled.belief.covariance, BELIEF.covariance)
+    second.tick(clock(), None, dict)
+    assert stored(tmp_path).belief.at == began
+    other = Belief(BELIEF.soil, BELIEF.gains + 1e-3, BELIEF.covariance)
+    for _ in range(3):
+        clock.now += PERIOD
+        second.tick(clock(), other, dict)
+        assert stored(tmp_path).belief.at == began + 560.0
+    clock.now -= 1e6
+    assert keeper_in(tmp_path, clock).recalled.elapsed == PERSISTENCE
+
+
+def test_a_belief_that_cannot_be_is_not_stored(tmp_path: Path):
+    clock = FakeClock()
+    keeper = keeper_in(tmp_path, clock)
+    keeper.tick(clock(), BELIEF, dict)
+    known = stored(tmp_path).belief
+    keeper.close(Belief(BELIEF.soil * np.nan, BELIEF.gains, BELIEF.covariance), {"windows": 3})
+    assert stored(tmp_path).belief == known
+    assert stored(tmp_path).totals == {"windows": 3}
+
+
+def test_a_run_leaves_what_it_learnt_and_the_next_one_knows_the_sensors(recording, tmp_path: Path):
+    clock = FakeClock()
+    service, _ = service_with(keeper_in(tmp_path, clock), clock, recording)
+    run(service, clock, DURATION)
+    learnt = service._solver.estimator.tracker.newest
+    service.stop()
+    service.run()
+    state = stored(tmp_path)
+    assert state.belief.gains == dict(zip(OWNER.gains, learnt.gains.tolist(), strict=True))
+    assert state.totals["windows"] == service.windows > 3
+    assert state.totals["frames"] == sum(service.intake.admission.counts.received.values()) > 1000
+    assert state.totals["bus.sent"] == service.bus.counts.sent
+
+    for kept in (None, keeper_in(tmp_path, clock)):
+        service, wire = service_with(kept, clock, recording)
+        run(service, clock, DURATION)
+        assert first_verdict(wire) >= CONFIG.estimator.window  # what is known of sensors is no window
+        gains = service._solver.estimator.tracker.newest.gains
+    assert not np.array_equal(gains, learnt.gains)
+
+
+def first_verdict(wire: ScriptedBus) -> float:
+    """Seconds from the first frame to the first traversability that is not unknown."""
+    message = output_database(CONFIG).get_message_by_name("Traversability")
+    known = [
+        t for t, m in wire.sent if m.arbitration_id == message.frame_id and message.decode(m.data)["State"] != "unknown"
+    ]
+    return known[0] - wire.sent[0][0]
+
+
+def test_the_file_can_be_read_by_people(tmp_path: Path):
+    keeper_in(tmp_path, FakeClock()).close(BELIEF, {"windows": 3})
+    state = json.loads((tmp_path / FILE).read_text())["state"]
+    assert list(state["belief"]["soil"]) == ["k_c", "k_phi", "n", "phi", "c", "K"]
+    assert state["belief"]["gains"]["torque.FL"] == 0.0
+    assert state["totals"] == {"windows": 3}

@@ -1,0 +1,294 @@
+"""The stored state: bit for bit what was known, or one line on why not."""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import operator
+import os
+import re
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from soilbus.can.dbc_files import load_databases
+from soilbus.can.mapping import channels_of
+from soilbus.daemon import store
+from soilbus.daemon.store import Owner, State, StateError, belief_of, dumped, loaded, read, stored_belief, write_whole
+from soilbus.estimation.belief import Belief
+from soilbus.simulator.reference import reference_configuration
+
+
+def owner_of(settings: list[str] | None = None, database=None) -> Owner:
+    config = reference_configuration(settings or [])
+    database = database or load_databases(config)
+    return Owner.of(config, channels_of(config, database), database)
+
+
+OWNER = owner_of()
+N = len(OWNER.std)
+FREE = OWNER.std > 0.0
+
+
+def belief_with(seed: int) -> Belief:
+    """One that an estimator might have had."""
+    rng = np.random.default_rng(seed)
+    root = 0.1 * rng.standard_normal((N, N + 2)) * OWNER.std[:, None]
+    off = 0.5 * OWNER.std * rng.standard_normal(N)
+    return Belief(OWNER.median[:6] * np.exp(off[:6]), off[6:], root @ root.T)
+
+
+def state_with(belief: Belief | None, **changed) -> State:
+    stored = None if belief is None else stored_belief(belief, 1.7e9, OWNER)
+    return State(
+        **{"at": 1.7e9, "starts": 3, "belief": stored, "totals": {"windows": 5, "failed.internal": 2}} | changed
+    )
+
+
+CONTENT = dumped(state_with(belief_with(1)), OWNER)
+
+
+def sealed(change) -> bytes:
+    """The file with its content changed by somebody who knows how to seal it."""
+    raw = json.loads(CONTENT)
+    change(raw["state"])
+    raw["checksum"] = store._digest(raw["state"])
+    return json.dumps(raw).encode()
+
+
+@settings(deadline=None, derandomize=True, max_examples=30)
+@given(st.integers(0, 2**31))
+def test_what_comes_back_is_bit_for_bit_what_was_stored(seed):
+    belief = belief_with(seed)
+    state = loaded(dumped(state_with(belief), OWNER), OWNER)
+    assert state == state_with(belief)
+    back = belief_of(state.belief, OWNER)
+    for part in ("soil", "gains", "covariance"):
+        assert np.array_equal(getattr(back, part), getattr(belief, part))
+
+
+@settings(deadline=None, derandomize=True, max_examples=150)
+@given(st.integers(0, len(CONTENT) - 1), st.integers(0, 255), st.booleans())
+def test_one_wrong_byte_or_a_cut_is_noticed(place, byte, cut):
+    spoilt = CONTENT[:place] if cut else CONTENT[:place] + bytes([byte]) + CONTENT[place + 1 :]
+    try:
+        found = loaded(spoilt, OWNER)
+    except StateError:
+        return
+    assert found == loaded(CONTENT, OWNER)  # a space, or the same byte
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
+    lambda x: st.lists(x) | st.dictionaries(st.text(max_size=5), x),
+    max_leaves=8,
+)
+
+
+@settings(deadline=None, derandomize=True, max_examples=50)
+@given(st.binary(max_size=200) | JSON.map(lambda x: json.dumps(x).encode()))
+def test_no_bytes_are_a_traceback(content):
+    with pytest.raises(StateError):
+        loaded(content, OWNER)
+
+
+def places(value, path=()):
+    """The way to everything in a JSON value."""
+    yield path
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, member in items:
+        yield from places(member, (*path, key))
+
+
+PLACES = list(places(json.loads(CONTENT)["state"]))[1:]
+STRANGE = [None, True, 0, -1, 1e308, -1e308, 5e-324, -0.0, math.nan, math.inf, 2**63, 10**400, "", "1", [], {}, [[]]]
+
+
+@pytest.mark.filterwarnings("error")
+@settings(deadline=None, derandomize=True, max_examples=200)
+@given(st.lists(st.tuples(st.sampled_from(PLACES), st.sampled_from(STRANGE) | JSON), min_size=1, max_size=3))
+def test_nothing_that_is_sealed_well_is_a_traceback(edits):
+    def edit(state):
+        for (*way, last), value in edits:
+            with suppress(KeyError, IndexError, TypeError):  # another edit has taken it away
+                functools.reduce(operator.getitem, way, state)[last] = value
+
+    try:
+        state = loaded(sealed(edit), OWNER)
+    except StateError:
+        return
+    assert loaded(dumped(state, OWNER), OWNER) == state
+
+
+def _scaled(state, row, factor):
+    for i in range(N):
+        state["belief"]["covariance"][row][i] *= factor
+
+
+def _covariance(state, i, j, value):
+    state["belief"]["covariance"][i][j] = value
+
+
+def _indefinite(state):
+    c = state["belief"]["covariance"]
+    c[7][8] = c[8][7] = 1.1 * (c[7][7] * c[8][8]) ** 0.5
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b"", "not JSON"),
+        (CONTENT[:-3], "not JSON"),
+        (b"[" * 100_000, "not JSON"),
+        (b'{"at": ' + b"9" * 5000 + b"}", "not JSON"),
+        (b'"soilbus state"', "not a state of soilbus"),
+        (b'{"format": "openpilot", "version": 1}', "not a state of soilbus"),
+        (CONTENT.replace(b'"version": 1', b'"version": 2'), "version 2, this is 1"),
+        (CONTENT.replace(b'"starts": 3', b'"starts": 4'), "wrong checksum"),
+        (CONTENT.replace(OWNER.key.encode(), b"0" * 64), "another configuration"),
+        (sealed(lambda s: s.update(more=1)), "more"),
+        (sealed(lambda s: s.pop("totals")), "totals"),
+        (sealed(lambda s: s.update(starts=0)), "starts"),
+        (sealed(lambda s: s.update(starts="3")), "starts"),
+        (sealed(lambda s: s.update(at=float("nan"))), "at"),
+        (sealed(lambda s: s["totals"].update(windows=-1)), "windows"),
+        (sealed(lambda s: s["totals"].update({f"x{i}": 1 for i in range(2000)})), "totals"),
+        (sealed(lambda s: s["belief"]["soil"].pop("phi")), "other parameters"),
+        (sealed(lambda s: s["belief"]["gains"].update({"torque.XX": 0.0})), "other parameters"),
+        (sealed(lambda s: s["belief"]["covariance"].pop()), "another shape"),
+        (sealed(lambda s: s["belief"]["covariance"][3].pop()), "another shape"),
+        (sealed(lambda s: s["belief"]["soil"].update(phi=1.5)), "physical bounds"),
+        (sealed(lambda s: s["belief"]["soil"].update(n=0.0)), "physical bounds"),
+        (sealed(lambda s: s["belief"]["soil"].update(k_phi=1e30)), "physical bounds"),
+        (sealed(lambda s: s["belief"]["gains"].update({"torque.FL": 0.5})), "physical bounds"),
+        (sealed(lambda s: s["belief"]["gains"].update({"torque.FL": float("inf")})), "torque.FL"),
+        (sealed(lambda s: _covariance(s, 2, 2, 0.0)), "positive definite"),
+        (sealed(lambda s: _covariance(s, 2, 2, -1.0)), "positive definite"),
+        (sealed(lambda s: _covariance(s, 2, 2, 5e-324)), "positive definite"),
+        (sealed(lambda s: _covariance(s, 2, 2, 1e300)), "out of bounds"),
+        (sealed(lambda s: _scaled(s, 9, 1.5)), "not symmetric"),
+        (sealed(_indefinite), "positive definite"),
+    ],
+)  # fmt: skip
+def test_each_fault_is_told_in_one_line(content, why):
+    with pytest.raises(StateError, match=re.escape(why)) as caught:
+        loaded(content, OWNER)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_held_and_what_effects_have_is_stored_too():
+    effect = 'model.effects=[{name="slip_sinkage", softening={value=0.3, std=0.1}}]'
+    owner = owner_of([effect, "soil.k_c.value=0.0", "soil.k_c.std=0.0"])
+    held = owner.std == 0.0
+    assert np.flatnonzero(held)[0] == 0
+    assert len(owner.gains) > len(OWNER.gains)
+    std = np.where(held, 0.0, 0.1 * owner.std)
+    gains = np.where(np.arange(len(owner.gains)) >= len(OWNER.gains), -3.0, 0.0) * owner.std[6:]  # pulls of parameters
+    belief = Belief(owner.median[:6], gains, np.diag(std**2))
+    state = State(at=0.0, starts=1, belief=stored_belief(belief, 0.0, owner), totals={})
+    assert np.array_equal(belief_of(loaded(dumped(state, owner), owner).belief, owner).gains, gains)
+    other = Belief(belief.soil + np.eye(6)[0], belief.gains, belief.covariance)
+    with pytest.raises(StateError, match="physical"):
+        stored_belief(other, 0.0, owner)
+
+
+def test_a_belief_that_could_not_be_read_back_is_not_stored():
+    belief = belief_with(2)
+    for spoilt in (
+        Belief(belief.soil * np.nan, belief.gains, belief.covariance),
+        Belief(belief.soil, belief.gains + 1.0, belief.covariance),
+        Belief(belief.soil, belief.gains, -belief.covariance),
+    ):
+        with pytest.raises(StateError):
+            stored_belief(spoilt, 0.0, OWNER)
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "wheel.FL.radius=0.51", "vehicle.mass=2301.0", "noise.draft.gain=0.006", "soil.c.value=2100.0",
+        "estimator.window=9.0", "model.shear_law=rational", "wheel.FL.gear_ratio=25.0",
+    ],
+)  # fmt: skip
+def test_what_a_belief_depends_on_is_in_the_key(setting):
+    assert owner_of([setting]).key != OWNER.key
+
+
+def test_the_wiring_is_in_the_key_down_to_the_bit():
+    config = reference_configuration()
+    database = load_databases(config)
+    channel = channels_of(config, database)[0]
+    signal = database.get_message_by_name(channel.message).get_signal_by_name(channel.signal)
+    assert owner_of(database=database).key == OWNER.key
+    signal.conversion.offset += 1.0
+    assert owner_of(database=database).key != OWNER.key
+
+
+@pytest.mark.parametrize("setting", ["bus.channel=can7", "traversability.margin=0.2", "output.dbc=soilbus.dbc"])
+def test_what_a_belief_does_not_depend_on_is_not(setting):
+    assert owner_of([setting]).key == OWNER.key
+
+
+def test_what_is_no_file_is_refused_and_nothing_is_nothing(tmp_path: Path):
+    path = tmp_path / "state.json"
+    assert read(path, OWNER) is None
+    path.write_bytes(CONTENT)
+    assert read(path, OWNER) == loaded(CONTENT, OWNER)
+    (tmp_path / "link").symlink_to(path)
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "large").write_bytes(CONTENT + b" " * store.LARGEST)
+    for name in ("link", "fifo", "large", ".", "state.json/x"):
+        with pytest.raises(StateError):
+            read(tmp_path / name, OWNER)
+
+
+def test_only_the_owner_may_read_it(tmp_path: Path):
+    write_whole(tmp_path / "state.json", CONTENT)
+    assert (tmp_path / "state.json").stat().st_mode & 0o777 == 0o600
+
+
+def test_it_is_on_the_disk_before_it_has_the_name_and_the_name_is_too(tmp_path: Path, monkeypatch):
+    calls = []
+    fsync, replace = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda fd: calls.append(os.readlink(f"/proc/self/fd/{fd}")) or fsync(fd))
+    monkeypatch.setattr(os, "replace", lambda a, b: calls.append("renamed") or replace(a, b))
+    write_whole(tmp_path / "state.json", CONTENT)
+    assert calls == [str(tmp_path / "state.json.new"), "renamed", str(tmp_path)]
+
+
+@pytest.mark.parametrize("step", ["fsync", "replace"])
+def test_a_full_disk_leaves_the_old_file_and_no_other(step, tmp_path: Path, monkeypatch):
+    path = tmp_path / "state.json"
+    write_whole(path, CONTENT)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, step, full)
+    with pytest.raises(OSError, match="No space"):
+        write_whole(path, b"new")
+    monkeypatch.undo()
+    assert [p.name for p in tmp_path.iterdir()] == ["state.json"]
+    assert read(path, OWNER) == loaded(CONTENT, OWNER)
+
+
+def test_two_hundred_kills_lose_nothing_that_was_stored(tmp_path: Path):
+    killer = Path(__file__).with_name("killed.py")
+    environment = {**os.environ, "PYTHONPATH": str(killer.parents[2] / "service")}
+    done = subprocess.run(
+        [sys.executable, killer, tmp_path / "state.json", "200", "1"],
+        capture_output=True, text=True, env=environment, timeout=120.0,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    told = json.loads(done.stdout)
+    assert told["kills"] == 200
+    assert told["broken"] == told["lost"] == 0
+    assert told["written"] > 200
+    assert told["in the middle"] > 20  # a kill between the file beside and the rename leaves the file beside

@@ -1,0 +1,1 @@
+"""Fuzz targets of everything that reads what others wrote."""

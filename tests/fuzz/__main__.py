@@ -1,0 +1,123 @@
+"""`PYTHONPATH=service:tests/support python -m tests.fuzz --target NAME --seconds N --seed S`.
+
+Coverage-guided by atheris (extra `fuzz`) where it is installed; with --plain by seeded mutations
+alone.  Either way a crash, an input that takes longer than LONGEST, or memory beyond LARGEST ends
+the run with exit code 1 and the input in a file named by its digest.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import resource
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+LONGEST = 30
+"""Seconds for one input."""
+LARGEST = 2048
+"""Megabytes of address space beyond what the start takes."""
+PACKAGES = ["soilbus", "cantools"]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse, fuzz, tell."""
+    chosen = _parsed(arguments)
+    if not chosen.plain and _has_atheris():
+        import atheris
+
+        with atheris.instrument_imports(include=PACKAGES):
+            from .targets import TARGETS
+        return _guided(chosen.target, TARGETS, chosen.seconds, chosen.seed)
+    from .targets import TARGETS
+
+    return _plain(chosen.target, TARGETS, chosen.seconds, chosen.seed)
+
+
+def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
+    parser.add_argument("--target", required=True, help="frames, windows, service, dbc, config, model, log-...")
+    parser.add_argument("--seconds", type=int, default=60, help="how long (60)")
+    parser.add_argument("--seed", type=int, default=1, help="of the random numbers (1)")
+    parser.add_argument("--plain", action="store_true", help="seeded mutations, not guided by coverage")
+    return parser.parse_args(arguments)
+
+
+def _has_atheris() -> bool:
+    try:
+        import atheris  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+def _guided(name, targets, seconds: int, seed: int) -> int:
+    """libFuzzer's loop, which ends the process itself."""
+    import atheris
+
+    target = targets[name]
+    folder = Path(tempfile.mkdtemp(prefix=f"soilbus-fuzz-{name}-"))
+    for i, data in enumerate(target.seeds()):
+        (folder / f"seed{i}").write_bytes(data)
+    frames = 0
+
+    def one(data: bytes) -> None:
+        nonlocal frames
+        frames += target.one(data)
+
+    flags = [
+        f"-max_total_time={seconds}", f"-seed={seed}", f"-timeout={LONGEST}", f"-rss_limit_mb={LARGEST}",
+        "-max_len=65536", "-print_final_stats=1", f"-artifact_prefix={name}-",
+    ]  # fmt: skip
+    atheris.Setup([sys.argv[0], *flags, str(folder)], one)
+    import atexit
+
+    atexit.register(lambda: print(f"{name}: {frames} frames", file=sys.stderr))
+    atheris.Fuzz()
+    return 0
+
+
+def _plain(name, targets, seconds: float, seed: int) -> int:
+    from .mutation import mutated
+
+    target = targets[name]
+    seeds, rng = target.seeds(), np.random.default_rng(seed)
+    for data in seeds:
+        target.one(data)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + (LARGEST << 20),) * 2)
+    signal.signal(signal.SIGALRM, _too_long)
+    begin, inputs, total = time.monotonic(), 0, 0
+    while time.monotonic() - begin < seconds:
+        data = mutated(seeds, rng)
+        signal.alarm(LONGEST)
+        try:
+            total += target.one(data)
+        except BaseException as error:
+            kept = Path(f"{name}-{hashlib.sha1(data).hexdigest()[:12]}")
+            kept.write_bytes(data)
+            if isinstance(error, KeyboardInterrupt):
+                raise
+            print(f"{name}: {type(error).__name__}: {error} on an input kept in {kept}", file=sys.stderr)
+            raise
+        finally:
+            signal.alarm(0)
+        inputs += 1
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    spent = time.process_time()
+    print(f"{name}: {inputs} inputs, {total} frames, {spent:.0f} s processor time, peak {peak:.0f} MB: nothing found")
+    return 0
+
+
+def _too_long(signum: int, frame: object) -> None:
+    raise TimeoutError(f"longer than {LONGEST} s")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

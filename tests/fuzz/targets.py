@@ -1,0 +1,309 @@
+"""What is fuzzed: each target takes bytes and raises only where the code under test is wrong."""
+
+from __future__ import annotations
+
+import gzip
+import math
+import tempfile
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import can
+import numpy as np
+
+from fakes import FakeClock, InlineExecutor, ScriptedBus
+from soilbus.assembly import completion_of, effects_of
+from soilbus.can.bus import LiveBus
+from soilbus.can.dbc_files import load_databases, output_database, shipped_dbc
+from soilbus.can.publish import Publisher
+from soilbus.config import Config, ConfigError
+from soilbus.config_file import load_config
+from soilbus.daemon.intake import Intake
+from soilbus.daemon.notify import Notifier
+from soilbus.daemon.pipeline import Pipeline
+from soilbus.daemon.replay import LogError, read_frames
+from soilbus.daemon.service import Service
+from soilbus.simulator.frames import frames, write_log
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import TRACTOR, reference_configuration
+from soilbus.simulator.scenario import excited
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.effects.effect import Effect
+
+from .stream import RECORD, Fed, Known, frames_of
+
+MOTORS = [f"wheel.{w}.motor_speed=Motor{w}.ShaftSpeed" for w in ("FL", "FR", "RL", "RR")]
+MOST_WINDOWS = 62
+"""Per frame: a clock that is set ahead by hours costs a minute of empty windows."""
+MOST_FRAMES = 20_000
+"""Of one log that are read."""
+
+
+class Target(NamedTuple):
+    """`one` takes an input and says how many frames it held; seeds are good inputs to start from."""
+
+    one: Callable[[bytes], int]
+    seeds: Callable[[], list[bytes]]
+
+
+@cache
+def reference() -> Config:
+    return reference_configuration(["estimator.window=2.0", *MOTORS])
+
+
+@cache
+def drive() -> tuple[can.Message, ...]:
+    """Two seconds of a good drive."""
+    return tuple(frames(simulate(reference(), excited("loam", 2.0), seed=3), reference()))
+
+
+@cache
+def moment() -> tuple[Known, ...]:
+    """The last frame of each message of a good drive."""
+    last = {m.arbitration_id: Known(m.arbitration_id, m.is_extended_id, bytes(m.data)) for m in drive()}
+    return tuple(last.values())
+
+
+def good_stream() -> list[bytes]:
+    """The moment over and over, at some 50 Hz, for 3 s; and the same with bits turned over."""
+    n = len(moment())
+    rows = [bytes([0, i % n, 2 if i % n else 5, 0, *bytes(8)]) for i in range(n * 150)]
+    rng = np.random.default_rng(1)
+    bent = [row[:3] + b"\1" + (rng.bytes(8) if rng.random() < 0.2 else bytes(8)) for row in rows]
+    return [b"".join(rows[: 40 * n]), b"".join(bent[: 40 * n]), b"".join(rows), b"".join(bent)]
+
+
+# --- frames: decoding, admission, binning
+
+
+def check_frames(data: bytes) -> int:
+    """Every frame of a mapped message is admitted or refused for one reason; samples are numbers in their order."""
+    return _admitted(_intake(), frames_of(data, moment()))
+
+
+def _intake() -> Intake:
+    return Intake(reference(), load_databases(reference()))
+
+
+def _admitted(intake: Intake, stream: Iterator[Fed]) -> int:
+    n, counts, now = 0, intake.admission.counts, -math.inf
+    last: dict[str, float] = {}
+    for n, frame in enumerate(stream, 1):
+        intake.admission.feed(*frame)
+        now = frame.t if math.isfinite(frame.t) else now
+        if n % 64 == 0:
+            steps = counts.clock_steps
+            for name, column in intake.admission.take(now).columns.items():
+                assert np.isfinite(column.t).all()
+                assert np.isfinite(column.value).all()
+                assert (np.diff(column.t) >= 0.0).all()
+                if counts.clock_steps == steps and len(column.t):
+                    last[name] = float(column.t[-1])
+    intake.admission.take()
+    received, admitted = sum(counts.received.values()), sum(counts.admitted.values())
+    assert received == admitted + sum(counts.refused.values()), "a frame is neither admitted nor refused"
+    assert received + counts.unknown == n, "a frame is not counted"
+    assert len(counts.unknown_ids) <= 1024
+    return n
+
+
+# --- windows: what the intake makes of any frames
+
+
+def check_windows(data: bytes) -> int:
+    """Windows come in their order and end; no sensor's reading is infinite in them."""
+    intake = _intake()
+    n, now, seen = 0, 0.0, 0
+    for n, frame in enumerate(frames_of(data, moment()), 1):
+        intake.admission.feed(*frame)
+        now = frame.t if math.isfinite(frame.t) else now
+        if n % 100 == 0:
+            intake.latest(now)
+            seen += _looked_at(intake, now)
+            assert seen <= MOST_WINDOWS * n, "windows without end"
+    return n
+
+
+def _looked_at(intake: Intake, now: float) -> int:
+    tasks = intake.due(now)
+    for task in tasks:
+        assert not any(np.isinf(getattr(task.window, q)).any() for q in task.window.variance)
+        assert task.end <= now
+        assert len(task.window.t) <= 21
+    return len(tasks)
+
+
+# --- service: the whole loop
+
+
+def check_service(data: bytes) -> int:
+    """The loop sends what the DBC can say, at its times, and never GO: no moment repeated for ever is a drive."""
+    clock = FakeClock()
+    messages = [
+        can.Message(
+            timestamp=f.t, arbitration_id=f.identifier, is_extended_id=f.extended, is_remote_frame=f.remote,
+            data=b"" if f.remote else f.data[:8],
+        )
+        for f in frames_of(data[: RECORD * 600], moment())
+        if f.extended or f.identifier <= 0x7FF
+    ]  # fmt: skip
+    wire = _Paced(clock, messages)
+    database = output_database(reference())
+    bus = LiveBus(lambda: wire, clock, clock.sleep)
+    pipeline = Pipeline(reference(), load_databases(reference()))
+    service = Service(reference(), pipeline, bus, Publisher(database), Notifier(), InlineExecutor(), clock)
+    end = clock.now + 0.005 * len(messages) + 2.0
+    rounds = 0
+    while clock.now < end:
+        service.step()
+        rounds += 1
+        assert rounds < 200 + 400 * (end - 1000.0), "the loop does not wait"
+    verdict = database.get_message_by_name("Traversability").frame_id
+    for _, message in wire.sent:
+        told = database.decode_message(message.arbitration_id, bytes(message.data))
+        assert message.arbitration_id != verdict or str(told["State"]) != "go"
+    return len(messages)
+
+
+class _Paced(ScriptedBus):
+    """Hands out messages every 5 ms, whatever their stamps say."""
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        due = 1000.0 + 0.005 * self.next
+        if self.next >= len(self.messages) or due > self.clock.now + (timeout or 0.0):
+            self.clock.sleep(max(timeout or 0.0, 1e-4))
+            return None
+        self.clock.now = max(self.clock.now, due)
+        self.next += 1
+        return self.messages[self.next - 1]
+
+
+# --- files: DBC, configuration, model, logs
+
+
+def check_dbc(data: bytes) -> int:
+    """A DBC is refused with ConfigError, or what it says is decoded."""
+    with _folder() as folder:
+        (folder / "tractor.dbc").write_bytes(data)
+        (folder / "f.toml").write_bytes(TRACTOR.read_bytes())
+        try:
+            config = load_config(folder / "f.toml")
+            intake = Intake(config, load_databases(config))
+        except ConfigError as error:
+            return _told(error.faults)
+        return _admitted(intake, frames_of(_some_frames(), moment()))
+
+
+def check_config(data: bytes) -> int:
+    """A configuration is refused with ConfigError, each fault on one line, or a pipeline can be built of it."""
+    with _folder() as folder:
+        (folder / "f.toml").write_bytes(data)
+        try:
+            config = load_config(folder / "f.toml")
+            pipeline = Pipeline(config, load_databases(config))
+        except ConfigError as error:
+            return _told(error.faults)
+        return _admitted(pipeline.intake, frames_of(_some_frames(), moment()))
+
+
+def check_model(data: bytes) -> int:
+    """A [model] as `diagnose --model-out` writes it is refused with ConfigError, or its effects can be used."""
+    with _folder() as folder:
+        (folder / "f.toml").write_bytes(TRACTOR.read_bytes() + b"\n" + data)
+        try:
+            config = load_config(folder / "f.toml")
+            active, (effects, free) = effects_of(config), completion_of(config)
+        except ConfigError as error:
+            return _told(error.faults)
+        for one in active:
+            assert all(np.isfinite(value).all() for value in one.values.values())
+        assert all(math.isfinite(f.value) and f.std >= 0.0 for f in free)
+        assert len(effects) <= len(active)
+    return 0
+
+
+def _told(faults: list[str], where: str = "") -> int:
+    """No frame, but what is wrong, each fault on a line of its own."""
+    assert faults
+    assert all(fault.strip() and "\n" not in fault and where in fault for fault in faults), faults
+    return 0
+
+
+def _log(suffix: str) -> Callable[[bytes], int]:
+    def check(data: bytes) -> int:
+        """A log is read, or refused with one line that names it."""
+        with _folder() as folder:
+            path = folder / f"a{suffix}"
+            path.write_bytes(data)
+            n, intake = 0, _intake()
+            try:
+                for n, (t, identifier, extended, content, remote, error) in enumerate(read_frames(path), 1):
+                    if not error:
+                        intake.admission.feed(t, identifier, extended, content, remote)
+                    if n >= MOST_FRAMES:
+                        break
+            except LogError as error:
+                _told([str(error)], str(path))
+            intake.ingest(1.7e9 + 10.0)
+            return n
+
+    return check
+
+
+def _log_seeds(suffix: str) -> Callable[[], list[bytes]]:
+    def seeds() -> list[bytes]:
+        with _folder() as folder:
+            path = folder / f"good{suffix}"
+            write_log(drive()[:200], path)
+            return [path.read_bytes()]
+
+    return seeds
+
+
+@cache
+def _some_frames() -> bytes:
+    return good_stream()[1]
+
+
+def _folder():
+    context = tempfile.TemporaryDirectory(prefix="soilbus-fuzz-")
+
+    class Folder:
+        def __enter__(self) -> Path:
+            return Path(context.__enter__())
+
+        def __exit__(self, *what: object) -> None:
+            context.__exit__(*what)
+
+    return Folder()
+
+
+def _dbc_seeds() -> list[bytes]:
+    whole = shipped_dbc("tractor.dbc").read_bytes()
+    return [whole, whole.split(b"CM_ ")[0]]
+
+
+def _model_seeds() -> list[bytes]:
+    def parameters(effect: Effect) -> str:
+        return ", ".join(f"{p.name} = {{value = {p.neutral}, std = {p.std}}}" for p in effect.parameters)
+
+    each = [f'{{name = "{e.name}", {parameters(e)}}}' for e in CATALOGUE.values()]
+    by_wheel = '{name = "wheel_load_offset", offset = {FL = 100.0, RR = {value = -50.0, std = 10.0}}}'
+    return [f"[model]\neffects = [{', '.join(some)}]\n".encode() for some in (each[:3], each[9:], [by_wheel])]
+
+
+TARGETS: dict[str, Target] = {
+    "frames": Target(check_frames, good_stream),
+    "windows": Target(check_windows, good_stream),
+    "service": Target(check_service, good_stream),
+    "dbc": Target(check_dbc, _dbc_seeds),
+    "config": Target(check_config, lambda: [TRACTOR.read_bytes()]),
+    "model": Target(check_model, _model_seeds),
+    "log-candump": Target(_log(".log"), _log_seeds(".log")),
+    "log-gz": Target(_log(".log.gz"), lambda: [gzip.compress(_log_seeds(".log")()[0], mtime=0)]),
+    "log-asc": Target(_log(".asc"), _log_seeds(".asc")),
+    "log-blf": Target(_log(".blf"), _log_seeds(".blf")),
+    "log-csv": Target(_log(".csv"), _log_seeds(".csv")),
+}

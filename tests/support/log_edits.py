@@ -1,0 +1,300 @@
+"""Edits of a recording: what dying, lying and confused senders make of good frames.
+
+A `Log` holds each message's frames as columns.  Edits change physical values (in the DBC's
+units), payloads or stamps from a moment on and leave every other bit alone; the Checksum of
+a message that has ours is made right again unless the edit is to break it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from cantools.database import Database
+from cantools.database.can import Message
+from numpy.typing import NDArray
+
+from soilbus.can.admission import checksum_byte_of
+from soilbus.can.checksum import column_checksums
+from soilbus.can.decode import ColumnDecoder
+from soilbus.can.publish import value_codes
+
+Array = NDArray[np.float64]
+Frame = tuple[float, int, bool, bytes]
+Since = NDArray[np.bool_]
+
+
+class Stream:
+    """The frames of one message: stamps t [s] (N,), payload (N, length)."""
+
+    def __init__(self, message: Message, t: Array, payload: NDArray[np.uint8]) -> None:
+        self.message, self.t, self.payload = message, t, payload
+
+    def signal(self, name: str) -> Array:
+        """Physical values (N,)."""
+        return np.asarray(ColumnDecoder(self.message, [name]).decode(self.payload)[name], float)
+
+    def raw(self, name: str) -> NDArray[np.int64]:
+        return np.asarray(ColumnDecoder(self.message, [name]).raw(self.payload)[name], np.int64)
+
+    def before(self, t: float) -> Stream:
+        """The frames before t [s]."""
+        return Stream(self.message, self.t[self.t < t], self.payload[self.t < t])
+
+    def with_values(self, name: str, values: Array, where: Since) -> Stream:
+        codes = value_codes(self.message.get_signal_by_name(name)).column(values)
+        return self.with_codes(name, codes, where)
+
+    def with_codes(self, name: str, codes: NDArray[np.int64], where: Since) -> Stream:
+        """With other raw codes of a signal and the checksum that belongs to them."""
+        signal = self.message.get_signal_by_name(name)
+        bits = np.unpackbits(self.payload, axis=1)
+        shifts = np.arange(signal.length)
+        new = (codes[:, None] >> shifts) & 1
+        bits[:, places(signal)] = np.where(where[:, None], new, bits[:, places(signal)])
+        return self.with_payload(np.packbits(bits, axis=1)).checked()
+
+    def with_payload(self, payload: NDArray[np.uint8]) -> Stream:
+        return Stream(self.message, self.t, payload)
+
+    def checked(self) -> Stream:
+        place = checksum_byte_of(self.message)
+        if place is None:
+            return self
+        payload = self.payload.copy()
+        ids = np.full(len(payload), self.message.frame_id, np.int64)
+        payload[:, place] = column_checksums(ids, payload, place)
+        return self.with_payload(payload)
+
+
+def places(signal) -> NDArray[np.intp]:
+    """Columns of a signal's bits in unpackbits' order, least significant first."""
+    if signal.byte_order == "big_endian":
+        last = 8 * (signal.start // 8) + 7 - signal.start % 8 + signal.length - 1
+        return last - np.arange(signal.length)
+    position = signal.start + np.arange(signal.length)
+    return np.asarray(8 * (position // 8) + 7 - position % 8)
+
+
+class Log:
+    """A recording by message name; frames of no known message are dropped."""
+
+    def __init__(self, frames: Iterable[Frame], database: Database) -> None:
+        by_id: dict[int, list[Frame]] = {}
+        for frame in frames:
+            by_id.setdefault(frame[1], []).append(frame)
+        self.streams: dict[str, Stream] = {}
+        for message in database.messages:
+            if found := by_id.get(message.frame_id):
+                t = np.array([f[0] for f in found])
+                payload = np.frombuffer(b"".join(bytes(f[3]) for f in found), np.uint8)
+                self.streams[message.name] = Stream(message, t, payload.reshape(len(t), -1))
+
+    @classmethod
+    def of(cls, streams: dict[str, Stream]) -> Log:
+        new = cls.__new__(cls)
+        new.streams = streams
+        return new
+
+    def frames(self) -> list[Frame]:
+        """In the order of their stamps."""
+        out: list[Frame] = []
+        for stream in self.streams.values():
+            m = stream.message
+            out += [
+                (t, m.frame_id, m.is_extended_frame, bytes(data))
+                for t, data in zip(stream.t.tolist(), stream.payload, strict=True)
+            ]
+        return sorted(out, key=lambda f: f[0])
+
+    def changed(self, name: str, edit: Callable[[Stream], Stream | None]) -> Log:
+        """With one message's stream edited, or taken out (None)."""
+        stream = edit(self.streams[name])
+        others = {n: s for n, s in self.streams.items() if n != name}
+        return Log.of(others if stream is None else others | {name: stream})
+
+
+Edit = Callable[[Log, float], Log]
+"""Of a log, from a time [s] on."""
+
+
+def split(path: str) -> tuple[str, str]:
+    message, _, signal = path.partition(".")
+    return message, signal
+
+
+def cut(message: str) -> Edit:
+    """Nothing follows."""
+    return lambda log, t: log.changed(message, lambda s: s.before(t) if (s.t < t).any() else None)
+
+
+def mapped(*paths: str, by: Callable[[Array], Array]) -> Edit:
+    """Values (N,) of signals replaced by a function of them."""
+
+    def edit(log: Log, t: float) -> Log:
+        for path in paths:
+            message, signal = split(path)
+            log = log.changed(message, lambda s, n=signal: s.with_values(n, by(s.signal(n)), s.t >= t))
+        return log
+
+    return edit
+
+
+def flipped(*paths: str) -> Edit:
+    """The other sign."""
+    return mapped(*paths, by=np.negative)
+
+
+def scaled(factor: float, *paths: str) -> Edit:
+    """A wrong factor."""
+    return mapped(*paths, by=lambda values: factor * values)
+
+
+def offset(by: float, *paths: str) -> Edit:
+    """A lost zero."""
+    return mapped(*paths, by=lambda values: values + by)
+
+
+def frozen(*paths: str) -> Edit:
+    """The signals repeat their last good value; the rest of the frame goes on."""
+
+    def edit(log: Log, t: float) -> Log:
+        for path in paths:
+            message, signal = split(path)
+
+            def stuck(s: Stream, n: str = signal) -> Stream:
+                code = s.raw(n)
+                return s.with_codes(n, np.full(len(code), code[max(int(np.sum(s.t < t)) - 1, 0)]), s.t >= t)
+
+            log = log.changed(message, stuck)
+        return log
+
+    return edit
+
+
+def stalled(message: str) -> Edit:
+    """The whole frame is repeated, counter and checksum with it."""
+
+    def edit(s: Stream, t: float) -> Stream:
+        payload = s.payload.copy()
+        payload[s.t >= t] = payload[max(int(np.sum(s.t < t)) - 1, 0)]
+        return s.with_payload(payload)
+
+    return lambda log, t: log.changed(message, lambda s: edit(s, t))
+
+
+def spiked(by: float, every: int, *paths: str) -> Edit:
+    """Every so many samples one stands out by so much."""
+
+    def edit(log: Log, t: float) -> Log:
+        for path in paths:
+            message, signal = split(path)
+
+            def spikes(s: Stream, n: str = signal) -> Stream:
+                hit = (s.t >= t) & (np.arange(len(s.t)) % every == 0)
+                return s.with_values(n, s.signal(n) + by, hit)
+
+            log = log.changed(message, spikes)
+        return log
+
+    return edit
+
+
+def codes(code: int, *paths: str) -> Edit:
+    """A code that means no value."""
+
+    def edit(log: Log, t: float) -> Log:
+        for path in paths:
+            message, signal = split(path)
+            log = log.changed(message, lambda s, n=signal: s.with_codes(n, np.full(len(s.t), code), s.t >= t))
+        return log
+
+    return edit
+
+
+def delayed(by: float, *messages: str) -> Edit:
+    """Frames come, and are stamped, so much later [s]."""
+
+    def edit(log: Log, t: float) -> Log:
+        for message in messages:
+            log = log.changed(message, lambda s: Stream(s.message, np.where(s.t >= t, s.t + by, s.t), s.payload))
+        return log
+
+    return edit
+
+
+def swapped(a: str, b: str) -> Edit:
+    """Two signals of the same layout exchanged (both messages at the same rate, as their frames come)."""
+
+    def edit(log: Log, t: float) -> Log:
+        (ma, sa), (mb, sb) = split(a), split(b)
+        one, other = log.streams[ma], log.streams[mb]
+        va, vb = one.signal(sa), other.signal(sb)
+        of_b = np.interp(one.t, other.t, vb)
+        of_a = np.interp(other.t, one.t, va)
+        log = log.changed(ma, lambda s: s.with_values(sa, of_b, s.t >= t))
+        return log.changed(mb, lambda s: s.with_values(sb, of_a, s.t >= t))
+
+    return edit
+
+
+def every_frame(change: Callable[[Stream, float], Stream]) -> Edit:
+    """The same edit of all streams."""
+
+    def edit(log: Log, t: float) -> Log:
+        for name in log.streams:
+            log = log.changed(name, lambda s: change(s, t))
+        return log
+
+    return edit
+
+
+def duplicated(log: Log, t: float) -> Log:
+    """Each frame comes twice, 0.2 ms apart."""
+
+    def twice(s: Stream, t: float) -> Stream:
+        late = s.t >= t
+        stamps = np.concatenate([s.t, s.t[late] + 2e-4])
+        order = np.argsort(stamps, kind="stable")
+        return Stream(s.message, stamps[order], np.concatenate([s.payload, s.payload[late]])[order])
+
+    return every_frame(twice)(log, t)
+
+
+def reordered(log: Log, t: float) -> Log:
+    """Each second frame changes places with the one before: the payloads come in the wrong order."""
+
+    def exchange(s: Stream, t: float) -> Stream:
+        order = np.arange(len(s.t))
+        first = np.flatnonzero(s.t >= t)[: -1 if int(np.sum(s.t >= t)) % 2 else None]
+        order[first[0::2]], order[first[1::2]] = first[1::2], first[0::2]
+        return s.with_payload(s.payload[order])
+
+    return every_frame(exchange)(log, t)
+
+
+def broken_checksums(message: str) -> Edit:
+    """The Checksum's last bit is wrong."""
+
+    def edit(s: Stream, t: float) -> Stream:
+        payload = s.payload.copy()
+        payload[s.t >= t, checksum_byte_of(s.message)] ^= 1
+        return s.with_payload(payload)
+
+    return lambda log, t: log.changed(message, lambda s: edit(s, t))
+
+
+def clock_set(by: float) -> Edit:
+    """All stamps jump."""
+    return every_frame(lambda s, t: Stream(s.message, np.where(s.t >= t, s.t + by, s.t), s.payload))
+
+
+def both(*edits: Edit) -> Edit:
+    """One after the other."""
+
+    def edit(log: Log, t: float) -> Log:
+        for each in edits:
+            log = each(log, t)
+        return log
+
+    return edit

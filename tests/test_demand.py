@@ -1,0 +1,61 @@
+"""The present demand: what sensors say of draft and slope, and how well they say it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from soilbus.assembly import rig_of
+from soilbus.capability.demand import present_demand
+from soilbus.estimation.window import BinStore
+from soilbus.simulator.reference import reference_configuration
+from soilbus.terra.vehicle import GRAVITY
+
+RIG = rig_of(reference_configuration())
+WEIGHT = RIG.chassis.mass * GRAVITY
+T = np.arange(0.0, 10.0, 0.02)
+
+
+def window_of(draft, pitch):
+    store = BinStore(RIG, 0.1, 0.0)
+    store.add({"draft": (T, draft), **({} if pitch is None else {"pitch": (T, pitch)})})
+    return store.window(0.0, 10.0)
+
+
+def demand_of(draft, pitch):
+    return present_demand(window_of(draft, pitch), RIG.chassis, 1.0)
+
+
+def test_the_std_is_that_of_the_sensors_however_the_draft_swings():
+    rng = np.random.default_rng(4)
+    swing, slope = 3000.0 + 1500.0 * np.sin(0.7 * T), np.full(len(T), 0.04)
+    truth = demand_of(swing, slope)
+    noisy = [
+        demand_of(swing + 40.0 * rng.standard_normal(len(T)), slope + 0.002 * rng.standard_normal(len(T)))
+        for _ in range(200)
+    ]
+    pulls = np.array([d.pull for d in noisy])
+    assert pulls.mean() == pytest.approx(truth.pull, abs=4.0 * pulls.std() / len(pulls) ** 0.5)
+    assert np.mean([d.std for d in noisy]) == pytest.approx(pulls.std(), rel=0.2)  # sampling: 5 %
+    assert truth.sine == pytest.approx(np.sin(0.04), rel=1e-6)
+
+
+def test_the_last_hop_counts_where_it_asks_for_more_and_else_the_whole_window():
+    rising = demand_of(1000.0 + 100.0 * T, None)
+    assert rising.pull == pytest.approx(1000.0 + 100.0 * T[T >= 9.0].mean(), abs=2.0)
+    lifted = demand_of(np.where(T < 9.0, 4000.0, 0.0), None)
+    assert lifted.pull == pytest.approx(3600.0, abs=10.0)
+
+
+def test_an_unknown_slope_counts_as_level_and_an_unknown_draft_as_no_demand():
+    level = demand_of(np.full(len(T), 2000.0), None)
+    assert (level.pull, level.sine) == (pytest.approx(2000.0), 0.0)
+    assert 0.0 < level.std < 20.0
+    climbing = demand_of(np.full(len(T), 2000.0), np.full(len(T), 0.1))
+    assert climbing.pull == pytest.approx(2000.0 + WEIGHT * np.sin(0.1), rel=1e-6)
+    window = window_of(np.full(len(T), 2000.0), None)
+    gone = dataclasses.replace(window, draft=np.where(window.t > 8.9, np.nan, window.draft))
+    assert present_demand(gone, RIG.chassis, 1.0) is None
+    assert present_demand(window, None, 1.0) is None

@@ -1,0 +1,58 @@
+"""What soilbus depends on, within which bounds."""
+
+from __future__ import annotations
+
+import ast
+import sys
+import tomllib
+from importlib.metadata import PackageNotFoundError, version
+from itertools import chain
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+REPO = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((REPO / "pyproject.toml").read_text())
+EXTRAS = PROJECT["project"]["optional-dependencies"]
+ALL = sorted(
+    {*PROJECT["build-system"]["requires"], *PROJECT["project"]["dependencies"], *chain.from_iterable(EXTRAS.values())}
+)
+OF_THE_DAEMON = {"numpy", "cantools", "can", "crccheck", "pydantic"}
+
+
+@pytest.mark.parametrize("text", ALL)
+def test_each_has_a_lower_and_an_upper_bound_and_what_is_here_is_within(text: str) -> None:
+    requirement = Requirement(text)
+    assert {">=", "<"} <= {bound.operator for bound in requirement.specifier}
+    try:
+        assert requirement.specifier.contains(version(requirement.name))
+    except PackageNotFoundError:
+        return  # an extra that is not installed here
+
+
+def test_one_package_has_the_same_bounds_wherever_it_is_named() -> None:
+    names = [Requirement(text).name for text in ALL]
+    assert len(names) == len(set(names))
+
+
+def imported(module: str, seen: set[str]) -> set[str]:
+    """Top-level packages, ours aside, that a module of ours and what it imports at its head import."""
+    path = REPO / "service" / Path(*module.split("."))
+    path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    if module in seen or not path.is_file():
+        return set()
+    seen.add(module)
+    found: set[str] = set()
+    for node in ast.parse(path.read_text()).body:
+        names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+        if isinstance(node, ast.ImportFrom):
+            names = [node.module or "", *(f"{node.module}.{a.name}" for a in node.names)]
+        for name in names:
+            found |= imported(name, seen) if name.startswith("soilbus") else {name.partition(".")[0]}
+    return found
+
+
+def test_the_daemon_imports_no_more_than_it_may() -> None:
+    foreign = imported("soilbus.daemon.start", set()) - sys.stdlib_module_names
+    assert foreign <= OF_THE_DAEMON
