@@ -219,5 +219,5 @@ def test_sysusers_makes_the_user_that_the_unit_names(tmp_path: Path, tool) -> No
 
 
 def test_documented_units_are_all_there() -> None:
-    named = set(re.findall(r"`([\w@.-]+\.(?:service|network|sysusers))`", (UNITS / "README.md").read_text()))
+    named = set(re.findall(r"`([\w@.-]+\.(?:service|network|sysctl|sysusers))`", (UNITS / "README.md").read_text()))
     assert named == {path.name for path in UNITS.iterdir() if path.suffix != ".md"}
