@@ -14,7 +14,7 @@ import pytest
 from installation import REPO, prepare, properties
 
 # OpenBLAS asks for mbind when it is loaded, and can do without.
-DROPIN = ("WatchdogSec=4", "SystemCallErrorNumber=kill", "SystemCallFilter=~mbind:EPERM")
+DROPIN = ("WatchdogSec=6", "SystemCallErrorNumber=kill", "SystemCallFilter=~mbind:EPERM")
 
 
 @pytest.fixture(scope="module")
