@@ -28,10 +28,10 @@ cursor() { cursor=$(journalctl -q -n 0 --show-cursor | sed -n 's/^-- cursor: //p
 # Nothing to do: silence, then no bus at all, then another bus of the same name.
 cursor
 systemctl start $unit || { note failed; journalctl --no-pager -n 50; exit 1; }
-sleep 6
+sleep 8
 says no_frames && text >"$out/silent"
 ip link set vcan1 down
-sleep 6
+sleep 8
 text >"$out/down"
 ip link del vcan1
 sleep 1

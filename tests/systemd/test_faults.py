@@ -14,7 +14,7 @@ import pytest
 from installation import REPO, prepare, properties
 
 # OpenBLAS asks for mbind when it is loaded, and can do without.
-DROPIN = ("WatchdogSec=4", "SystemCallErrorNumber=kill", "SystemCallFilter=~mbind:EPERM")
+DROPIN = ("WatchdogSec=6", "SystemCallErrorNumber=kill", "SystemCallFilter=~mbind:EPERM")
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,6 @@ def test_the_state_outlives_restarts(out: Path) -> None:
     assert state["totals"]["windows"] > 4
     assert state["totals"]["failed.internal"] >= 3
     assert state["totals"]["bus.sent"] > 100
-    assert state["belief"] is not None
     assert json.loads((out / "fresh.json").read_text())["state"]["starts"] == 1
 
 
