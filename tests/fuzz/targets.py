@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import can
 import numpy as np
+from cantools.database import Database
 
 from fakes import FakeClock, InlineExecutor, ScriptedBus
 from soilbus.assembly import completion_of, effects_of
@@ -67,9 +68,9 @@ def moment() -> tuple[Known, ...]:
 
 
 def good_stream() -> list[bytes]:
-    """The moment over and over, at some 50 Hz, for 3 s; and the same with bits turned over."""
+    """The moment over and over, at some 50 Hz, for 6 s; and the same with bits turned over."""
     n = len(moment())
-    rows = [bytes([0, i % n, 2 if i % n else 5, 0, *bytes(8)]) for i in range(n * 150)]
+    rows = [bytes([0, i % n, 2 if i % n else 5, 0, *bytes(8)]) for i in range(n * 300)]
     rng = np.random.default_rng(1)
     bent = [row[:3] + b"\1" + (rng.bytes(8) if rng.random() < 0.2 else bytes(8)) for row in rows]
     return [b"".join(rows[: 40 * n]), b"".join(bent[: 40 * n]), b"".join(rows), b"".join(bent)]
@@ -83,8 +84,13 @@ def check_frames(data: bytes) -> int:
     return _admitted(_intake(), frames_of(data, moment()))
 
 
+@cache
+def vehicle() -> Database:
+    return load_databases(reference())
+
+
 def _intake() -> Intake:
-    return Intake(reference(), load_databases(reference()))
+    return Intake(reference(), vehicle())
 
 
 def _admitted(intake: Intake, stream: Iterator[Fed]) -> int:
@@ -152,7 +158,7 @@ def check_service(data: bytes) -> int:
     wire = _Paced(clock, messages)
     database = output_database(reference())
     bus = LiveBus(lambda: wire, clock, clock.sleep)
-    pipeline = Pipeline(reference(), load_databases(reference()))
+    pipeline = Pipeline(reference(), vehicle())
     service = Service(reference(), pipeline, bus, Publisher(database), Notifier(), InlineExecutor(), clock)
     end = clock.now + 0.005 * len(messages) + 2.0
     rounds = 0
