@@ -250,9 +250,7 @@ class Intake:
 
     def latest(self, now: float) -> Latest:
         """Slip and pull over the last moments before `now` [s]."""
-        if (
-            self._bins is None or not now - self._newest <= LONGEST_GAP
-        ):  # nor nan; there are no bins for years of silence
+        if self._bins is None or not abs(now - self._newest) <= LONGEST_GAP:  # nor nan: no bins for years of silence
             return Latest(dict.fromkeys(self.rig.wheels), None)
         last = math.floor((now - self._bins.origin) / self._settings.bin) * self._settings.bin + self._bins.origin
         window = without(self._bins.glimpse(last - SLIP_SPAN, last), self.rig, set(self._lying))
