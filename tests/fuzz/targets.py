@@ -44,10 +44,14 @@ MOST_FRAMES = 20_000
 
 
 class Target(NamedTuple):
-    """`one` takes an input and says how many frames it held; seeds are good inputs to start from."""
+    """`one` takes an input and says how many frames it held; seeds are good inputs to start from.
+
+    A guided fuzzer gets on with inputs of at most `longest` bytes.
+    """
 
     one: Callable[[bytes], int]
     seeds: Callable[[], list[bytes]]
+    longest: int = 1 << 16
 
 
 @cache
@@ -307,9 +311,9 @@ def _model_seeds() -> list[bytes]:
 
 
 TARGETS: dict[str, Target] = {
-    "frames": Target(check_frames, good_stream),
-    "windows": Target(check_windows, good_stream),
-    "service": Target(check_service, lambda: good_stream()[:2]),
+    "frames": Target(check_frames, good_stream, 200 * RECORD),
+    "windows": Target(check_windows, good_stream, 600 * RECORD),
+    "service": Target(check_service, lambda: good_stream()[:2], 600 * RECORD),
     "dbc": Target(check_dbc, _dbc_seeds),
     "config": Target(check_config, lambda: [TRACTOR.read_bytes()]),
     "model": Target(check_model, _model_seeds),
