@@ -170,6 +170,21 @@ def test_readings_may_repeat_as_often_as_their_noise_lets_them(good):
         assert implausible(at_rest, RIG, s.min_speed, s.max_turn, s.bin, given) == names
 
 
+def test_a_radar_coarser_than_its_signal_is_not_frozen(good):
+    """Steps of 0.1 km/h inside a sensor whose signal has steps of 1 mm/s: readings stay for seconds, here and there."""
+    window, _ = good
+    step = 0.1 / 3.6
+    slowly = 1.3 + 0.08 * np.sin(2.0 * np.pi * (window.t - window.t[0]) / 25.0)
+    coarse = step * np.round(slowly / step)
+    same = np.diff(coarse) == 0.0
+    assert max(end - first for first, end in runs(same)) > 10
+    speed = slowly[:, None] / RIG.radius / 0.8
+    assert judged(_changed(window, ground_speed=coarse, speed=speed), None) == ()
+    alive = slowly + 0.01 * np.random.default_rng(1).standard_normal(len(coarse))
+    alive[50:] = alive[50]
+    assert judged(_changed(window, ground_speed=alive, speed=speed), None) == ("ground_speed",)
+
+
 @given(st.lists(st.booleans(), max_size=40), st.integers(1, 12))
 @settings(derandomize=True, deadline=None)
 def test_runs(holds, bins):

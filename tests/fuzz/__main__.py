@@ -64,7 +64,7 @@ def _guided(name, targets, seconds: int, seed: int) -> int:
     target = targets[name]
     folder = Path(tempfile.mkdtemp(prefix=f"soilbus-fuzz-{name}-"))
     for i, data in enumerate(target.seeds()):
-        (folder / f"seed{i}").write_bytes(data)
+        (folder / f"seed{i}").write_bytes(data[: target.longest])
     frames = 0
 
     def one(data: bytes) -> None:
@@ -73,7 +73,7 @@ def _guided(name, targets, seconds: int, seed: int) -> int:
 
     flags = [
         f"-max_total_time={seconds}", f"-seed={seed}", f"-timeout={LONGEST}", f"-rss_limit_mb={LARGEST}",
-        "-max_len=65536", "-print_final_stats=1", f"-artifact_prefix={name}-",
+        f"-max_len={target.longest}", "-print_final_stats=1", f"-artifact_prefix={name}-",
     ]  # fmt: skip
     atheris.Setup([sys.argv[0], *flags, str(folder)], one)
     import atexit

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import can
 import numpy as np
+from cantools.database import Database
 
 from fakes import FakeClock, InlineExecutor, ScriptedBus
 from soilbus.assembly import completion_of, effects_of
@@ -28,7 +29,7 @@ from soilbus.daemon.service import Service
 from soilbus.simulator.frames import frames, write_log
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import TRACTOR, reference_configuration
-from soilbus.simulator.scenario import excited
+from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Effect
 
@@ -37,15 +38,20 @@ from .stream import RECORD, Fed, Known, frames_of
 MOTORS = [f"wheel.{w}.motor_speed=Motor{w}.ShaftSpeed" for w in ("FL", "FR", "RL", "RR")]
 MOST_WINDOWS = 62
 """Per frame: a clock that is set ahead by hours costs a minute of empty windows."""
+ROUNDS = 16
 MOST_FRAMES = 20_000
 """Of one log that are read."""
 
 
 class Target(NamedTuple):
-    """`one` takes an input and says how many frames it held; seeds are good inputs to start from."""
+    """`one` takes an input and says how many frames it held; seeds are good inputs to start from.
+
+    A guided fuzzer gets on with inputs of at most `longest` bytes.
+    """
 
     one: Callable[[bytes], int]
     seeds: Callable[[], list[bytes]]
+    longest: int = 1 << 16
 
 
 @cache
@@ -55,24 +61,29 @@ def reference() -> Config:
 
 @cache
 def drive() -> tuple[can.Message, ...]:
-    """Two seconds of a good drive."""
-    return tuple(frames(simulate(reference(), excited("loam", 2.0), seed=3), reference()))
+    """Two seconds of a drive on clay that is too soft for the draft, where GO would always be wrong."""
+    soft = Scenario(
+        2.0, (Patch(0.0, "wet_clay"),), Swing(1.2, 1.6), draft=Swing(2e3, 4e3), lift_slip=Swing(0.5, 0.65)
+    )  # fmt: skip
+    return tuple(frames(simulate(reference(), soft, seed=3), reference()))
 
 
 @cache
-def moment() -> tuple[Known, ...]:
-    """The last frame of each message of a good drive."""
-    last = {m.arbitration_id: Known(m.arbitration_id, m.is_extended_id, bytes(m.data)) for m in drive()}
-    return tuple(last.values())
+def known() -> tuple[Known, ...]:
+    """Its last ROUNDS frames of each message, round after round: a whole turn of the counters."""
+    of: dict[int, list[Known]] = {}
+    for m in drive():
+        of.setdefault(m.arbitration_id, []).append(Known(m.arbitration_id, m.is_extended_id, bytes(m.data)))
+    return tuple(k for turn in zip(*(frames[-ROUNDS:] for frames in of.values()), strict=True) for k in turn)
 
 
 def good_stream() -> list[bytes]:
-    """The moment over and over, at some 50 Hz, for 3 s; and the same with bits turned over."""
-    n = len(moment())
-    rows = [bytes([0, i % n, 2 if i % n else 5, 0, *bytes(8)]) for i in range(n * 150)]
+    """These frames over and over, at some 50 Hz; and the same with bits turned over in every fifth."""
+    n, messages = len(known()), len(known()) // ROUNDS
+    rows = [bytes([0, i % n, 2 if i % messages else 5, 0, *bytes(8)]) for i in range(20 * n)]
     rng = np.random.default_rng(1)
     bent = [row[:3] + b"\1" + (rng.bytes(8) if rng.random() < 0.2 else bytes(8)) for row in rows]
-    return [b"".join(rows[: 40 * n]), b"".join(bent[: 40 * n]), b"".join(rows), b"".join(bent)]
+    return [b"".join(some) for some in (rows[: 5 * n], bent[: 5 * n], rows, bent)]
 
 
 # --- frames: decoding, admission, binning
@@ -80,11 +91,16 @@ def good_stream() -> list[bytes]:
 
 def check_frames(data: bytes) -> int:
     """Every frame of a mapped message is admitted or refused for one reason; samples are numbers in their order."""
-    return _admitted(_intake(), frames_of(data, moment()))
+    return _admitted(_intake(), frames_of(data, known()))
+
+
+@cache
+def vehicle() -> Database:
+    return load_databases(reference())
 
 
 def _intake() -> Intake:
-    return Intake(reference(), load_databases(reference()))
+    return Intake(reference(), vehicle())
 
 
 def _admitted(intake: Intake, stream: Iterator[Fed]) -> int:
@@ -116,7 +132,7 @@ def check_windows(data: bytes) -> int:
     """Windows come in their order and end; no sensor's reading is infinite in them."""
     intake = _intake()
     n, now, seen = 0, 0.0, 0
-    for n, frame in enumerate(frames_of(data, moment()), 1):
+    for n, frame in enumerate(frames_of(data, known()), 1):
         intake.admission.feed(*frame)
         now = frame.t if math.isfinite(frame.t) else now
         if n % 100 == 0:
@@ -139,20 +155,20 @@ def _looked_at(intake: Intake, now: float) -> int:
 
 
 def check_service(data: bytes) -> int:
-    """The loop sends what the DBC can say, at its times, and never GO: no moment repeated for ever is a drive."""
+    """The loop sends what the DBC can say, at its times, and never GO."""
     clock = FakeClock()
     messages = [
         can.Message(
             timestamp=f.t, arbitration_id=f.identifier, is_extended_id=f.extended, is_remote_frame=f.remote,
             data=b"" if f.remote else f.data[:8],
         )
-        for f in frames_of(data[: RECORD * 600], moment())
+        for f in frames_of(data[: RECORD * 2400], known())
         if f.extended or f.identifier <= 0x7FF
     ]  # fmt: skip
     wire = _Paced(clock, messages)
     database = output_database(reference())
     bus = LiveBus(lambda: wire, clock, clock.sleep)
-    pipeline = Pipeline(reference(), load_databases(reference()))
+    pipeline = Pipeline(reference(), vehicle())
     service = Service(reference(), pipeline, bus, Publisher(database), Notifier(), InlineExecutor(), clock)
     end = clock.now + 0.005 * len(messages) + 2.0
     rounds = 0
@@ -193,7 +209,7 @@ def check_dbc(data: bytes) -> int:
             intake = Intake(config, load_databases(config))
         except ConfigError as error:
             return _told(error.faults)
-        return _admitted(intake, frames_of(_some_frames(), moment()))
+        return _admitted(intake, frames_of(_some_frames(), known()))
 
 
 def check_config(data: bytes) -> int:
@@ -205,7 +221,7 @@ def check_config(data: bytes) -> int:
             pipeline = Pipeline(config, load_databases(config))
         except ConfigError as error:
             return _told(error.faults)
-        return _admitted(pipeline.intake, frames_of(_some_frames(), moment()))
+        return _admitted(pipeline.intake, frames_of(_some_frames(), known()))
 
 
 def check_model(data: bytes) -> int:
@@ -295,9 +311,9 @@ def _model_seeds() -> list[bytes]:
 
 
 TARGETS: dict[str, Target] = {
-    "frames": Target(check_frames, good_stream),
-    "windows": Target(check_windows, good_stream),
-    "service": Target(check_service, good_stream),
+    "frames": Target(check_frames, good_stream, 200 * RECORD),
+    "windows": Target(check_windows, good_stream, 600 * RECORD),
+    "service": Target(check_service, lambda: good_stream()[:2], 600 * RECORD),
     "dbc": Target(check_dbc, _dbc_seeds),
     "config": Target(check_config, lambda: [TRACTOR.read_bytes()]),
     "model": Target(check_model, _model_seeds),

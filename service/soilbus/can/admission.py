@@ -124,7 +124,7 @@ class Admission:
         self._inboxes: list[_Inbox] = []
         self._by_key: dict[int, _Inbox] = {}
         self._groups: dict[int, _Inbox] = {}
-        self._step_below = -math.inf
+        self._earliest = math.inf  # an earlier stamp does not follow the last one; inf: there is none
         by_message: dict[str, list[Channel]] = {}
         for channel in channels:
             by_message.setdefault(channel.message, []).append(channel)
@@ -147,12 +147,9 @@ class Admission:
             inbox = self._inbox_of_group(arbitration_id, extended)
             if inbox is None:
                 return
-        if t > LAST_TIME or t < -LAST_TIME:
-            self._refuse_unheard(inbox, Reason.BAD_TIME)
+        if not self._earliest <= t <= LAST_TIME and not self._is_time(inbox, t):
             return
-        if t < self._step_below:
-            self._step_clock()
-        self._step_below = t - CLOCK_STEP
+        self._earliest = t - CLOCK_STEP
         if remote:
             self._refuse_unheard(inbox, Reason.REMOTE_FRAME)
         else:
@@ -202,6 +199,15 @@ class Admission:
         if key in self.counts.unknown_ids or len(self.counts.unknown_ids) < MAX_LISTED_UNKNOWN:
             self.counts.unknown_ids[key] += 1
         return None
+
+    def _is_time(self, inbox: _Inbox, t: float) -> bool:
+        """Whether a stamp that does not follow the last one is of a clock that was set; else its frame is refused."""
+        if t < -LAST_TIME or t > LAST_TIME:
+            self._refuse_unheard(inbox, Reason.BAD_TIME)
+            return False
+        if t < self._earliest < math.inf:
+            self._step_clock()
+        return True
 
     def _step_clock(self) -> None:
         """Believe the new time; what was filed under the old one has no place in it."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from soilbus.assembly import rig_of
 from soilbus.can.admission import Admission
-from soilbus.can.channels import Channel, Decoded
+from soilbus.can.channels import Channel, Column, Decoded
 from soilbus.can.dbc_files import checked_messages
 from soilbus.can.mapping import POSITION_ROLES, channels_of
 from soilbus.config import Config
@@ -140,6 +140,7 @@ class Intake:
         self._lying: tuple[str, ...] = ()
         self.next_end = math.inf
         self.last_seen: dict[str, float] = {}
+        self._newest = -math.inf  # stamp of the latest sample, admitted or refused
         self._clock_steps = self.admission.counts.clock_steps
 
     def ingest(self, until: float = math.inf) -> None:
@@ -148,10 +149,16 @@ class Intake:
         if self.admission.counts.clock_steps != self._clock_steps:
             self._restart()
         self.refusals.add(decoded)
-        if self._bins is None and (first := _first_time(decoded)) is not None:
-            origin = first - EDGE_LEAD
-            self._bins = BinStore(self.rig, self._settings.bin, origin)
-            self.next_end = origin + self._settings.window
+        if (times := _times(decoded)) is not None:
+            first, last = times
+            if last - (self._newest if self._bins is not None else first) > LONGEST_GAP:
+                decoded, first = _after_silence(decoded, self._newest)
+                if first > self._newest + LONGEST_GAP:
+                    self._restart()
+            self._newest = max(self._newest, last)
+            if self._bins is None:
+                self._bins = BinStore(self.rig, self._settings.bin, first - EDGE_LEAD)
+                self.next_end = first - EDGE_LEAD + self._settings.window
         heard = {name: (c.t, c.value) for name, c in decoded.columns.items() if len(c.t)}
         self.last_seen |= {name: float(t[-1]) for name, (t, _) in heard.items()}
         for name, (t, value) in heard.items():
@@ -176,7 +183,7 @@ class Intake:
             self.ingest(self.next_end)
             if self.next_end > now or self._bins is None:  # the clock was set meanwhile
                 break
-            if self.last_seen and self.next_end - max(self.last_seen.values()) > LONGEST_GAP:
+            if self.next_end - self._newest > LONGEST_GAP:
                 self._restart()
                 break
             tasks.append(self._task(self._bins, self.next_end))
@@ -243,8 +250,7 @@ class Intake:
 
     def latest(self, now: float) -> Latest:
         """Slip and pull over the last moments before `now` [s]."""
-        silent = now - max(self.last_seen.values(), default=-math.inf)
-        if self._bins is None or not silent <= LONGEST_GAP:  # nor nan; there are no bins for years of silence
+        if self._bins is None or not abs(now - self._newest) <= LONGEST_GAP:  # nor nan: no bins for years of silence
             return Latest(dict.fromkeys(self.rig.wheels), None)
         last = math.floor((now - self._bins.origin) / self._settings.bin) * self._settings.bin + self._bins.origin
         window = without(self._bins.glimpse(last - SLIP_SPAN, last), self.rig, set(self._lying))
@@ -263,10 +269,24 @@ class Intake:
         return dict(zip(self.rig.wheels, column_means(slip), strict=True))
 
 
-def _first_time(decoded: Decoded) -> float | None:
-    """Time of the earliest sample, admitted or refused; None where there is none."""
-    times = [c.t[0] for c in decoded.columns.values() if len(c.t)] + [t[0] for t in decoded.refused.values()]
-    return float(min(times)) if times else None
+def _times(decoded: Decoded) -> tuple[float, float] | None:
+    """Times of the earliest and of the latest sample, admitted or refused; None where there is none."""
+    ends = [(c.t[0], c.t[-1]) for c in decoded.columns.values() if len(c.t)]
+    ends += [(known.min(), known.max()) for t in decoded.refused.values() if len(known := t[np.isfinite(t)])]
+    return (float(min(first for first, _ in ends)), float(max(last for _, last in ends))) if ends else None
+
+
+def _after_silence(decoded: Decoded, newest: float) -> tuple[Decoded, float]:
+    """What came after the last LONGEST_GAP without a sample, counted from `newest` [s] on, and when it begins [s].
+
+    A clock that is set ahead makes such a gap between two frames of one batch.
+    """
+    times = [c.t for c in decoded.columns.values()] + [t[np.isfinite(t)] for t in decoded.refused.values()]
+    t = np.sort(np.concatenate(times))
+    gaps = np.flatnonzero(np.diff(t, prepend=newest) > LONGEST_GAP)
+    begin = float(t[gaps[-1]] if len(gaps) else t[0])
+    columns = {n: Column(c.t[c.t >= begin], c.value[c.t >= begin]) for n, c in decoded.columns.items()}
+    return Decoded(columns, decoded.refused), begin
 
 
 def column_means(rows: Array) -> list[float | None]:

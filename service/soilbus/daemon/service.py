@@ -204,6 +204,8 @@ class Service:
                 "model_gap: for minutes the model has not described %s (chi-square; 1 is noise); "
                 "record a drive with candump -l and run: soilbus diagnose --config F LOG", told,
             )  # fmt: skip
+        if _kind(result.reason) == "implausible" and (self.result is None or self.result.reason != result.reason):
+            log.warning("%s: contradicts the other sensors, not used in this window", result.reason)
         self.result, self._ended = result, ended
         able = result.traversability.capability
         if able is not None and result.status is Status.VALID:

@@ -39,6 +39,8 @@ SAME = 1e-12
 """Relative difference of means of equal readings: rounding."""
 CHANCE = 1e-12
 """Chance, by the noise that the sensor is said to have, below which a run of equal readings is a frozen sensor."""
+COARSE = 0.1
+"""Share of repeated readings elsewhere in the window by which a sensor is coarser than its signal, not frozen."""
 STILL_SHARE = 0.1
 """Rim speed, as a share of the ground speed, below which a wheel does not turn."""
 BRAKED = 0.2
@@ -174,8 +176,11 @@ def frozen(scene: Scene) -> Iterator[str]:
     for i in np.flatnonzero(same.sum(axis=0) >= scene.sustained).tolist():
         name = rig.channels[i]
         noise, resolution = rig.noise[name.partition(".")[0]], scene.resolution.get(name, Resolution(0.0, False))
-        stretches = ((first, last + 1) for first, last in runs(same[:, i]) if last - first >= scene.sustained)
-        if any(_stuck(float(value[first, i]), variance[first:end, i], noise, resolution) for first, end in stretches):
+        stretches = [(first, last) for first, last in runs(same[:, i]) if last - first >= scene.sustained]
+        within = sum(last - first for first, last in stretches)
+        if same[:, i].sum() - within > COARSE * (np.isfinite(value[:, i]).sum() - within):
+            continue
+        if any(_stuck(float(value[a, i]), variance[a : b + 1, i], noise, resolution) for a, b in stretches):
             yield name
 
 
