@@ -341,6 +341,9 @@ def figures(able) -> dict[str, Estimate]:
         ("loam", Swing(0.08, 0.15), 1100.0),
         ("wet_clay", Swing(0.05, 0.40), 2400.0),
         ("lete_sand", Swing(0.05, 0.40), 1100.0),
+        ("clayey_soil_38", Swing(0.05, 0.40), 2400.0),
+        ("upland_sandy_loam_51", Swing(0.08, 0.15), 2400.0),
+        ("heavy_clay_40", Swing(0.05, 0.40), 1100.0),
     ],
 )
 def test_means_and_deviations_equal_monte_carlo(name, slip, limit, monkeypatch):

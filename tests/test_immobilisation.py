@@ -250,6 +250,7 @@ def test_figures_of_trials_that_have_them():
     sudden = WarningTrial("draft", 20.0, 1, 1.5, 2.0, 2.2, 3.0)
     found = figures("draft", [early, late, short, never, sudden])
     assert (found.boggings, found.warned, found.sudden, found.hours) == (3, 2, 1, 0.0)
+    assert found.delay == pytest.approx(0.7)
     assert (found.lead, found.least) == (2.5, 2.0)
     assert WarningTrial("draft", 20.0, 1, 1.5, 2.0, 4.5, 3.0).sudden is False  # time enough to react and to warn
     firm = figures("firm", [WarningTrial("firm", 1800.0, n, math.nan, math.nan) for n in (0, 1)])

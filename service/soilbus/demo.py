@@ -22,7 +22,8 @@ from soilbus.can.dbc_files import filters_of, output_database
 from soilbus.config import Config
 from soilbus.daemon.pipeline import WindowResult
 from soilbus.daemon.start import start_service
-from soilbus.report.dashboard import Dashboard, show
+from soilbus.report.dashboard import show
+from soilbus.report.readings import Readings
 from soilbus.report.table import table
 from soilbus.simulator.frames import frames
 from soilbus.simulator.play import send_in_time
@@ -54,7 +55,7 @@ def run_demo(duration: float) -> None:
             worker = threading.Thread(target=service.run, daemon=True)
             worker.start()
             sender.start()
-            show(Dashboard(ours), ear, console, done=lambda: not sender.is_alive())
+            show(Readings(ours), ear, console, done=lambda: not sender.is_alive())
             service.stop()
             worker.join(timeout=2.0)
     console.print("\n" + _story(results), highlight=False, end="")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 
 import can
 import pytest
@@ -11,7 +12,8 @@ from rich.console import Console
 from fakes import FakeClock
 from soilbus.can.dbc_files import output_database
 from soilbus.can.publish import Publisher
-from soilbus.report.dashboard import Dashboard
+from soilbus.report.dashboard import WIDTH, panel
+from soilbus.report.readings import Readings
 from soilbus.simulator.reference import reference_configuration
 
 
@@ -19,7 +21,7 @@ from soilbus.simulator.reference import reference_configuration
 def setup():
     database = output_database(reference_configuration())
     clock = FakeClock()
-    return Publisher(database), Dashboard(database, clock), clock
+    return Publisher(database), Readings(database, clock), clock
 
 
 def message(frame) -> can.Message:
@@ -27,8 +29,8 @@ def message(frame) -> can.Message:
 
 
 def shown(dashboard) -> str:
-    console = Console(width=90, record=True, file=io.StringIO())
-    console.print(dashboard.render())
+    console = Console(width=WIDTH, record=True, file=io.StringIO())
+    console.print(panel(dashboard))
     return console.export_text()
 
 
@@ -88,7 +90,7 @@ def test_the_warning_and_the_best_slips_are_shown(setup):
     advice = {"SlipForEfficiencyFront": 0.123, "SlipForEfficiencyRear": 0.105}
     dashboard.receive(message(publisher.frame("TractionAdvice", advice)))
     assert "GETTING STUCK" not in shown(dashboard)
-    assert "best slip 0.12/0.10" in shown(dashboard)
+    assert re.search(r"efficiency +0\.12 +0\.10", shown(dashboard))
     dashboard.receive(message(publisher.frame("DemandForecast", {"Warning": "immobilisation", "TimeLeft": 4.2})))
     assert "GETTING STUCK in 4 s" in shown(dashboard)
     clock.now += 1.0
@@ -106,3 +108,76 @@ def test_the_soil_class_is_shown_while_it_is_fresh(setup):
     assert "sandy_loam" not in shown(dashboard)
     dashboard.receive(message(publisher.frame("SoilClass", {"Kind": "unknown", "Probability": 0.6})))
     assert "soil: unknown (0.60)" in shown(dashboard)
+
+
+WHOLE = {
+    "SoilbusStatus": {"State": "valid", "Reason": "none", "RejectedShare": 2.0},
+    "SoilbusIdentity": {"VersionMajor": 0, "VersionMinor": 3, "VersionPatch": 1, "Uptime": 5},
+    "WheelSlip": {f"SlipWheel{i}": 0.11 for i in range(1, 5)},
+    "WheelSlip2": {"SlipWheel5": 0.15, "SlipWheel6": 0.16},
+    "Traversability": {
+        "State": "go", "LimitingCause": "slip", "Probability": 0.97, "Age": 0.4, "SinceValid": 1.4, "Window": 7
+    },
+    "TorqueDemand": {"TorqueRequired": 3456, "TorqueAvailable": 9600},
+    "DraftCapability": {"MaxDraft": 6410, "MaxDraftStd": 110},
+    "GradeCapability": {"MaxGrade": 0.271, "MaxGradeStd": 0.004},
+    "SoilStrength": {"BearingPressure": 99.1, "BearingPressureStd": 0.45, "Chi2": 1.3},
+    "SoilCohesiveModulus": {"Value": 5.3, "Std": 2.0},
+    "SoilFrictionalModulus": {"Value": 1515.0, "Std": 30.0},
+    "SoilSinkageExponent": {"Value": 0.7, "Std": 0.02},
+    "SoilFrictionAngle": {"Value": 29.0, "Std": 0.6},
+    "SoilCohesion": {"Value": 1.7, "Std": 0.4},
+    "SoilShearModulus": {"Value": 25.0, "Std": 3.0},
+    "WheelSinkage": {f"SinkageWheel{i}": 31.0 for i in range(1, 5)},
+    "WheelSinkage2": {"SinkageWheel5": 35.0, "SinkageWheel6": 36.0},
+    "TractionAdvice": {
+        "SlipForEfficiencyFront": 0.12, "SlipForEfficiencyRear": 0.1, "SlipForPullFront": 0.6, "SlipForPullRear": 0.55
+    },
+    "TractionLimits": {"MaxDraft": 5900, "MaxDraftStd": 120, "MaxGrade": 0.13, "MaxGradeStd": 0.006},
+    "DemandForecast": {"Slip": 0.21, "SlipStd": 0.01, "Sinkage": 44.0, "Warning": "immobilisation", "TimeLeft": 4.2},
+    "SoilClass": {"Kind": "sandy_loam_15", "Probability": 0.93, "UnknownProbability": 0.05},
+}  # fmt: skip
+SAID = {
+    "SoilbusStatus": ("service: valid", "refused 2.0 %"), "SoilbusIdentity": ("soilbus 0.3.1",),
+    "WheelSlip": ("+0.11",), "WheelSlip2": ("+0.15", "+0.16"),
+    "Traversability": (" GO ", "p = 0.97", "limit: slip", "0.4 s old", "valid 1.4 s ago"),
+    "TorqueDemand": ("torque 3456 of 9600 N m",), "DraftCapability": ("6410 ± 110",),
+    "GradeCapability": ("0.271 ± 0.004",), "SoilStrength": ("99.1 ± 0.45", "1.3"),
+    "SoilCohesiveModulus": ("5.3 ± 2",), "SoilFrictionalModulus": ("1515 ± 30",),
+    "SoilSinkageExponent": ("0.7 ± 0.02",), "SoilFrictionAngle": ("29 ± 0.6",), "SoilCohesion": ("1.7 ± 0.4",),
+    "SoilShearModulus": ("25 ± 3",), "WheelSinkage": ("31",), "WheelSinkage2": ("35", "36"),
+    "TractionAdvice": ("0.12   0.10", "0.60   0.55"), "TractionLimits": ("5900 ± 120", "0.13 ± 0.006"),
+    "DemandForecast": ("slip to come 0.21", "sinkage 44 mm", "GETTING STUCK in 4 s"),
+    "SoilClass": ("soil: sandy_loam_15 (0.93)", "none of the known 0.05"),
+}  # fmt: skip
+
+
+def test_every_frame_is_shown_and_gone_when_it_is_stale(setup):
+    publisher, dashboard, clock = setup
+    assert set(SAID) == set(WHOLE) == set(publisher.schedule)
+    for name, values in WHOLE.items():
+        before = shown(dashboard)
+        dashboard.receive(message(publisher.frame(name, values)))
+        text = shown(dashboard)
+        for words in SAID[name]:
+            assert words in text, name
+            assert words not in before, name
+        assert max(len(line) for line in text.splitlines()) <= WIDTH
+    clock.now += 4.0
+    text = shown(dashboard)
+    assert not [words for said in SAID.values() for words in said if words in text]
+
+
+def test_what_is_not_vouched_for_is_grey(setup):
+    publisher, dashboard, _ = setup
+    for status, grey in (("valid", False), ("not_excited", True), ("degraded", True)):
+        values = {"MaxDraft": 6410, "MaxDraftStd": 110, "Status": status}
+        dashboard.receive(message(publisher.frame("DraftCapability", values)))
+        console = Console(width=WIDTH, record=True, file=io.StringIO(), force_terminal=True, color_system="standard")
+        console.print(panel(dashboard))
+        (line,) = (line for line in console.export_text(styles=True).splitlines() if "6410" in line)
+        assert ("\x1b[2m6410" in line) == grey
+        assert dashboard.is_valid("DraftCapability") != grey
+    assert not dashboard.is_valid("TractionAdvice")
+    dashboard.receive(message(publisher.frame("WheelSlip", WHOLE["WheelSlip"])))
+    assert dashboard.is_valid("WheelSlip")  # has no status of its own

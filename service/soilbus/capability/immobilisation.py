@@ -40,9 +40,12 @@ SETTLED = 2.0
 AHEAD = 10.0
 """Time left [s] from which is warned."""
 MUCH = 0.78
-"""Share of the capacity from which a rise of the demand beyond its last peaks is carried on."""
+"""Share of the capacity from which a rise of the demand beyond its last peaks is carried on, and no warning ends."""
 WEAKENING, SHORT_WEAKENING = 0.006, 0.03
 """Loss [1/s], as a share of the capacity, from which the ground is said to weaken, by the long and the short memory."""
+STEEPER = 1.6
+"""Times that a loss will still grow which the short memory sees so much steeper than the long one: front wheels meet
+an edge first, rear ones a wheelbase later."""
 SURE = 2.5
 """Standard deviations by which such a loss must differ from none."""
 STEADY = 0.003
@@ -115,7 +118,8 @@ def watched(before: Watch, t: float, slip: Iterable[float | None], pull: float |
             rise = demand.line().slope
             to_limit = _time_of_creep(creep, float(curve.slip[-1]), rise / (pull + reserve))
             time_left = min(_time_left(capacity, pull, rise, peaks.greatest), to_limit)
-    caused = t if time_left is not None and time_left < AHEAD else before.caused
+    still = before.warning is Alert.IMMOBILISATION and pull > MUCH * (pull + reserve)
+    caused = t if still or (time_left is not None and time_left < AHEAD) else before.caused
     warning = Alert.UNKNOWN if time_left is None else Alert.NONE
     if t - caused < CALM:
         warning = Alert.IMMOBILISATION
@@ -197,11 +201,12 @@ def _time_left(capacity: Capacity, asked: float, rise: float, peak: float) -> fl
     able = capacity.long.line()
     outgrows = asked >= peak and asked > MUCH * able.value and rise > able.slope
     to_rise = (able.value - asked) / (rise - able.slope) if outgrows else math.inf
-    weakening = (
-        _time_of_weakening(capacity, able, WEAKENING, peak),
-        _time_of_weakening(capacity, capacity.short.line(), SHORT_WEAKENING, peak),
-    )
-    return max(min(to_rise, *weakening), 0.0)
+    long = _time_of_weakening(capacity, able, WEAKENING, peak)
+    latest = capacity.short.line()
+    short = _time_of_weakening(capacity, latest, SHORT_WEAKENING, peak)
+    if latest.slope < STEEPER * min(able.slope, 0.0):
+        short /= STEEPER
+    return max(min(to_rise, long, short), 0.0)
 
 
 def _time_of_weakening(capacity: Capacity, line: Line, least: float, peak: float) -> float:

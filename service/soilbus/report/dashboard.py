@@ -1,26 +1,25 @@
-"""A live terminal dashboard that knows the tractor only by our frames, as any dashboard ECU would."""
+"""A live terminal dashboard that knows the tractor only by our frames, as any dashboard ECU would.
+
+Grey is what soilbus guesses but does not vouch for (Status other than valid); - is what nobody knows.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
 
 import can
-from cantools.database.can import Database
 from rich.console import Console, Group
 from rich.live import Live
 from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from soilbus.can.admission import checksum_byte_of
 from soilbus.can.bus import open_bus
-from soilbus.can.checksum import COUNTER, frame_checksum
 from soilbus.can.dbc_files import filters_of, output_database
 from soilbus.config import Config
+from soilbus.report.readings import Readings
 
-CYCLES_UNTIL_STALE = 3
 COLOURS = {"go": "green", "caution": "yellow", "no_go": "red", "unknown": "white"}
 PARAMETERS = {
     "k_c": ("SoilCohesiveModulus", "kN/m^(n+1)"),
@@ -30,125 +29,157 @@ PARAMETERS = {
     "c": ("SoilCohesion", "kPa"),
     "K": ("SoilShearModulus", "mm"),
 }
+LIMITS = {
+    # what: messages of draft and of slope
+    "on the level": ("DraftCapability", "GradeCapability"),
+    "here and now": ("TractionLimits", "TractionLimits"),
+}
+ADVICE = {"efficiency": "SlipForEfficiency", "pull": "SlipForPull"}
+WIDTH = 78
 
 
-class Dashboard:
-    """The last good frame of each message, and how old it is."""
+def panel(known: Readings) -> Panel:
+    """What a driver sees."""
+    way = str(known.value("Traversability", "State") or "unknown")
+    head = Text(f" {way.upper().replace('_', '-')} ", style=f"bold black on {COLOURS[way]}")
+    ground, task = (Table.grid(padding=(0, 4)) for _ in range(2))
+    ground.add_row(_soil(known), _wheels(known))
+    task.add_row(_limits(known), _advice(known))
+    told = (Text("  ".join(words)) for words in (_detail(known), _demand(known)))
+    parts = (head, _warning(known), *told, Text(" ".join(_kind(known))), Text(""))
+    last = (Text(""), task, Text(""), Text("  ".join(_service(known))))
+    return Panel(Group(*parts, ground, *last), title="soilbus", width=WIDTH)
 
-    def __init__(self, database: Database, clock: Callable[[], float] = time.monotonic) -> None:
-        self._messages = {m.frame_id: m for m in database.messages}
-        self._cycle = {m.name: (m.cycle_time or 1000) / 1000.0 for m in database.messages}
-        self._clock = clock
-        self._values: dict[str, dict[str, Any]] = {}
-        self._seen: dict[str, float] = {}
-        self.bad_frames = 0
 
-    def receive(self, message: can.Message) -> None:
-        """Take one frame; one with a wrong checksum or the counter of the one before counts as not received."""
-        layout = self._messages.get(message.arbitration_id) if message.is_extended_id else None
-        if layout is None or len(message.data) != layout.length:
-            return
-        place = checksum_byte_of(layout)
-        data = bytes(message.data)
-        if place is not None and data[place] != frame_checksum(message.arbitration_id, data, place):
-            self.bad_frames += 1
-            return
-        values: dict[str, Any] = layout.decode(data)  # type: ignore[assignment]
-        if COUNTER in values and values[COUNTER] == self._values.get(layout.name, {}).get(COUNTER):
-            self.bad_frames += 1
-            return
-        self._values[layout.name] = values
-        self._seen[layout.name] = self._clock()
+def _detail(known: Readings) -> Iterator[str]:
+    """Of the verdict."""
+    yield from _said(known, "Traversability", "Probability", "p = {:.2f}")
+    yield from _said(known, "Traversability", "LimitingCause", "limit: {}")
+    yield from _said(known, "Traversability", "Age", "{:.1f} s old")
+    yield from _said(known, "Traversability", "SinceValid", "valid {:.1f} s ago")
 
-    def value(self, message: str, signal: str) -> float | str | None:
-        """A signal's value or name; None where the frame is stale or the value not available."""
-        age = self._clock() - self._seen.get(message, -1e9)
-        if age > CYCLES_UNTIL_STALE * self._cycle[message] + 0.2:
-            return None
-        value = self._values[message].get(signal)
-        if isinstance(value, (int, float)):
-            return float(value)
-        name = str(value)
-        return None if name in ("not_available", "error") else name
 
-    def render(self) -> Panel:
-        """What a driver sees."""
-        way = str(self.value("Traversability", "State") or "unknown")
-        head = Text(f" {way.upper().replace('_', '-')} ", style=f"bold black on {COLOURS[way]}")
-        detail = "  ".join(
-            filter(
-                None,
-                (
-                    self._text("Traversability", "Probability", "p = {:.2f}"),
-                    self._text("Traversability", "LimitingCause", "limit: {}"),
-                    self._pair("DraftCapability", "MaxDraft", "MaxDraftStd", "max. draft {} N"),
-                    self._advice(),
-                    self._text("SoilClass", "Kind", "soil: {}") + self._text("SoilClass", "Probability", " ({:.2f})"),
-                    self._text("SoilbusStatus", "State", "service: {}"),
-                    self._text("SoilbusStatus", "Reason", "({})"),
-                ),
-            )
-        )
-        soil = Table(box=None, pad_edge=False)
-        for title in ("soil", "value ± std", "unit"):
-            soil.add_column(title)
-        soil.add_row("bearing pressure", self._pair("SoilStrength", "BearingPressure", "BearingPressureStd"), "kPa")
-        for name, (message, unit) in PARAMETERS.items():
-            soil.add_row(name, self._pair(message, "Value", "Std"), unit)
-        wheels = Table(box=None, pad_edge=False)
-        for title in ("wheel", "slip", "sinkage, mm"):
-            wheels.add_column(title)
-        for i in range(1, 5):
-            wheels.add_row(
-                str(i),
-                self._text("WheelSlip", f"SlipWheel{i}", "{:+.2f}") or "-",
-                self._text("WheelSinkage", f"SinkageWheel{i}", "{:.0f}") or "-",
-            )
-        body = Table.grid(padding=(0, 4))
-        body.add_row(soil, wheels)
-        return Panel(Group(head, self._warning(), Text(detail), Text(""), body), title="soilbus", width=76)
+def _kind(known: Readings) -> Iterator[str]:
+    yield from _said(known, "SoilClass", "Kind", "soil: {}")
+    yield from _said(known, "SoilClass", "Probability", "({:.2f})")
+    yield from _said(known, "SoilClass", "UnknownProbability", "none of the known {:.2f}")
 
-    def _warning(self) -> Text:
-        if self.value("DemandForecast", "Warning") != "immobilisation":
-            return Text("")
-        left = self._text("DemandForecast", "TimeLeft", " in {:.0f} s")
-        return Text(f" GETTING STUCK{left} ", style="bold white on red")
 
-    def _advice(self) -> str:
-        """Slips for best efficiency, front and rear."""
-        slips = (self._text("TractionAdvice", f"SlipForEfficiency{axle}", "{:.2f}") for axle in ("Front", "Rear"))
-        return "best slip " + "/".join(slip or "-" for slip in slips)
+def _demand(known: Readings) -> Iterator[str]:
+    """What the present task asks for, and what comes of it."""
+    needed, there = (known.number("TorqueDemand", f"Torque{what}") for what in ("Required", "Available"))
+    if needed is not None or there is not None:
+        yield "torque {} of {} N m".format(*("-" if x is None else f"{x:.0f}" for x in (needed, there)))
+    yield from _said(known, "DemandForecast", "Slip", "slip to come {:.2f}")
+    yield from _said(known, "DemandForecast", "Sinkage", "sinkage {:.0f} mm")
 
-    def _text(self, message: str, signal: str, form: str) -> str:
-        value = self.value(message, signal)
-        return "" if value is None or value == "none" else form.format(value)
 
-    def _pair(self, message: str, value: str, std: str, form: str = "{}") -> str:
-        v, s = self.value(message, value), self.value(message, std)
-        return "-" if not isinstance(v, float) or not isinstance(s, float) else form.format(f"{v:.3g} ± {s:.2g}")
+def _service(known: Readings) -> Iterator[str]:
+    version = [known.number("SoilbusIdentity", f"Version{part}") for part in ("Major", "Minor", "Patch")]
+    if None not in version:
+        yield "soilbus " + ".".join(f"{part:.0f}" for part in version)
+    yield from _said(known, "SoilbusStatus", "State", "service: {}")
+    yield from _said(known, "SoilbusStatus", "Reason", "({})")
+    yield from _said(known, "SoilbusStatus", "RejectedShare", "refused {:.1f} %")
+    if known.bad_frames:
+        yield f"bad frames {known.bad_frames}"
+
+
+def _soil(known: Readings) -> Table:
+    soil = _table("soil", "value ± std", "unit")
+    soil.add_row("bearing pressure", _pair(known, "SoilStrength", "BearingPressure"), "kPa")
+    for name, (message, unit) in PARAMETERS.items():
+        soil.add_row(name, _pair(known, message, "Value", "Std"), unit)
+    soil.add_row("fit, chi-square", _one(known, "SoilStrength", "Chi2", "{:.1f}"), "")
+    return soil
+
+
+def _limits(known: Readings) -> Table:
+    limits = _table("largest", "draft, N", "slope, rad")
+    for name, (of_draft, of_slope) in LIMITS.items():
+        limits.add_row(name, _pair(known, of_draft, "MaxDraft"), _pair(known, of_slope, "MaxGrade"))
+    return limits
+
+
+def _advice(known: Readings) -> Table:
+    advice = _table("best slip for", "front", "rear")
+    for name, signal in ADVICE.items():
+        axles = [_one(known, "TractionAdvice", f"{signal}{axle}", "{:.2f}") for axle in ("Front", "Rear")]
+        advice.add_row(name, *axles)
+    return advice
+
+
+def _wheels(known: Readings) -> Table:
+    """Wheels 5 to 8 where there are that many."""
+    wheels = _table("wheel", "slip", "sinkage, mm")
+    for i in range(1, 9):
+        more = "2" if i > 4 else ""
+        slip = _one(known, f"WheelSlip{more}", f"SlipWheel{i}", "{:+.2f}")
+        depth = _one(known, f"WheelSinkage{more}", f"SinkageWheel{i}", "{:.0f}")
+        if i <= 4 or {slip.plain, depth.plain} != {"-"}:
+            wheels.add_row(str(i), slip, depth)
+    return wheels
+
+
+def _warning(known: Readings) -> Text:
+    if known.value("DemandForecast", "Warning") != "immobilisation":
+        return Text("")
+    left = "".join(_said(known, "DemandForecast", "TimeLeft", " in {:.0f} s"))
+    return Text(f" GETTING STUCK{left} ", style="bold white on red")
+
+
+def _table(*titles: str) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for title in titles:
+        table.add_column(title, no_wrap=True)
+    return table
+
+
+def _said(known: Readings, message: str, signal: str, form: str) -> Iterator[str]:
+    """A signal in words, nothing where it is not known."""
+    value = known.value(message, signal)
+    if value is not None and value != "none":
+        yield form.format(value)
+
+
+def _one(known: Readings, message: str, signal: str, form: str) -> Text:
+    value = known.number(message, signal)
+    return Text("-" if value is None else form.format(value), style="" if known.is_valid(message) else "dim")
+
+
+def _pair(known: Readings, message: str, signal: str, std: str | None = None) -> Text:
+    value, spread = known.number(message, signal), known.number(message, std or f"{signal}Std")
+    told = "-" if value is None or spread is None else f"{_figures(value, spread)}"
+    return Text(told, style="" if known.is_valid(message) else "dim")
+
+
+def _figures(value: float, spread: float) -> str:
+    """Value and std, without powers of ten."""
+    large = max(abs(value), spread) >= 100.0
+    return f"{value:.0f} ± {spread:.0f}" if large and spread >= 1.0 else f"{value:.3g} ± {spread:.2g}"
 
 
 def watch(config: Config, seconds: float | None = None) -> None:
     """Show the dashboard of the configured bus until interrupted, or for some seconds; raises BusError."""
     database = output_database(config)
     with open_bus(config.bus.model_dump(), filters_of(database)) as bus:
-        show(Dashboard(database), bus, Console(), until=None if seconds is None else time.monotonic() + seconds)
+        show(Readings(database), bus, Console(), until=None if seconds is None else time.monotonic() + seconds)
 
 
 def show(
-    dashboard: Dashboard,
+    known: Readings,
     bus: can.BusABC,
     console: Console,
     until: float | None = None,
     done: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Feed a dashboard from a bus and redraw it five times a second until `until` (monotonic) or `done`."""
-    with Live(dashboard.render(), console=console, auto_refresh=False, screen=False) as live:
+    """Feed readings from a bus and redraw them five times a second until `until` (monotonic) or `done`."""
+    with Live(panel(known), console=console, auto_refresh=False, screen=False) as live:
         redraw = time.monotonic()
         while not done() and (until is None or time.monotonic() < until):
             message = bus.recv(max(0.0, redraw - time.monotonic()))
             if message is not None and not message.is_error_frame:
-                dashboard.receive(message)
+                known.receive(message)
             if time.monotonic() >= redraw:
                 redraw = time.monotonic() + 0.2
-                live.update(dashboard.render(), refresh=True)
+                live.update(panel(known), refresh=True)

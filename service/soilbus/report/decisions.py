@@ -48,7 +48,7 @@ def _warning_section(warnings: Sequence[WarningFigures]) -> Iterator[str]:
     yield f"Warning of immobilisation at least {ENOUGH_TIME:g} s or {ENOUGH_WAY:g} m before slip passes its limit"
     yield ""
     boggings = [found for found in warnings if found.boggings or found.sudden]
-    head = ("boggings", "foreseeable", "in time", "median lead", "least", "too sudden")
+    head = ("boggings", "foreseeable", "in time", "median lead", "least", "too sudden", "warned after")
     yield table(head, [_bogging_row(found) for found in boggings])
     yield "Target: all that can be foreseen in time.  Too sudden: from where the ground has lost"
     yield f"{100.0 * FELT:.0f} % of the largest draft, slip passes in less than that and {REACTION:g} s to react."
@@ -60,9 +60,13 @@ def _warning_section(warnings: Sequence[WarningFigures]) -> Iterator[str]:
 
 def _bogging_row(found: WarningFigures) -> tuple[str, ...]:
     return (
-        found.kind, str(found.boggings), str(found.warned), f"{found.lead:.1f} s", f"{found.least:.1f} s",
-        str(found.sudden),
+        found.kind, str(found.boggings), str(found.warned), _seconds(found.lead), _seconds(found.least),
+        str(found.sudden), _seconds(found.delay),
     )  # fmt: skip
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.1f} s" if math.isfinite(value) else "-"
 
 
 def _draft_section(drafts: Sequence[DraftFigures]) -> Iterator[str]:
@@ -119,7 +123,7 @@ def as_json(
         "immobilisation": {
             w.kind: {
                 "boggings": w.boggings, "in_time": w.warned, "lead": number(w.lead), "least_lead": number(w.least),
-                "sudden": w.sudden, "hours": w.hours, "false": w.false,
+                "sudden": w.sudden, "delay": number(w.delay), "hours": w.hours, "false": w.false,
             }
             for w in warnings
         },

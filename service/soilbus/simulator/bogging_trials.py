@@ -81,7 +81,8 @@ class WarningFigures:
     """One kind.
 
     Boggings: how many that could be foreseen in time, how many of these were, median and
-    least lead [s], and how many were too sudden.  Firm ground: hours and false warnings.
+    least lead [s]; how many were too sudden, and the median delay [s] of their warnings behind
+    the first sign.  Firm ground: hours and false warnings.
     """
 
     kind: str
@@ -90,6 +91,7 @@ class WarningFigures:
     lead: float
     least: float
     sudden: int
+    delay: float
     hours: float
     false: int
 
@@ -236,13 +238,15 @@ def figures(kind: str, trials: Sequence[WarningTrial]) -> WarningFigures:
     asked = [t for t in bogged if not t.sudden]
     rest = [t for t in trials if t.kind in (FIRM, HARSH)]
     leads = np.array([t.lead for t in asked])
+    delays = [t.possible - t.lead for t in bogged if t.sudden]
     return WarningFigures(
         kind=kind,
         boggings=len(asked),
         warned=sum(t.in_time for t in asked),
         lead=float(np.median(leads)) if len(asked) else float("nan"),
         least=float(leads.min()) if len(asked) else float("nan"),
-        sudden=len(bogged) - len(asked),
+        sudden=len(delays),
+        delay=float(np.median(delays)) if delays else float("nan"),
         hours=sum(t.seconds for t in rest) / 3600.0,
         false=sum(t.warnings for t in rest),
     )

@@ -19,6 +19,8 @@ from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import WheelModel
 
 FIRM = ("rubicon_sandy_loam_43", "north_gower_clayey_loam_46", "upland_sandy_loam_51", "loam")
+OUTGROWN = FIRM[:2] + FIRM[3:]
+"""Where the reference tractor's motors can turn the wheels into slip: on the others a draft only stalls them."""
 SOFT = ("wet_clay", "clayey_soil_38", "lean_clay_32", "heavy_clay_40")
 KINDS = ("softening", "patch", "draft", "grade", "digging")
 """Ground that softens over many metres; a soft patch with an edge; a draft and a grade that outgrow firm ground;
@@ -42,7 +44,7 @@ class Trouble(NamedTuple):
 
 def bogging(config: Config, kind: str, rng: np.random.Generator) -> Trouble:
     """A drive of one of KINDS that is meant to end stuck; SimulationError where the vehicle cannot be driven."""
-    firm = str(rng.choice(FIRM))
+    firm = str(rng.choice(OUTGROWN if kind in ("draft", "grade") else FIRM))
     most = largest_draft(config, firm)
     start = rng.uniform(22.0, 32.0)
     if kind in ("softening", "patch"):
