@@ -144,7 +144,9 @@ def _sunk(state: WheelState) -> Array:
 
 
 def _same(one: Any, other: Any) -> bool:
-    return one is other or (np.shape(one) == np.shape(other) and bool(np.all(one == other)))
+    if one is other or not (isinstance(one, np.ndarray) and isinstance(other, np.ndarray)):
+        return bool(one is other or np.all(one == other))
+    return one.shape == other.shape and bool((one == other).all())
 
 
 class CompletedProblem(WindowProblem):
@@ -214,7 +216,9 @@ class CompletedProblem(WindowProblem):
                     angle = turned
                     break
                 still_off = excess(turned)
-                along = (still_off - off) / np.log(turned / angle)  # a secant; where it tells nothing the last one serves
+                along = (still_off - off) / np.log(
+                    turned / angle
+                )  # a secant; where it tells nothing the last one serves
                 slope = np.where((along > 0.0) & np.isfinite(along), along, slope)
                 angle, off = turned, still_off
         return Latents(base.load, base.speed, base.ground_speed, angle)
