@@ -216,9 +216,7 @@ class CompletedProblem(WindowProblem):
                     angle = turned
                     break
                 still_off = excess(turned)
-                along = (still_off - off) / np.log(
-                    turned / angle
-                )  # a secant; where it tells nothing the last one serves
+                along = (still_off - off) / np.log(turned / angle)  # where it tells nothing the last one serves
                 slope = np.where((along > 0.0) & np.isfinite(along), along, slope)
                 angle, off = turned, still_off
         return Latents(base.load, base.speed, base.ground_speed, angle)
