@@ -250,7 +250,7 @@ def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects
 def check(problem: CompletedProblem, prior: SoilPrior, fit: Fit) -> Checked:
     """Held-out blocks under a model fitted to the others."""
     soil, gains = Soil(*fit.mode.soil.tolist()), fit.mode.gains
-    latents = problem.carried(problem.start(soil), soil, gains)
+    latents = problem.start(soil, None, gains)
     fitting = Fitting(problem, prior, fit.mode)
     with np.errstate(all="ignore"):
         at = problem.linearise(soil, gains, latents)
