@@ -230,8 +230,7 @@ def _fitted(
         return fit
     fitting, gains = Fitting(problem, prior, before), np.where(problem.gain_std > 0.0, start.gains, 0.0)
     ends = (start.soil, problem.allowed(gains)), (fit.optimum.soil, problem.allowed(fit.optimum.gains))
-    slow = descended(fitting, [fitting.start(soil, gains=g) for soil, g in ends])
-    return fit if slow is None or fit.cost < slow.cost else slow
+    return descended(fitting, [fitting.start(soil, gains=g) for soil, g in ends]) or fit
 
 
 def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects: Sequence[Effect]) -> Belief:
