@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.diagnosis.descent import descended
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.sizes import correction
+from soilbus.diagnosis.slow_descent import descended
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.completed import CompletedProblem, Free, parameters_of
 from soilbus.estimation.coordinates import at_edges
@@ -159,7 +159,7 @@ def complete(
     free = tuple(f for effect in effects for f in known.get(effect.name) or parameters_of(effect, present.n_wheels))
     for _ in range(len(free) + 1):
         completion = _complete(records, prior, effects, free, starts, most, hopeless)
-        if completion is None or completion.free_at_edge is None:
+        if completion is None or not completion.converged or completion.free_at_edge is None:
             break
         free = completion.free_at_edge
         starts = completion.as_starts()
@@ -249,7 +249,7 @@ def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects
 def check(problem: CompletedProblem, prior: SoilPrior, fit: Fit) -> Checked:
     """Held-out blocks under a model fitted to the others."""
     soil, gains = Soil(*fit.mode.soil.tolist()), fit.mode.gains
-    latents = problem.carried(problem.start(soil), soil, gains)
+    latents = problem.start(soil, None, gains)
     fitting = Fitting(problem, prior, fit.mode)
     with np.errstate(all="ignore"):
         at = problem.linearise(soil, gains, latents)

@@ -27,6 +27,8 @@ TEMPERATURE = 6.0
 FORM_ERROR, GREAT_FORM_ERROR = 0.001, 0.1
 """By how much less besides, for each unit that is explained: no effect's formula is the field's, and a formula
 that is off by a share e of the effect leaves e^2 of what there was to explain.  Usually, and at times."""
+GROWN = 1500.0
+"""Fall of -2 log evidence from which the greater error grows no more: great effects have been seen to tell apart."""
 AT_TIMES = 0.15
 """How often it is the greater one."""
 FORM_LEFT = 0.02
@@ -55,7 +57,7 @@ def probabilities(falls: Mapping[str, float], explained: float) -> dict[str, flo
     What is left to one is the probability that nothing more is missing.
     """
     most = max(falls.values())
-    usual, great = (_shares(falls, _temperature(explained + most, e)) for e in (FORM_ERROR, GREAT_FORM_ERROR))
+    usual, great = (_shares(falls, heat(explained + most)) for heat in (_temperature, _great_temperature))
     something = 1.0 / (1.0 + math.exp(-most / (2.0 * _temperature(explained, FORM_LEFT))))
     chances = {n: something * ((1.0 - AT_TIMES) * usual[n] + AT_TIMES * great[n]) for n in falls}
     return dict(sorted(chances.items(), key=lambda item: -item[1]))
@@ -63,12 +65,16 @@ def probabilities(falls: Mapping[str, float], explained: float) -> dict[str, flo
 
 def hopeless(behind: float, explained: float) -> bool:
     """Whether a name so far behind the best one in -2 log evidence cannot get into the set."""
-    return behind > HOPELESS * _temperature(explained, GREAT_FORM_ERROR)
+    return behind > HOPELESS * _great_temperature(explained)
 
 
-def _temperature(explained: float, form_error: float) -> float:
+def _temperature(explained: float, form_error: float = FORM_ERROR) -> float:
     """What differences of -2 log evidence are divided by, where so much of it is explained in all."""
     return TEMPERATURE + form_error * max(explained, 0.0)
+
+
+def _great_temperature(explained: float) -> float:
+    return _temperature(min(explained, GROWN), GREAT_FORM_ERROR)
 
 
 def _shares(falls: Mapping[str, float], temperature: float) -> dict[str, float]:

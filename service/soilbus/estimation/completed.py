@@ -144,7 +144,9 @@ def _sunk(state: WheelState) -> Array:
 
 
 def _same(one: Any, other: Any) -> bool:
-    return one is other or (np.shape(one) == np.shape(other) and bool(np.all(one == other)))
+    if one is other or not (isinstance(one, np.ndarray) and isinstance(other, np.ndarray)):
+        return bool(one is other or np.all(one == other))
+    return one.shape == other.shape and bool((one == other).all())
 
 
 class CompletedProblem(WindowProblem):
@@ -200,17 +202,23 @@ class CompletedProblem(WindowProblem):
             return base
         active = self.active(np.zeros(len(self.free)) if gains is None else gains[self.n_sensors :])
         angle, nothing = base.entry_angle, np.zeros_like(base.load)
-        for _ in range(LOAD_ROUNDS):
-            excess, more = (
-                self._told(self._contact(soil, active, base, turned), active, base, nothing).wheels[0]
-                for turned in (angle, angle * (1.0 + STEP))
-            )
-            slope = (more - excess) / STEP
-            with np.errstate(all="ignore"):
-                step = np.where(slope > 0.0, -excess / slope, 0.0)
-            angle = np.clip(angle * np.exp(np.clip(step, -0.5, 0.5)), MIN_ENTRY_ANGLE, MAX_ENTRY_ANGLE * 0.98)
-            if np.abs(step).max(initial=0.0) < 1e-3:
-                break
+
+        def excess(angle: Array) -> Array:
+            return np.asarray(self._told(self._contact(soil, active, base, angle), active, base, nothing).wheels[0])
+
+        off = excess(angle)
+        with np.errstate(all="ignore"):
+            slope = (excess(angle * (1.0 + STEP)) - off) / STEP
+            for _ in range(LOAD_ROUNDS):
+                step = np.where(slope > 0.0, -off / slope, 0.0)
+                turned = np.clip(angle * np.exp(np.clip(step, -0.5, 0.5)), MIN_ENTRY_ANGLE, MAX_ENTRY_ANGLE * 0.98)
+                if np.abs(step).max(initial=0.0) < 1e-3:
+                    angle = turned
+                    break
+                still_off = excess(turned)
+                along = (still_off - off) / np.log(turned / angle)  # where it tells nothing the last one serves
+                slope = np.where((along > 0.0) & np.isfinite(along), along, slope)
+                angle, off = turned, still_off
         return Latents(base.load, base.speed, base.ground_speed, angle)
 
     def sinkages(self, soil: Soil, gains: Array, latents: Latents) -> Array:

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
-from soilbus.estimation.coordinates import MAX_STEP
+from soilbus.estimation.descent import FAR, LEFT_OVER, LEFT_OVER_RESUMED, LITTLE, MAX_REFUSED, approach, settle
 from soilbus.estimation.linearised import Linearised, Optimum
-from soilbus.estimation.normal_equations import Fitting, Place, Point
+from soilbus.estimation.normal_equations import Fitting, Place
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.soil_class import foretelling
@@ -26,34 +26,17 @@ _K_C = PARAMETERS.index("k_c")
 
 MAX_ITERATIONS = 30
 MAX_RESUMED = 10
-CONVERGED = 1e-6
-"""Squared length of a step in posterior standard deviations that ends the fit."""
-LEFT_OVER, LEFT_OVER_RESUMED = 2e-8, 1e-3
-"""The same for what a full step leaves behind, foreseen from how fast the steps shrink."""
-SETTLING = 1.0
-"""The same, below which the latents and gains join in."""
-ENOUGH = 0.02
-"""Relative fall of the cost below which the approach has done its part."""
-LITTLE = 1e-3
-"""The same where other parameters than the soil's move too."""
-WORSE = 20.0
-"""Rise of the cost that a step may bring: where the cost bends, steps that overshoot come back by themselves."""
-AT_FIRST = 0.02
-"""Share of the cost by which it may rise besides at the first step: with latents as measured it seems too low."""
-SLOWLY = 0.5
-"""Length of a step over that of the last, along it, above which steps are extrapolated."""
-MAX_STRIDE = 8.0
 THINNED = 24
 """Instants of a window that the search for good starts looks at."""
 MAX_KINDS = 2
 """Known soils that the search starts from where the first starts did not agree."""
 MAX_APPROACH = 10
+AS_MEASURED = 4.0
+"""How many times the cost of an optimum that with the latents as measured may be, at the most."""
 MAX_SETTLED = 2
 MAX_HOPELESS = 5
 HOPELESS = 60.0
 """Cost for each thinned instant beyond which the window cannot be one soil."""
-MAX_REFUSED = 5
-"""Steps taken back one after the other after which a fit has failed: what is left is noise of the linear model."""
 APART = 2.0
 """Standard deviations between two optima from which they are told apart."""
 ALIKE, WIDER = 0.5, 1.2
@@ -64,8 +47,6 @@ PLAUSIBLE = 3.0
 """Cost per residual, gains held, up to which an optimum of the search may be the soil's."""
 ILL_TOLD = 0.6
 """Std of log k_c below which a fit tells k_c, and no other optimum across it is looked for."""
-FAR = 10.0
-"""Standard deviations on a few instants beyond which an end is not the optimum looked at."""
 FAR_ABOVE = 1.5
 """Ratio of costs on a few instants beyond which an end is no rival."""
 SAME_END = 0.02
@@ -166,8 +147,8 @@ def fit_window(problem: WindowProblem, prior: SoilPrior, before: Belief | None =
         if best is None or best.chi2 > PLAUSIBLE:
             return best
         if not best.converged:
-            near = _approach(Fitting(problem, prior, before, with_gains=False), best.mode.soil, MAX_ITERATIONS, 0.0)
-            best = best if near is None else _settle(fitting, near, MAX_ITERATIONS) or best
+            near = approach(Fitting(problem, prior, before, with_gains=False), best.mode.soil, MAX_ITERATIONS, 0.0)
+            best = best if near is None else _settled(fitting, near, MAX_ITERATIONS) or best
         return _with_rival(fitting, thin, best, ends) if best.converged else best
 
 
@@ -177,7 +158,7 @@ def _best(fitting: Fitting, thin: Fitting, ends: Sequence[Place]) -> Fit | None:
     best: Fit | None = None
     for end in unlike[:MAX_SETTLED]:
         most = MAX_ITERATIONS if end.cost < HOPELESS * THINNED else MAX_HOPELESS
-        fit = _settle(fitting, replace(fitting.start(end.soil), trials=end.trials), most)
+        fit = _settled(fitting, replace(fitting.start(end.soil), trials=end.trials), most)
         if fit is not None and (best is None or (fit.converged, -fit.cost) > (best.converged, -best.cost)):
             best = fit
         if best is not None and best.converged:
@@ -196,7 +177,7 @@ def _with_rival(fitting: Fitting, thin: Fitting, found: Fit, ends: Sequence[Plac
     end = _other_end(fitting, thin, found, ends) if np.ptp(fitting.problem.rig.width) > 0.0 else None
     if end is None:
         return found
-    other = _settle(fitting, fitting.start(end.soil), MAX_ITERATIONS)
+    other = _settled(fitting, fitting.start(end.soil), MAX_ITERATIONS)
     if other is None or not other.converged:
         return found
     better, worse = (found, other) if found.evidence <= other.evidence else (other, found)
@@ -226,7 +207,7 @@ def _other_end(fitting: Fitting, thin: Fitting, found: Fit, ends: Sequence[Place
     start = fitting.coordinates.across(found.mode.soil) if ill_told and known is None else None
     if start is None:
         return known
-    end = _approach(thin, start, MAX_APPROACH)
+    end = approach(thin, start, MAX_APPROACH)
     return end if end is not None and is_elsewhere(end) else None
 
 
@@ -238,7 +219,7 @@ def _ends(thin: Fitting) -> list[Place]:
     """
     ends: list[Place] = []
     for start in starting_soils(thin.problem, thin.coordinates.prior, thin.before):
-        end = _approach(thin, np.asarray(start), MAX_APPROACH, known=ends)
+        end = approach(thin, np.asarray(start), MAX_APPROACH, known=ends)
         if end is None:
             continue
         met = any(abs(end.cost - other.cost) < SAME_END * other.cost for other in ends)
@@ -273,8 +254,8 @@ def descend(problem: WindowProblem, prior: SoilPrior, start: Soil, before: Belie
     before = Belief.of(prior, problem.gain_std) if before is None else before
     soil = np.where(prior.log_std > 0.0, np.asarray(start, float), prior.median)
     with np.errstate(all="ignore"):
-        near = _approach(Fitting(problem, prior, before, with_gains=False), soil, MAX_ITERATIONS)
-        return None if near is None else _settle(Fitting(problem, prior, before), near, MAX_ITERATIONS)
+        near = approach(Fitting(problem, prior, before, with_gains=False), soil, MAX_ITERATIONS)
+        return None if near is None else _settled(Fitting(problem, prior, before), near, MAX_ITERATIONS)
 
 
 def continued(
@@ -296,12 +277,12 @@ def continued(
     gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
     with np.errstate(all="ignore"):
         if start.near:
-            fit = _settle(fitting, fitting.start(start.soil, gains=gains), MAX_RESUMED, refusals=1, hopeless=hopeless)
+            fit = _settled(fitting, fitting.start(start.soil, gains=gains), MAX_RESUMED, refusals=1, hopeless=hopeless)
             if fit is not None and fit.converged:
                 return fit
         moving = Fitting(problem, prior, before, first=first)
-        near = _approach(moving, start.soil, most, LITTLE, gains)
-        return None if near is None else _settle(fitting, near, most, hopeless=hopeless)
+        near = approach(moving, start.soil, most, LITTLE, gains, hopeless=AS_MEASURED * hopeless)
+        return None if near is None else _settled(fitting, near, most, hopeless=hopeless)
 
 
 @dataclass(frozen=True, slots=True)
@@ -331,72 +312,15 @@ def resume(ahead: Foreseen) -> Fit | None:
         if point is not None and step is not None:
             near = fitting.moved(near, point, step)
         first = 0.0 if point is None or step is None else point.length(step)
-        return _settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED, first)
+        return _settled(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED, first)
 
 
 def settled(fitting: Fitting, near: Place) -> Fit | None:
     """Descent from a place near the optimum; None where the numbers stop being finite."""
-    return _settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED)
+    return _settled(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED)
 
 
-def _approach(
-    fitting: Fitting,
-    soil: Array,
-    most: int,
-    least: float = ENOUGH,
-    gains: Array | None = None,
-    known: Sequence[Place] = (),
-) -> Place | None:
-    """Levenberg-damped steps of the soil and the active gains, latents as measured, until they are short.
-
-    A descent that is foreseen to end at one of the `known` places ends there at once.
-    """
-    place = fitting.start(soil, gains=gains)
-    point = fitting.point(place)
-    damping, trials = 1e-3, 1
-    while point is not None:
-        step = point.step(damping)
-        if step is None:
-            return None
-        if point.length(step) < SETTLING or trials >= most or damping > 1e6:
-            return replace(place, cost=point.cost, trials=trials)
-        for end in known:
-            if _leads_to(fitting, place, point, step, end):
-                return replace(end, trials=trials)
-        new_place = fitting.restarted(place, point, step)
-        new = fitting.point(new_place)
-        trials += 1
-        if new is None or new.cost >= point.cost:
-            damping *= 10.0
-            continue
-        enough = point.cost - new.cost < least * point.cost
-        place, point, damping = new_place, new, damping * 0.1
-        if enough:
-            return replace(place, cost=point.cost, trials=trials)
-    return None
-
-
-def _leads_to(fitting: Fitting, place: Place, point: Point, step: Array, end: Place) -> bool:
-    """Whether a step of the soil comes so near to where another descent ended that this one will end there too.
-
-    Only a short step is trusted to tell.
-    """
-    if np.abs(step).max() > MAX_STEP:
-        return False
-    off = fitting.coordinates.position(end.soil) - fitting.coordinates.position(place.soil) - step
-    return point.length(off) < FAR**2
-
-
-def _stride(point: Point, last: Array, share: float, step: Array) -> float:
-    """How many times a step to go that follows this share of the last one (Aitken's extrapolation).
-
-    More than once where steps shrink slowly, less where they turn back.
-    """
-    left = 1.0 - (1.0 - float(last @ point.information @ step) / point.length(last)) / share
-    return min(1.0 / max(1.0 - left, 1.0 / MAX_STRIDE), MAX_STRIDE) if abs(left) > SLOWLY else 1.0
-
-
-def _settle(
+def _settled(
     fitting: Fitting,
     near: Place,
     most: int,
@@ -405,62 +329,20 @@ def _settle(
     refusals: int = MAX_REFUSED,
     hopeless: float = np.inf,
 ) -> Fit | None:
-    """Steps of soil, gains and latents together from a place near the optimum.
-
-    `before` is the squared length of the step that led there, if it was one of these.
-    Given up after more `refusals` in a row, and where the foreseen cost is above `hopeless`.
-    A step that makes things worse is taken back and tried again shorter: damping would
-    hold back just the weak directions, along which the steps overshoot.
-    """
-    best: tuple[Place, Point] | None = None
-    share, length, refused = 1.0, np.inf, 0
-    iterations, converged = near.trials, False
-    last_step: Array | None = None
-    last_share = 1.0
-    worse = np.inf
-    for _ in range(most):
-        iterations += 1
-        point = fitting.point(near)
-        if best is not None and (point is None or point.cost > best[1].cost + worse):
-            near, point = best
-            if refused == 1:
-                near = fitting.carried(near)
-                point = fitting.point(near)
-            share = 0.4 * min(share, 1.0)
-            before, last_step = 0.0, None  # nothing can be foreseen after a refused step
-            refused += 1
-            if refused > refusals:
-                break
-        else:
-            share, refused = min(2.0 * share, 1.0), 0
-        full = None if point is None else point.step()
-        if point is None or full is None:
-            return None
-        worse = WORSE if best is not None else WORSE + AT_FIRST * point.cost
-        best = (near, point)
-        length = point.length(full)
-        if last_step is not None and share == 1.0:
-            share = _stride(point, last_step, last_share, full)
-        near = fitting.moved(near, point, share * full)
-        last_step, last_share = full, share
-        converged = length < CONVERGED or (share == 1.0 and length * length < left_over * before)
-        before = length if share == 1.0 else 0.0
-        if converged or point.cost - length > hopeless:
-            break
-    if best is None:
+    """Where a descent from a place near the optimum ends, as settle(), with what is known there."""
+    end = settle(fitting, near, most, left_over, before, refusals, hopeless)
+    beliefs = None if end is None else fitting.beliefs(end.place, end.point, end.last.soil)
+    if end is None or beliefs is None:
         return None
-    last, point = best
-    beliefs = fitting.beliefs(near, point, last.soil)
-    if beliefs is None:
-        return None
+    fallen = end.length if end.converged else 0.0
     return Fit(
-        belief=beliefs[0] if converged else beliefs[1],
+        belief=beliefs[0] if end.converged else beliefs[1],
         mode=beliefs[1],
-        sinkage=fitting.problem.mean_sinkage(near.as_soil(), near.gains, near.latents),
-        optimum=Optimum(fitting.problem.t, last.soil, last.gains, last.latents, point.at),
-        cost=point.cost - (length if converged else 0.0),
-        evidence=point.evidence - (length if converged else 0.0),
+        sinkage=fitting.problem.mean_sinkage(end.place.as_soil(), end.place.gains, end.place.latents),
+        optimum=Optimum(fitting.problem.t, end.last.soil, end.last.gains, end.last.latents, end.point.at),
+        cost=end.point.cost - fallen,
+        evidence=end.point.evidence - fallen,
         rows=fitting.problem.n_rows,
-        iterations=iterations,
-        converged=converged,
+        iterations=end.iterations,
+        converged=end.converged,
     )

@@ -286,13 +286,14 @@ class WindowProblem(Readings):
         """Derivatives A (N, m, 2 W + 1) of the residuals from those of DP, T and z."""
         N, W = self.n, self.n_wheels
         A = np.zeros((N, self._n_residuals, 2 * W + 1))
-        A[:, W, :W], A[:, W, W : 2 * W], A[:, W, 2 * W] = at.by_load[0], at.by_speed[0], at.by_ground[0].sum(1)
+        by_load, by_speed, by_ground = -at.by_load, -at.by_speed, -at.by_ground
+        A[:, W, :W], A[:, W, W : 2 * W], A[:, W, 2 * W] = by_load[0], by_speed[0], by_ground[0].sum(1)
         for kind, first in ((1, 0), (2, W + 1)) if self.with_sinkage else ((1, 0),):
             wheel_rows = A[:, first : first + W]
-            diagonals(wheel_rows[:, :, :W])[:] = at.by_load[kind]
-            diagonals(wheel_rows[:, :, W : 2 * W])[:] = at.by_speed[kind]
-            wheel_rows[:, :, 2 * W] = at.by_ground[kind]
-        return np.negative(A, out=A)
+            diagonals(wheel_rows[:, :, :W])[:] = by_load[kind]
+            diagonals(wheel_rows[:, :, W : 2 * W])[:] = by_speed[kind]
+            wheel_rows[:, :, 2 * W] = by_ground[kind]
+        return A
 
     def updated(self, at: Linearised, latents: Latents, soil_step: Array, gain_step: Array) -> Latents:
         """Latents after a step (6,) of the soil and (G,) of the gains, by the linear model."""

@@ -209,7 +209,7 @@ def _stress(state: WheelState, model: WheelModel, skid: bool) -> _Stress:
     q = model.quadrature
     if model.exit_angle:
         q = q._replace(exit=_leave(theta, model))
-    if skid or model.peak_c2 or model.pan_stiffness or model.one_off:
+    if skid or model.peak_c2 or model.pan_stiffness or model.exit_angle:
         peak = np.asarray(model.peak_c1 + model.peak_c2 * slip)
         splits = [place_of_turn(theta, slip, peak, q)] if skid else []
         if model.pan_stiffness:
@@ -218,8 +218,8 @@ def _stress(state: WheelState, model: WheelModel, skid: bool) -> _Stress:
         share, weight = on_branches(x, w, peak, q.exit)
         rim = rim_at(theta, share, r / K)
     else:
-        share, weight = fixed_shares(q)
-        rim = rim_of_fixed_shares(theta, q, r / K)
+        share, weight = fixed_shares.__wrapped__(q) if model.one_off else fixed_shares(q)
+        rim = rim_of_fixed_shares(theta, q, r / K, model.one_off)
     log_z = np.log(r * rim.depth)
     sigma = np.exp(n * log_z + np.log(K_L))  # the rear takes the front's stress (eqs. 5-9)
     normal = steep = sigma * weight

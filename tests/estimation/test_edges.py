@@ -1,0 +1,122 @@
+"""What is at a bound stays there, and the others are where they then fit best."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import lsq_linear
+
+from soilbus.assembly import model_of, rig_of
+from soilbus.estimation.belief import Belief
+from soilbus.estimation.completed import SMOOTHED, CompletedProblem, parameters_of, smoothed
+from soilbus.estimation.coordinates import BOUND, Coordinates, at_edges, share_of_step
+from soilbus.estimation.gauss_newton import Start, continued, descend, fit_window
+from soilbus.estimation.normal_equations import Fitting, Point
+from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.soils import SOILS
+
+WET_CLAY = SOILS["wet_clay"]
+C = PARAMETERS.index("c")
+
+
+@given(st.integers(0, 10_000), st.lists(st.sampled_from([-1.0, 0.0, 1.0]), min_size=4, max_size=4))
+@settings(max_examples=60, deadline=None)
+def test_a_step_never_leaves_the_edges_and_with_one_it_is_the_best_there_is(seed, edges):
+    rng = np.random.default_rng(seed)
+    root, target = np.tril(rng.normal(size=(4, 4)), -1) + np.eye(4), rng.normal(size=4)
+    none = np.zeros((4, 4))
+    point = Point(root.T @ root, none, none, root.T @ target, 0.0, np.array(edges), None)
+    step = point.step()
+    assert np.all(step * np.array(edges) <= 0.0)
+    cost = float(np.sum((root @ step + target) ** 2))
+    assert cost <= float(target @ target)
+    if np.count_nonzero(edges) < 2:
+        low, high = (np.where(np.array(edges) == way, 0.0, way * np.inf) for way in (-1.0, 1.0))
+        best = lsq_linear(root, -target, (low, high), method="bvls").x
+        assert step == pytest.approx(best, abs=1e-9)
+
+
+def test_steps_end_at_the_bounds():
+    assert share_of_step(np.array([0.5, np.inf, -0.2]), np.array([1.0, 9.0, -0.1])) == 0.5
+    assert share_of_step(np.array([np.inf]), np.array([3.0])) == 1.0
+    assert at_edges(np.array([1.0, 2.0, 3.0]), np.ones(3), np.full(3, 3.0)).tolist() == [-1.0, 0.0, 1.0]
+    prior = SoilPrior.from_value_std(dict(zip(PARAMETERS, [(v, 0.25 * v) for v in WET_CLAY], strict=True)))
+    coordinates = Coordinates(prior, 0.3)
+    soil = np.asarray(WET_CLAY, float)
+    step = np.zeros(6)
+    step[C] = 0.6
+    soil = coordinates.moved(soil, coordinates.reach(soil, step) * step)
+    assert not coordinates.edges(soil).any()
+    soil = coordinates.moved(soil, coordinates.reach(soil, step) * step)
+    assert coordinates.edges(soil)[C] == 1.0
+    assert soil[C] == pytest.approx(WET_CLAY.c * np.exp(BOUND * prior.log_std[C]))
+
+
+def test_a_fit_converges_with_a_parameter_at_its_bound(simulated):
+    case = simulated(WET_CLAY, 5, overrides=[f"soil.c.value={0.2 * WET_CLAY.c}", f"soil.c.std={0.02 * WET_CLAY.c}"])
+    fit = fit_window(case.problem(), case.prior)
+    bound = case.prior.median[C] * np.exp(BOUND * case.prior.log_std[C])
+    assert bound < 0.5 * WET_CLAY.c
+    assert fit.converged
+    assert fit.mode.soil[C] == pytest.approx(bound)
+    log_std = case.prior.log_std.copy()
+    log_std[C] = 0.0  # the others are where they are with c held at the bound
+    median = np.where(np.arange(6) == C, bound, case.prior.median)
+    held = descend(case.problem(), SoilPrior(median, log_std), WET_CLAY._replace(c=bound))
+    std = np.sqrt(np.diag(held.posterior.log_covariance))
+    free = std > 0.0
+    assert np.abs(np.log(fit.mode.soil / held.mode.soil)[free] / std[free]).max() < 0.05
+
+
+@pytest.fixture(scope="module")
+def bulldozed(simulated):
+    """A drive under a model with bulldozing that it has not: as likely less than none as more."""
+    case = simulated(SOILS["loam"], 11)
+    rig, config = rig_of(case.config), case.config
+    plain = CompletedProblem(case.window, rig, model_of(config), config.estimator.min_speed)
+    effect = CATALOGUE["bulldozing"]
+    return plain.completed([effect], parameters_of(effect, plain.n_wheels)), case.prior
+
+
+def test_parameters_of_effects_stay_inside_their_ranges(bulldozed):
+    problem, prior = bulldozed
+    before = Belief.of(prior, problem.gain_std)
+    gains = np.concatenate([np.zeros(problem.n_sensors), [1.0, 1.0]])
+    fit = continued(problem, prior, before, Start(np.asarray(SOILS["loam"]), gains), problem.n_sensors)
+    assert fit.converged
+    low, high = problem.gain_bounds()
+    assert np.all(fit.mode.gains >= low - 1e-9)
+    assert np.all(fit.mode.gains <= high + 1e-9)
+    assert np.isfinite(low[problem.n_sensors :]).all()
+    assert np.isinf(low[: problem.n_sensors]).all()
+
+
+def test_angles_solved_anew_carry_the_loads_with_the_effects_as_they_are(simulated):
+    case = simulated(SOILS["loam"], 12)
+    plain = CompletedProblem(case.window, rig_of(case.config), model_of(case.config), 0.2)
+    effect = CATALOGUE["multipass"]
+    problem = plain.completed([effect], parameters_of(effect, plain.n_wheels))
+    gains = np.concatenate([np.zeros(problem.n_sensors), [1.0, 0.5]])
+    fitting = Fitting(problem, case.prior, Belief.of(case.prior, problem.gain_std))
+    place = fitting.start(np.asarray(SOILS["loam"]), gains=gains)
+    place.latents.entry_angle *= 1.1
+    point = fitting.point(fitting.carried(place))
+    assert np.abs(point.at.off).max() < 1e-3 * problem.load.mean()
+
+
+def test_smoothing_is_the_parabola_through_the_neighbours():
+    rng = np.random.default_rng(2)
+    t = np.concatenate([0.1 * np.arange(20), 5.0 + 0.1 * np.arange(12), 9.0 + 0.1 * np.arange(3)])
+    values = rng.normal(size=(len(t), 2))
+    told, half = smoothed(t, values), SMOOTHED // 2
+    for run in (range(20), range(20, 32)):
+        for i in run:
+            first = min(max(i - half, run[0]), run[-1] + 1 - SMOOTHED)
+            near = slice(first, first + SMOOTHED)
+            for wheel in range(2):
+                parabola = np.polynomial.Polynomial.fit(t[near] - t[i], values[near, wheel], 2)
+                assert told[i, wheel] == pytest.approx(parabola(0.0))
+    assert np.array_equal(told[32:], values[32:])
