@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.diagnosis.descent import descended
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.sizes import correction
+from soilbus.diagnosis.slow_descent import descended
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.completed import CompletedProblem, Free, parameters_of
 from soilbus.estimation.coordinates import at_edges
@@ -230,8 +230,7 @@ def _fitted(
         return fit
     fitting, gains = Fitting(problem, prior, before), np.where(problem.gain_std > 0.0, start.gains, 0.0)
     ends = (start.soil, problem.allowed(gains)), (fit.optimum.soil, problem.allowed(fit.optimum.gains))
-    slow = descended(fitting, [fitting.start(soil, gains=g) for soil, g in ends])
-    return fit if slow is None or fit.cost < slow.cost else slow
+    return descended(fitting, [fitting.start(soil, gains=g) for soil, g in ends]) or fit
 
 
 def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects: Sequence[Effect]) -> Belief:

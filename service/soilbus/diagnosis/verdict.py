@@ -1,7 +1,7 @@
 """From evidences to a verdict: none, named, ambiguous or unknown, with probabilities.
 
-The constants were set looking at the blind cases of seed 1 (`python -m tests.diagnosis.blind`);
-what is reported of them is half of seed 2's, which nothing was set on.
+The constants were set looking at the blind cases of seeds 1 and 2 and the `tune` half of seed 3
+(`python -m tests.diagnosis.blind`); what is reported are `report` halves of seeds from 3 on.
 """
 
 from __future__ import annotations
@@ -24,17 +24,21 @@ PAYS, PAYS_BESIDE = 12.0, 30.0
 """Fall of -2 log evidence from which an effect is added, alone and beside others: they leave more than noise."""
 TEMPERATURE = 6.0
 """By how much evidences are less certain than they say, where little is to be explained."""
-FORM_ERROR = 0.001
+FORM_ERROR, GREAT_FORM_ERROR = 0.001, 0.1
 """By how much less besides, for each unit that is explained: no effect's formula is the field's, and a formula
-that is off by a share e of the effect leaves e^2 of what there was to explain."""
+that is off by a share e of the effect leaves e^2 of what there was to explain.  Usually, and at times."""
+GROWN = 1500.0
+"""Fall of -2 log evidence from which the greater error grows no more: great effects have been seen to tell apart."""
+AT_TIMES = 0.15
+"""How often it is the greater one."""
+FORM_LEFT = 0.02
+"""The same for whether there is a further effect at all: share of what is explained that its formula may leave."""
+HOPELESS = 4.0
+"""Great temperatures behind the best one from which a name is so improbable that it is not fitted to all instants."""
 SURE = 0.8
 """Probability from which a name stands alone."""
 PLAUSIBLE = 0.02
 """Probability from which a name belongs to the set."""
-FORM_LEFT = 0.02
-"""The same for whether there is a further effect at all: share of what is explained that its formula may leave."""
-HOPELESS = 30.0
-"""Temperatures behind the best from which a name that a few instants speak of is fitted to all no more."""
 ADDS = 0.001
 """Share of what is explained already that a further effect must explain: less than that formulas are off."""
 WORTH = 0.25
@@ -47,27 +51,37 @@ LEAST_GAP = 1.04
 """Reduced chi-square up to which no gap is told, however many residuals: noise is not known better."""
 
 
-def temperature(explained: float) -> float:
-    """What differences of -2 log evidence are to be divided by, where so much of it is explained in all."""
-    return TEMPERATURE + FORM_ERROR * max(explained, 0.0)
-
-
 def probabilities(falls: Mapping[str, float], explained: float) -> dict[str, float]:
     """Probability of each name from its fall of -2 log evidence, the largest first, where others explain so much.
 
     What is left to one is the probability that nothing more is missing.
     """
     most = max(falls.values())
-    heat = 2.0 * temperature(explained + most)
-    weights = {name: math.exp((fall - most) / heat) for name, fall in falls.items()}
-    something = 1.0 / (1.0 + math.exp(-most / (2.0 * (TEMPERATURE + FORM_LEFT * max(explained, 0.0)))))
-    total = sum(weights.values())
-    return dict(sorted(((n, something * w / total) for n, w in weights.items()), key=lambda item: -item[1]))
+    usual, great = (_shares(falls, heat(explained + most)) for heat in (_temperature, _great_temperature))
+    something = 1.0 / (1.0 + math.exp(-most / (2.0 * _temperature(explained, FORM_LEFT))))
+    chances = {n: something * ((1.0 - AT_TIMES) * usual[n] + AT_TIMES * great[n]) for n in falls}
+    return dict(sorted(chances.items(), key=lambda item: -item[1]))
 
 
 def hopeless(behind: float, explained: float) -> bool:
     """Whether a name so far behind the best one in -2 log evidence cannot get into the set."""
-    return behind > HOPELESS * temperature(explained)
+    return behind > HOPELESS * _great_temperature(explained)
+
+
+def _temperature(explained: float, form_error: float = FORM_ERROR) -> float:
+    """What differences of -2 log evidence are divided by, where so much of it is explained in all."""
+    return TEMPERATURE + form_error * max(explained, 0.0)
+
+
+def _great_temperature(explained: float) -> float:
+    return _temperature(min(explained, GROWN), GREAT_FORM_ERROR)
+
+
+def _shares(falls: Mapping[str, float], temperature: float) -> dict[str, float]:
+    most = max(falls.values())
+    weights = {name: math.exp((fall - most) / (2.0 * temperature)) for name, fall in falls.items()}
+    total = sum(weights.values())
+    return {name: weight / total for name, weight in weights.items()}
 
 
 def gap_limit(rows: int) -> float:

@@ -329,22 +329,52 @@ class CompletedProblem(WindowProblem):
         """
         (load, pull, torque), depth, around = contact
         late = self._from_other_instants(active, torque, around) if late is None else late
-        error: Any = 0.0
-        missing = np.zeros(self.n)
+        error: Array | float = 0.0
         for effect, values in active:
             if effect.torque is not None and not effect.mixes_instants:
                 torque = effect.torque(torque, around, values)
             if effect.load is not None:
                 error = error + effect.load(around, values)
-            if effect.resistance is not None:
-                missing = missing + effect.resistance(around, values)
-        draft = true_draft(active, self.draft, around)
+        missing, draft = self._unread(active, around, pull.sum(axis=1))
         wheels = np.empty((4, *load.shape))
         np.subtract(load, latents.load, out=wheels[0])
         wheels[0] += error
         wheels[1], wheels[3] = pull, depth
         np.add(torque, late, out=wheels[2])
         return _Outcome(wheels, missing + draft - self.draft, late)
+
+    def _unread(self, active: Sequence[Active], around: Surroundings, pull: Array) -> tuple[Array, Array]:
+        """Resistances (N,) in no reading, and drafts (N,) without what effects add to theirs.
+
+        Both go by the draft and the acceleration that the whole balance tells, not by their
+        readings: a reading's own noise beside the error that is proportional to it would
+        make a greater draft, and a smaller mass, look better (errors in variables).
+        """
+
+        def resistance(around: Surroundings) -> Array:
+            told = [effect.resistance(around, values) for effect, values in active if effect.resistance is not None]
+            return np.asarray(sum(told, np.zeros(self.n)))
+
+        draft = true_draft(active, self.draft, around)
+        off = self.demand - self.draft + draft + resistance(around) - pull
+        by_draft, by_acceleration = self._shares
+        told = around._replace(acceleration=around.acceleration - (by_acceleration * off)[:, None])
+        errors = [(effect.draft, values) for effect, values in active if effect.draft is not None]
+        if errors:
+            true = draft - by_draft * off
+            draft = self.draft - sum(error(true, told, values) for error, values in errors)
+        return resistance(told), np.asarray(draft)
+
+    @property
+    def _shares(self) -> tuple[Array, Array]:
+        """What the noise of draft [1] and acceleration [1/kg] has of each newton that the balance is off (N,)."""
+        mass = 0.0 if self.rig.chassis is None else self.rig.chassis.mass
+        known = self.draft_var > 0.0
+        by_draft, by_acceleration = (
+            np.divide(variance, self.demand_var, out=np.zeros(self.n), where=known)
+            for variance in (self.draft_var, mass * self.acceleration_var)
+        )
+        return by_draft, by_acceleration
 
     def _from_other_instants(self, active: Sequence[Active], torque: Array, around: Surroundings) -> Array:
         """What effects that mix instants add to the torque readings (N, W)."""

@@ -26,6 +26,8 @@ LITTLE = 1e-3
 """The same where other parameters than the soil's move too."""
 WORSE = 20.0
 """Rise of the cost that a step may bring: where the cost bends, steps that overshoot come back by themselves."""
+AT_FIRST = 0.02
+"""Share of the cost by which it may rise besides at the first step: with latents as measured it seems too low."""
 SLOWLY = 0.5
 """Length of a step over that of the last, along it, above which steps are extrapolated."""
 MAX_STRIDE = 8.0
@@ -132,10 +134,11 @@ def settle(
     iterations, converged = near.trials, False
     last_step: Array | None = None
     last_share = 1.0
+    worse = np.inf
     for _ in range(most):
         iterations += 1
         point = fitting.point(near)
-        if best is not None and (point is None or point.cost > best[1].cost + WORSE):
+        if best is not None and (point is None or point.cost > best[1].cost + worse):
             near, point = best
             if refused == 1:
                 near = fitting.carried(near)
@@ -150,6 +153,7 @@ def settle(
         full = None if point is None else point.step()
         if point is None or full is None:
             return None
+        worse = WORSE if best is not None else WORSE + AT_FIRST * point.cost
         best = (near, point)
         length = point.length(full)
         if last_step is not None and share == 1.0:

@@ -26,7 +26,7 @@ GAIN_QUANTITIES = ("torque", "load", "speed", "ground_speed", "draft")
 _BY_INSTANT = (
     "t", "usable", "torque", "torque_var", "has_torque", "sinkage", "sinkage_var", "has_sinkage", "load", "load_var",
     "speed", "speed_var", "ground_speed", "ground_speed_var", "slip", "draft", "draft_var", "demand", "demand_var",
-    "has_balance", "since", "distance", "wheel_angle", "acceleration",
+    "has_balance", "since", "distance", "wheel_angle", "acceleration", "acceleration_var",
     "_measured", "_measured_var", "_row_var", "_known",
 )  # fmt: skip
 """Attributes of a window's problem with a row for each instant."""
@@ -103,7 +103,7 @@ class Readings:
         """The pull that draft, slope and inertia ask of the wheels, and its variance."""
         self.draft, draft_var, known = take("draft")
         demand, variance = self.draft.copy(), draft_var.copy()
-        acceleration = np.zeros_like(demand)
+        acceleration, acceleration_var = np.zeros_like(demand), np.zeros_like(demand)
         if self.rig.chassis is not None:
             mass = self.rig.chassis.mass
             pitch, pitch_var, has_pitch = take("pitch")
@@ -116,7 +116,7 @@ class Readings:
                 acceleration, acceleration_var = differentiated_speed(self.t, self.ground_speed, self.ground_speed_var)
             demand += mass * (GRAVITY * np.sin(pitch) + acceleration)
             variance += mass**2 * ((GRAVITY * np.cos(pitch)) ** 2 * pitch_var + acceleration_var)
-        self.acceleration = acceleration
+        self.acceleration, self.acceleration_var = acceleration, acceleration_var
         self.demand, self.demand_var = demand, variance
         self.draft_var = np.where(known & usable.all(axis=1), draft_var, 0.0)
         self.has_balance = known & usable.all(axis=1)

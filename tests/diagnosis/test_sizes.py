@@ -1,0 +1,82 @@
+"""Evidence of effects of any size, probabilities from evidences, and scores where the effect's absence is blind."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.stats import norm
+
+from soilbus.diagnosis.sizes import SCALES, correction, evidence_of_any_size
+from soilbus.diagnosis.verdict import PLAUSIBLE, hopeless, pays, probabilities
+from soilbus.estimation.completed import Free
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.effects.effect import Parameter
+
+SIZE = Free("x", Parameter("size", "1", 0.0, 1.0, -9.0, 9.0), None, 0.0, 1.0)
+PLACE = Free("x", Parameter("place", "1", 0.5, 1.0, -9.0, 9.0), None, 0.5, 1.0)
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.floats(0.1, 1e4), st.floats(-30.0, 30.0))
+def test_the_evidence_is_that_of_a_mixture_of_prior_scales(information, best):
+    """Against adaptive integration of the likelihood over each of the priors."""
+    pull = information * best / 10.0
+
+    def of(scale: float) -> float:
+        sd = (information + 1.0 / scale**2) ** -0.5
+        top = sd**2 * pull
+        height = pull * top - information * top**2 / 2.0
+
+        def density(u: float) -> float:
+            return float(np.exp(pull * u - information * u**2 / 2.0 - height) * norm.pdf(u, 0.0, scale))
+
+        return quad(density, top - 12.0 * sd, top + 12.0 * sd, epsabs=0.0)[0] * np.exp(height)
+
+    with np.errstate(over="ignore"):
+        expected = np.array([of(scale) for scale in SCALES])
+    if not np.isfinite(expected).all():
+        return
+    told = evidence_of_any_size(np.array([[information]]), np.array([pull]), [SIZE])
+    assert told == pytest.approx(-2.0 * np.log(expected.mean()), abs=1e-6)
+
+
+def test_only_parameters_that_say_how_great_an_effect_is_are_scaled():
+    information, pull = np.diag([50.0, 50.0]), np.array([5.0, 200.0])
+    one = evidence_of_any_size(information[:1, :1], pull[:1], [SIZE])
+    other = np.log(51.0) - 200.0**2 / 51.0
+    assert evidence_of_any_size(information, pull, [SIZE, PLACE]) == pytest.approx(one + other)
+
+
+def test_a_small_effect_of_many_parameters_pays_less_for_them():
+    free = [SIZE] * 8
+    covariance = np.eye(8) * 0.02**2
+    small, usual = (correction(np.full(8, size), covariance, free) for size in (0.08, 1.0))
+    assert small < -10.0 < usual < 2.0 * np.log(len(SCALES))
+
+
+def test_alike_names_share_the_probability_and_form_errors_leave_some_to_others():
+    alike = probabilities({"a": 500.0, "b": 499.0, "c": 20.0}, 0.0)
+    assert alike["a"] == pytest.approx(alike["b"], abs=0.05)
+    assert sum(alike.values()) == pytest.approx(1.0, abs=1e-6)
+    assert alike["c"] < PLAUSIBLE
+    clear = probabilities({"a": 1100.0, "b": 850.0}, 0.0)
+    assert 0.9 < clear["a"] < 1.0 - PLAUSIBLE
+    assert not hopeless(250.0, 1100.0)
+    assert hopeless(1090.0, 1100.0)
+
+
+def test_a_further_effect_beside_a_great_one_is_doubted():
+    alone, beside = (probabilities({"a": 60.0}, explained)["a"] for explained in (0.0, 5e4))
+    assert alone > 0.99
+    assert 0.5 < beside < 0.6
+    assert pays(60.0, 0.0, 1.0, 3000, 10000)
+    assert pays(20.0, 0.0, 1.0, 3000, 10000)
+    assert not pays(20.0, 400.0, 1.0, 3000, 10000)
+    assert not pays(60.0, 1e5, 1.0, 3000, 10000)
+
+
+def test_every_further_start_is_of_the_catalogue():
+    assert {e.name for e in CATALOGUE.values() for p in e.parameters if p.starts} == {"hardpan", "lugs"}
