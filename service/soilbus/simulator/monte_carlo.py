@@ -28,9 +28,11 @@ from numpy.typing import NDArray
 from soilbus.allocator import keep_freed_memory
 from soilbus.assembly import completion_of, model_of, prior_of, rig_of
 from soilbus.config import Config
+from soilbus.estimation.belief import Belief
 from soilbus.estimation.bound import cramer_rao
 from soilbus.estimation.completed import CompletedProblem
 from soilbus.estimation.gauss_newton import fit_window
+from soilbus.estimation.marginal import with_whole
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import BinStore
@@ -190,11 +192,13 @@ def _trial(recording: Recording, config: Config, duration: float, prior: SoilPri
     bound = cramer_rao(noiseless, prior, soil)
     begin = time.thread_time()
     fit = fit_window(noisy, prior)
+    if fit is not None and fit.converged:
+        fit = with_whole(noisy, prior, Belief.of(prior, noisy.gain_std), fit)
     seconds = time.thread_time() - begin
     if fit is None:
         nothing = np.full(len(PARAMETERS) + 1, np.nan)
         return Trial(nothing, nothing, nothing, np.nan, False, seconds)
-    (value, std), (truth, least) = (_logarithms(p, config) for p in (fit.posterior, bound))
+    (value, std), (truth, least) = (_logarithms(p, config) for p in (fit.whole.posterior, bound))
     return Trial(value - truth, std, least, fit.chi2, fit.converged, seconds)
 
 
