@@ -44,7 +44,7 @@ FINE = 400
 _K_C, _K_PHI, _N = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n"))
 
 
-class _Node(NamedTuple):
+class Node(NamedTuple):
     """A fit with n held, at the logarithm u, and -2 log of what was known of n there."""
 
     u: float
@@ -62,6 +62,14 @@ class _Node(NamedTuple):
         return self.fit.evidence + self.known
 
 
+class Ridge(NamedTuple):
+    """Fits along n on both sides of the optimum `top`, down to where they are unlikely, in the order of n."""
+
+    problem: DenoisedProblem
+    top: Fit
+    nodes: list[Node]
+
+
 def with_whole(problem: WindowProblem, prior: SoilPrior, before: Belief, found: Fit) -> Fit:
     """The fit with mean and covariance of the whole posterior, where its top may not tell them.
 
@@ -75,17 +83,33 @@ def with_whole(problem: WindowProblem, prior: SoilPrior, before: Belief, found: 
     if spread < WELL_KNOWN and found.rival is None:
         return found
     with np.errstate(all="ignore"):
-        calm = DenoisedProblem(problem, found.optimum)
-        optimum = found.optimum
-        top = _converged(Fitting(calm, prior, before), Place(optimum.soil, optimum.gains, calm.latents, np.inf, 1))
-        if top is None:
+        along = ridge(problem, prior, before, found)
+        if along is None:
             return found
-        ridge = prior.log_std[[_K_C, _K_PHI, _N]].all() and np.ptp(problem.rig.width) > 0.0
-        nodes = _ridge(calm, prior, before, top) if ridge else []
         coordinates = Coordinates(prior, float(problem.rig.width.mean()))
-        whole = _averaged(nodes, coordinates, before) if len(nodes) > 2 else top.belief
+        whole = _averaged(along.nodes, coordinates, before) if len(along.nodes) > 2 else along.top.belief
     finite = np.isfinite(whole.soil).all() and np.isfinite(whole.covariance).all()
-    return replace(found, belief=top.belief, mode=top.mode, averaged=whole) if finite else found
+    return replace(found, belief=along.top.belief, mode=along.top.mode, averaged=whole) if finite else found
+
+
+def ridge(problem: WindowProblem, prior: SoilPrior, before: Belief, found: Fit) -> Ridge | None:
+    """The ridge through an optimum; without nodes where k_c, k_phi and n are not all free and the tyres unlike.
+
+    None where the descent finds no optimum of the denoised problem.
+    """
+    optimum = found.optimum
+    calm = DenoisedProblem(problem, optimum)
+    top = _converged(Fitting(calm, prior, before), Place(optimum.soil, optimum.gains, calm.latents, np.inf, 1))
+    if top is None:
+        return None
+    if not prior.log_std[[_K_C, _K_PHI, _N]].all() or np.ptp(problem.rig.width) == 0.0:
+        return Ridge(calm, top, [])
+    first = _held(calm, prior, before, top, math.log(top.mode.soil[_N]))
+    if first is None:
+        return Ridge(calm, top, [])
+    step = min(math.sqrt(top.mode.covariance[_N, _N]), LONGEST)
+    down, up = (_along(calm, prior, before, first, way, step) for way in (-1.0, 1.0))
+    return Ridge(calm, top, [*reversed(down), first, *up])
 
 
 def _converged(fitting: Fitting, near: Place) -> Fit | None:
@@ -98,20 +122,8 @@ def _converged(fitting: Fitting, near: Place) -> Fit | None:
     return None
 
 
-def _ridge(problem: WindowProblem, prior: SoilPrior, before: Belief, found: Fit) -> list[_Node]:
-    """Fits along n on both sides of an optimum, down to where they are unlikely, in the order of n."""
-    top = _held(problem, prior, before, found, math.log(found.mode.soil[_N]))
-    if top is None:
-        return []
-    step = min(math.sqrt(found.mode.covariance[_N, _N]), LONGEST)
-    down, up = (_along(problem, prior, before, top, way, step) for way in (-1.0, 1.0))
-    return [*reversed(down), top, *up]
-
-
-def _along(
-    problem: WindowProblem, prior: SoilPrior, before: Belief, top: _Node, way: float, step: float
-) -> list[_Node]:
-    nodes: list[_Node] = []
+def _along(problem: WindowProblem, prior: SoilPrior, before: Belief, top: Node, way: float, step: float) -> list[Node]:
+    nodes: list[Node] = []
     last, least = top, top.unlikelihood
     for _ in range(MAX_STEPS):
         node = _held(problem, prior, before, last.fit, last.u + way * step)
@@ -124,7 +136,7 @@ def _along(
     return nodes
 
 
-def _held(problem: WindowProblem, prior: SoilPrior, before: Belief, near: Fit, u: float) -> _Node | None:
+def _held(problem: WindowProblem, prior: SoilPrior, before: Belief, near: Fit, u: float) -> Node | None:
     """A fit with n held, from the optimum of one nearby."""
     soil, n = near.optimum.soil.copy(), math.exp(u)
     if abs(u - math.log(prior.median[_N])) > BOUND * prior.log_std[_N]:
@@ -139,10 +151,10 @@ def _held(problem: WindowProblem, prior: SoilPrior, before: Belief, near: Fit, u
     fitting = Fitting(problem, SoilPrior(median, log_std), before.given(_N, u))
     latents = problem.carried(near.optimum.latents, Soil(*soil.tolist()), near.optimum.gains)
     fit = _converged(fitting, Place(soil, near.optimum.gains, latents, np.inf, 1))
-    return None if fit is None else _Node(u, fit, deviation**2)
+    return None if fit is None else Node(u, fit, deviation**2)
 
 
-def _averaged(nodes: list[_Node], coordinates: Coordinates, before: Belief) -> Belief:
+def _averaged(nodes: list[Node], coordinates: Coordinates, before: Belief) -> Belief:
     """Mean and covariance of the mixture of all nodes and of what lies between them, by straight lines.
 
     Both are the posterior's, but n is known no better than by likelihood and what was known
@@ -158,8 +170,8 @@ def _averaged(nodes: list[_Node], coordinates: Coordinates, before: Belief) -> B
     along = np.array([np.interp(fine, u, column) for column in place.T])
     own = np.array([_in_coordinates(b.covariance, coordinates.log_directions(b.soil), free, active) for b in beliefs])
     share = np.array([np.interp(fine, u, one) for one in np.eye(len(u))])
-    weight = _density(u, np.array([node.unlikelihood for node in nodes]), fine)
-    likeliest = _density(u, np.array([node.cost for node in nodes]), fine)
+    weight = density(u, np.array([node.unlikelihood for node in nodes]), fine)
+    likeliest = density(u, np.array([node.cost for node in nodes]), fine)
     mean = along @ weight
     off = along - mean[:, None]
     covariance = np.tensordot(share @ weight, own, axes=1) + (off * weight) @ off.T
@@ -182,7 +194,7 @@ def _in_coordinates(covariance: Array, directions: Array, free: Indices, active:
     return np.asarray(back @ covariance[np.ix_(kept, kept)] @ back.T)
 
 
-def _density(u: Array, value: Array, fine: Array) -> Array:
+def density(u: Array, value: Array, fine: Array) -> Array:
     """Share of each of the fine places in a density that is -2 log known at u: its roots lie on straight lines."""
     root = np.sqrt(np.maximum(value - value.min(), 0.0))
     sign = np.where(np.arange(len(u)) < int(np.argmin(value)), -1.0, 1.0)
