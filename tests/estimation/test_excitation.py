@@ -92,6 +92,12 @@ def test_constant_loads_with_varied_slip_lack_a_range_of_loads(soil):
     assert varied.bearing.std / varied.bearing.value < 0.8 * short.bearing.std / short.bearing.value
 
 
+def test_constant_loads_on_dry_sand_lack_a_range_of_loads_and_nothing_else():
+    short, varied = (said("dry_sand", minima.EXCITED, shift, seconds=2.0) for shift in (STILL, LEANING))
+    assert (short.status, short.reason) == (Status.NOT_EXCITED, "not_excited load_range")
+    assert (varied.status, varied.reason) == (Status.VALID, "none")
+
+
 @pytest.mark.parametrize("soil", ["loam", "lete_sand", "sandy_loam_23_michigan"])
 def test_varied_loads_with_constant_slip_lack_a_range_of_slips(soil):
     strict = ["estimator.max_tan_phi_std=0.05"]
