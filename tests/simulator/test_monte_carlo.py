@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -39,6 +40,18 @@ def made_up(n, spread=1.0, shift=0.0, held=(), seed=0):
         error = bound * (shift + spread * rng.standard_normal(7))
         windows.append(Trial(error, bound, bound, 1.0, True, 0.01))
     return windows
+
+
+def test_what_is_attainable_is_told_beside_what_is_attained():
+    windows = [replace(w, exact=w.error / 1.3, effective=float(i)) for i, w in enumerate(made_up(400))]
+    cell = summary("loam", 2.0, True, [*windows, *made_up(3, spread=50.0)])
+    assert cell.exact.windows == 400
+    assert cell.exact.share == pytest.approx(np.full(7, 1.3))
+    assert cell.exact.scatter == pytest.approx(np.zeros(7), abs=1e-12)
+    assert cell.exact.best == pytest.approx(cell.exact.ours / 1.3)
+    assert cell.exact.effective == 199.5
+    assert "1.30+-0.00" in monte_carlo_report([cell])
+    assert as_json(cell)["quantities"]["n"]["exact"] == pytest.approx(cell.exact.best[2])
 
 
 def lost(converged=False, chi2=np.nan):

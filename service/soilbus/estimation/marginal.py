@@ -18,13 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
-from soilbus.estimation.coordinates import BOUND, TYPICAL_DEPTH
+from soilbus.estimation.coordinates import BOUND, TYPICAL_DEPTH, Coordinates
+from soilbus.estimation.denoised import DenoisedProblem
 from soilbus.estimation.gauss_newton import Fit, settled
 from soilbus.estimation.normal_equations import Fitting, Place
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
+from soilbus.terra.wheel import Soil
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 WELL_KNOWN = 0.05
 """Sd of the logarithm of n below which a posterior with one top counts as Gaussian."""
@@ -32,6 +35,8 @@ LONGEST = 0.1
 """Longest first step of the logarithm of n; each next one is longer."""
 GROWTH = 1.4
 MAX_STEPS = 12
+MAX_TRIES = 3
+"""Times that a descent is resumed."""
 UNLIKELY = 9.0
 """-2 log of a probability, relative to the greatest, where the ridge has ended."""
 FINE = 400
@@ -39,41 +44,86 @@ FINE = 400
 _K_C, _K_PHI, _N = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n"))
 
 
-class _Node(NamedTuple):
-    """A fit with n held, at the logarithm u; unlikelihood is -2 log of its posterior density."""
+class Node(NamedTuple):
+    """A fit with n held, at the logarithm u, and -2 log of what was known of n there."""
 
     u: float
     fit: Fit
-    unlikelihood: float
+    known: float
+
+    @property
+    def cost(self) -> float:
+        """-2 log of the posterior density of the likeliest soil with this n."""
+        return self.fit.cost + self.known
+
+    @property
+    def unlikelihood(self) -> float:
+        """-2 log of the posterior density of n."""
+        return self.fit.evidence + self.known
+
+
+class Ridge(NamedTuple):
+    """Fits along n on both sides of the optimum `top`, down to where they are unlikely, in the order of n."""
+
+    problem: DenoisedProblem
+    top: Fit
+    nodes: list[Node]
 
 
 def with_whole(problem: WindowProblem, prior: SoilPrior, before: Belief, found: Fit) -> Fit:
     """The fit with mean and covariance of the whole posterior, where its top may not tell them.
 
-    That is where k_c, k_phi and n are free and the tyres unlike, and n is badly known or
-    there is a rival.  What is averaged is each held fit's belief, so its moments along k_c's
-    share count; the present soil (`present`) comes after.
+    That is where n is badly known or there is a rival.  There the noise of loads and speeds
+    may have told more of it than the soil has (`denoised`); and where k_c, k_phi and n are free
+    and the tyres unlike, the posterior is a ridge that is averaged along n.  What is averaged is each
+    held fit's belief, so its moments along k_c's share count; the present soil (`present`)
+    comes after.
     """
-    spread = math.sqrt(found.mode.covariance[_N, _N])
-    ridge = prior.log_std[[_K_C, _K_PHI, _N]].all() and np.ptp(problem.rig.width) > 0.0
-    if not ridge or (spread < WELL_KNOWN and found.rival is None):
+    spread = math.sqrt(max(found.mode.covariance[_N, _N], found.belief.covariance[_N, _N]))
+    if spread < WELL_KNOWN and found.rival is None:
         return found
     with np.errstate(all="ignore"):
-        top = _held(problem, prior, before, found, math.log(found.mode.soil[_N]))
-        if top is None:
+        along = ridge(problem, prior, before, found)
+        if along is None:
             return found
-        step = min(spread, LONGEST)
-        ways = [_along(problem, prior, before, top, way, step) for way in (-1.0, 1.0)]
-        nodes = sorted([top, *ways[0], *ways[1]], key=lambda node: node.u)
-        whole = _averaged(nodes, before) if len(nodes) > 2 else found.belief
+        coordinates = Coordinates(prior, float(problem.rig.width.mean()))
+        whole = _averaged(along.nodes, coordinates, before) if len(along.nodes) > 2 else along.top.belief
     finite = np.isfinite(whole.soil).all() and np.isfinite(whole.covariance).all()
-    return replace(found, averaged=whole) if finite else found
+    return replace(found, belief=along.top.belief, mode=along.top.mode, averaged=whole) if finite else found
 
 
-def _along(
-    problem: WindowProblem, prior: SoilPrior, before: Belief, top: _Node, way: float, step: float
-) -> list[_Node]:
-    nodes: list[_Node] = []
+def ridge(problem: WindowProblem, prior: SoilPrior, before: Belief, found: Fit) -> Ridge | None:
+    """The ridge through an optimum; without nodes where k_c, k_phi and n are not all free and the tyres unlike.
+
+    None where the descent finds no optimum of the denoised problem.
+    """
+    optimum = found.optimum
+    calm = DenoisedProblem(problem, optimum)
+    top = _converged(Fitting(calm, prior, before), Place(optimum.soil, optimum.gains, calm.latents, np.inf, 1))
+    if top is None:
+        return None
+    if not prior.log_std[[_K_C, _K_PHI, _N]].all() or np.ptp(problem.rig.width) == 0.0:
+        return Ridge(calm, top, [])
+    first = _held(calm, prior, before, top, math.log(top.mode.soil[_N]))
+    if first is None:
+        return Ridge(calm, top, [])
+    step = min(math.sqrt(top.mode.covariance[_N, _N]), LONGEST)
+    down, up = (_along(calm, prior, before, first, way, step) for way in (-1.0, 1.0))
+    return Ridge(calm, top, [*reversed(down), first, *up])
+
+
+def _converged(fitting: Fitting, near: Place) -> Fit | None:
+    """The optimum near a place; None where there is none."""
+    for _ in range(MAX_TRIES):
+        fit = settled(fitting, near)
+        if fit is None or fit.converged:
+            return fit
+        near = Place(fit.optimum.soil, fit.optimum.gains, fit.optimum.latents, np.inf, 1)
+    return None
+
+
+def _along(problem: WindowProblem, prior: SoilPrior, before: Belief, top: Node, way: float, step: float) -> list[Node]:
+    nodes: list[Node] = []
     last, least = top, top.unlikelihood
     for _ in range(MAX_STEPS):
         node = _held(problem, prior, before, last.fit, last.u + way * step)
@@ -86,7 +136,7 @@ def _along(
     return nodes
 
 
-def _held(problem: WindowProblem, prior: SoilPrior, before: Belief, near: Fit, u: float) -> _Node | None:
+def _held(problem: WindowProblem, prior: SoilPrior, before: Belief, near: Fit, u: float) -> Node | None:
     """A fit with n held, from the optimum of one nearby."""
     soil, n = near.optimum.soil.copy(), math.exp(u)
     if abs(u - math.log(prior.median[_N])) > BOUND * prior.log_std[_N]:
@@ -99,34 +149,54 @@ def _held(problem: WindowProblem, prior: SoilPrior, before: Belief, near: Fit, u
     median, log_std = prior.median.copy(), prior.log_std.copy()
     median[_N], log_std[_N] = n, 0.0
     fitting = Fitting(problem, SoilPrior(median, log_std), before.given(_N, u))
-    fit = settled(fitting, Place(soil, near.optimum.gains, near.optimum.latents, np.inf, 1))
-    return None if fit is None else _Node(u, fit, fit.evidence + deviation**2)
+    latents = problem.carried(near.optimum.latents, Soil(*soil.tolist()), near.optimum.gains)
+    fit = _converged(fitting, Place(soil, near.optimum.gains, latents, np.inf, 1))
+    return None if fit is None else Node(u, fit, deviation**2)
 
 
-def _averaged(nodes: list[_Node], before: Belief) -> Belief:
-    """Mean and covariance of the mixture of all nodes and of what lies between them, by straight lines."""
+def _averaged(nodes: list[Node], coordinates: Coordinates, before: Belief) -> Belief:
+    """Mean and covariance of the mixture of all nodes and of what lies between them, by straight lines.
+
+    Both are the posterior's, but n is known no better than by likelihood and what was known
+    alone, where it counts by the likeliest soil that has it.  The posterior counts all that have it,
+    and is too sure where k_c may be next to nothing: there are many such, for their log k_c may be anything.
+    """
+    n, free = len(PARAMETERS), coordinates.free
+    active = n + np.flatnonzero(np.diag(before.covariance)[n:] > 0.0)
     beliefs = [node.fit.belief for node in nodes]
     u = np.array([node.u for node in nodes])
     fine = np.linspace(u[0], u[-1], FINE)
-    with np.errstate(divide="ignore"):
-        place = np.array([np.concatenate([np.log(b.soil), b.gains]) for b in beliefs])
-    free = np.flatnonzero(np.diag(before.covariance) > 0.0)
-    weight = np.exp(-0.5 * (_curve(u, np.array([node.unlikelihood for node in nodes]), fine)))
-    weight /= weight.sum()
-    along = np.array([np.interp(fine, u, column) for column in place.T[free]])
-    of_node = np.array([np.interp(fine, u, one) @ weight for one in np.eye(len(u))])
+    place = np.array([[*coordinates.position(b.soil), *b.gains[active - n]] for b in beliefs])
+    along = np.array([np.interp(fine, u, column) for column in place.T])
+    own = np.array([_in_coordinates(b.covariance, coordinates.log_directions(b.soil), free, active) for b in beliefs])
+    share = np.array([np.interp(fine, u, one) for one in np.eye(len(u))])
+    weight = density(u, np.array([node.unlikelihood for node in nodes]), fine)
+    likeliest = density(u, np.array([node.cost for node in nodes]), fine)
     mean = along @ weight
     off = along - mean[:, None]
-    covariance = np.tensordot(of_node, np.array([b.covariance for b in beliefs]), axes=1)
-    covariance[np.ix_(free, free)] += (off * weight) @ off.T
-    whole = place[0].copy()
-    whole[free] = mean
-    n = len(PARAMETERS)
-    return replace(beliefs[0], soil=np.exp(whole[:n]), gains=whole[n:], covariance=covariance)
+    covariance = np.tensordot(share @ weight, own, axes=1) + (off * weight) @ off.T
+    i = int(np.searchsorted(free, _N))
+    with_n = covariance[:, i] / covariance[i, i]
+    covariance += max(float(off[i] ** 2 @ likeliest - covariance[i, i]), 0.0) * np.outer(with_n, with_n)
+    soil, gains = coordinates.soil_at(mean[: len(free)]), beliefs[0].gains.copy()
+    gains[active - n] = mean[len(free) :]
+    spread = np.zeros((n + len(gains), len(mean)))
+    spread[:n, : len(free)] = coordinates.log_directions(soil)
+    spread[active, len(free) + np.arange(len(active))] = 1.0
+    return Belief(soil, gains, spread @ covariance @ spread.T)
 
 
-def _curve(u: Array, value: Array, fine: Array) -> Array:
-    """The values between the nodes, above the least: squares of straight lines between their roots."""
+def _in_coordinates(covariance: Array, directions: Array, free: Indices, active: Indices) -> Array:
+    """Covariance (F + A, F + A) of coordinates and active gains, from that of logarithms and all gains."""
+    kept = np.concatenate([free, active])
+    back = np.eye(len(kept))
+    back[: len(free), : len(free)] = np.linalg.inv(directions[free])
+    return np.asarray(back @ covariance[np.ix_(kept, kept)] @ back.T)
+
+
+def density(u: Array, value: Array, fine: Array) -> Array:
+    """Share of each of the fine places in a density that is -2 log known at u: its roots lie on straight lines."""
     root = np.sqrt(np.maximum(value - value.min(), 0.0))
     sign = np.where(np.arange(len(u)) < int(np.argmin(value)), -1.0, 1.0)
-    return np.asarray(np.interp(fine, u, sign * root) ** 2)
+    density = np.exp(-0.5 * np.interp(fine, u, sign * root) ** 2)
+    return np.asarray(density / density.sum())

@@ -5,6 +5,10 @@ prior whose medians miss the truth by as much as it says (log-normal about the t
 for every free parameter), so that all is as the estimator believes it to be.  It is
 estimated from nothing else, as the first window after a start is.  Errors, standard
 deviations and bounds are those of logarithms.
+
+The bound is local: it knows how the window would change with a soil next to the true one.
+Where the soils that the window allows are not next to it, no estimate may reach it, and what
+can be reached is what the mean of the exact posterior does on the same windows (`exact`).
 """
 
 from __future__ import annotations
@@ -16,7 +20,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from multiprocessing import get_context
@@ -28,9 +32,12 @@ from numpy.typing import NDArray
 from soilbus.allocator import keep_freed_memory
 from soilbus.assembly import completion_of, model_of, prior_of, rig_of
 from soilbus.config import Config
+from soilbus.estimation.belief import Belief
 from soilbus.estimation.bound import cramer_rao
 from soilbus.estimation.completed import CompletedProblem
+from soilbus.estimation.exact import samples
 from soilbus.estimation.gauss_newton import fit_window
+from soilbus.estimation.marginal import with_whole
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import BinStore
@@ -47,6 +54,8 @@ DURATIONS = (2.0, 10.0, 60.0)
 SLIP = Swing(0.05, 0.40)
 ROUGHLY_KNOWN = ("soil.c.value=3000", "soil.c.std=750", "soil.K.value=0.02", "soil.K.std=0.005")
 """Settings with which cohesion and shear modulus are known to 25 %."""
+EXACT_UP_TO = 10.0
+"""Duration [s] of windows from which on exact posteriors take too long, and Gaussian ones are as good."""
 MAX_PHI = 1.2
 """A prior that is off by more than this friction angle [rad] is drawn again: the model ends at a right angle."""
 NORMAL_95 = 1.959964
@@ -54,19 +63,25 @@ _PHI = PARAMETERS.index("phi")
 
 
 class Task(NamedTuple):
-    """One drive to be simulated and estimated, with and without sinkage sensors."""
+    """One drive to be simulated and estimated, with and without sinkage sensors.
+
+    exact is how many samples of the exact posterior are drawn beside each fit.
+    """
 
     config: Config
     soil: str
     duration: float
     seed: int
+    exact: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
     """One window: error, std and bound (6 + 1,) of the parameters' logarithms and the bearing pressure's.
 
-    What is held has no error and no bound.  All of it is nan where the fit failed.
+    What is held has no error and no bound.  All of it is nan where the fit failed.  exact (7,)
+    is the error of the exact posterior's mean and effective how many independent samples it is worth;
+    None and nan where none were drawn.
     """
 
     error: Array
@@ -75,6 +90,8 @@ class Trial:
     chi2: float
     converged: bool
     seconds: float
+    exact: Array | None = None
+    effective: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +103,7 @@ class Cell:
     share of 95 % intervals that hold the truth, bound the root mean square of the bounds.
     These and chi2, the mean of the reduced chi-squares, are of the windows that converged;
     failed and not_converged count the others.  seconds is the median processor time of a fit.
+    exact is None without samples of exact posteriors.
     """
 
     soil: str
@@ -101,6 +119,24 @@ class Cell:
     bound: Array
     chi2: float
     seconds: float
+    exact: Exact | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Exact:
+    """The exact posteriors of some windows, beside the estimates: root mean squares (Q,) of errors over the bounds.
+
+    ours are the estimates', best those of the posteriors' means; share is ours over best and
+    scatter its standard deviation by chance, for the windows are the same.  effective is the median of how
+    many independent samples a posterior is told by.
+    """
+
+    windows: int
+    ours: Array
+    best: Array
+    share: Array
+    scatter: Array
+    effective: float
 
 
 _T = TypeVar("_T")
@@ -121,17 +157,18 @@ def monte_carlo(
     soils: Sequence[str] = SOILS,
     durations: Sequence[float] = DURATIONS,
     each: Each = map,
+    exact: int = 0,
 ) -> Iterator[Cell]:
     """Cells of all soils and durations, each with and without sinkage sensors (the same drives).
 
-    `each` is the built-in map, or that of `processes`.  The same seed gives the same
-    windows.  Raises KeyError for an unknown soil and SimulationError where the tractor
-    cannot drive on one.
+    With so many samples of the exact posterior of each window up to EXACT_UP_TO.  `each` is
+    the built-in map, or that of `processes`.  The same seed gives the same windows.  Raises
+    KeyError for an unknown soil and SimulationError where the tractor cannot drive on one.
     """
     for name in soils:
         soil_named(name)
     places = list(product(soils, durations))
-    tasks = [task for place in places for task in tasks_of(config, *place, windows, seed)]
+    tasks = [task for place in places for task in tasks_of(config, *place, windows, seed, exact)]
     results = iter(each(trials, tasks))
     for soil, duration in places:
         pairs = [next(results) for _ in range(windows)]
@@ -150,7 +187,7 @@ def processes(count: int) -> Iterator[Each]:
         yield partial(pool.map, chunksize=4)
 
 
-def tasks_of(config: Config, soil: str, duration: float, windows: int, seed: int) -> list[Task]:
+def tasks_of(config: Config, soil: str, duration: float, windows: int, seed: int, exact: int = 0) -> list[Task]:
     """Independent drives on a soil, the same ones whatever else is asked for."""
     # The simulator's of_mean noise and the estimator's refer to the same window.
     hop = min(config.estimator.hop, duration)
@@ -158,7 +195,8 @@ def tasks_of(config: Config, soil: str, duration: float, windows: int, seed: int
     of_cell = config.model_copy(update={"estimator": of_window})
     key = [seed, zlib.crc32(soil.encode()), round(1e3 * duration)]
     seeds = np.random.SeedSequence(key).generate_state(windows)
-    return [Task(of_cell, soil, duration, int(s)) for s in seeds]
+    drawn = exact if duration <= EXACT_UP_TO else 0
+    return [Task(of_cell, soil, duration, int(s), drawn) for s in seeds]
 
 
 def trials(task: Task) -> tuple[Trial, Trial]:
@@ -166,13 +204,13 @@ def trials(task: Task) -> tuple[Trial, Trial]:
 
     Raises SimulationError where the tractor cannot drive on, KeyError for an unknown soil.
     """
-    config, name, duration, seed = task
+    config, name, duration, seed, _ = task
     soil = soil_named(name)
     recording = simulate(config, Scenario(duration, (Patch(0.0, name, soil),), slip=SLIP), seed)
     if recording.bogged_at is not None:
         raise SimulationError(f"the tractor gets stuck on {name}")
     prior = missed(prior_of(config), soil, np.random.default_rng([seed, 1]))
-    with_sinkage, without = (_trial(recording, config, duration, prior, soil, fitted) for fitted in (True, False))
+    with_sinkage, without = (_trial(recording, task, prior, soil, fitted) for fitted in (True, False))
     return with_sinkage, without
 
 
@@ -184,18 +222,29 @@ def missed(prior: SoilPrior, soil: Soil, rng: np.random.Generator) -> SoilPrior:
             return SoilPrior(median, prior.log_std)
 
 
-def _trial(recording: Recording, config: Config, duration: float, prior: SoilPrior, soil: Soil, sinkage: bool) -> Trial:
+def _trial(recording: Recording, task: Task, prior: SoilPrior, soil: Soil, sinkage: bool) -> Trial:
+    config, _, duration, seed, drawn = task
     names = [n for n in rig_of(config).channels if n in recording.channels and (sinkage or not n.startswith("sinkage"))]
     noisy, noiseless = (_problem(recording, config, duration, names, of_truth) for of_truth in (False, True))
     bound = cramer_rao(noiseless, prior, soil)
     begin = time.thread_time()
-    fit = fit_window(noisy, prior)
+    found, before = fit_window(noisy, prior), Belief.of(prior, noisy.gain_std)
+    fit = with_whole(noisy, prior, before, found) if found is not None and found.converged else found
     seconds = time.thread_time() - begin
-    if fit is None:
+    if fit is None or found is None:
         nothing = np.full(len(PARAMETERS) + 1, np.nan)
         return Trial(nothing, nothing, nothing, np.nan, False, seconds)
-    (value, std), (truth, least) = (_logarithms(p, config) for p in (fit.posterior, bound))
-    return Trial(value - truth, std, least, fit.chi2, fit.converged, seconds)
+    (value, std), (truth, least) = (_logarithms(p, config) for p in (fit.whole.posterior, bound))
+    trial = Trial(value - truth, std, least, fit.chi2, fit.converged, seconds)
+    if not drawn or not fit.converged:
+        return trial
+    posterior = samples(noisy, prior, before, found, drawn, np.random.default_rng([seed, 2]))
+    if posterior is None:
+        return trial
+    z_ref, b_ref = config.estimator.z_ref, config.estimator.b_ref
+    bearing = [math.log(Soil(*one).bearing_pressure(z_ref, b_ref)) for one in np.exp(posterior.logs).tolist()]
+    exact = np.append(posterior.share @ posterior.logs, posterior.share @ np.array(bearing)) - truth
+    return replace(trial, exact=exact, effective=posterior.effective)
 
 
 def _problem(
@@ -248,7 +297,26 @@ def summary(soil: str, duration: float, sinkage: bool, windows: Sequence[Trial])
             bound=np.sqrt((bound**2).sum(axis=0) / count),
             chi2=float(sum(trial.chi2 for trial in good) / count),
             seconds=float(np.median([trial.seconds for trial in windows])),
+            exact=_exact([trial for trial in good if trial.exact is not None], np.asarray(free)),
         )
+
+
+def _exact(windows: Sequence[Trial], free: NDArray[np.bool_]) -> Exact | None:
+    """The figures of windows whose exact posteriors are known; None without any."""
+    if not windows:
+        return None
+    bound = np.array([trial.bound for trial in windows])[:, free]
+    ours = (np.array([trial.error for trial in windows])[:, free] / bound) ** 2
+    best = (np.array([trial.exact for trial in windows])[:, free] / bound) ** 2
+    square = ours.sum(0) / best.sum(0)
+    return Exact(
+        windows=len(windows),
+        ours=np.sqrt(ours.mean(0)),
+        best=np.sqrt(best.mean(0)),
+        share=np.sqrt(square),
+        scatter=0.5 * np.sqrt(square) * np.sqrt(((ours - square * best) ** 2).sum(0)) / ours.sum(0),
+        effective=float(np.median([trial.effective for trial in windows])),
+    )
 
 
 def as_json(cell: Cell) -> dict[str, Any]:
@@ -258,6 +326,8 @@ def as_json(cell: Cell) -> dict[str, Any]:
         return value if math.isfinite(value) else None
 
     columns = {"rms": cell.rms, "bias": cell.bias, "coverage": cell.coverage, "bound": cell.bound}
+    if cell.exact is not None:
+        columns |= {"rms_beside_exact": cell.exact.ours, "exact": cell.exact.best}
     return {
         "soil": cell.soil, "duration": cell.duration, "sinkage": cell.sinkage, "windows": cell.windows,
         "failed": cell.failed, "not_converged": cell.not_converged, "chi2": number(cell.chi2), "seconds": cell.seconds,

@@ -1,0 +1,51 @@
+"""Denoised latents: known cases of shrinkage, and information that noise does not make."""
+
+from __future__ import annotations
+
+import minima
+import numpy as np
+import pytest
+
+from soilbus.assembly import prior_of
+from soilbus.estimation.belief import Belief
+from soilbus.estimation.bound import cramer_rao
+from soilbus.estimation.denoised import DenoisedProblem, expected
+from soilbus.estimation.gauss_newton import fit_window, settled
+from soilbus.estimation.normal_equations import Fitting, Place
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Swing
+from soilbus.terra.soils import SOILS
+
+
+def test_noise_alone_is_the_mean_and_signals_stay():
+    rng = np.random.default_rng(2)
+    signal = np.outer(np.sin(np.arange(200.0) / 9.0), [3.0, -1.0, 2.0, 0.0])
+    sd = np.array([0.1, 0.2, 0.3, 0.1])
+    noise = sd * rng.standard_normal(signal.shape)
+    variance = np.broadcast_to(sd**2, signal.shape)
+    level = 5.0 + noise
+    assert expected(level, variance) == pytest.approx(np.broadcast_to(level.mean(0), level.shape))
+    calm = expected(signal + noise, variance)
+    left, before = (((x - signal) / sd).std() for x in (calm, signal + noise))
+    assert left < 0.6 * before  # one direction of four
+    exact = variance * np.array([1.0, 1.0, 1.0, 0.0])
+    assert expected(signal + noise, exact)[:, 3] == pytest.approx((signal + noise)[:, 3])
+
+
+def test_a_window_without_variation_tells_no_more_than_the_bound():
+    # With the latents as fitted, noise tells n: a third less spread here than any unbiased estimate has.
+    soil, still = SOILS["wet_clay"], Swing(0.0, 1e-9)
+    config = reference_configuration([*minima.told("wet_clay"), "soil.k_c.value=43680", "soil.k_c.std=20000"])
+    prior, ratio = prior_of(config), []
+    for seed in range(8):
+        problem = minima.window(config, "wet_clay", 10.0, minima.constant(0.1), False, 40 + seed, still)
+        fit = fit_window(problem, prior)
+        calm = DenoisedProblem(problem, fit.optimum)
+        before = Belief.of(prior, problem.gain_std)
+        place = Place(fit.optimum.soil, fit.optimum.gains, calm.latents, np.inf, 1)
+        top = settled(Fitting(calm, prior, before), place)
+        bound = cramer_rao(calm, prior, soil).log_covariance[2, 2]
+        ratio.append([one.mode.covariance[2, 2] / bound for one in (fit, top)])
+    fitted, denoised = np.sqrt(np.median(ratio, axis=0))
+    assert denoised > 0.85
+    assert fitted < 0.93 * denoised

@@ -1,0 +1,50 @@
+"""Exact posteriors by importance sampling against the nested average that the service reports."""
+
+from __future__ import annotations
+
+import minima
+import numpy as np
+import pytest
+
+from soilbus.assembly import prior_of
+from soilbus.estimation.belief import Belief
+from soilbus.estimation.exact import samples
+from soilbus.estimation.gauss_newton import fit_window
+from soilbus.estimation.marginal import with_whole
+from soilbus.estimation.posterior import SoilPrior
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Swing
+
+STILL = Swing(0.0, 1e-9)
+
+
+@pytest.fixture(scope="module")
+def ill_told():
+    """A window of constant slip and loads on wet clay."""
+    config = reference_configuration([*minima.told("wet_clay"), "soil.k_c.value=43680", "soil.k_c.std=20000"])
+    problem = minima.window(config, "wet_clay", 4.0, minima.constant(0.15), True, 5, STILL)
+    prior = prior_of(config)
+    return problem, prior, Belief.of(prior, problem.gain_std), fit_window(problem, prior)
+
+
+def test_the_average_along_n_has_the_moments_of_the_exact_posterior(ill_told):
+    problem, prior, before, fit = ill_told
+    exact = samples(problem, prior, before, fit, 500, np.random.default_rng(1))
+    assert exact.share.sum() == pytest.approx(1.0)
+    assert exact.effective > 60.0
+    mean = exact.share @ exact.logs
+    std = np.sqrt(exact.share @ (exact.logs - mean) ** 2)
+    whole = with_whole(problem, prior, before, fit).whole
+    chance = 3.5 / np.sqrt(exact.effective)
+    assert np.abs((np.log(whole.soil) - mean) / std).max() < 0.1 + chance
+    # The average is never surer; how much less sure where k_c may be next to nothing, is its own choice.
+    ratio = np.sqrt(np.diag(whole.covariance)[:6]) / std
+    assert ratio.min() > 1.0 - 0.1 - chance / np.sqrt(2.0)
+    assert ratio.max() < 1.5
+
+
+def test_without_a_ridge_there_are_no_samples(ill_told):
+    problem, prior, _, _ = ill_told
+    held = SoilPrior(prior.median, np.where(np.arange(6) == 0, 0.0, prior.log_std))
+    before, fit = Belief.of(held, problem.gain_std), fit_window(problem, held)
+    assert samples(problem, held, before, fit, 10, np.random.default_rng(1)) is None
