@@ -116,7 +116,7 @@ def test_a_window_that_fails_leaves_what_is_known_alone():
             wild = window.torque * nonsense.choice([-3.0, 3.0], window.torque.shape)
             bad = disturbed.estimate(replace(window, torque=wild), end)
             assert bad.mismatch
-            assert all(known.end != end for known in disturbed._beliefs)
+            assert all(at != end for at, _ in disturbed._beliefs)
         else:
             last = disturbed.estimate(window, end)
     expected = undisturbed.estimate(*drive[-1])

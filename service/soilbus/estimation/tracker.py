@@ -26,7 +26,7 @@ from soilbus.estimation.gauss_newton import Fit, Foreseen, fit_window, foreseen,
 from soilbus.estimation.marginal import with_whole
 from soilbus.estimation.normal_equations import Fitting
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-from soilbus.estimation.present import Drifts, present_and_drifts
+from soilbus.estimation.present import at_present
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.soil_change import Crossing, suspicion, without_crossing
 from soilbus.estimation.window import Rig, Window
@@ -117,14 +117,6 @@ class Tracked:
     turning: int = 0
 
 
-class Learned(NamedTuple):
-    """What a window that ended at `end` [s] leaves for those that begin later."""
-
-    end: float
-    belief: Belief
-    drifts: Drifts
-
-
 class Alarm(NamedTuple):
     """When the data first disagreed with the soil known [s], and how fast the vehicle then was [m/s]."""
 
@@ -167,8 +159,7 @@ class Tracker:
         self._good_until = -math.inf
         self._alarm: Alarm | None = None
         self._crossing: Crossing | None = None
-        self._drifts = Drifts.about(self.settings.drift)  # as the last fit that was told leaves them
-        self._beliefs: list[Learned] = []
+        self._beliefs: list[tuple[float, Belief]] = []
 
     def estimate(self, window: Window, end: float) -> Tracked:
         """One window that ends at `end` [s]; windows in their order."""
@@ -203,12 +194,13 @@ class Tracker:
                 fitting, fit = self._afresh(problem, before)
         if changed is not None:
             return self._remembered(replace(changed, standstill=left_out[0], turning=left_out[1]), end)
-        ground = self._ground(self._crossing, end) if new and self._crossing else Ground.SAME
         if new and fit is not None and self._unsettled(fit):
             fitting, fit = self._past_the_border(window, fitting, fit)
-            ground = Ground.SETTLING
-            since = self._crossing.end if self._crossing else since
-        fit = self._told(fitting, fit, since)
+        fit = self._told(fitting, fit)
+        if new and self._crossing:
+            since, ground = self._crossing.end, self._new_ground(self._crossing, fit, end)
+        else:
+            ground = Ground.SAME
         return self._remembered(Tracked(fit, self.mismatch(fit), ground, since, *left_out), end)
 
     def _alarm_in(self, window: Window, ahead: Foreseen, last: Fit, fit: Fit | None, filled: float) -> Alarm | None:
@@ -245,14 +237,13 @@ class Tracker:
                 return Fitting(problem, there, known), other
         return Fitting(problem, self._here, before), fit
 
-    def _told(self, fitting: Fitting, fit: Fit | None, since: float) -> Fit | None:
+    def _told(self, fitting: Fitting, fit: Fit | None) -> Fit | None:
         """A fit that is going to be reported: with the whole posterior, of the soil at the window's end."""
         if fit is None or not fit.converged:
             return fit
         if not self.mismatch(fit):
             fit = with_whole(fitting.problem, fitting.coordinates.prior, fitting.before, fit)
-        present, self._drifts = present_and_drifts(fitting, fit, self.settings.window, self._drifts_at(since))
-        return present
+        return at_present(fitting, fit, self.settings.window, self.settings.drift)
 
     def mismatch(self, fit: Fit | None) -> bool:
         """Whether a fit failed or leaves more than noise."""
@@ -273,7 +264,7 @@ class Tracker:
             self._good_until = end
             learned = end - tracked.since >= LEARNED * self.settings.window and fit.is_gaussian
             if learned and tracked.ground in (Ground.SAME, Ground.NEW):
-                self._beliefs.append(Learned(end, fit.whole, self._drifts))
+                self._beliefs.append((end, fit.whole))
         return tracked
 
     def _known_at(self, t: float, problem: WindowProblem) -> Belief:
@@ -284,25 +275,15 @@ class Tracker:
         ended = self._ended(t)
         if not ended:
             return Belief.of(self._here, problem.gain_std)
-        end, belief, _ = self._beliefs[ended[-1]]
+        end, belief = self._beliefs[ended[-1]]
         elapsed = (t - end) / self.settings.window
         gains = problem.gain_std**2 * min((elapsed + 1.0) / GAIN_MEMORY, 1.0)
         if self._crossing is not None and end <= self._crossing.end:
             return belief.of_another_soil(self._here).drifted(np.zeros((_SOIL, _SOIL)), gains)
         return belief.drifted(self._drift(belief, elapsed), gains)
 
-    def _drifts_at(self, t: float) -> Drifts:
-        """How fast the soil may drift from t [s] on, by what windows that had ended by then tell."""
-        ended = self._ended(t)
-        if not ended:
-            return Drifts.about(self.settings.drift, self._crossing is not None)
-        end, _, drifts = self._beliefs[ended[-1]]
-        if self._crossing is not None and end <= self._crossing.end:
-            return Drifts.about(self.settings.drift, border=True)
-        return drifts.later((t - end) / self.settings.window + 1.0)
-
     def _ended(self, t: float) -> list[int]:
-        return [i for i, known in enumerate(self._beliefs) if known.end <= t + _SAME_TIME]
+        return [i for i, (end, _) in enumerate(self._beliefs) if end <= t + _SAME_TIME]
 
     def _forget_before(self, start: float) -> None:
         """Only the newest of the beliefs that windows from `start` [s] on may build on is kept, and what follows it."""
@@ -345,16 +326,17 @@ class Tracker:
             if old is not None and not self._likelier(old, new, fit_window(self._problem(apart), self._here, before)):
                 return None
             self._crossing, self._here = crossing, there
-            ground = self._ground(crossing, float(window.t[-1]))
-            return Tracked(self._told(Fitting(second, there, known), new, crossing.end), False, ground, crossing.end)
+            told = self._told(Fitting(second, there, known), new)
+            return Tracked(told, False, self._new_ground(crossing, told, float(window.t[-1])), crossing.end)
         if ahead is None or old is None or not waits:
             return None
-        return Tracked(self._told(ahead.fitting, old, float(window.t[0])), False, Ground.CHANGING, float(window.t[0]))
+        return Tracked(self._told(ahead.fitting, old), False, Ground.CHANGING, float(window.t[0]))
 
-    def _ground(self, crossing: Crossing, end: float) -> Ground:
-        """What a window that ends at `end` [s] has of the soil after a crossing: a long border may go on."""
+    def _new_ground(self, crossing: Crossing, fit: Fit | None, end: float) -> Ground:
+        """Whether the border before a window that ends at `end` [s] is over: a long one may go on."""
         needed = min(crossing.end - crossing.begin, AS_LONG * self.settings.window)
-        return Ground.NEW if end - crossing.end >= needed else Ground.SETTLING
+        over = end - crossing.end >= needed and fit is not None and not self._unsettled(fit)
+        return Ground.NEW if over else Ground.SETTLING
 
     def _unsettled(self, fit: Fit) -> bool:
         """Whether a fit of a new soil leaves more than noise alone mostly does."""
