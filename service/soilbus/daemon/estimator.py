@@ -34,6 +34,8 @@ MIN_NEW_SOIL = 0.2
 """Share of a window that a new soil must fill before its estimate is valid."""
 SKEWED = 0.5
 """Standard deviations between mode and mean of a new soil's posterior from which they do not hold: its data are few."""
+SHARP = 0.5
+"""Share of the allowed std of bearing pressure below which they hold all the same."""
 STUCK_RIM_SPEED = 2.5
 """Least rim speed of a vehicle that is stuck, in units of the least speed at which slip is judged."""
 AMBIGUOUS = 2.0
@@ -275,7 +277,10 @@ class WindowEstimator:
             return True
         if tracked.since > end - MIN_NEW_SOIL * self._settings.window:
             return True
-        return tracked.ground is Ground.NEW and fit.posterior.distance(fit.mode.posterior.soil) > SKEWED
+        bearing = self._bearing(fit.whole.posterior)
+        skewed = fit.posterior.distance(fit.mode.posterior.soil) > SKEWED
+        sharp = bearing.std < SHARP * self._settings.max_bearing_std * bearing.value
+        return tracked.ground is Ground.NEW and skewed and not sharp
 
     def _failure(self, tracked: Tracked) -> str | None:
         """In what way a solve failed: not_finite, model_mismatch or no_convergence; None where it did not."""

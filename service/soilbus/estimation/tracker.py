@@ -46,8 +46,8 @@ TRUST, TRUST_AGAIN = 3.5, 0.0
 """Standard deviations of chi-square that a window may have above the allowed: always, and after a mismatch."""
 SETTLED = 1.5
 """The same just after a border: what is left of it in the window misleads long before it is a mismatch."""
-AS_LONG = 0.4
-"""Share of a window for which a new soil must last after a border of that length; after a shorter one less."""
+AS_LONG = 2.0
+"""Times a gradual border for which a new soil must last until that is over; at most as long as until it is learned."""
 LOOK_BACK = 0.2
 """Share of a window before the end of the last fit's data from which on a change is looked for."""
 RECENT = 2.0
@@ -62,8 +62,8 @@ LEARNED = 0.5
 """Share of a window that its data must fill for later windows to build on it: the posterior of less is not Gaussian."""
 BORDERS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.5, 10.5)
 """Lengths after the first sign of another soil that may be of neither, in wheelbases: borders are sharp or gradual."""
-LONGER = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0)
-"""Wheelbases by which a border may turn out to be longer than it seemed at first."""
+LONGER = (0.1, 0.25, 0.45, 0.7)
+"""Shares of the data of a new soil that may turn out to be of its border after all."""
 OF_BORDER = 25.0
 """Fall of the cost, beyond that of as many residuals of noise, from which data are of the border after all."""
 GAIN_MEMORY = 60.0
@@ -154,7 +154,7 @@ class Tracker:
     def forget(self) -> None:
         """Begin anew."""
         self._here = self.prior  # of the present soil
-        self._distrusted = False
+        self._distrusted = self._in_border = False  # the last window was a mismatch; and of no soil since a border
         self._fit: Fit | None = None
         self._good_until = -math.inf
         self._alarm: Alarm | None = None
@@ -164,10 +164,11 @@ class Tracker:
     def estimate(self, window: Window, end: float) -> Tracked:
         """One window that ends at `end` [s]; windows in their order."""
         start = end - self.settings.window
-        new = self._crossing is not None and start < self._crossing.end
+        crossing = self._crossing
+        new = crossing is not None and (self._in_border or start < crossing.end)
         window = self._of_this_soil(window)
         problem = self._problem(window)
-        since = self._crossing.end if new and self._crossing else start
+        since = max(crossing.end, start) if new and crossing else start
         left_out = problem.standstill, problem.turning
         if problem.n_rows < self.settings.min_rows:
             self._fit = None
@@ -194,11 +195,12 @@ class Tracker:
                 fitting, fit = self._afresh(problem, before)
         if changed is not None:
             return self._remembered(replace(changed, standstill=left_out[0], turning=left_out[1]), end)
+        new = new or self._crossing is not crossing
         if new and fit is not None and self._unsettled(fit):
             fitting, fit = self._past_the_border(window, fitting, fit)
         fit = self._told(fitting, fit)
         if new and self._crossing:
-            since, ground = self._crossing.end, self._new_ground(self._crossing, fit, end)
+            since, ground = max(self._crossing.end, start), self._new_ground(self._crossing, fit, end)
         else:
             ground = Ground.SAME
         return self._remembered(Tracked(fit, self.mismatch(fit), ground, since, *left_out), end)
@@ -260,6 +262,7 @@ class Tracker:
         self._fit = fit if fit is not None and fit.converged else None
         if fit is not None:
             self._distrusted = tracked.mismatch
+            self._in_border = tracked.mismatch and tracked.ground is Ground.SETTLING
         if fit is not None and not tracked.mismatch:
             self._good_until = end
             learned = end - tracked.since >= LEARNED * self.settings.window and fit.is_gaussian
@@ -334,7 +337,9 @@ class Tracker:
 
     def _new_ground(self, crossing: Crossing, fit: Fit | None, end: float) -> Ground:
         """Whether the border before a window that ends at `end` [s] is over: a long one may go on."""
-        needed = min(crossing.end - crossing.begin, AS_LONG * self.settings.window)
+        length = crossing.end - crossing.begin
+        sharp = length < crossing.lag + self.settings.window / 100.0  # shorter than the vehicle
+        needed = 0.0 if sharp else min(AS_LONG * length, LEARNED * self.settings.window)
         over = end - crossing.end >= needed and fit is not None and not self._unsettled(fit)
         return Ground.NEW if over else Ground.SETTLING
 
@@ -346,7 +351,9 @@ class Tracker:
         """The fit of the data after a border longer than was thought, if those left out are why they do not agree."""
         crossing = self._crossing
         assert crossing is not None  # else there is no border
-        for longer in (crossing._replace(end=crossing.end + share * crossing.lag) for share in LONGER):
+        begin = max(crossing.end, float(window.t[0]))
+        for end in (begin + share * (float(window.t[-1]) - begin) for share in LONGER):
+            longer = crossing._replace(end=end)
             apart = without_crossing(window, longer, self.rig.front)
             problem = self._problem(apart.rows(np.flatnonzero(apart.t >= longer.end)))
             if problem.n_rows < 2 * MIN_NEW_ROWS:
