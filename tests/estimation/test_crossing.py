@@ -6,13 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drives import B_REF, Z_REF, errors, tracker_of, windows
+from drives import B_REF, Z_REF, errors, task_of, tracker_of, windows
 
+from soilbus.daemon.estimator import WindowEstimator
 from soilbus.estimation.tracker import Ground, Tracked
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
-from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.simulator.scenario import Patch, Scenario, Swing, soil_along
 from soilbus.terra.soils import SOILS
+from soilbus.terra.wheel import Soil
+from soilbus.traversability import Status
 
 SPEED = 1.5
 CROSSED = 20.0
@@ -76,6 +79,52 @@ def test_a_border_may_be_longer_than_thought(first, second, seed, at, how):
             assert abs(off(result, second)) < 3.5
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "at", "transition", "seed"),
+    [
+        ("loam", "wet_clay", 17.11, 1.0, 103),  # few data, and a posterior far from Gaussian: 3.4 sd off
+        ("wet_clay", "dry_sand", 16.0, 15.0, 100),  # a border that seemed over: 7.7 sd
+        ("dry_sand", "wet_clay", 16.0, 15.0, 100),  # 8.2 sd
+    ],
+)
+def test_no_valid_window_near_a_border_is_wrong(first, second, at, transition, seed):
+    # All of these had a valid window that far off.  Right is the soil anywhere between the axles.
+    config = reference_configuration()
+    patches = (Patch(0.0, first), Patch(at, second))
+    scenario = Scenario(
+        at + transition + 8.0, patches, Swing(1.0, 1.0 + 1e-6), slip=Swing(0.05, 0.40), transition=transition
+    )
+    recording = simulate(config, scenario, seed)
+    estimator, between = WindowEstimator(config), np.linspace(-0.95, 1.0, 9)
+    valid_after = 0
+    for window, end in windows(config, recording):
+        result = estimator.estimate(task_of(window, end, config, index=round(end - 10.0))).result
+        place = np.interp(end, recording.truth["t"], recording.truth["distance"])
+        if result.status is Status.VALID and place > at - 2.0:
+            under = np.transpose(soil_along(patches, place + between, transition))
+            away = [np.abs(errors(result.posterior, Soil(*map(float, soil)))).max() for soil in under]
+            assert min(away) < 3.0
+            valid_after += place > at + transition
+    assert valid_after >= 2
+
+
+def test_a_soil_found_afresh_is_another_one_from_where_its_data_begin():
+    # Nothing but failed windows in between, so that no border was seen.
+    config = reference_configuration()
+    tracker = tracker_of(config)
+    for soil, first in (("loam", 0.0), ("wet_clay", 30.0)):
+        scenario = Scenario(13.0, (Patch(0.0, soil),), slip=Swing(0.05, 0.40))
+        results = []
+        for window, end in windows(config, simulate(config, scenario, 2)):
+            late = replace(window, t=window.t + first)
+            results.append(tracker.estimate(late, end + first))
+        empty = replace(window, t=window.t + first, ground_speed=np.full(len(window.t), np.nan))
+        assert tracker.estimate(empty, end + first).fit is None
+    assert [r.ground for r in results] == [Ground.NEW] + [Ground.SAME] * (len(results) - 1)
+    assert all(abs(off(r, "wet_clay")) < 3.5 for r in results)
+    assert tracker._crossing.end == pytest.approx(30.0, abs=0.2)
+
+
 def test_what_no_soil_explains_is_a_mismatch_and_no_new_soil():
     # From 13 s on the right rear wheel seems to pull with no torque: the other three are as they were.
     config = reference_configuration()
@@ -116,7 +165,7 @@ def test_a_window_that_fails_leaves_what_is_known_alone():
             wild = window.torque * nonsense.choice([-3.0, 3.0], window.torque.shape)
             bad = disturbed.estimate(replace(window, torque=wild), end)
             assert bad.mismatch
-            assert all(known.end != end for known in disturbed._beliefs)
+            assert all(at != end for at, _ in disturbed._beliefs)
         else:
             last = disturbed.estimate(window, end)
     expected = undisturbed.estimate(*drive[-1])

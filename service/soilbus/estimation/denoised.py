@@ -56,13 +56,14 @@ class DenoisedProblem(WindowProblem):
         """Sinkage [m] of each wheel at each instant (N, W)."""
         return self._problem.sinkages(soil, gains, latents)
 
-    def linearise(self, soil: Soil, gains: Array, latents: Latents) -> Linearised:
+    def linearise(self, soil: Soil, gains: Array, latents: Latents, by_sensors: bool = True) -> Linearised:
         """Residuals and derivatives at the expected latents, weighed as at the optimum; updates leave these alone."""
-        at = self._problem.linearise(soil, gains, latents)
+        at = self._problem.linearise(soil, gains, latents, by_sensors)
         W, change = self.n_wheels, self._by_noise - at.by_latents
         rows = at.rows.reshape(*change.shape[:2], -1)
         rows[:, :, 0] += (change @ (at.corrected - self._expected)[:, :, None])[:, :, 0]
-        rows[:, :, 7 + W : 6 + self.n_sensors] -= change * at.by_gain[:, None, :]
+        if by_sensors:
+            rows[:, :, 7 + W : 6 + self.n_sensors] -= change * at.by_gain[:, None, :]
         weighed = (self._inverse @ rows).reshape(at.rows.shape)
         nothing = np.zeros_like(at.variance)
         return replace(

@@ -26,7 +26,7 @@ from soilbus.estimation.gauss_newton import Fit, Foreseen, fit_window, foreseen,
 from soilbus.estimation.marginal import with_whole
 from soilbus.estimation.normal_equations import Fitting
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-from soilbus.estimation.present import Drifts, present_and_drifts
+from soilbus.estimation.present import at_present
 from soilbus.estimation.recall import is_borne_out, recalled
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.soil_change import Crossing, suspicion, without_crossing
@@ -47,8 +47,8 @@ TRUST, TRUST_AGAIN = 3.5, 0.0
 """Standard deviations of chi-square that a window may have above the allowed: always, and after a mismatch."""
 SETTLED = 1.5
 """The same just after a border: what is left of it in the window misleads long before it is a mismatch."""
-AS_LONG = 0.4
-"""Share of a window for which a new soil must last after a border of that length; after a shorter one less."""
+AS_LONG = 2.0
+"""Times a gradual border for which a new soil must last until that is over; at most as long as until it is learned."""
 LOOK_BACK = 0.2
 """Share of a window before the end of the last fit's data from which on a change is looked for."""
 RECENT = 2.0
@@ -63,8 +63,8 @@ LEARNED = 0.5
 """Share of a window that its data must fill for later windows to build on it: the posterior of less is not Gaussian."""
 BORDERS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.5, 10.5)
 """Lengths after the first sign of another soil that may be of neither, in wheelbases: borders are sharp or gradual."""
-LONGER = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0)
-"""Wheelbases by which a border may turn out to be longer than it seemed at first."""
+LONGER = (0.1, 0.25, 0.45, 0.7)
+"""Shares of the data of a new soil that may turn out to be of its border after all."""
 OF_BORDER = 25.0
 """Fall of the cost, beyond that of as many residuals of noise, from which data are of the border after all."""
 GAIN_MEMORY = 60.0
@@ -118,14 +118,6 @@ class Tracked:
     turning: int = 0
 
 
-class Learned(NamedTuple):
-    """What a window that ended at `end` [s] leaves for those that begin later."""
-
-    end: float
-    belief: Belief
-    drifts: Drifts
-
-
 class Alarm(NamedTuple):
     """When the data first disagreed with the soil known [s], and how fast the vehicle then was [m/s]."""
 
@@ -174,21 +166,21 @@ class Tracker:
     def forget(self) -> None:
         """Begin anew."""
         self._here = self.prior  # of the present soil
-        self._distrusted = False
+        self._distrusted = self._in_border = False  # the last window was a mismatch; and of no soil since a border
         self._fit: Fit | None = None
         self._good_until = -math.inf
         self._alarm: Alarm | None = None
         self._crossing: Crossing | None = None
-        self._drifts = Drifts.about(self.settings.drift)  # as the last fit that was told leaves them
-        self._beliefs: list[Learned] = []
+        self._beliefs: list[tuple[float, Belief]] = []
 
     def estimate(self, window: Window, end: float) -> Tracked:
         """One window that ends at `end` [s]; windows in their order."""
         start = end - self.settings.window
-        new = self._crossing is not None and start < self._crossing.end
+        crossing = self._crossing
+        new = crossing is not None and (self._in_border or start < crossing.end)
         window = self._of_this_soil(window)
         problem = self._problem(window)
-        since = self._crossing.end if new and self._crossing else start
+        since = max(crossing.end, start) if new and crossing else start
         left_out = problem.standstill, problem.turning
         if problem.n_rows < self.settings.min_rows:
             self._fit = None
@@ -215,12 +207,14 @@ class Tracker:
                 fitting, fit = self._afresh(problem, before)
         if changed is not None:
             return self._remembered(replace(changed, standstill=left_out[0], turning=left_out[1]), end)
-        ground = self._ground(self._crossing, end) if new and self._crossing else Ground.SAME
+        new = new or self._crossing is not crossing
         if new and fit is not None and self._unsettled(fit):
             fitting, fit = self._past_the_border(window, fitting, fit)
-            ground = Ground.SETTLING
-            since = self._crossing.end if self._crossing else since
-        fit = self._told(fitting, fit, since)
+        fit = self._told(fitting, fit)
+        if new and self._crossing:
+            since, ground = max(self._crossing.end, start), self._new_ground(self._crossing, fit, end)
+        else:
+            ground = Ground.SAME
         return self._remembered(Tracked(fit, self.mismatch(fit), ground, since, *left_out), end)
 
     def _alarm_in(self, window: Window, ahead: Foreseen, last: Fit, fit: Fit | None, filled: float) -> Alarm | None:
@@ -257,14 +251,13 @@ class Tracker:
                 return Fitting(problem, there, known), other
         return Fitting(problem, self._here, before), fit
 
-    def _told(self, fitting: Fitting, fit: Fit | None, since: float) -> Fit | None:
+    def _told(self, fitting: Fitting, fit: Fit | None) -> Fit | None:
         """A fit that is going to be reported: with the whole posterior, of the soil at the window's end."""
         if fit is None or not fit.converged:
             return fit
         if not self.mismatch(fit):
             fit = with_whole(fitting.problem, fitting.coordinates.prior, fitting.before, fit)
-        present, self._drifts = present_and_drifts(fitting, fit, self.settings.window, self._drifts_at(since))
-        return present
+        return at_present(fitting, fit, self.settings.window, self.settings.drift)
 
     def mismatch(self, fit: Fit | None) -> bool:
         """Whether a fit failed or leaves more than noise."""
@@ -281,11 +274,12 @@ class Tracker:
         self._fit = fit if fit is not None and fit.converged else None
         if fit is not None:
             self._distrusted = tracked.mismatch
+            self._in_border = tracked.mismatch and tracked.ground is Ground.SETTLING
         if fit is not None and not tracked.mismatch:
             self._good_until = end
             learned = end - tracked.since >= LEARNED * self.settings.window and fit.is_gaussian
             if learned and tracked.ground in (Ground.SAME, Ground.NEW):
-                self._beliefs.append(Learned(end, fit.whole, self._drifts))
+                self._beliefs.append((end, fit.whole))
         return tracked
 
     def _known_at(self, t: float, problem: WindowProblem) -> Belief:
@@ -296,25 +290,15 @@ class Tracker:
         ended = self._ended(t)
         if not ended:
             return self._known_at_first(problem)
-        end, belief, _ = self._beliefs[ended[-1]]
+        end, belief = self._beliefs[ended[-1]]
         elapsed = (t - end) / self.settings.window
         gains = problem.gain_std**2 * min((elapsed + 1.0) / GAIN_MEMORY, 1.0)
         if self._crossing is not None and end <= self._crossing.end:
             return belief.of_another_soil(self._here).drifted(np.zeros((_SOIL, _SOIL)), gains)
         return belief.drifted(self._drift(belief, elapsed), gains)
 
-    def _drifts_at(self, t: float) -> Drifts:
-        """How fast the soil may drift from t [s] on, by what windows that had ended by then tell."""
-        ended = self._ended(t)
-        if not ended:
-            return Drifts.about(self.settings.drift, self._crossing is not None)
-        end, _, drifts = self._beliefs[ended[-1]]
-        if self._crossing is not None and end <= self._crossing.end:
-            return Drifts.about(self.settings.drift, border=True)
-        return drifts.later((t - end) / self.settings.window + 1.0)
-
     def _ended(self, t: float) -> list[int]:
-        return [i for i, known in enumerate(self._beliefs) if known.end <= t + _SAME_TIME]
+        return [i for i, (end, _) in enumerate(self._beliefs) if end <= t + _SAME_TIME]
 
     def _known_at_first(self, problem: WindowProblem) -> Belief:
         """Before any window: the prior, and the gains of another run unless the data speak against them."""
@@ -366,16 +350,19 @@ class Tracker:
             if old is not None and not self._likelier(old, new, fit_window(self._problem(apart), self._here, before)):
                 return None
             self._crossing, self._here = crossing, there
-            ground = self._ground(crossing, float(window.t[-1]))
-            return Tracked(self._told(Fitting(second, there, known), new, crossing.end), False, ground, crossing.end)
+            told = self._told(Fitting(second, there, known), new)
+            return Tracked(told, False, self._new_ground(crossing, told, float(window.t[-1])), crossing.end)
         if ahead is None or old is None or not waits:
             return None
-        return Tracked(self._told(ahead.fitting, old, float(window.t[0])), False, Ground.CHANGING, float(window.t[0]))
+        return Tracked(self._told(ahead.fitting, old), False, Ground.CHANGING, float(window.t[0]))
 
-    def _ground(self, crossing: Crossing, end: float) -> Ground:
-        """What a window that ends at `end` [s] has of the soil after a crossing: a long border may go on."""
-        needed = min(crossing.end - crossing.begin, AS_LONG * self.settings.window)
-        return Ground.NEW if end - crossing.end >= needed else Ground.SETTLING
+    def _new_ground(self, crossing: Crossing, fit: Fit | None, end: float) -> Ground:
+        """Whether the border before a window that ends at `end` [s] is over: a long one may go on."""
+        length = crossing.end - crossing.begin
+        sharp = length < crossing.lag + self.settings.window / 100.0  # shorter than the vehicle
+        needed = 0.0 if sharp else min(AS_LONG * length, LEARNED * self.settings.window)
+        over = end - crossing.end >= needed and fit is not None and not self._unsettled(fit)
+        return Ground.NEW if over else Ground.SETTLING
 
     def _unsettled(self, fit: Fit) -> bool:
         """Whether a fit of a new soil leaves more than noise alone mostly does."""
@@ -385,7 +372,9 @@ class Tracker:
         """The fit of the data after a border longer than was thought, if those left out are why they do not agree."""
         crossing = self._crossing
         assert crossing is not None  # else there is no border
-        for longer in (crossing._replace(end=crossing.end + share * crossing.lag) for share in LONGER):
+        begin = max(crossing.end, float(window.t[0]))
+        for end in (begin + share * (float(window.t[-1]) - begin) for share in LONGER):
+            longer = crossing._replace(end=end)
             apart = without_crossing(window, longer, self.rig.front)
             problem = self._problem(apart.rows(np.flatnonzero(apart.t >= longer.end)))
             if problem.n_rows < 2 * MIN_NEW_ROWS:
