@@ -15,9 +15,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+
+from .mutation import mutated
 
 LONGEST = 30
 """Seconds for one input."""
@@ -28,65 +32,44 @@ PACKAGES = ["soilbus", "cantools"]
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse, fuzz, tell."""
-    chosen = _parsed(arguments)
-    if not chosen.plain and _has_atheris():
-        import atheris
-
-        with atheris.instrument_imports(include=PACKAGES):
-            from .targets import TARGETS
-        return _guided(chosen.target, TARGETS, chosen.seconds, chosen.seed)
-    from .targets import TARGETS
-
-    return _plain(chosen.target, TARGETS, chosen.seconds, chosen.seed)
-
-
-def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--target", required=True, help="frames, windows, service, dbc, config, model, log-...")
     parser.add_argument("--seconds", type=int, default=60, help="how long (60)")
     parser.add_argument("--seed", type=int, default=1, help="of the random numbers (1)")
     parser.add_argument("--plain", action="store_true", help="seeded mutations, not guided by coverage")
-    return parser.parse_args(arguments)
+    chosen = parser.parse_args(arguments)
+    guided = not chosen.plain and find_spec("atheris") is not None
+    targets = _instrumented() if guided else import_module("tests.fuzz.targets").TARGETS
+    if chosen.target not in targets:
+        parser.error(f"no target is named {chosen.target}; known: {', '.join(targets)}")
+    return (_guided if guided else _plain)(chosen.target, targets[chosen.target], chosen.seconds, chosen.seed)
 
 
-def _has_atheris() -> bool:
-    try:
-        import atheris  # noqa: F401
-    except ImportError:
-        return False
-    return True
-
-
-def _guided(name, targets, seconds: int, seed: int) -> int:
-    """libFuzzer's loop, which ends the process itself."""
+def _instrumented():
+    """The targets with everything that they import watched for coverage."""
     import atheris
 
-    target = targets[name]
+    with atheris.instrument_imports(include=PACKAGES):
+        return import_module("tests.fuzz.targets").TARGETS
+
+
+def _guided(name, target, seconds: int, seed: int) -> int:
+    """libFuzzer's loop, which ends the process itself and leaves its corpus in a temporary folder."""
+    import atheris
+
     folder = Path(tempfile.mkdtemp(prefix=f"soilbus-fuzz-{name}-"))
     for i, data in enumerate(target.seeds()):
         (folder / f"seed{i}").write_bytes(data[: target.longest])
-    frames = 0
-
-    def one(data: bytes) -> None:
-        nonlocal frames
-        frames += target.one(data)
-
     flags = [
         f"-max_total_time={seconds}", f"-seed={seed}", f"-timeout={LONGEST}", f"-rss_limit_mb={LARGEST}",
         f"-max_len={target.longest}", "-print_final_stats=1", f"-artifact_prefix={name}-",
     ]  # fmt: skip
-    atheris.Setup([sys.argv[0], *flags, str(folder)], one)
-    import atexit
-
-    atexit.register(lambda: print(f"{name}: {frames} frames", file=sys.stderr))
+    atheris.Setup([sys.argv[0], *flags, str(folder)], target.one)
     atheris.Fuzz()
     return 0
 
 
-def _plain(name, targets, seconds: float, seed: int) -> int:
-    from .mutation import mutated
-
-    target = targets[name]
+def _plain(name, target, seconds: float, seed: int) -> int:
     seeds, rng = target.seeds(), np.random.default_rng(seed)
     for data in seeds:
         target.one(data)
