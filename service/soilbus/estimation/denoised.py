@@ -48,6 +48,10 @@ class DenoisedProblem(WindowProblem):
         """As the problem itself, like all that follows."""
         return self._problem.allowed(gains)
 
+    def gain_bounds(self) -> tuple[Array, Array]:
+        """Least and greatest value that each of the gains may have, (G,) each."""
+        return self._problem.gain_bounds()
+
     def carried(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
         """The same latents with the entry angles at which this soil carries their loads."""
         return self._problem.carried(latents, soil, gains)
