@@ -39,7 +39,7 @@ SETTLED = 2.0
 """Age [s] from which a trend is believed."""
 AHEAD = 10.0
 """Time left [s] from which is warned."""
-MUCH = 0.78
+MUCH = 0.76
 """Share of the capacity from which a rise of the demand beyond its last peaks is carried on, and no warning ends."""
 WEAKENING, SHORT_WEAKENING = 0.006, 0.03
 """Loss [1/s], as a share of the capacity, from which the ground is said to weaken, by the long and the short memory."""
