@@ -83,12 +83,12 @@ def said(soil, slip, shift, sinkage=True, overrides=(), seconds=10.0, seed=1):
     return WindowEstimator(config).solve(next(tasks(config, scenario, seed, "none" if sinkage else "sinkage")))
 
 
-@pytest.mark.parametrize("soil", ["wet_clay", "xi_wet_clay", "clayey_soil_38"])
+@pytest.mark.parametrize("soil", ["wet_clay", "xi_wet_clay", "dry_sand"])
 def test_constant_loads_with_varied_slip_lack_a_range_of_loads(soil):
-    short = said(soil, minima.EXCITED, STILL, sinkage=False, seconds=2.0)
+    short = said(soil, minima.EXCITED, STILL, sinkage=False, seconds=5.0)
     assert (short.status, short.reason) == (Status.NOT_EXCITED, "not_excited load_range")
     assert short.traversability.state is not State.GO
-    varied = said(soil, minima.EXCITED, LEANING, sinkage=False, seconds=2.0)
+    varied = said(soil, minima.EXCITED, LEANING, sinkage=False, seconds=5.0)
     assert varied.bearing.std / varied.bearing.value < 0.8 * short.bearing.std / short.bearing.value
 
 

@@ -52,11 +52,6 @@ class Node(NamedTuple):
     known: float
 
     @property
-    def cost(self) -> float:
-        """-2 log of the posterior density of the likeliest soil with this n."""
-        return self.fit.cost + self.known
-
-    @property
     def unlikelihood(self) -> float:
         """-2 log of the posterior density of n."""
         return self.fit.evidence + self.known
@@ -89,7 +84,9 @@ def with_whole(problem: WindowProblem, prior: SoilPrior, before: Belief, found: 
         coordinates = Coordinates(prior, float(problem.rig.width.mean()))
         whole = _averaged(along.nodes, coordinates, before) if len(along.nodes) > 2 else along.top.belief
     finite = np.isfinite(whole.soil).all() and np.isfinite(whole.covariance).all()
-    return replace(found, belief=along.top.belief, mode=along.top.mode, averaged=whole) if finite else found
+    if not finite or found.rival is not None:  # beside its rival an optimum is told as it was found
+        return replace(found, averaged=whole) if finite else found
+    return replace(found, belief=along.top.belief, mode=along.top.mode, averaged=whole)
 
 
 def ridge(problem: WindowProblem, prior: SoilPrior, before: Belief, found: Fit) -> Ridge | None:
@@ -155,12 +152,7 @@ def _held(problem: WindowProblem, prior: SoilPrior, before: Belief, near: Fit, u
 
 
 def _averaged(nodes: list[Node], coordinates: Coordinates, before: Belief) -> Belief:
-    """Mean and covariance of the mixture of all nodes and of what lies between them, by straight lines.
-
-    Both are the posterior's, but n is known no better than by likelihood and what was known
-    alone, where it counts by the likeliest soil that has it.  The posterior counts all that have it,
-    and is too sure where k_c may be next to nothing: there are many such, for their log k_c may be anything.
-    """
+    """Mean and covariance of the mixture of all nodes and of what lies between them, by straight lines."""
     n, free = len(PARAMETERS), coordinates.free
     active = n + np.flatnonzero(np.diag(before.covariance)[n:] > 0.0)
     beliefs = [node.fit.belief for node in nodes]
@@ -171,13 +163,9 @@ def _averaged(nodes: list[Node], coordinates: Coordinates, before: Belief) -> Be
     own = np.array([_in_coordinates(b.covariance, coordinates.log_directions(b.soil), free, active) for b in beliefs])
     share = np.array([np.interp(fine, u, one) for one in np.eye(len(u))])
     weight = density(u, np.array([node.unlikelihood for node in nodes]), fine)
-    likeliest = density(u, np.array([node.cost for node in nodes]), fine)
     mean = along @ weight
     off = along - mean[:, None]
     covariance = np.tensordot(share @ weight, own, axes=1) + (off * weight) @ off.T
-    i = int(np.searchsorted(free, _N))
-    with_n = covariance[:, i] / covariance[i, i]
-    covariance += max(float(off[i] ** 2 @ likeliest - covariance[i, i]), 0.0) * np.outer(with_n, with_n)
     soil, gains = coordinates.soil_at(mean[: len(free)]), beliefs[0].gains.copy()
     gains[active - n] = mean[len(free) :]
     spread = np.zeros((n + len(gains), len(mean)))
