@@ -13,7 +13,7 @@ from .blind.trial import tried
 VISIBLE = (
     "single/multipass:density/medium/", "single/rate_stiffening:penetration/medium/", "single/soil_drift:ramp/medium/",
     "single/torque_lag:filter/medium/", "single/inertia:flywheel/medium/", "single/hardpan:graded/large/",
-    "single/rolling_radius:one_axle/medium/",
+    "single/rolling_radius:one_axle/medium/", "single/rut_recovery:constant/large/",
 )  # fmt: skip
 
 
@@ -41,8 +41,9 @@ def test_effects_alike_are_told_as_a_set():
     assert sum(trial.sets[0].values()) == pytest.approx(1.0, abs=0.05)
 
 
-def test_where_nothing_is_missing_nothing_is_named():
-    for case in islice(cases("plain", 1), 3):
+@pytest.mark.parametrize("kind", ["plain", "hard"])
+def test_where_nothing_is_missing_nothing_is_named(kind):
+    for case in islice(cases(kind, 1), 3):
         trial = tried(case)
         assert (trial.verdict, trial.named) == ("none", ()), case.id
 

@@ -189,6 +189,7 @@ FORMS = (
         (0.011, 0.09),
         0.2,
         by_hooks(forces=_constant_exit),
+        other=False,
     ),
     Form(
         "rut_recovery",
