@@ -322,6 +322,14 @@ def test_a_good_drive_is_go_and_comes_back_to_go(moment, tracked):
         assert not drive.faults
 
 
+def test_sensors_that_always_say_the_same_are_named_and_never_go(moment, tracked):
+    drive = Drive({i: messages[-1:] * MOMENTS for i, messages in moment.items()}, tracked)
+    drive.run(LEAD + 2.0)
+    assert drive.go == 0
+    assert drive.result.status is Status.DEGRADED
+    assert drive.result.reason.startswith("implausible torque.FL torque.FR")
+
+
 def test_the_time_since_the_last_valid_posterior_grows_until_there_is_one(moment, tracked):
     drive = Drive(moment, tracked)
     drive.run(1.0)

@@ -86,7 +86,7 @@ class Resolution(NamedTuple):
 class Scene(NamedTuple):
     """One window as the checks see it: bins of length `bin` [s]; driving (N,), slip and traction (N, W).
 
-    traction is torque over load and radius; both are nan where unknown and where the vehicle
+    traction is torque over load and radius; both are nan where unknown, slip also where the vehicle
     does not drive straight on.  motor_speed [rad/s] (N, W) is at the wheel's side of the gear.
     """
 
