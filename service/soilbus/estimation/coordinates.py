@@ -23,8 +23,8 @@ MAX_STEP = 0.7
 """Longest step of a coordinate."""
 BOUND = 4.0
 """Prior standard deviations of the logarithm to which a free parameter is confined."""
-EDGE = 1e-9
-"""Distance from a bound that is none, of a logarithm or of a gain."""
+EDGE = 1e-4
+"""Distance from a bound that is none, of a logarithm or in standard deviations of an effect's parameter."""
 LITTLE, MUCH = 0.03, 0.4
 """Shares of k_c in the modulus under a mean tyre, on either side of what most windows can tell from none."""
 MAX_PHI = 1.2
@@ -115,14 +115,17 @@ class Coordinates:
     def reach(self, soil: Array, step: Array) -> float:
         """Share of a step (F,) from a soil (6,) that is no longer than steps may be and stays within the bounds."""
         low, high = self._log_bounds
-        room = np.where(step > 0.0, high, low) - np.log(soil[self.free])
-        room[self.free == _K_PHI] = np.inf  # whose coordinate is the pressure
+        change = self.log_directions(soil)[self.free] @ step
+        room = np.where(change > 0.0, high, low) - np.log(soil[self.free])
         longest = MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-12)
-        return min(1.0, longest, share_of_step(room, step))
+        return min(1.0, longest, share_of_step(room, change))
 
     def edges(self, soil: Array) -> Array:
-        """Which way (F,) a coordinate of a soil (6,) cannot go: -1 or 1 where its parameter is at a bound, else 0."""
-        return at_edges(np.log(soil[self.free]), *self._log_bounds)
+        """Directions (E, F) in which no step can go, since a parameter is at a bound."""
+        at = at_edges(np.log(soil[self.free]), *self._log_bounds)
+        if not at.any():
+            return np.zeros((0, len(at)))
+        return np.asarray((at[:, None] * self.log_directions(soil)[self.free])[at != 0.0])
 
     @cached_property
     def _log_bounds(self) -> tuple[Array, Array]:
@@ -153,5 +156,5 @@ def at_edges(place: Array, low: Array, high: Array) -> Array:
 
 def share_of_step(room: Array, step: Array) -> float:
     """Share of a step (M,), 1 at most, that leaves everything within the room (M,) there is; inf: no end of it."""
-    cramped = (step != 0.0) & np.isfinite(room)
-    return float((room[cramped] / step[cramped]).min(initial=1.0))
+    cramped = np.abs(step) > np.abs(room) + EDGE
+    return max(float((room[cramped] / step[cramped]).min(initial=1.0)), 0.0)

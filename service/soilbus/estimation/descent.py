@@ -67,7 +67,7 @@ def approach(
     """
     place = fitting.start(soil, gains=gains)
     point = fitting.point(place)
-    damping, trials = 1e-3, 1
+    damping, ease, trials = 1e-3, 0.1, 1
     while point is not None:
         step = point.step(damping)
         if step is None:
@@ -82,10 +82,10 @@ def approach(
         new = fitting.point(new_place)
         trials += 1
         if new is None or new.cost >= point.cost:
-            damping *= 10.0
+            damping, ease = 10.0 * damping, 1.0
             continue
         enough = point.cost - new.cost < least * point.cost
-        place, point, damping = new_place, new, damping * 0.1
+        place, point, damping, ease = new_place, new, damping * ease, 0.1
         if enough:
             return replace(place, cost=point.cost, trials=trials)
     return None

@@ -50,8 +50,8 @@ class Point:
 
     information (F + A, F + A) is Gauss-Newton's, of which `known` is what was known
     before; bend, which comes on top for a step, is the curvature of the coordinates.
-    cost is -2 log posterior up to a constant.  edges (F + A,) is 1 or -1 where a coordinate
-    cannot go up or down, else 0.
+    cost is -2 log posterior up to a constant.  edges (E, F + A) are the directions in which
+    no step can go.
     """
 
     information: Array
@@ -65,18 +65,20 @@ class Point:
     def step(self, damping: float = 0.0) -> Array | None:
         """Step (F + A,) to the minimum, held back in proportion to the diagonal; None where there is none.
 
-        What is at an edge and would go beyond stays, and the others go where they then do best.
+        A step that would go beyond an edge goes along it, to where the cost then is least.
         """
         curved = self.information + self.bend
         curved.flat[:: len(curved) + 1] *= 1.0 + damping
-        step = _solution(curved, self.gradient)
-        moving = np.ones(len(self.gradient), bool)
-        while step is not None and (beyond := step * self.edges > 0.0).any():
-            moving &= ~beyond
-            rest = _solution(curved[np.ix_(moving, moving)], self.gradient[moving])
-            step = np.zeros(len(moving))
-            step[moving] = np.nan if rest is None else rest
-        return step if step is not None and np.isfinite(step).all() else None
+        solution = _solution(curved, np.column_stack([self.gradient, self.edges.T]))
+        if solution is None:
+            return None
+        step = -solution[:, 0]
+        held = np.zeros(len(self.edges), bool)
+        while (beyond := ~held & (self.edges @ step > 0.0)).any():
+            held |= beyond
+            along, edges = solution[:, 1:][:, held], self.edges[held]
+            step = along @ np.linalg.lstsq(edges @ along, edges @ solution[:, 0], rcond=None)[0] - solution[:, 0]
+        return step if np.isfinite(step).all() else None
 
     @property
     def evidence(self) -> float:
@@ -151,9 +153,6 @@ class Fitting:
         known = self.before_at(place)
         bend = np.zeros((len(gradient), len(gradient)))
         bend[:free, :free] = self.coordinates.bend(gradient[:free])
-        edges = np.zeros(len(gradient))
-        edges[:free] = self.coordinates.edges(place.soil)
-        edges[free:] = at_edges(place.gains[self.active], *self._gain_bounds)
         cost = at.chi2 + known.cost
         if not np.isfinite(cost):
             return None
@@ -163,7 +162,7 @@ class Fitting:
             bend=bend,
             gradient=gradient + known.gradient,
             cost=cost,
-            edges=edges,
+            edges=self._edges(place),
             at=at,
         )
 
@@ -201,6 +200,16 @@ class Fitting:
         gain_step[self.active] = step[free:]
         latents = self.problem.updated(point.at, place.latents, soil - place.soil, gain_step)
         return self._reached(place, point, soil, place.gains + gain_step, latents)
+
+    def _edges(self, place: Place) -> Array:
+        """Directions (E, F + A) in which no step from there can go."""
+        of_soil = self.coordinates.edges(place.soil)
+        at = at_edges(place.gains[self.active], *self._gain_bounds)
+        own = np.flatnonzero(at)
+        edges = np.zeros((len(of_soil) + len(own), len(self.free) + len(self.active)))
+        edges[: len(of_soil), : len(self.free)] = of_soil
+        edges[len(of_soil) + np.arange(len(own)), len(self.free) + own] = at[own]
+        return edges
 
     def _reach(self, place: Place, step: Array) -> float:
         """Share of a step (F + A,) that can be taken."""
@@ -294,11 +303,13 @@ class Fitting:
         return self.coordinates.log_directions(soil)
 
 
-def _solution(information: Array, gradient: Array) -> Array | None:
-    """-information^-1 gradient (F,); None where the information is singular."""
+def _solution(information: Array, right: Array) -> Array | None:
+    """information^-1 right (F, M); None where the information is singular."""
     scale = 1.0 / np.sqrt(information.diagonal())
     try:
-        return np.asarray(np.linalg.solve(information * scale[:, None] * scale, gradient * scale) * -scale)
+        return np.asarray(
+            np.linalg.solve(information * scale[:, None] * scale, right * scale[:, None]) * scale[:, None]
+        )
     except np.linalg.LinAlgError:
         return None
 

@@ -304,7 +304,8 @@ def load_and_slope(state: WheelState, model: WheelModel, skid: bool) -> Array:
 def _forces(state: WheelState, model: WheelModel, skid: bool) -> Array:
     """W, DP and T (3, N)."""
     at = _stress(state, model, skid)
-    return _unit(state) * _whole(_integrals(np.stack([at.normal, at.rubbed, at.stuck]), 1, at.rim), state)
+    normal, rubbed, stuck = _integrals(np.stack([at.normal, at.rubbed, at.stuck]), 1, at.rim).swapaxes(0, 1)
+    return _unit(state) * _whole(normal, rubbed, stuck, state)
 
 
 def _integrals(fields: Array, n_normal: int, rim: Rim) -> Array:
@@ -319,32 +320,33 @@ def _integrals(fields: Array, n_normal: int, rim: Rim) -> Array:
     return out
 
 
-def _whole(parts: Array, state: WheelState) -> Array:
+def _whole(by_normal: Array, by_rubbed: Array, by_stuck: Array, state: WheelState) -> Array:
     """Integrals (3, N) of the stresses from those of the normal, the rubbed and the stuck part."""
-    return np.asarray(parts[:, 0] + (state.tan_phi * parts[:, 1] + state.c * parts[:, 2]))
+    return np.asarray(by_normal + (state.tan_phi * by_rubbed + state.c * by_stuck))
 
 
 def _forces_and_jacobian(state: WheelState, model: WheelModel, skid: bool) -> Array:
     """W, DP and T and their derivatives by INPUTS (3 + 21, N)."""
     at = _stress(state, model, skid)
     tau, mobilising = _shear(at, state)
-    changes = np.empty((6, *at.normal.shape))
-    np.multiply(at.steep, at.log_z, out=changes[0])
+    fields = np.empty((9, *at.normal.shape))
+    fields[0], fields[3], fields[4] = at.normal, at.rubbed, at.stuck
+    np.multiply(at.steep, at.log_z, out=fields[1])
     if at.by_sill is not None:
-        changes[0] += at.by_sill
-    changes[1], changes[2] = _entering(at, state, tau, mobilising)
-    np.multiply(at.shear_share, changes[0], out=changes[3])
-    np.multiply(mobilising, at.rim.travel, out=changes[4])
-    np.multiply(mobilising, at.j_K, out=changes[5])
-    parts = _integrals(np.stack([at.normal, at.rubbed, at.stuck]), 1, at.rim)
-    by_normal, by_rubbed, by_stuck = parts.swapaxes(0, 1)
-    deeper, pressed, turned, rubbed_deeper, by_slip, by_K = _integrals(changes, 2, at.rim).swapaxes(0, 1)
+        fields[1] += at.by_sill
+    fields[2], fields[5] = _entering(at, state, tau, mobilising)
+    np.multiply(at.shear_share, fields[1], out=fields[6])
+    np.multiply(mobilising, at.rim.travel, out=fields[7])
+    np.multiply(mobilising, at.j_K, out=fields[8])
+    by_normal, deeper, pressed, by_rubbed, by_stuck, turned, rubbed_deeper, by_slip, by_K = _integrals(
+        fields, 3, at.rim
+    ).swapaxes(0, 1)
     turned[2] += _dot(at.normal, np.broadcast_to(at.share, at.normal.shape))
     if model.peak_c2:
         by_slip = by_slip + model.peak_c2 * _by_peak(at, state, model, tau, mobilising)
     if model.exit_angle:
         turned += _leaving(state.entry_angle, model) * _by_leave(at, state, model, tau, mobilising)
-    whole, unit = _whole(parts, state), _unit(state)
+    whole, unit = _whole(by_normal, by_rubbed, by_stuck, state), _unit(state)
     columns = (
         pressed + turned + whole / state.entry_angle,
         by_slip,
