@@ -47,7 +47,7 @@ def test_both_wheels_of_ding_dig_in_as_they_slip(ding, wheel, errors):
     found = ding[wheel, errors]
     first = found.additions[0]
     assert first.effect.name == "slip_sinkage"
-    others = max(fall for name, fall in first.falls.items() if name != "slip_sinkage")
+    others = max((fall for name, fall in first.falls.items() if name != "slip_sinkage"), default=0.0)
     assert first.falls["slip_sinkage"] > (1.3 if errors == 1 else 1.0) * others
     assert found.completed.gap - 1.0 < 0.5 * (found.base.gap - 1.0)
     assert found.completed.parameters()["slip_sinkage"]["exponent"].value == pytest.approx(0.7, abs=0.3)
