@@ -158,6 +158,8 @@ def _promising(
     best: dict[str, tuple[Effect, Sequence[Start]]] = {}
     for fall, effect, completion in tried:
         behind = BEHIND if completion.converged and tried[0][2].converged else BEHIND_UNSETTLED
+        if few[0].learned.n == records[0].learned.n:  # a table stays whole: nothing is saved
+            behind = math.inf
         if fall > max(NEAR * tried[0][0], tried[0][0] - behind, 0.0) and len(best) < FITTED:
             best.setdefault(effect.name, (effect, completion.as_starts()))
     return list(best.values())
