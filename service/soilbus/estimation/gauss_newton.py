@@ -158,8 +158,7 @@ def _best(fitting: Fitting, thin: Fitting, ends: Sequence[Place]) -> Fit | None:
     best: Fit | None = None
     for end in unlike[:MAX_SETTLED]:
         most = MAX_ITERATIONS if end.cost < HOPELESS * THINNED else MAX_HOPELESS
-        near = fitting.start(end.soil, fitting.problem.angles_as(thin.problem, end.latents))
-        fit = _settled(fitting, replace(near, trials=end.trials), most)
+        fit = _settled(fitting, replace(fitting.start(end.soil), trials=end.trials), most)
         if fit is not None and (best is None or (fit.converged, -fit.cost) > (best.converged, -best.cost)):
             best = fit
         if best is not None and best.converged:
@@ -216,12 +215,10 @@ def _ends(thin: Fitting) -> list[Place]:
     """Optima on a few instants of the window, the best first.
 
     Descents from unlike soils that meet at a plausible cost are proof enough; otherwise
-    every start is tried.  The likeliest of the known soils comes first: from there it is
-    not far, and of the descent from what is believed it can then be seen early where it leads.
+    every start is tried.
     """
     ends: list[Place] = []
-    believed, likeliest, *others = starting_soils(thin.problem, thin.coordinates.prior, thin.before)
-    for start in (likeliest, believed, *others):
+    for start in starting_soils(thin.problem, thin.coordinates.prior, thin.before):
         end = approach(thin, np.asarray(start), MAX_APPROACH, known=ends)
         if end is None:
             continue

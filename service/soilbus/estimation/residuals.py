@@ -130,10 +130,6 @@ class WindowProblem(Readings):
             return start, at
         return before.latents.followed_by(shared, start), before.at.followed_by(shared, at)
 
-    def angles_as(self, other: WindowProblem, latents: Latents) -> Array:
-        """Entry angles [rad] (N, W) at the measured loads and slips as these latents of another part have them."""
-        return self._measured_on(other._angle_curve(latents)).entry_angle
-
     def _shared(self, t: Array) -> int:
         """How many of the first instants are the last of those at t (M,)."""
         n = len(t) - int(np.searchsorted(t, self.t[0] - SAME_INSTANT))
