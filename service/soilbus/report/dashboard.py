@@ -35,6 +35,13 @@ LIMITS = {
     "here and now": ("TractionLimits", "TractionLimits"),
 }
 ADVICE = {"efficiency": "SlipForEfficiency", "pull": "SlipForPull"}
+FAULTS_OF_BUS = {
+    "Overruns": "overruns",
+    "Dropped": "dropped",
+    "ForeignFrames": "foreign",
+    "ErrorFrames": "errors",
+    "Reopened": "reopened",
+}
 WIDTH = 78
 
 
@@ -47,7 +54,7 @@ def panel(known: Readings) -> Panel:
     task.add_row(_limits(known), _advice(known))
     told = (Text("  ".join(words)) for words in (_detail(known), _demand(known)))
     parts = (head, _warning(known), *told, Text(" ".join(_kind(known))), Text(""))
-    last = (Text(""), task, Text(""), Text("  ".join(_service(known))))
+    last = (Text(""), task, Text(""), *(Text("  ".join(words)) for words in (_service(known), _bus(known))))
     return Panel(Group(*parts, ground, *last), title="soilbus", width=WIDTH)
 
 
@@ -83,6 +90,14 @@ def _service(known: Readings) -> Iterator[str]:
     yield from _said(known, "SoilbusStatus", "RejectedShare", "refused {:.1f} %")
     if known.bad_frames:
         yield f"bad frames {known.bad_frames}"
+
+
+def _bus(known: Readings) -> Iterator[str]:
+    """How the bus does, by what the service counted on it."""
+    yield from _said(known, "BusHealth", "BusState", "bus: {}")
+    for signal, what in FAULTS_OF_BUS.items():
+        if count := known.number("BusHealth", signal):
+            yield f"{what} {count:.0f}"
 
 
 def _soil(known: Readings) -> Table:
