@@ -136,6 +136,7 @@ WHOLE = {
     "TractionLimits": {"MaxDraft": 5900, "MaxDraftStd": 120, "MaxGrade": 0.13, "MaxGradeStd": 0.006},
     "DemandForecast": {"Slip": 0.21, "SlipStd": 0.01, "Sinkage": 44.0, "Warning": "immobilisation", "TimeLeft": 4.2},
     "SoilClass": {"Kind": "sandy_loam_15", "Probability": 0.93, "UnknownProbability": 0.05},
+    "BusHealth": {"BusState": "error_passive", "Overruns": 7, "Dropped": 3, "ErrorFrames": 21, "Reopened": 2},
 }  # fmt: skip
 SAID = {
     "SoilbusStatus": ("service: valid", "refused 2.0 %"), "SoilbusIdentity": ("soilbus 0.3.1",),
@@ -149,6 +150,7 @@ SAID = {
     "TractionAdvice": ("0.12   0.10", "0.60   0.55"), "TractionLimits": ("5900 ± 120", "0.13 ± 0.006"),
     "DemandForecast": ("slip to come 0.21", "sinkage 44 mm", "GETTING STUCK in 4 s"),
     "SoilClass": ("soil: sandy_loam_15 (0.93)", "none of the known 0.05"),
+    "BusHealth": ("bus: error_passive", "overruns 7", "dropped 3", "errors 21", "reopened 2"),
 }  # fmt: skip
 
 

@@ -54,7 +54,8 @@ def panel(known: Readings) -> Panel:
     task.add_row(_limits(known), _advice(known))
     told = (Text("  ".join(words)) for words in (_detail(known), _demand(known)))
     parts = (head, _warning(known), *told, Text(" ".join(_kind(known))), Text(""))
-    last = (Text(""), task, Text(""), *(Text("  ".join(words)) for words in (_service(known), _bus(known))))
+    service, bus = (Text("  ".join(words)) for words in (_service(known), _bus(known)))
+    last = (Text(""), task, Text(""), service, bus)
     return Panel(Group(*parts, ground, *last), title="soilbus", width=WIDTH)
 
 
