@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from soilbus.diagnosis.sizes import SCALES, correction, evidence_of_any_size
-from soilbus.diagnosis.verdict import PLAUSIBLE, hopeless, pays, probabilities
+from soilbus.diagnosis.verdict import PLAUSIBLE, hopeless, is_real, pays, probabilities
 from soilbus.estimation.completed import Free
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Parameter
@@ -80,3 +80,11 @@ def test_a_further_effect_beside_a_great_one_is_doubted():
 
 def test_every_further_start_is_of_the_catalogue():
     assert {e.name for e in CATALOGUE.values() for p in e.parameters if p.starts} == {"hardpan", "lugs"}
+
+
+def test_a_great_gap_that_is_left_is_not_explained():
+    assert is_real(30.0, 8.0, 3000)
+    assert not is_real(30.0, 3.0, 3000)
+    assert not is_real(1.6, 1.15, 3000)
+    assert is_real(1.6, 1.3, 3000)
+    assert not is_real(1.2, 1.03, 3000)
