@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gzip
+import hashlib
+import json
 import math
 import tempfile
 from collections.abc import Callable, Iterator
@@ -26,6 +28,8 @@ from soilbus.daemon.notify import Notifier
 from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.replay import LogError, read_frames
 from soilbus.daemon.service import Service
+from soilbus.daemon.store import Owner, State, StateError, belief_of, dumped, loaded, stored_belief
+from soilbus.estimation.belief import Belief
 from soilbus.simulator.frames import frames, write_log
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import TRACTOR, reference_configuration
@@ -240,6 +244,43 @@ def check_model(data: bytes) -> int:
     return 0
 
 
+def check_state(data: bytes) -> int:
+    """A stored state is refused with one line, as it is and sealed anew, or its belief is finite and bounded."""
+    for content in (data, _sealed(data)):
+        try:
+            state = loaded(content, owner())
+        except StateError as error:
+            _told([str(error)])
+            continue
+        if state.belief is not None:
+            belief = belief_of(state.belief, owner())
+            assert np.isfinite(belief.soil).all()
+            assert np.linalg.eigvalsh(belief.covariance).min() > -1e-9 * belief.covariance.max()
+    return 0
+
+
+def _sealed(data: bytes) -> bytes:
+    """The same with the checksum that belongs to it, as somebody makes it who knows how."""
+    try:
+        raw = json.loads(data)
+        state = json.dumps(raw["state"], sort_keys=True, separators=(",", ":")).encode()
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return data
+    return json.dumps(raw | {"checksum": hashlib.sha256(state).hexdigest(), "key": owner().key}).encode()
+
+
+@cache
+def owner() -> Owner:
+    return Owner.of(reference(), _intake().channels, vehicle())
+
+
+def _state_seeds() -> list[bytes]:
+    n, std = len(owner().median), owner().std
+    belief = Belief(owner().median[:6], np.zeros(n - 6), np.diag((0.5 * std) ** 2))
+    states = [stored_belief(belief, 1.7e9, owner()), None]
+    return [dumped(State(at=1.7e9, starts=2, belief=b, totals={"windows": 7}), owner()) for b in states]
+
+
 def _told(faults: list[str], where: str = "") -> int:
     """No frame, but what is wrong, each fault on a line of its own."""
     assert faults
@@ -317,6 +358,7 @@ TARGETS: dict[str, Target] = {
     "dbc": Target(check_dbc, _dbc_seeds),
     "config": Target(check_config, lambda: [TRACTOR.read_bytes()]),
     "model": Target(check_model, _model_seeds),
+    "state": Target(check_state, _state_seeds),
     "log-candump": Target(_log(".log"), _log_seeds(".log")),
     "log-gz": Target(_log(".log.gz"), lambda: [gzip.compress(_log_seeds(".log")()[0], mtime=0)]),
     "log-asc": Target(_log(".asc"), _log_seeds(".asc")),
