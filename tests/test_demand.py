@@ -9,6 +9,7 @@ import pytest
 
 from soilbus.assembly import rig_of
 from soilbus.capability.demand import present_demand
+from soilbus.estimation.posterior import Estimate
 from soilbus.estimation.window import BinStore
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.vehicle import GRAVITY
@@ -40,6 +41,15 @@ def test_the_std_is_that_of_the_sensors_however_the_draft_swings():
     assert pulls.mean() == pytest.approx(truth.pull, abs=4.0 * pulls.std() / len(pulls) ** 0.5)
     assert np.mean([d.std for d in noisy]) == pytest.approx(pulls.std(), rel=0.2)  # sampling: 5 %
     assert truth.sine == pytest.approx(np.sin(0.04), rel=1e-6)
+
+
+def test_a_load_cell_that_reads_too_much_asks_for_less_and_less_surely():
+    slope = np.full(len(T), 0.04)
+    window = window_of(np.full(len(T), 3060.0), slope)
+    demand = present_demand(window, RIG.chassis, 1.0, Estimate(0.02, 0.005))
+    assert demand.pull == pytest.approx(3000.0 + WEIGHT * np.sin(0.04), rel=1e-6)
+    alone = demand_of(np.full(len(T), 3060.0), slope)
+    assert demand.std**2 - alone.std**2 == pytest.approx(15.0**2)
 
 
 def test_the_last_hop_counts_where_it_asks_for_more_and_else_the_whole_window():

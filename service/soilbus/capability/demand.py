@@ -7,16 +7,19 @@ import math
 import numpy as np
 
 from soilbus.capability.assessment import Demand
+from soilbus.estimation.posterior import Estimate
 from soilbus.estimation.window import Window, pull_asked
 from soilbus.terra.vehicle import GRAVITY, Chassis
 
+EXACT = Estimate(0.0, 0.0)
 
-def present_demand(window: Window, chassis: Chassis | None, hop: float) -> Demand | None:
+
+def present_demand(window: Window, chassis: Chassis | None, hop: float, gain: Estimate = EXACT) -> Demand | None:
     """Draft and slope, over the last hop [s] or the whole window, whichever asks for more.
 
     A driver who has just lifted the implement because it was too much still wants it
-    down.  The std is that of the sensors: what the demand will do next is the margin's business.
-    None where the draft of the last hop is not known.
+    down.  The std is that of the sensors, noise and the draft's `gain` error: what the demand will
+    do next is the margin's business.  None where the draft of the last hop is not known.
     """
     if chassis is None or not len(window.t):
         return None
@@ -31,4 +34,5 @@ def present_demand(window: Window, chassis: Chassis | None, hop: float) -> Deman
     variance = window.variance["draft"] + weight**2 * of_slope
     std = math.sqrt(float(variance[part].sum())) / np.count_nonzero(part)
     slope = float((pull - window.draft)[part].mean())
-    return Demand(float(pull[part].mean()), std, slope / weight)
+    draft = float(window.draft[part].mean()) / (1.0 + gain.value)
+    return Demand(draft + slope, math.hypot(std, draft * gain.std), slope / weight)

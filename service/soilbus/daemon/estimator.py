@@ -22,6 +22,7 @@ from soilbus.daemon.positions import Position
 from soilbus.estimation.completed import active_at
 from soilbus.estimation.gauss_newton import Fit
 from soilbus.estimation.posterior import Estimate, Posterior
+from soilbus.estimation.readings import gain_names
 from soilbus.estimation.soil_class import SoilClasses, guessed
 from soilbus.estimation.tracker import MIN_ROWS, Ground, Settings, Tracked, Tracker
 from soilbus.estimation.window import Rig, Window
@@ -163,7 +164,7 @@ class WindowEstimator:
         model = self._present_model(task.window, tracked, effects)
         window = _with_true_draft(task.window, effects, self.rig)
         last_hop = list(moments(window, self.rig, task.end - self._settings.hop, self._settings.min_speed))
-        demand = present_demand(window, self.rig.chassis, self._settings.hop)
+        demand = present_demand(window, self.rig.chassis, self._settings.hop, self._draft_gain(tracked))
         return Undecided(result, demand, task.torque_limit, stuck, last_hop, task.fresh, model)
 
     def decide(self, window: Undecided) -> WindowResult:
@@ -225,6 +226,12 @@ class WindowEstimator:
         """Posterior, of both optima where there are two, widened where the residuals are larger than the noise."""
         posterior = fit.whole.posterior
         return Posterior(posterior.soil, posterior.log_covariance * _widening(tracked, fit))
+
+    def _draft_gain(self, tracked: Tracked) -> Estimate:
+        """Gain error of the load cell at the hitch: as fitted, else what is known of it beforehand."""
+        if tracked.fit is None or tracked.mismatch:
+            return Estimate(0.0, self.rig.noise["draft"].gain)
+        return tracked.fit.whole.gain(gain_names(self.rig).index("draft"))
 
     def _bearing(self, posterior: Posterior) -> Estimate:
         return posterior.bearing_pressure(self._settings.z_ref, self._settings.b_ref)

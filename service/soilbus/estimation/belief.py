@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
+from soilbus.estimation.posterior import PARAMETERS, Estimate, Posterior, SoilPrior
 from soilbus.terra.wheel import Soil
 
 Array = NDArray[np.float64]
@@ -40,6 +40,10 @@ class Belief:
     def posterior(self) -> Posterior:
         """What is known of the soil alone."""
         return Posterior(Soil(*self.soil.tolist()), self.covariance[:_SOIL, :_SOIL])
+
+    def gain(self, index: int) -> Estimate:
+        """What is known of one gain error."""
+        return Estimate(float(self.gains[index]), float(np.sqrt(self.covariance[_SOIL + index, _SOIL + index])))
 
     def mixed(self, other: Belief, share: float) -> Belief:
         """The same with the spread, about it, of what is this with probability 1 - share and another with share."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.coordinates import BOUND, TYPICAL_DEPTH, Coordinates
 from soilbus.estimation.denoised import DenoisedProblem
-from soilbus.estimation.gauss_newton import Fit, settled
+from soilbus.estimation.gauss_newton import Fit, fit_window, settled
 from soilbus.estimation.normal_equations import Fitting, Place
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
@@ -87,6 +87,14 @@ def with_whole(problem: WindowProblem, prior: SoilPrior, before: Belief, found: 
     if not finite or found.rival is not None:  # beside its rival an optimum is told as it was found
         return replace(found, averaged=whole) if finite else found
     return replace(found, belief=along.top.belief, mode=along.top.mode, averaged=whole)
+
+
+def cold_fit(problem: WindowProblem, prior: SoilPrior) -> Fit | None:
+    """A window on its own, as the service tells its first one: fitted, and with its whole posterior."""
+    fit = fit_window(problem, prior)
+    if fit is None or not fit.converged:
+        return fit
+    return with_whole(problem, prior, Belief.of(prior, problem.gain_std), fit)
 
 
 def ridge(problem: WindowProblem, prior: SoilPrior, before: Belief, found: Fit) -> Ridge | None:

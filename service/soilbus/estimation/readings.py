@@ -32,6 +32,12 @@ _BY_INSTANT = (
 """Attributes of a window's problem with a row for each instant."""
 
 
+def gain_names(rig: Rig) -> list[str]:
+    """Names of the sensors' gain errors, in the order of every window's."""
+    per_wheel = ("torque", "load", "speed")
+    return [n for q in GAIN_QUANTITIES for n in ([f"{q}.{w}" for w in rig.wheels] if q in per_wheel else [q])]
+
+
 class Readings:
     """The usable instants (N) of a window: arrays (N, W) of the wheels and (N,) of the vehicle, in SI.
 
@@ -79,7 +85,8 @@ class Readings:
         self.length = float(self.distance[-1]) if len(self.distance) else 0.0
         self.wheel_angle = turned(self.t, self.speed)
         self._balance(take, usable)
-        self.gain_names, self.gain_std = self._gains()
+        self.gain_names = gain_names(rig)
+        self.gain_std = np.array([rig.noise[name.partition(".")[0]].gain for name in self.gain_names])
         self.n_sensors = len(self.gain_names)
         self.slip = slip[kept]
         self._measured = np.concatenate([self.load, self.speed, self.ground_speed[:, None]], axis=1)
@@ -120,15 +127,6 @@ class Readings:
         self.demand, self.demand_var = demand, variance
         self.draft_var = np.where(known & usable.all(axis=1), draft_var, 0.0)
         self.has_balance = known & usable.all(axis=1)
-
-    def _gains(self) -> tuple[list[str], Array]:
-        names, std = [], []
-        for quantity in GAIN_QUANTITIES:
-            per_wheel = quantity in ("torque", "load", "speed")
-            for name in [f"{quantity}.{w}" for w in self.rig.wheels] if per_wheel else [quantity]:
-                names.append(name)
-                std.append(self.rig.noise[quantity].gain)
-        return names, np.array(std)
 
     @property
     def _n_residuals(self) -> int:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.capability.assessment import assess
 from soilbus.config import Config
-from soilbus.estimation.gauss_newton import fit_window
+from soilbus.estimation.marginal import cold_fit
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import BinStore, Rig
 from soilbus.simulator.equilibrium import Mechanics, Situation, solve
@@ -100,12 +100,12 @@ def trial(task: Task) -> DraftTrial:
     store = BinStore(rig, config.estimator.bin, 0.0)
     store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
     prior = missed(prior_of(config), soil, np.random.default_rng([seed, 1]))
-    fit = fit_window(WindowProblem(store.window(0.0, duration), rig, model, config.estimator.min_speed), prior)
+    fit = cold_fit(WindowProblem(store.window(0.0, duration), rig, model, config.estimator.min_speed), prior)
     limit = np.array([wheel.max_torque or np.nan for wheel in config.wheel])
     truth = true_largest_draft(soil, rig, limit, settings.max_slip, WheelModel(shear_law=config.model.shear_law))
     if fit is None or not fit.converged:
         return DraftTrial(name, np.nan, np.nan, truth)
-    able, _ = assess(fit.posterior, rig, model, None, limit, settings.max_slip, settings.max_sinkage)
+    able, _ = assess(fit.whole.posterior, rig, model, None, limit, settings.max_slip, settings.max_sinkage)
     if able is None:
         return DraftTrial(name, np.nan, np.nan, truth)
     return DraftTrial(name, able.max_draft.value, able.max_draft.std, truth)

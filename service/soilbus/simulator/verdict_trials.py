@@ -27,7 +27,8 @@ from soilbus.capability.assessment import Demand
 from soilbus.capability.demand import present_demand
 from soilbus.config import Config
 from soilbus.config import Traversability as Settings
-from soilbus.estimation.gauss_newton import fit_window
+from soilbus.estimation.marginal import cold_fit
+from soilbus.estimation.readings import gain_names
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import BinStore, Rig, Window
 from soilbus.simulator.draft_trials import true_largest_draft
@@ -134,13 +135,17 @@ def trial(task: Task) -> Call:
     settings = config.traversability.model_copy(update={"max_sinkage": ground.max_sinkage})
     measured, exact = (_window(recording, config, rig, of_truth) for of_truth in (False, True))
     prior = missed(prior_of(config), ground.soil, np.random.default_rng([seed, 1]))
-    fit = fit_window(WindowProblem(measured, rig, model_of(config), config.estimator.min_speed), prior)
-    demand, asked = (present_demand(window, rig.chassis, config.estimator.hop) for window in (measured, exact))
-    if fit is None or not fit.converged or demand is None or asked is None:
+    fit = cold_fit(WindowProblem(measured, rig, model_of(config), config.estimator.min_speed), prior)
+    asked = present_demand(exact, rig.chassis, config.estimator.hop)
+    if fit is None or not fit.converged or asked is None:
+        return Call(ground.name, math.nan, State.UNKNOWN, None, False)
+    gain = fit.whole.gain(gain_names(rig).index("draft"))
+    demand = present_demand(measured, rig.chassis, config.estimator.hop, gain)
+    if demand is None:
         return Call(ground.name, math.nan, State.UNKNOWN, None, False)
 
     def judged(by: Settings) -> Traversability:
-        return judge(fit.posterior, Status.VALID, demand, rig, model_of(config), ground.torque_limit, by)[0]
+        return judge(fit.whole.posterior, Status.VALID, demand, rig, model_of(config), ground.torque_limit, by)[0]
 
     way = judged(settings)
     if rng.random() < NEAR and (margin := _margin(way, demand, rng)) is not None:
