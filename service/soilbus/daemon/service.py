@@ -264,7 +264,7 @@ class Service:
             return ServiceState.FAULT, self._fault or INTERNAL
         if now - self.bus.last_foreign < FOREIGN_HOLD:
             return ServiceState.DEGRADED, "foreign_sender"
-        if self.result is None:
+        if self.result is None or self._ended <= self._interrupted:
             return ServiceState.ESTIMATING, "none"
         reason = self.result.reason
         if self.result.gaps and reason.split()[0] in ("none", "model_mismatch"):

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 CONVERGED = 1e-6
 """Squared length of a step in posterior standard deviations that ends the fit."""
-LEFT_OVER, LEFT_OVER_RESUMED = 2e-8, 1e-3
+LEFT_OVER, LEFT_OVER_RESUMED = 2e-8, 1e-4
 """The same for what a full step leaves behind, foreseen from how fast the steps shrink."""
 SETTLING = 1.0
 """The same, below which the latents and gains join in."""
