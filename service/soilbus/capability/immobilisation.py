@@ -39,8 +39,9 @@ SETTLED = 2.0
 """Age [s] from which a trend is believed."""
 AHEAD = 10.0
 """Time left [s] from which is warned."""
-MUCH = 0.76
-"""Share of the capacity from which a rise of the demand beyond its last peaks is carried on, and no warning ends."""
+MUCH, TOO_MUCH = 0.71, 0.76
+"""Share of the capacity from which a rise of the demand beyond its last peaks is carried on, and from which no warning
+ends."""
 WEAKENING, SHORT_WEAKENING = 0.006, 0.03
 """Loss [1/s], as a share of the capacity, from which the ground is said to weaken, by the long and the short memory."""
 STEEPER = 1.6
@@ -118,7 +119,7 @@ def watched(before: Watch, t: float, slip: Iterable[float | None], pull: float |
             rise = demand.line().slope
             to_limit = _time_of_creep(creep, float(curve.slip[-1]), rise / (pull + reserve))
             time_left = min(_time_left(capacity, pull, rise, peaks.greatest), to_limit)
-    still = before.warning is Alert.IMMOBILISATION and pull > MUCH * (pull + reserve)
+    still = before.warning is Alert.IMMOBILISATION and pull > TOO_MUCH * (pull + reserve)
     caused = t if still or (time_left is not None and time_left < AHEAD) else before.caused
     warning = Alert.UNKNOWN if time_left is None else Alert.NONE
     if t - caused < CALM:
