@@ -9,7 +9,7 @@ from soilbus.assembly import completion_of, model_of, rig_of
 from soilbus.capability.assessment import Demand, assess
 from soilbus.capability.uncertain_model import UncertainModel
 from soilbus.estimation.belief import Belief
-from soilbus.estimation.completed import active_at
+from soilbus.estimation.effect_parameters import active_at
 from soilbus.estimation.posterior import Posterior
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.effects.steady import CompletedModel

@@ -10,7 +10,7 @@ import numpy as np
 
 from soilbus.config import Config, ConfigError
 from soilbus.config import Effect as EffectSetting
-from soilbus.estimation.completed import Free
+from soilbus.estimation.effect_parameters import Free
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.window import Rig, SensorNoise
 from soilbus.terra.effects.catalogue import CATALOGUE

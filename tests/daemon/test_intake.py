@@ -57,7 +57,7 @@ def windows(recorded: list[Frame], every: int = 200, glimpse: bool = False):
             tasks += intake.due(t)
             if glimpse:  # as the live service does at every tick
                 intake.ingest()
-                slip = intake.latest_slip(t)
+                slip = intake.latest(t).slip
                 assert all(s is None or -0.1 < s < 0.7 for s in slip.values())
         intake.admission.feed(t, identifier, extended, data)
     return tasks + intake.finish(recorded[-1][0]), intake
@@ -112,9 +112,9 @@ def test_slip_in_reverse_is_that_of_the_same_drive_forward():
             tasks += intake.due(m.timestamp)
             intake.admission.feed_message(m)
             last = m.timestamp
-        slips += [[*tasks[0].slip.values(), *intake.latest_slip(last).values()]]
+        slips += [[*tasks[0].slip.values(), *intake.latest(last).slip.values()]]
         intake.ingest()
-        slips[-1] += intake.latest_slip(last).values()
+        slips[-1] += intake.latest(last).slip.values()
     ahead, back = slips
     assert all(0.0 < s < 0.5 for s in ahead[:4] + ahead[8:])
     assert back[:4] == pytest.approx(ahead[:4], abs=1e-3)  # codes are rounded

@@ -14,7 +14,7 @@ from soilbus.capability.balance import LEVEL, Duty, balance
 from soilbus.capability.wheels import Axles, wheel_table
 from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.replay import fed
-from soilbus.estimation.completed import active_at
+from soilbus.estimation.effect_parameters import active_at
 from soilbus.simulator.drive import drive
 from soilbus.simulator.frames import frames, write_log
 from soilbus.simulator.recording import simulate

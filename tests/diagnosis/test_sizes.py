@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from soilbus.diagnosis.sizes import SCALES, correction, evidence_of_any_size
 from soilbus.diagnosis.verdict import PLAUSIBLE, hopeless, is_real, pays, probabilities
-from soilbus.estimation.completed import Free
+from soilbus.estimation.effect_parameters import Free
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Parameter
 

@@ -7,7 +7,8 @@ import pytest
 
 import soilbus.estimation.completed as completed
 from soilbus.assembly import model_of, rig_of
-from soilbus.estimation.completed import CompletedProblem, parameters_of
+from soilbus.estimation.completed import CompletedProblem
+from soilbus.estimation.effect_parameters import parameters_of
 from soilbus.estimation.window import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

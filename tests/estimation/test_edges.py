@@ -10,11 +10,13 @@ from scipy.optimize import lsq_linear
 
 from soilbus.assembly import model_of, rig_of
 from soilbus.estimation.belief import Belief
-from soilbus.estimation.completed import SMOOTHED, CompletedProblem, parameters_of, smoothed
+from soilbus.estimation.completed import CompletedProblem
 from soilbus.estimation.coordinates import BOUND, Coordinates, at_edges, share_of_step
+from soilbus.estimation.effect_parameters import parameters_of
 from soilbus.estimation.gauss_newton import Start, continued, descend, fit_window
 from soilbus.estimation.normal_equations import Fitting, Point
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+from soilbus.estimation.smoothing import SMOOTHED, smoothed
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.soils import SOILS
 

@@ -14,7 +14,8 @@ from soilbus.assembly import rig_of, with_effects
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.mapping import channels_of
 from soilbus.daemon.plausibility import Plausibility
-from soilbus.estimation.plausibility import Resolution, implausible, lasts, runs
+from soilbus.estimation.plausibility import Resolution, implausible
+from soilbus.estimation.series import lasts, runs
 from soilbus.estimation.window import BinStore, Window, forward
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.reference import reference_configuration

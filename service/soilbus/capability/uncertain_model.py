@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
-from soilbus.estimation.completed import Free, active_at
+from soilbus.estimation.effect_parameters import Free, active_at
 from soilbus.estimation.posterior import PARAMETERS
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.effects.steady import CompletedModel, Slopes, Wheel

@@ -19,7 +19,7 @@ from soilbus.config import Config
 from soilbus.daemon.gap import GapWatch, squares
 from soilbus.daemon.intake import WindowTask
 from soilbus.daemon.positions import Position
-from soilbus.estimation.completed import active_at
+from soilbus.estimation.effect_parameters import active_at
 from soilbus.estimation.gauss_newton import Fit
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.readings import gain_names

@@ -257,10 +257,6 @@ class Intake:
         pull = None if self.rig.chassis is None else column_means(pull_given(window, self.rig.chassis)[:, None])[0]
         return Latest(self._slip(window), pull)
 
-    def latest_slip(self, now: float) -> dict[str, float | None]:
-        """Slip ratio by wheel over the last moments before `now` [s]; None where unknown."""
-        return self.latest(now).slip
-
     def _slip(self, window: Window) -> dict[str, float | None]:
         window = forward(window)
         ground = window.ground_speed[:, None]

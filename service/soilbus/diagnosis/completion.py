@@ -19,8 +19,9 @@ from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.sizes import correction
 from soilbus.diagnosis.slow_descent import descended
 from soilbus.estimation.belief import Belief
-from soilbus.estimation.completed import CompletedProblem, Free, parameters_of
+from soilbus.estimation.completed import CompletedProblem
 from soilbus.estimation.coordinates import at_edges
+from soilbus.estimation.effect_parameters import Free, parameters_of
 from soilbus.estimation.gauss_newton import MAX_ITERATIONS, Fit, Start, continued, fit_window
 from soilbus.estimation.linearised import Latents, Linearised
 from soilbus.estimation.normal_equations import Fitting, Place

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.completed import Free
+from soilbus.estimation.effect_parameters import Free
 
 Array = NDArray[np.float64]
 

@@ -10,18 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
-from functools import cache
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.estimation.effect_parameters import Free, active_at
 from soilbus.estimation.linearised import Latents
 from soilbus.estimation.residuals import MAX_TURN, Response, WindowProblem
+from soilbus.estimation.smoothing import smoothed
 from soilbus.estimation.window import Rig, Window
-from soilbus.terra.effects.along import stretches
-from soilbus.terra.effects.effect import Active, Effect, Parameter, Surroundings, reactions_with, true_draft, wheel_with
+from soilbus.terra.effects.effect import Active, Effect, Surroundings, reactions_with, true_draft, wheel_with
 from soilbus.terra.stress import lumped_modulus
 from soilbus.terra.wheel import (
     INPUTS,
@@ -41,54 +40,6 @@ STEP = 1e-6
 """Relative step of the differences; in standard deviations of a parameter, STEP_OF_EFFECT."""
 STEP_OF_EFFECT = 1e-4
 LOAD_ROUNDS = 6
-SMOOTHED = 9
-"""Instants through which a parabola smooths the torque that comes from other instants."""
-
-
-@dataclass(frozen=True, slots=True)
-class Free:
-    """One parameter of an effect, of one wheel (its number) or of all (None): value and std of the prior."""
-
-    effect: str
-    parameter: Parameter
-    wheel: int | None
-    value: float
-    std: float
-
-    @property
-    def name(self) -> str:
-        """effect.parameter, with the wheel's number where it has one."""
-        return f"{self.effect}.{self.parameter.name}" + ("" if self.wheel is None else f".{self.wheel}")
-
-    def within(self, pull: float) -> bool:
-        """Whether so many prior std from the prior value is inside the parameter's range."""
-        return self.parameter.low <= self.value + self.std * pull <= self.parameter.high
-
-    def allowed(self, pull: float) -> float:
-        """So many prior std, kept inside the parameter's range."""
-        return pull if self.within(pull) or self.std == 0.0 else (self.at(pull) - self.value) / self.std
-
-    def at(self, pull: float) -> float:
-        """The parameter's value so many prior std from its prior value, kept inside its range."""
-        return min(max(self.value + self.std * pull, self.parameter.low), self.parameter.high)
-
-
-def parameters_of(effect: Effect, n_wheels: int) -> list[Free]:
-    """The parameters of an effect as before any data: absent, with the catalogue's prior."""
-    wheels: Sequence[int | None] = range(n_wheels) if effect.each_wheel else (None,)
-    return [Free(effect.name, p, w, p.neutral, p.std) for p in effect.parameters for w in wheels]
-
-
-def active_at(effects: Sequence[Effect], free: Sequence[Free], pulls: Array, n_wheels: int) -> list[Active]:
-    """The effects with their values where the parameters are so many std (P,) from their prior values."""
-    values: dict[str, dict[str, Any]] = {e.name: {} for e in effects}
-    for f, u in zip(free, pulls.tolist(), strict=True):
-        of_effect = values[f.effect]
-        if f.wheel is None:
-            of_effect[f.parameter.name] = f.at(u)
-        else:
-            of_effect.setdefault(f.parameter.name, np.zeros(n_wheels))[f.wheel] = f.at(u)
-    return [Active(e, values[e.name]) for e in effects]
 
 
 class _Outcome(NamedTuple):
@@ -403,33 +354,6 @@ class CompletedProblem(WindowProblem):
             duration=self.duration,
             length=self.length,
         )
-
-
-def smoothed(t: Array, values: Array) -> Array:
-    """Values (N, W) at times t [s] (N,) by a parabola through the SMOOTHED nearest instants of the same stretch.
-
-    Savitzky & Golay 1964 (Anal. Chem. 36:1627); shorter stretches stay as they are.
-    """
-    out = np.array(values, float)
-    half, through = SMOOTHED // 2, _parabolas()
-    for run in stretches(t):
-        if len(run) < SMOOTHED:
-            continue
-        first, last = run[0], run[-1] + 1  # runs have no holes
-        middle = out[first + half : last - half]
-        middle[:] = 0.0
-        for place, weight in enumerate(through[half].tolist()):
-            middle += weight * values[first + place : last - 2 * half + place]
-        out[first : first + half] = through[:half] @ values[first : first + SMOOTHED]
-        out[last - half : last] = through[half + 1 :] @ values[last - SMOOTHED : last]
-    return out
-
-
-@cache
-def _parabolas() -> Array:
-    """What makes a least-squares parabola through SMOOTHED equal steps from the values there (SMOOTHED, SMOOTHED)."""
-    powers = (np.arange(SMOOTHED)[:, None] - SMOOTHED // 2) ** np.arange(3)
-    return np.asarray(powers @ np.linalg.pinv(powers))
 
 
 def _of_instant(step: Any) -> Any:

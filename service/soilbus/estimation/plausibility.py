@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.estimation.series import change, change_variance, lasts, median, moving_sum, running_sum, runs, smooth
 from soilbus.estimation.window import (
     VEHICLE_QUANTITIES,
     WHEEL_QUANTITIES,
@@ -232,8 +233,8 @@ def geared(scene: Scene) -> Iterator[str]:
             yield f"motor_speed.{rig.wheels[i]}"
             continue
         where = apart[:, i]
-        usual = _median((rig.radius * window.speed)[where][:, good])
-        of_motor, of_wheel = (abs(_median(rig.radius[i] * s[where, i]) - usual) for s in (motor, window.speed))
+        usual = median((rig.radius * window.speed)[where][:, good])
+        of_motor, of_wheel = (abs(median(rig.radius[i] * s[where, i]) - usual) for s in (motor, window.speed))
         yield f"{'motor_speed' if of_motor > of_wheel else 'speed'}.{rig.wheels[i]}"
 
 
@@ -259,7 +260,7 @@ def loads(scene: Scene) -> Iterator[str]:
     bad, sound = of_axle if abs(front) > abs(rear) else of_axle[::-1]
     if len(bad) == len(sound) == 2:
         left, other = (
-            _median(window.load[wrong][:, axle[0]] / window.load[wrong][:, axle].sum(axis=1)) for axle in (bad, sound)
+            median(window.load[wrong][:, axle[0]] / window.load[wrong][:, axle].sum(axis=1)) for axle in (bad, sound)
         )
         if abs(left - other) > LOAD_SIDE:
             heavier = 0 if left > other else 1
@@ -291,8 +292,8 @@ def traction(scene: Scene) -> Iterator[str]:
     others = [i for i in range(len(rig.wheels)) if i not in {*idles, *drags}]
     for i in drags:
         where = dragged[:, i]
-        usual = _median(slip[where][:, others])
-        odd = math.isfinite(usual) and abs(_median(slip[where, i]) - usual) > ODD_SLIP
+        usual = median(slip[where][:, others])
+        odd = math.isfinite(usual) and abs(median(slip[where, i]) - usual) > ODD_SLIP
         yield f"{'speed' if odd else 'torque'}.{rig.wheels[i]}"
 
 
@@ -300,18 +301,18 @@ def _pulls(scene: Scene, where: Mask) -> bool:
     """Whether draft, slope and inertia ask the wheels to pull at these instants."""
     chassis = scene.rig.chassis
     if chassis is None:
-        return bool(_median(scene.window.draft[where]) > 0.0)
-    return _median(pull_given(scene.window, chassis)[where]) > TRACTION / 3.0 * chassis.mass * GRAVITY
+        return bool(median(scene.window.draft[where]) > 0.0)
+    return median(pull_given(scene.window, chassis)[where]) > TRACTION / 3.0 * chassis.mass * GRAVITY
 
 
 def accelerated(scene: Scene) -> Iterator[str]:
     """The acceleration, where it says that the vehicle slows down whenever it speeds up."""
     window = scene.window
     lag = max(round(LAG / scene.bin), 1)
-    gained = _change(_smooth(window.ground_speed), lag)
-    told = scene.bin * _moving_sum(window.acceleration, lag)
-    noise = np.sqrt(_change_variance(window.variance["ground_speed"], lag) / 3.0)
-    told_noise = scene.bin * np.sqrt(_moving_sum(window.variance["acceleration"], lag))
+    gained = change(smooth(window.ground_speed), lag)
+    told = scene.bin * moving_sum(window.acceleration, lag)
+    noise = np.sqrt(change_variance(window.variance["ground_speed"], lag) / 3.0)
+    told_noise = scene.bin * np.sqrt(moving_sum(window.variance["acceleration"], lag))
     if _opposite(scene, gained, noise, LEAST_SPEED, told, told_noise, LEAST_SPEED, LEAST_SLOWING):
         yield "acceleration"
 
@@ -322,12 +323,12 @@ def pulling(scene: Scene) -> Iterator[str]:
     if chassis is None:
         return
     lag, weight, variance = max(round(LAG / scene.bin), 1), chassis.mass * GRAVITY, window.variance
-    driven = _change((window.torque / rig.radius).sum(axis=1), lag)
-    noise = np.sqrt(_change_variance((variance["torque"] / rig.radius**2).sum(axis=1), lag))
+    driven = change((window.torque / rig.radius).sum(axis=1), lag)
+    noise = np.sqrt(change_variance((variance["torque"] / rig.radius**2).sum(axis=1), lag))
     known = np.isfinite(window.pitch) & np.isfinite(window.acceleration)
-    pull = _change(np.where(known, pull_given(window, chassis), np.nan), lag)
+    pull = change(np.where(known, pull_given(window, chassis), np.nan), lag)
     of_pull = variance["draft"] + weight**2 * variance["pitch"] + chassis.mass**2 * variance["acceleration"]
-    pull_noise = np.sqrt(_change_variance(of_pull, lag))
+    pull_noise = np.sqrt(change_variance(of_pull, lag))
     least = LEAST_FORCE * weight
     if _opposite(scene, driven, noise, least, pull, pull_noise, least, LEAST_PULLING):
         yield "draft"
@@ -355,51 +356,8 @@ def _opposite(
     product, n = a * b, max(round(seconds / scene.bin), 1)
     if len(a) < n:
         return False
-    opposite, of_both, of_one, of_other = (_running_sum(x, n) for x in (product < 0.0, product, a * a, b * b))
+    opposite, of_both, of_one, of_other = (running_sum(x, n) for x in (product < 0.0, product, a * a, b * b))
     return bool(((opposite >= OPPOSITE * n) & (of_both < CORRELATION * np.sqrt(of_one * of_other))).any())
-
-
-def _running_sum(values: NDArray[Any], n: int) -> Array:
-    """Sums of each n neighbours of (N,), (N - n + 1,); none where there are fewer."""
-    if len(values) < n:
-        return np.zeros(0)
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(values, n).sum(axis=1))
-
-
-def _change(values: Array, lag: int) -> Array:
-    return values[lag:] - values[:-lag]
-
-
-def _change_variance(variance: Array, lag: int) -> Array:
-    return variance[lag:] + variance[:-lag]
-
-
-def _smooth(values: Array) -> Array:
-    """Means (N,) of each three neighbours."""
-    wide = np.pad(values, 1, mode="edge")
-    return np.asarray((wide[:-2] + wide[1:-1] + wide[2:]) / 3.0)
-
-
-def _moving_sum(values: Array, lag: int) -> Array:
-    """Sums (N - lag,) from each bin's middle to that of the one `lag` later."""
-    return _running_sum((values[1:] + values[:-1]) / 2.0, lag)
-
-
-def _median(values: Array) -> float:
-    """Median of what is known; nan of nothing."""
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else math.nan
-
-
-def lasts(holds: Mask, bins: int) -> bool:
-    """Whether something holds in so many bins in a row."""
-    return any(last - first >= bins for first, last in runs(holds))
-
-
-def runs(holds: Mask) -> list[tuple[int, int]]:
-    """First index of each run of True, and the index after its last."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]]).astype(np.int8)))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 CHECKS: Sequence[Callable[[Scene], Iterator[str]]] = (

@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
-from soilbus.estimation.completed import CompletedProblem, Free
+from soilbus.estimation.completed import CompletedProblem
 from soilbus.estimation.coordinates import Coordinates
 from soilbus.estimation.curve import with_curve
+from soilbus.estimation.effect_parameters import Free
 from soilbus.estimation.gauss_newton import Fit, Foreseen, fit_window, foreseen, resume
 from soilbus.estimation.marginal import with_whole
 from soilbus.estimation.normal_equations import Fitting

@@ -1,0 +1,60 @@
+"""Parameters of effects as unknowns of a fit: what is known of each beforehand, and effects with given values."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.terra.effects.effect import Active, Effect, Parameter
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Free:
+    """One parameter of an effect, of one wheel (its number) or of all (None): value and std of the prior."""
+
+    effect: str
+    parameter: Parameter
+    wheel: int | None
+    value: float
+    std: float
+
+    @property
+    def name(self) -> str:
+        """effect.parameter, with the wheel's number where it has one."""
+        return f"{self.effect}.{self.parameter.name}" + ("" if self.wheel is None else f".{self.wheel}")
+
+    def within(self, pull: float) -> bool:
+        """Whether so many prior std from the prior value is inside the parameter's range."""
+        return self.parameter.low <= self.value + self.std * pull <= self.parameter.high
+
+    def allowed(self, pull: float) -> float:
+        """So many prior std, kept inside the parameter's range."""
+        return pull if self.within(pull) or self.std == 0.0 else (self.at(pull) - self.value) / self.std
+
+    def at(self, pull: float) -> float:
+        """The parameter's value so many prior std from its prior value, kept inside its range."""
+        return min(max(self.value + self.std * pull, self.parameter.low), self.parameter.high)
+
+
+def parameters_of(effect: Effect, n_wheels: int) -> list[Free]:
+    """The parameters of an effect as before any data: absent, with the catalogue's prior."""
+    wheels: Sequence[int | None] = range(n_wheels) if effect.each_wheel else (None,)
+    return [Free(effect.name, p, w, p.neutral, p.std) for p in effect.parameters for w in wheels]
+
+
+def active_at(effects: Sequence[Effect], free: Sequence[Free], pulls: Array, n_wheels: int) -> list[Active]:
+    """The effects with their values where the parameters are so many std (P,) from their prior values."""
+    values: dict[str, dict[str, Any]] = {e.name: {} for e in effects}
+    for f, u in zip(free, pulls.tolist(), strict=True):
+        of_effect = values[f.effect]
+        if f.wheel is None:
+            of_effect[f.parameter.name] = f.at(u)
+        else:
+            of_effect.setdefault(f.parameter.name, np.zeros(n_wheels))[f.wheel] = f.at(u)
+    return [Active(e, values[e.name]) for e in effects]
