@@ -14,9 +14,9 @@ from cantools.database import Database
 from cantools.database.can import Message
 from numpy.typing import NDArray
 
-from soilbus.can.admission import checksum_byte_of
 from soilbus.can.checksum import column_checksums
 from soilbus.can.decode import ColumnDecoder
+from soilbus.can.inbox import checksum_byte_of
 from soilbus.can.publish import value_codes
 
 Array = NDArray[np.float64]

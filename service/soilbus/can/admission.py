@@ -8,36 +8,40 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
-from cantools.database.can import Database, Message, Signal
+from cantools.database.can import Database, Message
 from numpy.typing import NDArray
 
 from soilbus.can.channels import Channel, Column, Decoded, Reason
-from soilbus.can.checksum import CHECKSUM, COUNTER, column_checksums
-from soilbus.can.decode import ColumnDecoder, SignalColumn
+from soilbus.can.decode import SignalColumn
+from soilbus.can.inbox import (
+    Batch,
+    Data,
+    Frame,
+    Inbox,
+    Mask,
+    checksum_right,
+    counter_moved,
+    inbox_of,
+    not_twice,
+    popped,
+    time_forward,
+)  # fmt: skip
 from soilbus.can.j1939 import STANDARD_PGNS, SourceLock, group_mask, pgn_of, source_of
-from soilbus.can.plain import PlainPlan, plain_plan
-from soilbus.can.validity import REASONS, CodeRule, in_si, judge_codes, judge_validity, rule_of
+from soilbus.can.validity import REASONS, CodeRule, in_si, judge_codes, judge_validity
 
 CLOCK_STEP = 1.0
 """Backward jump [s] above which the clock was set and the new time is believed."""
 LAST_TIME = 1e10
 """Stamps [s] beyond it, either way, are no times: a clock that ticks in seconds would not move any more."""
-TWICE = 0.002
-"""Seconds within which a frame that equals the one before it is that frame once more: cycles are longer."""
 MAX_LISTED_UNKNOWN = 1024
 
 _EXTENDED = 1 << 31
 _NONE: NDArray[np.float64] = np.empty(0)
-_NO_FRAME = (-math.inf, -1, b"")
-
-Data = bytes | bytearray
-Frame = tuple[float, int, Data]
-Mask = NDArray[np.bool_]
 
 
 class CanMessage(Protocol):
@@ -68,42 +72,6 @@ class Counts:
     clock_steps: int = 0
 
 
-@dataclass(slots=True)
-class _Batch:
-    """Frames of one message: times [s] (N,), identifiers (N,), payload (N, length)."""
-
-    t: NDArray[np.float64]
-    ids: NDArray[np.int64]
-    payload: NDArray[np.uint8]
-
-    def where(self, mask: Mask) -> _Batch:
-        return _Batch(self.t[mask], self.ids[mask], self.payload[mask])
-
-
-@dataclass(slots=True)
-class _Inbox:
-    """One message: its frames not yet taken, and what must be remembered between batches."""
-
-    message: Message
-    channels: tuple[Channel, ...]
-    rules: tuple[CodeRule, ...]
-    decoder: ColumnDecoder
-    plain: PlainPlan | None
-    lock: SourceLock | None
-    checksum_byte: int | None
-    frames: list[Frame] = field(default_factory=list)
-    last_t: float = -math.inf
-    last_id: int = -1
-    last_counter: int = -1
-    last_frame: tuple[float, int, bytes] = _NO_FRAME
-
-    def forget(self) -> None:
-        self.frames.clear()
-        self.last_t, self.last_id, self.last_counter, self.last_frame = -math.inf, -1, -1, _NO_FRAME
-        if self.lock is not None:
-            self.lock.release()
-
-
 class Admission:
     """Collects frames and hands out admitted samples.
 
@@ -121,9 +89,9 @@ class Admission:
 
     def __init__(self, channels: Iterable[Channel], database: Database, checked: Collection[str] = ()) -> None:
         self.counts = Counts()
-        self._inboxes: list[_Inbox] = []
-        self._by_key: dict[int, _Inbox] = {}
-        self._groups: dict[int, _Inbox] = {}
+        self._inboxes: list[Inbox] = []
+        self._by_key: dict[int, Inbox] = {}
+        self._groups: dict[int, Inbox] = {}
         self._earliest = math.inf  # an earlier stamp does not follow the last one; inf: there is none
         by_message: dict[str, list[Channel]] = {}
         for channel in channels:
@@ -131,7 +99,7 @@ class Admission:
         for name, members in by_message.items():
             message = database.get_message_by_name(name)
             is_open = hears_any_source(message, database)
-            inbox = _inbox(message, members, is_open, name in checked)
+            inbox = inbox_of(message, members, is_open, name in checked)
             key = _key(message.frame_id, message.is_extended_frame)
             if key in self._by_key:
                 raise ValueError(f"{name}: another mapped message has the identifier {message.frame_id:#x} too")
@@ -173,7 +141,7 @@ class Admission:
         """
         out = Decoded()
         for inbox in self._inboxes:
-            self._open(inbox, _popped(inbox, until), out)
+            self._open(inbox, popped(inbox, until), out)
         return out
 
     def can_filters(self) -> list[dict[str, Any]]:
@@ -188,7 +156,7 @@ class Admission:
             filters.append({"can_id": message.frame_id & mask, "can_mask": mask, "extended": extended})
         return filters
 
-    def _inbox_of_group(self, arbitration_id: int, extended: bool) -> _Inbox | None:
+    def _inbox_of_group(self, arbitration_id: int, extended: bool) -> Inbox | None:
         """Where a frame goes whose identifier is not in the DBC: to its group, or nowhere."""
         key = _key(arbitration_id, extended)
         inbox = self._groups.get(pgn_of(arbitration_id)) if extended else None
@@ -200,7 +168,7 @@ class Admission:
             self.counts.unknown_ids[key] += 1
         return None
 
-    def _is_time(self, inbox: _Inbox, t: float) -> bool:
+    def _is_time(self, inbox: Inbox, t: float) -> bool:
         """Whether a stamp that does not follow the last one is of a clock that was set; else its frame is refused."""
         if t < -LAST_TIME or t > LAST_TIME:
             self._refuse_unheard(inbox, Reason.BAD_TIME)
@@ -218,7 +186,7 @@ class Admission:
                 self.counts.refused[inbox.message.name, Reason.TIME_BACKWARDS] += len(inbox.frames)
             inbox.forget()
 
-    def _open(self, inbox: _Inbox, frames: list[Frame], out: Decoded) -> None:
+    def _open(self, inbox: Inbox, frames: list[Frame], out: Decoded) -> None:
         batch = None
         if frames:
             self.counts.received[inbox.message.name] += len(frames)
@@ -237,7 +205,7 @@ class Admission:
         for channel, rule in zip(inbox.channels, inbox.rules, strict=True):
             _judge(channel, rule, inbox.message, batch.t, columns, out)
 
-    def _checked_batch(self, inbox: _Inbox, frames: list[Frame], out: Decoded) -> _Batch | None:
+    def _checked_batch(self, inbox: Inbox, frames: list[Frame], out: Decoded) -> Batch | None:
         """The frames that pass every frame-level check; None when there are none."""
         length = inbox.message.length
         times, ids, datas = zip(*frames, strict=True)
@@ -255,41 +223,41 @@ class Admission:
         if good is not frames:
             times, ids, datas = zip(*good, strict=True)
         payload = np.frombuffer(b"".join(datas), dtype=np.uint8).reshape(-1, length)
-        batch: _Batch | None = _Batch(np.array(times, dtype=np.float64), np.array(ids, dtype=np.int64), payload)
+        batch: Batch | None = Batch(np.array(times, dtype=np.float64), np.array(ids, dtype=np.int64), payload)
         for check, reason in (
-            (_checksum_right, Reason.BAD_CHECKSUM),
-            (_time_forward, Reason.TIME_BACKWARDS),
-            (_counter_moved, Reason.BAD_COUNTER),
-            (_not_twice, Reason.DUPLICATE),
+            (checksum_right, Reason.BAD_CHECKSUM),
+            (time_forward, Reason.TIME_BACKWARDS),
+            (counter_moved, Reason.BAD_COUNTER),
+            (not_twice, Reason.DUPLICATE),
         ):
             batch = self._passed(inbox, batch, check, reason, out)
         return batch
 
     def _passed(
         self,
-        inbox: _Inbox,
-        batch: _Batch | None,
-        check: Callable[[_Inbox, _Batch], Mask | None],
+        inbox: Inbox,
+        batch: Batch | None,
+        check: Callable[[Inbox, Batch], Mask | None],
         reason: Reason,
         out: Decoded,
-    ) -> _Batch | None:
+    ) -> Batch | None:
         mask = check(inbox, batch) if batch is not None else None
         if batch is None or mask is None or mask.all():
             return batch
         self._refuse(inbox, batch.t[~mask], reason, out)
         return batch.where(mask) if mask.any() else None
 
-    def _refuse(self, inbox: _Inbox, t: NDArray[np.float64], reason: Reason, out: Decoded) -> None:
+    def _refuse(self, inbox: Inbox, t: NDArray[np.float64], reason: Reason, out: Decoded) -> None:
         self.counts.refused[inbox.message.name, reason] += len(t)
         for channel in inbox.channels:
             out.refused[channel.name, reason] = t
 
-    def _refuse_unheard(self, inbox: _Inbox, reason: Reason) -> None:
+    def _refuse_unheard(self, inbox: Inbox, reason: Reason) -> None:
         """One frame that is not even filed."""
         self.counts.received[inbox.message.name] += 1
         self.counts.refused[inbox.message.name, reason] += 1
 
-    def _count_wrong_source(self, inbox: _Inbox, n: int) -> None:
+    def _count_wrong_source(self, inbox: Inbox, n: int) -> None:
         if n:
             self.counts.refused[inbox.message.name, Reason.WRONG_SOURCE] += n
 
@@ -306,97 +274,11 @@ def hears_any_source(message: Message, database: Database) -> bool:
     return sum(m.is_extended_frame and pgn_of(m.frame_id) == pgn for m in database.messages) == 1
 
 
-def checksum_byte_of(message: Message) -> int | None:
-    """Byte that carries a message's Checksum; None without a Counter and an aligned 8-bit Checksum."""
-    named: dict[str, Signal] = {s.name: s for s in message.signals}
-    checksum = named.get(CHECKSUM)
-    if checksum is None or COUNTER not in named or checksum.length != 8:
-        return None
-    aligned = 7 if checksum.byte_order == "big_endian" else 0
-    return checksum.start // 8 if checksum.start % 8 == aligned else None
-
-
-def _inbox(message: Message, channels: Sequence[Channel], is_open: bool, checked: bool) -> _Inbox:
-    checksum_byte = checksum_byte_of(message) if checked else None
-    if checked and checksum_byte is None:
-        raise ValueError(f"{message.name}: no {COUNTER} and byte-aligned 8-bit {CHECKSUM} to check")
-    wanted = [c.signal for c in channels] + [c.valid_signal for c in channels if c.valid_signal is not None]
-    decoder = ColumnDecoder(message, wanted + ([COUNTER] if checked else []))
-    rules = tuple(rule_of(message.get_signal_by_name(c.signal)) for c in channels)
-    return _Inbox(
-        message=message,
-        channels=tuple(channels),
-        rules=rules,
-        decoder=decoder,
-        plain=plain_plan(message, channels, rules, decoder),
-        lock=SourceLock.at_cycle(source_of(message.frame_id), (message.cycle_time or 0) / 1e3) if is_open else None,
-        checksum_byte=checksum_byte,
-    )
-
-
-def _popped(inbox: _Inbox, until: float) -> list[Frame]:
-    """Takes the frames before `until` out of the inbox."""
-    frames, inbox.frames = inbox.frames, []
-    if until == math.inf:
-        return frames
-    inbox.frames = [f for f in frames if f[0] >= until]
-    return [f for f in frames if not f[0] >= until] if inbox.frames else frames
-
-
 def _of_locked_source(lock: SourceLock, frames: list[Frame]) -> list[Frame]:
     if {source_of(i) for i in {f[1] for f in frames}} == {lock.source}:
         lock.admits(frames[-1][0], source_of(frames[-1][1]))
         return frames
     return [f for f in frames if lock.admits(f[0], source_of(f[1]))]
-
-
-def _checksum_right(inbox: _Inbox, batch: _Batch) -> Mask | None:
-    if inbox.checksum_byte is None:
-        return None
-    due = column_checksums(batch.ids, batch.payload, inbox.checksum_byte)
-    right: Mask = batch.payload[:, inbox.checksum_byte] == due
-    return right
-
-
-def _time_forward(inbox: _Inbox, batch: _Batch) -> Mask | None:
-    t = batch.t
-    first, last = float(t[0]), float(t[-1])
-    rises = np.count_nonzero(t[1:] >= t[:-1]) == len(t) - 1  # never of a nan
-    if rises and first >= inbox.last_t and math.isfinite(first) and math.isfinite(last):
-        inbox.last_t = last
-        return None
-    mask = np.zeros(len(t), dtype=np.bool_)
-    for i, now in enumerate(t.tolist()):
-        if math.isfinite(now) and now >= inbox.last_t:
-            mask[i] = True
-            inbox.last_t = now
-    return mask
-
-
-def _counter_moved(inbox: _Inbox, batch: _Batch) -> Mask | None:
-    """False where a frame repeats the counter of the one before it from the same sender."""
-    if inbox.checksum_byte is None:
-        return None
-    counter = inbox.decoder.columns(batch.payload)[COUNTER].raw
-    before = np.concatenate(([inbox.last_counter], counter[:-1]))
-    id_before = np.concatenate(([inbox.last_id], batch.ids[:-1]))
-    inbox.last_counter, inbox.last_id = int(counter[-1]), int(batch.ids[-1])
-    moved: Mask = (counter != before) | (batch.ids != id_before)
-    return moved
-
-
-def _not_twice(inbox: _Inbox, batch: _Batch) -> Mask | None:
-    """False where a frame comes once more: counted twice, its noise would seem smaller than it is."""
-    t_before, id_before, data_before = inbox.last_frame
-    inbox.last_frame = float(batch.t[-1]), int(batch.ids[-1]), batch.payload[-1].tobytes()
-    close = np.diff(batch.t, prepend=t_before) < TWICE
-    if not close.any():
-        return None
-    length = batch.payload.shape[1]
-    first = np.frombuffer(data_before.ljust(length, b"\0"), np.uint8).reshape(1, length)
-    same = (batch.payload == np.concatenate([first, batch.payload[:-1]])).all(axis=1)
-    once: Mask = ~(close & same & (batch.ids == np.concatenate([[id_before], batch.ids[:-1]])))
-    return once
 
 
 def _judge(

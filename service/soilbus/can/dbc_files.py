@@ -8,8 +8,8 @@ from typing import Any
 
 from cantools.database.can import Database, Message
 
-from soilbus.can.admission import checksum_byte_of
 from soilbus.can.checksum import CHECKSUM, COUNTER
+from soilbus.can.inbox import checksum_byte_of
 from soilbus.config import Config, ConfigError
 
 _PACKAGE = Path(__file__).resolve().parents[1]

@@ -9,8 +9,8 @@ from typing import Any
 import can
 from cantools.database.can import Database
 
-from soilbus.can.admission import checksum_byte_of
 from soilbus.can.checksum import COUNTER, frame_checksum
+from soilbus.can.inbox import checksum_byte_of
 
 CYCLES_UNTIL_STALE = 3
 GRACE = 0.2

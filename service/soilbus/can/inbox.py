@@ -1,0 +1,157 @@
+"""One message's frames: filed as they come, and checked as whole columns.
+
+A check gives a mask (N,) of the frames that pass, None where all do.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from cantools.database.can import Message, Signal
+from numpy.typing import NDArray
+
+from soilbus.can.channels import Channel
+from soilbus.can.checksum import CHECKSUM, COUNTER, column_checksums
+from soilbus.can.decode import ColumnDecoder
+from soilbus.can.j1939 import SourceLock, source_of
+from soilbus.can.plain import PlainPlan, plain_plan
+from soilbus.can.validity import CodeRule, rule_of
+
+TWICE = 0.002
+"""Seconds within which a frame that equals the one before it is that frame once more: cycles are longer."""
+
+_NO_FRAME = (-math.inf, -1, b"")
+
+Data = bytes | bytearray
+Frame = tuple[float, int, Data]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(slots=True)
+class Batch:
+    """Frames of one message: times [s] (N,), identifiers (N,), payload (N, length)."""
+
+    t: NDArray[np.float64]
+    ids: NDArray[np.int64]
+    payload: NDArray[np.uint8]
+
+    def where(self, mask: Mask) -> Batch:
+        """Those of a mask (N,)."""
+        return Batch(self.t[mask], self.ids[mask], self.payload[mask])
+
+
+@dataclass(slots=True)
+class Inbox:
+    """One message: its frames not yet taken, and what must be remembered between batches."""
+
+    message: Message
+    channels: tuple[Channel, ...]
+    rules: tuple[CodeRule, ...]
+    decoder: ColumnDecoder
+    plain: PlainPlan | None
+    lock: SourceLock | None
+    checksum_byte: int | None
+    frames: list[Frame] = field(default_factory=list)
+    last_t: float = -math.inf
+    last_id: int = -1
+    last_counter: int = -1
+    last_frame: tuple[float, int, bytes] = _NO_FRAME
+
+    def forget(self) -> None:
+        """As if no frame had ever come."""
+        self.frames.clear()
+        self.last_t, self.last_id, self.last_counter, self.last_frame = -math.inf, -1, -1, _NO_FRAME
+        if self.lock is not None:
+            self.lock.release()
+
+
+def checksum_byte_of(message: Message) -> int | None:
+    """Byte that carries a message's Checksum; None without a Counter and an aligned 8-bit Checksum."""
+    named: dict[str, Signal] = {s.name: s for s in message.signals}
+    checksum = named.get(CHECKSUM)
+    if checksum is None or COUNTER not in named or checksum.length != 8:
+        return None
+    aligned = 7 if checksum.byte_order == "big_endian" else 0
+    return checksum.start // 8 if checksum.start % 8 == aligned else None
+
+
+def inbox_of(message: Message, channels: Sequence[Channel], is_open: bool, checked: bool) -> Inbox:
+    """An empty inbox; is_open: heard from any source.  ValueError where a message to be checked cannot be."""
+    checksum_byte = checksum_byte_of(message) if checked else None
+    if checked and checksum_byte is None:
+        raise ValueError(f"{message.name}: no {COUNTER} and byte-aligned 8-bit {CHECKSUM} to check")
+    wanted = [c.signal for c in channels] + [c.valid_signal for c in channels if c.valid_signal is not None]
+    decoder = ColumnDecoder(message, wanted + ([COUNTER] if checked else []))
+    rules = tuple(rule_of(message.get_signal_by_name(c.signal)) for c in channels)
+    return Inbox(
+        message=message,
+        channels=tuple(channels),
+        rules=rules,
+        decoder=decoder,
+        plain=plain_plan(message, channels, rules, decoder),
+        lock=SourceLock.at_cycle(source_of(message.frame_id), (message.cycle_time or 0) / 1e3) if is_open else None,
+        checksum_byte=checksum_byte,
+    )
+
+
+def popped(inbox: Inbox, until: float) -> list[Frame]:
+    """Takes the frames before `until` out of the inbox."""
+    frames, inbox.frames = inbox.frames, []
+    if until == math.inf:
+        return frames
+    inbox.frames = [f for f in frames if f[0] >= until]
+    return [f for f in frames if not f[0] >= until] if inbox.frames else frames
+
+
+def checksum_right(inbox: Inbox, batch: Batch) -> Mask | None:
+    """False where the payload does not give the Checksum; None where none is asked for."""
+    if inbox.checksum_byte is None:
+        return None
+    due = column_checksums(batch.ids, batch.payload, inbox.checksum_byte)
+    right: Mask = batch.payload[:, inbox.checksum_byte] == due
+    return right
+
+
+def time_forward(inbox: Inbox, batch: Batch) -> Mask | None:
+    """False where time goes back or is no number; None where it goes on throughout."""
+    t = batch.t
+    first, last = float(t[0]), float(t[-1])
+    rises = np.count_nonzero(t[1:] >= t[:-1]) == len(t) - 1  # never of a nan
+    if rises and first >= inbox.last_t and math.isfinite(first) and math.isfinite(last):
+        inbox.last_t = last
+        return None
+    mask = np.zeros(len(t), dtype=np.bool_)
+    for i, now in enumerate(t.tolist()):
+        if math.isfinite(now) and now >= inbox.last_t:
+            mask[i] = True
+            inbox.last_t = now
+    return mask
+
+
+def counter_moved(inbox: Inbox, batch: Batch) -> Mask | None:
+    """False where a frame repeats the counter of the one before it from the same sender."""
+    if inbox.checksum_byte is None:
+        return None
+    counter = inbox.decoder.columns(batch.payload)[COUNTER].raw
+    before = np.concatenate(([inbox.last_counter], counter[:-1]))
+    id_before = np.concatenate(([inbox.last_id], batch.ids[:-1]))
+    inbox.last_counter, inbox.last_id = int(counter[-1]), int(batch.ids[-1])
+    moved: Mask = (counter != before) | (batch.ids != id_before)
+    return moved
+
+
+def not_twice(inbox: Inbox, batch: Batch) -> Mask | None:
+    """False where a frame comes once more: counted twice, its noise would seem smaller than it is."""
+    t_before, id_before, data_before = inbox.last_frame
+    inbox.last_frame = float(batch.t[-1]), int(batch.ids[-1]), batch.payload[-1].tobytes()
+    close = np.diff(batch.t, prepend=t_before) < TWICE
+    if not close.any():
+        return None
+    length = batch.payload.shape[1]
+    first = np.frombuffer(data_before.ljust(length, b"\0"), np.uint8).reshape(1, length)
+    same = (batch.payload == np.concatenate([first, batch.payload[:-1]])).all(axis=1)
+    once: Mask = ~(close & same & (batch.ids == np.concatenate([[id_before], batch.ids[:-1]])))
+    return once
