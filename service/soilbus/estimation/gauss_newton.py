@@ -285,7 +285,7 @@ def continued(
         if start.near:
             place = fitting.near(start.soil, gains, start.latents)
             fit = _settled(fitting, place, MAX_RESUMED, refusals=1, hopeless=hopeless, in_all=MAX_ASTRAY)
-            if fit is not None and fit.converged:
+            if fit is not None and (fit.converged or fit.chi2 < PLAUSIBLE):
                 return fit
         moving = Fitting(problem, prior, before, first=first)
         near = approach(moving, start.soil, most, LITTLE, gains, hopeless=AS_MEASURED * hopeless)
