@@ -18,7 +18,7 @@ from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import Soil, WheelModel, sinkage, state_on
 
-from . import contact_forms, outside, soil_forms, vehicle_forms
+from . import contact_forms, further_forms, outside, soil_forms, vehicle_forms
 from .form import SIZES, Form, Hidden, Setting, together
 
 KINDS = ("single", "pair", "outside", "plain", "hard")
@@ -28,7 +28,7 @@ SOILS = (
     "rubicon_sandy_loam_43", "sandy_loam_11_michigan",
 )  # fmt: skip
 DURATION = 120.0
-FORMS = (*soil_forms.FORMS, *contact_forms.FORMS, *vehicle_forms.FORMS)
+FORMS = (*soil_forms.FORMS, *contact_forms.FORMS, *vehicle_forms.FORMS, *further_forms.FORMS)
 PAIRS, NULLS = 24, 24
 """Cases of these kinds for each seed."""
 _ALIKE = ({"grade", "draft_offset"}, {"draft_offset", "draft_gain"})
