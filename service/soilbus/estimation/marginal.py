@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
-from soilbus.estimation.coordinates import BOUND, TYPICAL_DEPTH, Coordinates
+from soilbus.estimation.coordinates import BOUND, Coordinates
 from soilbus.estimation.denoised import DenoisedProblem
 from soilbus.estimation.gauss_newton import Fit, fit_window, settled
 from soilbus.estimation.normal_equations import Fitting, Place
@@ -41,6 +41,7 @@ UNLIKELY = 9.0
 """-2 log of a probability, relative to the greatest, where the ridge has ended."""
 FINE = 400
 """Values of n that are averaged."""
+_SOIL = len(PARAMETERS)
 _K_C, _K_PHI, _N = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n"))
 
 
@@ -109,11 +110,13 @@ def ridge(problem: WindowProblem, prior: SoilPrior, before: Belief, found: Fit) 
         return None
     if not prior.log_std[[_K_C, _K_PHI, _N]].all() or np.ptp(problem.rig.width) == 0.0:
         return Ridge(calm, top, [])
-    first = _held(calm, prior, before, top, math.log(top.mode.soil[_N]))
+    first = _held(calm, prior, before, top, math.log(top.mode.soil[_N]), None)
     if first is None:
         return Ridge(calm, top, [])
     step = min(math.sqrt(top.mode.covariance[_N, _N]), LONGEST)
-    down, up = (_along(calm, prior, before, first, way, step) for way in (-1.0, 1.0))
+    covariance = top.mode.covariance
+    slope = covariance[:, _N] / covariance[_N, _N]
+    down, up = (_along(calm, prior, before, first, slope, way, step) for way in (-1.0, 1.0))
     return Ridge(calm, top, [*reversed(down), first, *up])
 
 
@@ -127,35 +130,48 @@ def _converged(fitting: Fitting, near: Place) -> Fit | None:
     return None
 
 
-def _along(problem: WindowProblem, prior: SoilPrior, before: Belief, top: Node, way: float, step: float) -> list[Node]:
+def _along(
+    problem: WindowProblem, prior: SoilPrior, before: Belief, top: Node, slope: Array, way: float, step: float
+) -> list[Node]:
+    """Nodes to one side; slope (6 + G,) is how logarithms of the soil and gains change with that of n at the top."""
     nodes: list[Node] = []
     last, least = top, top.unlikelihood
     for _ in range(MAX_STEPS):
-        node = _held(problem, prior, before, last.fit, last.u + way * step)
+        node = _held(problem, prior, before, last.fit, last.u + way * step, slope)
         if node is None:
             break
         nodes.append(node)
+        slope = (_place(node.fit) - _place(last.fit)) / (node.u - last.u)
         last, least, step = node, min(least, node.unlikelihood), step * GROWTH
         if node.unlikelihood > least + UNLIKELY:
             break
     return nodes
 
 
-def _held(problem: WindowProblem, prior: SoilPrior, before: Belief, near: Fit, u: float) -> Node | None:
-    """A fit with n held, from the optimum of one nearby."""
-    soil, n = near.optimum.soil.copy(), math.exp(u)
+def _place(fit: Fit) -> Array:
+    """Logarithms of the soil and gains (6 + G,) of an optimum."""
+    return np.concatenate([np.log(fit.optimum.soil), fit.optimum.gains])
+
+
+def _held(
+    problem: WindowProblem, prior: SoilPrior, before: Belief, near: Fit, u: float, slope: Array | None
+) -> Node | None:
+    """A fit with n held, from the optimum of one nearby, moved along the slope (6 + G,) of the ridge there."""
+    soil, gains, n = near.optimum.soil.copy(), near.optimum.gains, math.exp(u)
     if abs(u - math.log(prior.median[_N])) > BOUND * prior.log_std[_N]:
         return None
-    stiffer = TYPICAL_DEPTH ** (soil[_N] - n)
+    if slope is not None:
+        moved = _place(near) + slope * (u - math.log(soil[_N]))
+        free = prior.log_std > 0.0
+        soil[free] = Coordinates(prior, float(problem.rig.width.mean())).within(np.exp(moved[:_SOIL]))[free]
+        gains = problem.allowed(moved[_SOIL:])
     soil[_N] = n
-    soil[_K_C] *= stiffer if prior.log_std[_K_C] > 0.0 else 1.0
-    soil[_K_PHI] *= stiffer
     deviation = (u - math.log(before.soil[_N])) / math.sqrt(before.covariance[_N, _N])
     median, log_std = prior.median.copy(), prior.log_std.copy()
     median[_N], log_std[_N] = n, 0.0
     fitting = Fitting(problem, SoilPrior(median, log_std), before.given(_N, u))
-    latents = problem.carried(near.optimum.latents, Soil(*soil.tolist()), near.optimum.gains)
-    fit = _converged(fitting, Place(soil, near.optimum.gains, latents, np.inf, 1))
+    latents = problem.carried(near.optimum.latents, Soil(*soil.tolist()), gains)
+    fit = _converged(fitting, Place(soil, gains, latents, np.inf, 1))
     return None if fit is None else Node(u, fit, deviation**2)
 
 
