@@ -80,6 +80,8 @@ class CompletedProblem(WindowProblem):
 
     def _complete(self, effects: Sequence[Effect], free: Sequence[Free]) -> None:
         self.effects, self.free = tuple(effects), tuple(free)
+        named = {effect.name: effect for effect in self.effects}
+        self._effect_of = [named[f.effect] for f in self.free]
         std = [float(f.std > 0.0) for f in self.free]
         self.gain_names = [*self.gain_names[: self.n_sensors], *(f.name for f in self.free)]
         self.gain_std = np.concatenate([self.gain_std[: self.n_sensors], std])
@@ -165,9 +167,12 @@ class CompletedProblem(WindowProblem):
         pull_by_effects = np.zeros((len(self.free), self.n))
         for i, (step_of_effect, other, wheels) in others.items():
             moved = contact if wheels is None else self._contact(wheels, other, near)
-            told = self._told(moved, other, latents, self._from_other_instants(other, moved))
-            by_effects[:, i] = (told - at) / step_of_effect
-            pull_by_effects[i] = (self._pull(moved, other) - pull) / step_of_effect
+            effect = self._effect_of[i]
+            if wheels is not None or effect.torque is not None or effect.load is not None:
+                told = self._told(moved, other, latents, self._from_other_instants(other, moved))
+                by_effects[:, i] = (told - at) / step_of_effect
+            if wheels is not None or effect.draft is not None or effect.resistance is not None:
+                pull_by_effects[i] = (self._pull(moved, other) - pull) / step_of_effect
         slope, off = by_angle[0], -at[0]
         along = by_angle[1:] / slope  # what a load more turns into, by way of the entry angle
 
@@ -196,13 +201,13 @@ class CompletedProblem(WindowProblem):
         self, soil: Soil, pulls: Array, latents: Latents
     ) -> dict[int, tuple[float, list[Active], _Wheels | None]]:
         """For each free parameter a step, the effects after it, and the wheels then, None where they stay."""
-        at_wheels = {e.name for e in self.effects if e.wheel is not None or e.forces is not None}
         others = {}
         for i in np.flatnonzero(self.gain_std[self.n_sensors :] > 0.0).tolist():
             shifted = pulls.copy()
             inward = STEP if self.free[i].within(pulls[i] + STEP) else -STEP
             shifted[i] += inward
-            active, stays = self.active(shifted), self.free[i].effect not in at_wheels
+            active, effect = self.active(shifted), self._effect_of[i]
+            stays = effect.wheel is None and effect.forces is None
             others[i] = inward, active, None if stays else self._wheels(soil, active, latents, latents.entry_angle)
         return others
 
