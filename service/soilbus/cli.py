@@ -15,7 +15,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from soilbus.allocator import keep_freed_memory
+from soilbus.allocator import keep_freed_memory, loading
 from soilbus.arguments import between, counted, natural
 from soilbus.config import Config, ConfigError
 from soilbus.config_file import load_config
@@ -135,7 +135,7 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("bench", _bench, "every performance figure beside its peer, in one run", "")
     sub.add_argument("--bus", metavar="CHANNEL", help="the service on this bus, filled up: a vcan, never a vehicle's")
     sub.add_argument(
-        "--seconds", type=between(15.0, 200.0), default=40.0, metavar="S", help="of a full bus (default 40)"
+        "--seconds", type=between(15.0, 200.0), default=120.0, metavar="S", help="of a full bus (default 120)"
     )
     sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
     return parser
@@ -158,15 +158,16 @@ def _demo(args: argparse.Namespace) -> None:
 
 
 def _run(args: argparse.Namespace) -> None:
-    from soilbus.can.bus import BusError
-    from soilbus.daemon.start import start_service
+    with loading():
+        from soilbus.can.bus import BusError
+        from soilbus.daemon.start import start_service
 
-    config = _configured(args)
-    wait = args.wait or "NOTIFY_SOCKET" in os.environ
-    try:
-        service = start_service(config, wait)
-    except BusError as error:
-        raise WorkError(str(error)) from None
+        config = _configured(args)
+        wait = args.wait or "NOTIFY_SOCKET" in os.environ
+        try:
+            service = start_service(config, wait)
+        except BusError as error:
+            raise WorkError(str(error)) from None
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.stop())
     service.run()
