@@ -206,7 +206,7 @@ class WindowEstimator:
         if window.fresh:
             self._watch, self._curve = Watch(), None
         for moment in window.moments:
-            self._watch = watched(self._watch, *moment, self._curve)
+            self._watch = watched(self._watch, moment.t, moment.slip, moment.pull, self._curve, moment.inertia)
 
     def _effects(self, fit: Fit | None) -> list[Active]:
         """The effects with their parameters as a fit leaves them, else as configured."""

@@ -178,7 +178,7 @@ def watch(seen: Observation) -> tuple[Array, NDArray[np.bool_]]:
     for moment in seen.moments:
         while due is not None and moment.t >= due[0]:
             curve, due = due[1], next(curves, None)
-        state = watched(state, *moment, curve)
+        state = watched(state, moment.t, moment.slip, moment.pull, curve, moment.inertia)
         out.append((moment.t, state.warning is Alert.IMMOBILISATION))
     t, warned = np.array(out, float).reshape(-1, 2).T
     return t, warned > 0.5
