@@ -21,7 +21,7 @@ from soilbus.estimation.belief import Belief
 from soilbus.estimation.coordinates import BOUND, TYPICAL_DEPTH, Coordinates
 from soilbus.estimation.denoised import DenoisedProblem
 from soilbus.estimation.gauss_newton import Fit, fit_window, settled
-from soilbus.estimation.normal_equations import Fitting, Place
+from soilbus.estimation.normal_equations import Fitting, Place, solved
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.terra.wheel import Soil
@@ -82,7 +82,8 @@ def with_whole(problem: WindowProblem, prior: SoilPrior, before: Belief, found: 
         if along is None:
             return found
         coordinates = Coordinates(prior, float(problem.rig.width.mean()))
-        whole = _averaged(along.nodes, coordinates, before) if len(along.nodes) > 2 else along.top.belief
+        told = told_of_k_c(along, prior, before) if len(along.nodes) > 2 else None
+        whole = along.top.belief if told is None else _averaged(along.nodes, told, coordinates, before)
     finite = np.isfinite(whole.soil).all() and np.isfinite(whole.covariance).all()
     if not finite or found.rival is not None:  # beside its rival an optimum is told as it was found
         return replace(found, averaged=whole) if finite else found
@@ -159,8 +160,27 @@ def _held(problem: WindowProblem, prior: SoilPrior, before: Belief, near: Fit, u
     return None if fit is None else Node(u, fit, deviation**2)
 
 
-def _averaged(nodes: list[Node], coordinates: Coordinates, before: Belief) -> Belief:
-    """Mean and covariance of the mixture of all nodes and of what lies between them, by straight lines."""
+def told_of_k_c(along: Ridge, prior: SoilPrior, before: Belief) -> Array | None:
+    """Variance (nodes,) of log k_c that a window on the soil of each node could have at best; None: not to be told."""
+    fitting = Fitting(along.problem, prior, before)
+    variance = []
+    for node in along.nodes:
+        place = Place(node.fit.optimum.soil, node.fit.optimum.gains, node.fit.optimum.latents, np.inf, 1)
+        point = fitting.with_before(place, node.fit.optimum.at)
+        inverse = None if point is None else solved(point.information, point.gradient)
+        if inverse is None:
+            return None
+        variance.append(inverse[1][_K_C, _K_C])
+    return np.array(variance)
+
+
+def _averaged(nodes: list[Node], told: Array, coordinates: Coordinates, before: Belief) -> Belief:
+    """The mixture of all nodes and of what lies between them, by straight lines, with its spread about what it says.
+
+    That is the mean, but for k_c, of which soils of the ridge let a window tell as unlike as by a factor
+    of ten: there the soil whose mean square error is least in units of the variance that each of them
+    would leave, `told` (nodes,).
+    """
     n, free = len(PARAMETERS), coordinates.free
     active = n + np.flatnonzero(np.diag(before.covariance)[n:] > 0.0)
     beliefs = [node.fit.belief for node in nodes]
@@ -172,6 +192,8 @@ def _averaged(nodes: list[Node], coordinates: Coordinates, before: Belief) -> Be
     share = np.array([np.interp(fine, u, one) for one in np.eye(len(u))])
     weight = density(u, np.array([node.unlikelihood for node in nodes]), fine)
     mean = along @ weight
+    of_k_c = weight / np.interp(fine, u, told)
+    mean[_K_C] = along[_K_C] @ of_k_c / of_k_c.sum()
     off = along - mean[:, None]
     covariance = np.tensordot(share @ weight, own, axes=1) + (off * weight) @ off.T
     soil, gains = coordinates.soil_at(mean[: len(free)]), beliefs[0].gains.copy()
