@@ -7,7 +7,7 @@ import pytest
 from borders import crossed, first_valid, wrong
 from scipy.stats import norm
 
-from soilbus.estimation.marginal import confidence, density
+from soilbus.estimation.marginal import confidence, density, longer_side
 from soilbus.simulator.reference import reference_configuration
 
 SPEED = 1.5
@@ -43,3 +43,12 @@ def test_a_confidence_distribution_has_the_quantiles_of_the_signed_root():
         assert np.interp(place, fine, share) == pytest.approx(expected, abs=0.005)
     # As a density the flat side has more than half.
     assert density(u, root**2 + 4.0, fine)[fine < 0.0].sum() == pytest.approx(0.7 / 2.7, abs=0.005)
+
+
+def test_the_longer_side_of_a_distribution_counts():
+    at = np.linspace(0.0, 20.0, 20001)
+    exponential = np.exp(-at) / np.exp(-at).sum()
+    # Of its square distances from the mean, 1 in all, those above are 2 on average.
+    assert longer_side(at - 1.0, exponential) == pytest.approx(2.0, rel=0.01)
+    assert longer_side(1.0 - at, exponential) == pytest.approx(2.0, rel=0.01)
+    assert longer_side(at - 10.0, np.full(20001, 1.0 / 20001)) == pytest.approx(1.0, rel=0.01)

@@ -24,7 +24,8 @@ from soilbus.estimation.gauss_newton import Fit
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.readings import gain_names
 from soilbus.estimation.soil_class import SoilClasses, guessed
-from soilbus.estimation.tracker import MIN_ROWS, Ground, Settings, Tracked, Tracker
+from soilbus.estimation.tracked import MIN_ROWS, Ground, Settings, Tracked
+from soilbus.estimation.tracker import Tracker
 from soilbus.estimation.window import Rig, Window
 from soilbus.hysteresis import Held, settled
 from soilbus.terra.effects.effect import Active, Surroundings, true_draft

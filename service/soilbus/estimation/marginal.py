@@ -182,15 +182,18 @@ def _averaged(nodes: list[Node], coordinates: Coordinates, before: Belief) -> Be
     along = np.array([np.interp(fine, u, column) for column in place.T])
     own = np.array([_in_coordinates(b.covariance, coordinates.log_directions(b.soil), free, active) for b in beliefs])
     share = np.array([np.interp(fine, u, one) for one in np.eye(len(u))])
-    mean = along @ density(u, np.array([node.unlikelihood for node in nodes]), fine)
-    off, weight = along - mean[:, None], confidence(u, np.array([node.misfit for node in nodes]), fine)
-    covariance = np.tensordot(share @ weight, own, axes=1) + (off * weight) @ off.T
+    probable = density(u, np.array([node.unlikelihood for node in nodes]), fine)
+    weight = confidence(u, np.array([node.misfit for node in nodes]), fine)
+    mean = along @ probable
+    off = along - mean[:, None]
+    spread = longer_side(fine - fine @ probable, weight) * (off * weight) @ off.T
+    covariance = np.tensordot(share @ weight, own, axes=1) + spread
     soil, gains = coordinates.soil_at(mean[: len(free)]), beliefs[0].gains.copy()
     gains[active - n] = mean[len(free) :]
-    spread = np.zeros((n + len(gains), len(mean)))
-    spread[:n, : len(free)] = coordinates.log_directions(soil)
-    spread[active, len(free) + np.arange(len(active))] = 1.0
-    return Belief(soil, gains, spread @ covariance @ spread.T)
+    by_coordinates = np.zeros((n + len(gains), len(mean)))
+    by_coordinates[:n, : len(free)] = coordinates.log_directions(soil)
+    by_coordinates[active, len(free) + np.arange(len(active))] = 1.0
+    return Belief(soil, gains, by_coordinates @ covariance @ by_coordinates.T)
 
 
 def _in_coordinates(covariance: Array, directions: Array, free: Indices, active: Indices) -> Array:
@@ -212,6 +215,16 @@ def confidence(u: Array, value: Array, fine: Array) -> Array:
     root = _signed_root(u, value, fine)
     density = np.exp(-0.5 * root**2) * np.maximum(np.gradient(root), 0.0)
     return np.asarray(density / density.sum())
+
+
+def longer_side(off: Array, weight: Array) -> float:
+    """Mean square on the longer side of places (M,) so far off a centre, of these shares, over that of all; 1 at least.
+
+    What is said is a mean and one standard deviation: it must hold on either side.
+    """
+    square = float(weight @ off**2)
+    sides = [weight * side for side in (off > 0.0, off < 0.0) if (weight * side).any()]
+    return max([1.0, *(float(side @ off**2 / side.sum()) / square for side in sides)])
 
 
 def _signed_root(u: Array, value: Array, fine: Array) -> Array:
