@@ -15,7 +15,8 @@ from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.capability.assessment import OverSlip, assess
 from soilbus.capability.immobilisation import Alert, Moment, Watch, moments, watched
 from soilbus.config import Config
-from soilbus.estimation.tracker import Ground, Settings, Tracker
+from soilbus.estimation.tracked import Ground, Settings
+from soilbus.estimation.tracker import Tracker
 from soilbus.estimation.window import BinStore, Rig
 from soilbus.simulator.boggings import FIRM_DRIVE, KINDS, Trouble, bogging, firm_ground
 from soilbus.simulator.drive import drive
