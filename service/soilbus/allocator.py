@@ -1,6 +1,10 @@
-"""One hint to the C library's allocator."""
+"""Hints to the allocators: the C library's, and Python's collector of garbage."""
 
 from __future__ import annotations
+
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -15,3 +19,18 @@ def keep_freed_memory() -> None:
     """
     block = np.empty(31 * 2**20, dtype=np.uint8)
     del block
+
+
+@contextmanager
+def loading() -> Iterator[None]:
+    """What is loaded meanwhile stays: nothing is collected, and no later collection looks at what is there by then.
+
+    Looking through it again and again is a tenth of the time that loading takes, and later
+    halts the loop for as long as several frames.
+    """
+    gc.disable()
+    try:
+        yield
+        gc.freeze()
+    finally:
+        gc.enable()

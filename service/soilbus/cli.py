@@ -15,7 +15,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from soilbus.allocator import keep_freed_memory
+from soilbus.allocator import keep_freed_memory, loading
 from soilbus.arguments import between, counted, natural
 from soilbus.config import Config, ConfigError
 from soilbus.config_file import load_config
@@ -121,6 +121,7 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("montecarlo", _montecarlo, "errors of simulated windows beside the Cramér-Rao bound", "optional")
     sub.add_argument("--windows", type=counted, default=200, metavar="N", help="of each kind (default 200)")
     sub.add_argument("--exact", type=natural, default=0, metavar="M", help="samples of exact posteriors (default 0)")
+    sub.add_argument("--around", type=between(0.0, 1.0), default=0.0, metavar="S", help="std of soils' log (default 0)")
     sub.add_argument("--seed", type=natural, default=1, help="of drives, noise and priors (default 1)")
     sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
 
@@ -135,7 +136,7 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("bench", _bench, "every performance figure beside its peer, in one run", "")
     sub.add_argument("--bus", metavar="CHANNEL", help="the service on this bus, filled up: a vcan, never a vehicle's")
     sub.add_argument(
-        "--seconds", type=between(15.0, 200.0), default=40.0, metavar="S", help="of a full bus (default 40)"
+        "--seconds", type=between(15.0, 200.0), default=120.0, metavar="S", help="of a full bus (default 120)"
     )
     sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
     return parser
@@ -158,15 +159,16 @@ def _demo(args: argparse.Namespace) -> None:
 
 
 def _run(args: argparse.Namespace) -> None:
-    from soilbus.can.bus import BusError
-    from soilbus.daemon.start import start_service
+    with loading():
+        from soilbus.can.bus import BusError
+        from soilbus.daemon.start import start_service
 
-    config = _configured(args)
-    wait = args.wait or "NOTIFY_SOCKET" in os.environ
-    try:
-        service = start_service(config, wait)
-    except BusError as error:
-        raise WorkError(str(error)) from None
+        config = _configured(args)
+        wait = args.wait or "NOTIFY_SOCKET" in os.environ
+        try:
+            service = start_service(config, wait)
+        except BusError as error:
+            raise WorkError(str(error)) from None
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.stop())
     service.run()
@@ -337,7 +339,8 @@ def _montecarlo(args: argparse.Namespace) -> None:
     config = _configured(args) if args.config else reference_configuration([*ROUGHLY_KNOWN, *args.set])
     try:
         with processes(os.cpu_count() or 1) as each:
-            cells = list(with_progress(monte_carlo(config, args.windows, args.seed, each=each, exact=args.exact)))
+            more = {"exact": args.exact, "around": args.around}
+            cells = list(with_progress(monte_carlo(config, args.windows, args.seed, each=each, **more)))
     except SimulationError as error:
         raise WorkError(str(error)) from None
     if args.json is not None:

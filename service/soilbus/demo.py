@@ -50,7 +50,7 @@ def run_demo(duration: float) -> None:
         ours = output_database(config)
         bus = config.bus.model_dump()
         with open_bus(bus, []) as tractor, open_bus(bus, filters_of(ours)) as ear:
-            service = start_service(config, wait=False, on_window=results.append)
+            service = start_service(config, wait=False, on_window=results.append, rehearse=False)
             sender = threading.Thread(target=send_in_time, args=(messages, tractor.send, SPEED_UP), daemon=True)
             worker = threading.Thread(target=service.run, daemon=True)
             worker.start()

@@ -15,11 +15,12 @@ from soilbus.can.publish import Publisher
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.service import Service
+from soilbus.daemon.warm_up import warm_up
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import soil_named
 
 from .books import Beat, Estimates, Hour, unaccounted
-from .traffic import SOIL, traffic
+from .traffic import SOIL, traffic_beside
 from .wire import Wire
 
 HOUR = 3600.0
@@ -48,7 +49,8 @@ def soak(duration: float, seed: int, each_hour: Callable[[Hour], None] = lambda 
     config = reference_configuration()
     clock = FakeClock()
     database, out = load_databases(config), output_database(config)
-    wire = Wire(clock, traffic(config, seed), seed)
+    warm_up(config, database, out)  # as start_service does
+    wire = Wire(clock, traffic_beside(config, seed), seed)
     pipeline = Pipeline(config, database)
     estimator = config.estimator
     estimates = Estimates(soil_named(SOIL).bearing_pressure(estimator.z_ref, estimator.b_ref))

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import pytest
 
 from . import wire
-from .run import soak
+from .books import Hour
+from .run import Soak, soak
+from .verdict import GROWTH, demands
 
 
 @pytest.fixture(scope="module")
@@ -52,3 +56,35 @@ def _forgetful(usual):
         return kept
 
     return handed
+
+
+def _fine(**changed) -> Soak:
+    hours = [Hour(3600, 3500, 0.0045, 0.6, 2.0, 80_000_000 + 1000 * i) for i in range(8)]
+    told = Soak(hours, 10, 9, Counter(stuck=1), 3, {}, Counter(), 0, 100, 0)
+    return told._replace(**changed)
+
+
+def test_a_good_run_meets_every_demand():
+    assert all(demand.met for demand in demands(_fine()))
+
+
+@pytest.mark.parametrize(
+    ("changed", "asked"),
+    [
+        ({"lost": {"MotorFL": 1}}, "every frame accounted for"),
+        ({"admitted": 8}, "every frame accounted for"),
+        ({"deadline_misses": 1}, "no deadline missed"),
+        ({"off_beat": 1}, "every frame on its beat"),
+        ({"hours": [_fine().hours[0], _fine().hours[0]._replace(memory=80_000_001 + int(GROWTH))]}, "memory grows"),
+        ({"hours": [_fine().hours[0], _fine().hours[0]._replace(error=0.006)]}, "estimates as good"),
+        ({"hours": [_fine().hours[0], _fine().hours[0]._replace(worst_z=5.1)]}, "no valid window"),
+    ],
+)
+def test_each_demand_can_be_missed(changed, asked):
+    missed = [demand.asked for demand in demands(_fine(**changed)) if not demand.met]
+    assert len(missed) == 1
+    assert missed[0].startswith(asked)
+
+
+def test_a_short_run_cannot_tell_of_memory():
+    assert [demand.met for demand in demands(_fine(hours=_fine().hours[:1]))].count(None) == 2

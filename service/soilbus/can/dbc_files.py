@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -123,6 +124,12 @@ def _read(path: Path) -> Database:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = raw.decode("cp1252", errors="replace")
+    return _parsed(text)
+
+
+@lru_cache(maxsize=4)
+def _parsed(text: str) -> Database:
+    """For reading only: a start asks for each text twice, and parsing is slow."""
     # not strict: an overlap in a message that nobody maps is none of our business
     database = Database(strict=False)
     database.add_dbc_string(text)

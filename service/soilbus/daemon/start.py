@@ -19,12 +19,20 @@ from soilbus.daemon.outputs import check_cycle_times
 from soilbus.daemon.pipeline import Pipeline, WindowResult
 from soilbus.daemon.service import Service
 from soilbus.daemon.store import Owner
+from soilbus.daemon.warm_up import warm_up
 
 SWITCH_INTERVAL = 0.0005
 
 
-def start_service(config: Config, wait: bool, on_window: Callable[[WindowResult], None] | None = None) -> Service:
+def start_service(
+    config: Config,
+    wait: bool,
+    on_window: Callable[[WindowResult], None] | None = None,
+    rehearse: bool = True,
+) -> Service:
     """The service with its bus open; with `wait` an interface that is not there yet may come later.
+
+    With `rehearse` its worker does made-up windows while the first real one fills.
 
     Raises ConfigError for a configuration that cannot work, BusError for a bus that
     cannot be opened.
@@ -44,6 +52,8 @@ def start_service(config: Config, wait: bool, on_window: Callable[[WindowResult]
     # The loop must get its turn between the estimator's steps, or the socket overflows.
     sys.setswitchinterval(SWITCH_INTERVAL)
     workers = ThreadPoolExecutor(max_workers=1, thread_name_prefix="estimate")
+    if rehearse:
+        workers.submit(warm_up, config, pipeline.database, ours)  # where it raises, the first window is late, no more
     keeper = _keeper(pipeline, os.environ)
     return Service(
         config, pipeline, bus, publisher, Notifier.from_environment(), workers, on_window=on_window, keeper=keeper

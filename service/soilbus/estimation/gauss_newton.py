@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.descent import FAR, LEFT_OVER, LEFT_OVER_RESUMED, LITTLE, MAX_REFUSED, approach, settle
-from soilbus.estimation.linearised import Latents, Linearised, Optimum
+from soilbus.estimation.linearised import Bend, Latents, Linearised, Optimum
 from soilbus.estimation.normal_equations import Fitting, Place
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
@@ -90,7 +90,8 @@ class Fit:
     sinkage (W,) is the mean over the window [m], nan where unknown; optimum is for resume();
     rival is another optimum that the data leave about as likely, where one was looked for
     and found; averaged is the mean of the whole posterior, where that was worked out (see
-    `marginal`).  All are of a constant soil until `present` moves them to the window's end.
+    `marginal`); bend: cost and evidence are those on a way that bends (see `bends`).
+    All are of a constant soil until `present` moves them to the window's end.
     """
 
     belief: Belief
@@ -104,6 +105,7 @@ class Fit:
     converged: bool
     rival: Rival | None = None
     averaged: Belief | None = None
+    bend: Bend | None = None
 
     @property
     def posterior(self) -> Posterior:

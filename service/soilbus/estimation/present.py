@@ -6,6 +6,9 @@ errors stay what they are: an information filter from piece to piece (e.g. Ander
 Moore, Optimal Filtering, 1979, sect. 6.3).  What the last piece has is the present soil;
 a constant one would be late by half a window, and too sure of itself.
 
+On a way that bends (`bends`) each second of a piece has a curve of its own besides, which is no
+soil's.
+
 The linear window tells the mode.  By as much as the filter moves that, and by what it adds
 to the covariance there (never less than nothing: what may wander is known the worse), all
 else that a fit says moves too: moments, averages and rivals keep their shape.
@@ -14,11 +17,13 @@ else that a fit says moves too: moments, averages and rivals keep their shape.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
+from soilbus.estimation.bends import along_bends, seconds
 from soilbus.estimation.gauss_newton import Fit
 from soilbus.estimation.normal_equations import Fitting, Place, solved
 
@@ -36,7 +41,7 @@ def at_present(fitting: Fitting, fit: Fit, window: float, drift: float) -> Fit:
     The same fit where nothing wanders or the numbers stop being finite.  Cost and evidence
     stay those of a constant soil: a wandering one would explain too much that is no soil.
     """
-    if not drift:
+    if not (drift or fit.bend):
         return fit
     optimum, t = fit.optimum, fit.optimum.t
     place = Place(optimum.soil, optimum.gains, optimum.latents, fit.cost, 0)
@@ -50,8 +55,10 @@ def at_present(fitting: Fitting, fit: Fit, window: float, drift: float) -> Fit:
     joint[1:, 1:] = before.information
     joint[0, 1:] = joint[1:, 0] = before.gradient
     soil = slice(1, 1 + free)
-    stiff = np.eye(free) * PIECES / drift**2
-    ends = np.searchsorted(t - t[-1], window * (_ENDS - 1.0), side="right").tolist()
+    steps = _ENDS if drift else _ENDS[-1:]
+    stiff = np.eye(free) * PIECES / drift**2 if drift else np.zeros((free, free))
+    of_bends = _Bends.of(fitting, fit, fit.bend.std) if fit.bend else None
+    ends = np.searchsorted(t - t[-1], window * (steps - 1.0), side="right").tolist()
     for begin, end in zip([0, *ends[:-1]], ends, strict=True):
         if begin:
             link = joint[:, soil].copy()
@@ -62,7 +69,10 @@ def at_present(fitting: Fitting, fit: Fit, window: float, drift: float) -> Fit:
             joint -= link @ np.linalg.solve(step, link.T)
         if end > begin:
             rows = slice(begin * m, end * m)
-            joint += of_residual.T @ (optimum.at.rows[rows].T @ optimum.at.weighed[rows]) @ of_residual
+            normal = optimum.at.rows[rows].T @ optimum.at.weighed[rows]
+            if of_bends is not None:
+                normal -= of_bends.explained(optimum.at.rows, begin * m, end * m)
+            joint += of_residual.T @ normal @ of_residual
     constant = of_residual.T @ optimum.at.normal @ of_residual[:, 1:]
     still = solved(constant[1:] + before.information, constant[0] + before.gradient)
     wandering = solved(joint[1:, 1:], joint[1:, 0])
@@ -85,3 +95,23 @@ def at_present(fitting: Fitting, fit: Fit, window: float, drift: float) -> Fit:
         rival=None if fit.rival is None else fit.rival._replace(belief=moved(fit.rival.belief)),
         averaged=None if fit.averaged is None else moved(fit.averaged),
     )
+
+
+class _Bends(NamedTuple):
+    """Derivatives (R,) of the residuals by the curve of their own second, these weighed, and which second that is."""
+
+    rows: Array
+    weighed: Array
+    second: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, fitting: Fitting, fit: Fit, std: Array) -> _Bends:
+        t, m = fit.optimum.t, fit.optimum.at.by_latents.shape[1]
+        return cls(*along_bends(fitting, fit, std), np.repeat(seconds(t, t[-1]), m))
+
+    def explained(self, rows: Array, begin: int, end: int) -> Array:
+        """Of the normal equations (1 + 6 + G, 1 + 6 + G) of these residuals what bends can take away."""
+        part = slice(begin, end)
+        own = self.second[part] == np.unique(self.second[part])[:, None]
+        across = (own * self.weighed[part]) @ rows[part]
+        return np.asarray(across.T @ (across / (1.0 + own @ (self.weighed[part] * self.rows[part]))[:, None]))

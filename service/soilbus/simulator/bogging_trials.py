@@ -15,7 +15,8 @@ from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.capability.assessment import OverSlip, assess
 from soilbus.capability.immobilisation import Alert, Moment, Watch, moments, watched
 from soilbus.config import Config
-from soilbus.estimation.tracker import Ground, Settings, Tracker
+from soilbus.estimation.tracked import Ground, Settings
+from soilbus.estimation.tracker import Tracker
 from soilbus.estimation.window import BinStore, Rig
 from soilbus.simulator.boggings import FIRM_DRIVE, KINDS, Trouble, bogging, firm_ground
 from soilbus.simulator.drive import drive
@@ -178,7 +179,7 @@ def watch(seen: Observation) -> tuple[Array, NDArray[np.bool_]]:
     for moment in seen.moments:
         while due is not None and moment.t >= due[0]:
             curve, due = due[1], next(curves, None)
-        state = watched(state, *moment, curve)
+        state = watched(state, moment.t, moment.slip, moment.pull, curve, moment.inertia)
         out.append((moment.t, state.warning is Alert.IMMOBILISATION))
     t, warned = np.array(out, float).reshape(-1, 2).T
     return t, warned > 0.5

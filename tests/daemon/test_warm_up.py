@@ -1,0 +1,81 @@
+"""The first windows are rehearsed where nothing depends on them, and nothing of it is left behind."""
+
+from __future__ import annotations
+
+import gc
+from pathlib import Path
+
+import pytest
+
+from soilbus.allocator import loading
+from soilbus.can.dbc_files import load_databases, output_database
+from soilbus.config import ConfigError
+from soilbus.config_file import load_config
+from soilbus.daemon import start
+from soilbus.daemon.warm_up import WINDOWS, warm_up
+from soilbus.simulator.reference import reference_configuration
+from soilbus.traversability import Status
+
+FIELD = Path(__file__).resolve().parents[1] / "field"
+VIRTUAL = ("bus.interface=virtual", "bus.channel=warm-up")
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """Starts the service of a configuration, and hands out what its rehearsal came to."""
+    rehearsals, services = [], []
+
+    def noted(config, database, ours):
+        rehearsals.append(warm_up(config, database, ours))
+
+    monkeypatch.setattr(start, "warm_up", noted)
+
+    def of(config):
+        services.append(start.start_service(config, wait=False))
+        services[-1]._workers.shutdown(wait=True)
+        return services[-1], rehearsals
+
+    yield of
+    for service in services:
+        service.bus.close()
+
+
+@pytest.mark.parametrize("path", ["field.toml", None])
+def test_all_that_a_valid_window_takes_is_rehearsed(path):
+    config = reference_configuration() if path is None else load_config(FIELD / path)
+    results = warm_up(config, load_databases(config), output_database(config))
+    assert [result.status for result in results] == [Status.VALID] * WINDOWS
+    assert all(result.traversability.capability is not None for result in results)
+
+
+def test_a_start_rehearses_and_knows_nothing_of_it(started):
+    service, rehearsals = started(reference_configuration(VIRTUAL))
+    assert [len(results) for results in rehearsals] == [WINDOWS]
+    assert service._newest() is None
+    assert service.intake.last_seen == {}
+    assert service.intake.admission.counts.received.total() == 0
+    counters = {name: service.publisher.frame(name, {}).data for name in ("Traversability", "SoilStrength")}
+    fresh = start.Publisher(output_database(service.config))
+    assert counters == {name: fresh.frame(name, {}).data for name in counters}
+
+
+def test_a_vehicle_that_cannot_be_simulated_starts_all_the_same(started):
+    service, rehearsals = started(load_config(FIELD / "deere.toml", VIRTUAL))
+    assert rehearsals == []
+    service.step()
+    assert service.bus.is_open
+
+
+def test_nothing_is_collected_while_loading_and_what_is_loaded_is_left_alone():
+    kept = gc.get_freeze_count()
+    try:
+        with loading():
+            assert not gc.isenabled()
+            loaded = [[] for _ in range(10)]
+        assert gc.isenabled()
+        assert gc.get_freeze_count() >= kept + len(loaded)
+        with pytest.raises(ConfigError), loading():
+            raise ConfigError(["wrong"])
+        assert gc.isenabled()
+    finally:
+        gc.unfreeze()
