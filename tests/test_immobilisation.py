@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from soilbus.capability.assessment import OverSlip
 from soilbus.capability.immobilisation import AHEAD, CALM, LONGEST_GAP, SETTLED, Alert, Watch, watched
-from soilbus.capability.trend import Demand
-from soilbus.simulator import boggings
+from soilbus.capability.trend import Capacity, Demand
+from soilbus.simulator import boggings, firm_drives
 from soilbus.simulator.bogging_trials import REACTION, Task, WarningTrial, figures, trial
 from soilbus.simulator.drive import drive as driven
 from soilbus.simulator.reference import reference_configuration
@@ -237,6 +237,20 @@ def test_wheels_that_all_but_roll_tell_nothing_of_the_ground():
         assert state.warning is not Alert.IMMOBILISATION
 
 
+def test_ground_of_which_little_is_known_yet_does_not_surely_weaken():
+    capacity = Capacity()
+    for i in range(12):  # wheels that have rolled for long pull again
+        capacity = capacity.joined(0.1, 6000.0 - 100.0 * i if i > 5 else None, None)
+    assert capacity.is_told
+    assert capacity.short.line().slope == pytest.approx(-1000.0)
+    assert capacity.slope_std(capacity.short.line()) == math.inf
+    few = many = capacity.joined(0.1, 5000.0, 5100.0)
+    for _ in range(100):
+        many = many.joined(0.1, 5000.0, 5100.0)
+    line = capacity.short.line()
+    assert few.slope_std(line) > 1.5 * many.slope_std(line)
+
+
 MAYBE = st.none() | st.floats(allow_nan=True, allow_infinity=True)
 
 
@@ -277,9 +291,9 @@ def test_at_the_edge_of_a_soft_patch_the_warning_comes_as_soon_as_it_can_be_felt
     assert found.warnings == 1
 
 
-@pytest.mark.parametrize("kind", ["firm", "harsh"])
+@pytest.mark.parametrize("kind", firm_drives.FIRM_KINDS)
 def test_firm_ground_is_left_in_peace(kind, monkeypatch):
-    monkeypatch.setattr(boggings, "FIRM_DRIVE", 60.0)
+    monkeypatch.setattr(firm_drives, "FIRM_DRIVE", 60.0)
     found = trial(Task(CONFIG, kind, 1))
     assert found.seconds == pytest.approx(50.0, abs=0.2)
     assert found.warnings == 0

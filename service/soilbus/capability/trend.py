@@ -72,6 +72,11 @@ class Trend(NamedTuple):
         return self.y / self.n if self.n > 0.0 else 0.0
 
 
+def _estimated(squares: Trend, alike: float) -> float:
+    """Mean of squares of which so many say the same, widened as poorly known of few (as Student's t); inf of none."""
+    return squares.mean * (1.0 + 2.0 * alike / squares.n) if squares.n > 0.0 else math.inf
+
+
 class Capacity(NamedTuple):
     """Trends of the capacity [N] with the long and the short memory, and what they are worth.
 
@@ -117,10 +122,11 @@ class Capacity(NamedTuple):
         """Of one of the two lines' slopes [N/s], at most: old moments are forgotten, but count as if they were not.
 
         Changes within LAG, twice the variance of the scatter, hold little of a slow change of the ground.
+        inf where none is known, as when wheels pull again that have rolled for long.
         """
-        moments_in_lag = LAG / SHORT * self.told.n
-        variance = self.scatter.mean / 2.0
-        return math.sqrt(moments_in_lag * variance / line.spread) if line.spread > 0.0 else math.inf
+        in_lag = LAG / SHORT * self.told.n
+        variance = _estimated(self.scatter, in_lag) / 2.0
+        return math.sqrt(in_lag * variance / line.spread) if line.spread > 0.0 else math.inf
 
 
 class Demand(NamedTuple):
@@ -141,11 +147,9 @@ class Demand(NamedTuple):
     def swing_std(self) -> float:
         """Standard deviation [N] of the swing, inf where it is not known.
 
-        The square of a change beyond the change before is six times the variance of values without relation.  Of
-        few of them the variance is poorly known: `1 + 2 / n` widens as Student's t does.
+        The square of a change beyond the change before is six times the variance of values without relation.
         """
-        n = self.swing.n / self._in_swing
-        return math.sqrt(self.swing.mean / 6.0 * (1.0 + 2.0 / n)) if n > 0.0 else math.inf
+        return math.sqrt(_estimated(self.swing, self._in_swing) / 6.0)
 
     def slope_std(self, line: Line) -> float:
         """Of the line's slope [N/s] by the swing alone, at most: values within SWING count as one."""
