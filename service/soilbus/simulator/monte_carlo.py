@@ -7,10 +7,10 @@ estimated from nothing else, as the first window after a start is.  Errors, stan
 deviations and bounds are those of logarithms.
 
 The bound is local: it knows how the window would change with a soil next to the true one.
-Where the soils that the window allows are not next to it, no estimate may reach it, and what
-can be reached is what the mean of the exact posterior does on the same windows (`exact`).
-For the same reason no interval holds each single soil 95 times in 100, but soils that lie about it
-as they may (`around`).
+Where the soils that the window allows are not next to it, an estimate may miss it, and the mean
+of the exact posterior (`exact`) says how far one does that has the least error on average over
+these soils.  For the same reason no interval holds each single soil 95 times in 100, but soils
+that lie about it as they may (`around`).
 """
 
 from __future__ import annotations
