@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from borders import crossed, first_valid, wrong
+from borders import crossed, drive, first_valid, least_sd, wrong
 from scipy.stats import norm
 
 from soilbus.estimation.marginal import confidence, density, longer_side
@@ -52,3 +52,13 @@ def test_the_longer_side_of_a_distribution_counts():
     assert longer_side(at - 1.0, exponential) == pytest.approx(2.0, rel=0.01)
     assert longer_side(1.0 - at, exponential) == pytest.approx(2.0, rel=0.01)
     assert longer_side(at - 10.0, np.full(20001, 1.0 / 20001)) == pytest.approx(1.0, rel=0.01)
+
+
+def test_no_estimate_can_be_surer_than_the_bound_says():
+    config, seed = reference_configuration(), 202
+    driven = drive(config, "loam:wet_clay", SPEED, 1.0, seed, after=3.0)
+    told = [w for w in crossed(config, "loam:wet_clay", SPEED, 1.0, seed, after=3.0) if w.t > 1.0]
+    least = [least_sd(config, driven, w.t) for w in told]
+    assert least == sorted(least, reverse=True)
+    assert least[0] > 0.10  # no status can be valid then
+    assert all(w.sd > 0.9 * bound for w, bound in zip(told, least, strict=True))

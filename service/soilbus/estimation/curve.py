@@ -45,12 +45,8 @@ def rim_differences(readings: Readings) -> Array:
 
 def rim_difference(readings: Readings) -> float:
     """Root mean square of these over the window, 0 where none is known."""
-    return rms(rim_differences(readings))
-
-
-def rms(values: Array) -> float:
-    """Root mean square of what is known; 0 of nothing."""
-    known = values[np.isfinite(values)]
+    apart = rim_differences(readings)
+    known = apart[np.isfinite(apart)]
     return math.sqrt(float(np.mean(known**2))) if len(known) else 0.0
 
 

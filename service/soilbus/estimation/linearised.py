@@ -92,7 +92,7 @@ class Optimum:
 
 
 class Bend(NamedTuple):
-    """Optimum of a window before its data were freed of a bending way, and the std (N,) of the bends beforehand."""
+    """Optimum of a window before its data were freed of a bending way, and how large bends (N, K) may be beforehand."""
 
     optimum: Optimum
-    std: Array
+    bends: Array

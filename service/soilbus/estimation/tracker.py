@@ -372,8 +372,7 @@ class Tracker:
         way = bending(fitting, fit)
         if fit is None or way is None:
             return fitting, fit
-        straight = straightened(window, self.rig, way, float(fit.optimum.t[-1]))
-        return on_the_way(fitting, fit, way, self._problem(straight))
+        return on_the_way(fitting, fit, way, self._problem(straightened(window, self.rig, way)))
 
     def _likelier(self, old: Fit, new: Fit, one: Fit | None) -> bool:
         """Whether two soils explain much better what one, of the same data, explains."""
