@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import pytest
-
-from .completed_windows import EFFECTS, recorded, times
+from completed_windows import EFFECTS, recorded, times
 
 MOST = 4.0
 """Times a plain window's time: 40 ms where that takes 10."""
