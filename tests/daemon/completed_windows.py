@@ -1,4 +1,4 @@
-"""`PYTHONPATH=service:tests/support python -m tests.daemon.completed_windows [EFFECT...]`: a window's time under each.
+"""`PYTHONPATH=service python tests/daemon/completed_windows.py [EFFECT...]`: a window's time under each.
 
 One recording without effects, estimated with each effect in the model as `diagnose --model-out`
 writes it: free within a tenth of the prior std, and half of that from absence, as the data allow.
