@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import soilbus.bench as bench
 from soilbus.bench import growth, paper, service, window
@@ -66,6 +68,22 @@ def test_json_to_stdout_is_nothing_but_json(monkeypatch, capsys):
     results = json.loads(capsys.readouterr().out)
     assert results["tried"] == 3.0
     assert results["details"]["tried"]["met"] is True
+
+
+def test_all_is_measured_with_as_many_threads_as_the_unit_gives_the_service(monkeypatch):
+    unit = (Path(__file__).parents[1] / "systemd/soilbus@.service").read_text()
+    assert f"OPENBLAS_NUM_THREADS={bench.THREADS} OMP_NUM_THREADS={bench.THREADS}" in unit
+    seen = []
+
+    def measure(_):
+        seen.extend(pool["num_threads"] for pool in threadpool_info())
+        return {}
+
+    monkeypatch.setattr(bench, "RECORDING", 1.0)
+    monkeypatch.setattr(bench, "MEASUREMENTS", (measure,))
+    with threadpool_limits(2):
+        bench.run_bench()
+    assert set(seen) == {bench.THREADS}
 
 
 @pytest.mark.parametrize(

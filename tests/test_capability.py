@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq, minimize_scalar
 
+from drawn import assessed as assessed_within
+from drawn import by_draws, figures
 from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.capability import assessment
 from soilbus.capability.assessment import Demand, assess, slip_grid
 from soilbus.capability.balance import LEVEL, Duty, balance
-from soilbus.capability.sigma_points import SigmaPoints, cubature
+from soilbus.capability.draws import DRAWS, estimates, likely, mean_and_std, normals
+from soilbus.capability.sigma_points import LEADING, SigmaPoints
 from soilbus.capability.wheels import WheelTable, wheel_table
 from soilbus.estimation.gauss_newton import fit_window
 from soilbus.estimation.posterior import Estimate, Posterior
@@ -233,25 +236,39 @@ def test_torque_over_slip_is_that_of_equation_22():
 # --- the posterior's spread ---
 
 
-@pytest.mark.parametrize("n", range(6))
-def test_the_cubature_is_exact_to_degree_five(n):
-    points, weight = cubature(n)
-    moments = {0: 1.0, 1: 0.0, 2: 1.0, 3: 0.0, 4: 3.0, 5: 0.0}
-    for powers in itertools.product(range(6), repeat=n):
+@pytest.mark.parametrize("n", range(10))
+def test_draws_have_the_moments_of_standard_normals(n):
+    leading = min(n, LEADING)
+    z = normals(n, leading)
+    assert z.shape == (DRAWS, n)
+    assert np.allclose(z[1::2], -z[::2])
+    assert np.allclose(z.T @ z / DRAWS, np.eye(n))
+    expected = {0: 1.0, 1: 0.0, 2: 1.0, 3: 0.0, 4: 3.0, 5: 0.0}
+    for powers in itertools.product(range(6), repeat=leading):
         if sum(powers) <= 5:
-            expected = math.prod(moments[p] for p in powers)
-            assert weight @ np.prod(points**powers, axis=1) == pytest.approx(expected, abs=1e-12)
-    assert np.all(weight > 0.0)
-    assert np.allclose(points[1::2], -points[2::2])
-    assert not points[0].any()
+            moment = np.prod(z[:, :leading] ** powers, axis=1).mean()
+            assert moment == pytest.approx(math.prod(expected[p] for p in powers), abs=1e-6)
+    assert np.abs(z).max(initial=0.0) < 4.0
 
 
-def test_sigma_points_have_the_posterior_s_covariance():
+@pytest.mark.parametrize("leading", range(1, LEADING + 1))
+def test_the_surface_is_exact_for_polynomials(leading):
+    root = np.diag([0.3, 0.2, 0.1, 0.0, 0.0, 0.0][:leading] + [0.0] * (6 - leading))
+    points = SigmaPoints.of(Posterior(SOILS["loam"], root @ root))
+    x = np.log(points.soils / points.soils[0])[:, :leading] / np.diag(root)[:leading]
+    z = np.concatenate([np.zeros((1, leading)), normals(leading, leading)])
+    for powers in itertools.product(range(7), repeat=leading):
+        first, *others = powers
+        if sum(powers) <= 2 or sum(others) == 0 or (leading > 2 and first <= 2 and sum(others) == 1):
+            at_points, at_draws = ((each**powers).prod(axis=1) for each in (x, z))
+            assert points.drawn(at_points) == pytest.approx(at_draws, rel=1e-6, abs=1e-6), powers
+
+
+def test_draws_have_the_posterior_s_covariance():
     root = np.random.default_rng(1).normal(0.0, 0.1, (6, 6)) * np.array([1.0, 0.5, 0.1, 0.1, 1.0, 0.0])[:, None]
     posterior = Posterior(SOILS["loam"]._replace(K=0.0), root @ root.T)
     points = SigmaPoints.of(posterior)
-    logs = np.log(points.soils[:, :5])
-    mean, std = points.mean_and_std(logs)
+    mean, std = mean_and_std(points.drawn(np.log(points.soils[:, :5])))
     assert mean == pytest.approx(np.log(posterior.soil[:5]))
     assert std == pytest.approx(np.sqrt(np.diag(posterior.log_covariance)[:5]))
     assert not points.soils[:, 5].any()
@@ -259,52 +276,41 @@ def test_sigma_points_have_the_posterior_s_covariance():
 
 def test_first_order_is_exact_for_what_is_linear_and_blind_to_what_only_bends():
     root = np.random.default_rng(2).normal(0.0, 0.1, (6, 6))
+    root[1] *= 3.0  # what bends is not well known
     posterior = Posterior(SOILS["loam"], root @ root.T)
     points = SigmaPoints.of(posterior)
     logs = np.log(points.soils / points.soils[0])
     gradient = np.array([3.0, -1.0, 2.0, 0.5, -4.0, 1.0])
-    value, std = points.first_order(7.0 + logs @ gradient)
-    assert value == 7.0
-    assert std == pytest.approx(math.sqrt(gradient @ posterior.log_covariance @ gradient))
-    bent = points.first_order(7.0 + logs @ gradient + 5.0 * logs[:, 1] ** 2)
-    assert bent == pytest.approx((value, std), rel=0.02)  # what is left is the last two directions
-    mean, _ = points.mean_and_std(7.0 + logs @ gradient + 5.0 * logs[:, 1] ** 2)
+    found = likely(points.drawn(7.0 + logs @ gradient))
+    assert found.value == 7.0
+    assert found.std == pytest.approx(math.sqrt(gradient @ posterior.log_covariance @ gradient))
+    bending = points.drawn(7.0 + logs @ gradient + 5.0 * logs[:, 1] ** 2)
+    bent = likely(bending)
+    assert (bent.value, bent.std) == pytest.approx(
+        (found.value, found.std), rel=0.02
+    )  # what is left is the last three directions
+    mean, _ = mean_and_std(bending)
     assert mean > 7.0 + 0.5 * 5.0 * posterior.log_covariance[1, 1]
 
 
 def test_a_point_without_a_value_is_mirrored():
     points = SigmaPoints.of(Posterior(SOILS["loam"], np.diag([0.04, 0.01, 0.0, 0.0, 0.0, 0.0])))
     samples = 1000.0 + 100.0 * np.log(points.soils[:, 0])
-    whole = points.estimates(samples)[0]
-    samples[3] = np.nan
-    assert dataclasses.astuple(points.estimates(samples)[0]) == pytest.approx(dataclasses.astuple(whole))
-    samples[0] = np.nan
-    assert points.estimates(samples) == [None]
+    whole = points.drawn(samples)
+    for i in range(1, len(samples)):
+        known = np.arange(len(samples)) != i
+        changed = np.where(known, samples, 1e6)
+        alike = points.drawn(changed, known) == pytest.approx(whole)
+        assert alike == (points.mirror[i] != i), i
+        assert np.abs(points.drawn(changed, known)).max() < 2e3
 
 
-class Draws:
-    """Random soils of a posterior in the place of its sigma points."""
-
-    N = 10_000
-
-    def __init__(self, soils: np.ndarray) -> None:
-        self.soils = soils
-
-    @classmethod
-    def of(cls, posterior: Posterior, shifts: np.ndarray) -> Draws:
-        assert not len(shifts)
-        rng = np.random.default_rng(7)
-        logs = rng.multivariate_normal(np.zeros(6), posterior.log_covariance, cls.N, method="eigh")
-        return cls(np.asarray(posterior.soil) * np.exp(np.concatenate([np.zeros((1, 6)), logs])))
-
-    def mean_and_std(self, samples):
-        return np.nanmean(samples[1:], axis=0), np.nanstd(samples[1:], axis=0)
-
-    def estimates(self, *samples):
-        return [None if s is None else Estimate(*(float(x) for x in self.mean_and_std(s))) for s in samples]
-
-    def likely(self, samples):
-        return self.estimates(samples)[0]
+def test_what_most_draws_lack_is_not_known():
+    samples = np.concatenate([[1.0], np.tile([0.9, 1.1], 50)])
+    assert estimates(samples) == [Estimate(pytest.approx(1.0), pytest.approx(0.1))]
+    assert estimates(samples, np.where(np.arange(101) == 0, np.nan, samples), None)[1:] == [None, None]
+    some, most = (np.where(np.arange(101) < 101 - lost, samples, np.nan) for lost in (40, 60))
+    assert estimates(some, most) == [Estimate(pytest.approx(1.0), pytest.approx(0.1)), None]
 
 
 def fitted(name: str, slip: Swing) -> Posterior:
@@ -315,23 +321,6 @@ def fitted(name: str, slip: Swing) -> Posterior:
     fit = fit_window(WindowProblem(store.window(0.0, 10.0), RIG, model_of(CONFIG), 0.2), prior_of(CONFIG))
     assert fit is not None
     return fit.posterior
-
-
-def figures(able) -> dict[str, Estimate]:
-    """Every estimate of a capability by name; those without any spread (at a limit) are left out."""
-    forecast = able.forecast
-    found = {
-        "max_draft": able.max_draft,
-        "max_grade": able.max_grade,
-        "max_grade_with_draft": able.max_grade_with_draft,
-        "max_pull": able.max_pull,
-        "slip": forecast.slip,
-        "torque": forecast.torque,
-        **{f"sinkage {wheel}": depth for wheel, depth in forecast.sinkage.items()},
-        **{f"efficiency {axle}": point.efficiency for axle, point in able.set_points.items()},
-        **{f"most pull {axle}": point.pull for axle, point in able.set_points.items()},
-    }
-    return {name: e for name, e in found.items() if e is not None and e.std > 1e-9}
 
 
 @pytest.mark.parametrize(
@@ -346,15 +335,13 @@ def figures(able) -> dict[str, Estimate]:
         ("heavy_clay_40", Swing(0.05, 0.40), 1100.0),
     ],
 )
-def test_means_and_deviations_equal_monte_carlo(name, slip, limit, monkeypatch):
+def test_means_and_deviations_equal_monte_carlo(name, slip, limit):
     posterior = fitted(name, slip)
-    limits, model = np.full(4, limit), model_of(CONFIG)
-    demand = Demand(0.5 * assess(posterior, RIG, model, None, limits, 0.6, 0.25)[0].max_draft.value, 20.0, 0.02)
-    ours = assess(posterior, RIG, model, demand, limits, 0.6, 0.25)[0]
-    monkeypatch.setattr(assessment, "SigmaPoints", Draws)
-    drawn = assess(posterior, RIG, model, demand, limits, 0.6, 0.25)[0]
-    expected = figures(drawn)
-    found = figures(ours)
+    demand = Demand(0.5 * assessed_within(posterior, limit, None).max_draft.value, 20.0, 0.02)
+    ours = assessed_within(posterior, limit, demand)
+    with by_draws():
+        drawn = assessed_within(posterior, limit, demand)
+    expected, found = figures(drawn), {name: e for name, e in figures(ours).items() if e.std > 1e-9}
     assert set(found) <= set(expected)
     assert len(found) >= 8
     for quantity, estimate in found.items():

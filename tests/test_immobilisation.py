@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -11,7 +12,8 @@ from hypothesis import strategies as st
 
 from soilbus.capability.assessment import OverSlip
 from soilbus.capability.immobilisation import AHEAD, CALM, LONGEST_GAP, SETTLED, Alert, Watch, watched
-from soilbus.simulator import boggings
+from soilbus.capability.trend import Capacity, Demand
+from soilbus.simulator import boggings, firm_drives
 from soilbus.simulator.bogging_trials import REACTION, Task, WarningTrial, figures, trial
 from soilbus.simulator.drive import drive as driven
 from soilbus.simulator.reference import reference_configuration
@@ -36,12 +38,13 @@ def slip_at(pull):
     return float(np.interp(pull, np.interp(fine, SLIP, pull_at(SLIP)), fine, left=0.0, right=0.7))
 
 
-def drive(demand, lost=lambda t: 0.0, until=60.0, step=0.1):
-    """(t, watch) of a drive whose demand and lost pull [N] are functions of time; it ends where slip passes."""
+def drive(demand, lost=lambda t: 0.0, until=60.0, step=0.1, inertia=lambda t: 0.0):
+    """(t, watch) of a drive with demand, lost pull and inertia [N] as functions of time; it ends where slip passes."""
     state, out = Watch(), []
     for t in np.arange(0.0, until, step):
-        slip = slip_at(demand(t) + lost(t))
-        state = watched(state, t, [slip] * 4, demand(t), CURVE)
+        given = demand(t) + inertia(t)
+        slip = slip_at(given + lost(t))
+        state = watched(state, t, [slip] * 4, given, CURVE, inertia(t))
         out.append((t, state))
         if slip > 0.6:
             break
@@ -75,6 +78,60 @@ def test_an_easy_draft_that_comes_and_goes_is_no_cause():
     assert {state.warning for t, state in out if t > SETTLED + 0.1} == {Alert.NONE}
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_hard_draft_that_swings_is_no_cause_however_new_its_peaks(seed):
+    rng = np.random.default_rng(seed)
+    rate, phase = 2.0 * np.pi * rng.uniform(0.1, 0.4, 4), rng.uniform(0.0, 2.0 * np.pi, 4)
+
+    t = np.arange(0.0, 120.0, 0.1)
+    swing = np.sin(rate * t[:, None] + phase).sum(axis=1)
+    share = 0.1 + 0.68 * (swing - swing.min()) / np.ptp(swing)
+    out = drive(lambda now: MOST * share[round(10.0 * now)], until=120.0)
+    assert {state.warning for t, state in out if t > SETTLED + 0.1} == {Alert.NONE}
+
+
+def test_a_swinging_draft_that_outgrows_the_ground_is_foreseen():
+    for rate, phase in itertools.product((60.0, 120.0), (0.0, 1.5, 3.0, 4.5)):
+        out = drive(lambda t: 2400.0 + rate * t + 700.0 * math.sin(1.5 * t + phase))  # noqa: B023
+        assert out[-1][1].warning is Alert.IMMOBILISATION
+        assert out[-1][0] - first_warning(out) >= 3.0
+
+
+def test_speeding_up_is_no_cause_where_a_draft_as_large_is():
+    def hard(t):
+        return 1500.0 * min(max(t - 20.0, 0.0) / 6.0, 1.0)
+
+    speeding = drive(lambda t: 3600.0, inertia=lambda t: hard(t) if t < 27.0 else 0.0, until=60.0)
+    pulling = drive(lambda t: 3600.0 + hard(t), until=60.0)
+    assert first_warning(speeding) == math.inf
+    assert 20.0 < first_warning(pulling) < 27.0
+
+
+def test_a_warning_near_the_limit_does_not_flap():
+    out = drive(lambda t: 0.82 * MOST + 0.05 * MOST * math.sin(1.5 * t), until=120.0)
+    warned = np.array([state.warning is Alert.IMMOBILISATION for _, state in out])
+    assert np.count_nonzero(warned[1:] & ~warned[:-1]) == 1
+    assert warned[-1]
+
+
+def test_a_rise_is_as_sure_as_the_demand_did_not_swing():
+    def slope_and_std(value):
+        demand, past = Demand(), [value(0.1 * i) for i in range(600)]
+        for i, now in enumerate(past):
+            earlier, earliest = (past[i - lag] if i >= lag else None for lag in (15, 30))
+            demand = demand.joined(0.1, now, earlier, earliest)
+        line = demand.trend.line()
+        return line.slope, demand.slope_std(line)
+
+    assert slope_and_std(lambda t: 50.0 * t) == pytest.approx((50.0, 0.0), abs=1e-5)
+    swings = [slope_and_std(lambda t, p=p: 500.0 * math.sin(1.3 * t + p)) for p in np.linspace(0.0, 6.0, 20)]
+    assert max(abs(slope) / std for slope, std in swings) < 2.5
+    rng = np.random.default_rng(3)
+    scatter = np.repeat(rng.normal(0.0, 300.0, 100), 15)  # values SWING apart without relation
+    seen = [slope_and_std(lambda t, n=n: scatter[n + round(10.0 * t)]) for n in range(0, 900, 45)]
+    assert 0.2 < np.std([slope for slope, _ in seen]) / np.mean([std for _, std in seen]) < 1.0  # at most
+
+
 def test_on_weakening_ground_the_next_peak_of_the_draft_counts():
     def draft(t):
         return 2800.0 + 700.0 * math.sin(0.6 * t)
@@ -98,7 +155,7 @@ def test_nothing_is_said_before_a_trend_has_settled_or_without_inputs():
     for slips, pull, curve in (([None, None], 1.0, CURVE), ([0.1], None, CURVE), ([0.1], 1.0, None), ([], 1.0, CURVE)):
         assert watched(state, t + 0.1, slips, pull, curve) == state  # a gap may be short
         later = watched(state, t + LONGEST_GAP + 0.1, slips, pull, curve)
-        assert later == Watch(peaks=state.peaks)
+        assert later == Watch(peaks=state.peaks, asked=state.asked)
         assert later.warning is Alert.UNKNOWN
     assert watched(state, t - 5.0, [0.1], 2000.0, CURVE).warning is Alert.UNKNOWN
     assert watched(state, t + 5.0, [0.1], 2000.0, CURVE).warning is Alert.UNKNOWN
@@ -180,6 +237,20 @@ def test_wheels_that_all_but_roll_tell_nothing_of_the_ground():
         assert state.warning is not Alert.IMMOBILISATION
 
 
+def test_ground_of_which_little_is_known_yet_does_not_surely_weaken():
+    capacity = Capacity()
+    for i in range(12):  # wheels that have rolled for long pull again
+        capacity = capacity.joined(0.1, 6000.0 - 100.0 * i if i > 5 else None, None)
+    assert capacity.is_told
+    assert capacity.short.line().slope == pytest.approx(-1000.0)
+    assert capacity.slope_std(capacity.short.line()) == math.inf
+    few = many = capacity.joined(0.1, 5000.0, 5100.0)
+    for _ in range(100):
+        many = many.joined(0.1, 5000.0, 5100.0)
+    line = capacity.short.line()
+    assert few.slope_std(line) > 1.5 * many.slope_std(line)
+
+
 MAYBE = st.none() | st.floats(allow_nan=True, allow_infinity=True)
 
 
@@ -220,9 +291,9 @@ def test_at_the_edge_of_a_soft_patch_the_warning_comes_as_soon_as_it_can_be_felt
     assert found.warnings == 1
 
 
-@pytest.mark.parametrize("kind", ["firm", "harsh"])
+@pytest.mark.parametrize("kind", firm_drives.FIRM_KINDS)
 def test_firm_ground_is_left_in_peace(kind, monkeypatch):
-    monkeypatch.setattr(boggings, "FIRM_DRIVE", 60.0)
+    monkeypatch.setattr(firm_drives, "FIRM_DRIVE", 60.0)
     found = trial(Task(CONFIG, kind, 1))
     assert found.seconds == pytest.approx(50.0, abs=0.2)
     assert found.warnings == 0

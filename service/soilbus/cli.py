@@ -121,6 +121,7 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("montecarlo", _montecarlo, "errors of simulated windows beside the Cramér-Rao bound", "optional")
     sub.add_argument("--windows", type=counted, default=200, metavar="N", help="of each kind (default 200)")
     sub.add_argument("--exact", type=natural, default=0, metavar="M", help="samples of exact posteriors (default 0)")
+    sub.add_argument("--around", type=between(0.0, 1.0), default=0.0, metavar="S", help="std of soils' log (default 0)")
     sub.add_argument("--seed", type=natural, default=1, help="of drives, noise and priors (default 1)")
     sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
 
@@ -338,7 +339,8 @@ def _montecarlo(args: argparse.Namespace) -> None:
     config = _configured(args) if args.config else reference_configuration([*ROUGHLY_KNOWN, *args.set])
     try:
         with processes(os.cpu_count() or 1) as each:
-            cells = list(with_progress(monte_carlo(config, args.windows, args.seed, each=each, exact=args.exact)))
+            more = {"exact": args.exact, "around": args.around}
+            cells = list(with_progress(monte_carlo(config, args.windows, args.seed, each=each, **more)))
     except SimulationError as error:
         raise WorkError(str(error)) from None
     if args.json is not None:

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,11 +21,12 @@ from soilbus.assembly import prior_of
 from soilbus.config import Config
 from soilbus.config_file import load_config
 from soilbus.daemon.tables import candidates, recordings_of_tables
-from soilbus.diagnosis.completion import Completion
+from soilbus.diagnosis.completion import Completion, complete
 from soilbus.diagnosis.diagnose import Diagnosis, diagnose
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.verdict import gap_limit
 from soilbus.report.table import table
+from soilbus.terra.effects.catalogue import CATALOGUE
 
 RIGS = Path(__file__).with_name("rigs")
 POINTS = Path(__file__).resolve().parents[3] / "shared/field/single-wheel-published.csv"
@@ -90,6 +92,32 @@ def records_of(config: Config, points: Path, told: Completion | None = None) -> 
     if told is None:
         return records
     return tuple(r.completed(told.effects, told.free, told.fits[-1].belief) for r in records)
+
+
+class Beside(NamedTuple):
+    """What one effect beside those known does for the other wheel: fall of -2 log evidence, strain left of the soil."""
+
+    fall: float
+    strain: float
+
+
+def lugs_beside_a_shifted_peak(errors: float, points: Path = POINTS) -> dict[str, Beside]:
+    """Ding's lugged wheel with soil and slip sinkage as the smooth one had them: what each name then adds.
+
+    "nothing" is the known model by itself.
+    """
+    config = configuration("ding2011", "smooth", errors)
+    smooth = complete(records_of(config, points), prior_of(config), [CATALOGUE["slip_sinkage"]])
+    assert smooth is not None
+    config = configuration("ding2011", "lugged", errors)
+    records, prior = records_of(config, points, smooth), prior_of(config)
+    fits = {
+        name: complete(records, prior, [*smooth.effects, *(CATALOGUE[n] for n in added)])
+        for name, *added in (("nothing",), ("lugs", "lugs"), ("stress_peak_shift", "stress_peak_shift"))
+    }
+    known = fits["nothing"]
+    assert known is not None
+    return {n: Beside(known.evidence - fit.evidence, strain(fit)) for n, fit in fits.items() if fit is not None}
 
 
 def strain(completion: Completion) -> float:
@@ -175,6 +203,10 @@ def main() -> int:
     print("effects: fall of -2 log evidence in the round that added them; beside: others in the first round")
     print("soil strained: chi-square per parameter from what was known of the soil before\n")
     print(soils(found))
+    print("\nDing's lugged wheel on the smooth wheel's soil: fall of -2 log evidence (strain left of the soil)")
+    for errors in (*ERRORS, 3.0):
+        told = ", ".join(f"{n} {b.fall:.0f} ({b.strain:.1f})" for n, b in lugs_beside_a_shifted_peak(errors).items())
+        print(f"  errors x{errors:g}: {told}")
     return 0
 
 

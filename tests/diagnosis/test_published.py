@@ -10,14 +10,14 @@ from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.diagnosis.completion import complete
 from soilbus.diagnosis.diagnose import diagnose
 from soilbus.diagnosis.records import record_of
-from soilbus.diagnosis.verdict import Verdict, gap_limit
+from soilbus.diagnosis.verdict import TEMPERATURE, Verdict, gap_limit
 from soilbus.estimation.window import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
 
-from .published import configuration, diagnosed, records_of, strain
+from .published import configuration, diagnosed, lugs_beside_a_shifted_peak, records_of, strain
 
 TESTED_PHI = math.radians(31.9)
 """Friction angle of the soil of Ding et al. 2011, from their shear tests."""
@@ -70,6 +70,17 @@ def test_the_smooth_wheels_soil_is_strained_by_the_lugged_wheel(points, ding, er
     assert strain(shown) > 1.5
     again = records_of(configuration("ding2011", "smooth", errors), points, ding["smooth", errors].completed)
     assert strain(complete(again, prior_of(config), again[0].learned.effects)) < 0.5  # its own points do not
+
+
+@pytest.mark.parametrize("errors", [2.0, 3.0])
+def test_lugs_explain_the_lugged_wheel_as_well_as_another_shape_of_the_stress(points, errors):
+    """With errors that Ding's smooth wheel itself asks for the evidences are too near to tell; only lugs leave the
+    soil as the smooth wheel had it: grip is what they add, for a rim slides on soil sooner than soil shears."""
+    beside = lugs_beside_a_shifted_peak(errors, points)
+    lugs, shifted, nothing = (beside[name] for name in ("lugs", "stress_peak_shift", "nothing"))
+    assert abs(lugs.fall - shifted.fall) < TEMPERATURE < lugs.fall
+    assert lugs.strain < 0.5 * nothing.strain
+    assert shifted.strain > 0.8 * nothing.strain
 
 
 def test_points_without_torque_are_diagnosed(points):

@@ -11,7 +11,8 @@ from soilbus.config import Config
 from soilbus.daemon.intake import WindowTask
 from soilbus.daemon.positions import PositionTrack
 from soilbus.estimation.posterior import Posterior
-from soilbus.estimation.tracker import Settings, Tracker
+from soilbus.estimation.tracked import Settings
+from soilbus.estimation.tracker import Tracker
 from soilbus.estimation.window import BinStore, Window
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Scenario

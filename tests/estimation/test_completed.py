@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import soilbus.estimation.completed as completed
 from soilbus.assembly import model_of, rig_of
 from soilbus.estimation.completed import CompletedProblem
 from soilbus.estimation.effect_parameters import parameters_of
@@ -15,6 +14,7 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.soils import SOILS
+from soilbus.terra.tangent import Tangent
 from soilbus.terra.wheel import wheel_forces
 
 SOIL = SOILS["loam"]
@@ -44,7 +44,7 @@ def test_the_tangent_serves_as_well_as_the_contact(problems, monkeypatch, name):
     gains = np.concatenate([np.zeros(problem.n_sensors), np.full(len(free), PULL)])
     latents = problem.carried(problem.start(SOIL), SOIL, gains)
     fast = problem._response(SOIL, gains, latents)
-    monkeypatch.setattr(completed._Bare, "forces_at", lambda self, state, model: wheel_forces(state, model))
+    monkeypatch.setattr(Tangent, "at", lambda self, state, model: wheel_forces(state, model))
     slow = problem._response(SOIL, gains, latents)
     for field, told, expected in zip(fast._fields, fast, slow, strict=True):
         for one, other in zip(*(a.reshape(-1, *a.shape[-2:]) for a in (told, expected)), strict=True):

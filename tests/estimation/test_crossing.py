@@ -9,7 +9,7 @@ import pytest
 from drives import B_REF, Z_REF, errors, task_of, tracker_of, windows
 
 from soilbus.daemon.estimator import WindowEstimator
-from soilbus.estimation.tracker import Ground, Tracked
+from soilbus.estimation.tracked import Ground, Tracked
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, soil_along

@@ -6,23 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from curves import TRACK, curved, driven
 from drives import errors, tracker_of, windows
 
 from soilbus.assembly import rig_of
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.curve import rim_difference, sides, with_curve
-from soilbus.estimation.window import Rig, Window
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
-
-TRACK = 1.5
-
-
-def curved(window: Window, rig: Rig, radius: float) -> Window:
-    """The window on a curve to the left: each wheel with the same slip to the ground that goes by under it."""
-    return replace(window, speed=window.speed * (1.0 + sides(rig) * TRACK / (2.0 * radius)))
 
 
 @pytest.mark.parametrize("radius", [75.0, 25.0, -40.0])
@@ -31,7 +24,7 @@ def test_a_curve_changes_neither_the_soil_nor_how_sure_of_it_a_window_is(radius)
     rig, scenario = rig_of(config), Scenario(14.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))
     straight, bent = tracker_of(config), tracker_of(config)
     for window, end in windows(config, simulate(config, scenario, 1)):
-        expected, told = straight.estimate(window, end), bent.estimate(curved(window, rig, radius), end)
+        expected, told = straight.estimate(window, end), bent.estimate(curved(window, rig, 1.0 / radius), end)
         assert not told.mismatch
         of_curve, of_line = (errors(r.fit.posterior, SOILS["loam"]) for r in (told, expected))
         assert of_curve == pytest.approx(of_line, abs=0.3)
@@ -47,15 +40,38 @@ def _names(tracker, window):
 
 def test_without_that_unknown_a_curve_is_a_mismatch(monkeypatch):
     monkeypatch.setattr("soilbus.estimation.tracker.with_curve", lambda belief, problem: belief)
+    monkeypatch.setattr("soilbus.estimation.bends.BENT", np.inf)
     config = reference_configuration()
     scenario = Scenario(11.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))
     window, end = next(windows(config, simulate(config, scenario, 1)))
-    assert tracker_of(config).estimate(curved(window, rig_of(config), 25.0), end).mismatch
+    assert tracker_of(config).estimate(curved(window, rig_of(config), 1.0 / 25.0), end).mismatch
+
+
+@pytest.mark.parametrize("seed", [100])
+def test_a_curve_that_begins_within_a_window_is_no_soil(seed, monkeypatch):
+    monkeypatch.setattr("curves.END", 19.0)
+    config = reference_configuration()
+
+    def away() -> np.ndarray:
+        told = [w for w in driven(config, "loam", 75.0, seed) if w.t > 0.0]
+        assert all(w.valid for w in told)
+        return np.array([w.away for w in told])
+
+    assert np.abs(away()).max() < 3.0
+    monkeypatch.setattr("soilbus.estimation.bends.BENT", np.inf)
+    assert np.abs(away()[:, 1]).max() > 3.0
+
+
+def test_straight_ahead_no_curve_is_seen():
+    config = reference_configuration()
+    tracker, scenario = tracker_of(config), Scenario(16.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))
+    for window, end in windows(config, simulate(config, scenario, 2)):
+        assert not tracker.estimate(window, end).fit.bend
 
 
 def test_only_differences_between_the_sides_are_freed_and_by_as_much_as_the_rims_differ(simulated):
     case = simulated(SOILS["loam"], 3)
-    problem = case.problem(curved(case.window, case.rig, 50.0))
+    problem = case.problem(curved(case.window, case.rig, 1.0 / 50.0))
     assert rim_difference(problem) == pytest.approx(TRACK / 100.0, abs=0.007)
     before = Belief.of(case.prior, problem.gain_std)
     added = with_curve(before, problem).covariance - before.covariance

@@ -10,7 +10,7 @@ from soilbus.assembly import prior_of
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.exact import samples
 from soilbus.estimation.gauss_newton import fit_window
-from soilbus.estimation.marginal import with_whole
+from soilbus.estimation.marginal import ridge, told_of_k_c, with_whole
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Swing
@@ -35,6 +35,11 @@ def test_the_average_along_n_has_the_moments_of_the_exact_posterior(ill_told):
     mean = exact.share @ exact.logs
     std = np.sqrt(exact.share @ (exact.logs - mean) ** 2)
     whole = with_whole(problem, prior, before, fit).whole
+    along = ridge(problem, prior, before, fit)
+    told = np.interp(exact.logs[:, 2], [node.u for node in along.nodes], told_of_k_c(along, prior, before))
+    assert told.max() > 2.0 * told.min()  # k_c is said as its error counts, so this is worth a look
+    mean[0] = (exact.share / told) @ exact.logs[:, 0] / (exact.share / told).sum()
+    std = np.sqrt(exact.share @ (exact.logs - mean) ** 2)
     chance = 3.5 / np.sqrt(exact.effective)
     assert np.abs((np.log(whole.soil) - mean) / std).max() < 0.1 + chance
     # The average is never surer; how much less sure where k_c may be next to nothing, is its own choice.

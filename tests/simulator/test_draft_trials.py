@@ -71,6 +71,7 @@ def test_the_command(tmp_path, capsys):
     of_kind = said["immobilisation"]["softening"]
     assert set(of_kind) == {"boggings", "in_time", "lead", "least_lead", "sudden", "delay", "hours", "false"}
     assert (of_kind["hours"], of_kind["false"]) == (0.0, 0)
+    assert said["false_warnings"] == {}
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+import soilbus.simulator.monte_carlo as of_room
 from soilbus.assembly import prior_of
 from soilbus.cli import main
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
@@ -52,6 +54,28 @@ def test_what_is_attainable_is_told_beside_what_is_attained():
     assert cell.exact.effective == 199.5
     assert "1.30+-0.00" in monte_carlo_report([cell])
     assert as_json(cell)["quantities"]["n"]["exact"] == pytest.approx(cell.exact.best[2])
+
+
+def test_soils_around_a_named_one_are_drawn_until_the_tractor_gets_on(monkeypatch):
+    def stuck_at_first(config, scenario, seed):
+        driven.append(scenario.soils[0].parameters())
+        return SimpleNamespace(bogged_at=1.0 if len(driven) % 2 else None)
+
+    driven = []
+    monkeypatch.setattr(of_room, "simulate", stuck_at_first)
+    held = reference_configuration([*ROUGHLY_KNOWN, "soil.K.std=0"])
+    found = [of_room._driven(task)[1] for task in tasks_of(held, "wet_clay", 2.0, 200, 5, around=0.2)]
+    assert found == driven[1::2]
+    logs = np.log(np.array(found) / np.asarray(SOILS["wet_clay"]))
+    assert logs[:, :5].std(axis=0) == pytest.approx(np.full(5, 0.2), rel=0.2)
+    assert np.abs(logs[:, :5].mean(axis=0)).max() < 0.06
+    assert not logs[:, 5].any()
+    assert [of_room._driven(task)[1] for task in tasks_of(held, "wet_clay", 2.0, 3, 5, around=0.2)] == found[:3]
+    driven.append(None)  # the next one gets on
+    (named,) = tasks_of(held, "wet_clay", 2.0, 1, 5)
+    assert of_room._driven(named)[1] == SOILS["wet_clay"]
+    with pytest.raises(SimulationError, match="stuck on wet_clay"):
+        of_room._driven(named)
 
 
 def lost(converged=False, chi2=np.nan):

@@ -10,7 +10,8 @@ import numpy as np
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from soilbus.terra.wheel import LONGEST, WheelModel, WheelState
+from soilbus.terra.wheel import WheelModel, WheelState
+from soilbus.terra.wheel_state import LONGEST
 
 EXACT = {"epsabs": 0.0, "epsrel": 1e-11, "limit": 200}
 

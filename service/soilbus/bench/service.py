@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from soilbus.bench.figure import Figure
 from soilbus.can.dbc_files import load_databases
+from soilbus.config import Config
 from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.replay import read_frames
 from soilbus.simulator.reference import reference_configuration
@@ -25,7 +26,8 @@ def window_times(log: Path) -> dict[str, Figure]:
     posterior and status (the tracker's); service_window_ms has decoding, binning and
     screening of the last second and the decision besides.
     """
-    intake, estimate, decision = 1e3 * np.min([_once(log) for _ in range(ROUNDS)], axis=0).T
+    config = reference_configuration()
+    intake, estimate, decision = 1e3 * np.min([seconds_of_windows(log, config) for _ in range(ROUNDS)], axis=0).T
     whole = intake + estimate + decision
     count = f"{len(whole)} windows of 10 s, 1 s hop, four wheels"
     parts = ", ".join(
@@ -44,9 +46,8 @@ def window_times(log: Path) -> dict[str, Figure]:
     }  # fmt: skip
 
 
-def _once(log: Path) -> NDArray[np.float64]:
-    """Seconds (windows, 3) of intake, estimate and decision."""
-    config = reference_configuration()
+def seconds_of_windows(log: Path, config: Config) -> NDArray[np.float64]:
+    """Processor seconds (windows, 3) of intake, estimate and decision of a log under a configuration."""
     pipeline = Pipeline(config, load_databases(config))
     intake, estimator = pipeline.intake, pipeline.estimator
     times = []

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.capability.balance import PARTS, Balance, Duty, balance
+from soilbus.capability.draws import estimates, likely, mean_and_std
 from soilbus.capability.limits import (
     Cause,
     Largest,
@@ -25,7 +26,7 @@ from soilbus.capability.uncertain_model import ModelOfRows, UncertainModel
 from soilbus.capability.wheels import Axles, WheelTable, wheel_table
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.window import Rig
-from soilbus.terra.effects.steady import CompletedModel
+from soilbus.terra.effects.steady import CompletedModel, Wheel
 from soilbus.terra.wheel import WheelModel
 
 Array = NDArray[np.float64]
@@ -67,7 +68,8 @@ class OverSlip:
 class SetPoint:
     """Slips of one axle within the limits: of best traction efficiency, and of most pull.
 
-    None where the axle gives no pull.
+    None where the axle most likely gives no pull.  Where pull over slip has two tops about as high, the
+    mean lies between them: its std says so.
     """
 
     efficiency: Estimate | None
@@ -78,7 +80,8 @@ class SetPoint:
 class Forecast:
     """The present demand met in steady driving: slip, sinkage [m] by wheel, the deepest, summed torque [N m].
 
-    likely_depth is the deepest to first order, for probabilities.
+    likely_depth is the deepest to first order, for probabilities.  All on the condition that the demand can
+    be met: soils where no slip does are left out.
     """
 
     slip: Estimate
@@ -95,7 +98,7 @@ class Capability:
     max_draft [N] on the level; grades [rad], without draft and with the present one;
     max_pull [N] on the present slope, of draft and slope together, and max_draft_here of the
     draft alone; likely_pull is max_pull to first order, for probabilities; limit is what ends max_draft.
-    forecast is None where no slip meets the demand.
+    forecast is None where most likely no slip meets the demand.
     """
 
     max_draft: Estimate
@@ -139,8 +142,11 @@ def assess(
     table = wheel_table(points.soils, rig, uncertain, slip_grid(max_slip), last, TOLERANCE)
     skids = np.linspace(-MAX_SKID, table.slip[0], SKID_GRID)
     skid = cache(lambda: wheel_table(points.soils, rig, uncertain, skids))
-    level = balance(table)
-    vehicle = _Vehicle(table, level, Limits.of(table.axles, torque_limit, max_sinkage, completed), skid)
+    of_points = balance(table)
+    level = of_points.drawn(points)
+    limits = Limits.of(table.axles, torque_limit, max_sinkage, completed)
+    limits = limits._replace(angle=points.drawn(limits.angle))
+    vehicle = _Vehicle(table, of_points, points, limits, skid)
     draft = vehicle.largest(Duty(), level)
     if draft is None:
         return None, table
@@ -148,11 +154,12 @@ def assess(
     if demand is not None:
         flat = abs(demand.sine) < LEVEL_SINE
         duty = Duty(None, demand.sine)
-        present = level if flat else balance(table, duty, level)
+        here = of_points if flat else balance(table, duty, of_points)
+        present = level if flat else here.drawn(points)
         pull = draft if flat else vehicle.largest(duty, present)
         with_draft = vehicle.grade(demand.pull - table.axles.weight * demand.sine)
-        forecast = _forecast(demand, present, table.axles, rig, completed, points)
-    max_draft, max_grade, max_grade_with_draft, max_pull = points.estimates(
+        forecast = _forecast(demand, here, present, table.axles, rig, completed, points)
+    max_draft, max_grade, max_grade_with_draft, max_pull = estimates(
         draft.pull, vehicle.grade(0.0), with_draft, None if pull is None else pull.pull
     )
     if max_draft is None:
@@ -166,25 +173,26 @@ def assess(
         max_grade=max_grade,
         max_grade_with_draft=max_grade_with_draft,
         max_pull=max_pull,
-        likely_pull=None if pull is None else points.likely(pull.pull),
+        likely_pull=likely(None if pull is None else pull.pull),
         limit=draft.cause,
-        set_points=_set_points(table.axles, level, vehicle.limits, draft, points),
+        set_points=_set_points(table.axles, level, vehicle.limits, draft),
         forecast=forecast,
-        over_slip=_over_slip(level, table, points),
+        over_slip=_over_slip(level, table),
     ), table
 
 
 @dataclass(frozen=True, slots=True)
 class _Vehicle:
-    """The wheels where they drive and, asked for seldom, where they skid."""
+    """The wheels where they drive and, asked for seldom, where they skid: of the points; limits are of their draws."""
 
     table: WheelTable
     level: Balance
+    points: SigmaPoints
     limits: Limits
     skid: Callable[[], WheelTable]
 
     def largest(self, duty: Duty, driving: Balance) -> Largest | None:
-        """Largest pull under a duty; None where nothing is within the limits.
+        """Each draw's largest pull under a duty; None where nothing is within the limits.
 
         Where even the least slip asks for more torque than there is, the pull is that of
         wheels that skid: below zero, as only a push or a slope moves the vehicle.
@@ -205,7 +213,7 @@ class _Vehicle:
 
     def _skidding(self, duty: Duty) -> Largest:
         """Largest pull of wheels that skid; the least where even that asks for too much torque."""
-        skidding = balance(self.skid(), duty)
+        skidding = balance(self.skid(), duty).drawn(self.points)
         found = largest_pull(skidding, self.limits)
         least = np.where(skidding.known, skidding.pull, np.inf).argmin(axis=1)
         pull = np.where(skidding.known.any(axis=1), skidding.pull[np.arange(len(least)), least], np.nan)
@@ -213,48 +221,47 @@ class _Vehicle:
         return Largest(np.where(none, pull, found.pull), np.where(none, skidding.slip[least], found.slip), "torque")
 
     def grade(self, draft: float) -> Array | None:
-        """Steepest slope [rad] (D,) that is climbed with a draft [N]."""
+        """Steepest slope [rad] (1 + N,) that each draw climbs with a draft [N]."""
         duty = Duty(draft, None)
-        found = self.largest(duty, balance(self.table, duty, self.level))
+        found = self.largest(duty, balance(self.table, duty, self.level).drawn(self.points))
         if found is None:
             return None
         return np.asarray(np.arcsin(np.clip((found.pull - draft) / self.table.axles.weight, -1.0, 1.0)))
 
 
-def _set_points(
-    axles: Axles, level: Balance, limits: Limits, draft: Largest, points: SigmaPoints
-) -> dict[str, SetPoint]:
+def _set_points(axles: Axles, level: Balance, limits: Limits, draft: Largest) -> dict[str, SetPoint]:
     """Efficiency is drawbar power over the wheels' power, DP V/(T omega)."""
     names = {"front": axles.front[:, 0], "rear": ~axles.front[:, 0]}
     names = {name: kinds for name, kinds in names.items() if kinds.any()}
     values = []
     for kinds in names.values():
-        pull, force = (axle_sum(each, axles, kinds) for each in (level.drawbar, level.torque / axles.radius))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            values += [np.where(force > 0.0, pull * (1.0 - level.slip) / force, -1.0), pull]
-    slips = points.estimates(*slips_of_most(np.array(values), level, limits, draft.slip))
+        pull, force = axle_sum(level.drawbar, axles, kinds), axle_sum(level.torque, axles, kinds, 1.0 / axles.radius)
+        values += [pull * (1.0 - level.slip) / np.where(force > 0.0, force, -np.inf), pull]
+    slips = estimates(*slips_of_most(np.array(values), level, limits, draft.slip))
     return {name: SetPoint(*slips[2 * i : 2 * i + 2]) for i, name in enumerate(names)}
 
 
 def _forecast(
-    demand: Demand, present: Balance, axles: Axles, rig: Rig, model: ModelOfRows, points: SigmaPoints
+    demand: Demand, here: Balance, present: Balance, axles: Axles, rig: Rig, model: ModelOfRows, points: SigmaPoints
 ) -> Forecast | None:
     place = place_of_pull(present, demand.pull)
     torque = (place.on(present.torque) * axles.count[:, 0]).sum(axis=1)
     slip = place.on(np.broadcast_to(present.slip, present.pull.shape))
-    draft, sine = Duty(None, demand.sine).split(place.on(present.pull), axles.weight)
-    wheel = axles.wheel(axles.loads(draft[:, None], sine)[..., 0])
-    depth = np.asarray(model.sinkage(place.on(present.angle), wheel))
-    slip_needed, required, *depths = points.estimates(slip, torque, *depth.T)
-    likely = points.likely(depth[:, int(np.argmax(depth[0]))])
-    if slip_needed is None or required is None or likely is None:
+    load = axles.loads(*Duty(None, demand.sine).split(here.pull, axles.weight))
+    depth = model.sinkage(here.angle, Wheel(axles.radius, axles.width, ~axles.front, load))
+    depth = place.on(points.drawn(depth, here.known[:, None]))
+    slip_needed, required, *depths = estimates(slip, torque, *depth.T)
+    likely_depth = likely(depth[:, int(np.argmax(depth[0]))])
+    if slip_needed is None or required is None or likely_depth is None:
         return None
-    by_kind = [depth for depth in depths if depth is not None]
+    by_kind = [each for each in depths if each is not None]
     by_wheel = {name: by_kind[kind] for name, kind in zip(rig.wheels, axles.of_wheel, strict=True)}
-    return Forecast(slip_needed, by_wheel, max(by_kind, key=lambda depth: depth.value), required, likely)
+    return Forecast(slip_needed, by_wheel, max(by_kind, key=lambda depth: depth.value), required, likely_depth)
 
 
-def _over_slip(level: Balance, table: WheelTable, points: SigmaPoints) -> OverSlip:
+def _over_slip(level: Balance, table: WheelTable) -> OverSlip:
+    known = level.known[:, ::PARTS].copy()
+    known[:, 1:] |= level.known[:, PARTS - 1 :: PARTS]
     torque = (level.torque[..., ::PARTS] * table.axles.count).sum(axis=1)
-    torque = np.where(table.balanced, torque, np.nan)
-    return OverSlip(table.slip, *points.mean_and_std(table.pull), *points.mean_and_std(torque))
+    pull, torque = (np.where(known, each, np.nan) for each in (level.pull[:, ::PARTS], torque))
+    return OverSlip(table.slip, *mean_and_std(pull), *mean_and_std(torque))

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.capability.sigma_points import SigmaPoints
 from soilbus.capability.wheels import WheelTable
 
 Array = NDArray[np.float64]
@@ -67,6 +68,13 @@ class Balance:
     def angle(self) -> Array:
         """Entry angle [rad] (D, A, F)."""
         return self._of_wheels(2)
+
+    def drawn(self, points: SigmaPoints) -> Balance:
+        """The same of a posterior's mode and draws (1 + N in the place of D), from that of its points."""
+        known = np.broadcast_to(self.known[0], (len(points.share), len(self.slip)))
+        if not self.known.all():
+            known = known & (points.drawn(self.known.astype(float)) > 0.5)
+        return Balance(self.slip, known, points.drawn(self.columns, self.known[:, None]))
 
     def _of_wheels(self, quantity: int) -> Array:
         kinds = self.columns.shape[1] // 3

@@ -6,6 +6,10 @@ window's pull over slip says is still to come from the present slip on.  It does
 the draft, and falls steadily where the soil softens.  The warning comes when
 it is about to fall below what is asked for, now and then or growing.
 
+What speeds the vehicle up is part of the pull that is given, but no vehicle gains speed for long: draft and slope
+are what may outgrow the ground.  A rise of theirs is carried on only where it is surely none of
+the swings that came back before.
+
 Every window brings another curve, and with it another capacity on the same ground: that is no
 change of the ground.  So the trend is that along the newest curve, of the last moments too.
 """
@@ -23,12 +27,12 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.capability.assessment import OverSlip
-from soilbus.capability.trend import LAG, Capacity, Line, Peaks, Trend
-from soilbus.estimation.window import Rig, Window, pull_given
+from soilbus.capability.trend import LAG, SWING, Capacity, Demand, Line, Peaks, Trend
+from soilbus.estimation.window import Rig, Window, inertia_of, pull_given
 from soilbus.terra.vehicle import slip_ratio
 
-DEMAND_MEMORY = 4.0
-"""Time constant [s] of forgetting the demand, which swings and for the most part comes back."""
+SLIP_MEMORY = 4.0
+"""Time constant [s] of forgetting slip that creeps."""
 HOLD = 300.0
 """A peak of the demand is remembered this long [s] at least, and at most twice as long."""
 LONGEST_GAP = 1.0
@@ -39,16 +43,16 @@ SETTLED = 2.0
 """Age [s] from which a trend is believed."""
 AHEAD = 10.0
 """Time left [s] from which is warned."""
-MUCH, TOO_MUCH = 0.71, 0.76
-"""Share of the capacity from which a rise of the demand beyond its last peaks is carried on, and from which no warning
-ends."""
+MUCH, TOO_MUCH, NEARLY_ALL = 0.71, 0.76, 0.85
+"""Share of the capacity from which a rise of draft and slope beyond their last peaks is carried on, from which no
+warning ends, and from which any rise or swing of theirs may come to be too much."""
 WEAKENING, SHORT_WEAKENING = 0.006, 0.03
 """Loss [1/s], as a share of the capacity, from which the ground is said to weaken, by the long and the short memory."""
 STEEPER = 1.6
 """Times that a loss will still grow which the short memory sees so much steeper than the long one: front wheels meet
 an edge first, rear ones a wheelbase later."""
 SURE = 2.5
-"""Standard deviations by which such a loss must differ from none."""
+"""Standard deviations by which such a loss, and a rise of the demand, must differ from none."""
 STEADY = 0.003
 """Rise of the demand [1/s], as a share of the capacity, up to which growing slip is the ground's doing."""
 CALM = 5.0
@@ -65,38 +69,55 @@ class Alert(StrEnum):
     IMMOBILISATION = "immobilisation"
 
 
-_NO_TREND, _NO_CAPACITY, _NO_PEAKS = Trend(), Capacity(), Peaks()
+_NO_TREND, _NO_CAPACITY, _NO_DEMAND, _NO_PEAKS = Trend(), Capacity(), Demand(), Peaks()
+
+
+class Look(NamedTuple):
+    """Time [s], mean slip, pull [N] that is given, and what draft and slope ask of it [N]."""
+
+    t: float
+    slip: float
+    pull: float
+    asked: float
 
 
 @dataclass(frozen=True, slots=True)
 class Watch:
     """What is remembered from one moment to the next; `watched` makes the next one.
 
-    t [s] is the last moment with slip and pull, since that of the first; recent are the last of them as
-    (t, mean slip, pull) and curve is what the trend of the capacity rests on; capacity and demand [N] and the
-    mean slip are trends, peaks holds the demand's greatest of late; caused [s] is when there was last a cause to
-    warn.  warning and time_left [s] (None: not foreseeable) are what to tell.
+    t [s] is the last moment with slip and pull, since that of the first; recent are the last of them
+    and curve is what the trend of the capacity rests on; capacity, demand [N] of draft and slope and the
+    mean slip are trends, peaks and asked hold the greatest pull and demand of late; caused [s] is when there was last
+    a cause to warn.  warning and time_left [s] (None: not foreseeable) are what to tell.
     """
 
     t: float = -math.inf
     since: float = math.inf
-    recent: tuple[tuple[float, float, float], ...] = ()
+    recent: tuple[Look, ...] = ()
     curve: OverSlip | None = None
     capacity: Capacity = _NO_CAPACITY
-    demand: Trend = _NO_TREND
+    demand: Demand = _NO_DEMAND
     slip: Trend = _NO_TREND
     peaks: Peaks = _NO_PEAKS
+    asked: Peaks = _NO_PEAKS
     caused: float = -math.inf
     warning: Alert = Alert.UNKNOWN
     time_left: float | None = None
 
 
-def watched(before: Watch, t: float, slip: Iterable[float | None], pull: float | None, curve: OverSlip | None) -> Watch:
+def watched(
+    before: Watch,
+    t: float,
+    slip: Iterable[float | None],
+    pull: float | None,
+    curve: OverSlip | None,
+    inertia: float = 0.0,
+) -> Watch:
     """The watch after a look at the wheels' slips and the pull [N] (draft, slope, inertia) at the time t [s].
 
-    None is what is not known.  Moments may come at any rate.  After LONGEST_GAP without
-    slip, pull or curve the trends start anew, and when time goes back the peaks are forgotten
-    too.  Unknown until the trends have settled.
+    inertia [N] is the share of the pull that speeds the vehicle up.  None is what is not known.
+    Moments may come at any rate.  After LONGEST_GAP without slip, pull or curve the trends start
+    anew, and when time goes back the peaks are forgotten too.  Unknown until the trends have settled.
     """
     slips = [s for s in slip if s is not None and math.isfinite(s)]
     if not slips or pull is None or not math.isfinite(pull) or curve is None:
@@ -104,33 +125,38 @@ def watched(before: Watch, t: float, slip: Iterable[float | None], pull: float |
     step = t - before.t
     if not 0.0 <= step <= LONGEST_GAP:
         before, step = replace(_anew(before, t), since=t), 0.0
-    mean_slip = sum(slips) / len(slips)
-    reserve = _reserve(curve, mean_slip)
-    kept = before.recent[bool(before.recent and t - before.recent[0][0] > REMEMBERED) :]
+    look = Look(t, sum(slips) / len(slips), pull, pull - inertia)
+    reserve = _reserve(curve, look.slip)
+    kept = before.recent[bool(before.recent and t - before.recent[0].t > REMEMBERED) :]
     trend = before.capacity if curve is before.curve else _along(curve, kept)
-    capacity = trend.joined(step, _able(curve, mean_slip, pull), _earlier(curve, t, kept))
-    demand = before.demand.joined(step, pull, DEMAND_MEMORY)
-    peaks = before.peaks.joined(t, pull, HOLD)
-    creep = before.slip.joined(step, mean_slip, DEMAND_MEMORY)
+    earlier, once, twice = (_ago(kept, t - lag) for lag in (LAG, SWING, 2.0 * SWING))
+    capacity = trend.joined(step, _able(curve, look), None if earlier is None else _able(curve, earlier))
+    demand = before.demand.joined(step, look.asked, *(None if a is None else a.asked for a in (once, twice)))
+    peaks, asked = before.peaks.joined(t, pull, HOLD), before.asked.joined(t, look.asked, HOLD)
+    creep = before.slip.joined(step, look.slip, SLIP_MEMORY)
+    able = pull + reserve
+    share, rise = (look.asked / able, demand.trend.line().slope / able) if able > 0.0 else (0.0, 0.0)
     time_left = None
     if t - before.since >= SETTLED:
         time_left = 0.0
         if reserve > 0.0:
-            rise = demand.line().slope
-            to_limit = _time_of_creep(creep, float(curve.slip[-1]), rise / (pull + reserve))
-            time_left = min(_time_left(capacity, pull, rise, peaks.greatest), to_limit)
-    still = before.warning is Alert.IMMOBILISATION and pull > TOO_MUCH * (pull + reserve)
-    caused = t if still or (time_left is not None and time_left < AHEAD) else before.caused
+            to_limit = _time_of_creep(creep, float(curve.slip[-1]), rise)
+            outgrown = _time_to_outgrow(capacity, look.asked, demand, asked.greatest)
+            time_left = min(_time_to_weaken(capacity, peaks.greatest), outgrown, to_limit)
+    warns = before.warning is Alert.IMMOBILISATION
+    enough = share > TOO_MUCH if warns else share > NEARLY_ALL and rise > STEADY and time_left is not None
+    caused = t if enough or (time_left is not None and time_left < AHEAD) else before.caused
     warning = Alert.UNKNOWN if time_left is None else Alert.NONE
     if t - caused < CALM:
         warning = Alert.IMMOBILISATION
-    recent = (*kept, (t, mean_slip, pull))
-    return Watch(t, before.since, recent, curve, capacity, demand, creep, peaks, caused, warning, time_left)
+    return Watch(
+        t, before.since, (*kept, look), curve, capacity, demand, creep, peaks, asked, caused, warning, time_left
+    )  # fmt: skip
 
 
-def _along(curve: OverSlip, recent: Sequence[tuple[float, float, float]]) -> Capacity:
+def _along(curve: OverSlip, recent: Sequence[Look]) -> Capacity:
     """The capacity at the last moments by a curve."""
-    t, slip, pull = np.array(recent, float).reshape(-1, 3).T
+    t, slip, pull, _ = np.array(recent, float).reshape(-1, len(Look._fields)).T
     known = np.isfinite(curve.pull)
     slips, pulls = curve.slip[known], curve.pull[known]
     ahead = np.append(np.maximum.accumulate(pulls[::-1])[::-1], pulls[-1:])[np.searchsorted(slips, slip, "right")]
@@ -138,28 +164,29 @@ def _along(curve: OverSlip, recent: Sequence[tuple[float, float, float]]) -> Cap
     return Capacity.through(t, np.where(slip >= curve.slip[0], able, np.nan))
 
 
-def _able(curve: OverSlip, slip: float, pull: float) -> float | None:
+def _able(curve: OverSlip, look: Look) -> float | None:
     """Pull [N] that the ground could give; None from wheels that all but roll, for these ask nothing of it."""
-    return pull + _reserve(curve, slip) if slip >= curve.slip[0] else None
+    return look.pull + _reserve(curve, look.slip) if look.slip >= curve.slip[0] else None
 
 
-def _earlier(curve: OverSlip, t: float, recent: Sequence[tuple[float, float, float]]) -> float | None:
-    """The capacity at the first moment that is no more than LAG before the time t [s]; None where it is not known."""
-    place = bisect_left(recent, t - LAG, key=lambda moment: moment[0])
-    return _able(curve, *recent[place][1:]) if place < len(recent) else None
+def _ago(recent: Sequence[Look], t: float) -> Look | None:
+    """The first look from the time t [s] on; None where it came much later."""
+    place = bisect_left(recent, t, key=lambda look: look.t)
+    return recent[place] if place < len(recent) and recent[place].t - t < LAG else None
 
 
 def _anew(before: Watch, t: float) -> Watch:
     """Nothing remembered but the peaks."""
-    return Watch(peaks=before.peaks) if t >= before.peaks.since else Watch()
+    return Watch(peaks=before.peaks, asked=before.asked) if t >= before.peaks.since else Watch()
 
 
 class Moment(NamedTuple):
-    """Time [s], slips of the wheels and pull [N]; nan is what is not known."""
+    """Time [s], slips of the wheels, pull [N] and the inertia [N] in it; nan is what is not known."""
 
     t: float
     slip: list[float]
     pull: float
+    inertia: float = 0.0
 
 
 def moments(window: Window, rig: Rig, since: float, min_speed: float) -> Iterator[Moment]:
@@ -171,10 +198,11 @@ def moments(window: Window, rig: Rig, since: float, min_speed: float) -> Iterato
         return
     ground = window.ground_speed[:, None]
     slip = np.where(ground > min_speed, slip_ratio(rig.radius, window.speed, ground), np.nan)
-    pull = pull_given(window, rig.chassis)
+    pull, inertia = pull_given(window, rig.chassis), inertia_of(window, rig.chassis)
     for i in np.flatnonzero(window.t > since).tolist():
         recent = slice(max(i + 1 - SPAN, 0), i + 1)
-        yield Moment(float(window.t[i]), slip[recent].mean(axis=0).tolist(), float(pull[recent].mean()))
+        slips = slip[recent].mean(axis=0).tolist()
+        yield Moment(float(window.t[i]), slips, float(pull[recent].mean()), float(inertia[recent].mean()))
 
 
 def _reserve(curve: OverSlip, slip: float) -> float:
@@ -195,19 +223,25 @@ def _known(curve: OverSlip) -> tuple[list[float], list[float], list[float]]:
     return curve.slip[known].tolist(), pull.tolist(), np.maximum.accumulate(pull[::-1])[::-1].tolist()
 
 
-def _time_left(capacity: Capacity, asked: float, rise: float, peak: float) -> float:
-    """Time [s] until the capacity, going on as it does, meets the demand's peak or its rise."""
+def _time_to_outgrow(capacity: Capacity, asked: float, demand: Demand, peak: float) -> float:
+    """Time [s] until draft and slope meet the capacity, both going on as they do; inf where they surely do not rise."""
+    if not capacity.is_told or asked < peak:
+        return math.inf
+    able, line = capacity.long.line(), demand.trend.line()
+    outgrows = asked > MUCH * able.value and line.slope > max(able.slope, SURE * demand.slope_std(line))
+    return max(able.value - asked, 0.0) / (line.slope - able.slope) if outgrows else math.inf
+
+
+def _time_to_weaken(capacity: Capacity, peak: float) -> float:
+    """Time [s] until the capacity, going on as it does, falls to the pull's peak."""
     if not capacity.is_told:
         return math.inf
-    able = capacity.long.line()
-    outgrows = asked >= peak and asked > MUCH * able.value and rise > able.slope
-    to_rise = (able.value - asked) / (rise - able.slope) if outgrows else math.inf
+    able, latest = capacity.long.line(), capacity.short.line()
     long = _time_of_weakening(capacity, able, WEAKENING, peak)
-    latest = capacity.short.line()
     short = _time_of_weakening(capacity, latest, SHORT_WEAKENING, peak)
     if latest.slope < STEEPER * min(able.slope, 0.0):
         short /= STEEPER
-    return max(min(to_rise, long, short), 0.0)
+    return max(min(long, short), 0.0)
 
 
 def _time_of_weakening(capacity: Capacity, line: Line, least: float, peak: float) -> float:

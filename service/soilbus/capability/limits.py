@@ -41,8 +41,12 @@ class Largest(NamedTuple):
 
 def within(balance: Balance, limits: Limits) -> NDArray[np.bool_]:
     """Steady states within the limits (D, F)."""
-    low = (balance.torque <= limits.torque[:, None]) & (balance.angle <= limits.angle[..., None])
-    return np.asarray(balance.known & low.all(axis=1))
+    usable = balance.known
+    for kind, torque in enumerate(limits.torque):
+        usable = (
+            usable & (balance.torque[:, kind] <= torque) & (balance.angle[:, kind] <= limits.angle[..., kind, None])
+        )
+    return usable
 
 
 def largest_pull(balance: Balance, limits: Limits) -> Largest:
@@ -111,7 +115,7 @@ def slips_of_most(values: Array, balance: Balance, limits: Limits, top: Array) -
     """
     slip, last = balance.slip, len(balance.slip) - 1
     usable = within(balance, limits) & (values > 0.0)
-    best = np.where(usable, values, -np.inf).argmax(axis=-1)[..., None]
+    best = (values * usable).argmax(axis=-1)[..., None]
     after = np.minimum(best + 1, last)
     i = np.clip(best, 1, last - 1) + np.arange(-1, 2)
     x0, x1, x2 = np.moveaxis(slip[i], -1, 0)
@@ -125,6 +129,7 @@ def slips_of_most(values: Array, balance: Balance, limits: Limits, top: Array) -
     return np.where(usable.any(axis=-1), np.where(inside, vertex, at_end), np.nan)
 
 
-def axle_sum(values: Array, axles: Axles, kinds: NDArray[np.bool_]) -> Array:
-    """Sum over the wheels of some kinds (A,), (D, A, F) to (D, F)."""
-    return np.asarray((values * axles.count)[:, kinds].sum(axis=1))
+def axle_sum(values: Array, axles: Axles, kinds: NDArray[np.bool_], each: Array | float = 1.0) -> Array:
+    """Sum over the wheels of some kinds (A,), (D, A, F) to (D, F), each wheel's times a factor (A, 1)."""
+    share = (axles.count * each)[:, 0].tolist()
+    return np.asarray(sum(share[kind] * values[:, kind] for kind in np.flatnonzero(kinds)))

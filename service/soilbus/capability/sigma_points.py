@@ -1,27 +1,38 @@
-"""A posterior as a few soils, and the mean and standard deviation of what follows from them.
+"""A posterior as a few soils, and what its draws have, as foretold from what these soils have.
 
-The leading principal directions of the logarithms' covariance carry a cubature that is
-exact for polynomials of degree five (Lu & Darmofal 2004, SIAM J. Sci. Comput. 26:613, n^2 + 3n + 3
-points): logarithms uncertain by half do not act one by one.  What is left is so well
-known that everything is linear in it: one point for each direction.
+A polynomial through what the soils have tells each draw's (response surface, Box & Wilson
+1951), along the leading principal directions of the logarithms' covariance.  The first of these
+is the ridge on which k_c, k_phi and n replace each other, sd 0.3 to 1.6: along it forces bend
+to and fro, so it has points of its own and a higher degree.  What the leading directions
+leave is so well known that everything is linear in it: one point for each direction.
+
+Forces over slip are smooth in the soil.  What the vehicle can do is not: a torque limit ends
+the pull before the ground does, and the best slip jumps from one top to another.  So it is
+found draw by draw.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from numpy.polynomial.hermite_e import hermeval
 from numpy.typing import NDArray
 
-from soilbus.estimation.posterior import Estimate, Posterior
+from soilbus.capability.draws import normals
+from soilbus.estimation.posterior import Posterior
 from soilbus.terra.wheel import Soil
 
 Array = NDArray[np.float64]
 
-LEADING = 4
-"""Directions under the cubature."""
+LEADING = 3
+"""Directions under the polynomial."""
+AXIS = (1.2, 3.2)
+"""Of the first direction's own points, in standard deviations on both sides of the mode."""
+AXIS_DEGREE = 6
 MAX_PHI = 1.2
 """Friction angle [rad] at which points are held back: the model ends at a right angle."""
 _LEAST = 1e-14
@@ -31,13 +42,15 @@ _PHI = Soil._fields.index("phi")
 
 @dataclass(frozen=True, slots=True)
 class SigmaPoints:
-    """Soils (D, 6), the mode first; weight (P,) of the first P: the mode, then pairs that mirror each other.
+    """Soils (D, 6), the mode first, and the share (1 + N, D) of each in what the mode and each of N draws have.
 
-    The rest are single points, one standard deviation away along a direction that is independent of all others.
+    mirror (D,) is the point on the other side of the mode, the point itself where there is none.  The last
+    points are one standard deviation away along directions that are independent of all others.
     """
 
     soils: Array
-    weight: Array
+    share: Array
+    mirror: NDArray[np.intp]
 
     @classmethod
     def of(cls, posterior: Posterior, shifts: Array | None = None) -> SigmaPoints:
@@ -51,84 +64,78 @@ class SigmaPoints:
         free = np.flatnonzero(variance > _LEAST * max(variance[-1], 0.0))[::-1]
         axes = directions[:, free] * np.sqrt(variance[free])
         axes = axes * np.sign(axes[np.abs(axes).argmax(axis=0), np.arange(len(free))])
-        points, weight = cubature(min(len(free), LEADING))
+        leading = min(len(free), LEADING)
+        points = design(leading)
         steps = np.concatenate([points @ axes[:, :LEADING].T, axes[:, LEADING:].T, along])
         soils = np.asarray(posterior.soil) * np.exp(steps)
         soils[1:, _PHI] = np.minimum(soils[1:, _PHI], max(MAX_PHI, posterior.soil.phi))
-        return cls(soils, weight)
+        return cls(soils, *_shares(leading, len(soils) - len(points)))
 
-    def mean_and_std(self, samples: Array) -> tuple[Array, Array]:
-        """Mean and standard deviation (...) of quantities given at the points (D, ...).
+    def drawn(self, samples: Array, known: NDArray[np.bool_] | None = None) -> Array:
+        """Samples (D, ...) at the points, known or not, to the mode and the draws (1 + N, ...).
 
-        A point without a value (nan) gets its mirror image's, mirrored about the mode's;
-        where both have none, and wherever the mode has none, the mean is nan.
+        What is not known at a point is as at its mirror, mirrored about the mode's; where neither is
+        known, it is the mode's.
         """
-        mode, near, linear = self._changes(samples)
-        shift = self.weight[1:] @ near
-        variance = self.weight[1:] @ near**2 - shift**2 + (linear**2).sum(axis=0)
-        shape = samples.shape[1:]
-        return (mode + shift).reshape(shape), np.sqrt(np.maximum(variance, 0.0)).reshape(shape)
-
-    def first_order(self, samples: Array) -> tuple[float, float]:
-        """Value at the mode and standard deviation of what changes sign with the soil, of samples (D,).
-
-        Mean-value first-order reliability (Cornell 1969).  It knows no curvature, and so gives the
-        median of what bends only.  The mean does not: what is hardly known lies along a curved valley
-        of the likelihood, which straight directions leave, and what bends there looks certain to grow.
-        """
-        mode, near, linear = self._changes(samples)
-        odd = 0.5 * (near - near[np.arange(len(near)) ^ 1])
-        return float(mode[0]), math.sqrt(float((self.weight[1:] @ odd**2 + (linear**2).sum(axis=0))[0]))
-
-    def _changes(self, samples: Array) -> tuple[Array, Array, Array]:
-        """Samples (D, ...) at the mode (Q,), and how those under the cubature and in the other directions differ."""
         flat = samples.reshape(len(samples), -1)
-        mode, n = flat[0], len(self.weight)
-        change = flat[1:] - mode
-        near, linear = change[: n - 1], change[n - 1 :]
-        if np.isnan(change).any():
-            near = np.where(np.isnan(near), -near[np.arange(n - 1) ^ 1], near)
-            linear = np.where(np.isnan(linear), 0.0, linear)
-        return mode, near, linear
-
-    def likely(self, samples: Array | None) -> Estimate | None:
-        """A scalar's median and spread of first order from its samples (D,); None as `estimates`."""
-        return None if samples is None else _known(*self.first_order(samples))
-
-    def estimates(self, *samples: Array | None) -> list[Estimate | None]:
-        """Scalars from their samples (D,) each; None where there are none or the mean is not known."""
-        known = [each for each in samples if each is not None]
-        if not known:
-            return [None] * len(samples)
-        found = zip(*(a.tolist() for a in self.mean_and_std(np.stack(known, axis=1))), strict=True)
-        return [None if each is None else _known(*next(found)) for each in samples]
-
-
-def _known(value: float, std: float) -> Estimate | None:
-    return Estimate(value, std) if math.isfinite(value) else None
+        if known is not None and not known.all():
+            known = np.broadcast_to(known, samples.shape).reshape(flat.shape)
+            flat = np.where(known, flat, np.where(known[self.mirror], 2.0 * flat[0] - flat[self.mirror], flat[0]))
+        return np.asarray(self.share @ flat).reshape(-1, *samples.shape[1:])
 
 
 @cache
-def cubature(n: int) -> tuple[Array, Array]:
-    """Points (P, n) and weights (P,) of degree five for n independent standard normals, the origin first.
+def _shares(leading: int, linear: int) -> tuple[Array, NDArray[np.intp]]:
+    """share and mirror of SigmaPoints with so many directions under the polynomial and beside it."""
+    points = design(leading)
+    z = normals(leading + linear, leading)
+    fit = np.linalg.pinv(_polynomials(points))
+    of_draws = np.concatenate([_polynomials(z[:, :leading]) @ fit, z[:, leading:]], axis=1)
+    of_draws[:, 0] -= z[:, leading:].sum(axis=1)
+    of_mode = np.eye(1, of_draws.shape[1])
+    mirror = np.arange(of_draws.shape[1])
+    for i, point in enumerate(points):
+        mirror[i] = next((j for j, other in enumerate(points) if np.allclose(other, -point)), i)
+    return np.concatenate([of_mode, of_draws]), mirror
 
-    The vertices of a regular simplex and the middles of its edges, pushed out to two
-    spheres, each beside its mirror image.
+
+@cache
+def design(n: int) -> Array:
+    """Points (P, n) for n independent standard normals, the origin first.
+
+    The vertices of a regular simplex, their mirror images and the middles of its edges, pushed out to
+    one sphere, as in the cubature of Lu & Darmofal (2004, SIAM J. Sci. Comput. 26:613); then
+    those on the first axis, where a vertex is besides.
     """
     if n == 0:
-        return np.zeros((1, 0)), np.ones(1)
+        return np.zeros((1, 0))
     vertices = np.zeros((n + 1, n))
     for k in range(n):
         vertices[k, k] = math.sqrt((n + 1) * (n - k) / (n * (n - k + 1)))
         vertices[k + 1 :, k] = -math.sqrt((n + 1) / (n * (n - k + 1) * (n - k)))
     i, j = np.triu_indices(n + 1, 1)
-    if n == 1:
-        i, j = i[:0], j[:0]  # the middle is the origin
-    middles = math.sqrt(n / (2.0 * max(n - 1, 1))) * (vertices[i] + vertices[j])
-    outer = math.sqrt(n + 2.0) * np.concatenate([vertices, middles])
-    weight = np.concatenate([
-        np.full(2 * (n + 1), n**2 * (7.0 - n) / (2.0 * (n + 1) ** 2 * (n + 2) ** 2)),
-        np.full(2 * len(middles), 2.0 * (n - 1) ** 2 / ((n + 1) ** 2 * (n + 2) ** 2)),
-    ])  # fmt: skip
-    points = np.stack([outer, -outer], axis=1).reshape(-1, n)
-    return np.concatenate([np.zeros((1, n)), points]), np.concatenate([[2.0 / (n + 2.0)], weight])
+    middles = vertices[i] + vertices[j] if n > 1 else np.zeros((0, 1))  # of one edge, the origin
+    middles = middles / np.linalg.norm(middles, axis=1, keepdims=True)
+    on_axis = np.outer([*AXIS, *np.negative(AXIS)], np.eye(1, n))
+    sphere = math.sqrt(n + 2.0) * np.concatenate([vertices, -vertices, middles])
+    return np.concatenate([np.zeros((1, n)), sphere, on_axis])
+
+
+def _polynomials(x: Array) -> Array:
+    """Orthonormal polynomials of standard normals (P, n): (P, terms).
+
+    All to degree two, those of the first to AXIS_DEGREE, and its square times each other one, which the
+    points of two directions do not tell from that one itself.
+    """
+    n = x.shape[1]
+    degrees = [d for d in itertools.product(range(3), repeat=n) if sum(d) <= 2]
+    if n:
+        degrees += [(d, *(0,) * (n - 1)) for d in range(3, AXIS_DEGREE + 1)]
+        degrees += [(2, *(int(i == k) for i in range(1, n))) for k in range(1, n) if n > 2]
+    terms = [math.prod((_hermite(column, d) for column, d in zip(x.T, of, strict=True)), start=1.0) for of in degrees]
+    return np.stack([np.broadcast_to(term, len(x)) for term in terms], axis=1)
+
+
+def _hermite(x: Array, degree: int) -> Array:
+    """Hermite polynomial with variance one under a standard normal."""
+    return np.asarray(hermeval(x, np.eye(degree + 1)[degree]) / math.sqrt(math.factorial(degree)))

@@ -14,6 +14,12 @@ LONG, SHORT = 2.5, 0.8
 """Time constants [s] of forgetting a capacity: of ground that softens over many metres, and of a soft patch's edge."""
 SCATTER = 10.0
 """Time constant [s] of forgetting how much a capacity scatters."""
+RISE = 4.0
+"""Time constant [s] of forgetting a demand, of which a line is to show a rise and not a swing."""
+SWINGS = 20.0
+"""Time constant [s] of forgetting how a demand swings."""
+SWING = 1.5
+"""Time [s] after which a demand that swings is another: draft swings within some seconds."""
 LAG = 0.5
 """Time [s] after which a capacity's scatter is another: neither the same samples nor the same metre of ground."""
 ENOUGH = 0.4
@@ -66,6 +72,11 @@ class Trend(NamedTuple):
         return self.y / self.n if self.n > 0.0 else 0.0
 
 
+def _estimated(squares: Trend, alike: float) -> float:
+    """Mean of squares of which so many say the same, widened as poorly known of few (as Student's t); inf of none."""
+    return squares.mean * (1.0 + 2.0 * alike / squares.n) if squares.n > 0.0 else math.inf
+
+
 class Capacity(NamedTuple):
     """Trends of the capacity [N] with the long and the short memory, and what they are worth.
 
@@ -111,10 +122,43 @@ class Capacity(NamedTuple):
         """Of one of the two lines' slopes [N/s], at most: old moments are forgotten, but count as if they were not.
 
         Changes within LAG, twice the variance of the scatter, hold little of a slow change of the ground.
+        inf where none is known, as when wheels pull again that have rolled for long.
         """
-        moments_in_lag = LAG / SHORT * self.told.n
-        variance = self.scatter.mean / 2.0
-        return math.sqrt(moments_in_lag * variance / line.spread) if line.spread > 0.0 else math.inf
+        in_lag = LAG / SHORT * self.told.n
+        variance = _estimated(self.scatter, in_lag) / 2.0
+        return math.sqrt(in_lag * variance / line.spread) if line.spread > 0.0 else math.inf
+
+
+class Demand(NamedTuple):
+    """Trend of a demand [N] and how much it swings about it.
+
+    swing: square of its change within SWING beyond the change in the SWING before [N^2], which is none on any line.
+    """
+
+    trend: Trend = Trend()
+    swing: Trend = Trend()
+
+    def joined(self, step: float, value: float, earlier: float | None, earliest: float | None) -> Demand:
+        """A step [s] later, with one more value; earlier and earliest are those of SWING and of twice SWING before."""
+        change = None if earlier is None or earliest is None else (value - 2.0 * earlier + earliest) ** 2
+        return Demand(self.trend.joined(step, value, RISE), self.swing.joined(step, change, SWINGS))
+
+    @property
+    def swing_std(self) -> float:
+        """Standard deviation [N] of the swing, inf where it is not known.
+
+        The square of a change beyond the change before is six times the variance of values without relation.
+        """
+        return math.sqrt(_estimated(self.swing, self._in_swing) / 6.0)
+
+    def slope_std(self, line: Line) -> float:
+        """Of the line's slope [N/s] by the swing alone, at most: values within SWING count as one."""
+        return self.swing_std * math.sqrt(self._in_swing / line.spread) if line.spread > 0.0 else math.inf
+
+    @property
+    def _in_swing(self) -> float:
+        """Values within SWING."""
+        return SWING / RISE * self.trend.n
 
 
 class Peaks(NamedTuple):

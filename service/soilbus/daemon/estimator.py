@@ -24,7 +24,8 @@ from soilbus.estimation.gauss_newton import Fit
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.readings import gain_names
 from soilbus.estimation.soil_class import SoilClasses, guessed
-from soilbus.estimation.tracker import MIN_ROWS, Ground, Settings, Tracked, Tracker
+from soilbus.estimation.tracked import MIN_ROWS, Ground, Settings, Tracked
+from soilbus.estimation.tracker import Tracker
 from soilbus.estimation.window import Rig, Window
 from soilbus.hysteresis import Held, settled
 from soilbus.terra.effects.effect import Active, Surroundings, true_draft
@@ -32,12 +33,8 @@ from soilbus.terra.effects.steady import CompletedModel
 from soilbus.traversability import State as Way
 from soilbus.traversability import Status, Traversability, judge
 
-MIN_NEW_SOIL = 0.2
+MIN_NEW_SOIL = 0.15
 """Share of a window that a new soil must fill before its estimate is valid."""
-SKEWED = 0.5
-"""Standard deviations between mode and mean of a new soil's posterior from which they do not hold: its data are few."""
-SHARP = 0.5
-"""Share of the allowed std of bearing pressure below which they hold all the same."""
 STUCK_RIM_SPEED = 2.5
 """Least rim speed of a vehicle that is stuck, in units of the least speed at which slip is judged."""
 AMBIGUOUS = 2.0
@@ -206,7 +203,7 @@ class WindowEstimator:
         if window.fresh:
             self._watch, self._curve = Watch(), None
         for moment in window.moments:
-            self._watch = watched(self._watch, *moment, self._curve)
+            self._watch = watched(self._watch, moment.t, moment.slip, moment.pull, self._curve, moment.inertia)
 
     def _effects(self, fit: Fit | None) -> list[Active]:
         """The effects with their parameters as a fit leaves them, else as configured."""
@@ -282,7 +279,7 @@ class WindowEstimator:
             return status, "model_mismatch" if failure == "model_mismatch" else "no_convergence"
         if task.poor:
             return Status.DEGRADED, "input_stale " + " ".join(task.poor)
-        if self._hardly_new(tracked, fit, task.end):
+        if self._hardly_new(tracked, task.end):
             return Status.NOT_EXCITED, "not_excited new_soil"
         if self._ambiguous(fit):
             return Status.NOT_EXCITED, "ambiguous"
@@ -296,16 +293,11 @@ class WindowEstimator:
             return Status.NOT_EXCITED, " ".join(["not_excited", *(name for name, it_is in lacking.items() if it_is)])
         return Status.VALID, "none"
 
-    def _hardly_new(self, tracked: Tracked, fit: Fit, end: float) -> bool:
+    def _hardly_new(self, tracked: Tracked, end: float) -> bool:
         """Whether the window has too little of the soil that has just begun."""
         if tracked.ground in (Ground.CHANGING, Ground.SETTLING):
             return True
-        if tracked.since > end - MIN_NEW_SOIL * self._settings.window:
-            return True
-        bearing = self._bearing(fit.whole.posterior)
-        skewed = fit.posterior.distance(fit.mode.posterior.soil) > SKEWED
-        sharp = bearing.std < SHARP * self._settings.max_bearing_std * bearing.value
-        return tracked.ground is Ground.NEW and skewed and not sharp
+        return tracked.since > end - MIN_NEW_SOIL * self._settings.window
 
     def _failure(self, tracked: Tracked) -> str | None:
         """In what way a solve failed: not_finite, model_mismatch or no_convergence; None where it did not."""

@@ -25,7 +25,15 @@ from soilbus.daemon.plausibility import Plausibility
 from soilbus.daemon.positions import PositionTrack
 from soilbus.estimation.plausibility import without
 from soilbus.estimation.screening import WILD
-from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, BinStore, Window, forward, pull_given
+from soilbus.estimation.window import (
+    VEHICLE_QUANTITIES,
+    WHEEL_QUANTITIES,
+    BinStore,
+    Window,
+    forward,
+    inertia_of,
+    pull_given,
+)
 from soilbus.terra.vehicle import slip_ratio
 
 Array = NDArray[np.float64]
@@ -67,10 +75,14 @@ class WindowTask:
 
 
 class Latest(NamedTuple):
-    """Slip ratio by wheel and pull [N] (draft, slope, inertia) of the last moments; None where unknown."""
+    """Slip ratio by wheel, pull [N] (draft, slope, inertia) of the last moments and the inertia in it.
+
+    None where unknown.
+    """
 
     slip: dict[str, float | None]
     pull: float | None
+    inertia: float = 0.0
 
 
 @dataclass(slots=True)
@@ -254,8 +266,11 @@ class Intake:
             return Latest(dict.fromkeys(self.rig.wheels), None)
         last = math.floor((now - self._bins.origin) / self._settings.bin) * self._settings.bin + self._bins.origin
         window = without(self._bins.glimpse(last - SLIP_SPAN, last), self.rig, set(self._lying))
-        pull = None if self.rig.chassis is None else column_means(pull_given(window, self.rig.chassis)[:, None])[0]
-        return Latest(self._slip(window), pull)
+        if self.rig.chassis is None:
+            return Latest(self._slip(window), None)
+        pull, inertia = pull_given(window, self.rig.chassis), inertia_of(window, self.rig.chassis)
+        given = column_means(pull[:, None])[0]
+        return Latest(self._slip(window), given, 0.0 if given is None else float(inertia[np.isfinite(pull)].mean()))
 
     def _slip(self, window: Window) -> dict[str, float | None]:
         window = forward(window)

@@ -310,7 +310,7 @@ class Service:
         for message, values in slip_frames(latest.slip):
             self.bus.send(self.publisher.frame(message, values))
         self._watch = watched(
-            self._watch, self.bus_time(now), latest.slip.values(), latest.pull, self._present_curve(now)
+            self._watch, self.bus_time(now), latest.slip.values(), latest.pull, self._present_curve(now), latest.inertia
         )  # fmt: skip
         self.bus.send(self.publisher.frame(*forecast_frame(self.result if known else None, self._watch)))
         limit = decided.limit if decided is not None else None

@@ -32,8 +32,9 @@ from soilbus.terra.wheel import Soil
 Array = NDArray[np.float64]
 
 _SOIL = len(PARAMETERS)
-CHECK_ROUNDS = 3
-"""Linearisations that bring the latents of held-out blocks to their values under a model."""
+CHECK_ROUNDS, CHECK_AGAIN = 3, 2
+"""Linearisations that bring the latents of held-out blocks to their values under a model: from what was measured,
+and from what they were under a model much like it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +123,12 @@ class Completion:
 
     def as_starts(self) -> tuple[Start, ...]:
         """Where these fits ended."""
-        return tuple(Start(fit.mode.soil, fit.mode.gains, near=fit.converged) for fit in self.fits)
+        return tuple(
+            Start(fit.mode.soil, fit.mode.gains, fit.converged, fit.optimum.latents, check.latents)
+            if fit.converged
+            else Start(fit.mode.soil, fit.mode.gains)
+            for fit, check in zip(self.fits, self.checks, strict=True)
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -186,7 +192,8 @@ def _complete(
             return None
         fits.append(fit)
         befores.append(before)
-        checks.append(check(record.checked.completed(effects, free), prior, fit))
+        near = None if starts is None else starts[i].checked
+        checks.append(check(record.checked.completed(effects, free), prior, fit, near))
         known = fit.mode
     added = [effect for effect in effects if effect not in records[0].learned.effects]
     sizes = sum(_sizes(effect, free, fits, checks) for effect in added)
@@ -230,8 +237,8 @@ def _fitted(
     if fit is None or fit.converged or fit.cost > hopeless:
         return fit
     fitting, gains = Fitting(problem, prior, before), np.where(problem.gain_std > 0.0, start.gains, 0.0)
-    ends = (start.soil, problem.allowed(gains)), (fit.optimum.soil, problem.allowed(fit.optimum.gains))
-    return descended(fitting, [fitting.start(soil, gains=g) for soil, g in ends]) or fit
+    end = Place(fit.optimum.soil, problem.allowed(fit.optimum.gains), fit.optimum.latents, fit.cost, 0)
+    return descended(fitting, end, fitting.start(start.soil, gains=problem.allowed(gains))) or fit
 
 
 def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects: Sequence[Effect]) -> Belief:
@@ -247,14 +254,16 @@ def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects
     return Belief(after.soil, gains, covariance)
 
 
-def check(problem: CompletedProblem, prior: SoilPrior, fit: Fit) -> Checked:
-    """Held-out blocks under a model fitted to the others."""
+def check(problem: CompletedProblem, prior: SoilPrior, fit: Fit, near: Latents | None = None) -> Checked:
+    """Held-out blocks under a model fitted to the others; near are their latents under a model much like it."""
     soil, gains = Soil(*fit.mode.soil.tolist()), fit.mode.gains
-    latents = problem.start(soil, None, gains)
     fitting = Fitting(problem, prior, fit.mode)
+    rounds = CHECK_ROUNDS if near is None or len(near.load) != problem.n else CHECK_AGAIN
     with np.errstate(all="ignore"):
+        latents = fitting.near(fit.mode.soil, gains, near).latents
+        latents = problem.carried(latents, soil, gains)
         at = problem.linearise(soil, gains, latents)
-        for _ in range(CHECK_ROUNDS - 1):
+        for _ in range(rounds - 1):
             latents = problem.updated(at, latents, np.zeros(_SOIL), np.zeros(len(gains)))
             at = problem.linearise(soil, gains, latents)
         point = fitting.with_before(Place(fit.mode.soil, gains, latents, np.inf, 0), at)

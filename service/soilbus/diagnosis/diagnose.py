@@ -203,7 +203,8 @@ def _without(records: Sequence[Record], prior: SoilPrior, present: Completion, e
     n_sensors = records[0].learned.n_sensors
     kept = [n_sensors + i for i, f in enumerate(present.free) if f.effect != effect.name]
     starts = [
-        Start(fit.mode.soil, np.concatenate([fit.mode.gains[:n_sensors], fit.mode.gains[kept]])) for fit in present.fits
+        start._replace(gains=np.concatenate([start.gains[:n_sensors], start.gains[kept]]))
+        for start in present.as_starts()
     ]
     return complete(records, prior, [e for e in present.effects if e.name != effect.name], starts, STEPS)
 

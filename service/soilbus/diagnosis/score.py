@@ -20,6 +20,7 @@ from soilbus.diagnosis.sizes import evidence_of_any_size
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.effect_parameters import Free, parameters_of
 from soilbus.estimation.gauss_newton import Start
+from soilbus.estimation.linearised import Latents, Linearised
 from soilbus.estimation.normal_equations import Fitting, Place, solved
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
@@ -50,9 +51,11 @@ class _Normal:
 
     fitting: Fitting
     place: Place
+    at: Linearised
     by_effects: Array
     left: Array
     answer: Array
+    checked: Latents
 
 
 def scores(
@@ -122,7 +125,7 @@ def _normal(
     answer = inverse[1] @ information[base, new]
     left = information[new, new] - np.eye(P) - information[new, base] @ answer
     by_effects = point.gradient[new] - answer.T @ point.gradient[base]
-    return _Normal(fitting, place, by_effects, left, answer)
+    return _Normal(fitting, place, point.at, by_effects, left, answer, present.checks[i].latents)
 
 
 def _score(effect: Effect, columns: NDArray[np.intp], free: Sequence[Free], normals: Sequence[_Normal]) -> Score:
@@ -183,4 +186,9 @@ def _start(normal: _Normal, columns: NDArray[np.intp], step: Array) -> Start:
     soil = fitting.coordinates.moved(place.soil, follow[:n_free])
     gains = place.gains[:n_known].copy()
     gains[fitting.active[fitting.active < n_known]] += follow[n_free:]
-    return Start(soil, np.concatenate([gains, step]), near=share == 1.0)
+    if share < 1.0:
+        return Start(soil, np.concatenate([gains, step]), checked=normal.checked)
+    change = np.zeros(len(place.gains))
+    change[:n_known], change[n_known + columns] = gains - place.gains[:n_known], step
+    latents = fitting.problem.updated(normal.at, place.latents, soil - place.soil, change)
+    return Start(soil, np.concatenate([gains, step]), True, latents, normal.checked)

@@ -9,8 +9,6 @@ what is left: variable projection, Golub & Pereyra 1973, SIAM J. Numer. Anal. 10
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from soilbus.estimation.gauss_newton import Fit
@@ -23,15 +21,22 @@ ENOUGH = 0.1
 EASED, HELD_BACK = 0.3, 10.0
 """What a step that lowers the cost, and one that does not, makes of the damping."""
 MOST_DAMPING = 1e4
+NEAR = 2.0
+"""Cost for each residual below which one linear step brings the latents to their best."""
 
 
-def descended(fitting: Fitting, starts: Sequence[Place]) -> Fit | None:
-    """The optimum below the best of some places; None where the numbers are not finite."""
+def descended(fitting: Fitting, end: Place, start: Place) -> Fit | None:
+    """The optimum below where the fast descent ended, or below its start where that costs less.
+
+    None where the numbers are not finite.
+    """
     with np.errstate(all="ignore"):
-        found = [place for place in (_relaxed(fitting, start) for start in starts) if place is not None]
-        if not found:
+        at_start = fitting.point(start)
+        if at_start is not None and at_start.cost < end.cost:
+            end = start
+        here = _relaxed(fitting, end)
+        if here is None:
             return None
-        here = min(found, key=lambda place: place[1].cost)
         damping, falling, steps = 1e-2, np.inf, 0
         while falling > ENOUGH and damping < MOST_DAMPING and steps < MAX_STEPS:
             step = here[1].step(damping)
@@ -46,10 +51,13 @@ def descended(fitting: Fitting, starts: Sequence[Place]) -> Fit | None:
 
 
 def _relaxed(fitting: Fitting, place: Place) -> tuple[Place, Point] | None:
-    """The place with latents where they fit best, and the normal equations there."""
+    """The place with latents where they fit best, and the normal equations there.
+
+    Where residuals are no longer many standard deviations the linear model has brought them there.
+    """
     point = fitting.point(place)
-    if point is None:
-        return None
+    if point is None or point.cost < NEAR * fitting.problem.n_rows:
+        return None if point is None else (place, point)
     place = fitting.moved(place, point, np.zeros(len(point.gradient)))
     point = fitting.point(place)
     return None if point is None else (place, point)

@@ -2,8 +2,8 @@
 
 The parameters of the effects take their place beside the gain errors of the sensors: each
 as (parameter - value) / std, zero with variance one before any data.  Derivatives are
-differences here: an effect is any small function, and a dozen evaluations of the forces are
-cheaper than a derivative by hand for every pair of effects.
+differences of the effects' hooks, which are any small functions; the integrals between the
+hooks are taken along their tangent, so that there is one integration for all of them.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from soilbus.estimation.smoothing import smoothed
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.effects.effect import Active, Effect, Surroundings, reactions_with, true_draft, wheel_with
 from soilbus.terra.stress import lumped_modulus
+from soilbus.terra.tangent import Tangent, shape_of_change, tangent
 from soilbus.terra.wheel import (
-    INPUTS,
     MAX_ENTRY_ANGLE,
     MIN_ENTRY_ANGLE,
     Soil,
@@ -31,26 +31,13 @@ from soilbus.terra.wheel import (
     WheelState,
     sinkage,
     wheel_forces,
-    wheel_forces_and_derivatives,
 )
 
 Array = NDArray[np.float64]
 
 STEP = 1e-6
-"""Relative step of the differences; in standard deviations of a parameter, STEP_OF_EFFECT."""
-STEP_OF_EFFECT = 1e-4
+"""Step of the differences: relative, but for effects' parameters in standard deviations."""
 LOAD_ROUNDS = 6
-
-
-class _Outcome(NamedTuple):
-    """Load that the soil carries beyond what it must, drawbar pull, torque reading, sinkage (4, N, W); pull (N,).
-
-    late (N, W) is what other instants add to the torque readings.
-    """
-
-    wheels: Array
-    pull: Array
-    late: Array
 
 
 class _Contact(NamedTuple):
@@ -61,43 +48,12 @@ class _Contact(NamedTuple):
     around: Surroundings
 
 
-class _Bare(NamedTuple):
-    """Wheels as the effects' hooks leave them, with forces (3, N, W) and derivatives (3, 7, N, W) by INPUTS.
-
-    depth (N, W) is their sinkage.
-    """
+class _Wheels(NamedTuple):
+    """Wheels as the effects' hooks leave them, and what effects depend on."""
 
     state: WheelState
     model: WheelModel
-    depth: Array
-    forces: Array
-    by_inputs: Array
-
-    def depth_at(self, state: WheelState) -> Array:
-        """Sinkage (N, W) of other wheels."""
-        same = state.entry_angle is self.state.entry_angle and _same(state.radius, self.state.radius)
-        return self.depth if same else _sunk(state)
-
-    def forces_at(self, state: WheelState, model: WheelModel) -> Array:
-        """Forces (3, N, W) of other wheels: along the tangent, which is all that a difference sees, where it holds."""
-        if model != self.model or not (_same(state.radius, self.state.radius) and _same(state.width, self.state.width)):
-            return wheel_forces(state, model)
-        forces = self.forces.copy()
-        for i, name in enumerate(INPUTS):
-            value, here = getattr(state, name), getattr(self.state, name)
-            if not _same(value, here):
-                forces += self.by_inputs[:, i] * (value - here)
-        return forces
-
-
-def _sunk(state: WheelState) -> Array:
-    return np.broadcast_to(sinkage(state.entry_angle, state.radius), np.shape(state.entry_angle))
-
-
-def _same(one: Any, other: Any) -> bool:
-    if one is other or not (isinstance(one, np.ndarray) and isinstance(other, np.ndarray)):
-        return bool(one is other or np.all(one == other))
-    return one.shape == other.shape and bool((one == other).all())
+    around: Surroundings
 
 
 class CompletedProblem(WindowProblem):
@@ -124,6 +80,8 @@ class CompletedProblem(WindowProblem):
 
     def _complete(self, effects: Sequence[Effect], free: Sequence[Free]) -> None:
         self.effects, self.free = tuple(effects), tuple(free)
+        named = {effect.name: effect for effect in self.effects}
+        self._effect_of = [named[f.effect] for f in self.free]
         std = [float(f.std > 0.0) for f in self.free]
         self.gain_names = [*self.gain_names[: self.n_sensors], *(f.name for f in self.free)]
         self.gain_std = np.concatenate([self.gain_std[: self.n_sensors], std])
@@ -155,7 +113,8 @@ class CompletedProblem(WindowProblem):
         angle, nothing = base.entry_angle, np.zeros_like(base.load)
 
         def excess(angle: Array) -> Array:
-            return np.asarray(self._told(self._contact(soil, active, base, angle), active, base, nothing).wheels[0])
+            contact = self._contact(self._wheels(soil, active, base, angle), active)
+            return np.asarray(self._told(contact, active, base, nothing)[0])
 
         off = excess(angle)
         with np.errstate(all="ignore"):
@@ -177,23 +136,25 @@ class CompletedProblem(WindowProblem):
         if not self.effects:
             return super().sinkages(soil, gains, latents)
         active = self.active(gains[self.n_sensors :])
-        return np.asarray(self._contact(soil, active, latents, latents.entry_angle).depth)
+        return _depth(self._wheels(soil, active, latents, latents.entry_angle).state)
 
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         if not self.effects:
             return super()._response(soil, gains, latents)
         pulls = gains[self.n_sensors :]
         active, angle = self.active(pulls), latents.entry_angle
-        near = self._bare(soil, active, latents, angle)
-        here = self._contact(soil, active, latents, angle, near)
-        at = self._told(here, active, latents, None)
-
-        def by(changed: _Outcome, step: Any) -> _Outcome:
-            return _Outcome((changed.wheels - at.wheels) / step, (changed.pull - at.pull) / _of_instant(step), at.late)
+        here = self._wheels(soil, active, latents, angle)
+        others = self._beside(soil, pulls, latents)
+        shape = [shape_of_change(here.model, other.model) for _, _, other in others.values() if other is not None]
+        near = tangent(here.state, here.model, frozenset().union(*shape))
+        contact = self._contact(here, active, near)
+        late = self._from_other_instants(active, contact)
+        at = self._told(contact, active, latents, late)
+        pull = self._pull(contact, active)
 
         def by_moving(moved: Latents, step: Any) -> Array:
-            contact = self._contact(soil, active, moved, moved.entry_angle, near)
-            return by(self._told(contact, active, moved, at.late), step).wheels
+            contact = self._contact(self._wheels(soil, active, moved, moved.entry_angle), active, near)
+            return np.asarray((self._told(contact, active, moved, late) - at) / step)
 
         by_latents = {}
         for name in ("entry_angle", "load", "speed", "ground_speed"):
@@ -204,23 +165,22 @@ class CompletedProblem(WindowProblem):
         by_soil = self._by_soil(soil, active, latents, at, near)
         by_effects = np.zeros((4, len(self.free), self.n, self.n_wheels))
         pull_by_effects = np.zeros((len(self.free), self.n))
-        at_wheels = {e.name for e in self.effects if e.wheel is not None or e.forces is not None}
-        for i in np.flatnonzero(self.gain_std[self.n_sensors :] > 0.0):
-            shifted = pulls.copy()
-            inward = STEP_OF_EFFECT if self.free[i].within(pulls[i] + STEP_OF_EFFECT) else -STEP_OF_EFFECT
-            shifted[i] += inward
-            other = self.active(shifted)
-            contact = self._contact(soil, other, latents, angle, near) if self.free[i].effect in at_wheels else here
-            d = by(self._told(contact, other, latents, None), inward)
-            by_effects[:, i], pull_by_effects[i] = d.wheels, d.pull
-        slope, off = by_angle[0], -at.wheels[0]
+        for i, (step_of_effect, other, wheels) in others.items():
+            moved = contact if wheels is None else self._contact(wheels, other, near)
+            effect = self._effect_of[i]
+            if wheels is not None or effect.torque is not None or effect.load is not None:
+                told = self._told(moved, other, latents, self._from_other_instants(other, moved))
+                by_effects[:, i] = (told - at) / step_of_effect
+            if wheels is not None or effect.draft is not None or effect.resistance is not None:
+                pull_by_effects[i] = (self._pull(moved, other) - pull) / step_of_effect
+        slope, off = by_angle[0], -at[0]
         along = by_angle[1:] / slope  # what a load more turns into, by way of the entry angle
 
         def held(d: Array) -> Array:
             """Derivatives (3, ..., N, W) with the entry angle following the load."""
             return np.asarray(d[1:] - (along[:, None] if d.ndim == 4 else along) * d[0])
 
-        value = at.wheels[1:] + along * off
+        value = at[1:] + along * off
         return Response(
             value=value,
             by_load=held(by_latents["load"]),
@@ -233,66 +193,73 @@ class CompletedProblem(WindowProblem):
             load_slope=slope,
             off=off,
             by_effects=held(by_effects),
-            pull=at.pull,
+            pull=pull,
             pull_by_effects=pull_by_effects,
         )
 
-    def _by_soil(self, soil: Soil, active: Sequence[Active], latents: Latents, at: _Outcome, near: _Bare) -> Array:
+    def _beside(
+        self, soil: Soil, pulls: Array, latents: Latents
+    ) -> dict[int, tuple[float, list[Active], _Wheels | None]]:
+        """For each free parameter a step, the effects after it, and the wheels then, None where they stay."""
+        others = {}
+        for i in np.flatnonzero(self.gain_std[self.n_sensors :] > 0.0).tolist():
+            shifted = pulls.copy()
+            inward = STEP if self.free[i].within(pulls[i] + STEP) else -STEP
+            shifted[i] += inward
+            active, effect = self.active(shifted), self._effect_of[i]
+            stays = effect.wheel is None and effect.forces is None
+            others[i] = inward, active, None if stays else self._wheels(soil, active, latents, latents.entry_angle)
+        return others
+
+    def _by_soil(self, soil: Soil, active: Sequence[Active], latents: Latents, at: Array, near: Tangent) -> Array:
         """Derivatives (4, 6, N, W) by k_c, k_phi, n, phi, c, K at held entry angles."""
         out = np.empty((4, 6, self.n, self.n_wheels))
         for i, name in enumerate(Soil._fields[1:], 1):
             step = STEP * max(abs(getattr(soil, name)), 1e-9)
             changed = soil._replace(**{name: getattr(soil, name) + step})
-            contact = self._contact(changed, active, latents, latents.entry_angle, near)
-            out[:, i] = (self._told(contact, active, latents, None).wheels - at.wheels) / step
+            contact = self._contact(self._wheels(changed, active, latents, latents.entry_angle), active, near)
+            told = self._told(contact, active, latents, self._from_other_instants(active, contact))
+            np.divide(told - at, step, out=out[:, i])
         np.divide(out[:, 1], self.rig.width, out=out[:, 0])  # both act through K_L = k_c/b + k_phi
         return out
 
-    def _contact(
-        self, soil: Soil, active: Sequence[Active], latents: Latents, angle: Array, near: _Bare | None = None
-    ) -> _Contact:
-        """What happens between wheels and ground at given entry angles; only a small step away from `near`."""
-        state, around = self._wheels(soil, latents, angle)
-        state, model = wheel_with(active, state, self.model, around)
-        forces = wheel_forces(state, model) if near is None else near.forces_at(state, model)
-        depth = _sunk(state) if near is None else near.depth_at(state)
-        return _Contact(reactions_with(active, forces, state, around), depth, around)
-
-    def _bare(self, soil: Soil, active: Sequence[Active], latents: Latents, angle: Array) -> _Bare:
-        """The wheels at given entry angles, with derivatives."""
-        state, around = self._wheels(soil, latents, angle)
-        state, model = wheel_with(active, state, self.model, around)
-        return _Bare(state, model, _sunk(state), *wheel_forces_and_derivatives(state, model))
-
-    def _wheels(self, soil: Soil, latents: Latents, angle: Array) -> tuple[WheelState, Surroundings]:
-        """The wheels before any effect, and what effects depend on."""
+    def _wheels(self, soil: Soil, active: Sequence[Active], latents: Latents, angle: Array) -> _Wheels:
+        """The wheels at given entry angles."""
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
         K_L = lumped_modulus(soil.k_c, soil.k_phi, self.rig.width)
         tan_phi = float(np.tan(soil.phi))
         state = WheelState(angle, slip, self.rig.radius, self.rig.width, K_L, soil.n, tan_phi, soil.c, soil.K)
-        return state, self._surroundings(latents)
+        around = self._surroundings(latents)
+        return _Wheels(*wheel_with(active, state, self.model, around), around)
 
-    def _told(self, contact: _Contact, active: Sequence[Active], latents: Latents, late: Array | None) -> _Outcome:
-        """What sensors and the balance of forces make of it; `late` as found at other latents.
+    def _contact(self, wheels: _Wheels, active: Sequence[Active], near: Tangent | None = None) -> _Contact:
+        """What happens between wheels and ground; only a small step away from `near`."""
+        state, model, around = wheels
+        forces = wheel_forces(state, model) if near is None else near.at(state, model)
+        return _Contact(reactions_with(active, forces, state, around), _depth(state), around)
 
-        What an effect brings in from other instants is taken from a smoothed torque, and
-        not followed through their latents: each instant is solved for by itself.
+    def _told(self, contact: _Contact, active: Sequence[Active], latents: Latents, late: Array) -> Array:
+        """Load that the soil carries beyond what it must, drawbar pull, torque reading and sinkage (4, N, W).
+
+        late (N, W) is what other instants add to the torque readings.  It is taken from a
+        smoothed torque, and not followed through their latents: each instant is solved for by itself.
         """
         (load, pull, torque), depth, around = contact
-        late = self._from_other_instants(active, torque, around) if late is None else late
-        error: Array | float = 0.0
+        wheels = np.empty((4, *load.shape))
+        np.subtract(load, latents.load, out=wheels[0])
         for effect, values in active:
             if effect.torque is not None and not effect.mixes_instants:
                 torque = effect.torque(torque, around, values)
             if effect.load is not None:
-                error = error + effect.load(around, values)
-        missing, draft = self._unread(active, around, pull.sum(axis=1))
-        wheels = np.empty((4, *load.shape))
-        np.subtract(load, latents.load, out=wheels[0])
-        wheels[0] += error
+                wheels[0] += effect.load(around, values)
         wheels[1], wheels[3] = pull, depth
         np.add(torque, late, out=wheels[2])
-        return _Outcome(wheels, missing + draft - self.draft, late)
+        return wheels
+
+    def _pull(self, contact: _Contact, active: Sequence[Active]) -> Array:
+        """What the wheels must pull besides what the readings ask for (N,) [N]."""
+        missing, draft = self._unread(active, contact.around, contact.forces[1].sum(axis=1))
+        return np.asarray(missing + draft - self.draft)
 
     def _unread(self, active: Sequence[Active], around: Surroundings, pull: Array) -> tuple[Array, Array]:
         """Resistances (N,) in no reading, and drafts (N,) without what effects add to theirs.
@@ -327,9 +294,10 @@ class CompletedProblem(WindowProblem):
         )
         return by_draft, by_acceleration
 
-    def _from_other_instants(self, active: Sequence[Active], torque: Array, around: Surroundings) -> Array:
+    def _from_other_instants(self, active: Sequence[Active], contact: _Contact) -> Array:
         """What effects that mix instants add to the torque readings (N, W)."""
-        late = np.zeros_like(torque)
+        torque, around = contact.forces[2], contact.around
+        late: Array = np.zeros_like(torque)
         mixing = [(e, v) for e, v in active if e.torque is not None and e.mixes_instants]
         if not mixing:
             return late
@@ -356,9 +324,9 @@ class CompletedProblem(WindowProblem):
         )
 
 
-def _of_instant(step: Any) -> Any:
-    """A step by instant (N,) of one by instant and wheel."""
-    return step[:, 0] if np.ndim(step) == 2 else step
+def _depth(state: WheelState) -> Array:
+    """Sinkage [m] (N, W) of wheels."""
+    return np.broadcast_to(sinkage(state.entry_angle, state.radius), np.shape(state.entry_angle))
 
 
 def _with(latents: Latents, name: str, value: Array) -> Latents:

@@ -10,6 +10,7 @@ forces tell.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -32,21 +33,54 @@ def sides(rig: Rig) -> Array:
     return side
 
 
-def rim_difference(readings: Readings) -> float:
-    """Root mean square over the window of half the relative difference of rim speeds between the sides."""
+def rim_differences(readings: Readings) -> Array:
+    """Half the relative difference of rim speeds between the sides at each instant (N,); nan where not all turn."""
     side = sides(readings.rig)
-    whole = readings.usable[:, side != 0.0].all(axis=1)
-    if not side.any() or not whole.any():
-        return 0.0
-    rim = (readings.rig.radius * readings.speed)[whole][:, side != 0.0]
-    return float(np.sqrt(np.mean(((rim @ side[side != 0.0]) / rim.sum(axis=1)) ** 2)))
+    known = side != 0.0
+    rim = readings.rig.radius * readings.speed
+    if not known.any():
+        return np.full(readings.n, np.nan)
+    return np.where(readings.usable[:, known].all(axis=1), (rim @ side) / rim[:, known].sum(axis=1), np.nan)
+
+
+def rim_difference(readings: Readings) -> float:
+    """Root mean square of these over the window, 0 where none is known."""
+    apart = rim_differences(readings)
+    known = apart[np.isfinite(apart)]
+    return math.sqrt(float(np.mean(known**2))) if len(known) else 0.0
 
 
 def with_curve(belief: Belief, readings: Readings) -> Belief:
     """What is known before a window whose curve is not: as sharp as the rim speeds allow, either way."""
+    along = rim_difference(readings) * _by_side(readings)
+    return replace(belief, covariance=belief.covariance + np.outer(along, along))
+
+
+def without_curve(belief: Belief, readings: Readings) -> Belief:
+    """What a window leaves known for later ones: its curve is not theirs, and hides what the speed sensors have of it.
+
+    Of that only its prior is left.
+    """
+    curve, side = with_curve(belief, readings), _by_side(readings)
+    count = np.count_nonzero(side)
+    if not count:
+        return belief
+    variance = float(np.sum((side[len(PARAMETERS) :] * readings.gain_std) ** 2))
+    mean_along = curve.covariance @ side / count
+    spread = float(side @ mean_along) / count + variance / count**2
+    if not spread > 0.0:
+        return belief
+    step = -mean_along / spread * float(side[len(PARAMETERS) :] @ belief.gains) / count
+    return Belief(
+        belief.soil * np.exp(step[: len(PARAMETERS)]),
+        belief.gains + step[len(PARAMETERS) :],
+        curve.covariance - np.outer(mean_along, mean_along) / spread,
+    )
+
+
+def _by_side(readings: Readings) -> Array:
+    """Derivatives (6 + G) of soil and gains by a curve: those of the speed gains, as `sides`."""
+    along = np.zeros(len(PARAMETERS) + len(readings.gain_std))
     names = [f"speed.{wheel}" for wheel in readings.rig.wheels]
-    gains = len(PARAMETERS) + np.array([readings.gain_names.index(name) for name in names])
-    along = rim_difference(readings) * sides(readings.rig)
-    covariance = belief.covariance.copy()
-    covariance[np.ix_(gains, gains)] += np.outer(along, along)
-    return replace(belief, covariance=covariance)
+    along[len(PARAMETERS) + np.array([readings.gain_names.index(name) for name in names])] = sides(readings.rig)
+    return along

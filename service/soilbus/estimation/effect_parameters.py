@@ -49,7 +49,10 @@ def parameters_of(effect: Effect, n_wheels: int) -> list[Free]:
 
 
 def active_at(effects: Sequence[Effect], free: Sequence[Free], pulls: Array, n_wheels: int) -> list[Active]:
-    """The effects with their values where the parameters are so many std (P,) from their prior values."""
+    """The effects with their values where the parameters are so many std (P,) from their prior values.
+
+    Those of which every parameter is zero and absent there are left out: they would do nothing, at a cost.
+    """
     values: dict[str, dict[str, Any]] = {e.name: {} for e in effects}
     for f, u in zip(free, pulls.tolist(), strict=True):
         of_effect = values[f.effect]
@@ -57,4 +60,9 @@ def active_at(effects: Sequence[Effect], free: Sequence[Free], pulls: Array, n_w
             of_effect[f.parameter.name] = f.at(u)
         else:
             of_effect.setdefault(f.parameter.name, np.zeros(n_wheels))[f.wheel] = f.at(u)
-    return [Active(e, values[e.name]) for e in effects]
+    return [Active(e, values[e.name]) for e in effects if not _absent(e, values[e.name])]
+
+
+def _absent(effect: Effect, values: dict[str, Any]) -> bool:
+    """Whether nothing is left of it, not even the place at which it would be: the depth of a pan without stiffness."""
+    return all(neutral == 0.0 and not np.any(values[name]) for name, neutral in effect.neutral.items())

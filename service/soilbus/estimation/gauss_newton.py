@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.descent import FAR, LEFT_OVER, LEFT_OVER_RESUMED, LITTLE, MAX_REFUSED, approach, settle
-from soilbus.estimation.linearised import Linearised, Optimum
+from soilbus.estimation.linearised import Bend, Latents, Linearised, Optimum
 from soilbus.estimation.normal_equations import Fitting, Place
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
@@ -26,6 +26,8 @@ _K_C = PARAMETERS.index("k_c")
 
 MAX_ITERATIONS = 30
 MAX_RESUMED = 10
+MAX_ASTRAY = 2
+"""Refused steps in all of a fit with effects that has a slower descent to fall back on."""
 THINNED = 24
 """Instants of a window that the search for good starts looks at."""
 MAX_KINDS = 2
@@ -56,12 +58,16 @@ SAME_END = 0.02
 class Start(NamedTuple):
     """Where a fit may begin: soil (6,), sensors' gains and effects' parameters (G,).
 
-    near: a fit of the same model, be it to fewer instants, ended there.
+    near: a fit of the same model, be it to fewer instants, ended there.  latents: what is
+    foreseen of the latents there, of use to fits to the same instants; checked: of those of
+    instants that are held out.
     """
 
     soil: Array
     gains: Array
     near: bool = False
+    latents: Latents | None = None
+    checked: Latents | None = None
 
 
 class Rival(NamedTuple):
@@ -84,7 +90,8 @@ class Fit:
     sinkage (W,) is the mean over the window [m], nan where unknown; optimum is for resume();
     rival is another optimum that the data leave about as likely, where one was looked for
     and found; averaged is the mean of the whole posterior, where that was worked out (see
-    `marginal`).  All are of a constant soil until `present` moves them to the window's end.
+    `marginal`); bend: cost and evidence are those on a way that bends (see `bends`).
+    All are of a constant soil until `present` moves them to the window's end.
     """
 
     belief: Belief
@@ -98,6 +105,7 @@ class Fit:
     converged: bool
     rival: Rival | None = None
     averaged: Belief | None = None
+    bend: Bend | None = None
 
     @property
     def posterior(self) -> Posterior:
@@ -277,12 +285,13 @@ def continued(
     gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
     with np.errstate(all="ignore"):
         if start.near:
-            fit = _settled(fitting, fitting.start(start.soil, gains=gains), MAX_RESUMED, refusals=1, hopeless=hopeless)
-            if fit is not None and fit.converged:
+            place = fitting.near(start.soil, gains, start.latents)
+            fit = _settled(fitting, place, MAX_RESUMED, refusals=1, hopeless=hopeless, in_all=MAX_ASTRAY)
+            if fit is not None and (fit.converged or fit.chi2 < PLAUSIBLE):
                 return fit
         moving = Fitting(problem, prior, before, first=first)
         near = approach(moving, start.soil, most, LITTLE, gains, hopeless=AS_MEASURED * hopeless)
-        return None if near is None else _settled(fitting, near, most, hopeless=hopeless)
+        return None if near is None else _settled(fitting, near, most, hopeless=hopeless, in_all=MAX_ASTRAY)
 
 
 @dataclass(frozen=True, slots=True)
@@ -328,9 +337,10 @@ def _settled(
     before: float = 0.0,
     refusals: int = MAX_REFUSED,
     hopeless: float = np.inf,
+    in_all: float = np.inf,
 ) -> Fit | None:
     """Where a descent from a place near the optimum ends, as settle(), with what is known there."""
-    end = settle(fitting, near, most, left_over, before, refusals, hopeless)
+    end = settle(fitting, near, most, left_over, before, refusals, hopeless, in_all)
     beliefs = None if end is None else fitting.beliefs(end.place, end.point, end.last.soil)
     if end is None or beliefs is None:
         return None

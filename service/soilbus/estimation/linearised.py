@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,3 +89,10 @@ class Optimum:
     gains: Array
     latents: Latents
     at: Linearised
+
+
+class Bend(NamedTuple):
+    """Optimum of a window before its data were freed of a bending way, and how large bends (N, K) may be beforehand."""
+
+    optimum: Optimum
+    bends: Array

@@ -6,6 +6,13 @@ which k_c rises and falls again while n only falls.  The covariance at its top s
 of where it leads.  So n is held at several values in turn, everything else is fitted, and
 what these fits say is averaged with their probabilities (nested Laplace approximations:
 Rue, Martino & Chopin 2009, J. R. Statist. Soc. B 71:319, sect. 3).
+
+Those probabilities count the volume of what the data leave open: where k_c may be next to
+nothing there is much of it, on the logarithm's scale, and soils with much k_c seem less likely than they
+fit.  That makes the best mean, but intervals about it that exclude such soils too often when one of
+them is there.  So the spread about the mean is that of the confidence distribution along n: the signed
+root of the profile likelihood's fall is standard normal (Barndorff-Nielsen & Cox, Inference
+and Asymptotics, 1994, sect. 3.4), for one soil as often as for another.
 """
 
 from __future__ import annotations
@@ -18,10 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
-from soilbus.estimation.coordinates import BOUND, TYPICAL_DEPTH, Coordinates
+from soilbus.estimation.coordinates import BOUND, Coordinates
 from soilbus.estimation.denoised import DenoisedProblem
 from soilbus.estimation.gauss_newton import Fit, fit_window, settled
-from soilbus.estimation.normal_equations import Fitting, Place
+from soilbus.estimation.normal_equations import Fitting, Place, solved
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.terra.wheel import Soil
@@ -41,6 +48,7 @@ UNLIKELY = 9.0
 """-2 log of a probability, relative to the greatest, where the ridge has ended."""
 FINE = 400
 """Values of n that are averaged."""
+_SOIL = len(PARAMETERS)
 _K_C, _K_PHI, _N = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n"))
 
 
@@ -55,6 +63,11 @@ class Node(NamedTuple):
     def unlikelihood(self) -> float:
         """-2 log of the posterior density of n."""
         return self.fit.evidence + self.known
+
+    @property
+    def misfit(self) -> float:
+        """-2 log of the profile likelihood of n: of the likeliest soil with this n."""
+        return self.fit.cost + self.known
 
 
 class Ridge(NamedTuple):
@@ -82,7 +95,8 @@ def with_whole(problem: WindowProblem, prior: SoilPrior, before: Belief, found: 
         if along is None:
             return found
         coordinates = Coordinates(prior, float(problem.rig.width.mean()))
-        whole = _averaged(along.nodes, coordinates, before) if len(along.nodes) > 2 else along.top.belief
+        told = told_of_k_c(along, prior, before) if len(along.nodes) > 2 else None
+        whole = along.top.belief if told is None else _averaged(along.nodes, told, coordinates, before)
     finite = np.isfinite(whole.soil).all() and np.isfinite(whole.covariance).all()
     if not finite or found.rival is not None:  # beside its rival an optimum is told as it was found
         return replace(found, averaged=whole) if finite else found
@@ -109,11 +123,13 @@ def ridge(problem: WindowProblem, prior: SoilPrior, before: Belief, found: Fit) 
         return None
     if not prior.log_std[[_K_C, _K_PHI, _N]].all() or np.ptp(problem.rig.width) == 0.0:
         return Ridge(calm, top, [])
-    first = _held(calm, prior, before, top, math.log(top.mode.soil[_N]))
+    first = _held(calm, prior, before, top, math.log(top.mode.soil[_N]), None)
     if first is None:
         return Ridge(calm, top, [])
     step = min(math.sqrt(top.mode.covariance[_N, _N]), LONGEST)
-    down, up = (_along(calm, prior, before, first, way, step) for way in (-1.0, 1.0))
+    covariance = top.mode.covariance
+    slope = covariance[:, _N] / covariance[_N, _N]
+    down, up = (_along(calm, prior, before, first, slope, way, step) for way in (-1.0, 1.0))
     return Ridge(calm, top, [*reversed(down), first, *up])
 
 
@@ -127,40 +143,72 @@ def _converged(fitting: Fitting, near: Place) -> Fit | None:
     return None
 
 
-def _along(problem: WindowProblem, prior: SoilPrior, before: Belief, top: Node, way: float, step: float) -> list[Node]:
+def _along(
+    problem: WindowProblem, prior: SoilPrior, before: Belief, top: Node, slope: Array, way: float, step: float
+) -> list[Node]:
+    """Nodes to one side; slope (6 + G,) is how logarithms of the soil and gains change with that of n at the top."""
     nodes: list[Node] = []
     last, least = top, top.unlikelihood
     for _ in range(MAX_STEPS):
-        node = _held(problem, prior, before, last.fit, last.u + way * step)
+        node = _held(problem, prior, before, last.fit, last.u + way * step, slope)
         if node is None:
             break
         nodes.append(node)
+        slope = (_place(node.fit) - _place(last.fit)) / (node.u - last.u)
         last, least, step = node, min(least, node.unlikelihood), step * GROWTH
         if node.unlikelihood > least + UNLIKELY:
             break
     return nodes
 
 
-def _held(problem: WindowProblem, prior: SoilPrior, before: Belief, near: Fit, u: float) -> Node | None:
-    """A fit with n held, from the optimum of one nearby."""
-    soil, n = near.optimum.soil.copy(), math.exp(u)
+def _place(fit: Fit) -> Array:
+    """Logarithms of the soil and gains (6 + G,) of an optimum."""
+    return np.concatenate([np.log(fit.optimum.soil), fit.optimum.gains])
+
+
+def _held(
+    problem: WindowProblem, prior: SoilPrior, before: Belief, near: Fit, u: float, slope: Array | None
+) -> Node | None:
+    """A fit with n held, from the optimum of one nearby, moved along the slope (6 + G,) of the ridge there."""
+    soil, gains, n = near.optimum.soil.copy(), near.optimum.gains, math.exp(u)
     if abs(u - math.log(prior.median[_N])) > BOUND * prior.log_std[_N]:
         return None
-    stiffer = TYPICAL_DEPTH ** (soil[_N] - n)
+    if slope is not None:
+        moved = _place(near) + slope * (u - math.log(soil[_N]))
+        free = prior.log_std > 0.0
+        soil[free] = Coordinates(prior, float(problem.rig.width.mean())).within(np.exp(moved[:_SOIL]))[free]
+        gains = problem.allowed(moved[_SOIL:])
     soil[_N] = n
-    soil[_K_C] *= stiffer if prior.log_std[_K_C] > 0.0 else 1.0
-    soil[_K_PHI] *= stiffer
     deviation = (u - math.log(before.soil[_N])) / math.sqrt(before.covariance[_N, _N])
     median, log_std = prior.median.copy(), prior.log_std.copy()
     median[_N], log_std[_N] = n, 0.0
     fitting = Fitting(problem, SoilPrior(median, log_std), before.given(_N, u))
-    latents = problem.carried(near.optimum.latents, Soil(*soil.tolist()), near.optimum.gains)
-    fit = _converged(fitting, Place(soil, near.optimum.gains, latents, np.inf, 1))
+    latents = problem.carried(near.optimum.latents, Soil(*soil.tolist()), gains)
+    fit = _converged(fitting, Place(soil, gains, latents, np.inf, 1))
     return None if fit is None else Node(u, fit, deviation**2)
 
 
-def _averaged(nodes: list[Node], coordinates: Coordinates, before: Belief) -> Belief:
-    """Mean and covariance of the mixture of all nodes and of what lies between them, by straight lines."""
+def told_of_k_c(along: Ridge, prior: SoilPrior, before: Belief) -> Array | None:
+    """Variance (nodes,) of log k_c that a window on the soil of each node could have at best; None: not to be told."""
+    fitting = Fitting(along.problem, prior, before)
+    variance = []
+    for node in along.nodes:
+        place = Place(node.fit.optimum.soil, node.fit.optimum.gains, node.fit.optimum.latents, np.inf, 1)
+        point = fitting.with_before(place, node.fit.optimum.at)
+        inverse = None if point is None else solved(point.information, point.gradient)
+        if inverse is None:
+            return None
+        variance.append(inverse[1][_K_C, _K_C])
+    return np.array(variance)
+
+
+def _averaged(nodes: list[Node], told: Array, coordinates: Coordinates, before: Belief) -> Belief:
+    """Mean of the mixture of all nodes and of what lies between them, by straight lines, and its spread about that.
+
+    But for k_c, of which soils of the ridge let a window tell as unlike as by a factor of ten: there it is
+    the soil whose mean square error is least in units of the variance that each of them would leave,
+    `told` (nodes,).
+    """
     n, free = len(PARAMETERS), coordinates.free
     active = n + np.flatnonzero(np.diag(before.covariance)[n:] > 0.0)
     beliefs = [node.fit.belief for node in nodes]
@@ -170,16 +218,20 @@ def _averaged(nodes: list[Node], coordinates: Coordinates, before: Belief) -> Be
     along = np.array([np.interp(fine, u, column) for column in place.T])
     own = np.array([_in_coordinates(b.covariance, coordinates.log_directions(b.soil), free, active) for b in beliefs])
     share = np.array([np.interp(fine, u, one) for one in np.eye(len(u))])
-    weight = density(u, np.array([node.unlikelihood for node in nodes]), fine)
-    mean = along @ weight
+    probable = density(u, np.array([node.unlikelihood for node in nodes]), fine)
+    weight = confidence(u, np.array([node.misfit for node in nodes]), fine)
+    mean = along @ probable
+    of_k_c = probable / np.interp(fine, u, told)
+    mean[_K_C] = along[_K_C] @ of_k_c / of_k_c.sum()
     off = along - mean[:, None]
-    covariance = np.tensordot(share @ weight, own, axes=1) + (off * weight) @ off.T
+    spread = longer_side(fine - fine @ probable, weight) * (off * weight) @ off.T
+    covariance = np.tensordot(share @ weight, own, axes=1) + spread
     soil, gains = coordinates.soil_at(mean[: len(free)]), beliefs[0].gains.copy()
     gains[active - n] = mean[len(free) :]
-    spread = np.zeros((n + len(gains), len(mean)))
-    spread[:n, : len(free)] = coordinates.log_directions(soil)
-    spread[active, len(free) + np.arange(len(active))] = 1.0
-    return Belief(soil, gains, spread @ covariance @ spread.T)
+    by_coordinates = np.zeros((n + len(gains), len(mean)))
+    by_coordinates[:n, : len(free)] = coordinates.log_directions(soil)
+    by_coordinates[active, len(free) + np.arange(len(active))] = 1.0
+    return Belief(soil, gains, by_coordinates @ covariance @ by_coordinates.T)
 
 
 def _in_coordinates(covariance: Array, directions: Array, free: Indices, active: Indices) -> Array:
@@ -192,7 +244,29 @@ def _in_coordinates(covariance: Array, directions: Array, free: Indices, active:
 
 def density(u: Array, value: Array, fine: Array) -> Array:
     """Share of each of the fine places in a density that is -2 log known at u: its roots lie on straight lines."""
+    density = np.exp(-0.5 * _signed_root(u, value, fine) ** 2)
+    return np.asarray(density / density.sum())
+
+
+def confidence(u: Array, value: Array, fine: Array) -> Array:
+    """Share of each of the fine places in the confidence distribution of a profile that is -2 log known at u."""
+    root = _signed_root(u, value, fine)
+    density = np.exp(-0.5 * root**2) * np.maximum(np.gradient(root), 0.0)
+    return np.asarray(density / density.sum())
+
+
+def longer_side(off: Array, weight: Array) -> float:
+    """Mean square on the longer side of places (M,) so far off a centre, of these shares, over that of all; 1 at least.
+
+    What is said is a mean and one standard deviation: it must hold on either side.
+    """
+    square = float(weight @ off**2)
+    sides = [weight * side for side in (off > 0.0, off < 0.0) if (weight * side).any()]
+    return max([1.0, *(float(side @ off**2 / side.sum()) / square for side in sides)])
+
+
+def _signed_root(u: Array, value: Array, fine: Array) -> Array:
+    """Root of the rise above the least value, negative before it, by straight lines between those at u."""
     root = np.sqrt(np.maximum(value - value.min(), 0.0))
     sign = np.where(np.arange(len(u)) < int(np.argmin(value)), -1.0, 1.0)
-    density = np.exp(-0.5 * np.interp(fine, u, sign * root) ** 2)
-    return np.asarray(density / density.sum())
+    return np.asarray(np.interp(fine, u, sign * root))

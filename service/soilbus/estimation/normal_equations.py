@@ -129,6 +129,12 @@ class Fitting:
         gains = self.before.gains if gains is None else gains
         return Place(soil, gains, self.problem.start(Soil(*soil.tolist()), guess, gains), np.inf, 0)
 
+    def near(self, soil: Array, gains: Array, latents: Latents | None) -> Place:
+        """A soil with gains (G,) and the latents foreseen there where they are of these instants, else as measured."""
+        if latents is None or latents.load.shape != (self.problem.n, self.problem.n_wheels):
+            return self.start(soil, gains=gains)
+        return Place(soil, gains, latents, np.inf, 0)
+
     def restarted(self, place: Place, point: Point, step: Array) -> Place:
         """The place after a step (F + A,) with latents as measured, as they are at this place already."""
         free, gains = len(self.free), place.gains.copy()

@@ -11,17 +11,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from enum import StrEnum
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
+from soilbus.estimation.bends import bending, on_the_way, straightened
 from soilbus.estimation.completed import CompletedProblem
 from soilbus.estimation.coordinates import Coordinates
-from soilbus.estimation.curve import with_curve
+from soilbus.estimation.curve import with_curve, without_curve
 from soilbus.estimation.effect_parameters import Free
 from soilbus.estimation.gauss_newton import Fit, Foreseen, fit_window, foreseen, resume
 from soilbus.estimation.marginal import with_whole
@@ -31,6 +31,7 @@ from soilbus.estimation.present import at_present
 from soilbus.estimation.recall import is_borne_out, recalled
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.soil_change import Crossing, suspicion, without_crossing
+from soilbus.estimation.tracked import Ground, Settings, Tracked
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.soils import SOILS
@@ -38,8 +39,8 @@ from soilbus.terra.wheel import WheelModel
 
 Array = NDArray[np.float64]
 
-MIN_ROWS, MIN_NEW_ROWS = 60, 30
-"""Residuals that a window needs, and those that each of two soils needs to be told apart."""
+MIN_NEW_ROWS = 30
+"""Residuals that each of two soils needs to be told apart."""
 ALARM = 12.0
 """Log likelihood ratio from which another soil is looked for."""
 CHANGED = 20.0
@@ -74,49 +75,6 @@ WHEELBASE = 2.0
 """Length [m] that stands for the wheelbase of a rig that has none."""
 _SAME_TIME = 1e-3
 _SOIL = len(PARAMETERS)
-
-
-class Ground(StrEnum):
-    """What the data of a window are of."""
-
-    SAME = "same"
-    NEW = "new"
-    """Another soil than before, since less than a window: only its own data count."""
-    CHANGING = "changing"
-    """Too little of another soil is in to tell it; the estimate is of the one before."""
-    SETTLING = "settling"
-    """Another soil than before, whose border may go on: its data do not agree, or are of too little time."""
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """What the tracker needs to be told; times s, speeds m/s.
-
-    drift: sd of the logarithm of each soil coordinate after one window; it grows with the
-    square root of time.  min_rows: residuals below which a window is not fitted.
-    """
-
-    window: float
-    min_speed: float
-    max_turn: float
-    max_chi2: float
-    drift: float
-    min_rows: int = MIN_ROWS
-
-
-@dataclass(frozen=True, slots=True)
-class Tracked:
-    """A window's fit (None without), whether the model fails to describe its data, and of which ground they are.
-
-    since [s] is where the data that count begin; standstill and turning count instants left out.
-    """
-
-    fit: Fit | None
-    mismatch: bool
-    ground: Ground
-    since: float
-    standstill: int = 0
-    turning: int = 0
 
 
 class Alarm(NamedTuple):
@@ -193,7 +151,7 @@ class Tracker:
         last = self._fit
         changed = None
         if last is None or last.rival is not None:
-            fitting, fit = self._afresh(problem, before)
+            fitting, fit = self._afresh(window, problem, before)
             if self.mismatch(fit) and self._alarm is not None:
                 changed = self._another_soil(window, self._alarm, fit, before, None)
         else:
@@ -201,13 +159,14 @@ class Tracker:
             fitting, fit = ahead.fitting, resume(ahead)
             if fit is None or not fit.converged:  # a long valley is no sign of another soil
                 fit = fit_window(problem, self._here, before)
+            fitting, fit = self._on_the_way(window, fitting, fit)
             self._alarm = self._alarm_in(window, ahead, last, fit, end - since)
             if self._alarm is not None:
                 changed = self._another_soil(window, self._alarm, fit, before, last)
             if changed is None and self.mismatch(fit):
-                fitting, fit = self._afresh(problem, before)
+                fitting, fit = self._afresh(window, problem, before)
         if changed is not None:
-            return self._remembered(replace(changed, standstill=left_out[0], turning=left_out[1]), end)
+            return self._remembered(replace(changed, standstill=left_out[0], turning=left_out[1]), end, problem)
         new = new or self._crossing is not crossing
         if new and fit is not None and self._unsettled(fit):
             fitting, fit = self._past_the_border(window, fitting, fit)
@@ -216,7 +175,7 @@ class Tracker:
             since, ground = max(self._crossing.end, start), self._new_ground(self._crossing, fit, end)
         else:
             ground = Ground.SAME
-        return self._remembered(Tracked(fit, self.mismatch(fit), ground, since, *left_out), end)
+        return self._remembered(Tracked(fit, self.mismatch(fit), ground, since, *left_out), end, problem)
 
     def _alarm_in(self, window: Window, ahead: Foreseen, last: Fit, fit: Fit | None, filled: float) -> Alarm | None:
         """The first sign of another soil in a window of which the present one fills so much [s], if there is any.
@@ -228,6 +187,8 @@ class Tracker:
             return self._alarm
         if self._good_until <= end - length or filled <= GRACE * length:
             return None
+        if fit is not None and fit.bend and not self.mismatch(fit):
+            return None  # a curve is why
         t = ahead.fitting.problem.t
         first = int(np.searchsorted(t, float(last.optimum.t[-1]) - LOOK_BACK * length))
         place = replace(last.whole, soil=last.optimum.soil, gains=last.optimum.gains)
@@ -239,9 +200,9 @@ class Tracker:
         near = window.ground_speed[(window.t >= begin - 1.0) & (window.t <= begin)]
         return Alarm(begin, max(float(np.nanmean(near)), self.settings.min_speed))
 
-    def _afresh(self, problem: WindowProblem, before: Belief) -> tuple[Fitting, Fit | None]:
+    def _afresh(self, window: Window, problem: WindowProblem, before: Belief) -> tuple[Fitting, Fit | None]:
         """A fit that starts anywhere; what was known of the soil counts only where it agrees with the data."""
-        fit = fit_window(problem, self._here, before)
+        fitting, fit = self._as_one(window, problem, before)
         if self.mismatch(fit) and self._beliefs:
             there = elsewhere(self.prior)
             known = before.of_another_soil(there)
@@ -250,7 +211,7 @@ class Tracker:
                 begin = float(problem.t[0])
                 self._crossing, self._here = Crossing(begin, begin, 0.0), there
                 return Fitting(problem, there, known), other
-        return Fitting(problem, self._here, before), fit
+        return fitting, fit
 
     def _told(self, fitting: Fitting, fit: Fit | None) -> Fit | None:
         """A fit that is going to be reported: with the whole posterior, of the soil at the window's end."""
@@ -269,10 +230,12 @@ class Tracker:
         deviations = TRUST_AGAIN if self._distrusted else TRUST
         return self.settings.max_chi2 + deviations * math.sqrt(2.0 / max(fit.rows, 1))
 
-    def _remembered(self, tracked: Tracked, end: float) -> Tracked:
+    def _remembered(self, tracked: Tracked, end: float, problem: WindowProblem) -> Tracked:
         """The same, taken note of; a failed or bad fit leaves what is known alone."""
         fit = tracked.fit
-        self._fit = fit if fit is not None and fit.converged else None
+        self._fit = None
+        if fit is not None and fit.converged:  # the next window has all its bends again
+            self._fit = fit if fit.bend is None else replace(fit, optimum=fit.bend.optimum, bend=None)
         if fit is not None:
             self._distrusted = tracked.mismatch
             self._in_border = tracked.mismatch and tracked.ground is Ground.SETTLING
@@ -280,7 +243,7 @@ class Tracker:
             self._good_until = end
             learned = end - tracked.since >= LEARNED * self.settings.window and fit.is_gaussian
             if learned and tracked.ground in (Ground.SAME, Ground.NEW):
-                self._beliefs.append((end, fit.whole))
+                self._beliefs.append((end, without_curve(fit.whole, problem)))
         return tracked
 
     def _known_at(self, t: float, problem: WindowProblem) -> Belief:
@@ -348,7 +311,7 @@ class Tracker:
             new = fit_window(second, there, known)
             if new is None or self.mismatch(new):
                 continue
-            if old is not None and not self._likelier(old, new, fit_window(self._problem(apart), self._here, before)):
+            if old is not None and not self._likelier(old, new, self._as_one(apart, self._problem(apart), before)[1]):
                 return None
             self._crossing, self._here = crossing, there
             told = self._told(Fitting(second, there, known), new)
@@ -398,6 +361,18 @@ class Tracker:
         over = sum(end <= start for end in ends)
         apart = 0.0 if chassis is None else lag
         return [Crossing(alarm.t - _SAME_TIME, end, apart) for end in ends[max(over - 1, 0) :]]
+
+    def _as_one(self, window: Window, problem: WindowProblem, before: Belief) -> tuple[Fitting, Fit | None]:
+        """A window as one soil, this one, from any start."""
+        fit = fit_window(problem, self._here, before)
+        return self._on_the_way(window, Fitting(problem, self._here, before), fit)
+
+    def _on_the_way(self, window: Window, fitting: Fitting, fit: Fit | None) -> tuple[Fitting, Fit | None]:
+        """A fit of a window freed of the bends of its way, where it has any."""
+        way = bending(fitting, fit)
+        if fit is None or way is None:
+            return fitting, fit
+        return on_the_way(fitting, fit, way, self._problem(straightened(window, self.rig, way)))
 
     def _likelier(self, old: Fit, new: Fit, one: Fit | None) -> bool:
         """Whether two soils explain much better what one, of the same data, explains."""

@@ -353,4 +353,9 @@ def pull_asked(window: Window, chassis: Chassis) -> Array:
 
 def pull_given(window: Window, chassis: Chassis) -> Array:
     """As `pull_asked`, with what the wheels give to speed up where the acceleration is known."""
-    return pull_asked(window, chassis) + chassis.mass * np.nan_to_num(window.acceleration)
+    return pull_asked(window, chassis) + inertia_of(window, chassis)
+
+
+def inertia_of(window: Window, chassis: Chassis) -> Array:
+    """Force [N] (N,) that speeds the vehicle up; none where the acceleration is not known."""
+    return np.asarray(chassis.mass * np.nan_to_num(window.acceleration))

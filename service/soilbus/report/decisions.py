@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 from soilbus.report.table import table
 from soilbus.simulator.bogging_trials import ENOUGH_TIME, ENOUGH_WAY, FELT, REACTION, WarningFigures
 from soilbus.simulator.draft_trials import SPREAD, DraftFigures
+from soilbus.simulator.firm_drives import EASY, HARD
 from soilbus.simulator.verdict_trials import Bin, Reliability
 
 MAX_ERROR = 0.05
 COVERAGE = (0.90, 0.98)
+TWO_SIDED = 1.96
+"""Standard deviations either side of the mean that hold 95 % of a normal distribution."""
 
 
 def decisions_report(drafts: Sequence[DraftFigures], calls: Reliability, warnings: Sequence[WarningFigures]) -> str:
@@ -53,9 +57,47 @@ def _warning_section(warnings: Sequence[WarningFigures]) -> Iterator[str]:
     yield "Target: all that can be foreseen in time.  Too sudden: from where the ground has lost"
     yield f"{100.0 * FELT:.0f} % of the largest draft, slip passes in less than that and {REACTION:g} s to react."
     yield ""
-    of_firm = ("without a bogging", "hours", "false warnings")
-    yield table(of_firm, [(f.kind, f"{f.hours:.2f}", str(f.false)) for f in warnings if f.hours])
-    yield "Target: at most one false warning an hour."
+    firm = [found for found in warnings if found.hours]
+    yield table(
+        ("without a bogging", "hours", "false warnings"), [(f.kind, f"{f.hours:.2f}", str(f.false)) for f in firm]
+    )
+    for name, pooled in _pooled(firm).items():
+        yield (
+            f"{name.capitalize()} drives: {pooled.false} false in {pooled.hours:.2f} h, {pooled.rate:.2f} an hour "
+            f"(95 % interval {pooled.least:.2f} to {pooled.most:.2f})."
+        )
+    yield "Target: at most one false warning an hour, on hard drives alone too."
+
+
+class _Pooled(NamedTuple):
+    """False warnings of some kinds together; rate [1/h] and its 95 % interval."""
+
+    hours: float
+    false: int
+    rate: float
+    least: float
+    most: float
+
+
+def _pooled(firm: Sequence[WarningFigures]) -> dict[str, _Pooled]:
+    """Easy and hard drives, of which there are any."""
+    out = {}
+    for name, kinds in {"easy": (EASY,), "hard": HARD}.items():
+        found = [f for f in firm if f.kind in kinds]
+        hours, false = sum(f.hours for f in found), sum(f.false for f in found)
+        if hours:
+            least, most = poisson_interval(false)
+            out[name] = _Pooled(hours, false, false / hours, least / hours, most / hours)
+    return out
+
+
+def poisson_interval(count: int) -> tuple[float, float]:
+    """95 % interval of what a count is expected to be (Byar's approximation: Breslow and Day 1987, eq. 2.9)."""
+
+    def bound(n: int, z: float) -> float:
+        return n * (1.0 - 1.0 / (9.0 * n) + z / (3.0 * math.sqrt(n))) ** 3 if n else 0.0
+
+    return bound(count, -TWO_SIDED), bound(count + 1, TWO_SIDED)
 
 
 def _bogging_row(found: WarningFigures) -> tuple[str, ...]:
@@ -127,4 +169,5 @@ def as_json(
             }
             for w in warnings
         },
+        "false_warnings": {name: found._asdict() for name, found in _pooled(warnings).items()},
     }  # fmt: skip

@@ -13,9 +13,9 @@ MAX_RMS = 1.15
 COVERAGE = (0.93, 0.97)
 MAX_CHI2_OFF = 0.03
 ATTAINABLE = """Each quantity: what the mean of the exact posterior attains on these windows (RMS error over the
-Cramér-Rao bound), and our RMS error over that.  No estimate does better on average over the soils
-that the windows and what was known allow: where the first figure is above 1.15, the bound, which
-knows the true soil only, tells too little.  samples: median number of effective ones.
+Cramér-Rao bound), and our RMS error over that.  No estimate has a smaller mean square error on average
+over the soils that the windows and what was known allow; but one that is weighed by how well each of
+these soils would be told, as ours of k_c, may be nearer to the bound.  samples: median number of effective ones.
 """
 
 

@@ -15,18 +15,18 @@ from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.capability.assessment import OverSlip, assess
 from soilbus.capability.immobilisation import Alert, Moment, Watch, moments, watched
 from soilbus.config import Config
-from soilbus.estimation.tracker import Ground, Settings, Tracker
+from soilbus.estimation.tracked import Ground, Settings
+from soilbus.estimation.tracker import Tracker
 from soilbus.estimation.window import BinStore, Rig
-from soilbus.simulator.boggings import FIRM_DRIVE, KINDS, Trouble, bogging, firm_ground
+from soilbus.simulator.boggings import KINDS, Trouble, bogging
 from soilbus.simulator.drive import drive
+from soilbus.simulator.firm_drives import EASY, FIRM_DRIVE, FIRM_KINDS, HARD, firm_ground
 from soilbus.simulator.monte_carlo import Each
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Swing
 
 Array = NDArray[np.float64]
 
-FIRM, HARSH = "firm", "harsh"
-"""Drives without a bogging: easy, and hard on every trend."""
 LOOK = 0.1
 """Time [s] between two looks, as in the service."""
 ENOUGH_TIME, ENOUGH_WAY = 3.0, 3.0
@@ -40,7 +40,7 @@ EARLIEST = 5.0
 
 
 class Task(NamedTuple):
-    """One drive: a kind of boggings.KINDS, or FIRM or HARSH."""
+    """One drive: a kind of boggings.KINDS or firm_drives.FIRM_KINDS."""
 
     config: Config
     kind: str
@@ -122,8 +122,8 @@ def observed(task: Task) -> Observation:
     """Drive and estimate."""
     config, rig = task.config, rig_of(task.config)
     rng = np.random.default_rng([task.seed, 3])
-    if task.kind in (FIRM, HARSH):
-        trouble = Trouble(firm_ground(config, task.kind == HARSH, rng))
+    if task.kind in FIRM_KINDS:
+        trouble = Trouble(firm_ground(config, task.kind, rng))
     else:
         trouble = bogging(config, task.kind, rng)
     recording = simulate(config, trouble.scenario, task.seed, trouble.effects)
@@ -178,7 +178,7 @@ def watch(seen: Observation) -> tuple[Array, NDArray[np.bool_]]:
     for moment in seen.moments:
         while due is not None and moment.t >= due[0]:
             curve, due = due[1], next(curves, None)
-        state = watched(state, *moment, curve)
+        state = watched(state, moment.t, moment.slip, moment.pull, curve, moment.inertia)
         out.append((moment.t, state.warning is Alert.IMMOBILISATION))
     t, warned = np.array(out, float).reshape(-1, 2).T
     return t, warned > 0.5
@@ -216,18 +216,20 @@ def _curve(tracker: Tracker, store: BinStore, end: float, config: Config, rig: R
 def warning_trials(
     config: Config, boggings: int, hours: float, seed: int, each: Each = map
 ) -> tuple[WarningFigures, ...]:
-    """Figures of so many boggings, evenly of all kinds, and of so many hours on firm ground, half of them harsh.
+    """Figures of so many boggings, evenly of all kinds, and of so many hours without one, half of them hard.
 
     The same seed gives the same drives.  Raises SimulationError where the vehicle cannot be driven.
     """
     firm = math.ceil(3600.0 * hours / (FIRM_DRIVE - config.estimator.window))
-    kinds = [KINDS[i % len(KINDS)] for i in range(boggings)] + [(FIRM, HARSH)[i % 2] for i in range(firm)]
+    kinds = [KINDS[i % len(KINDS)] for i in range(boggings)] + [
+        HARD[i // 2 % len(HARD)] if i % 2 else EASY for i in range(firm)
+    ]
     key = np.random.SeedSequence([seed, zlib.crc32(b"warnings")])
     seeds = key.generate_state(len(kinds)).tolist()
     trials = list(each(trial, [Task(config, kind, s) for kind, s in zip(kinds, seeds, strict=True)]))
     return tuple(
         figures(kind, found)
-        for kind in (*KINDS, FIRM, HARSH)
+        for kind in (*KINDS, *FIRM_KINDS)
         if (found := [t for t in trials if t.kind == kind])
     )  # fmt: skip
 
@@ -236,7 +238,7 @@ def figures(kind: str, trials: Sequence[WarningTrial]) -> WarningFigures:
     """The figures of some trials of one kind: boggings are those whose slip passed."""
     bogged = [t for t in trials if np.isfinite(t.lead)]
     asked = [t for t in bogged if not t.sudden]
-    rest = [t for t in trials if t.kind in (FIRM, HARSH)]
+    rest = [t for t in trials if t.kind in FIRM_KINDS]
     leads = np.array([t.lead for t in asked])
     delays = [t.possible - t.lead for t in bogged if t.sudden]
     return WarningFigures(

@@ -1,4 +1,4 @@
-"""Drives that end with the vehicle stuck, in the ways in which fields do that, and drives on firm ground."""
+"""Drives that end with the vehicle stuck, in the ways in which fields do that."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from soilbus.assembly import rig_of
 from soilbus.config import Config
 from soilbus.simulator.draft_trials import true_largest_draft
 from soilbus.simulator.drive import SimulationError, drive
-from soilbus.simulator.scenario import Patch, Profile, Scenario, Swing
+from soilbus.simulator.scenario import Patch, Profile, Scenario, Swing, realise
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active
 from soilbus.terra.soils import soil_named
@@ -22,11 +22,13 @@ FIRM = ("rubicon_sandy_loam_43", "north_gower_clayey_loam_46", "upland_sandy_loa
 OUTGROWN = FIRM[:2] + FIRM[3:]
 """Where the reference tractor's motors can turn the wheels into slip: on the others a draft only stalls them."""
 SOFT = ("wet_clay", "clayey_soil_38", "lean_clay_32", "heavy_clay_40")
-KINDS = ("softening", "patch", "draft", "grade", "digging")
+KINDS = ("softening", "patch", "draft", "grade", "digging", "uneven_softening", "uneven_draft")
 """Ground that softens over many metres; a soft patch with an edge; a draft and a grade that outgrow firm ground;
-wheels that dig themselves in at constant throttle."""
-BOGGING, FIRM_DRIVE = 60.0, 300.0
+wheels that dig themselves in at constant throttle; ground that softens, or a draft that grows, as the draft swings."""
+BOGGING = 60.0
 """Length of a drive [s]."""
+FAST = (0.1, 0.4)
+"""Frequencies [Hz] between which a draft swings fast."""
 SMOOTHED = 0.5
 """Time constant [s] of the ground speed behind the slip, at constant throttle."""
 LEAST_SPEED = 0.3
@@ -44,18 +46,18 @@ class Trouble(NamedTuple):
 
 def bogging(config: Config, kind: str, rng: np.random.Generator) -> Trouble:
     """A drive of one of KINDS that is meant to end stuck; SimulationError where the vehicle cannot be driven."""
-    firm = str(rng.choice(OUTGROWN if kind in ("draft", "grade") else FIRM))
+    firm = str(rng.choice(OUTGROWN if kind in ("draft", "grade", "uneven_draft") else FIRM))
     most = largest_draft(config, firm)
     start = rng.uniform(22.0, 32.0)
-    if kind in ("softening", "patch"):
-        length = rng.uniform(*((15.0, 40.0) if kind == "softening" else (2.0, 8.0)))
+    if kind in ("softening", "patch", "uneven_softening"):
+        length = rng.uniform(*((2.0, 8.0) if kind == "patch" else (15.0, 40.0)))
         soils = (Patch(0.0, firm), Patch(start, str(rng.choice(SOFT))))
         draft = _about(rng.uniform(0.35, 0.55), most)
+        if kind == "uneven_softening":
+            draft = Swing(0.2 * most, 0.6 * most, *FAST)
         return Trouble(Scenario(BOGGING, soils, draft=draft, lift_slip=NO_LIFT, transition=length))
-    if kind == "draft":
-        begin = rng.uniform(12.0, 20.0)
-        shares = rng.uniform((0.3, 1.1), (0.5, 1.3))
-        draft_of = Profile((begin, begin + rng.uniform(20.0, 40.0)), (shares * most).tolist())
+    if kind in ("draft", "uneven_draft"):
+        draft_of = _growing(rng, most, 0.0 if kind == "draft" else 0.15)
         return Trouble(Scenario(BOGGING, (Patch(0.0, firm),), draft=draft_of, lift_slip=NO_LIFT))
     if kind == "grade":
         share, length = rng.uniform(0.35, 0.55), rng.uniform(15.0, 40.0)
@@ -69,27 +71,23 @@ def bogging(config: Config, kind: str, rng: np.random.Generator) -> Trouble:
     raise ValueError(f"no kind of bogging is called {kind}; known: {', '.join(KINDS)}")
 
 
-def firm_ground(config: Config, harsh: bool, rng: np.random.Generator) -> Scenario:
-    """A drive on firm ground with a draft that it holds; harsh: fast, uneven, up and down, near the limit at times."""
-    firm = str(rng.choice(FIRM))
-    most = largest_draft(config, firm)
-    if not harsh:
-        return Scenario(
-            FIRM_DRIVE, (Patch(0.0, firm),), draft=Swing(0.2 * most, 0.65 * most), lift_slip=NO_LIFT
-        )  # fmt: skip
-    knots = np.arange(0.0, 3.0 * FIRM_DRIVE, 25.0)
-    slope = tuple(zip(knots.tolist(), rng.uniform(-0.04, 0.04, len(knots)).tolist(), strict=True))
-    return Scenario(
-        FIRM_DRIVE, (Patch(0.0, firm),), speed=Swing(0.8, 2.5), draft=Swing(0.1 * most, 0.65 * most, 0.1, 0.4),
-        lift_slip=NO_LIFT, side_shift=Swing(-0.4, 0.4), slip_spread=0.03, slope=slope,
-    )  # fmt: skip
-
-
 def largest_draft(config: Config, soil: str) -> float:
     """Largest draft [N] on a soil of the table within the allowed slip, whatever the motors can give."""
     rig = rig_of(config)
     no_limit = np.full(len(rig.radius), np.nan)
     return true_largest_draft(soil_named(soil), rig, no_limit, config.traversability.max_slip, WheelModel())
+
+
+def _growing(rng: np.random.Generator, most: float, swing: float) -> Profile:
+    """A draft that grows beyond the largest one, most [N]; swing is the share of that by which it swings about."""
+    begin = rng.uniform(12.0, 20.0)
+    shares = rng.uniform((0.3, 1.1), (0.5, 1.3))
+    grown = begin + rng.uniform(20.0, 40.0)
+    if not swing:
+        return Profile((begin, grown), (shares * most).tolist())
+    t = np.arange(0.0, BOGGING, 0.1)
+    swinging = np.interp(t, (begin, grown), shares) + realise(Swing(-swing, swing, *FAST), t, rng).value
+    return Profile(t.tolist(), (swinging * most).tolist())
 
 
 def _about(share: float, most: float) -> Swing:

@@ -18,7 +18,7 @@ from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import Soil, WheelModel, sinkage, state_on
 
-from . import contact_forms, outside, soil_forms, vehicle_forms
+from . import contact_forms, further_forms, outside, soil_forms, vehicle_forms
 from .form import SIZES, Form, Hidden, Setting, together
 
 KINDS = ("single", "pair", "outside", "plain", "hard")
@@ -28,9 +28,10 @@ SOILS = (
     "rubicon_sandy_loam_43", "sandy_loam_11_michigan",
 )  # fmt: skip
 DURATION = 120.0
-FORMS = (*soil_forms.FORMS, *contact_forms.FORMS, *vehicle_forms.FORMS)
-PAIRS, NULLS = 24, 24
-"""Cases of these kinds for each seed."""
+EARLIER = (*soil_forms.FORMS, *contact_forms.FORMS, *vehicle_forms.FORMS)
+FORMS = (*EARLIER, *further_forms.FORMS)
+PAIRS, FURTHER_PAIRS, NULLS = 24, 8, 24
+"""Cases of these kinds for each seed: pairs of earlier forms, pairs with a further one, nulls."""
 _ALIKE = ({"grade", "draft_offset"}, {"draft_offset", "draft_gain"})
 """Pairs that no diagnosis could tell from one of the two."""
 _HARSH = {"slowest": 0.15, "fastest": 0.40}
@@ -89,13 +90,15 @@ def cases(kind: str, seed: int) -> Iterator[Case]:
 
 def _pairs(seed: int) -> Iterator[tuple[tuple[Form, ...], str]]:
     rng = np.random.default_rng([seed, 2])
-    found = 0
-    while found < PAIRS:
-        one, other = (FORMS[i] for i in rng.choice(len(FORMS), 2, replace=False))
-        names = {one.effect, other.effect}
-        if len(names) == 2 and names not in _ALIKE:
-            found += 1
-            yield (one, other), str(rng.choice(SIZES[1:]))
+    for count, forms, further in ((PAIRS, EARLIER, False), (FURTHER_PAIRS, FORMS, True)):
+        found = 0
+        while found < count:
+            one, other = (forms[i] for i in rng.choice(len(forms), 2, replace=False))
+            names = {one.effect, other.effect}
+            wanted = not further or one in further_forms.FORMS or other in further_forms.FORMS
+            if len(names) == 2 and names not in _ALIKE and wanted:
+                found += 1
+                yield (one, other), str(rng.choice(SIZES[1:]))
 
 
 def _case(kind: str, seed: int, number: int, forms: tuple[Form, ...], size: str) -> Case:

@@ -20,7 +20,7 @@ SOIL_WEIGHT = 16e3
 """Of moist soil [N/m^3]."""
 
 
-def _less_pull(forces: Array, push: Any) -> Array:
+def less_pull(forces: Array, push: Any) -> Array:
     return np.stack([forces[0], forces[1] - push, forces[2]])
 
 
@@ -31,7 +31,7 @@ def _rankine(forces: Array, state: WheelState, around: Any, values: Any) -> Arra
     passive = np.tan(np.pi / 4.0 + phi / 2.0) ** 2
     heap = SOIL_WEIGHT * z**2 / (z + 0.1)  # grows with the sinkage until it runs off at the sides
     push = 0.5 * SOIL_WEIGHT * z**2 * passive + heap * z * passive + 2.0 * state.c * z * np.sqrt(passive)
-    return _less_pull(forces, values["size"] * state.width * push)
+    return less_pull(forces, values["size"] * state.width * push)
 
 
 def _cutting(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
@@ -50,7 +50,7 @@ def _cutting(forces: Array, state: WheelState, around: Any, values: Any) -> Arra
         np.pi + np.tan(np.pi / 4.0 + phi / 2.0)
     )
     push = state.width * wedge * (2.0 * z * c * K_c + SOIL_WEIGHT * z**2 * K_g) + sides
-    return _less_pull(forces, values["size"] * push)
+    return less_pull(forces, values["size"] * push)
 
 
 def _flanks(forces: Array, state: WheelState, around: Any, values: Any) -> Array:

@@ -61,12 +61,27 @@ def _saturated(draft: Array, around: Any, values: Any) -> Array:
 
 def _sticking(draft: Array, around: Any, values: Any) -> Array:
     """Friction in the pin: the reading follows only when the draft has moved away by more than the band."""
-    told = np.empty_like(draft)
-    held = draft[0]
-    for i, true in enumerate(draft):
-        held = min(max(held, true - values["size"]), true + values["size"])
+    return _held_back(draft, values["size"])
+
+
+def _held_back(true: Array, band: float) -> Array:
+    """Error (N,) of a reading that follows the truth (N,) only when that has moved away by more than the band."""
+    told = np.empty_like(true)
+    held = true[0]
+    for i, now in enumerate(true):
+        held = min(max(held, now - band), now + band)
         told[i] = held
-    return told - draft
+    return told - true
+
+
+def _swaying(draft: Array, around: Any, values: Any) -> Array:
+    """The implement sways at the hitch every two and a half seconds, and the pin reads some of its pull sideways."""
+    return values["size"] * np.sin(2.0 * np.pi * np.ravel(around.t) / 2.5) + 0.0 * draft
+
+
+def _stuck_gauge(torque: Array, around: Any, values: Any) -> Array:
+    """Friction beside each torque cell takes on its share before the cell does, whichever way the torque goes."""
+    return torque + np.stack([_held_back(of_wheel, values["size"]) for of_wheel in torque.T], axis=1)
 
 
 def _channels(change: Callable[[str, Array, Recording, float], Array | None]) -> Callable[[float, Setting], Hidden]:
@@ -131,4 +146,15 @@ FORMS = (
     ),
     Form("", "bouncing", "load cells at 1.3 Hz", "N", (5.5, 5.5), 600.0, by_hooks(load=_bouncing)),
     Form("", "nodding_radar", "ground speed every 2 s", "1", (0.0017, 0.0017), 0.04, _channels(_nodding_radar)),
+    Form("", "hitch_sway", "draft every 2.5 s", "N", (20.0, 20.0), 600.0, by_hooks(draft=_swaying)),
+    Form(
+        "",
+        "stuck_gauge",
+        "hysteresis of the torque cells",
+        "N m",
+        (3.0, 3.0),
+        60.0,
+        by_hooks(torque=_stuck_gauge),
+        imitable=True,
+    ),
 )

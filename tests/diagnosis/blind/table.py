@@ -48,6 +48,7 @@ def shares(trials: Sequence[Trial]) -> Iterator[str]:
     yield _share("pairs: both named", [set(t.hidden) <= set(t.named) for t in pairs], "")
     yield _share("pairs: both in the sets", [set(t.hidden) <= in_set(t) for t in pairs], ">= 80 %")
     done = [t for t in visible if t.named]
+    yield _share("visible and named: nothing else is named besides", [len(t.named) == 1 for t in done], "")
     yield _share("completed: gap <= 1.15", [t.gap_after <= 1.15 for t in done], ">= 85 %")
     excess = [t for t in done if t.gap_before > 1.1]
     gone = [t.gap_after - 1.0 <= 0.1 * (t.gap_before - 1.0) for t in excess]

@@ -34,7 +34,7 @@ def _delayed(torque: Array, around: Any, values: Any) -> Array:
     return np.stack([np.interp(t - values["size"], t, of_wheel) for of_wheel in torque.T], axis=1)
 
 
-def _filtered(torque: Array, around: Any, values: Any) -> Array:
+def filtered(torque: Array, around: Any, values: Any) -> Array:
     """Through a first-order low pass of this time constant."""
     share = -np.expm1(-float(around.t[1, 0] - around.t[0, 0]) / values["size"])
     out = torque.copy()
@@ -172,7 +172,7 @@ FORMS = (
         "drivetrain_loss", "viscous", "churning oil", "N m s", (1.2, 1.2), 50.0, by_hooks(torque=_viscous), other=False
     ),
     Form("torque_lag", "delay", "as from a queue", "s", (0.01, 0.01), 0.4, by_hooks(torque=_delayed), other=False),
-    Form("torque_lag", "filter", "first-order low pass", "s", (0.011, 0.011), 0.4, by_hooks(torque=_filtered)),
+    Form("torque_lag", "filter", "first-order low pass", "s", (0.011, 0.011), 0.4, by_hooks(torque=filtered)),
     Form(
         "grade",
         "sines",

@@ -105,6 +105,13 @@ def test_lugs_without_cohesion_are_a_greater_angle_of_friction():
     assert lugged == pytest.approx(wheel_forces(state._replace(tan_phi=state.tan_phi * factor), MODEL), rel=1e-12)
 
 
+def test_lugs_grip_soil_on_which_a_rim_would_slide():
+    soil = soil_named("wet_clay")
+    state = state_on(soil, 0.4, 0.3, 0.5, 0.3)
+    stronger = state._replace(c=1.3 * soil.c, tan_phi=1.3 * math.tan(soil.phi))
+    assert with_effect("lugs", state, grip=0.3) == pytest.approx(wheel_forces(stronger, MODEL), rel=1e-12)
+
+
 def test_a_soft_tyre_touches_where_its_undeformed_circle_enters_the_soil():
     """The substitute circle goes through both points; geometry by hand."""
     effect = CATALOGUE["tyre_deflection"]

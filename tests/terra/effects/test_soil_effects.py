@@ -12,6 +12,7 @@ from adaptive import adaptive_forces
 from soilbus.terra.effects.along import share_of_way, through_knots
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active, forces_with, wheel_with
+from soilbus.terra.effects.soil import DRIFT_KNOTS
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import (
@@ -137,10 +138,11 @@ def test_the_soil_drifts_along_the_way():
               "strength_2": 0.15}  # fmt: skip
     soil = changed("soil_drift", **values)
     u = AROUND.distance / AROUND.length
-    knots = np.linspace(0.0, 1.0, 5)
-    bend = CubicSpline(knots, [0.0, 0.3, -0.2, 0.1, 0.0], bc_type="natural")(u)
+    knots = np.linspace(0.0, 1.0, DRIFT_KNOTS + 2)
+    rest = [0.0] * (DRIFT_KNOTS - 3)
+    bend = CubicSpline(knots, [0.0, 0.3, -0.2, 0.1, *rest, 0.0], bc_type="natural")(u)
     assert np.log(soil.K_L / STATE.K_L) == pytest.approx((0.8 * (u - 0.5) + bend) * np.ones(4), rel=1e-10)
-    bend = CubicSpline(knots, [0.0, 0.0, 0.15, 0.0, 0.0], bc_type="natural")(u)
+    bend = CubicSpline(knots, [0.0, 0.0, 0.15, 0.0, *rest, 0.0], bc_type="natural")(u)
     for strength in (soil.tan_phi / STATE.tan_phi, soil.c / STATE.c):
         assert np.log(strength) == pytest.approx((-0.4 * (u - 0.5) + bend) * np.ones(1), rel=1e-10)
     assert CATALOGUE["soil_drift"].of_record

@@ -43,10 +43,10 @@ def test_a_constant_slope_holds_back_as_the_weight_along_it():
 
 def test_a_slope_changes_along_the_way():
     grade = CATALOGUE["grade"]
-    departures = [0.0, 0.02, -0.01, 0.0, 0.03, 0.0, 0.01, -0.02]
+    departures = [0.0, *np.random.default_rng(1).uniform(-0.03, 0.03, len(grade.parameters) - 1)]
     values = {f"slope_{i}": d for i, d in enumerate(departures)} | {"slope_0": 0.01}
     u = (AROUND.distance / AROUND.length)[:, 0]
-    slope = 0.01 + CubicSpline(np.linspace(0.0, 1.0, 8), departures, bc_type="natural")(u)
+    slope = 0.01 + CubicSpline(np.linspace(0.0, 1.0, len(departures)), departures, bc_type="natural")(u)
     assert grade.resistance(AROUND, values) == pytest.approx(2300.0 * 9.80665 * np.sin(slope), rel=1e-10)
     assert set(values) == set(grade.neutral)
     assert grade.of_record

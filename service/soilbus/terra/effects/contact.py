@@ -99,10 +99,10 @@ BULLDOZING = Effect(
 def _lugged_soil(
     state: WheelState, model: WheelModel, around: Surroundings, values: Values
 ) -> tuple[WheelState, WheelModel]:
-    """c (1 + 2 h/b) and tan phi (1 + 0.64 (h/b) arccot(h/b))."""
-    ratio = values["height"] / state.width
+    """c (1 + 2 h/b) and tan phi (1 + 0.64 (h/b) arccot(h/b)), both times 1 + grip."""
+    ratio, grip = values["height"] / state.width, 1.0 + values["grip"]
     friction = 1.0 + 0.64 * ratio * (np.pi / 2.0 - np.arctan(ratio))
-    return state._replace(c=state.c * (1.0 + 2.0 * ratio), tan_phi=state.tan_phi * friction), model
+    return state._replace(c=state.c * grip * (1.0 + 2.0 * ratio), tan_phi=state.tan_phi * grip * friction), model
 
 
 def _lugged_arm(forces: Array, state: WheelState, around: Surroundings, values: Values) -> Array:
@@ -113,13 +113,16 @@ def _lugged_arm(forces: Array, state: WheelState, around: Surroundings, values: 
 
 LUGS = Effect(
     name="lugs",
-    physics="Lugs hold a block of soil between them: it shears along their tips and along both its sides.",
+    physics="Lugs hold a block of soil between them: it shears on soil along their tips and along both its sides,"
+    " where a smooth rim would slide on the soil sooner than shear it.",
     source="side shear of a grouser: Bekker 1956, Theory of Land Locomotion; Wong 2008, ch. 4; shear radius between rim"
-    " and tip: Ding et al. 2011 (J. Terramechanics 48:27)",
+    " and tip: Ding et al. 2011 (J. Terramechanics 48:27); friction and adhesion of soil on steel are half to nine"
+    " tenths of those of soil on soil: Potyondy 1961 (Geotechnique 11:339)",
     tells="cohesive soil, and draft beside torque; on cohesionless soil they are a greater tan phi and no data tell",
     parameters=(
         Parameter("height", "m", 0.0, 0.03, 0.0, 0.12),
         Parameter("share", "1", 0.5, 0.25, 0.0, 1.0, starts=(0.02,)),
+        Parameter("grip", "1", 0.0, 0.2, 0.0, 1.0),
     ),
     wheel=_lugged_soil,
     forces=_lugged_arm,

@@ -103,7 +103,8 @@ HARDPAN = Effect(
     wheel=_hardpan,
 )
 
-DRIFT_KNOTS = 3
+DRIFT_KNOTS = 7
+"""Between the ends of the way: a soft border half way is no longer than two of them are apart."""
 
 
 def _drift_of(name: str, share: np.ndarray, values: Values) -> np.ndarray:

@@ -32,7 +32,8 @@ DRIVETRAIN_LOSS = Effect(
     torque=_drive_line,
 )
 
-SLOPE_KNOTS = 8
+SLOPE_KNOTS = 16
+"""One every ten metres of a drive of two minutes: fields undulate over twenty and more."""
 
 
 def _unmeasured_slope(around: Surroundings, values: Values) -> Array:

@@ -1,0 +1,127 @@
+"""Curves that begin, end or change within a window: one more unknown at each of its seconds, straight lines between.
+
+As in `curve`, but on a straight way so many unknowns would only cost, and so they count
+where the data speak for them.  At the optimum of a fit without them the window is linear:
+that tells how much better it fits on a bending way, and how the way bends.  The wheels'
+speeds are then freed of that, and the window is fitted anew; how badly the curves are known
+goes into what is said of the soil (`present`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.estimation.curve import rim_differences, sides
+from soilbus.estimation.gauss_newton import Fit, fit_window, settled
+from soilbus.estimation.linearised import Bend
+from soilbus.estimation.normal_equations import Fitting, Place
+from soilbus.estimation.posterior import PARAMETERS
+from soilbus.estimation.readings import Readings
+from soilbus.estimation.residuals import WindowProblem
+from soilbus.estimation.window import Rig, Window
+
+Array = NDArray[np.float64]
+
+APART = 1.0
+"""Seconds between two knots of the curve."""
+BENT = 25.0
+"""Fall of the cost from which the way is believed to bend; noise alone makes one of about 9 in a window of 10 s."""
+FIRST_GAIN = 1 + len(PARAMETERS)
+"""Column of Linearised.rows of the first gain."""
+
+
+class Way(NamedTuple):
+    """How the way bends: relative speeds (K,) beside the window's own curve at knots (K,) [s], and what they cost.
+
+    occam: logarithm, squared, of the room that they had beforehand over what the window leaves of it.
+    """
+
+    knots: Array
+    relative: Array
+    cost: float
+    occam: float
+
+
+def bends(readings: Readings) -> tuple[Array, Array]:
+    """How large (K,) a curve may be at each knot, and the relative speeds (N, K) at the instants by such curves.
+
+    As in `curve`, by the rim speeds: there and in the whole window.
+    """
+    hats = np.maximum(1.0 - np.abs(readings.t[:, None] - knots_of(readings.t)) / APART, 0.0)
+    apart = rim_differences(readings)
+    known = np.isfinite(apart)
+    near = (hats > 0.0) & known[:, None]
+    square = np.where(known, apart, 0.0) ** 2
+    std = np.sqrt(square @ near / np.maximum(near.sum(axis=0), 1) + square.sum() / max(int(known.sum()), 1))
+    return std, hats * std
+
+
+def knots_of(t: Array) -> Array:
+    """Knots (K,) [s] for instants t (N,), counted back from the last."""
+    count = math.ceil((t[-1] - t[0]) / APART - 1e-6)
+    return np.asarray(t[-1] - APART * np.arange(count, -1, -1))
+
+
+def along_bends(fitting: Fitting, fit: Fit) -> tuple[Array, Array]:
+    """Derivatives (N, m) of the residuals by a curve at their own instant, as a relative speed, and these weighed."""
+    problem, at = fitting.problem, fit.optimum.at
+    columns = [FIRST_GAIN + problem.gain_names.index(f"speed.{wheel}") for wheel in problem.rig.wheels]
+    shape, side = at.by_latents.shape[:2], sides(problem.rig)
+    return (at.rows[:, columns] @ side).reshape(shape), (at.weighed[:, columns] @ side).reshape(shape)
+
+
+def bending(fitting: Fitting, fit: Fit | None) -> Way | None:
+    """How the way bends, by the window linearised at the optimum of a fit; None where the data do not say so."""
+    problem = fitting.problem
+    if fit is None or not fit.converged or not sides(problem.rig).any():
+        return None
+    optimum = fit.optimum
+    place = Place(optimum.soil, optimum.gains, optimum.latents, fit.cost, 0)
+    known, directions = fitting.before_at(place), fitting.directions(place)
+    std, by_bends = bends(fitting.problem)
+    by_curve, weighed = along_bends(fitting, fit)
+    rows = optimum.at.rows.reshape(*weighed.shape, -1)
+    across = by_bends.T @ (weighed[:, None] @ rows)[:, 0]
+    mixed = across @ directions
+    normal = directions.T @ optimum.at.normal
+    right = np.column_stack([normal[:, 0] + known.gradient, mixed.T])
+    explained = mixed @ np.linalg.solve(normal @ directions + known.information, right)
+    gradient = across[:, 0] - explained[:, 0]
+    own = (by_curve * weighed).sum(axis=1)
+    information = by_bends.T @ (own[:, None] * by_bends) - explained[:, 1:] + np.eye(len(std))
+    bend = -np.linalg.solve(information, gradient)
+    fall = -float(gradient @ bend)
+    if not fall > BENT:
+        return None
+    return Way(knots_of(optimum.t), bend * std, float(bend @ bend), float(np.linalg.slogdet(information)[1]))
+
+
+def straightened(window: Window, rig: Rig, way: Way) -> Window:
+    """The window with the wheels' speeds as without these bends."""
+    relative = np.interp(window.t, way.knots, way.relative)
+    return replace(window, speed=window.speed / (1.0 + relative[:, None] * sides(rig)))
+
+
+def on_the_way(fitting: Fitting, fit: Fit, way: Way, straight: WindowProblem) -> tuple[Fitting, Fit]:
+    """The fit of the straightened data; where there is none that is better, the one there was.
+
+    Bends may have led that far astray, so it is no more than a place to begin.
+    """
+    prior, before, optimum = fitting.coordinates.prior, fitting.before, fit.optimum
+    if straight.n != fitting.problem.n:
+        return fitting, fit
+    again = Fitting(straight, prior, before)
+    with np.errstate(all="ignore"):
+        new = settled(again, again.start(optimum.soil, optimum.latents.entry_angle, optimum.gains))
+    if new is None or not new.converged:
+        new = fit_window(straight, prior, before)
+    if new is None or not new.converged or new.cost + way.cost > fit.cost:
+        return fitting, fit
+    cost, evidence = new.cost + way.cost, new.evidence + way.cost + way.occam
+    bend = Bend(optimum, bends(fitting.problem)[1])
+    return again, replace(new, cost=cost, evidence=min(fit.evidence, evidence), bend=bend)

@@ -1,0 +1,73 @@
+"""What a wheel's forces depend on: its state and the choices that make a wheel-soil model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from soilbus.terra.rim import Quadrature
+from soilbus.terra.stress import Array
+
+EXACT_NODES = 12
+"""Gauss-Legendre nodes a branch: errors below 1e-6 of W (of T: W r) for n in 0.1..1.6, K
+from 5 mm, entry angles up to 0.8 rad, slip -0.3 to 0.95; 2e-6 for rational shear in skid
+(tests/terra/test_wheel.py)."""
+FAST_NODES = 8
+"""Enough for fits: below 5e-5 in the same ranges, far below any sensor's noise."""
+
+LONGEST = 0.95
+"""Share of the entry angle that the exit angle never exceeds behind the axle: no rut comes up all the way."""
+
+
+@dataclass(frozen=True, slots=True)
+class WheelModel:
+    """The choices that make a wheel-soil model.
+
+    The angle of greatest stress is (peak_c1 + peak_c2 slip) times the entry angle (eq. 4),
+    the exit angle exit_ratio times it and exit_angle [rad] more (0: the rut does not recover;
+    behind the axle both are negative), but no farther behind than LONGEST times the entry
+    angle.  exponential_share of the shear strength is mobilised by the exponential law
+    whatever shear_law says.  From the depth pan_depth [m] on the pressure grows by
+    pan_stiffness times what the soil alone would add (0: no hard pan).  one_off: a model
+    whose shape no other call will share, so that nothing of it is kept.
+    """
+
+    shear_law: str = "exponential"
+    peak_c1: float = 0.5
+    peak_c2: float = 0.0
+    exit_ratio: float = 0.0
+    nodes: int = EXACT_NODES
+    exponential_share: float = 0.0
+    pan_depth: float = 0.0
+    pan_stiffness: float = 0.0
+    exit_angle: float = 0.0
+    one_off: bool = False
+
+    @property
+    def quadrature(self) -> Quadrature:
+        """Nodes for a wheel without slip."""
+        return Quadrature(self.nodes, 3 if self.nodes >= EXACT_NODES else 2, self.peak_c1, self.exit_ratio)
+
+    def leave(self, entry_angle: Array) -> Array:
+        """Exit angle over entry angle (N,)."""
+        return np.maximum(self.exit_ratio + self.exit_angle / entry_angle, -LONGEST)
+
+
+class WheelState(NamedTuple):
+    """What the forces of N wheel-instants depend on; floats or arrays that broadcast.
+
+    entry_angle [rad], slip [-], radius and width [m], K_L [N/m^(n+2)], n [-],
+    tan_phi [-], c [Pa], K [m].
+    """
+
+    entry_angle: Any
+    slip: Any
+    radius: Any
+    width: Any
+    K_L: Any
+    n: Any
+    tan_phi: Any
+    c: Any
+    K: Any

@@ -1,0 +1,111 @@
+"""Hidden effects in forms that came later, after the catalogue had taken on some of the others' formulas.
+
+They follow the others in the list of forms, so that cases of those stay what they were.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from soilbus.terra.stress import Array
+from soilbus.terra.wheel import WheelState
+
+from .contact_forms import SOIL_WEIGHT, less_pull
+from .form import Form, by_hooks
+from .rim import change
+from .vehicle_forms import filtered
+
+_GRAVITY = 9.80665
+
+
+def _unloading(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+    """What is pressed to the depth z springs back by p(z) / (k_0 + A_u z): stiffer the deeper it was pressed.
+
+    `size` is the share that comes back from the plain sinkage, where both terms are as great.
+    """
+    z, plain = state.radius * (1.0 - np.cos(state.entry_angle)), values["sinkage"]
+    back = values["size"] * plain * (z / plain) ** state.n * 2.0 / (1.0 + z / plain)
+    return forces + change(state, leave=-np.arccos(1.0 - back / state.radius))
+
+
+def _transported(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+    """The faster the rim slips the more soil it carries behind itself, on which it leaves the ground the later."""
+    share = values["size"] * (0.5 + 2.0 * np.maximum(state.slip, 0.0))
+    return forces + change(state, leave=-np.arccos(1.0 - share * (1.0 - np.cos(state.entry_angle))))
+
+
+def _thrown(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+    """A vertical blade's N factors, and the soil set in motion besides: (gamma N_g z^2 + c N_c z + rho N_a v^2 z) b."""
+    z = state.radius * (1.0 - np.cos(state.entry_angle))
+    root = np.tan(np.pi / 4.0 + np.arctan(state.tan_phi) / 2.0)
+    still = SOIL_WEIGHT * z**2 * root**2 / 2.0 + 2.0 * state.c * z * root
+    moving = 2.0 * SOIL_WEIGHT / _GRAVITY * around.ground_speed**2 * z
+    return less_pull(forces, values["size"] * state.width * (still + moving))
+
+
+def _mesh(torque: Array, around: Any, values: Any) -> Array:
+    """Friction between teeth falls with speed^0.7 and load^0.4; `size` is the share lost at 500 N m and 2.5 rad/s."""
+    speed, load = np.maximum(np.abs(around.wheel_speed), 0.1) / 2.5, np.maximum(np.abs(torque), 1.0) / 500.0
+    return np.asarray(torque + values["size"] * np.abs(torque) * speed**-0.7 * load**-0.4)
+
+
+def _twice_filtered(torque: Array, around: Any, values: Any) -> Array:
+    """Through two low passes of this time constant, one after the other."""
+    return filtered(filtered(torque, around, values), around, values)
+
+
+def _creeping(around: Any, values: Any) -> Array:
+    """One cell's zero, that goes on wandering as the cell gets warm in the sun."""
+    return values["size"] * (0.6 + around.t / 150.0) * np.array([0.0, 0.0, 1.0, 0.0]) + 0.0 * around.load
+
+
+FORMS = (
+    Form(
+        "rut_recovery",
+        "unloading",
+        "unloading line k_0 + A_u z: Wong 2008, ch. 2",
+        "1",
+        (0.0037, 0.04),
+        0.15,
+        by_hooks(forces=_unloading),
+    ),
+    Form(
+        "rut_recovery",
+        "transported",
+        "soil carried behind the wheel: Ishigami et al. 2007",
+        "1",
+        (0.0037, 0.04),
+        0.15,
+        by_hooks(forces=_transported),
+    ),
+    Form(
+        "bulldozing",
+        "thrown",
+        "soil set in motion: McKyes 1985, Soil Cutting and Tillage",
+        "widths",
+        (0.1, 0.3),
+        1.5,
+        by_hooks(forces=_thrown),
+    ),
+    Form(
+        "drivetrain_loss",
+        "mesh",
+        "friction of teeth: ISO/TR 14179-1:2001",
+        "1",
+        (0.02, 0.022),
+        0.12,
+        by_hooks(torque=_mesh),
+    ),
+    Form("torque_lag", "two_stage", "two low passes", "s", (0.006, 0.006), 0.2, by_hooks(torque=_twice_filtered)),
+    Form(
+        "wheel_load_offset",
+        "creeping",
+        "zero that wanders with warmth",
+        "N",
+        (150.0, 180.0),
+        900.0,
+        by_hooks(load=_creeping),
+    ),
+)

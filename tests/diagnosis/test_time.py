@@ -1,0 +1,43 @@
+"""How long a diagnosis takes, in units of one look at the same recording, whatever the machine."""
+
+from __future__ import annotations
+
+import time
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from soilbus.assembly import prior_of
+from soilbus.diagnosis.diagnose import diagnose
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.wheel import Soil
+
+from .blind.cases import cases
+from .blind.trial import record_of_case
+
+MOST_LOOKS = 900.0
+"""Linearisations of the plain model, some 6 ms each on one quiet core, as which a diagnosis may count: 5 s."""
+
+
+def seconds_of(work):
+    begin = time.process_time()
+    work()
+    return time.process_time() - begin
+
+
+def look(record, prior):
+    """Least processor time of one linearisation of the instants to be learned from, without effects."""
+    problem, soil = record.learned, Soil(*prior.median.tolist())
+    gains = np.zeros(problem.n_sensors)
+    latents = problem.start(soil, None, gains)
+    return min(seconds_of(lambda: problem.linearise(soil, gains, latents)) for _ in range(10))
+
+
+@pytest.mark.parametrize(("kind", "seed", "number"), [("single", 11, 7), ("pair", 11, 14), ("plain", 11, 0)])
+def test_a_diagnosis_takes_as_long_as_some_hundred_looks(kind, seed, number):
+    case = next(islice(cases(kind, seed), number, None))
+    record, prior = record_of_case(case), prior_of(case.config)
+    before = look(record, prior)
+    spent = seconds_of(lambda: diagnose([record], prior, list(CATALOGUE.values())))
+    assert spent < MOST_LOOKS * max(before, look(record, prior)), case.id

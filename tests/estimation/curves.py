@@ -1,0 +1,101 @@
+"""Drives into curves and out of them: are valid windows right while the curve changes?
+
+`PYTHONPATH=service:tests/support python tests/estimation/curves.py [--radii 75 40 25] [--soil loam] [--seeds 8]
+[--first 1]` prints a table; `--windows` every window besides.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from drives import errors, task_of, windows
+
+from soilbus.assembly import rig_of
+from soilbus.config import Config
+from soilbus.daemon.estimator import WindowEstimator
+from soilbus.estimation.curve import sides
+from soilbus.estimation.window import Rig, Window
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.terra.soils import SOILS
+from soilbus.traversability import Status
+
+TRACK = 1.5
+ENTERED, LEFT, END = 12.0, 25.0, 38.0
+"""Seconds: where a curve begins, where it ends, each with up to SPREAD more, and where the drive does."""
+SPREAD = 3.0
+STEERING = (0.3, 3.0)
+"""Seconds that the driver takes to steer."""
+WRONG = 3.0
+
+
+class Told(NamedTuple):
+    """What one window says: t [s] since the curve began, status, errors (2,) in standard deviations, sd of tan phi."""
+
+    t: float
+    valid: bool
+    reason: str
+    away: np.ndarray
+    sd: float
+
+
+def curved(window: Window, rig: Rig, curvature: np.ndarray | float) -> Window:
+    """The window on a curve to the left [1/m]: each wheel with the same slip to the ground that goes by under it."""
+    bend = np.broadcast_to(np.asarray(curvature, float), window.t.shape)[:, None]
+    return replace(window, speed=window.speed * (1.0 + sides(rig) * TRACK / 2.0 * bend))
+
+
+def driven(config: Config, soil: str, radius: float, seed: int) -> list[Told]:
+    """The windows of a drive with one curve of this radius [m], to the left or to the right."""
+    rng = np.random.default_rng([seed, 11])
+    begin, end = np.array([ENTERED, LEFT]) + SPREAD * rng.random(2)
+    steering, way = rng.uniform(*STEERING), rng.choice([-1.0, 1.0])
+    knots = [begin, begin + steering, end, end + steering]
+    recording = simulate(config, Scenario(END, (Patch(0.0, soil),), slip=Swing(0.05, 0.40)), seed)
+    estimator, rig, told = WindowEstimator(config), rig_of(config), []
+    for window, at in windows(config, recording):
+        bent = curved(window, rig, way / radius * np.interp(window.t, knots, [0.0, 1.0, 1.0, 0.0]))
+        result = estimator.estimate(task_of(bent, at, config, index=round(at - config.estimator.window))).result
+        away, sd = np.full(2, np.nan), np.nan
+        if result.posterior is not None:
+            away = errors(result.posterior, SOILS[soil])
+            sd = result.posterior.tan_phi().std / result.posterior.tan_phi().value
+        told.append(Told(at - begin, result.status is Status.VALID, result.reason, away, sd))
+    return told
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--radii", type=float, nargs="+", default=[75.0, 40.0, 25.0])
+    parser.add_argument("--soil", default="loam")
+    parser.add_argument("--seeds", type=int, default=8)
+    parser.add_argument("--first", type=int, default=1)
+    parser.add_argument("--windows", action="store_true")
+    args = parser.parse_args()
+    config = reference_configuration()
+    print("radius  windows since the curve  valid  rms error / sd: bearing  tan phi  most  wrong  others")
+    for radius in args.radii:
+        drives = {seed: driven(config, args.soil, radius, seed) for seed in range(args.first, args.first + args.seeds)}
+        told = [(seed, w) for seed, drive in drives.items() for w in drive if w.t > 0.0]
+        away = np.array([w.away for _, w in told if w.valid])
+        rms, others = np.sqrt(np.mean(away**2, axis=0)), [w.reason for _, w in told if not w.valid]
+        count = ", ".join(f"{others.count(reason)} {reason}" for reason in sorted(set(others)))
+        wrong = int((np.abs(away).max(axis=1) > WRONG).sum())
+        print(
+            f"{radius:6.0f}  {len(told):23d}  {len(away):5d}  {rms[0]:23.2f}  {rms[1]:7.2f} {np.abs(away).max():5.1f}"
+            f"  {wrong:5d}  {count}",
+            flush=True,
+        )
+        for seed, w in told:
+            if args.windows or (w.valid and np.abs(w.away).max() > WRONG):
+                state = "valid" if w.valid else "-"
+                print(f"  {seed:4d} {w.t:6.2f} {state:5} {w.away[0]:5.1f} {w.away[1]:5.1f} {w.sd:6.1%} {w.reason}")
+
+
+if __name__ == "__main__":
+    main()
