@@ -223,7 +223,10 @@ FAULTS = {
     ),
     "speed of another pulse wheel": Fault(le.scaled(1.3, SPEEDS[2]), BAD, lies("speed.RL")),
     "ground speed doubled": Fault(le.scaled(2.0, GROUND), BAD, lies("ground_speed")),
-    "ground speed halved": Fault(le.scaled(0.5, GROUND), BAD, "model_mismatch", length=BORDER),
+    "ground speed halved": Fault(le.scaled(0.5, GROUND), BAD, lies("ground_speed"), length=BORDER),
+    "ground speed halved from the start": Fault(
+        le.scaled(0.5, GROUND), BAD, lies("ground_speed", "acceleration"), since=FROM_THE_START, length=12.2
+    ),
     "load doubled": Fault(le.scaled(2.0, LOADS[3]), BAD, lies("load.RR")),
     "all loads doubled": Fault(le.scaled(2.0, *LOADS), BAD, lies(*of_all("load"))),
     "load zero lost": Fault(le.offset(1500.0, LOADS[0]), BAD, "model_mismatch", length=BORDER),

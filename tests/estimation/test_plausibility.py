@@ -14,7 +14,8 @@ from soilbus.assembly import rig_of, with_effects
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.mapping import channels_of
 from soilbus.daemon.plausibility import Plausibility
-from soilbus.estimation.plausibility import Resolution, implausible
+from soilbus.estimation.plausibility import implausible
+from soilbus.estimation.scene import Resolution
 from soilbus.estimation.series import lasts, runs
 from soilbus.estimation.window import BinStore, Window, forward
 from soilbus.simulator.recording import Recording, simulate
@@ -139,6 +140,48 @@ def test_a_lifted_implement_or_a_full_tank_is_no_lie(good):
     window, motor = good
     for by_wheel in ([-700.0, -700.0, 2700.0, 2700.0], [1200.0, 1200.0, 1200.0, 1200.0], [3e3, 3e3, -6e2, -6e2]):
         assert judged(_changed(window, load=window.load + np.array(by_wheel)), motor) == ()
+
+
+@pytest.fixture(scope="module")
+def lively() -> Window:
+    """A window whose speed changes all the time."""
+    scenario = Scenario(10.0, LOAM, Swing(0.8, 1.8, 0.1, 0.3), slip=Swing(0.05, 0.3))
+    return next(windows(simulate(CONFIG, scenario, seed=4)))[0]
+
+
+@pytest.mark.parametrize(
+    ("factor", "since", "names"),
+    [
+        (1.0, 0, ()),
+        (0.5, 0, ("ground_speed", "acceleration")),  # great slip and a wrong accelerometer look the same
+        (0.5, 40, ("ground_speed",)),
+        (0.85, 0, ()),
+    ],
+)
+def test_a_ground_speed_of_another_scale_contradicts_the_acceleration(factor, since, names, lively):
+    speed = lively.ground_speed.copy()
+    speed[since:] *= factor
+    assert judged(_changed(lively, ground_speed=speed)) == names
+
+
+@pytest.mark.parametrize(("factor", "names"), [(0.9, ()), (2.0, ("acceleration",))])
+def test_an_acceleration_of_another_scale_contradicts_the_ground_speed(factor, names, lively):
+    assert judged(_changed(lively, acceleration=factor * lively.acceleration)) == names
+
+
+@pytest.mark.parametrize("late", range(-4, 5))
+def test_a_radar_that_is_late_has_the_same_scale(late, lively):
+    speed = np.interp(lively.t - 0.1 * late, lively.t, lively.ground_speed)
+    assert judged(_changed(lively, ground_speed=speed)) == ()
+
+
+def test_a_blow_that_the_acceleration_tells_is_no_jump(lively):
+    """The vehicle runs into something, and loses half its speed within 0.2 s."""
+    speed, acceleration, wheels = (a.copy() for a in (lively.ground_speed, lively.acceleration, lively.speed))
+    speed[50:] -= 0.5
+    wheels[50:] -= 0.5 / RIG.radius
+    acceleration[49:51] -= 2.5
+    assert judged(_changed(lively, ground_speed=speed, acceleration=acceleration, speed=wheels)) == ()
 
 
 def test_what_does_not_last_or_is_not_driven_is_not_judged(good):

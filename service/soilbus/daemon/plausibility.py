@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from soilbus.can.channels import Channel
 from soilbus.config import Estimator
-from soilbus.estimation.plausibility import Resolution, implausible, without
+from soilbus.estimation.plausibility import implausible, without
+from soilbus.estimation.scene import Resolution
 from soilbus.estimation.window import Rig, Window
 
 Array = NDArray[np.float64]

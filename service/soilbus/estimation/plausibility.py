@@ -12,12 +12,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.series import change, change_variance, lasts, median, moving_sum, running_sum, runs, smooth
+from soilbus.estimation.changes import accelerated, pulling, scaled
+from soilbus.estimation.scene import DEVIATIONS, FALSE_SLIP, Resolution, Scene, scene_of
+from soilbus.estimation.series import lasts, median, runs
 from soilbus.estimation.window import (
     VEHICLE_QUANTITIES,
     WHEEL_QUANTITIES,
@@ -25,17 +27,12 @@ from soilbus.estimation.window import (
     SensorNoise,
     Window,
     pull_given,
-    turning,
 )
-from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads, slip_ratio
+from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-SUSTAINED = 1.0
-"""Seconds for which a contradiction must last."""
-DEVIATIONS = 5.0
-"""Standard deviations by which a change must stand out of the noise to count as one."""
 SAME = 1e-12
 """Relative difference of means of equal readings: rounding."""
 CHANCE = 1e-12
@@ -50,8 +47,6 @@ GEAR_SLACK = 0.03
 """Relative difference of motor and wheel speed that gear and radius of the wheel's sensor may have."""
 LEAST_TURN = 0.02
 """Difference [rad/s] of the two that resolution and phase may make besides."""
-FALSE_SLIP = 0.12
-"""Slip that a wrong rolling radius may feign: four of its standard deviations in `terra.effects`."""
 NO_TRACTION, TRACTION = 0.01, 0.15
 """Torque over load and radius of a wheel that drives nothing (any soil resists more), and of one that surely drives."""
 ODD_SLIP = 0.2
@@ -64,46 +59,6 @@ LOAD_SIDE = 0.10
 """Share of an axle's load by which its left and right must differ more than the other axle's for one to be named."""
 ANY_LOAD = 0.6
 """Wrong share of the weight that nothing carried explains, so that all load cells are wrong."""
-LAG = 1.0
-"""Seconds over which changes are compared."""
-OPPOSITE = 0.85
-"""Share of significant changes that go the wrong way."""
-CORRELATION = -0.9
-"""Their correlation, at most."""
-LEAST_SLOWING, LEAST_PULLING = 2.0, 4.0
-"""Seconds of significant changes, one after the other, that there must be of speed and of pull: at the border of a
-soft soil a driver who lifts the implement may pull less and drive more for a moment."""
-LEAST_FORCE, LEAST_SPEED = 0.01, 0.05
-"""Changes of force, as a share of the weight, and of speed [m/s] below which none is significant."""
-
-
-class Resolution(NamedTuple):
-    """Step [SI] between two readings of a channel (0: none), and whether it reads 0 at rest or without load."""
-
-    step: float
-    rests_at_zero: bool
-
-
-class Scene(NamedTuple):
-    """One window as the checks see it: bins of length `bin` [s]; driving (N,), slip and traction (N, W).
-
-    traction is torque over load and radius; both are nan where unknown, slip also where the vehicle
-    does not drive straight on.  motor_speed [rad/s] (N, W) is at the wheel's side of the gear.
-    """
-
-    window: Window
-    rig: Rig
-    bin: float
-    driving: Mask
-    slip: Array
-    traction: Array
-    motor_speed: Array
-    resolution: Mapping[str, Resolution]
-
-    @property
-    def sustained(self) -> int:
-        """Bins for which a contradiction must last."""
-        return max(round(SUSTAINED / self.bin), 1)
 
 
 def implausible(
@@ -144,24 +99,6 @@ def without(window: Window, rig: Rig, channels: set[str]) -> Window:
         values[quantity][..., rig.wheels.index(wheel) if wheel else slice(None)] = np.nan
     changed: dict[str, Any] = values
     return replace(window, **changed) if changed else window
-
-
-def scene_of(
-    window: Window,
-    rig: Rig,
-    min_speed: float,
-    max_turn: float,
-    bin_length: float,
-    resolution: Mapping[str, Resolution],
-    motor_speed: Array,
-) -> Scene:
-    """What the checks need of a window."""
-    driving = (window.ground_speed > min_speed) & ~turning(window, rig, max_turn)
-    ground = np.where(driving, window.ground_speed, np.nan)[:, None]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        traction = np.where(window.load > 0.0, window.torque / (rig.radius * window.load), np.nan)
-    slip = slip_ratio(rig.radius, window.speed, ground)
-    return Scene(window, rig, bin_length, driving, slip, traction, motor_speed, resolution)
 
 
 def frozen(scene: Scene) -> Iterator[str]:
@@ -305,62 +242,7 @@ def _pulls(scene: Scene, where: Mask) -> bool:
     return median(pull_given(scene.window, chassis)[where]) > TRACTION / 3.0 * chassis.mass * GRAVITY
 
 
-def accelerated(scene: Scene) -> Iterator[str]:
-    """The acceleration, where it says that the vehicle slows down whenever it speeds up."""
-    window = scene.window
-    lag = max(round(LAG / scene.bin), 1)
-    gained = change(smooth(window.ground_speed), lag)
-    told = scene.bin * moving_sum(window.acceleration, lag)
-    noise = np.sqrt(change_variance(window.variance["ground_speed"], lag) / 3.0)
-    told_noise = scene.bin * np.sqrt(moving_sum(window.variance["acceleration"], lag))
-    if _opposite(scene, gained, noise, LEAST_SPEED, told, told_noise, LEAST_SPEED, LEAST_SLOWING):
-        yield "acceleration"
-
-
-def pulling(scene: Scene) -> Iterator[str]:
-    """The draft, where the vehicle pulls less whenever its wheels drive more; told only with slope and inertia."""
-    window, rig, chassis = scene.window, scene.rig, scene.rig.chassis
-    if chassis is None:
-        return
-    lag, weight, variance = max(round(LAG / scene.bin), 1), chassis.mass * GRAVITY, window.variance
-    driven = change((window.torque / rig.radius).sum(axis=1), lag)
-    noise = np.sqrt(change_variance((variance["torque"] / rig.radius**2).sum(axis=1), lag))
-    known = np.isfinite(window.pitch) & np.isfinite(window.acceleration)
-    pull = change(np.where(known, pull_given(window, chassis), np.nan), lag)
-    of_pull = variance["draft"] + weight**2 * variance["pitch"] + chassis.mass**2 * variance["acceleration"]
-    pull_noise = np.sqrt(change_variance(of_pull, lag))
-    least = LEAST_FORCE * weight
-    if _opposite(scene, driven, noise, least, pull, pull_noise, least, LEAST_PULLING):
-        yield "draft"
-
-
-def _opposite(
-    scene: Scene,
-    one: Array,
-    one_noise: Array,
-    one_least: float,
-    other: Array,
-    other_noise: Array,
-    other_least: float,
-    seconds: float,
-) -> bool:
-    """Whether changes (M,) of two quantities that go together go against each other for so long.
-
-    Only changes count that are significant, of both: beyond their noise and at least so great.
-    """
-    with np.errstate(invalid="ignore"):
-        both = np.abs(one) > np.maximum(DEVIATIONS * one_noise, one_least)
-        both &= np.abs(other) > np.maximum(DEVIATIONS * other_noise, other_least)
-    both &= scene.driving[len(scene.driving) - len(both) :]
-    a, b = one[both], other[both]
-    product, n = a * b, max(round(seconds / scene.bin), 1)
-    if len(a) < n:
-        return False
-    opposite, of_both, of_one, of_other = (running_sum(x, n) for x in (product < 0.0, product, a * a, b * b))
-    return bool(((opposite >= OPPOSITE * n) & (of_both < CORRELATION * np.sqrt(of_one * of_other))).any())
-
-
 CHECKS: Sequence[Callable[[Scene], Iterator[str]]] = (
-    frozen, not_turning, geared, loads, accelerated, traction, pulling,
+    frozen, not_turning, geared, loads, accelerated, traction, scaled, pulling,
 )  # fmt: skip
 """In their order: what one names the next ones do not see."""
