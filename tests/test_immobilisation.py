@@ -107,6 +107,12 @@ def test_speeding_up_is_no_cause_where_a_draft_as_large_is():
     assert 20.0 < first_warning(pulling) < 27.0
 
 
+def test_slip_that_grows_as_the_vehicle_speeds_up_does_not_creep():
+    out = drive(lambda t: 1000.0, inertia=lambda t: 300.0 * min(max(t - 10.0, 0.0), 15.0) if t < 25.0 else 0.0)
+    assert max(state.slip.line().slope for t, state in out if t > 15.0) > 0.6 / 3.0 / AHEAD
+    assert first_warning(out) == math.inf
+
+
 def test_a_warning_near_the_limit_does_not_flap():
     out = drive(lambda t: 0.82 * MOST + 0.05 * MOST * math.sin(1.5 * t), until=120.0)
     warned = np.array([state.warning is Alert.IMMOBILISATION for _, state in out])
