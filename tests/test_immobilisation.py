@@ -107,6 +107,15 @@ def test_speeding_up_is_no_cause_where_a_draft_as_large_is():
     assert 20.0 < first_warning(pulling) < 27.0
 
 
+def test_slip_that_grows_as_the_vehicle_speeds_up_does_not_creep():
+    out = drive(
+        lambda t: 1000.0, inertia=lambda t: 480.0 * min(max(t - 10.0, 0.0), 10.0) if t < 21.0 else 0.0, until=40.0
+    )
+    ends = [(0.6 - line.value) / line.slope for _, state in out[10:] if (line := state.slip.line()).slope > 0.0]
+    assert min(ends) < AHEAD
+    assert first_warning(out) == math.inf
+
+
 def test_a_warning_near_the_limit_does_not_flap():
     out = drive(lambda t: 0.82 * MOST + 0.05 * MOST * math.sin(1.5 * t), until=120.0)
     warned = np.array([state.warning is Alert.IMMOBILISATION for _, state in out])

@@ -31,8 +31,8 @@ from soilbus.capability.trend import LAG, SWING, Capacity, Demand, Line, Peaks, 
 from soilbus.estimation.window import Rig, Window, inertia_of, pull_given
 from soilbus.terra.vehicle import slip_ratio
 
-SLIP_MEMORY = 4.0
-"""Time constant [s] of forgetting slip that creeps."""
+CREEP = 4.0
+"""Time constant [s] of forgetting slip that creeps, and the pull that it gives."""
 HOLD = 300.0
 """A peak of the demand is remembered this long [s] at least, and at most twice as long."""
 LONGEST_GAP = 1.0
@@ -54,7 +54,8 @@ an edge first, rear ones a wheelbase later."""
 SURE = 2.5
 """Standard deviations by which such a loss, and a rise of the demand, must differ from none."""
 STEADY = 0.003
-"""Rise of the demand [1/s], as a share of the capacity, up to which growing slip is the ground's doing."""
+"""Rise of the pull [1/s], as a share of the capacity, up to which growing slip is the ground's doing, and of draft and
+slope beyond which they may come to be too much."""
 CALM = 5.0
 """The warning ends this long [s] after its last cause."""
 SPAN = 3
@@ -86,9 +87,9 @@ class Watch:
     """What is remembered from one moment to the next; `watched` makes the next one.
 
     t [s] is the last moment with slip and pull, since that of the first; recent are the last of them
-    and curve is what the trend of the capacity rests on; capacity, demand [N] of draft and slope and the
-    mean slip are trends, peaks and asked hold the greatest pull and demand of late; caused [s] is when there was last
-    a cause to warn.  warning and time_left [s] (None: not foreseeable) are what to tell.
+    and curve is what the trend of the capacity rests on; capacity, demand [N] of draft and slope, mean
+    slip and given pull are trends, peaks and asked hold the greatest pull and demand of late; caused [s] is
+    when there was last a cause to warn.  warning and time_left [s] (None: not foreseeable) are what to tell.
     """
 
     t: float = -math.inf
@@ -98,6 +99,7 @@ class Watch:
     capacity: Capacity = _NO_CAPACITY
     demand: Demand = _NO_DEMAND
     slip: Trend = _NO_TREND
+    given: Trend = _NO_TREND
     peaks: Peaks = _NO_PEAKS
     asked: Peaks = _NO_PEAKS
     caused: float = -math.inf
@@ -133,14 +135,14 @@ def watched(
     capacity = trend.joined(step, _able(curve, look), None if earlier is None else _able(curve, earlier))
     demand = before.demand.joined(step, look.asked, *(None if a is None else a.asked for a in (once, twice)))
     peaks, asked = before.peaks.joined(t, pull, HOLD), before.asked.joined(t, look.asked, HOLD)
-    creep = before.slip.joined(step, look.slip, SLIP_MEMORY)
+    creep, given = before.slip.joined(step, look.slip, CREEP), before.given.joined(step, pull, CREEP)
     able = pull + reserve
     share, rise = (look.asked / able, demand.trend.line().slope / able) if able > 0.0 else (0.0, 0.0)
     time_left = None
     if t - before.since >= SETTLED:
         time_left = 0.0
         if reserve > 0.0:
-            to_limit = _time_of_creep(creep, float(curve.slip[-1]), rise)
+            to_limit = _time_of_creep(creep, float(curve.slip[-1]), given.line().slope / able)
             outgrown = _time_to_outgrow(capacity, look.asked, demand, asked.greatest)
             time_left = min(_time_to_weaken(capacity, peaks.greatest), outgrown, to_limit)
     warns = before.warning is Alert.IMMOBILISATION
@@ -150,7 +152,7 @@ def watched(
     if t - caused < CALM:
         warning = Alert.IMMOBILISATION
     return Watch(
-        t, before.since, (*kept, look), curve, capacity, demand, creep, peaks, asked, caused, warning, time_left
+        t, before.since, (*kept, look), curve, capacity, demand, creep, given, peaks, asked, caused, warning, time_left
     )  # fmt: skip
 
 
@@ -251,6 +253,6 @@ def _time_of_weakening(capacity: Capacity, line: Line, least: float, peak: float
 
 
 def _time_of_creep(slip: Trend, limit: float, rise: float) -> float:
-    """Time [s] until slip, growing under a demand that hardly rises (rise [1/s]), passes the limit."""
+    """Time [s] until slip, growing under a pull that hardly rises (rise [1/s]), passes the limit."""
     line = slip.line()
     return max(limit - line.value, 0.0) / line.slope if line.slope > 0.0 and abs(rise) < STEADY else math.inf
