@@ -187,7 +187,7 @@ class Tracker:
             return self._alarm
         if self._good_until <= end - length or filled <= GRACE * length:
             return None
-        if fit is not None and fit.bend and not self.mismatch(fit):
+        if fit is not None and fit.bend and not self._unsettled(fit):
             return None  # a curve is why
         t = ahead.fitting.problem.t
         first = int(np.searchsorted(t, float(last.optimum.t[-1]) - LOOK_BACK * length))
@@ -368,7 +368,9 @@ class Tracker:
         return self._on_the_way(window, Fitting(problem, self._here, before), fit)
 
     def _on_the_way(self, window: Window, fitting: Fitting, fit: Fit | None) -> tuple[Fitting, Fit | None]:
-        """A fit of a window freed of the bends of its way, where it has any."""
+        """A fit of a window freed of the bends of its way, where it has any; just after a border that would hide it."""
+        if self._crossing is not None and float(window.t[-1]) < self._crossing.end + self.settings.window:
+            return fitting, fit
         way = bending(fitting, fit)
         if fit is None or way is None:
             return fitting, fit
