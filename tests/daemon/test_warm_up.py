@@ -28,7 +28,7 @@ def started(monkeypatch):
     def noted(config, database, ours):
         rehearsals.append(warm_up(config, database, ours))
 
-    monkeypatch.setattr(start, "warm_up", noted)
+    monkeypatch.setattr("soilbus.daemon.warm_up.warm_up", noted)
 
     def of(config):
         services.append(start.start_service(config, wait=False))

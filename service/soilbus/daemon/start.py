@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from cantools.database.can import Database
+
 from soilbus.can.bus import BusError, LiveBus, open_bus
 from soilbus.can.dbc_files import filters_of, load_databases, output_database
 from soilbus.can.publish import Publisher
@@ -19,7 +21,6 @@ from soilbus.daemon.outputs import check_cycle_times
 from soilbus.daemon.pipeline import Pipeline, WindowResult
 from soilbus.daemon.service import Service
 from soilbus.daemon.store import Owner
-from soilbus.daemon.warm_up import warm_up
 
 SWITCH_INTERVAL = 0.0005
 
@@ -53,11 +54,18 @@ def start_service(
     sys.setswitchinterval(SWITCH_INTERVAL)
     workers = ThreadPoolExecutor(max_workers=1, thread_name_prefix="estimate")
     if rehearse:
-        workers.submit(warm_up, config, pipeline.database, ours)  # where it raises, the first window is late, no more
+        workers.submit(_rehearse, config, pipeline.database, ours)  # where it raises, the first window is late, no more
     keeper = _keeper(pipeline, os.environ)
     return Service(
         config, pipeline, bus, publisher, Notifier.from_environment(), workers, on_window=on_window, keeper=keeper
     )
+
+
+def _rehearse(config: Config, database: Database, ours: Database) -> None:
+    """In the worker: what only this needs is loaded when the service is ready."""
+    from soilbus.daemon.warm_up import warm_up
+
+    warm_up(config, database, ours)
 
 
 def _keeper(pipeline: Pipeline, environ: Mapping[str, str]) -> Keeper | None:
