@@ -55,7 +55,7 @@ SURE = 2.5
 """Standard deviations by which such a loss, and a rise of the demand, must differ from none."""
 STEADY = 0.003
 """Rise of the pull [1/s], as a share of the capacity, up to which growing slip is the ground's doing, and of draft and
-slope beyond which they may come to be too much."""
+slope beyond which they may come to be too much: where they are given too, for a vehicle that slows down gives less."""
 CALM = 5.0
 """The warning ends this long [s] after its last cause."""
 SPAN = 3
@@ -137,7 +137,7 @@ def watched(
     peaks, asked = before.peaks.joined(t, pull, HOLD), before.asked.joined(t, look.asked, HOLD)
     creep, given = before.slip.joined(step, look.slip, CREEP), before.given.joined(step, pull, CREEP)
     able = pull + reserve
-    share, rise = (look.asked / able, demand.trend.line().slope / able) if able > 0.0 else (0.0, 0.0)
+    share, rise = (min(look.asked, pull) / able, demand.trend.line().slope / able) if able > 0.0 else (0.0, 0.0)
     time_left = None
     if t - before.since >= SETTLED:
         time_left = 0.0
