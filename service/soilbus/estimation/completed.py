@@ -80,8 +80,7 @@ class CompletedProblem(WindowProblem):
 
     def _complete(self, effects: Sequence[Effect], free: Sequence[Free]) -> None:
         self.effects, self.free = tuple(effects), tuple(free)
-        named = {effect.name: effect for effect in self.effects}
-        self._effect_of = [named[f.effect] for f in self.free]
+        self._named = {effect.name: effect for effect in self.effects}
         std = [float(f.std > 0.0) for f in self.free]
         self.gain_names = [*self.gain_names[: self.n_sensors], *(f.name for f in self.free)]
         self.gain_std = np.concatenate([self.gain_std[: self.n_sensors], std])
@@ -167,7 +166,7 @@ class CompletedProblem(WindowProblem):
         pull_by_effects = np.zeros((len(self.free), self.n))
         for i, (step_of_effect, other, wheels) in others.items():
             moved = contact if wheels is None else self._contact(wheels, other, near)
-            effect = self._effect_of[i]
+            effect = self._named[self.free[i].effect]
             if wheels is not None or effect.torque is not None or effect.load is not None:
                 told = self._told(moved, other, latents, self._from_other_instants(other, moved))
                 by_effects[:, i] = (told - at) / step_of_effect
@@ -206,7 +205,7 @@ class CompletedProblem(WindowProblem):
             shifted = pulls.copy()
             inward = STEP if self.free[i].within(pulls[i] + STEP) else -STEP
             shifted[i] += inward
-            active, effect = self.active(shifted), self._effect_of[i]
+            active, effect = self.active(shifted), self._named[self.free[i].effect]
             stays = effect.wheel is None and effect.forces is None
             others[i] = inward, active, None if stays else self._wheels(soil, active, latents, latents.entry_angle)
         return others

@@ -181,6 +181,7 @@ FORMS = (
         (0.0005, 0.0005),
         0.04,
         by_hooks(resistance=_swaying_slope),
+        other=False,
     ),
     Form("grade", "hill", "a hill with its load transfer", "rad", (0.0006, 0.0006), 0.08, _hill),
     Form("grade", "no_sensor", "undulating field, pitch not measured", "rad", (0.0006, 0.0006), 0.08, _no_pitch_sensor),
