@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import json
 import math
@@ -223,7 +224,7 @@ def test_what_a_belief_depends_on_is_in_the_key(setting):
 
 def test_the_wiring_is_in_the_key_down_to_the_bit():
     config = reference_configuration()
-    database = load_databases(config)
+    database = copy.deepcopy(load_databases(config))
     channel = channels_of(config, database)[0]
     signal = database.get_message_by_name(channel.message).get_signal_by_name(channel.signal)
     assert owner_of(database=database).key == OWNER.key
