@@ -170,6 +170,16 @@ def test_nothing_is_said_before_a_trend_has_settled_or_without_inputs():
     assert watched(state, t + 5.0, [0.1], 2000.0, CURVE).warning is Alert.UNKNOWN
 
 
+def test_the_swing_that_first_takes_four_fifths_is_carried_on_sure_or_not():
+    """Under a draft that swings and grows it may be the last one that is held."""
+
+    def share(t: float) -> float:
+        return 0.3 + 0.012 * t + 0.3 * math.sin(0.8 * t)
+
+    end = next(t for t in np.arange(0.0, 60.0, 0.1) if share(t) >= 1.0)
+    assert end - first_warning(drive(lambda t: MOST * share(t), until=end)) > 12.0
+
+
 def test_a_draft_that_was_held_before_is_no_cause_after_a_break():
     held = drive(lambda t: min(2500.0 + 100.0 * t, 5000.0), until=60.0)
     t, state = held[-1]

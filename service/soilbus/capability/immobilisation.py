@@ -43,9 +43,10 @@ SETTLED = 2.0
 """Age [s] from which a trend is believed."""
 AHEAD = 10.0
 """Time left [s] from which is warned."""
-MUCH, TOO_MUCH, NEARLY_ALL = 0.71, 0.76, 0.85
-"""Share of the capacity from which a rise of draft and slope beyond their last peaks is carried on, from which no
-warning ends, and from which any rise or swing of theirs may come to be too much."""
+MUCH, TOO_MUCH, SURE_OR_NOT, NEARLY_ALL = 0.71, 0.76, 0.79, 0.85
+"""Share of the capacity from which a rise of draft and slope beyond their last peaks is carried on where it is sure,
+from which no warning ends, from which it is carried on sure or not, and from which any rise or swing of theirs may come
+to be too much."""
 WEAKENING, SHORT_WEAKENING = 0.006, 0.03
 """Loss [1/s], as a share of the capacity, from which the ground is said to weaken, by the long and the short memory."""
 STEEPER = 1.6
@@ -226,11 +227,12 @@ def _known(curve: OverSlip) -> tuple[list[float], list[float], list[float]]:
 
 
 def _time_to_outgrow(capacity: Capacity, asked: float, demand: Demand, peak: float) -> float:
-    """Time [s] until draft and slope meet the capacity, both going on as they do; inf where they surely do not rise."""
+    """Time [s] until draft and slope meet the capacity, both going on as they do; inf where they do not surely rise."""
     if not capacity.is_told or asked < peak:
         return math.inf
     able, line = capacity.long.line(), demand.trend.line()
-    outgrows = asked > MUCH * able.value and line.slope > max(able.slope, SURE * demand.slope_std(line))
+    sure = line.slope > SURE * demand.slope_std(line) or asked > SURE_OR_NOT * able.value
+    outgrows = asked > MUCH * able.value and line.slope > max(able.slope, 0.0) and sure
     return max(able.value - asked, 0.0) / (line.slope - able.slope) if outgrows else math.inf
 
 
