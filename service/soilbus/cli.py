@@ -10,13 +10,13 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from soilbus.allocator import keep_freed_memory, loading
-from soilbus.arguments import between, counted, natural
+from soilbus.arguments import command_line
 from soilbus.config import Config, ConfigError
 from soilbus.config_file import load_config
 from soilbus.report.whole_file import NotWritten, whole_file
@@ -33,12 +33,12 @@ class WorkError(Exception):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
-    args = _parser().parse_args(arguments)
+    args = command_line().parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="soilbus: %(message)s", stream=sys.stderr)
     logging.getLogger("can").setLevel(logging.CRITICAL)  # a bus that is away is ours to tell of, once
     keep_freed_memory()
     try:
-        args.work(args)
+        _WORK[args.command](args)
         sys.stdout.flush()
     except ConfigError as error:
         for fault in error.faults:
@@ -52,94 +52,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return FAILED
     return DONE
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="soilbus", description="Tells a tractor what soil it is driving on.")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-
-    def command(name: str, work: Any, text: str, config: str = "required") -> argparse.ArgumentParser:
-        sub = commands.add_parser(name, help=text, description=text)
-        sub.set_defaults(work=work)
-        if config:
-            sub.add_argument("--config", metavar="FILE", required=config == "required", help="TOML configuration")
-            sub.add_argument(
-                "--set", action="append", default=[], metavar="KEY=VALUE", help="override a value (dotted TOML path)"
-            )
-        return sub
-
-    sub = command("demo", _demo, "simulated tractor, service and dashboard; needs no hardware, ends by itself", "")
-    sub.add_argument("--duration", type=float, default=42.0, metavar="S", help="simulated seconds (default 42)")
-
-    sub = command("run", _run, "the service on a live bus")
-    sub.add_argument("--wait", action="store_true", help="wait for an interface that is not there yet")
-
-    command("check", _check, "check configuration and DBCs, list every mapped signal")
-
-    sub = command("replay", _replay, "the service's own pipeline over recorded logs")
-    sub.add_argument("logs", nargs="+", type=Path, metavar="LOG")
-    sub.add_argument("--json", type=Path, metavar="OUT", help="one JSON object a line per window; - for stdout")
-    sub.add_argument("--report", type=Path, metavar="OUT.html", help="self-contained HTML with plots (extra: plots)")
-    sub.add_argument("--map", type=Path, metavar="OUT.geojson", help="a point for each window; needs a mapped position")
-    sub.add_argument("--partial", action="store_true", help="keep the windows before the point where a log is cut off")
-
-    sub = command("simulate", _simulate, "simulated tractor, to a bus in real time or to a log", "optional")
-    sub.add_argument("--soil", action="append", default=[], metavar="NAME", help="soil; repeat it for a sequence")
-    sub.add_argument(
-        "--effect", action="append", default=[], metavar="NAME=VALUE",
-        help="an effect on wheels or sensors; NAME.PARAMETER=VALUE for another than its first parameter; repeatable",
-    )  # fmt: skip
-    sub.add_argument("--duration", type=float, default=120.0, metavar="S")
-    sub.add_argument("--seed", type=natural, default=1)
-    sub.add_argument("--start", nargs=2, type=float, metavar=("LAT", "LON"), help="where it starts [deg]")
-    sub.add_argument("--heading", type=float, default=0.0, metavar="DEG", help="clockwise from north (default 0)")
-    sub.add_argument(
-        "--rows", nargs=2, type=float, metavar=("LENGTH", "SPACING"), help="up and down a field [m], not straight on"
-    )
-    target = sub.add_mutually_exclusive_group(required=True)
-    target.add_argument("--bus", action="store_true", help="send to the configured bus in real time")
-    target.add_argument("--log", type=Path, metavar="OUT", help="write a log (.log .log.gz .asc .blf)")
-
-    sub = command("diagnose", _diagnose, "what the model misses: find, name, add, show")
-    sub.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="recordings of one vehicle")
-    sub.add_argument("--json", type=Path, metavar="OUT", help="write the findings as JSON; - for stdout")
-    sub.add_argument("--report", type=Path, metavar="OUT.html", help="self-contained HTML with plots (extra: plots)")
-    sub.add_argument(
-        "--model-out", type=Path, metavar="OUT.toml", help="the configuration with the effects found, for any command"
-    )
-
-    sub = command("watch", _watch, "live terminal dashboard that reads only our frames", "optional")
-    sub.add_argument("--seconds", type=float, metavar="S", help="stop after this time")
-
-    sub = command("paper", _paper, "the tables of Xi et al. 2024 beside ours, and what holds of its method", "")
-    sub.add_argument(
-        "--sinkage", type=between(0.005, 0.2), default=0.05, metavar="M",
-        help="of the simulated wheels, 0.005 to 0.2 m; the paper does not print its own (default 0.05)",
-    )  # fmt: skip
-    sub.add_argument("--seed", type=natural, default=1, help="of the noise (default 1)")
-
-    sub = command("montecarlo", _montecarlo, "errors of simulated windows beside the Cramér-Rao bound", "optional")
-    sub.add_argument("--windows", type=counted, default=200, metavar="N", help="of each kind (default 200)")
-    sub.add_argument("--exact", type=natural, default=0, metavar="M", help="samples of exact posteriors (default 0)")
-    sub.add_argument("--around", type=between(0.0, 1.0), default=0.0, metavar="S", help="std of soils' log (default 0)")
-    sub.add_argument("--seed", type=natural, default=1, help="of drives, noise and priors (default 1)")
-    sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
-
-    sub = command("decisions", _decisions, "what soilbus foretells, beside what simulated drives then do", "optional")
-    sub.add_argument("--drives", type=counted, default=150, metavar="N", help="on each held soil (default 150)")
-    sub.add_argument("--calls", type=counted, default=600, metavar="N", help="of go, caution, no-go (default 600)")
-    sub.add_argument("--boggings", type=counted, default=40, metavar="N", help="drives into trouble (default 40)")
-    sub.add_argument("--hours", type=between(0.0, 100.0), default=1.0, metavar="H", help="on firm ground (default 1)")
-    sub.add_argument("--seed", type=natural, default=1, help="of soils, drives, noise and priors (default 1)")
-    sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
-
-    sub = command("bench", _bench, "every performance figure beside its peer, in one run", "")
-    sub.add_argument("--bus", metavar="CHANNEL", help="the service on this bus, filled up: a vcan, never a vehicle's")
-    sub.add_argument(
-        "--seconds", type=between(15.0, 200.0), default=120.0, metavar="S", help="of a full bus (default 120)"
-    )
-    sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
-    return parser
 
 
 def _configured(args: argparse.Namespace) -> Config:
@@ -407,6 +319,21 @@ def _check_folders(*paths: Path | None) -> None:
     for path in paths:
         if path is not None and not path.parent.is_dir():
             raise WorkError(f"{path}: no folder {path.parent}")
+
+
+_WORK: dict[str, Callable[[argparse.Namespace], None]] = {
+    "demo": _demo,
+    "run": _run,
+    "check": _check,
+    "replay": _replay,
+    "simulate": _simulate,
+    "diagnose": _diagnose,
+    "watch": _watch,
+    "paper": _paper,
+    "montecarlo": _montecarlo,
+    "decisions": _decisions,
+    "bench": _bench,
+}
 
 
 if __name__ == "__main__":

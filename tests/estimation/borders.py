@@ -6,12 +6,11 @@
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from drives import errors, task_of, windows
+from drives import errors, sweep, task_of, windows
 
 from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.config import Config
@@ -126,13 +125,10 @@ def wrong(told: list[Told]) -> list[Told]:
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = sweep(__doc__ or "", 20)
     parser.add_argument("pairs", nargs="*", default=list(PAIRS))
     parser.add_argument("--speeds", type=float, nargs="+", default=[1.5])
     parser.add_argument("--transition", type=float, default=1.0)
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--first", type=int, default=1)
-    parser.add_argument("--windows", action="store_true")
     args = parser.parse_args()
     config = reference_configuration()
     print("pair                     speed  drives  valid from [s]: median  most  within 2 s  valid windows  wrong  rms")

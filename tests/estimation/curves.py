@@ -6,12 +6,11 @@
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from drives import errors, task_of, windows
+from drives import errors, sweep, task_of, windows
 
 from soilbus.assembly import rig_of
 from soilbus.config import Config
@@ -70,12 +69,9 @@ def driven(config: Config, soil: str, radius: float, seed: int) -> list[Told]:
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = sweep(__doc__ or "", 8)
     parser.add_argument("--radii", type=float, nargs="+", default=[75.0, 40.0, 25.0])
     parser.add_argument("--soil", default="loam")
-    parser.add_argument("--seeds", type=int, default=8)
-    parser.add_argument("--first", type=int, default=1)
-    parser.add_argument("--windows", action="store_true")
     args = parser.parse_args()
     config = reference_configuration()
     print("radius  windows since the curve  valid  rms error / sd: bearing  tan phi  most  wrong  others")

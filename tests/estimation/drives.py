@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Iterator
 
 import numpy as np
@@ -65,3 +66,12 @@ def tasks(config: Config, scenario: Scenario, seed: int, without: str = "none") 
     length = config.estimator.window
     for i, end in enumerate(np.arange(length, scenario.duration + 0.05, config.estimator.hop).tolist()):
         yield task_of(store.window(end - length, end), end, config, i)
+
+
+def sweep(text: str, seeds: int) -> argparse.ArgumentParser:
+    """Arguments of a sweep over drives: which seeds, and whether to tell of every window."""
+    parser = argparse.ArgumentParser(description=text)
+    parser.add_argument("--seeds", type=int, default=seeds)
+    parser.add_argument("--first", type=int, default=1)
+    parser.add_argument("--windows", action="store_true")
+    return parser

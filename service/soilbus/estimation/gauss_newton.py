@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
-from soilbus.estimation.descent import FAR, LEFT_OVER, LEFT_OVER_RESUMED, LITTLE, MAX_REFUSED, approach, settle
+from soilbus.estimation.descent import FAR, LEFT_OVER_RESUMED, LITTLE, Settled, approach, settle
 from soilbus.estimation.linearised import Bend, Latents, Linearised, Optimum
 from soilbus.estimation.normal_equations import Fitting, Place
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
@@ -156,7 +156,7 @@ def fit_window(problem: WindowProblem, prior: SoilPrior, before: Belief | None =
             return best
         if not best.converged:
             near = approach(Fitting(problem, prior, before, with_gains=False), best.mode.soil, MAX_ITERATIONS, 0.0)
-            best = best if near is None else _settled(fitting, near, MAX_ITERATIONS) or best
+            best = best if near is None else _fit_at(fitting, settle(fitting, near, MAX_ITERATIONS)) or best
         return _with_rival(fitting, thin, best, ends) if best.converged else best
 
 
@@ -166,7 +166,8 @@ def _best(fitting: Fitting, thin: Fitting, ends: Sequence[Place]) -> Fit | None:
     best: Fit | None = None
     for end in unlike[:MAX_SETTLED]:
         most = MAX_ITERATIONS if end.cost < HOPELESS * THINNED else MAX_HOPELESS
-        fit = _settled(fitting, replace(fitting.start(end.soil), trials=end.trials), most)
+        start = replace(fitting.start(end.soil), trials=end.trials)
+        fit = _fit_at(fitting, settle(fitting, start, most))
         if fit is not None and (best is None or (fit.converged, -fit.cost) > (best.converged, -best.cost)):
             best = fit
         if best is not None and best.converged:
@@ -185,7 +186,7 @@ def _with_rival(fitting: Fitting, thin: Fitting, found: Fit, ends: Sequence[Plac
     end = _other_end(fitting, thin, found, ends) if np.ptp(fitting.problem.rig.width) > 0.0 else None
     if end is None:
         return found
-    other = _settled(fitting, fitting.start(end.soil), MAX_ITERATIONS)
+    other = _fit_at(fitting, settle(fitting, fitting.start(end.soil), MAX_ITERATIONS))
     if other is None or not other.converged:
         return found
     better, worse = (found, other) if found.evidence <= other.evidence else (other, found)
@@ -263,7 +264,8 @@ def descend(problem: WindowProblem, prior: SoilPrior, start: Soil, before: Belie
     soil = np.where(prior.log_std > 0.0, np.asarray(start, float), prior.median)
     with np.errstate(all="ignore"):
         near = approach(Fitting(problem, prior, before, with_gains=False), soil, MAX_ITERATIONS)
-        return None if near is None else _settled(Fitting(problem, prior, before), near, MAX_ITERATIONS)
+        fitting = Fitting(problem, prior, before)
+        return None if near is None else _fit_at(fitting, settle(fitting, near, MAX_ITERATIONS))
 
 
 def continued(
@@ -286,12 +288,15 @@ def continued(
     with np.errstate(all="ignore"):
         if start.near:
             place = fitting.near(start.soil, gains, start.latents)
-            fit = _settled(fitting, place, MAX_RESUMED, refusals=1, hopeless=hopeless, in_all=MAX_ASTRAY)
+            end = settle(fitting, place, MAX_RESUMED, refusals=1, hopeless=hopeless, in_all=MAX_ASTRAY)
+            fit = _fit_at(fitting, end)
             if fit is not None and (fit.converged or fit.chi2 < PLAUSIBLE):
                 return fit
         moving = Fitting(problem, prior, before, first=first)
         near = approach(moving, start.soil, most, LITTLE, gains, hopeless=AS_MEASURED * hopeless)
-        return None if near is None else _settled(fitting, near, most, hopeless=hopeless, in_all=MAX_ASTRAY)
+        if near is None:
+            return None
+        return _fit_at(fitting, settle(fitting, near, most, hopeless=hopeless, in_all=MAX_ASTRAY))
 
 
 @dataclass(frozen=True, slots=True)
@@ -321,26 +326,16 @@ def resume(ahead: Foreseen) -> Fit | None:
         if point is not None and step is not None:
             near = fitting.moved(near, point, step)
         first = 0.0 if point is None or step is None else point.length(step)
-        return _settled(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED, first)
+        return _fit_at(fitting, settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED, first))
 
 
 def settled(fitting: Fitting, near: Place) -> Fit | None:
     """Descent from a place near the optimum; None where the numbers stop being finite."""
-    return _settled(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED)
+    return _fit_at(fitting, settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED))
 
 
-def _settled(
-    fitting: Fitting,
-    near: Place,
-    most: int,
-    left_over: float = LEFT_OVER,
-    before: float = 0.0,
-    refusals: int = MAX_REFUSED,
-    hopeless: float = np.inf,
-    in_all: float = np.inf,
-) -> Fit | None:
-    """Where a descent from a place near the optimum ends, as settle(), with what is known there."""
-    end = settle(fitting, near, most, left_over, before, refusals, hopeless, in_all)
+def _fit_at(fitting: Fitting, end: Settled | None) -> Fit | None:
+    """The end of a descent, with what is known there; None where the numbers stopped being finite."""
     beliefs = None if end is None else fitting.beliefs(end.place, end.point, end.last.soil)
     if end is None or beliefs is None:
         return None
