@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, Phase, example, find, given, settings
 from hypothesis import strategies as st
 from hypothesis.errors import NoSuchExample
 
+from feeding import feed_message
 from onlooker import CONFIG, MOMENTS, NEEDED, Drive
 from soilbus.can.dbc_files import load_databases
 from soilbus.daemon.intake import Intake
@@ -51,7 +52,7 @@ def tracked():
     estimator._tracker.estimate = lambda *given: found.append(usual(*given)) or found[-1]
     messages = list(frames(simulate(config, excited("loam", 12.0), seed=3), config))
     for message in messages:
-        pipeline.admission.feed_message(message)
+        feed_message(pipeline.admission, message)
     results = pipeline.finish(messages[-1].timestamp)
     return next(t for t, r in zip(found, results, strict=True) if r.status is Status.VALID)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from feeding import feed_message
 from soilbus.can.candump import Frame
 from soilbus.can.dbc_files import load_databases
 from soilbus.config_file import load_config
@@ -110,7 +111,7 @@ def test_slip_in_reverse_is_that_of_the_same_drive_forward():
         tasks = []
         for m in frames(dataclasses.replace(recording, channels=channels), config, database):
             tasks += intake.due(m.timestamp)
-            intake.admission.feed_message(m)
+            feed_message(intake.admission, m)
             last = m.timestamp
         slips += [[*tasks[0].slip.values(), *intake.latest(last).slip.values()]]
         intake.ingest()

@@ -10,7 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from cantools.database.can import Database, Message
@@ -42,17 +42,6 @@ MAX_LISTED_UNKNOWN = 1024
 
 _EXTENDED = 1 << 31
 _NONE: NDArray[np.float64] = np.empty(0)
-
-
-class CanMessage(Protocol):
-    """What `feed_message` reads of python-can's Message."""
-
-    timestamp: float
-    arbitration_id: int
-    is_extended_id: bool
-    is_remote_frame: bool
-    is_error_frame: bool
-    data: bytearray
 
 
 @dataclass(slots=True)
@@ -122,15 +111,6 @@ class Admission:
             self._refuse_unheard(inbox, Reason.REMOTE_FRAME)
         else:
             inbox.frames.append((t, arbitration_id, data))
-
-    def feed_message(self, message: CanMessage) -> None:
-        """`feed` for python-can's messages; error frames are counted and dropped."""
-        if message.is_error_frame:
-            self.counts.error_frames += 1
-            return
-        self.feed(
-            message.timestamp, message.arbitration_id, message.is_extended_id, message.data, message.is_remote_frame
-        )
 
     def take(self, until: float = math.inf) -> Decoded:
         """Samples of all frames filed so far with t < until [s]; later frames stay.

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from soilbus.terra.effects.catalogue import CATALOGUE, effect_named
+from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active, Effect, Surroundings, forces_with, wheel_with
 from soilbus.terra.wheel import FORCES, WheelModel, WheelState, wheel_forces
 from wheels_around import REAR, wheels_around
@@ -37,12 +37,6 @@ def everything(effect: Effect, values: dict, state: WheelState, model: WheelMode
 def test_names_are_those_of_the_design_in_its_order():
     assert list(CATALOGUE) == NAMES
     assert [effect.name for effect in CATALOGUE.values()] == NAMES
-
-
-def test_an_effect_by_its_name():
-    assert effect_named("lugs") is CATALOGUE["lugs"]
-    with pytest.raises(KeyError, match=r"no effect is named mud; known: slip_sinkage, .*, soil_drift"):
-        effect_named("mud")
 
 
 @EFFECTS

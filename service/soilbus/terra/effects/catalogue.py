@@ -23,10 +23,3 @@ CATALOGUE: dict[str, Effect] = {
         WHEEL_LOAD_OFFSET, SOIL_DRIFT,
     )
 }  # fmt: skip
-
-
-def effect_named(name: str) -> Effect:
-    """The effect of that name; KeyError with the known names otherwise."""
-    if name not in CATALOGUE:
-        raise KeyError(f"no effect is named {name}; known: {', '.join(CATALOGUE)}")
-    return CATALOGUE[name]
