@@ -176,7 +176,7 @@ class Admission:
                 out.columns[channel.name] = Column(_NONE, _NONE)
             return
         self.counts.admitted[inbox.message.name] += len(batch.t)
-        blocks = inbox.decoder.blocks(batch.payload)
+        blocks = batch.blocks(inbox.decoder)
         plain = inbox.plain.samples(blocks) if inbox.plain is not None else None
         if plain is not None:
             out.columns.update((name, Column(batch.t, value)) for name, value in plain.items())

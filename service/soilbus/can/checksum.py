@@ -6,6 +6,8 @@ well as one with a wrong payload.
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from crccheck.crc import Crc8SaeJ1850  # type: ignore[import-untyped]
 from numpy.typing import NDArray
@@ -16,6 +18,7 @@ CHECKSUM = "Checksum"
 
 _INIT = 0xFF
 _XOR_OUT = 0xFF
+_ID_BYTES = 4
 _TABLE = bytes(Crc8SaeJ1850(initvalue=0).process((byte,)).value() for byte in range(256))
 _TABLE_ARRAY: NDArray[np.uint8] = np.frombuffer(_TABLE, dtype=np.uint8)
 
@@ -44,10 +47,23 @@ def column_checksums(
     arbitration_ids: NDArray[np.int64], payload: NDArray[np.uint8], checksum_byte_index: int
 ) -> NDArray[np.uint8]:
     """`frame_checksum` of many frames at once: identifiers (N,), payload (N, length) -> (N,)."""
-    crc = np.full(len(payload), _INIT, dtype=np.uint8)
-    for shift in (0, 8, 16, 24):
-        crc = _TABLE_ARRAY[crc ^ ((arbitration_ids >> shift) & 0xFF).astype(np.uint8)]
-    for column in range(payload.shape[1]):
-        if column != checksum_byte_index:
-            crc = _TABLE_ARRAY[crc ^ payload[:, column]]
-    return crc ^ np.uint8(_XOR_OUT)
+    identifiers = arbitration_ids.astype("<u4").view(np.uint8).reshape(-1, _ID_BYTES)
+    data = np.concatenate([identifiers, payload], axis=1)
+    shares, start = _shares(data.shape[1], _ID_BYTES + checksum_byte_index)
+    crc: NDArray[np.uint8] = np.bitwise_xor.reduce(shares[np.arange(len(shares)), data], axis=1, initial=start)
+    return crc
+
+
+@cache
+def _shares(length: int, left_out: int) -> tuple[NDArray[np.uint8], np.uint8]:
+    """What each byte of the data adds to the CRC, by its place and value (length, 256), and the CRC of zeros.
+
+    A CRC is linear over GF(2): what a byte does to it does not depend on the other bytes.
+    """
+    shares = np.zeros((length, 256), np.uint8)
+    moved_on = np.arange(256, dtype=np.uint8)  # what a byte has become when those after it have gone in
+    for place in reversed(range(length)):
+        if place != left_out:
+            moved_on = _TABLE_ARRAY[moved_on]
+            shares[place] = moved_on
+    return shares, moved_on[_INIT] ^ np.uint8(_XOR_OUT)

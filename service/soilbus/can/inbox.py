@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from soilbus.can.channels import Channel
 from soilbus.can.checksum import CHECKSUM, COUNTER, column_checksums
-from soilbus.can.decode import ColumnDecoder
+from soilbus.can.decode import Block, ColumnDecoder
 from soilbus.can.j1939 import SourceLock, source_of
 from soilbus.can.plain import PlainPlan, plain_plan
 from soilbus.can.validity import CodeRule, rule_of
@@ -32,11 +32,18 @@ Mask = NDArray[np.bool_]
 
 @dataclass(slots=True)
 class Batch:
-    """Frames of one message: times [s] (N,), identifiers (N,), payload (N, length)."""
+    """Frames of one message: times [s] (N,), identifiers (N,), payload (N, length); decoded once, when asked for."""
 
     t: NDArray[np.float64]
     ids: NDArray[np.int64]
     payload: NDArray[np.uint8]
+    _blocks: list[Block] | None = None
+
+    def blocks(self, decoder: ColumnDecoder) -> list[Block]:
+        """The payload decoded by the message's decoder."""
+        if self._blocks is None:
+            self._blocks = decoder.blocks(self.payload)
+        return self._blocks
 
     def where(self, mask: Mask) -> Batch:
         """Those of a mask (N,)."""
@@ -132,24 +139,28 @@ def time_forward(inbox: Inbox, batch: Batch) -> Mask | None:
 
 
 def counter_moved(inbox: Inbox, batch: Batch) -> Mask | None:
-    """False where a frame repeats the counter of the one before it from the same sender."""
+    """False where a frame repeats the counter of the one before it from the same sender; None where none does."""
     if inbox.checksum_byte is None:
         return None
-    counter = inbox.decoder.columns(batch.payload)[COUNTER].raw
-    before = np.concatenate(([inbox.last_counter], counter[:-1]))
-    id_before = np.concatenate(([inbox.last_id], batch.ids[:-1]))
+    counter = inbox.decoder.columns_of(batch.blocks(inbox.decoder))[COUNTER].raw
+    last_counter, last_id = inbox.last_counter, inbox.last_id
     inbox.last_counter, inbox.last_id = int(counter[-1]), int(batch.ids[-1])
+    if counter[0] != last_counter and np.count_nonzero(counter[1:] == counter[:-1]) == 0:
+        return None
+    before = np.concatenate(([last_counter], counter[:-1]))
+    id_before = np.concatenate(([last_id], batch.ids[:-1]))
     moved: Mask = (counter != before) | (batch.ids != id_before)
     return moved
 
 
 def not_twice(inbox: Inbox, batch: Batch) -> Mask | None:
-    """False where a frame comes once more: counted twice, its noise would seem smaller than it is."""
+    """False where a frame comes once more: counted twice, its noise would seem smaller than it is.  None where none."""
     t_before, id_before, data_before = inbox.last_frame
     inbox.last_frame = float(batch.t[-1]), int(batch.ids[-1]), batch.payload[-1].tobytes()
-    close = np.diff(batch.t, prepend=t_before) < TWICE
-    if not close.any():
+    t = batch.t
+    if t[0] - t_before >= TWICE and np.count_nonzero(t[1:] - t[:-1] < TWICE) == 0:
         return None
+    close = np.diff(t, prepend=t_before) < TWICE
     length = batch.payload.shape[1]
     first = np.frombuffer(data_before.ljust(length, b"\0"), np.uint8).reshape(1, length)
     same = (batch.payload == np.concatenate([first, batch.payload[:-1]])).all(axis=1)

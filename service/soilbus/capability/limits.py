@@ -41,11 +41,10 @@ class Largest(NamedTuple):
 
 def within(balance: Balance, limits: Limits) -> NDArray[np.bool_]:
     """Steady states within the limits (D, F)."""
-    usable = balance.known
+    usable = balance.known.copy()
     for kind, torque in enumerate(limits.torque):
-        usable = (
-            usable & (balance.torque[:, kind] <= torque) & (balance.angle[:, kind] <= limits.angle[..., kind, None])
-        )
+        usable &= balance.torque[:, kind] <= torque
+        usable &= balance.angle[:, kind] <= limits.angle[..., kind, None]
     return usable
 
 
@@ -55,27 +54,32 @@ def largest_pull(balance: Balance, limits: Limits) -> Largest:
     row, last = np.arange(len(usable)), usable.shape[1] - 1
     best = np.where(usable, balance.pull, -np.inf).argmax(axis=1)
     after = np.minimum(best + 1, last)
-    pull, slip = balance.pull[row, best], balance.slip[best]
-    more = balance.known[row, after] & (balance.pull[row, after] > pull)
-    by_torque = _share(balance.torque[row, :, best], balance.torque[row, :, after], limits.torque)
-    by_angle = _share(balance.angle[row, :, best], balance.angle[row, :, after], limits.angle)
-    share = np.where(more, np.minimum(by_torque, by_angle), 0.0)
-    pull = pull + share * (balance.pull[row, after] - pull)
+    here, there = balance.columns[row, :, best], balance.columns[row, :, after]
+    pull, slip = here[:, 0], balance.slip[best]
+    more = balance.known[row, after] & (there[:, 0] > pull)
+    kinds = len(limits.torque)
+    by_limit = _shares(here[:, 1 + kinds :], there[:, 1 + kinds :], limits)
+    share = np.where(more, by_limit.min(axis=1), 0.0)
+    pull = pull + share * (there[:, 0] - pull)
     slip = slip + share * (balance.slip[after] - slip)
-    none = ~usable.any(axis=1)
+    none = ~usable[row, best]
     cause: Cause = "traction"
     if best[0] == last:
         cause = "slip"
     elif more[0]:
-        cause = "torque" if by_torque[0] <= by_angle[0] else "sinkage"
+        cause = "torque" if by_limit[0, :kinds].min() <= by_limit[0, kinds:].min() else "sinkage"
     return Largest(np.where(none, np.nan, pull), np.where(none, np.nan, slip), cause)
 
 
-def _share(here: Array, there: Array, limit: Array) -> Array:
-    """Share of the way from here to there (D, A) at which the first limit (A,) or (D, A) is met, 1 if none is: (D,)."""
+def _shares(here: Array, there: Array, limits: Limits) -> Array:
+    """Shares of the way from here to there at which each limit is met, 1 where it is not.
+
+    All (D, 2 A): of the torques by kind of wheel, then of the entry angles.
+    """
+    limit = np.empty(here.shape)
+    limit[:, : len(limits.torque)], limit[:, len(limits.torque) :] = limits.torque, limits.angle
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.where(there > limit, (limit - here) / (there - here), 1.0)
-    return np.asarray(share.min(axis=1))
+        return np.where(there > limit, (limit - here) / (there - here), 1.0)
 
 
 class Place(NamedTuple):
@@ -115,18 +119,20 @@ def slips_of_most(values: Array, balance: Balance, limits: Limits, top: Array) -
     """
     slip, last = balance.slip, len(balance.slip) - 1
     usable = within(balance, limits) & (values > 0.0)
-    best = (values * usable).argmax(axis=-1)[..., None]
+    best = (values * usable).argmax(axis=-1)
     after = np.minimum(best + 1, last)
-    i = np.clip(best, 1, last - 1) + np.arange(-1, 2)
-    x0, x1, x2 = np.moveaxis(slip[i], -1, 0)
-    y0, y1, y2 = np.moveaxis(np.take_along_axis(values, i, -1), -1, 0)
+    quantity, row = np.ogrid[: len(values), : values.shape[1]]
+    middle = np.minimum(np.maximum(best, 1), last - 1)
+    i = np.stack([middle - 1, middle, middle + 1])
+    x0, x1, x2 = slip[i]
+    y0, y1, y2 = values[quantity, row, i]
     rise, fall = (y1 - y0) / (x1 - x0), (y2 - y1) / (x2 - x1)
     with np.errstate(divide="ignore", invalid="ignore"):
         vertex = 0.5 * (x0 + x1) + 0.5 * (x2 - x0) * rise / (rise - fall)
-    inside = np.take_along_axis(usable, i, -1).all(axis=-1) & (best[..., 0] == i[..., 1])
-    low, high = slip[best[..., 0]], slip[after[..., 0]]
-    at_end = np.where(np.take_along_axis(usable, after, -1)[..., 0], low, np.clip(top, low, high))
-    return np.where(usable.any(axis=-1), np.where(inside, vertex, at_end), np.nan)
+    inside = usable[quantity, row, i].all(axis=0) & (best == middle)
+    low, high = slip[best], slip[after]
+    at_end = np.where(usable[quantity, row, after], low, np.clip(top, low, high))
+    return np.where(usable[quantity, row, best], np.where(inside, vertex, at_end), np.nan)
 
 
 def axle_sum(values: Array, axles: Axles, kinds: NDArray[np.bool_], each: Array | float = 1.0) -> Array:

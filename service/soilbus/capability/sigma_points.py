@@ -72,16 +72,18 @@ class SigmaPoints:
         return cls(soils, *_shares(leading, len(soils) - len(points)))
 
     def drawn(self, samples: Array, known: NDArray[np.bool_] | None = None) -> Array:
-        """Samples (D, ...) at the points, known or not, to the mode and the draws (1 + N, ...).
+        """Samples (D, ..., F) at the points, known or not, to the mode and the draws (1 + N, ..., F).
 
         What is not known at a point is as at its mirror, mirrored about the mode's; where neither is
-        known, it is the mode's.
+        known, it is the mode's.  What has one index between the first and the last lies in memory index by index.
         """
-        flat = samples.reshape(len(samples), -1)
         if known is not None and not known.all():
-            known = np.broadcast_to(known, samples.shape).reshape(flat.shape)
-            flat = np.where(known, flat, np.where(known[self.mirror], 2.0 * flat[0] - flat[self.mirror], flat[0]))
-        return np.asarray(self.share @ flat).reshape(-1, *samples.shape[1:])
+            known = np.broadcast_to(known, samples.shape)
+            mirrored = np.where(known[self.mirror], 2.0 * samples[0] - samples[self.mirror], samples[0])
+            samples = np.where(known, samples, mirrored)
+        if samples.ndim == 3:
+            return np.asarray((self.share @ samples.swapaxes(0, 1)).swapaxes(0, 1))
+        return np.asarray(self.share @ samples.reshape(len(samples), -1)).reshape(-1, *samples.shape[1:])
 
 
 @cache

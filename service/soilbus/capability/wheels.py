@@ -83,8 +83,9 @@ class Axles:
 
     def loads(self, draft: Any, sine: Any) -> Array:
         """Load on each wheel [N] (..., A, S) for a draft [N] and a slope's sine, each (..., S)."""
-        draft, sine = (np.atleast_1d(a)[..., None, :] for a in (draft, np.clip(sine, -0.99, 0.99)))
-        return np.asarray(self.level * np.sqrt(1.0 - sine**2) + self.tilt * sine + self.lever * draft)
+        draft = np.atleast_1d(draft)[..., None, :]
+        sine = np.atleast_1d(np.minimum(np.maximum(sine, -0.99), 0.99))[..., None, :]
+        return np.asarray(self.level * np.sqrt(1.0 - sine * sine) + self.tilt * sine + self.lever * draft)
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import lru_cache
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -82,18 +83,25 @@ def _scales(gained: Array, told: Array, n: int, late: int) -> Array:
     Either may be late by so many bins; of the delays with which the two may go together the
     one counts with which they are most alike.
     """
-    moved = sliding_window_view(np.pad(told, late, constant_values=np.nan), len(told))
+    nothing = np.full(late, np.nan)
+    moved = sliding_window_view(np.concatenate([nothing, told, nothing]), len(told))
     known = np.isfinite(gained) & np.isfinite(moved)
     one, other = np.where(known, gained, 0.0), np.where(known, moved, 0.0)
-    both, of_one, of_other, count = (
-        sliding_window_view(x, n, axis=1).sum(axis=-1) for x in (one * other, one * one, other * other, known)
-    )
+    both, of_one, of_other, count = np.stack([one * other, one * one, other * other, known]) @ _stretches(len(told), n)
     enough = (count >= KNOWN * n) & (of_one > n * CHANGING**2) & (of_other > 0.0)
     together = np.divide(both, np.sqrt(of_one * of_other), where=enough, out=np.zeros(both.shape))
     scale = np.divide(both, of_other, where=together > MAY_BE, out=np.full(both.shape, np.inf))
     best = np.argmin(np.abs(np.log(scale)), axis=0)
     chosen = np.take_along_axis(scale, best[None], axis=0)[0]
     return np.where(together.max(axis=0) > TOGETHER, chosen, np.nan)
+
+
+@lru_cache(maxsize=8)
+def _stretches(length: int, n: int) -> Array:
+    """What sums each n neighbours of so many values: (length, length - n + 1) of ones and zeros."""
+    first = np.arange(length - n + 1)
+    place = np.arange(length)[:, None]
+    return np.asarray((place >= first) & (place < first + n), float)
 
 
 def _usual_slip(slip: Array, begins: Mask, n: int) -> float:
@@ -150,7 +158,7 @@ def _opposite(
     both &= scene.driving[len(scene.driving) - len(both) :]
     a, b = one[both], other[both]
     product, n = a * b, max(round(seconds / scene.bin), 1)
-    if len(a) < n:
+    if np.count_nonzero(product < 0.0) < OPPOSITE * n:
         return False
     opposite, of_both, of_one, of_other = (running_sum(x, n) for x in (product < 0.0, product, a * a, b * b))
     return bool(((opposite >= OPPOSITE * n) & (of_both < CORRELATION * np.sqrt(of_one * of_other))).any())

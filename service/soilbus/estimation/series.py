@@ -14,9 +14,7 @@ Mask = NDArray[np.bool_]
 
 def running_sum(values: NDArray[Any], n: int) -> Array:
     """Sums of each n neighbours of (N,), (N - n + 1,); none where there are fewer."""
-    if len(values) < n:
-        return np.zeros(0)
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(values, n).sum(axis=1))
+    return np.convolve(values, np.ones(n), "valid") if len(values) >= n else np.zeros(0)
 
 
 def change(values: Array, lag: int) -> Array:
@@ -31,7 +29,7 @@ def change_variance(variance: Array, lag: int) -> Array:
 
 def smooth(values: Array) -> Array:
     """Means (N,) of each three neighbours."""
-    wide = np.pad(values, 1, mode="edge")
+    wide = np.concatenate([values[:1], values, values[-1:]])
     return np.asarray((wide[:-2] + wide[1:-1] + wide[2:]) / 3.0)
 
 
@@ -48,6 +46,8 @@ def median(values: Array) -> float:
 
 def lasts(holds: Mask, bins: int) -> bool:
     """Whether something holds in so many bins in a row."""
+    if np.count_nonzero(holds) < bins:
+        return False
     return any(last - first >= bins for first, last in runs(holds))
 
 
