@@ -201,11 +201,14 @@ def moments(window: Window, rig: Rig, since: float, min_speed: float) -> Iterato
         return
     ground = window.ground_speed[:, None]
     slip = np.where(ground > min_speed, slip_ratio(rig.radius, window.speed, ground), np.nan)
-    pull, inertia = pull_given(window, rig.chassis), inertia_of(window, rig.chassis)
-    for i in np.flatnonzero(window.t > since).tolist():
-        recent = slice(max(i + 1 - SPAN, 0), i + 1)
-        slips = slip[recent].mean(axis=0).tolist()
-        yield Moment(float(window.t[i]), slips, float(pull[recent].mean()), float(inertia[recent].mean()))
+    of_bins = np.column_stack([slip, pull_given(window, rig.chassis), inertia_of(window, rig.chassis)])
+    chosen = np.flatnonzero(window.t > since)
+    place = chosen[:, None] + np.arange(1 - SPAN, 1)
+    there = place >= 0
+    total = np.where(there[:, :, None], of_bins[np.maximum(place, 0)], 0.0).sum(axis=1)
+    means = total / there.sum(axis=1)[:, None]
+    for t, (*slips, pull, inertia) in zip(window.t[chosen].tolist(), means.tolist(), strict=True):
+        yield Moment(t, slips, pull, inertia)
 
 
 def _reserve(curve: OverSlip, slip: float) -> float:

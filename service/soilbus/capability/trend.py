@@ -55,10 +55,12 @@ class Trend(NamedTuple):
     def joined(self, step: float, value: float | None, memory: float) -> Trend:
         """The trend a step [s] later, with one more value or none; memory is the time constant [s] of forgetting."""
         kept = math.exp(-step / memory)
-        n, x, y = kept * self.n, kept * self.x, kept * self.y
-        xx, xy = kept * self.xx, kept * self.xy
-        later = Trend(n, x - step * n, xx - 2.0 * step * x + step**2 * n, y, xy - step * y)
-        return later if value is None else later._replace(n=n + 1.0, y=y + value)
+        n, x, xx, y, xy = self
+        n, x, xx, y, xy = kept * n, kept * x, kept * xx, kept * y, kept * xy
+        later_x, later_xx, later_xy = x - step * n, xx - 2.0 * step * x + step**2 * n, xy - step * y
+        if value is None:
+            return Trend(n, later_x, later_xx, y, later_xy)
+        return Trend(n + 1.0, later_x, later_xx, y + value, later_xy)
 
     def line(self) -> Line:
         """The line; it lies flat where all values are of one time."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from soilbus.estimation.scene import DEVIATIONS, FALSE_SLIP, Scene
 from soilbus.estimation.series import change, change_variance, median, moving_sum, running_sum, smooth
-from soilbus.estimation.window import pull_given
+from soilbus.estimation.window import pull_given, zero_if_unknown
 from soilbus.terra.vehicle import GRAVITY
 
 Array = NDArray[np.float64]
@@ -115,7 +115,7 @@ def _jumps(scene: Scene) -> bool:
     window = scene.window
     at_once, about = (max(round(span / scene.bin), 1) for span in (AT_ONCE, ABOUT))
     jump = np.abs(change(window.ground_speed, at_once))
-    told = np.abs(scene.bin * moving_sum(np.nan_to_num(window.acceleration), at_once))
+    told = np.abs(scene.bin * moving_sum(zero_if_unknown(window.acceleration), at_once))
     most = sliding_window_view(np.pad(told, about), 2 * about + 1).max(axis=1)
     with np.errstate(invalid="ignore"):
         return bool((scene.driving[at_once:] & (jump > JUMP) & (most < UNEXPLAINED * jump)).any())

@@ -30,6 +30,7 @@ LITTLE, MUCH = 0.03, 0.4
 MAX_PHI = 1.2
 """Largest free friction angle [rad], beyond any soil's: the model ends at a right angle."""
 
+_LOG_DEPTH = math.log(TYPICAL_DEPTH)
 _K_C, _K_PHI, _N, _PHI = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "phi"))
 
 
@@ -47,18 +48,15 @@ class Coordinates:
 
     def log_directions(self, soil: Array) -> Array:
         """Derivatives (6, F) of the parameters' logarithms by the coordinates."""
-        free = self.free
-        directions = np.zeros((len(soil), len(free)))
-        directions[free, np.arange(len(free))] = 1.0
-        column = self._column
+        directions, column = self._own_directions.copy(), self._column
         if _K_PHI in column:
-            k_phi = soil[_K_PHI]
-            K_L = k_phi + soil[_K_C] / self.width
+            k_c, k_phi, n = soil[:3].tolist()
+            K_L = k_phi + k_c / self.width
             directions[_K_PHI, column[_K_PHI]] = K_L / k_phi
             if _K_C in column:
-                directions[_K_PHI, column[_K_C]] = -soil[_K_C] / self.width / k_phi
+                directions[_K_PHI, column[_K_C]] = -k_c / self.width / k_phi
             if _N in column:
-                directions[_K_PHI, column[_N]] = -K_L / k_phi * soil[_N] * np.log(TYPICAL_DEPTH)
+                directions[_K_PHI, column[_N]] = -K_L / k_phi * n * _LOG_DEPTH
         return directions
 
     def bend(self, gradient: Array) -> Array:
@@ -131,6 +129,11 @@ class Coordinates:
     def _log_bounds(self) -> tuple[Array, Array]:
         low, high = self._bounds
         return np.log(low), np.log(high)
+
+    @cached_property
+    def _own_directions(self) -> Array:
+        """As `log_directions`, of coordinates that each are their parameter's logarithm."""
+        return np.eye(len(PARAMETERS))[:, self.free]
 
     @cached_property
     def _column(self) -> dict[int, int]:

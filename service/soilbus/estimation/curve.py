@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +27,17 @@ Array = NDArray[np.float64]
 
 def sides(rig: Rig) -> Array:
     """-1 for the wheels on the left, 1 for those on the right, 0 where an axle has not two wheels (W,)."""
-    side = np.zeros(len(rig.wheels))
-    for members in (np.flatnonzero(rig.front), np.flatnonzero(~rig.front)):
-        if len(members) == 2:
-            side[members] = -1.0, 1.0
+    return _sides(tuple(rig.front.tolist()))
+
+
+@cache
+def _sides(front: tuple[bool, ...]) -> Array:
+    """As `sides`, from which wheels are on the front axle; not to be written to."""
+    side = np.zeros(len(front))
+    for axle in (np.array(front), ~np.array(front)):
+        if axle.sum() == 2:
+            side[axle] = -1.0, 1.0
+    side.flags.writeable = False
     return side
 
 

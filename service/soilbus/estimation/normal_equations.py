@@ -245,7 +245,7 @@ class Fitting:
             return None
         covariance = inverse[1]
         mode = self._belief(place.soil, place.gains, covariance, at)
-        if not self._with_share or covariance[_K_PHI, _K_PHI] > WELL_TOLD**2:
+        if not {_K_C, _K_PHI} <= set(self.free.tolist()) or covariance[_K_PHI, _K_PHI] > WELL_TOLD**2:
             return mode, mode
         moments = self._moments(place, point)
         if moments is None:
@@ -274,10 +274,6 @@ class Fitting:
         gradient = np.zeros(len(quadratic))
         gradient[:3] = pull[1] * share / (1.0 - share) - pull[0], *pull  # the data pull as much the other way
         return moments_along_share(quadratic, gradient, share)
-
-    @property
-    def _with_share(self) -> bool:
-        return bool(np.isin([_K_C, _K_PHI], self.free).all())
 
     def _by_share(self, soil: Array) -> Array:
         """Derivatives (F + A, F + A) of the coordinates, where log k_c is one, by those where that of its share is."""

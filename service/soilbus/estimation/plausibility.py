@@ -27,6 +27,7 @@ from soilbus.estimation.window import (
     SensorNoise,
     Window,
     pull_given,
+    zero_if_unknown,
 )
 from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads
 
@@ -206,7 +207,7 @@ def loads(scene: Scene) -> Iterator[str]:
 
 def _axle_excess(window: Window, rig: Rig, chassis: Chassis) -> Array:
     """By how much [N] the loads on front and rear axle exceed those of mass, draft, slope and inertia, (N, 2)."""
-    draft, pitch, acceleration = (np.nan_to_num(a) for a in (window.draft, window.pitch, window.acceleration))
+    draft, pitch, acceleration = (zero_if_unknown(a) for a in (window.draft, window.pitch, window.acceleration))
     due = np.stack(axle_loads(chassis, draft, pitch, acceleration), axis=1)
     told = np.stack([window.load[:, rig.front].sum(axis=1), window.load[:, ~rig.front].sum(axis=1)], axis=1)
     return np.asarray(told - due)

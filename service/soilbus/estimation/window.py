@@ -346,9 +346,14 @@ def window_of_samples(rig: Rig, t: Array, samples: Mapping[str, Array], names: S
     return _make_window(_NoiseTable.of(rig), np.asarray(t, float), mean, one, one)
 
 
+def zero_if_unknown(values: Array) -> Array:
+    """The same values with 0 in the place of nan."""
+    return np.where(np.isnan(values), 0.0, values)
+
+
 def pull_asked(window: Window, chassis: Chassis) -> Array:
     """Pull [N] (N,) that draft and slope ask of the wheels; nan without draft, level where the slope is not known."""
-    return np.asarray(pull_required(chassis, window.draft, np.nan_to_num(window.pitch), 0.0))
+    return np.asarray(pull_required(chassis, window.draft, zero_if_unknown(window.pitch), 0.0))
 
 
 def pull_given(window: Window, chassis: Chassis) -> Array:
@@ -358,4 +363,4 @@ def pull_given(window: Window, chassis: Chassis) -> Array:
 
 def inertia_of(window: Window, chassis: Chassis) -> Array:
     """Force [N] (N,) that speeds the vehicle up; none where the acceleration is not known."""
-    return np.asarray(chassis.mass * np.nan_to_num(window.acceleration))
+    return np.asarray(chassis.mass * zero_if_unknown(window.acceleration))
