@@ -60,12 +60,16 @@ class NotFitted(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Addition:
-    """One round: the effect added, its probability, and the other names with theirs; falls of -2 log evidence."""
+    """One round: the effect added, its probability, and the other names with theirs; falls of -2 log evidence.
+
+    beside are the names of the effects beside which it was named.
+    """
 
     effect: Effect
     probability: float
     alternatives: dict[str, float]
     falls: dict[str, float]
+    beside: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +154,7 @@ def _round(
     chances = probabilities(falls, explained)
     others = {n: p for n, p in chances.items() if n != best and p >= PLAUSIBLE}
     effect, completion = tried[best]
-    return Addition(effect, chances[best], others, falls), completion
+    return Addition(effect, chances[best], others, falls, frozenset(present.names)), completion
 
 
 def _converged(whole: Fits, present: Completion, completion: Completion) -> Completion:
@@ -233,21 +237,29 @@ def _reconsidered(
     additions: Sequence[Addition],
     candidates: Sequence[Effect],
 ) -> tuple[list[Addition], Completion]:
-    """Each earlier effect named anew beside the later ones: alone, it may have stood for two."""
-    chosen = list(additions)
-    for i in range(len(additions) - 1):
-        without = _without(whole, present, chosen[i].effect)
+    """Effects named anew that were named beside others than are there now: alone, one may have stood for two."""
+    chosen, looked = list(additions), set[frozenset[str]]()
+    while stale := [a for a in chosen if a.beside != (others := _others(a, present)) and others not in looked]:
+        addition = stale[0]
+        place, others = chosen.index(addition), _others(addition, present)
+        looked.add(others)
+        without = _without(whole, present, addition.effect)
         if without is None:
             continue
         left = [effect for effect in candidates if effect.name not in without.names]
-        found = _round(whole, few, without, left, base.evidence - without.evidence, chosen[i].falls)
+        found = _round(whole, few, without, left, base.evidence - without.evidence, addition.falls)
         if found is None and without.evidence < present.evidence + PAYS:
             present = without
+            del chosen[place]
         elif found is not None and found[1].evidence < present.evidence + SAME:
-            chosen[i], present = found
+            chosen[place], present = found
     order = {name: i for i, name in enumerate(present.names)}
-    kept = [addition for addition in chosen if addition.effect.name in order]
-    return sorted(kept, key=lambda addition: order[addition.effect.name]), present
+    return sorted(chosen, key=lambda addition: order[addition.effect.name]), present
+
+
+def _others(addition: Addition, present: Completion) -> frozenset[str]:
+    """Names of the present model's effects but that one's."""
+    return frozenset(present.names) - {addition.effect.name}
 
 
 def _without(whole: Fits, present: Completion, effect: Effect) -> Completion | None:
