@@ -48,7 +48,9 @@ def test_what_is_written_is_the_model_that_was_fitted(record, tmp_path):
     kept, free = completion_of(config)
     assert [effect.name for effect in kept] == ["draft_offset", "wheel_load_offset"]
     told = fitted.parameters()
-    of_wheels = [told["wheel_load_offset"][f"offset_{wheel}"] for wheel in rig_of(config).wheels]
+    of_wheels = [
+        told["wheel_load_offset"][f"{name}_{w}"] for name in ("offset", "drift") for w in rig_of(config).wheels
+    ]
     expected = [told["draft_offset"]["offset"], *of_wheels]
     np.testing.assert_allclose([(f.value, f.std) for f in free], [(e.value, e.std) for e in expected], rtol=1e-5)
     assert "# soil_drift (" in (tmp_path / "out.toml").read_text()

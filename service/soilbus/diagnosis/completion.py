@@ -107,28 +107,9 @@ class Completion:
         """Whether every fit ended at its optimum."""
         return all(fit.converged for fit in self.fits)
 
-    @property
-    def free_at_edge(self) -> tuple[Free, ...] | None:
-        """The parameters with those held that would leave their range; None where none would."""
-        problem, gains = self.checks[-1].problem, self.fits[-1].mode.gains
-        pulls = gains[problem.n_sensors :].tolist()
-        edges = at_edges(gains, *problem.gain_bounds())[problem.n_sensors :].tolist()
-        leaves = [f.std > 0.0 and edge != 0.0 for f, edge in zip(self.free, edges, strict=True)]
-        if not any(leaves):
-            return None
-        return tuple(
-            replace(f, value=f.at(u), std=0.0) if leaving else f
-            for f, u, leaving in zip(self.free, pulls, leaves, strict=True)
-        )
-
     def as_starts(self) -> tuple[Start, ...]:
         """Where these fits ended."""
-        return tuple(
-            Start(fit.mode.soil, fit.mode.gains, fit.converged, fit.optimum.latents, check.latents)
-            if fit.converged
-            else Start(fit.mode.soil, fit.mode.gains)
-            for fit, check in zip(self.fits, self.checks, strict=True)
-        )
+        return tuple(_start(fit, check.latents) for fit, check in zip(self.fits, self.checks, strict=True))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -156,7 +137,7 @@ def complete(
 ) -> Completion | None:
     """A model with these effects fitted to all recordings; None where a fit fails.
 
-    Each fit has at most so many steps, and is given up where it will not cost less than `hopeless`.
+    Each fit has at most so many steps; a fit that will not cost less than `hopeless` is given up, and None.
 
     Parameters of effects that the records' model has already keep the prior they have
     there; one that would leave its range is held at the edge.
@@ -164,16 +145,29 @@ def complete(
     present = records[0].learned
     known = {e.name: [f for f in present.free if f.effect == e.name] for e in present.effects}
     free = tuple(f for effect in effects for f in known.get(effect.name) or parameters_of(effect, present.n_wheels))
-    for _ in range(len(free) + 1):
-        completion = _complete(records, prior, effects, free, starts, most, hopeless)
-        if completion is None or not completion.converged or completion.free_at_edge is None:
+    near = None if starts is None else [start.checked for start in starts]
+    fitted = _fits(records, prior, effects, free, starts, most, hopeless)
+    for _ in range(len(free)):
+        inside = (
+            None if fitted is None else _held_at_edges(records[0].learned.completed(effects, free), fitted[1], free)
+        )
+        if fitted is None or inside is None:
             break
-        free = completion.free_at_edge
-        starts = completion.as_starts()
-    return completion
+        free, starts = inside, [_start(fit) for fit in fitted[1]]
+        fitted = _fits(records, prior, effects, free, starts, most, hopeless)
+    if fitted is None:
+        return None
+    befores, fits = fitted
+    checks = [
+        check(record.checked.completed(effects, free), prior, fit, None if near is None else near[i])
+        for i, (record, fit) in enumerate(zip(records, fits, strict=True))
+    ]
+    added = [effect for effect in effects if effect not in present.effects]
+    sizes = sum(_sizes(effect, free, fits, checks) for effect in added)
+    return Completion(tuple(effects), free, tuple(befores), tuple(fits), tuple(checks), sizes)
 
 
-def _complete(
+def _fits(
     records: Sequence[Record],
     prior: SoilPrior,
     effects: Sequence[Effect],
@@ -181,23 +175,39 @@ def _complete(
     starts: Sequence[Start] | None,
     most: int,
     hopeless: float,
-) -> Completion | None:
-    fits, checks, befores = [], [], []
-    known: Belief | None = None
+) -> tuple[list[Belief], list[Fit]] | None:
+    """What was known before each recording, and its fit."""
+    befores: list[Belief] = []
+    fits: list[Fit] = []
     for i, record in enumerate(records):
         problem = record.learned.completed(effects, free)
-        before = _of_first(record, prior, problem) if known is None else _of_next(known, prior, problem, effects)
+        before = _of_next(fits[-1].mode, prior, problem, effects) if fits else _of_first(record, prior, problem)
         fit = _fitted(problem, prior, before, None if starts is None else starts[i], most, hopeless)
         if fit is None:
             return None
-        fits.append(fit)
         befores.append(before)
-        near = None if starts is None else starts[i].checked
-        checks.append(check(record.checked.completed(effects, free), prior, fit, near))
-        known = fit.mode
-    added = [effect for effect in effects if effect not in records[0].learned.effects]
-    sizes = sum(_sizes(effect, free, fits, checks) for effect in added)
-    return Completion(tuple(effects), free, tuple(befores), tuple(fits), tuple(checks), sizes)
+        fits.append(fit)
+    return befores, fits
+
+
+def _held_at_edges(problem: CompletedProblem, fits: Sequence[Fit], free: tuple[Free, ...]) -> tuple[Free, ...] | None:
+    """The parameters with those held that would leave their range; None where none would, or fits did not converge."""
+    gains = fits[-1].mode.gains
+    edges = at_edges(gains, *problem.gain_bounds())[problem.n_sensors :].tolist()
+    leaves = [f.std > 0.0 and edge != 0.0 for f, edge in zip(free, edges, strict=True)]
+    if not any(leaves) or not all(fit.converged for fit in fits):
+        return None
+    pulls = gains[problem.n_sensors :].tolist()
+    return tuple(
+        replace(f, value=f.at(u), std=0.0) if leaving else f for f, u, leaving in zip(free, pulls, leaves, strict=True)
+    )
+
+
+def _start(fit: Fit, checked: Latents | None = None) -> Start:
+    """Where a fit ended."""
+    if not fit.converged:
+        return Start(fit.mode.soil, fit.mode.gains)
+    return Start(fit.mode.soil, fit.mode.gains, True, fit.optimum.latents, checked)
 
 
 def _sizes(effect: Effect, free: Sequence[Free], fits: Sequence[Fit], checks: Sequence[Checked]) -> float:
@@ -234,8 +244,10 @@ def _fitted(
             return fit
         start = Start(fit.mode.soil, fit.mode.gains)
     fit = continued(problem, prior, before, start, problem.n_sensors, most, hopeless)
-    if fit is None or fit.converged or fit.cost > hopeless:
+    if fit is None or fit.converged:
         return fit
+    if fit.cost > hopeless:
+        return None
     fitting, gains = Fitting(problem, prior, before), np.where(problem.gain_std > 0.0, start.gains, 0.0)
     end = Place(fit.optimum.soil, problem.allowed(fit.optimum.gains), fit.optimum.latents, fit.cost, 0)
     return descended(fitting, end, fitting.start(start.soil, gains=problem.allowed(gains))) or fit

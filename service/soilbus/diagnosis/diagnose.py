@@ -3,16 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from soilbus.diagnosis.completion import Completion, complete
+from soilbus.diagnosis.completion import Completion
+from soilbus.diagnosis.fits import Fits
 from soilbus.diagnosis.learned import Correction, corrections
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.score import further_scores, scores
-from soilbus.diagnosis.verdict import PAYS, PLAUSIBLE, SURE, Verdict, hopeless, is_real, pays, probabilities
+from soilbus.diagnosis.score import Score, further_scores, scores
+from soilbus.diagnosis.verdict import (
+    PAYS,
+    PLAUSIBLE,
+    SURE,
+    Verdict,
+    hopeless,
+    hopeless_from,
+    is_real,
+    least_that_pays,
+    pays,
+    probabilities,
+)
 from soilbus.diagnosis.where import Disagreement, disagreements
 from soilbus.estimation.gauss_newton import Start
 from soilbus.estimation.posterior import SoilPrior
@@ -21,6 +34,8 @@ from soilbus.terra.effects.effect import Effect
 MAX_EFFECTS = 3
 TRIED = 8
 """Candidates of a round, those of further starts besides, that are fitted to a few instants."""
+TRIED_AGAIN = 4
+"""The same of a round that names an effect anew, besides those that were fitted when it was named first."""
 FITTED = 6
 """Those of them that are fitted to all."""
 THINNED = 4
@@ -31,7 +46,10 @@ BEHIND_UNSETTLED = 150.0
 STEPS = 12
 """Steps of the soil, and then of everything, in which a candidate that explains much is fitted."""
 WORTH_TRYING = -2.0
-"""Foreseen change of -2 log evidence above which a candidate is not fitted."""
+"""Foreseen change of -2 log evidence above which a candidate does not count."""
+WORTH_FITTING = 0.2
+"""Share of what an effect must explain from which, where little is foreseen, it is fitted: what is foreseen of
+less is as good."""
 SAME = 1.0
 """Difference of -2 log evidence that is none."""
 
@@ -42,12 +60,16 @@ class NotFitted(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Addition:
-    """One round: the effect added, its probability, and the other names with theirs; falls of -2 log evidence."""
+    """One round: the effect added, its probability, and the other names with theirs; falls of -2 log evidence.
+
+    beside are the names of the effects beside which it was named.
+    """
 
     effect: Effect
     probability: float
     alternatives: dict[str, float]
     falls: dict[str, float]
+    beside: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +96,8 @@ def diagnose(
 ) -> Diagnosis:
     """The whole of it; NotFitted where already the present model cannot be fitted."""
     progress("fitting the present model")
-    base = complete(records, prior, records[0].learned.effects)
+    whole, few = Fits(records, prior), Fits([record.thinned(THINNED) for record in records], prior)
+    base = whole.of(records[0].learned.effects)
     if base is None:
         raise NotFitted("the present model does not converge on these recordings")
     law = records[0].learned.model.shear_law
@@ -85,13 +108,13 @@ def diagnose(
     while len(additions) < MAX_EFFECTS:
         progress(f"looking for effect {len(additions) + 1}")
         left = [effect for effect in candidates if effect.name not in present.names]
-        found = _round(records, prior, present, left, base.evidence - present.evidence)
+        found = _round(whole, few, present, left, base.evidence - present.evidence)
         if found is None:
             break
         addition, present = found
         additions.append(addition)
         if len(additions) > 1:
-            additions, present = _reconsidered(records, prior, base, present, additions, candidates)
+            additions, present = _reconsidered(whole, few, base, present, additions, candidates)
     additions.sort(key=lambda addition: -addition.falls[addition.effect.name])
     verdict = _verdict(base, present, additions)
     learned = corrections(list(records), present) if verdict is Verdict.UNKNOWN else []
@@ -99,114 +122,155 @@ def diagnose(
 
 
 def _round(
-    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect], explained: float
+    whole: Fits,
+    few: Fits,
+    present: Completion,
+    candidates: Sequence[Effect],
+    explained: float,
+    again: Collection[str] | None = None,
 ) -> tuple[Addition, Completion] | None:
-    """The best effect to add to the present model, which explains so much; None where none pays."""
+    """The best effect to add to the present model, which explains so much; None where none pays.
+
+    `again` are names that were fitted in an earlier round for the same place.
+    """
     tried: dict[str, tuple[Effect, Completion]] = {}
-    for effect, starts in _promising(records, prior, present, candidates, explained):
-        completion = complete(records, prior, (*present.effects, effect), starts, STEPS)
+    promising = _promising(whole, few, present, candidates, explained, again)
+    behind = math.inf
+    for effect, starts in promising.fits:
+        completion = whole.of((*present.effects, effect), [starts], STEPS, behind)
         if completion is not None:
             tried[effect.name] = effect, completion
+            reach = hopeless_from(explained + present.evidence - completion.evidence)
+            behind = min(behind, completion.cost + reach)
     if not tried:
         return None
     best = min(tried, key=lambda name: tried[name][1].evidence)
-    tried[best] = tried[best][0], _converged(records, prior, tried[best][1])
+    tried[best] = tried[best][0], _converged(whole, present, tried[best][1])
     falls = {name: present.evidence - completion.evidence for name, (_, completion) in tried.items()}
     best = max(falls, key=lambda name: falls[name])
     if not pays(falls[best], explained, present.gap, present.checked_rows, present.rows):
         return None
+    falls |= {name: min(fall, falls[best]) for name, fall in promising.foreseen.items()}
     chances = probabilities(falls, explained)
     others = {n: p for n, p in chances.items() if n != best and p >= PLAUSIBLE}
     effect, completion = tried[best]
-    return Addition(effect, chances[best], others, falls), completion
+    return Addition(effect, chances[best], others, falls, frozenset(present.names)), completion
 
 
-def _converged(records: Sequence[Record], prior: SoilPrior, completion: Completion) -> Completion:
-    """The same, or where further steps from there lead if they were too few."""
-    if completion.converged:
+def _converged(whole: Fits, present: Completion, completion: Completion) -> Completion:
+    """The same, or where further steps from there lead if they were too few and it is better than the present."""
+    if completion.converged or completion.evidence > present.evidence:
         return completion
-    further = complete(records, prior, completion.effects, completion.as_starts())
+    further = whole.of(completion.effects, [completion.as_starts()])
     return completion if further is None or further.evidence > completion.evidence else further
 
 
+class _Promising(NamedTuple):
+    """Candidates worth a fit of all data, with where it starts, and falls of -2 log evidence foreseen of others."""
+
+    fits: Sequence[tuple[Effect, Sequence[Start]]]
+    foreseen: dict[str, float]
+
+
 def _promising(
-    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect], explained: float
-) -> list[tuple[Effect, Sequence[Start]]]:
-    """The few candidates worth a fit of all data, and where it starts: foreseen by scores, tried on a few instants.
+    whole: Fits,
+    few: Fits,
+    present: Completion,
+    candidates: Sequence[Effect],
+    explained: float,
+    again: Collection[str] | None,
+) -> _Promising:
+    """The few candidates that count: foreseen by scores, tried on a few instants.
 
     Where little is foreseen a few instants tell nothing, and scores are as good as fits.
     """
-    few = [record.thinned(THINNED) for record in records]
-    before = complete(few, prior, present.effects, present.as_starts(), STEPS)
-    foreseen = scores(records, prior, present, candidates)
-    further = [] if before is None else [s for e in candidates for s in further_scores(few, prior, before, e)[:1]]
+    before = few.of(present.effects, [present.as_starts()], STEPS)
+    foreseen = scores(whole.records, whole.prior, present, candidates)
+    further = [] if before is None else _further(few, before, candidates)
     share = 1.0 if before is None else before.rows / present.rows
     most = max(-score.evidence / part for part, of in ((1.0, foreseen), (share, further)) for score in of)
     if before is None or most < CLEAR:
-        foreseen += [s for e in candidates for s in further_scores(records, prior, present, e)[:1]]
-        return _first_of_each(
-            (s.effect, s.starts)
-            for s in sorted(foreseen, key=lambda score: score.evidence)
-            if s.evidence < WORTH_TRYING
-        )
+        return _of_scores([*foreseen, *_further(whole, present, candidates)], least_that_pays(explained))
+    if again is not None:
+        foreseen = foreseen[:TRIED_AGAIN] + [s for s in foreseen[TRIED_AGAIN:] if s.effect.name in again]
+    starts: dict[str, list[Sequence[Start]]] = {}
+    for score in [s for s in (*foreseen[:TRIED], *further) if s.evidence < WORTH_TRYING]:
+        starts.setdefault(score.effect.name, []).append(score.starts)
+    effects = {effect.name: effect for effect in candidates}
     tried: list[tuple[float, Effect, Sequence[Start]]] = []
     least = math.inf
-    for score in [s for s in (*foreseen[:TRIED], *further) if s.evidence < WORTH_TRYING]:
-        with_it = (*present.effects, score.effect)
-        completion = complete(few, prior, with_it, score.starts, STEPS, least + BEHIND_UNSETTLED)
+    for name in starts:
+        completion = few.of((*present.effects, effects[name]), starts[name], STEPS, least + BEHIND_UNSETTLED)
         if completion is not None:
-            tried.append((before.evidence - completion.evidence, score.effect, completion.as_starts()))
+            tried.append((before.evidence - completion.evidence, effects[name], completion.as_starts()))
             least = min(least, completion.cost)
     tried.sort(key=lambda item: -item[0])
     best = tried[0][0] / share if tried else 0.0
-    return _first_of_each(
+    kept = [
         (effect, starts) for fall, effect, starts in tried
         if fall > 0.0 and not hopeless(best - fall / share, explained + best)
-    )  # fmt: skip
+    ]  # fmt: skip
+    return _Promising(kept[:FITTED], {})
 
 
-def _first_of_each(promising: Iterable[tuple[Effect, Sequence[Start]]]) -> list[tuple[Effect, Sequence[Start]]]:
-    """No effect twice, and no more than FITTED."""
-    best: dict[str, tuple[Effect, Sequence[Start]]] = {}
-    for effect, starts in promising:
-        best.setdefault(effect.name, (effect, starts))
-    return list(best.values())[:FITTED]
+def _of_scores(found: Iterable[Score], least: float) -> _Promising:
+    """The best score of each candidate that counts; those that come near what they must explain are fitted."""
+    best: dict[str, Score] = {}
+    for score in sorted(found, key=lambda score: score.evidence):
+        if score.evidence < WORTH_TRYING:
+            best.setdefault(score.effect.name, score)
+    chosen = list(best.values())[:FITTED]
+    fitted = [(s.effect, s.starts) for s in chosen if -s.evidence > WORTH_FITTING * least]
+    return _Promising(fitted, {s.effect.name: -s.evidence for s in chosen[len(fitted) :]})
+
+
+def _further(fits: Fits, present: Completion, candidates: Sequence[Effect]) -> list[Score]:
+    """The best of each candidate's scores from where its parameters may start besides."""
+    return [s for e in candidates for s in further_scores(fits.records, fits.prior, present, e)[:1]]
 
 
 def _reconsidered(
-    records: Sequence[Record],
-    prior: SoilPrior,
+    whole: Fits,
+    few: Fits,
     base: Completion,
     present: Completion,
     additions: Sequence[Addition],
     candidates: Sequence[Effect],
 ) -> tuple[list[Addition], Completion]:
-    """Each earlier effect named anew beside the later ones: alone, it may have stood for two."""
-    chosen = list(additions)
-    for i in range(len(additions) - 1):
-        without = _without(records, prior, present, chosen[i].effect)
+    """Effects named anew that were named beside others than are there now: alone, one may have stood for two."""
+    chosen, looked = list(additions), set[frozenset[str]]()
+    while stale := [a for a in chosen if a.beside != (others := _others(a, present)) and others not in looked]:
+        addition = stale[0]
+        place, others = chosen.index(addition), _others(addition, present)
+        looked.add(others)
+        without = _without(whole, present, addition.effect)
         if without is None:
             continue
         left = [effect for effect in candidates if effect.name not in without.names]
-        found = _round(records, prior, without, left, base.evidence - without.evidence)
+        found = _round(whole, few, without, left, base.evidence - without.evidence, addition.falls)
         if found is None and without.evidence < present.evidence + PAYS:
             present = without
+            del chosen[place]
         elif found is not None and found[1].evidence < present.evidence + SAME:
-            chosen[i], present = found
+            chosen[place], present = found
     order = {name: i for i, name in enumerate(present.names)}
-    kept = [addition for addition in chosen if addition.effect.name in order]
-    return sorted(kept, key=lambda addition: order[addition.effect.name]), present
+    return sorted(chosen, key=lambda addition: order[addition.effect.name]), present
 
 
-def _without(records: Sequence[Record], prior: SoilPrior, present: Completion, effect: Effect) -> Completion | None:
+def _others(addition: Addition, present: Completion) -> frozenset[str]:
+    """Names of the present model's effects but that one's."""
+    return frozenset(present.names) - {addition.effect.name}
+
+
+def _without(whole: Fits, present: Completion, effect: Effect) -> Completion | None:
     """The present model less one effect, fitted from where it stands."""
-    n_sensors = records[0].learned.n_sensors
+    n_sensors = whole.records[0].learned.n_sensors
     kept = [n_sensors + i for i, f in enumerate(present.free) if f.effect != effect.name]
     starts = [
         start._replace(gains=np.concatenate([start.gains[:n_sensors], start.gains[kept]]))
         for start in present.as_starts()
     ]
-    return complete(records, prior, [e for e in present.effects if e.name != effect.name], starts, STEPS)
+    return whole.of([e for e in present.effects if e.name != effect.name], [starts], STEPS)
 
 
 def _verdict(base: Completion, completed: Completion, additions: Sequence[Addition]) -> Verdict:

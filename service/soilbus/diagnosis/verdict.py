@@ -69,7 +69,12 @@ def probabilities(falls: Mapping[str, float], explained: float) -> dict[str, flo
 
 def hopeless(behind: float, explained: float) -> bool:
     """Whether a name so far behind the best one in -2 log evidence cannot get into the set."""
-    return behind > HOPELESS * _great_temperature(explained)
+    return behind > hopeless_from(explained)
+
+
+def hopeless_from(explained: float) -> float:
+    """How far behind that is."""
+    return HOPELESS * _great_temperature(explained)
 
 
 def _temperature(explained: float, form_error: float = FORM_ERROR) -> float:
@@ -99,8 +104,12 @@ def pays(fall: float, explained: float, gap: float, checked_rows: int, rows: int
     gap is the present one, on so many residuals.
     """
     excess = (gap - 1.0) * rows if gap > gap_limit(checked_rows) else 0.0
-    least = PAYS_BESIDE if explained > 0.0 else PAYS
-    return fall > max(least, ADDS * explained, WORTH * excess)
+    return fall > max(least_that_pays(explained), WORTH * excess)
+
+
+def least_that_pays(explained: float) -> float:
+    """Fall of -2 log evidence from which an effect is added at all, where others explain so much already."""
+    return max(PAYS_BESIDE if explained > 0.0 else PAYS, ADDS * explained)
 
 
 def is_real(before: float, after: float, checked_rows: int) -> bool:

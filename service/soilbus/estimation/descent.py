@@ -120,10 +120,12 @@ def settle(
     refusals: int = MAX_REFUSED,
     hopeless: float = np.inf,
     in_all: float = np.inf,
+    enough: float = CONVERGED,
 ) -> Settled | None:
     """Steps of soil, gains and latents together from a place near the optimum.
 
-    `before` is the squared length of the step that led there, if it was one of these.
+    `before` is the squared length of the step that led there, if it was one of these; a step
+    of less than `enough` is the last.
     Given up after more `refusals` in a row, or more `in_all`, and where the foreseen cost is above `hopeless`.
     None where the numbers stop being finite.
 
@@ -161,7 +163,7 @@ def settle(
             share = _stride(point, last_step, last_share, full)
         near = fitting.moved(near, point, share * full)
         last_step, last_share = full, share
-        converged = length < CONVERGED or (share == 1.0 and length * length < left_over * before)
+        converged = length < enough or (share == 1.0 and length * length < left_over * before)
         before = length if share == 1.0 else 0.0
         if converged or point.cost - length > hopeless:
             break

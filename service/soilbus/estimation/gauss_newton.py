@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,8 @@ _K_C = PARAMETERS.index("k_c")
 
 MAX_ITERATIONS = 30
 MAX_RESUMED = 10
+COMPARED = 3e-3
+"""Foreseen fall of the cost that ends fits which are compared by cost: differences below a tenth decide nothing."""
 MAX_ASTRAY = 2
 """Refused steps in all of a fit with effects that has a slower descent to fall back on."""
 THINNED = 24
@@ -284,11 +287,12 @@ def continued(
     takes to see that the cost will stay above `hopeless`.
     """
     fitting = Fitting(problem, prior, before)
+    settled_within = partial(settle, fitting, left_over=COMPARED, hopeless=hopeless, in_all=MAX_ASTRAY, enough=COMPARED)
     gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
     with np.errstate(all="ignore"):
         if start.near:
             place = fitting.near(start.soil, gains, start.latents)
-            end = settle(fitting, place, MAX_RESUMED, refusals=1, hopeless=hopeless, in_all=MAX_ASTRAY)
+            end = settled_within(place, MAX_RESUMED, refusals=1)
             fit = _fit_at(fitting, end)
             if fit is not None and (fit.converged or fit.chi2 < PLAUSIBLE):
                 return fit
@@ -296,7 +300,7 @@ def continued(
         near = approach(moving, start.soil, most, LITTLE, gains, hopeless=AS_MEASURED * hopeless)
         if near is None:
             return None
-        return _fit_at(fitting, settle(fitting, near, most, hopeless=hopeless, in_all=MAX_ASTRAY))
+        return _fit_at(fitting, settled_within(near, most))
 
 
 @dataclass(frozen=True, slots=True)

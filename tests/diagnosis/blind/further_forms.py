@@ -37,12 +37,20 @@ def _transported(forces: Array, state: WheelState, around: Any, values: Any) -> 
 
 
 def _thrown(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
-    """A vertical blade's N factors, and the soil set in motion besides: (gamma N_g z^2 + c N_c z + rho N_a v^2 z) b."""
+    """A vertical blade's N factors, that grow with speed, and the soil set in motion besides, with its square.
+
+    (gamma N_g z^2 + c N_c z) (1 + B v) b + rho N_a u^2 z b: drafts of tools have both parts, and the tread throws
+    soil at its own speed u.
+    """
     z = state.radius * (1.0 - np.cos(state.entry_angle))
     root = np.tan(np.pi / 4.0 + np.arctan(state.tan_phi) / 2.0)
     still = SOIL_WEIGHT * z**2 * root**2 / 2.0 + 2.0 * state.c * z * root
-    moving = 2.0 * SOIL_WEIGHT / _GRAVITY * around.ground_speed**2 * z
-    return less_pull(forces, values["size"] * state.width * (still + moving))
+    moving = 2.0 * SOIL_WEIGHT / _GRAVITY * (state.radius * around.wheel_speed) ** 2 * z
+    faster = 1.0 + _BY_SPEED * around.ground_speed
+    return less_pull(forces, values["size"] * state.width * (still * faster + moving))
+
+
+_BY_SPEED = 0.2  # s/m
 
 
 def _mesh(torque: Array, around: Any, values: Any) -> Array:
@@ -57,8 +65,12 @@ def _twice_filtered(torque: Array, around: Any, values: Any) -> Array:
 
 
 def _creeping(around: Any, values: Any) -> Array:
-    """One cell's zero, that goes on wandering as the cell gets warm in the sun."""
-    return values["size"] * (0.6 + around.t / 150.0) * np.array([0.0, 0.0, 1.0, 0.0]) + 0.0 * around.load
+    """One cell's zero, that wanders as the cell gets warm in the sun: ever more slowly."""
+    warmth = -np.expm1(-around.t / _WARMING)
+    return values["size"] * (0.6 + 0.8 * warmth) * np.array([0.0, 0.0, 1.0, 0.0]) + 0.0 * around.load
+
+
+_WARMING = 60.0  # s
 
 
 FORMS = (
@@ -83,7 +95,7 @@ FORMS = (
     Form(
         "bulldozing",
         "thrown",
-        "soil set in motion: McKyes 1985, Soil Cutting and Tillage",
+        "soil set in motion: McKyes 1985, Soil Cutting and Tillage; A + B S + C S^2: ASABE D497",
         "widths",
         (0.1, 0.3),
         1.5,

@@ -82,6 +82,16 @@ def test_bulldozing_is_rankines_passive_wedge():
     assert plain - ours == pytest.approx(np.array([0.0, wedge, 0.0]), rel=1e-9, abs=1e-9)
 
 
+def test_soil_set_in_motion_takes_its_momentum_from_the_wheel():
+    state = state_on(soil_named("wet_clay"), 0.5, 0.2, 0.5, 0.3)
+    effect, density, speed, seconds = CATALOGUE["bulldozing"], 1800.0, 1.7, 0.01
+    around = one_wheel(wheels_around()[1], ground_speed=speed)
+    plain = wheel_forces(state, MODEL)
+    lost = (plain - effect.forces(plain, state, around, effect.neutral | {"moved": density}))[1]
+    swept = density * 0.3 * 0.5 * (1.0 - math.cos(0.5)) * speed * seconds  # kg, brought to the vehicle's speed
+    assert lost * seconds == pytest.approx(swept * speed, rel=1e-9)
+
+
 def test_lugs_shear_at_their_sides_as_bekker_has_it():
     soil = soil_named("wet_clay")
     state = state_on(soil, 0.5, 0.2, 0.5, 0.3)

@@ -121,7 +121,16 @@ def test_the_hitchs_load_cell_has_zero_and_span():
 def test_each_wheels_load_cell_has_its_own_zero():
     effect = CATALOGUE["wheel_load_offset"]
     assert effect.each_wheel
-    error = effect.load(AROUND, {"offset": np.array([100.0, 0.0, -300.0, 50.0])})
+    error = effect.load(AROUND, {"offset": np.array([100.0, 0.0, -300.0, 50.0]), "drift": np.zeros(4)})
     assert error.shape == AROUND.load.shape
     assert np.all(error == [100.0, 0.0, -300.0, 50.0])
     assert [e.name for e in CATALOGUE.values() if e.each_wheel] == ["wheel_load_offset"]
+
+
+def test_a_wheels_zero_wanders_from_the_start_of_the_record():
+    drift = np.array([0.0, 2.0, -0.5, 0.0])
+    values = {"offset": np.array([100.0, 0.0, 0.0, 50.0]), "drift": drift}
+    around = AROUND._replace(t=np.array([[0.0], [10.0], [60.0]]), load=np.zeros((3, 4)))
+    error = CATALOGUE["wheel_load_offset"].load(around, values)
+    assert error[0].tolist() == [100.0, 0.0, 0.0, 50.0]
+    assert np.diff(error[:, 1:3], axis=0).tolist() == [[20.0, -5.0], [100.0, -25.0]]

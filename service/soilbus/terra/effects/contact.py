@@ -75,9 +75,10 @@ EXPONENTIAL_SHEAR = Effect(
 
 
 def _bulldozing(forces: Array, state: WheelState, around: Surroundings, values: Values) -> Array:
-    """Drawbar pull less b (density z^2 / 2 + cohesive_factor c z)."""
+    """Drawbar pull less b (density z^2 / 2 + cohesive_factor c z + moved v^2 z)."""
     z = sinkage(state.entry_angle, state.radius)
-    ahead = state.width * (values["density"] * z**2 / 2.0 + values["cohesive_factor"] * state.c * z)
+    moved = values["cohesive_factor"] * state.c + values["moved"] * np.asarray(around.ground_speed) ** 2
+    ahead = state.width * z * (values["density"] * z / 2.0 + moved)
     return np.stack([forces[0], forces[1] - ahead, forces[2]])
 
 
@@ -85,12 +86,14 @@ BULLDOZING = Effect(
     name="bulldozing",
     physics="The wheel pushes a wedge of soil ahead of it, which costs drawbar pull but no torque at the rim.",
     source="passive earth pressure b (gamma Kp z^2 / 2 + 2 c sqrt(Kp) z), or Bekker's N factors in its place:"
-    " Bekker 1969; Hetherington & Littleton 1978 (J. Terramechanics 15:95)",
+    " Bekker 1969; Hetherington & Littleton 1978 (J. Terramechanics 15:95); soil set in motion, rho N_a v^2 z:"
+    " McKyes 1985, Soil Cutting and Tillage",
     tells="loads from light to heavy (it grows faster than the sinkage) and a sinkage sensor;"
     " a constant push is a draft offset",
     parameters=(
         Parameter("density", "N/m^3", 0.0, 2e5, 0.0, 2e6),
         Parameter("cohesive_factor", "1", 0.0, 3.0, 0.0, 30.0),
+        Parameter("moved", "kg/m^3", 0.0, 2000.0, 0.0, 30000.0),
     ),
     forces=_bulldozing,
 )

@@ -66,15 +66,18 @@ TORQUE_LAG = Effect(
 
 
 def _wheel_load_offset(around: Surroundings, values: Values) -> Array:
-    return np.asarray(values["offset"] + np.zeros(np.shape(around.load)))
+    return np.asarray(values["offset"] + values["drift"] * np.asarray(around.t) + np.zeros(np.shape(around.load)))
 
 
 WHEEL_LOAD_OFFSET = Effect(
     name="wheel_load_offset",
-    physics="The load cell of a wheel has lost its zero: it adds the same force to every load.",
-    source=_LOAD_CELLS,
-    tells="weighing the vehicle standing: the loads must add up to its weight",
-    parameters=(Parameter("offset", "N", 0.0, 200.0, -3000.0, 3000.0),),
+    physics="The load cell of a wheel has lost its zero: it adds a force to every load, that may wander as it warms.",
+    source=_LOAD_CELLS + "; zero with temperature and in time: OIML R 60 (2021), 5.5 and 5.6",
+    tells="weighing the vehicle standing, before and after: the loads must add up to its weight",
+    parameters=(
+        Parameter("offset", "N", 0.0, 200.0, -3000.0, 3000.0),
+        Parameter("drift", "N/s", 0.0, 2.0, -30.0, 30.0),
+    ),
     each_wheel=True,
     load=_wheel_load_offset,
 )

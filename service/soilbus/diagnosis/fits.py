@@ -1,0 +1,43 @@
+"""Models fitted to the same recordings: each set of effects once, however many questions lead to it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from soilbus.diagnosis.completion import Completion, complete
+from soilbus.diagnosis.records import Record
+from soilbus.estimation.gauss_newton import MAX_ITERATIONS, Start
+from soilbus.estimation.posterior import SoilPrior
+from soilbus.terra.effects.effect import Effect
+
+
+class Fits:
+    """Recordings with what is known of models fitted to them: those that converged are not fitted again."""
+
+    def __init__(self, records: Sequence[Record], prior: SoilPrior) -> None:
+        self.records, self.prior = tuple(records), prior
+        self._converged: dict[frozenset[str], Completion] = {}
+
+    def of(
+        self,
+        effects: Sequence[Effect],
+        starts: Sequence[Sequence[Start]] = (),
+        most: int = MAX_ITERATIONS,
+        hopeless: float = math.inf,
+    ) -> Completion | None:
+        """The best fit with these effects from any of the starts (one Start for each recording), or from anywhere.
+
+        Steps and `hopeless` as in complete(); None where all fits fail.
+        """
+        names = frozenset(effect.name for effect in effects)
+        if names in self._converged:
+            return self._converged[names]
+        best: Completion | None = None
+        for start in starts or (None,):
+            found = complete(self.records, self.prior, effects, start, most, hopeless)
+            if found is not None and (best is None or found.evidence < best.evidence):
+                best = found
+        if best is not None and best.converged:
+            self._converged[names] = best
+        return best
