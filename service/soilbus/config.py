@@ -279,7 +279,7 @@ class Estimator(_Section):
 
     window: PositiveFloat = 10.0
     hop: PositiveFloat = 1.0
-    soil_drift: NonNegativeFloat = 0.03
+    soil_drift: NonNegativeFloat = 0.015
     """How far the soil may wander in the time of one window, as sd of a relative change."""
     bin: PositiveFloat = 0.1
     """Samples are averaged over bins of this length before the fit."""

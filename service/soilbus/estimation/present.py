@@ -6,6 +6,13 @@ errors stay what they are: an information filter from piece to piece (e.g. Ander
 Moore, Optimal Filtering, 1979, sect. 6.3).  What the last piece has is the present soil;
 a constant one would be late by half a window, and too sure of itself.
 
+A field changes along the way by and by, so that within a window a soil which changes much
+does so steadily.  A walk that is to follow it must be so wide that it makes every
+estimate unsure, and knows nothing of steps that all go one way.  So the change in a window is
+either the walk alone or the walk and a steady change, each as likely as it foretells
+the data, and what they say is averaged (multiple models: Bar-Shalom, Li & Kirubarajan,
+Estimation with Applications to Tracking and Navigation, 2001, sect. 11.6).
+
 On a way that bends (`bends`) its curves are unknown besides, as the gains are.
 
 The linear window tells the mode.  By as much as the filter moves that, and by what it adds
@@ -15,7 +22,9 @@ else that a fit says moves too: moments, averages and rivals keep their shape.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +32,26 @@ from numpy.typing import NDArray
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.bends import along_bends
 from soilbus.estimation.gauss_newton import Fit
-from soilbus.estimation.normal_equations import Fitting, Place, solved
+from soilbus.estimation.normal_equations import Fitting, Known, Place, solved
 
 Array = NDArray[np.float64]
 
 PIECES = 5
 """Pieces of a whole window."""
+STEADY = 7.0
+"""Sd of a steady change of the soil in the time of one window, in units of how far it wanders."""
 _ENDS = np.arange(1.0, PIECES + 1.0) / PIECES
+
+
+class Change(NamedTuple):
+    """From the optimum of a constant soil to the present one: step (F + A,) to take off, covariance, -2 log evidence.
+
+    Of coordinates and active gains; evidences of one window compare with each other alone.
+    """
+
+    step: Array
+    covariance: Array
+    evidence: float
 
 
 def at_present(fitting: Fitting, fit: Fit, window: float, drift: float) -> Fit:
@@ -41,48 +63,15 @@ def at_present(fitting: Fitting, fit: Fit, window: float, drift: float) -> Fit:
     """
     if not (drift or fit.bend):
         return fit
-    optimum, t = fit.optimum, fit.optimum.t
-    place = Place(optimum.soil, optimum.gains, optimum.latents, fit.cost, 0)
-    before = fitting.before_at(place)
-    free, m = len(fitting.free), optimum.at.by_latents.shape[1]
-    directions = fitting.directions(place)
-    rows, weighed, bends = optimum.at.rows, optimum.at.weighed, 0
-    if fit.bend:
-        of_bends = np.repeat(fit.bend.bends, m, axis=0)
-        by_curve, weighed_curve = (a.reshape(-1, 1) for a in along_bends(fitting, fit))
-        rows = np.column_stack([rows, of_bends * by_curve])
-        weighed = np.column_stack([weighed, of_bends * weighed_curve])
-        bends = of_bends.shape[1]
-    told = directions.shape[1]
-    of_residual = np.zeros((rows.shape[1], 1 + told + bends))
-    of_residual[0, 0] = 1.0
-    of_residual[: len(directions), 1 : 1 + told] = directions
-    of_residual[len(directions) :, 1 + told :] = np.eye(bends)
-    joint = np.zeros((of_residual.shape[1],) * 2)  # cost, half its gradient, information: of gains and the piece's soil
-    joint[1 : 1 + told, 1 : 1 + told] = before.information
-    joint[0, 1 : 1 + told] = joint[1 : 1 + told, 0] = before.gradient
-    joint[1 + told :, 1 + told :] = np.eye(bends)
-    soil = slice(1, 1 + free)
-    steps = _ENDS if drift else _ENDS[-1:]
-    stiff = np.eye(free) * PIECES / drift**2 if drift else np.zeros((free, free))
-    ends = np.searchsorted(t - t[-1], window * (steps - 1.0), side="right").tolist()
-    for begin, end in zip([0, *ends[:-1]], ends, strict=True):
-        if begin:
-            link = joint[:, soil].copy()
-            step = link[soil] + stiff
-            link[soil] = -stiff
-            joint[soil] = joint[:, soil] = 0.0
-            joint[soil, soil] = stiff
-            joint -= link @ np.linalg.solve(step, link.T)
-        if end > begin:
-            part = slice(begin * m, end * m)
-            joint += of_residual.T @ (rows[part].T @ weighed[part]) @ of_residual
+    optimum = fit.optimum
+    place, free = Place(optimum.soil, optimum.gains, optimum.latents, fit.cost, 0), len(fitting.free)
+    directions, before = fitting.directions(place), fitting.before_at(place)
     constant = directions.T @ optimum.at.normal
     still = solved(constant @ directions + before.information, constant[:, 0] + before.gradient)
-    wandering = solved(joint[1:, 1:], joint[1:, 0])
-    if wandering is None or still is None:
+    likely = _changes(_joint(fitting, fit, directions, before, window, drift), len(directions.T), free, drift)
+    if still is None or not likely:
         return fit
-    step, covariance = wandering[0][:told], wandering[1][:told, :told]
+    step, covariance = _averaged(likely)
     covariance[:free, :free] += np.eye(free) * drift**2 / (3.0 * PIECES)  # the end of the last piece is not its mean
     gains = place.gains.copy()
     gains[fitting.active] -= step[free:]
@@ -99,3 +88,87 @@ def at_present(fitting: Fitting, fit: Fit, window: float, drift: float) -> Fit:
         rival=None if fit.rival is None else fit.rival._replace(belief=moved(fit.rival.belief)),
         averaged=None if fit.averaged is None else moved(fit.averaged),
     )
+
+
+def _changes(joint: Array, told: int, free: int, drift: float) -> list[Change]:
+    """How the soil may have changed: it wanders, or changes steadily besides; without what is not finite."""
+    walk, steady = len(joint) - free, STEADY * drift
+    both = [_change(joint[:walk, :walk], told)]
+    if drift:
+        of_steady = np.arange(walk, len(joint))
+        joint[of_steady, of_steady] += 1.0 / steady**2
+        both.append(_change(joint, told, 2.0 * free * math.log(steady)))
+    return [change for change in both if change is not None]
+
+
+def _joint(fitting: Fitting, fit: Fit, directions: Array, before: Known, window: float, drift: float) -> Array:
+    """Cost, half its gradient and information of the last piece's soil, gains, bends, and of a steady change (F,).
+
+    The last, of the coordinates in the time of a window, as if nothing were known of it beforehand.
+    """
+    at, t = fit.optimum.at, fit.optimum.t
+    free, told, m = len(fitting.free), directions.shape[1], at.by_latents.shape[1]
+    ago = (t - t[-1]) / window
+    soil, steady = slice(1, 1 + free), slice(-free, None)
+    parts = []
+    for residuals, bends in zip((at.rows, at.weighed), _by_bends(fitting, fit), strict=True):
+        known = residuals @ directions
+        parts.append(np.hstack([residuals[:, :1], known, bends, known[:, :free] * np.repeat(ago, m)[:, None]]))
+    rows, weighed = parts
+    then = np.eye(told, rows.shape[1] - 1)  # what was known before is of the soil then
+    then[:free, steady] = ago[0] * np.eye(free)
+    joint = np.zeros((rows.shape[1],) * 2)
+    joint[0, 0] = before.cost
+    joint[1:, 1:] = then.T @ before.information @ then
+    joint[0, 1:] = joint[1:, 0] = then.T @ before.gradient
+    of_bends = np.arange(1 + told, len(joint) - free)
+    joint[of_bends, of_bends] += 1.0
+    steps = _ENDS if drift else _ENDS[-1:]
+    stiff = np.eye(free) * PIECES / drift**2 if drift else np.zeros((free, free))
+    ends = np.searchsorted(ago, steps - 1.0, side="right").tolist()
+    for begin, end in zip([0, *ends[:-1]], ends, strict=True):
+        if begin:
+            link = joint[:, soil].copy()
+            step = link[soil] + stiff
+            link[soil] = -stiff
+            joint[soil] = joint[:, soil] = 0.0
+            joint[soil, soil] = stiff
+            joint -= link @ np.linalg.solve(step, link.T)
+        if end > begin:
+            part = slice(begin * m, end * m)
+            joint += rows[part].T @ weighed[part]
+    return joint
+
+
+def _by_bends(fitting: Fitting, fit: Fit) -> tuple[Array, Array]:
+    """Derivatives (N m, K) of the residuals by bends in their standard deviations, and these weighed."""
+    m = fit.optimum.at.by_latents.shape[1]
+    if not fit.bend:
+        none = np.zeros((len(fit.optimum.t) * m, 0))
+        return none, none
+    of_bends = np.repeat(fit.bend.bends, m, axis=0)
+    by_curve, weighed = along_bends(fitting, fit)
+    return of_bends * by_curve.reshape(-1, 1), of_bends * weighed.reshape(-1, 1)
+
+
+def _change(joint: Array, told: int, room: float = 0.0) -> Change | None:
+    """What the first `told` unknowns change; room: -2 log of the density beforehand of the others at zero."""
+    solution = solved(joint[1:, 1:], joint[1:, 0])
+    if solution is None:
+        return None
+    step, covariance = solution
+    cost = float(joint[0, 0] - joint[0, 1:] @ step)
+    evidence = cost + room + float(np.linalg.slogdet(joint[1:, 1:])[1])
+    return Change(step[:told], covariance[:told, :told], evidence)
+
+
+def _averaged(likely: list[Change]) -> tuple[Array, Array]:
+    """Mean and covariance of changes that were as likely as each other before the data."""
+    evidence = np.array([change.evidence for change in likely])
+    probability = np.exp(-0.5 * (evidence - evidence.min()))
+    probability /= probability.sum()
+    steps = np.array([change.step for change in likely])
+    step = probability @ steps
+    off = steps - step
+    covariance = np.tensordot(probability, np.array([change.covariance for change in likely]), axes=1)
+    return step, covariance + (off.T * probability) @ off
