@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +14,9 @@ from soilbus.terra.wheel import Soil
 Array = NDArray[np.float64]
 
 _SOIL = len(PARAMETERS)
+_K_C = PARAMETERS.index("k_c")
+FAINT = 1e-3
+"""Least share of the variance of log k_c by which data lessen it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,11 +28,15 @@ class Belief:
     has none.  A window tells combinations of soil and gains, so what it leaves behind is
     kept jointly: gains do not change from window to window, and forgetting them would
     count the same ignorance as news each time.
+
+    With k_c_off it is what data alone told (`apart_from`): Gaussian in k_c, not in its logarithm.
+    The covariance then is that of k_c in units of the soil's, and its mean is 1 + k_c_off of these.
     """
 
     soil: Array
     gains: Array
     covariance: Array
+    k_c_off: float | None = None
 
     @classmethod
     def of(cls, prior: SoilPrior, gain_std: Array) -> Belief:
@@ -55,10 +63,31 @@ class Belief:
     def given(self, parameter: int, log: float) -> Belief:
         """What is known of everything else if the logarithm of a free parameter is this: held from then on."""
         along = self.covariance[:, parameter] / self.covariance[parameter, parameter]
-        off = along * (log - np.log(self.soil[parameter]))
         covariance = self.covariance - np.outer(along, self.covariance[parameter])
         covariance[parameter] = covariance[:, parameter] = 0.0
-        return Belief(self.soil * np.exp(off[:_SOIL]), self.gains + off[_SOIL:], covariance)
+        return self.moved(along * (log - np.log(self.soil[parameter])), covariance)
+
+    def moved(self, step: Array, covariance: Array) -> Belief:
+        """The same after a step (6 + G,) of the logarithms and gains, with another covariance."""
+        soil, gains = self.soil * np.exp(step[:_SOIL]), self.gains + step[_SOIL:]
+        if self.k_c_off is None:
+            return Belief(soil, gains, covariance)
+        soil[_K_C] = self.soil[_K_C]
+        return Belief(soil, gains, covariance, self.k_c_off + float(step[_K_C]))
+
+    def apart_from(self, prior: SoilPrior) -> Belief:
+        """What data alone told, where this is the mode of what they and the prior of log k_c say, with its curvature.
+
+        Forces are all but linear in k_c, so that windows add up as Gaussians of k_c, and everything that makes up for
+        k_c does so in proportion to it.  In its logarithm, of which a window may tell less than the
+        prior does, neither is true: window after window would seem to tell against much of it.
+        """
+        variance, along = float(prior.log_std[_K_C] ** 2), self.covariance[:, _K_C]
+        if variance == 0.0:
+            return self
+        untold = max(variance - float(along[_K_C]), FAINT * variance)
+        off = along * (math.log(self.soil[_K_C] / prior.median[_K_C]) / untold)
+        return replace(self, k_c_off=0.0).moved(off, self.covariance + np.outer(along, along) / untold)
 
     def drifted(self, soil: Array, gains: Array) -> Belief:
         """Later: the soil's logarithms may have changed with covariance (6, 6), the gains with variance (G,)."""

@@ -79,11 +79,7 @@ def without_curve(belief: Belief, readings: Readings) -> Belief:
     if not spread > 0.0:
         return belief
     step = -mean_along / spread * float(side[len(PARAMETERS) :] @ belief.gains) / count
-    return Belief(
-        belief.soil * np.exp(step[: len(PARAMETERS)]),
-        belief.gains + step[len(PARAMETERS) :],
-        curve.covariance - np.outer(mean_along, mean_along) / spread,
-    )
+    return belief.moved(step, curve.covariance - np.outer(mean_along, mean_along) / spread)
 
 
 def _by_side(readings: Readings) -> Array:

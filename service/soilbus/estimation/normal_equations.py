@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -91,11 +92,15 @@ class Point:
 
 
 class Known(NamedTuple):
-    """What was known before, as a parabola of coordinates and active gains: information, half its gradient, cost."""
+    """What was known before, as a parabola of coordinates and active gains: information, half its gradient, cost.
+
+    of_data: of the gradient, what data told of which k_c is Gaussian.
+    """
 
     information: Array
     gradient: Array
     cost: float
+    of_data: Array
 
 
 class Fitting:
@@ -119,6 +124,8 @@ class Fitting:
             raise ValueError("what was known before has no proper covariance")
         self._mean = np.concatenate([np.log(before.soil[self.free]), before.gains[self.active]])
         self._precision = inverse[1]
+        self._of_data = before.k_c_off is not None and _K_C in self.free
+        self._surplus = self._least_before() if self._of_data else 0.0
 
     def given(self, before: Belief) -> Fitting:
         """The same with something else known before."""
@@ -158,7 +165,7 @@ class Fitting:
         gradient = directions.T @ at.normal[:, 0]
         known = self.before_at(place)
         bend = np.zeros((len(gradient), len(gradient)))
-        bend[:free, :free] = self.coordinates.bend(gradient[:free])
+        bend[:free, :free] = self.coordinates.bend(gradient[:free] + known.of_data[:free])
         cost = at.chi2 + known.cost
         if not np.isfinite(cost):
             return None
@@ -177,11 +184,37 @@ class Fitting:
         off = self._off(place)
         by_known = self._by_known(place)
         pull = self._precision @ off
-        return Known(by_known.T @ self._precision @ by_known, by_known.T @ pull, float(off @ pull))
+        information, gradient, cost = by_known.T @ self._precision @ by_known, by_known.T @ pull, float(off @ pull)
+        if not self._of_data:
+            return Known(information, gradient, cost, np.zeros(len(gradient)))
+        of_data = gradient.copy()
+        log_off, precision = self._of_prior(place)
+        information[_K_C, _K_C] += precision
+        gradient[_K_C] += precision * log_off
+        return Known(information, gradient, cost + precision * log_off**2 - self._surplus, of_data)
 
     def _off(self, place: Place) -> Array:
-        """How far (F + A,) the free parameters' logarithms and the active gains are from what was known."""
-        return np.asarray(np.concatenate([np.log(place.soil[self.free]), place.gains[self.active]]) - self._mean)
+        """How far (F + A,) the free parameters' logarithms and the active gains are from what was known.
+
+        Of what data alone told it is not the logarithm of k_c, but k_c in units of the soil's known before.
+        """
+        off = np.concatenate([np.log(place.soil[self.free]), place.gains[self.active]]) - self._mean
+        if self._of_data:
+            off[_K_C] = place.soil[_K_C] / self.before.soil[_K_C] - 1.0 - self.before.k_c_off
+        return np.asarray(off)
+
+    def _of_prior(self, place: Place) -> tuple[float, float]:
+        """How far log k_c is from its prior's median, and that prior's precision."""
+        prior = self.coordinates.prior
+        return math.log(place.soil[_K_C] / prior.median[_K_C]), float(prior.log_std[_K_C] ** -2)
+
+    def _least_before(self) -> float:
+        """Least cost that what data told of k_c and its prior have together."""
+        prior, variance = self.coordinates.prior, float(self.before.covariance[_K_C, _K_C])
+        share = np.exp(prior.log_std[_K_C] * np.linspace(-4.0, 4.0, 161)) * prior.median[_K_C] / self.before.soil[_K_C]
+        off = share - 1.0 - self.before.k_c_off
+        log_off = np.log(share * self.before.soil[_K_C] / prior.median[_K_C]) / prior.log_std[_K_C]
+        return float(np.min(off**2 / variance + log_off**2))
 
     def directions(self, place: Place) -> Array:
         """What a column of Linearised.rows (1 + 6 + G) has of each coordinate and active gain (F + A)."""
@@ -195,6 +228,8 @@ class Fitting:
         free = len(self.free)
         by_known = np.eye(free + len(self.active))
         by_known[:free, :free] = self._log_directions(place.soil)[self.free]
+        if self._of_data:
+            by_known[_K_C] *= place.soil[_K_C] / self.before.soil[_K_C]
         return by_known
 
     def moved(self, place: Place, point: Point, step: Array) -> Place:
@@ -265,14 +300,19 @@ class Fitting:
         by_changes[others, others + 2] = 1.0
         by_changes[[_K_C, _K_PHI], 3:] = by_share[_K_C, 1:]
         by_changes[[_K_C, _K_PHI], [1, 2]] = 1.0
-        quadratic = by_changes.T @ self._precision @ by_changes
+        of_prior, precision, log_off = by_changes[_K_C].copy(), 0.0, 0.0
+        if self._of_data:
+            log_off, precision = self._of_prior(place)
+            by_changes[_K_C, [0, 1]] = 1.0, 0.0
+            by_changes[_K_C] *= place.soil[_K_C] / self.before.soil[_K_C]
+        quadratic = by_changes.T @ self._precision @ by_changes + precision * np.outer(of_prior, of_prior)
         of_data = np.concatenate([[0], others + 2])
         quadratic[np.ix_(of_data, of_data)] += by_share.T @ (point.information - point.known) @ by_share
         k_c, k_phi = place.soil[[_K_C, _K_PHI]]
         share = k_c / (k_c + k_phi * self.coordinates.width)
-        pull = (self._precision @ self._off(place))[[_K_C, _K_PHI]]
+        pull = by_changes.T @ self._precision @ self._off(place) + precision * log_off * of_prior
         gradient = np.zeros(len(quadratic))
-        gradient[:3] = pull[1] * share / (1.0 - share) - pull[0], *pull  # the data pull as much the other way
+        gradient[:3] = pull[2] * share / (1.0 - share) - pull[1], *pull[1:3]  # the data pull as much the other way
         return moments_along_share(quadratic, gradient, share)
 
     def _by_share(self, soil: Array) -> Array:

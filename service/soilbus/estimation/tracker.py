@@ -243,7 +243,7 @@ class Tracker:
             self._good_until = end
             learned = end - tracked.since >= LEARNED * self.settings.window and fit.is_gaussian
             if learned and tracked.ground in (Ground.SAME, Ground.NEW):
-                self._beliefs.append((end, without_curve(fit.whole, problem)))
+                self._beliefs.append((end, without_curve(fit.mode.apart_from(self._here), problem)))
         return tracked
 
     def _known_at(self, t: float, problem: WindowProblem) -> Belief:
