@@ -230,7 +230,8 @@ def _averaged(nodes: list[Node], told: Array, coordinates: Coordinates, before: 
     of_k_c = centre / k_c_told
     mean[_K_C] = along[_K_C] @ of_k_c / of_k_c.sum()
     off = along - mean[:, None]
-    spread = longer_side(fine - fine @ centre, weight) * (off * weight) @ off.T
+    doubt = longer_side(fine - fine @ probable, weight)  # how unlike both distributions are counts, too
+    spread = doubt * (off * weight) @ off.T
     covariance = np.tensordot(share @ weight, own, axes=1) + spread
     soil, gains = coordinates.soil_at(mean[: len(free)]), beliefs[0].gains.copy()
     gains[active - n] = mean[len(free) :]
