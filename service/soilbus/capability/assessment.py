@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.capability.balance import PARTS, Balance, Duty, balance
+from soilbus.capability.balance import PARTS, Balance, Duty, balance, climbing
 from soilbus.capability.draws import estimates, likely, mean_and_std
 from soilbus.capability.limits import (
     Cause,
@@ -150,17 +150,19 @@ def assess(
     draft = vehicle.largest(Duty(), level)
     if draft is None:
         return None, table
-    with_draft = pull = forecast = None
+    pull = forecast = None
+    drafts = [0.0]
     if demand is not None:
         flat = abs(demand.sine) < LEVEL_SINE
         duty = Duty(None, demand.sine)
         here = of_points if flat else balance(table, duty, of_points)
         present = level if flat else here.drawn(points)
         pull = draft if flat else vehicle.largest(duty, present)
-        with_draft = vehicle.grade(demand.pull - table.axles.weight * demand.sine)
+        drafts.append(demand.pull - table.axles.weight * demand.sine)
         forecast = _forecast(demand, here, present, table.axles, rig, completed, points)
-    max_draft, max_grade, max_grade_with_draft, max_pull = estimates(
-        draft.pull, vehicle.grade(0.0), with_draft, None if pull is None else pull.pull
+    grade, *with_draft = vehicle.grades(drafts)
+    max_draft, max_pull, max_grade, max_grade_with_draft = estimates(
+        draft.pull, None if pull is None else pull.pull, grade, *(with_draft or [None])
     )
     if max_draft is None:
         return None, table
@@ -220,13 +222,14 @@ class _Vehicle:
         none = ~np.isfinite(found.pull)
         return Largest(np.where(none, pull, found.pull), np.where(none, skidding.slip[least], found.slip), "torque")
 
-    def grade(self, draft: float) -> Array | None:
-        """Steepest slope [rad] (1 + N,) that each draw climbs with a draft [N]."""
-        duty = Duty(draft, None)
-        found = self.largest(duty, balance(self.table, duty, self.level).drawn(self.points))
-        if found is None:
-            return None
-        return np.asarray(np.arcsin(np.clip((found.pull - draft) / self.table.axles.weight, -1.0, 1.0)))
+    def grades(self, drafts: Sequence[float]) -> list[Array | None]:
+        """Steepest slope [rad] (1 + N,) that each draw climbs with each of the drafts [N]."""
+        slopes: list[Array | None] = []
+        for draft, of_points in zip(drafts, climbing(self.table, drafts, self.level), strict=True):
+            found = self.largest(Duty(draft, None), of_points.drawn(self.points))
+            rise = None if found is None else (found.pull - draft) / self.table.axles.weight
+            slopes.append(None if rise is None else np.arcsin(np.minimum(np.maximum(rise, -1.0), 1.0)))
+        return slopes
 
 
 def _set_points(axles: Axles, level: Balance, limits: Limits, draft: Largest) -> dict[str, SetPoint]:

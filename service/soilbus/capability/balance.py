@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple
@@ -24,7 +25,7 @@ MAX_SINE = 0.99
 class Duty(NamedTuple):
     """What the pull is for: a draft [N] and a slope (its sine).  The one that is None takes all that is left."""
 
-    draft: float | None = None
+    draft: Any = None
     sine: float | None = 0.0
 
     def split(self, pull: Any, weight: float) -> tuple[Any, Any]:
@@ -97,10 +98,18 @@ def balance(table: WheelTable, duty: Duty = LEVEL, level: Balance | None = None)
     return Balance(slip, _between(balanced, cell), level.columns + _times(change, of_changes))
 
 
+def climbing(table: WheelTable, drafts: Sequence[float], level: Balance) -> list[Balance]:
+    """As `balance` with each of the drafts [N] and the slope that takes what is left, all worked out together."""
+    slip, cell, _, _, of_changes = _refinement(tuple(table.slip.tolist()))
+    changes, balanced = _under(table, Duty(np.array(drafts)[:, None, None], None))
+    columns = level.columns + _times(changes, of_changes)
+    return [Balance(slip, _between(known, cell), of) for known, of in zip(balanced, columns, strict=True)]
+
+
 def _times(columns: Array, matrix: Array) -> Array:
-    """Columns (D, C, S), those not known as zero, times a matrix (S, F): (D, C, F)."""
+    """Columns (..., C, S), those not known as zero, times a matrix (S, F): (..., C, F)."""
     known = np.where(np.isfinite(columns), columns, 0.0)
-    return np.asarray(known.reshape(-1, len(matrix)) @ matrix).reshape(*columns.shape[:2], -1)
+    return np.asarray(known.reshape(-1, len(matrix)) @ matrix).reshape(*columns.shape[:-1], -1)
 
 
 def _between(balanced: NDArray[np.bool_], cell: NDArray[np.intp]) -> NDArray[np.bool_]:
@@ -108,9 +117,9 @@ def _between(balanced: NDArray[np.bool_], cell: NDArray[np.intp]) -> NDArray[np.
     return np.asarray((balanced[:, :-1] & balanced[:, 1:])[:, cell])
 
 
-def _columns(pull: Array, at: Array) -> Array:
-    """Pull, then drawbar pull, torque and entry angle by kind of wheel: (D, 1 + 3 A, S)."""
-    return np.concatenate([pull[:, None], *at], axis=1)
+def _columns(pull: Array, at: Iterable[Array]) -> Array:
+    """Pull (..., D, S), then pulls, torques and entry angles by kind, each (..., D, A, S): (..., D, 1 + 3 A, S)."""
+    return np.concatenate([pull[..., None, :], *at], axis=-2)
 
 
 def _by_slip(table: WheelTable) -> Array:
@@ -123,7 +132,10 @@ def _by_slip(table: WheelTable) -> Array:
 
 
 def _under(table: WheelTable, duty: Duty) -> tuple[Array, NDArray[np.bool_]]:
-    """Change of the table's columns under another duty, and where they are a steady state (D, S)."""
+    """Change of the table's columns under another duty, and where they are a steady state (D, S).
+
+    A duty of several drafts (Q, 1, 1) gives each for all of them, (Q, D, ...).
+    """
     axles, weight = table.axles, table.axles.weight
     level = pull = np.where(table.balanced, table.pull, 0.0)
     by_pull = axles.lever if duty.draft is None else axles.tilt / weight
@@ -132,9 +144,9 @@ def _under(table: WheelTable, duty: Duty) -> tuple[Array, NDArray[np.bool_]]:
         load = axles.loads(*duty.split(pull, weight))
         pull = pull - (table.pull_at(load) - pull) / slope
     _, sine = duty.split(pull, weight)
-    balanced = table.balanced & (load > 0.0).all(axis=1) & (np.abs(sine) < MAX_SINE)
+    balanced = table.balanced & (load > 0.0).all(axis=-2) & (np.abs(sine) < MAX_SINE)
     change = _columns(pull - level, table.change_at(load))
-    return np.where(balanced[:, None], change, np.nan), balanced
+    return np.where(balanced[..., None, :], change, np.nan), balanced
 
 
 @cache

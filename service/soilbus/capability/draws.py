@@ -68,6 +68,9 @@ def mean_and_std(samples: Array) -> tuple[Array, Array]:
     """
     change = samples[1:] - samples[0]
     known = np.isfinite(change)
+    if known.all():
+        mean = change.mean(axis=0)
+        return samples[0] + mean, np.sqrt(((change - mean) ** 2).mean(axis=0))
     count = known.sum(axis=0)
     of_count = 1.0 / np.maximum(count, 1)
     mean = np.where(known, change, 0.0).sum(axis=0) * of_count

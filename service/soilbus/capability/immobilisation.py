@@ -133,7 +133,7 @@ def watched(
     kept = before.recent[bool(before.recent and t - before.recent[0].t > REMEMBERED) :]
     trend = before.capacity if curve is before.curve else _along(curve, kept)
     earlier, once, twice = (_ago(kept, t - lag) for lag in (LAG, SWING, 2.0 * SWING))
-    capacity = trend.joined(step, _able(curve, look), None if earlier is None else _able(curve, earlier))
+    capacity = trend.joined(step, _able(curve, look, reserve), None if earlier is None else _able(curve, earlier))
     demand = before.demand.joined(step, look.asked, *(None if a is None else a.asked for a in (once, twice)))
     peaks, asked = before.peaks.joined(t, pull, HOLD), before.asked.joined(t, look.asked, HOLD)
     creep, given = before.slip.joined(step, look.slip, CREEP), before.given.joined(step, pull, CREEP)
@@ -167,9 +167,14 @@ def _along(curve: OverSlip, recent: Sequence[Look]) -> Capacity:
     return Capacity.through(t, np.where(slip >= curve.slip[0], able, np.nan))
 
 
-def _able(curve: OverSlip, look: Look) -> float | None:
-    """Pull [N] that the ground could give; None from wheels that all but roll, for these ask nothing of it."""
-    return look.pull + _reserve(curve, look.slip) if look.slip >= curve.slip[0] else None
+def _able(curve: OverSlip, look: Look, reserve: float | None = None) -> float | None:
+    """Pull [N] that the ground could give; None from wheels that all but roll, for these ask nothing of it.
+
+    reserve is what is still to come, where that is known already.
+    """
+    if look.slip < curve.slip[0]:
+        return None
+    return look.pull + (_reserve(curve, look.slip) if reserve is None else reserve)
 
 
 def _ago(recent: Sequence[Look], t: float) -> Look | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -138,4 +139,4 @@ def slips_of_most(values: Array, balance: Balance, limits: Limits, top: Array) -
 def axle_sum(values: Array, axles: Axles, kinds: NDArray[np.bool_], each: Array | float = 1.0) -> Array:
     """Sum over the wheels of some kinds (A,), (D, A, F) to (D, F), each wheel's times a factor (A, 1)."""
     share = (axles.count * each)[:, 0].tolist()
-    return np.asarray(sum(share[kind] * values[:, kind] for kind in np.flatnonzero(kinds)))
+    return reduce(np.add, (share[kind] * values[:, kind] for kind in np.flatnonzero(kinds).tolist()))

@@ -24,6 +24,7 @@ from soilbus.terra.effects.steady import CompletedModel, Slopes, Wheel
 from soilbus.terra.wheel import WheelModel, WheelState
 
 Array = NDArray[np.float64]
+_Rows = slice | NDArray[np.intp]
 
 _SOIL = len(PARAMETERS)
 _LEAST = 1e-8
@@ -68,6 +69,8 @@ class UncertainModel:
         mean = at(pulls)
         names = {active.effect.name for active in mean.effects}
         places = np.flatnonzero([f.effect in names and f.std > 0.0 for f in free])
+        if not len(places):
+            return cls(mean)
         of_effects = _SOIL + first + places
         variance, axes = np.linalg.eigh(belief.covariance[np.ix_(of_effects, of_effects)])
         doubts = []
@@ -123,7 +126,7 @@ class ModelOfRows:
     def forces_and_slopes(self, state: WheelState, rear: Any, load: Array) -> tuple[Array, Slopes]:
         """Forces (3, D, ...) and slopes of states and loads (D, ...)."""
 
-        def rows(model: CompletedModel, at: NDArray[np.intp]) -> Array:
+        def rows(model: CompletedModel, at: _Rows) -> Array:
             forces, slopes = model.forces_and_slopes(WheelState(*(a[at] for a in state)), rear, load[at])
             return np.stack([forces, *slopes])
 
@@ -140,15 +143,15 @@ class ModelOfRows:
         """Entry angle [rad] (D, A) at which wheels (A,) have sunk so deep [m]."""
         shape = (len(self.row), *np.shape(wheel.radius))
         return self._by_model(
-            lambda model, at: np.broadcast_to(model.angle_of_sinkage(depth, wheel), (len(at), *shape[1:])), shape
-        )
+            lambda model, at: np.broadcast_to(
+                model.angle_of_sinkage(depth, wheel), (len(self.row[at]), *shape[1:])
+            ), shape,
+        )  # fmt: skip
 
-    def _by_model(
-        self, rows: Callable[[CompletedModel, NDArray[np.intp]], Array], shape: tuple[int, ...], axis: int = 0
-    ) -> Array:
+    def _by_model(self, rows: Callable[[CompletedModel, _Rows], Array], shape: tuple[int, ...], axis: int = 0) -> Array:
         """An array of this shape from what each model says of its rows, which are along an axis."""
         if len(self.models) == 1:
-            return np.asarray(rows(self.models[0], np.arange(len(self.row))))
+            return np.asarray(rows(self.models[0], slice(None)))
         out = np.empty(shape)
         for i, model in enumerate(self.models):
             at = np.flatnonzero(self.row == i)

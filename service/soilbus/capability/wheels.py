@@ -111,15 +111,15 @@ class WheelTable:
     balanced: NDArray[np.bool_]
 
     def pull_at(self, load: Array) -> Array:
-        """Pull of the vehicle [N] (D, S) with its wheels at other loads (D, A, S)."""
+        """Pull of the vehicle [N] (..., D, S) with its wheels at other loads (..., D, A, S)."""
         change = load - self.load
         drawbar = self.at[0] + change * (self.by_load[0] + self.bend[0] * change)
-        return np.asarray((self.axles.count * drawbar).sum(axis=1))
+        return np.asarray((self.axles.count * drawbar).sum(axis=-2))
 
-    def change_at(self, load: Array) -> Array:
-        """Change of drawbar pull, torque and entry angle (3, D, A, S) at other loads (D, A, S)."""
+    def change_at(self, load: Array) -> list[Array]:
+        """Changes of drawbar pull, torque and entry angle (..., D, A, S) at other loads (..., D, A, S)."""
         change = load - self.load
-        return np.asarray(change * (self.by_load + self.bend * change))
+        return [change * (slope + bend * change) for slope, bend in zip(self.by_load, self.bend, strict=True)]
 
 
 def wheel_table(
@@ -233,7 +233,10 @@ def _bend(
 
 def _state(soils: Array, axles: Axles, slip: Array, angle: Array) -> WheelState:
     """Every soil under every kind of wheel at every slip, each field of the whole shape."""
-    k_c, k_phi, n, phi, c, K = (column[:, None, None] for column in soils.T)
+    k_c, k_phi, n, phi, c, K = soils.T[:, :, None, None]
     modulus = lumped_modulus(k_c, k_phi, axles.width)
-    fields = np.broadcast_arrays(angle, slip, axles.radius, axles.width, modulus, n, np.tan(phi), c, K)
+    state = WheelState(angle, slip, axles.radius, axles.width, modulus, n, np.tan(phi), c, K)
+    fields = np.empty((len(state), *angle.shape))
+    for field, values in zip(fields, state, strict=True):
+        field[...] = values
     return WheelState(*fields)

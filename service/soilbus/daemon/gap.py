@@ -37,7 +37,7 @@ def squares(at: Linearised, n_wheels: int) -> dict[str, Square]:
     """Those of torque, draft and, where it is measured, sinkage in one fitted window."""
     per_instant = at.by_latents.shape[1]
     square = (at.rows[:, 0] * at.weighed[:, 0]).reshape(-1, per_instant)
-    known = (at.weighed != 0.0).any(axis=1).reshape(-1, per_instant)
+    known = at.weighed.any(axis=1).reshape(-1, per_instant)
     parts = {"torque": slice(n_wheels), "draft": slice(n_wheels, n_wheels + 1), "sinkage": slice(n_wheels + 1, None)}
     found = {name: Square(float(square[:, part].sum()), int(np.sum(known[:, part]))) for name, part in parts.items()}
     return {name: of_channel for name, of_channel in found.items() if of_channel.rows}

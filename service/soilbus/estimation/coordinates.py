@@ -75,8 +75,8 @@ class Coordinates:
         """Coordinates (F,) of a soil (6,)."""
         logs = np.log(soil[self.free])
         if _K_PHI in self._column:
-            K_L = soil[_K_PHI] + soil[_K_C] / self.width
-            logs[self._column[_K_PHI]] = np.log(K_L) + soil[_N] * np.log(TYPICAL_DEPTH)
+            k_c, k_phi, n = soil[:3].tolist()
+            logs[self._column[_K_PHI]] = math.log(k_phi + k_c / self.width) + n * _LOG_DEPTH
         return logs
 
     def soil_at(self, position: Array) -> Array:
@@ -85,7 +85,7 @@ class Coordinates:
         soil = self.prior.median.copy()
         soil[free] = np.exp(position)
         if _K_PHI in self._column:
-            K_L = np.exp(position[self._column[_K_PHI]] - soil[_N] * np.log(TYPICAL_DEPTH))
+            K_L = np.exp(position[self._column[_K_PHI]] - soil[_N] * _LOG_DEPTH)
             soil[_K_PHI] = max(K_L - soil[_K_C] / self.width, 0.01 * K_L)
         return self.within(soil)
 
@@ -116,7 +116,7 @@ class Coordinates:
         change = self.log_directions(soil)[self.free] @ step
         room = np.where(change > 0.0, high, low) - np.log(soil[self.free])
         longest = MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-12)
-        return min(1.0, longest, share_of_step(room, change))
+        return min(longest, share_of_step(room, change))
 
     def edges(self, soil: Array) -> Array:
         """Directions (E, F) in which no step can go, since a parameter is at a bound."""
@@ -160,4 +160,6 @@ def at_edges(place: Array, low: Array, high: Array) -> Array:
 def share_of_step(room: Array, step: Array) -> float:
     """Share of a step (M,), 1 at most, that leaves everything within the room (M,) there is; inf: no end of it."""
     cramped = np.abs(step) > np.abs(room) + EDGE
+    if not cramped.any():
+        return 1.0
     return max(float((room[cramped] / step[cramped]).min(initial=1.0)), 0.0)

@@ -9,10 +9,12 @@ Rue, Martino & Chopin 2009, J. R. Statist. Soc. B 71:319, sect. 3).
 
 Those probabilities count the volume of what the data leave open: where k_c may be next to
 nothing there is much of it, on the logarithm's scale, and soils with much k_c seem less likely than they
-fit.  That makes the best mean, but intervals about it that exclude such soils too often when one of
-them is there.  So the spread about the mean is that of the confidence distribution along n: the signed
+fit.  That makes the best mean where such soils are among the likely ones.  Where k_c is told even a standard
+deviation towards them, there is only the choice of the logarithm, and a bias by it: the more k_c is known there,
+the more the centre is that of the confidence distribution along n, in which the signed
 root of the profile likelihood's fall is standard normal (Barndorff-Nielsen & Cox, Inference
-and Asymptotics, 1994, sect. 3.4), for one soil as often as for another.
+and Asymptotics, 1994, sect. 3.4), for one soil as often as for another.  The spread about the centre is
+always that one's: intervals by the probabilities exclude soils with much k_c too often when one is there.
 """
 
 from __future__ import annotations
@@ -203,7 +205,7 @@ def told_of_k_c(along: Ridge, prior: SoilPrior, before: Belief) -> Array | None:
 
 
 def _averaged(nodes: list[Node], told: Array, coordinates: Coordinates, before: Belief) -> Belief:
-    """Mean of the mixture of all nodes and of what lies between them, by straight lines, and its spread about that.
+    """Mean of all nodes and of what lies between them, by straight lines, and its spread about that.
 
     But for k_c, of which soils of the ridge let a window tell as unlike as by a factor of ten: there it is
     the soil whose mean square error is least in units of the variance that each of them would leave,
@@ -214,17 +216,22 @@ def _averaged(nodes: list[Node], told: Array, coordinates: Coordinates, before: 
     beliefs = [node.fit.belief for node in nodes]
     u = np.array([node.u for node in nodes])
     fine = np.linspace(u[0], u[-1], FINE)
+    probable = density(u, np.array([node.unlikelihood for node in nodes]), fine)
+    weight = confidence(u, np.array([node.misfit for node in nodes]), fine)
+    k_c_told = np.interp(fine, u, told)
+    known = 1.0 - _next(fine, probable, k_c_told) / before.covariance[_K_C, _K_C]
     place = np.array([[*coordinates.position(b.soil), *b.gains[active - n]] for b in beliefs])
+    place[:, _K_C] += known * (np.array([_unbiased_k_c(node, before) for node in nodes]) - place[:, _K_C])
     along = np.array([np.interp(fine, u, column) for column in place.T])
     own = np.array([_in_coordinates(b.covariance, coordinates.log_directions(b.soil), free, active) for b in beliefs])
     share = np.array([np.interp(fine, u, one) for one in np.eye(len(u))])
-    probable = density(u, np.array([node.unlikelihood for node in nodes]), fine)
-    weight = confidence(u, np.array([node.misfit for node in nodes]), fine)
-    mean = along @ probable
-    of_k_c = probable / np.interp(fine, u, told)
+    centre = known * weight + (1.0 - known) * probable
+    mean = along @ centre
+    of_k_c = centre / k_c_told
     mean[_K_C] = along[_K_C] @ of_k_c / of_k_c.sum()
     off = along - mean[:, None]
-    spread = longer_side(fine - fine @ probable, weight) * (off * weight) @ off.T
+    doubt = longer_side(fine - fine @ probable, weight)  # how unlike both distributions are counts, too
+    spread = doubt * (off * weight) @ off.T
     covariance = np.tensordot(share @ weight, own, axes=1) + spread
     soil, gains = coordinates.soil_at(mean[: len(free)]), beliefs[0].gains.copy()
     gains[active - n] = mean[len(free) :]
@@ -240,6 +247,24 @@ def _in_coordinates(covariance: Array, directions: Array, free: Indices, active:
     back = np.eye(len(kept))
     back[: len(free), : len(free)] = np.linalg.inv(directions[free])
     return np.asarray(back @ covariance[np.ix_(kept, kept)] @ back.T)
+
+
+def _next(fine: Array, probable: Array, value: Array) -> float:
+    """A value (M,) known at places (M,), one standard deviation above the mean of these shares (M,)."""
+    mean = float(fine @ probable)
+    return float(np.interp(mean + math.sqrt((fine - mean) ** 2 @ probable), fine, value))
+
+
+def _unbiased_k_c(node: Node, before: Belief) -> float:
+    """Logarithm of k_c given n of which the mean over windows on one soil is that soil's, to second order.
+
+    The model is all but linear in k_c, and so the mean of the posterior of its logarithm is biased down, and
+    its mode by less.  With the information as density of the prior the mean would not be (Hartigan 1965, Ann.
+    Math. Stat. 36:1137): that is half a variance above the mode, as far as it is the window that tells k_c.
+    """
+    variance = node.fit.mode.covariance[_K_C, _K_C]
+    of_window = 1.0 - variance / before.given(_N, node.u).covariance[_K_C, _K_C]
+    return float(np.log(node.fit.mode.soil[_K_C]) + 0.5 * variance * of_window)
 
 
 def density(u: Array, value: Array, fine: Array) -> Array:

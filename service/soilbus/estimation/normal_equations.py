@@ -70,10 +70,12 @@ class Point:
         """
         curved = self.information + self.bend
         curved.flat[:: len(curved) + 1] *= 1.0 + damping
-        solution = _solution(curved, np.column_stack([self.gradient, self.edges.T]))
+        solution = _solution(curved, np.concatenate([self.gradient[None], self.edges]).T)
         if solution is None:
             return None
         step = -solution[:, 0]
+        if not len(self.edges):
+            return step if np.isfinite(step).all() else None
         held = np.zeros(len(self.edges), bool)
         while (beyond := ~held & (self.edges @ step > 0.0)).any():
             held |= beyond
@@ -116,16 +118,22 @@ class Fitting:
         known[:first] = False
         self.active = np.flatnonzero(known)
         self._gain_bounds = tuple(bound[self.active] for bound in problem.gain_bounds())
+        self._has_bounds = bool(np.isfinite(self._gain_bounds).any())
         self.free = self.coordinates.free
+        self._identity = np.eye(len(self.free) + len(self.active))
+        self._of_gains = np.zeros((7 + len(before.gains), len(self._identity)))
+        self._of_gains[7 + self.active] = self._identity[len(self.free) :]
         self._by_sensors = with_gains and first == 0
         kept = np.concatenate([self.free, _SOIL + self.active])
-        inverse = solved(before.covariance[np.ix_(kept, kept)], np.zeros(len(kept)))
+        inverse = solved(before.covariance[kept[:, None], kept], np.zeros(len(kept)))
         if inverse is None:
             raise ValueError("what was known before has no proper covariance")
         self._mean = np.concatenate([np.log(before.soil[self.free]), before.gains[self.active]])
         self._precision = inverse[1]
         self._of_data = before.k_c_off is not None and _K_C in self.free
         self._surplus = self._least_before() if self._of_data else 0.0
+        self._none = np.zeros(len(kept))
+        self._last: tuple[Array, Array, Known] | None = None
 
     def given(self, before: Belief) -> Fitting:
         """The same with something else known before."""
@@ -164,11 +172,11 @@ class Fitting:
             directions = np.delete(directions, slice(7, 7 + self.problem.n_sensors), axis=0)
         gradient = directions.T @ at.normal[:, 0]
         known = self.before_at(place)
-        bend = np.zeros((len(gradient), len(gradient)))
-        bend[:free, :free] = self.coordinates.bend(gradient[:free] + known.of_data[:free])
         cost = at.chi2 + known.cost
-        if not np.isfinite(cost):
+        if not math.isfinite(cost):
             return None
+        bend = np.zeros_like(self._identity)
+        bend[:free, :free] = self.coordinates.bend((gradient + known.of_data)[:free])
         return Point(
             information=directions.T @ at.normal @ directions + known.information,
             known=known.information,
@@ -180,13 +188,18 @@ class Fitting:
         )
 
     def before_at(self, place: Place) -> Known:
-        """What was known before, seen from a place."""
+        """What was known before, seen from a place; asked again from the last one's soil and gains, it is at hand."""
+        if self._last is None or self._last[0] is not place.soil or self._last[1] is not place.gains:
+            self._last = place.soil, place.gains, self._before_at(place)
+        return self._last[2]
+
+    def _before_at(self, place: Place) -> Known:
         off = self._off(place)
         by_known = self._by_known(place)
         pull = self._precision @ off
         information, gradient, cost = by_known.T @ self._precision @ by_known, by_known.T @ pull, float(off @ pull)
         if not self._of_data:
-            return Known(information, gradient, cost, np.zeros(len(gradient)))
+            return Known(information, gradient, cost, self._none)
         of_data = gradient.copy()
         log_off, precision = self._of_prior(place)
         information[_K_C, _K_C] += precision
@@ -218,15 +231,12 @@ class Fitting:
 
     def directions(self, place: Place) -> Array:
         """What a column of Linearised.rows (1 + 6 + G) has of each coordinate and active gain (F + A)."""
-        free = len(self.free)
-        directions = np.zeros((7 + len(place.gains), free + len(self.active)))
-        directions[1:7, :free] = place.soil[:, None] * self._log_directions(place.soil)
-        directions[7 + self.active, free + np.arange(len(self.active))] = 1.0
+        directions = self._of_gains.copy()
+        directions[1:7, : len(self.free)] = place.soil[:, None] * self._log_directions(place.soil)
         return directions
 
     def _by_known(self, place: Place) -> Array:
-        free = len(self.free)
-        by_known = np.eye(free + len(self.active))
+        free, by_known = len(self.free), self._identity.copy()
         by_known[:free, :free] = self._log_directions(place.soil)[self.free]
         if self._of_data:
             by_known[_K_C] *= place.soil[_K_C] / self.before.soil[_K_C]
@@ -245,6 +255,8 @@ class Fitting:
     def _edges(self, place: Place) -> Array:
         """Directions (E, F + A) in which no step from there can go."""
         of_soil = self.coordinates.edges(place.soil)
+        if not (self._has_bounds or len(of_soil)):
+            return self._identity[:0]
         at = at_edges(place.gains[self.active], *self._gain_bounds)
         own = np.flatnonzero(at)
         edges = np.zeros((len(of_soil) + len(own), len(self.free) + len(self.active)))
@@ -255,13 +267,16 @@ class Fitting:
     def _reach(self, place: Place, step: Array) -> float:
         """Share of a step (F + A,) that can be taken."""
         free = len(self.free)
+        of_soil = self.coordinates.reach(place.soil, step[:free])
+        if not self._has_bounds:
+            return of_soil
         low, high = self._gain_bounds
         room = np.where(step[free:] > 0.0, high, low) - place.gains[self.active]
-        return min(self.coordinates.reach(place.soil, step[:free]), share_of_step(room, step[free:]))
+        return min(of_soil, share_of_step(room, step[free:]))
 
     def _reached(self, place: Place, point: Point, soil: Array, gains: Array, latents: Latents) -> Place:
         """Soil (6,), gains (G,) and foreseen latents as a place, with the entry angles solved where they turn far."""
-        turn = np.max(np.abs(latents.entry_angle / place.latents.entry_angle - 1.0), initial=0.0)
+        turn = np.abs(latents.entry_angle / place.latents.entry_angle - 1.0).max(initial=0.0)
         if turn > (LONG_TURN_WITH_EFFECTS if len(point.at.load_by_effects) else LONG_TURN):
             latents = self.problem.carried(latents, Soil(*soil.tolist()), gains)
         return Place(soil, gains, latents, point.cost, place.trials)
@@ -307,7 +322,7 @@ class Fitting:
             by_changes[_K_C] *= place.soil[_K_C] / self.before.soil[_K_C]
         quadratic = by_changes.T @ self._precision @ by_changes + precision * np.outer(of_prior, of_prior)
         of_data = np.concatenate([[0], others + 2])
-        quadratic[np.ix_(of_data, of_data)] += by_share.T @ (point.information - point.known) @ by_share
+        quadratic[of_data[:, None], of_data] += by_share.T @ (point.information - point.known) @ by_share
         k_c, k_phi = place.soil[[_K_C, _K_PHI]]
         share = k_c / (k_c + k_phi * self.coordinates.width)
         pull = by_changes.T @ self._precision @ self._off(place) + precision * log_off * of_prior
@@ -325,9 +340,8 @@ class Fitting:
     def _belief(self, soil: Array, gains: Array, covariance: Array, at: Array | None = None) -> Belief:
         """The belief with this covariance (F + A, F + A) of coordinates and active gains, there or at a soil nearby."""
         free = len(self.free)
-        spread = np.zeros((_SOIL + len(gains), free + len(self.active)))
+        spread = self._of_gains[1:].copy()
         spread[:_SOIL, :free] = self._log_directions(soil if at is None else at)
-        spread[_SOIL + self.active, free + np.arange(len(self.active))] = 1.0
         return Belief(soil, gains, spread @ covariance @ spread.T)
 
     def believed(self, place: Place, covariance: Array) -> Belief:
@@ -358,10 +372,11 @@ def _solution(information: Array, right: Array) -> Array | None:
 
 def solved(information: Array, gradient: Array) -> tuple[Array, Array] | None:
     """information^-1 gradient and information^-1, (F,) and (F, F); None where it is singular."""
-    scale = 1.0 / np.sqrt(np.diag(information))
+    scale = 1.0 / np.sqrt(information.diagonal())
+    scales = scale[:, None] * scale
     try:
-        inverse = np.linalg.inv(information * np.outer(scale, scale))
+        inverse = np.linalg.inv(information * scales)
     except np.linalg.LinAlgError:
         return None
-    inverse = inverse * np.outer(scale, scale)
+    inverse = inverse * scales
     return (inverse @ gradient, inverse) if np.isfinite(inverse).all() else None

@@ -82,7 +82,7 @@ class Posterior:
     def parameters(self) -> dict[str, Estimate]:
         """Each soil parameter with the root mean square by which one of this log-normal distribution is off its median.
 
-        So value +- 1.96 std holds 94 to 96 % of it, however wide it is: many k_c are far above their median.
+        So value +- 1.96 std holds 94 to 97 % of it, however wide it is: many k_c are far above their median.
         """
         variance = np.diag(self.log_covariance)
         apart = np.sqrt(np.expm1(2.0 * variance) - 2.0 * np.expm1(0.5 * variance))

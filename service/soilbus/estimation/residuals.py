@@ -315,4 +315,4 @@ class WindowProblem(Readings):
         if len(at.load_by_effects):
             change -= np.tensordot(gain_step[self.n_sensors :], at.load_by_effects, 1)
         low, high = angle * 0.6, np.minimum(angle * 1.6, MAX_ENTRY_ANGLE)
-        return np.asarray(np.clip(angle + change / at.load_slope, low, high))
+        return np.asarray(np.minimum(np.maximum(angle + change / at.load_slope, low), high))

@@ -2,7 +2,8 @@
 
 Each window is estimated from its own data and from what was known when it began: the
 posterior of the newest window that had ended by then, widened by the drift of the soil
-since.  No sample counts twice.  Where the newest data disagree with what was known and
+since.  No sample counts twice.  Of k_c it is carried what data told, apart from its prior,
+since they add up in k_c and not in its logarithm (Belief.apart_from).  Where the newest data disagree with what was known and
 another soil explains them much better, they alone count, with the configured prior for
 the soil and what is known of the sensors.
 """
@@ -114,9 +115,8 @@ class Tracker:
 
     @property
     def newest(self) -> Belief | None:
-        """What the newest window told that later ones build on; None before there is one."""
-        beliefs = self._beliefs  # asked from another thread
-        return beliefs[-1][1] if beliefs else None
+        """What the newest window told of which later ones build on the data; None before there is one."""
+        return self._newest
 
     def recall(self, belief: Belief, elapsed: float) -> None:
         """Begin, now and whenever anew, with what another run knew of the gains so many seconds ago."""
@@ -131,6 +131,7 @@ class Tracker:
         self._alarm: Alarm | None = None
         self._crossing: Crossing | None = None
         self._beliefs: list[tuple[float, Belief]] = []
+        self._newest: Belief | None = None
 
     def estimate(self, window: Window, end: float) -> Tracked:
         """One window that ends at `end` [s]; windows in their order."""
@@ -244,6 +245,7 @@ class Tracker:
             learned = end - tracked.since >= LEARNED * self.settings.window and fit.is_gaussian
             if learned and tracked.ground in (Ground.SAME, Ground.NEW):
                 self._beliefs.append((end, without_curve(fit.mode.apart_from(self._here), problem)))
+                self._newest = without_curve(fit.whole, problem)
         return tracked
 
     def _known_at(self, t: float, problem: WindowProblem) -> Belief:

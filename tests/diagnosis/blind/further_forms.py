@@ -45,7 +45,7 @@ def _thrown(forces: Array, state: WheelState, around: Any, values: Any) -> Array
     z = state.radius * (1.0 - np.cos(state.entry_angle))
     root = np.tan(np.pi / 4.0 + np.arctan(state.tan_phi) / 2.0)
     still = SOIL_WEIGHT * z**2 * root**2 / 2.0 + 2.0 * state.c * z * root
-    moving = 2.0 * SOIL_WEIGHT / _GRAVITY * (state.radius * around.wheel_speed) ** 2 * z
+    moving = SOIL_WEIGHT / _GRAVITY * (state.radius * around.wheel_speed) ** 2 * z
     faster = 1.0 + _BY_SPEED * around.ground_speed
     return less_pull(forces, values["size"] * state.width * (still * faster + moving))
 
