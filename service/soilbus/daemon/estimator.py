@@ -281,6 +281,8 @@ class WindowEstimator:
             return Status.DEGRADED, "input_stale " + " ".join(task.poor)
         if self._hardly_new(tracked, task.end):
             return Status.NOT_EXCITED, "not_excited new_soil"
+        if fit.off_scale:
+            return Status.DEGRADED, "model_mismatch"
         if self._ambiguous(fit):
             return Status.NOT_EXCITED, "ambiguous"
         posterior = fit.whole.posterior

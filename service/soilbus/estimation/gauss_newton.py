@@ -93,7 +93,8 @@ class Fit:
     sinkage (W,) is the mean over the window [m], nan where unknown; optimum is for resume();
     rival is another optimum that the data leave about as likely, where one was looked for
     and found; averaged is the mean of the whole posterior, where that was worked out (see
-    `marginal`); bend: cost and evidence are those on a way that bends (see `bends`).
+    `marginal`); bend: cost and evidence are those on a way that bends (see `bends`);
+    off_scale: sinkages and all else agree on no soil (see `scale`).
     All are of a constant soil until `present` moves them to the window's end.
     """
 
@@ -109,6 +110,7 @@ class Fit:
     rival: Rival | None = None
     averaged: Belief | None = None
     bend: Bend | None = None
+    off_scale: bool = False
 
     @property
     def posterior(self) -> Posterior:

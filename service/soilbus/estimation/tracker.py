@@ -31,6 +31,7 @@ from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.present import at_present
 from soilbus.estimation.recall import is_borne_out, recalled
 from soilbus.estimation.residuals import WindowProblem
+from soilbus.estimation.scale import sinkages_off_scale
 from soilbus.estimation.soil_change import Crossing, suspicion, without_crossing
 from soilbus.estimation.tracked import Ground, Settings, Tracked
 from soilbus.estimation.window import Rig, Window
@@ -219,7 +220,9 @@ class Tracker:
         if fit is None or not fit.converged:
             return fit
         if not self.mismatch(fit):
+            off_scale = sinkages_off_scale(fitting, fit)
             fit = with_whole(fitting.problem, fitting.coordinates.prior, fitting.before, fit)
+            fit = replace(fit, off_scale=off_scale)
         return at_present(fitting, fit, self.settings.window, self.settings.drift)
 
     def mismatch(self, fit: Fit | None) -> bool:
