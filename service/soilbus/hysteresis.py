@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from statistics import NormalDist
 
 from soilbus.config import Traversability as Settings
@@ -41,6 +42,7 @@ def _rank(state: State) -> int:
     return ORDER.index(state)
 
 
+@lru_cache(maxsize=8)
 def _raised(settings: Settings) -> Settings:
     """The settings with thresholds that lie `hysteresis` standard deviations higher."""
     normal = NormalDist()

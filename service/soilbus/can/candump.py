@@ -13,7 +13,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from io import StringIO
-from itertools import repeat
+from itertools import chain, islice, repeat
 
 import can
 
@@ -49,29 +49,36 @@ def candump_frames(lines: Iterable[str]) -> Iterator[Frame]:
     Raises what the reader (ValueError, IndexError) or `lines` raises, after the frames before
     that place.
     """
-    for batch in _batches(lines):
+    return chain.from_iterable(candump_batches(lines))
+
+
+def candump_batches(lines: Iterable[str]) -> Iterator[list[Frame]]:
+    """As `candump_frames`, in lists."""
+    for batch in _batches(iter(lines)):
         text = "".join(batch)
-        yield from _plain(text) if _PLAIN_LINES(text) else map(frame_of, can.CanutilsLogReader(StringIO(text)))
+        if _PLAIN_LINES(text):
+            yield list(_plain(text))
+        else:
+            yield from ([frame_of(message)] for message in can.CanutilsLogReader(StringIO(text)))
 
 
-def _batches(lines: Iterable[str]) -> Iterator[list[str]]:
+def _batches(lines: Iterator[str]) -> Iterator[list[str]]:
     """Lines in lists of BATCH; what was read before an error comes before the error."""
-    batch: list[str] = []
-    failure: Exception | None = None
-    try:
-        for line in lines:
-            batch.append(line)
-            if len(batch) == BATCH:
-                yield batch
-                batch = []
-    except Exception as error:
-        failure = error
-    yield batch
-    if failure is not None:
-        raise failure
+    full = True
+    while full:
+        batch: list[str] = []
+        failure: Exception | None = None
+        try:
+            batch.extend(islice(lines, BATCH))
+        except Exception as error:
+            failure = error
+        yield batch
+        if failure is not None:
+            raise failure
+        full = len(batch) == BATCH
 
 
-def _plain(text: str) -> Iterator[Frame]:
+def _plain(text: str) -> Iterable[Frame]:
     """Frames of lines that _PLAIN_LINES has found good: four words each once cut and undirected."""
     words = _DIRECTION.sub("\n", text).translate(_CUTS).split()
     identifiers = words[2::4]

@@ -236,11 +236,12 @@ def _set_points(axles: Axles, level: Balance, limits: Limits, draft: Largest) ->
     """Efficiency is drawbar power over the wheels' power, DP V/(T omega)."""
     names = {"front": axles.front[:, 0], "rear": ~axles.front[:, 0]}
     names = {name: kinds for name, kinds in names.items() if kinds.any()}
-    values = []
-    for kinds in names.values():
-        pull, force = axle_sum(level.drawbar, axles, kinds), axle_sum(level.torque, axles, kinds, 1.0 / axles.radius)
-        values += [pull * (1.0 - level.slip) / np.where(force > 0.0, force, -np.inf), pull]
-    slips = estimates(*slips_of_most(np.array(values), level, limits, draft.slip))
+    values = np.empty((len(names), 2, *level.pull.shape))
+    for (efficiency, pull), kinds in zip(values, names.values(), strict=True):
+        force = axle_sum(level.torque, axles, kinds, 1.0 / axles.radius)
+        pull[:] = axle_sum(level.drawbar, axles, kinds)
+        np.divide(pull * (1.0 - level.slip), np.where(force > 0.0, force, -np.inf), out=efficiency)
+    slips = estimates(*slips_of_most(values.reshape(-1, *level.pull.shape), level, limits, draft.slip))
     return {name: SetPoint(*slips[2 * i : 2 * i + 2]) for i, name in enumerate(names)}
 
 
@@ -266,5 +267,6 @@ def _over_slip(level: Balance, table: WheelTable) -> OverSlip:
     known = level.known[:, ::PARTS].copy()
     known[:, 1:] |= level.known[:, PARTS - 1 :: PARTS]
     torque = (level.torque[..., ::PARTS] * table.axles.count).sum(axis=1)
-    pull, torque = (np.where(known, each, np.nan) for each in (level.pull[:, ::PARTS], torque))
-    return OverSlip(table.slip, *mean_and_std(pull), *mean_and_std(torque))
+    both = np.where(known[:, None], np.stack([level.pull[:, ::PARTS], torque], axis=1), np.nan)
+    (pull, torque), (pull_std, torque_std) = mean_and_std(both)
+    return OverSlip(table.slip, pull, pull_std, torque, torque_std)

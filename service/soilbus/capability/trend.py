@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -43,15 +44,6 @@ class Trend(NamedTuple):
     y: float = 0.0
     xy: float = 0.0
 
-    @classmethod
-    def through(cls, x: Array, y: Array, memory: float) -> Trend:
-        """The trend of values (N,) at times [s] counted from now; nan is none."""
-        known = np.isfinite(y)
-        weight = np.exp(x / memory) * known
-        y = np.where(known, y, 0.0)
-        wx = weight * x
-        return cls(*(float(a) for a in (weight.sum(), wx.sum(), wx @ x, weight @ y, wx @ y)))
-
     def joined(self, step: float, value: float | None, memory: float) -> Trend:
         """The trend a step [s] later, with one more value or none; memory is the time constant [s] of forgetting."""
         kept = math.exp(-step / memory)
@@ -72,6 +64,16 @@ class Trend(NamedTuple):
     def mean(self) -> float:
         """Of the values, the last ones counting most; 0 where there are none."""
         return self.y / self.n if self.n > 0.0 else 0.0
+
+
+def _trends(x: Array, series: Sequence[Array], memories: Sequence[float]) -> list[Trend]:
+    """The trend of each series of values (N,) at times x [s] counted from now, with its memory [s]; nan is none."""
+    y = np.array(series, float)
+    known = np.isfinite(y)
+    weight = np.exp(x / np.array(memories)[:, None]) * known
+    y, wx = np.where(known, y, 0.0), weight * x
+    sums = (weight.sum(axis=1), wx.sum(axis=1), wx @ x, (weight * y).sum(axis=1), (wx * y).sum(axis=1))
+    return [Trend(*of_one) for of_one in np.transpose(sums).tolist()]
 
 
 def _estimated(squares: Trend, alike: float) -> float:
@@ -98,12 +100,7 @@ class Capacity(NamedTuple):
         x = t - t[-1]
         change = (values - values[np.searchsorted(t, t - LAG)]) ** 2
         change[0] = np.nan
-        return cls(
-            Trend.through(x, values, LONG),
-            Trend.through(x, values, SHORT),
-            Trend.through(x, np.isfinite(values).astype(float), SHORT),
-            Trend.through(x, change, SCATTER),
-        )
+        return cls(*_trends(x, [values, values, np.isfinite(values), change], [LONG, SHORT, SHORT, SCATTER]))
 
     def joined(self, step: float, value: float | None, earlier: float | None) -> Capacity:
         """A step [s] later, with one more value or none; earlier is that of LAG before."""

@@ -9,13 +9,14 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
+from itertools import chain
 from multiprocessing import get_all_start_methods, get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
 import can
 
-from soilbus.can.candump import Frame, candump_frames, frame_of
+from soilbus.can.candump import Frame, candump_batches, frame_of
 from soilbus.config import Config
 from soilbus.daemon.estimator import Undecided, WindowEstimator, WindowResult
 from soilbus.daemon.intake import Intake, WindowTask
@@ -37,28 +38,28 @@ def read_log(path: Path) -> Iterator[can.Message]:
 
     Raises LogError for a file that is missing, of an unknown format, or damaged.
     """
-    return _read(path, iter)
+    return chain.from_iterable(_read(path, lambda reader: ([message] for message in reader)))
 
 
 def read_frames(path: Path) -> Iterator[Frame]:
     """The frames of read_log()'s messages, several times as fast for a candump log."""
-    return _read(path, _frames)
+    return chain.from_iterable(_read(path, _frames))
 
 
-def _frames(reader: Any) -> Iterator[Frame]:
+def _frames(reader: Any) -> Iterator[list[Frame]]:
     if isinstance(reader, can.CanutilsLogReader):
-        return candump_frames(reader.file)
-    return map(frame_of, reader)
+        return candump_batches(reader.file)
+    return ([frame_of(message)] for message in reader)
 
 
-def _read(path: Path, items: Callable[[Any], Iterator[_T]]) -> Iterator[_T]:
-    """What `items` makes of python-can's reader of a log; LogError as read_log()."""
+def _read(path: Path, batches: Callable[[Any], Iterator[list[_T]]]) -> Iterator[list[_T]]:
+    """What `batches` makes of python-can's reader of a log; LogError as read_log()."""
     n = 0
     try:
         with _reader(path) as reader:
-            for item in items(reader):
-                n += 1
-                yield item
+            for batch in batches(reader):
+                n += len(batch)
+                yield batch
     except FileNotFoundError:
         raise LogError(f"{path}: no such file") from None
     except NotImplementedError:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,24 +19,15 @@ from numpy.typing import NDArray
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.posterior import PARAMETERS
 from soilbus.estimation.readings import Readings
-from soilbus.estimation.window import Rig
+from soilbus.estimation.window import Rig, pairs
 
 Array = NDArray[np.float64]
 
 
 def sides(rig: Rig) -> Array:
     """-1 for the wheels on the left, 1 for those on the right, 0 where an axle has not two wheels (W,)."""
-    return _sides(tuple(rig.front.tolist()))
-
-
-@cache
-def _sides(front: tuple[bool, ...]) -> Array:
-    """As `sides`, from which wheels are on the front axle; not to be written to."""
-    side = np.zeros(len(front))
-    for axle in (np.array(front), ~np.array(front)):
-        if axle.sum() == 2:
-            side[axle] = -1.0, 1.0
-    side.flags.writeable = False
+    side = np.zeros(len(rig.wheels))
+    side[pairs(rig)] = [[-1.0], [1.0]]
     return side
 
 

@@ -105,14 +105,16 @@ def without(window: Window, rig: Rig, channels: set[str]) -> Window:
 def frozen(scene: Scene) -> Iterator[str]:
     """Channels that read the very same for longer than their noise allows, while the vehicle drives."""
     window, rig = scene.window, scene.rig
-    value, variance = (
-        np.column_stack([of[q] for q in (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)])
-        for of in ({q: getattr(window, q) for q in window.variance}, window.variance)
-    )
+    quantities = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
+    value = np.column_stack([getattr(window, q) for q in quantities])
     with np.errstate(invalid="ignore"):
         same = np.abs(np.diff(value, axis=0)) <= SAME * np.abs(value[1:])
     same &= scene.driving[1:, None]
-    for i in np.flatnonzero(same.sum(axis=0) >= scene.sustained).tolist():
+    often = np.flatnonzero(same.sum(axis=0) >= scene.sustained).tolist()
+    if not often:
+        return
+    variance = np.column_stack([window.variance[q] for q in quantities])
+    for i in often:
         name = rig.channels[i]
         noise, resolution = rig.noise[name.partition(".")[0]], scene.resolution.get(name, Resolution(0.0, False))
         stretches = [(first, last) for first, last in runs(same[:, i]) if last - first >= scene.sustained]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -133,14 +134,22 @@ def turning(window: Window, rig: Rig, max_turn: float) -> NDArray[np.bool_]:
     with an unknown speed, or not with two wheels, does not count; without any no instant
     is in a turn.
     """
-    rim = rig.radius * window.speed
-    least = np.full(len(window.t), np.inf)
-    for members in (np.flatnonzero(rig.front), np.flatnonzero(~rig.front)):
-        if len(members) == 2:
-            left, right = rim[:, members].T
-            with np.errstate(invalid="ignore", divide="ignore"):
-                least = np.fmin(least, 2.0 * np.abs(left - right) / (left + right))
+    left, right = (rig.radius[side] * window.speed[:, side] for side in pairs(rig))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        apart = 2.0 * np.abs(left - right) / (left + right)
+    least = np.fmin.reduce(apart, axis=1, initial=np.inf)
     return np.asarray(np.isfinite(least) & (least > max_turn))
+
+
+def pairs(rig: Rig) -> NDArray[np.intp]:
+    """Left and right wheels (2, P) of the axles that have two."""
+    return _pairs(tuple(rig.front.tolist()))
+
+
+@cache
+def _pairs(front: tuple[bool, ...]) -> NDArray[np.intp]:
+    axles = [[i for i, is_front in enumerate(front) if is_front == wanted] for wanted in (True, False)]
+    return np.array([wheels for wheels in axles if len(wheels) == 2], np.intp).reshape(-1, 2).T
 
 
 class BinStore:
