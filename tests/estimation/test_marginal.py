@@ -1,0 +1,42 @@
+"""What the average along n says of a window whose sensors were perfect, and whose prior was told the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.bound import cramer_rao
+from soilbus.estimation.marginal import cold_fit
+from soilbus.estimation.posterior import SoilPrior
+from soilbus.estimation.residuals import WindowProblem
+from soilbus.estimation.window import BinStore
+from soilbus.simulator.monte_carlo import ROUGHLY_KNOWN, SLIP
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario
+from soilbus.terra.soils import SOILS
+
+DURATION = 10.0
+
+
+@pytest.mark.parametrize("seed", [21, 22])
+def test_without_noise_a_window_that_tells_k_c_says_the_truth(seed):
+    # Means of logarithms lie a third of the bound beside it: of k_c's, and so of n's and the pressure's.
+    config, soil = reference_configuration(ROUGHLY_KNOWN), SOILS["wet_clay"]
+    rig, truth = rig_of(config), SoilPrior(np.asarray(soil), prior_of(config).log_std)
+    drive = simulate(config, Scenario(DURATION, (Patch(0.0, "wet_clay", soil),), slip=SLIP), seed)
+    store = BinStore(rig, config.estimator.bin, 0.0)
+    fitted = [name for name in rig.channels if name in drive.channels and not name.startswith("sinkage")]
+    times = {name: drive.channels[name].t for name in fitted}
+    store.add({name: (t, np.interp(t, drive.truth["t"], drive.truth[name])) for name, t in times.items()})
+    problem = WindowProblem(store.window(0.0, DURATION), rig, model_of(config), config.estimator.min_speed)
+    told = cold_fit(problem, truth).whole.posterior
+    bound = cramer_rao(problem, truth, soil)
+    std = np.sqrt(np.diag(bound.log_covariance))
+    off = np.log(np.asarray(told.soil) / np.asarray(soil)) / std
+    assert std[0] < 0.3  # k_c is told
+    assert np.abs(off).max() < 0.15
+    z_ref, b_ref = config.estimator.z_ref, config.estimator.b_ref
+    pressure, least = (of.bearing_pressure(z_ref, b_ref) for of in (told, bound))
+    assert abs(pressure.value - least.value) < 0.15 * least.std
