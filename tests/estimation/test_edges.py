@@ -86,7 +86,7 @@ def bulldozed(simulated):
 def test_parameters_of_effects_stay_inside_their_ranges(bulldozed):
     problem, prior = bulldozed
     before = Belief.of(prior, problem.gain_std)
-    gains = np.concatenate([np.zeros(problem.n_sensors), [1.0, 1.0]])
+    gains = np.concatenate([np.zeros(problem.n_sensors), np.ones(len(problem.free))])
     fit = continued(problem, prior, before, Start(np.asarray(SOILS["loam"]), gains), problem.n_sensors)
     assert fit.converged
     low, high = problem.gain_bounds()

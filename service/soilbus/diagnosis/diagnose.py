@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -48,8 +48,8 @@ STEPS = 12
 WORTH_TRYING = -2.0
 """Foreseen change of -2 log evidence above which a candidate does not count."""
 WORTH_FITTING = 0.2
-"""Share of what an effect must explain from which, where little is foreseen, it is fitted: what is foreseen of
-less is as good."""
+"""Share of what an effect must explain, and of what the best is foreseen to, from which it is fitted where little
+is foreseen: of less the score is as good."""
 SAME = 1.0
 """Difference of -2 log evidence that is none."""
 
@@ -70,6 +70,12 @@ class Addition:
     alternatives: dict[str, float]
     falls: dict[str, float]
     beside: frozenset[str] = frozenset()
+
+    def beside_another(self, effect: Effect, other: Effect) -> Addition:
+        """The same with one effect beside it in place of another."""
+        if effect.name not in self.beside:
+            return self
+        return replace(self, beside=self.beside - {effect.name} | {other.name})
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,11 +197,7 @@ def _promising(
     most = max(-score.evidence / part for part, of in ((1.0, foreseen), (share, further)) for score in of)
     if before is None or most < CLEAR:
         return _of_scores([*foreseen, *_further(whole, present, candidates)], least_that_pays(explained))
-    if again is not None:
-        foreseen = foreseen[:TRIED_AGAIN] + [s for s in foreseen[TRIED_AGAIN:] if s.effect.name in again]
-    starts: dict[str, list[Sequence[Start]]] = {}
-    for score in [s for s in (*foreseen[:TRIED], *further) if s.evidence < WORTH_TRYING]:
-        starts.setdefault(score.effect.name, []).append(score.starts)
+    starts = _starts(foreseen, further, again)
     effects = {effect.name: effect for effect in candidates}
     tried: list[tuple[float, Effect, Sequence[Start]]] = []
     least = math.inf
@@ -220,8 +222,22 @@ def _of_scores(found: Iterable[Score], least: float) -> _Promising:
         if score.evidence < WORTH_TRYING:
             best.setdefault(score.effect.name, score)
     chosen = list(best.values())[:FITTED]
-    fitted = [(s.effect, s.starts) for s in chosen if -s.evidence > WORTH_FITTING * least]
+    enough = WORTH_FITTING * max([least, *(-s.evidence for s in chosen)])
+    fitted = [(s.effect, s.starts) for s in chosen if -s.evidence > enough]
     return _Promising(fitted, {s.effect.name: -s.evidence for s in chosen[len(fitted) :]})
+
+
+def _starts(
+    foreseen: Sequence[Score], further: Sequence[Score], again: Collection[str] | None
+) -> dict[str, list[Sequence[Start]]]:
+    """Where fits of the candidates that count start, the best foreseen first; `again` as of _round()."""
+    tried = foreseen[: TRIED if again is None else TRIED_AGAIN]
+    named = [score for score in foreseen[len(tried) :] if again is not None and score.effect.name in again]
+    starts: dict[str, list[Sequence[Start]]] = {}
+    for score in (*tried, *named, *further):
+        if score.evidence < WORTH_TRYING:
+            starts.setdefault(score.effect.name, []).append(score.starts)
+    return starts
 
 
 def _further(fits: Fits, present: Completion, candidates: Sequence[Effect]) -> list[Score]:
@@ -243,18 +259,49 @@ def _reconsidered(
         addition = stale[0]
         place, others = chosen.index(addition), _others(addition, present)
         looked.add(others)
+        left = [effect for effect in candidates if effect.name not in others]
+        stays = _stays(few, base, present, addition, left)
+        if stays is not None:
+            chosen[place] = stays
+            continue
         without = _without(whole, present, addition.effect)
         if without is None:
             continue
-        left = [effect for effect in candidates if effect.name not in without.names]
         found = _round(whole, few, without, left, base.evidence - without.evidence, addition.falls)
         if found is None and without.evidence < present.evidence + PAYS:
             present = without
             del chosen[place]
         elif found is not None and found[1].evidence < present.evidence + SAME:
+            if present.evidence - found[1].evidence < PAYS:  # what stands beside is named as well beside the other
+                chosen = [a.beside_another(addition.effect, found[0].effect) for a in chosen]
             chosen[place], present = found
     order = {name: i for i, name in enumerate(present.names)}
     return sorted(chosen, key=lambda addition: order[addition.effect.name]), present
+
+
+def _stays(
+    few: Fits, base: Completion, present: Completion, addition: Addition, candidates: Sequence[Effect]
+) -> Addition | None:
+    """The addition beside the present others, where a few instants tell that it, and no other, belongs there."""
+    effect, others = addition.effect, _others(addition, present)
+    here, without = few.of(present.effects, [present.as_starts()], STEPS), _without(few, present, effect)
+    if here is None or without is None:
+        return None
+    share = here.rows / present.rows
+    fall, explained = (without.evidence - here.evidence) / share, base.evidence - present.evidence
+    if fall < CLEAR:
+        return None
+    starts = _starts(
+        scores(few.records, few.prior, without, candidates), _further(few, without, candidates), addition.falls
+    )
+    for rival in candidates:
+        if rival.name in starts and rival.name != effect.name:
+            most = here.cost + BEHIND_UNSETTLED
+            completion = few.of((*without.effects, rival), starts[rival.name], STEPS, most)
+            if completion is not None and not hopeless((completion.evidence - here.evidence) / share, explained):
+                return None
+    (chance,) = probabilities({effect.name: fall}, explained - fall).values()
+    return Addition(effect, chance, {}, {effect.name: fall}, others)
 
 
 def _others(addition: Addition, present: Completion) -> frozenset[str]:
@@ -262,15 +309,15 @@ def _others(addition: Addition, present: Completion) -> frozenset[str]:
     return frozenset(present.names) - {addition.effect.name}
 
 
-def _without(whole: Fits, present: Completion, effect: Effect) -> Completion | None:
+def _without(fits: Fits, present: Completion, effect: Effect) -> Completion | None:
     """The present model less one effect, fitted from where it stands."""
-    n_sensors = whole.records[0].learned.n_sensors
+    n_sensors = fits.records[0].learned.n_sensors
     kept = [n_sensors + i for i, f in enumerate(present.free) if f.effect != effect.name]
     starts = [
         start._replace(gains=np.concatenate([start.gains[:n_sensors], start.gains[kept]]))
         for start in present.as_starts()
     ]
-    return whole.of([e for e in present.effects if e.name != effect.name], [starts], STEPS)
+    return fits.of([e for e in present.effects if e.name != effect.name], [starts], STEPS)
 
 
 def _verdict(base: Completion, completed: Completion, additions: Sequence[Addition]) -> Verdict:

@@ -76,7 +76,7 @@ WHEEL_LOAD_OFFSET = Effect(
     tells="weighing the vehicle standing, before and after: the loads must add up to its weight",
     parameters=(
         Parameter("offset", "N", 0.0, 200.0, -3000.0, 3000.0),
-        Parameter("drift", "N/s", 0.0, 2.0, -30.0, 30.0),
+        Parameter("drift", "N/s", 0.0, 0.5, -30.0, 30.0),
     ),
     each_wheel=True,
     load=_wheel_load_offset,
