@@ -3,9 +3,9 @@
 Each window is estimated from its own data and from what was known when it began: the
 posterior of the newest window that had ended by then, widened by the drift of the soil
 since.  No sample counts twice.  Of k_c it is carried what data told, apart from its prior,
-since they add up in k_c and not in its logarithm (Belief.apart_from).  Where the newest data disagree with what was known and
-another soil explains them much better, they alone count, with the configured prior for
-the soil and what is known of the sensors.
+since they add up in k_c and not in its logarithm (Belief.apart_from).
+Where the newest data disagree with what was known and another soil explains them much better,
+they alone count, with the configured prior for the soil and what is known of the sensors.
 """
 
 from __future__ import annotations
