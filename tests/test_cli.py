@@ -128,6 +128,7 @@ def test_partial_keeps_the_windows_before_the_cut(log, tractor, tmp_path, capsys
         ('dbc.input=["nowhere.dbc"]', ["nowhere.dbc", "No such file"]),
         ('dbc.input=["field.toml"]', ["field.toml", "not a DBC"]),
         ("soil.n.std=-1", ["soil.n.std"]),
+        ("noise.sinkage.gain=0.05", ["noise.sinkage", "a fixed gain error of this sensor is not estimated"]),
         ("vehicle.cg_ahead_of_rear_axle=3", ["less than wheelbase"]),
         ("wheel.QQ.radius=1", ["wheel.QQ"]),
         ("estimator.hop=20", ["bin <= hop <= window"]),

@@ -232,6 +232,13 @@ class NoiseOfChannels(_Section):
     slip: Noise = Noise(absolute=0.005)
     """Of a table that tells slip itself; its gain is the relative error of 1 - slip."""
 
+    @field_validator("sinkage", "pitch", "acceleration")
+    @classmethod
+    def _without_gain(cls, noise: Noise) -> Noise:
+        if noise.gain:
+            raise ValueError("a fixed gain error of this sensor is not estimated: say it in absolute or relative")
+        return noise
+
 
 class Prior(_Section):
     """What is known of a soil parameter beforehand; std = 0 holds it at value."""

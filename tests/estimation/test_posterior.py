@@ -51,7 +51,8 @@ def test_parameters_come_with_their_std():
     estimates = posterior.parameters()
     assert list(estimates) == list(PARAMETERS)
     assert estimates["k_phi"].value == LOAM.k_phi
-    assert estimates["k_phi"].std == pytest.approx(0.2 * LOAM.k_phi)
+    assert estimates["k_phi"].std == pytest.approx(0.2 * LOAM.k_phi, rel=0.04)  # test_carried has the exact one
+    assert estimates["n"].std == pytest.approx(0.05 * LOAM.n, rel=0.003)
     assert estimates["c"].std == 0.0
 
 

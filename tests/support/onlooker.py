@@ -170,7 +170,7 @@ class Drive:
 
     def content(self, estimator: WindowEstimator) -> None:
         def estimate(window, end):
-            estimator.tracker._beliefs = [(end, self.tracked.fit.whole)]
+            estimator.tracker._newest = self.tracked.fit.whole
             return dataclasses.replace(self.tracked, since=end - CONFIG.estimator.window, mismatch=self.wire.blind)
 
         estimator._tracker.estimate = estimate

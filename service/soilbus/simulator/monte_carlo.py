@@ -21,7 +21,7 @@ import time
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -228,9 +228,10 @@ def _driven(task: Task) -> tuple[Recording, Soil]:
     for _ in range(MAX_DRAWN if around else 1):
         soil = missed(SoilPrior(np.asarray(named), spread), named, rng).median if around else np.asarray(named)
         of_drive = Soil(*soil.tolist())
-        recording = simulate(config, Scenario(duration, (Patch(0.0, name, of_drive),), slip=SLIP), seed)
-        if recording.bogged_at is None:
-            return recording, of_drive
+        with suppress(SimulationError) if around else nullcontext():
+            recording = simulate(config, Scenario(duration, (Patch(0.0, name, of_drive),), slip=SLIP), seed)
+            if recording.bogged_at is None:
+                return recording, of_drive
     raise SimulationError(f"the tractor gets stuck on {name}")
 
 
