@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
+from soilbus.allocator import give_back_freed_memory
 from soilbus.daemon.estimator import WindowEstimator, WindowResult
 from soilbus.daemon.intake import WindowTask
 from soilbus.traversability import Status, Traversability
@@ -15,6 +16,8 @@ INTERNAL = "internal"
 """Reason and kind of failure of a window at which the estimator raised."""
 REPEATED = 3
 """Such windows in a row from which the service is in fault."""
+TIDIED = 60
+"""After each so many windows memory that is free is given back."""
 
 
 class Solver:
@@ -45,6 +48,8 @@ class Solver:
                 self.estimator = self._anew()
             return _failed(task)
         self._in_a_row = 0
+        if task.index % TIDIED == 0:
+            give_back_freed_memory()
         return result
 
 
