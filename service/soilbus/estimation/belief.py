@@ -89,6 +89,11 @@ class Belief:
         off = along * (math.log(self.soil[_K_C] / prior.median[_K_C]) / untold)
         return replace(self, k_c_off=0.0).moved(off, self.covariance + np.outer(along, along) / untold)
 
+    def variance_of_k_c(self, prior: SoilPrior) -> float:
+        """Of its logarithm, the prior counted in."""
+        own = float(self.covariance[_K_C, _K_C])
+        return own if self.k_c_off is None else 1.0 / (1.0 / own + float(prior.log_std[_K_C] ** -2))
+
     def drifted(self, soil: Array, gains: Array) -> Belief:
         """Later: the soil's logarithms may have changed with covariance (6, 6), the gains with variance (G,)."""
         covariance = self.covariance.copy()

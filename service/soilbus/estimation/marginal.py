@@ -187,7 +187,7 @@ def _held(
     fitting = Fitting(problem, SoilPrior(median, log_std), before.given(_N, u))
     latents = problem.carried(near.optimum.latents, Soil(*soil.tolist()), gains)
     fit = _converged(fitting, Place(soil, gains, latents, np.inf, 1))
-    return None if fit is None else Node(u, fit, deviation**2)
+    return None if fit is None else Node(u, fit, deviation**2 + fitting.surplus)
 
 
 def told_of_k_c(along: Ridge, prior: SoilPrior, before: Belief) -> Array | None:
@@ -219,9 +219,10 @@ def _averaged(nodes: list[Node], told: Array, coordinates: Coordinates, before: 
     probable = density(u, np.array([node.unlikelihood for node in nodes]), fine)
     weight = confidence(u, np.array([node.misfit for node in nodes]), fine)
     k_c_told = np.interp(fine, u, told)
-    known = 1.0 - _next(fine, probable, k_c_told) / before.covariance[_K_C, _K_C]
+    known = 1.0 - _next(fine, probable, k_c_told) / before.variance_of_k_c(coordinates.prior)
     place = np.array([[*coordinates.position(b.soil), *b.gains[active - n]] for b in beliefs])
-    place[:, _K_C] += known * (np.array([_unbiased_k_c(node, before) for node in nodes]) - place[:, _K_C])
+    unbiased = np.array([_unbiased_k_c(node, before, coordinates.prior) for node in nodes])
+    place[:, _K_C] += known * (unbiased - place[:, _K_C])
     along = np.array([np.interp(fine, u, column) for column in place.T])
     own = np.array([_in_coordinates(b.covariance, coordinates.log_directions(b.soil), free, active) for b in beliefs])
     share = np.array([np.interp(fine, u, one) for one in np.eye(len(u))])
@@ -255,7 +256,7 @@ def _next(fine: Array, probable: Array, value: Array) -> float:
     return float(np.interp(mean + math.sqrt((fine - mean) ** 2 @ probable), fine, value))
 
 
-def _unbiased_k_c(node: Node, before: Belief) -> float:
+def _unbiased_k_c(node: Node, before: Belief, prior: SoilPrior) -> float:
     """Logarithm of k_c given n of which the mean over windows on one soil is that soil's, to second order.
 
     The model is all but linear in k_c, and so the mean of the posterior of its logarithm is biased down, and
@@ -263,7 +264,7 @@ def _unbiased_k_c(node: Node, before: Belief) -> float:
     Math. Stat. 36:1137): that is half a variance above the mode, as far as it is the window that tells k_c.
     """
     variance = node.fit.mode.covariance[_K_C, _K_C]
-    of_window = 1.0 - variance / before.given(_N, node.u).covariance[_K_C, _K_C]
+    of_window = 1.0 - variance / before.given(_N, node.u).variance_of_k_c(prior)
     return float(np.log(node.fit.mode.soil[_K_C]) + 0.5 * variance * of_window)
 
 

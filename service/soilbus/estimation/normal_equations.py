@@ -106,7 +106,10 @@ class Known(NamedTuple):
 
 
 class Fitting:
-    """A window's residuals together with what was known before: free coordinates (F), active gains (A)."""
+    """A window's residuals together with what was known before: free coordinates (F), active gains (A).
+
+    surplus is what data and the prior of k_c cost together at least, which no cost counts.
+    """
 
     def __init__(
         self, problem: WindowProblem, prior: SoilPrior, before: Belief, with_gains: bool = True, first: int = 0
@@ -131,7 +134,7 @@ class Fitting:
         self._mean = np.concatenate([np.log(before.soil[self.free]), before.gains[self.active]])
         self._precision = inverse[1]
         self._of_data = before.k_c_off is not None and _K_C in self.free
-        self._surplus = self._least_before() if self._of_data else 0.0
+        self.surplus = self._least_before() if self._of_data else 0.0
         self._none = np.zeros(len(kept))
         self._last: tuple[Array, Array, Known] | None = None
 
@@ -204,7 +207,7 @@ class Fitting:
         log_off, precision = self._of_prior(place)
         information[_K_C, _K_C] += precision
         gradient[_K_C] += precision * log_off
-        return Known(information, gradient, cost + precision * log_off**2 - self._surplus, of_data)
+        return Known(information, gradient, cost + precision * log_off**2 - self.surplus, of_data)
 
     def _off(self, place: Place) -> Array:
         """How far (F + A,) the free parameters' logarithms and the active gains are from what was known.
