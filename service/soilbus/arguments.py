@@ -52,6 +52,11 @@ def command_line() -> argparse.ArgumentParser:
             )
         return sub
 
+    def figures(sub: argparse.ArgumentParser, seed_of: str = "") -> None:
+        if seed_of:
+            sub.add_argument("--seed", type=natural, default=1, help=f"of {seed_of} (default 1)")
+        sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
+
     sub = command("demo", "simulated tractor, service and dashboard; needs no hardware, ends by itself", "")
     sub.add_argument("--duration", type=float, default=42.0, metavar="S", help="simulated seconds (default 42)")
 
@@ -106,21 +111,19 @@ def command_line() -> argparse.ArgumentParser:
     sub.add_argument("--windows", type=counted, default=200, metavar="N", help="of each kind (default 200)")
     sub.add_argument("--exact", type=natural, default=0, metavar="M", help="samples of exact posteriors (default 0)")
     sub.add_argument("--around", type=between(0.0, 1.0), default=0.0, metavar="S", help="std of soils' log (default 0)")
-    sub.add_argument("--seed", type=natural, default=1, help="of drives, noise and priors (default 1)")
-    sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
+    figures(sub, "drives, noise and priors")
 
     sub = command("decisions", "what soilbus foretells, beside what simulated drives then do", "optional")
     sub.add_argument("--drives", type=counted, default=150, metavar="N", help="on each held soil (default 150)")
     sub.add_argument("--calls", type=counted, default=600, metavar="N", help="of go, caution, no-go (default 600)")
     sub.add_argument("--boggings", type=counted, default=40, metavar="N", help="drives into trouble (default 40)")
     sub.add_argument("--hours", type=between(0.0, 100.0), default=1.0, metavar="H", help="on firm ground (default 1)")
-    sub.add_argument("--seed", type=natural, default=1, help="of soils, drives, noise and priors (default 1)")
-    sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
+    figures(sub, "soils, drives, noise and priors")
 
     sub = command("bench", "every performance figure beside its peer, in one run", "")
     sub.add_argument("--bus", metavar="CHANNEL", help="the service on this bus, filled up: a vcan, never a vehicle's")
     sub.add_argument(
         "--seconds", type=between(15.0, 200.0), default=120.0, metavar="S", help="of a full bus (default 120)"
     )
-    sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
+    figures(sub)
     return parser

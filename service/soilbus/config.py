@@ -17,7 +17,6 @@ from pydantic import (
     NonNegativeFloat,
     PositiveFloat,
     PositiveInt,
-    ValidationError,
     field_validator,
     model_validator,
 )
@@ -391,23 +390,3 @@ class Config(_Section):
     def soil_prior(self) -> dict[str, Prior]:
         """Prior by parameter name, in the order k_c, k_phi, n, phi, c, K."""
         return {name: getattr(self.soil, name) for name in SoilPrior.model_fields}
-
-
-def parse_config(raw: Mapping[str, Any], folder: Path = Path("."), source: str = "configuration") -> Config:
-    """Check a configuration given as nested mappings; ConfigError lists every fault."""
-    if "folder" in raw:
-        raise ConfigError([f"{source}: folder: unknown key"])
-    try:
-        return Config.model_validate({**raw, "folder": folder})
-    except ValidationError as error:
-        raise ConfigError(f"{source}: {_fault(raw, e)}" for e in error.errors()) from None
-
-
-def _fault(raw: Mapping[str, Any], error: Any) -> str:
-    where = ".".join(str(part) for part in error["loc"] if part not in ("str",))
-    if error["type"] == "extra_forbidden":
-        return f"{where}: unknown key"
-    if error["type"] == "missing":
-        return f"{where}: missing"
-    message = str(error["msg"]).removeprefix("Value error, ")
-    return f"{where}: {message}" if where else message

@@ -1,13 +1,15 @@
-"""A configuration file and KEY=VALUE overrides -> a checked Config."""
+"""A configuration, from a file with KEY=VALUE overrides or as nested mappings -> a checked Config."""
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from soilbus.config import Config, ConfigError, parse_config
+from pydantic import ValidationError
+
+from soilbus.config import Config, ConfigError
 
 
 def load_config(path: Path | str, overrides: Iterable[str] = ()) -> Config:
@@ -23,6 +25,16 @@ def load_config(path: Path | str, overrides: Iterable[str] = ()) -> Config:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError([f"{path}: not TOML: {error}"]) from None
     return parse_config(overridden(raw, overrides), folder=path.parent, source=str(path))
+
+
+def parse_config(raw: Mapping[str, Any], folder: Path = Path("."), source: str = "configuration") -> Config:
+    """Check a configuration given as nested mappings; ConfigError lists every fault."""
+    if "folder" in raw:
+        raise ConfigError([f"{source}: folder: unknown key"])
+    try:
+        return Config.model_validate({**raw, "folder": folder})
+    except ValidationError as error:
+        raise ConfigError(f"{source}: {_fault(raw, e)}" for e in error.errors()) from None
 
 
 def overridden(raw: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
@@ -63,3 +75,13 @@ def _child(here: Any, part: str, path: str, text: str) -> Any:
     if not isinstance(child, (dict, list)):
         raise ConfigError([f"--set {text}: {path} is a value, not a table"])
     return child
+
+
+def _fault(raw: Mapping[str, Any], error: Any) -> str:
+    where = ".".join(str(part) for part in error["loc"] if part not in ("str",))
+    if error["type"] == "extra_forbidden":
+        return f"{where}: unknown key"
+    if error["type"] == "missing":
+        return f"{where}: missing"
+    message = str(error["msg"]).removeprefix("Value error, ")
+    return f"{where}: {message}" if where else message

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from cantools.database.can import Database, Message
 
-from soilbus.config import Config, parse_config
+from soilbus.config import Config
+from soilbus.config_file import parse_config
 
 
 def _shared_field() -> Path:

@@ -10,7 +10,8 @@ import pytest
 
 from soilbus.can.admission import Admission
 from soilbus.can.mapping import channels_of, load_databases
-from soilbus.config import ConfigError, parse_config
+from soilbus.config import ConfigError
+from soilbus.config_file import parse_config
 
 DBC = """VERSION ""
 BU_: X

@@ -14,7 +14,8 @@ from availability import unavailable
 from single_wheel import NOISE, RIG, WIDTH, noisy, sweep, write_csv
 from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.cli import main
-from soilbus.config import Config, ConfigError, parse_config
+from soilbus.config import Config, ConfigError
+from soilbus.config_file import parse_config
 from soilbus.daemon.diagnose import diagnose_logs
 from soilbus.daemon.outputs import json_line
 from soilbus.daemon.tables import TableError, candidates, recordings_of_tables, replay_tables, runs_of, window_of_rows
