@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from soilbus.estimation.coordinates import BOUND, Coordinates
+from soilbus.estimation.earlier import solved
 from soilbus.estimation.gauss_newton import descend, fit_window, foreseen, near, resume, starting_soils
-from soilbus.estimation.normal_equations import solved
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.soils import SOILS

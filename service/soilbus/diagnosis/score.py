@@ -18,10 +18,11 @@ from soilbus.diagnosis.completion import Completion
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.sizes import evidence_of_any_size
 from soilbus.estimation.belief import Belief
+from soilbus.estimation.earlier import solved
 from soilbus.estimation.effect_parameters import Free, parameters_of
 from soilbus.estimation.gauss_newton import Start
 from soilbus.estimation.linearised import Latents, Linearised
-from soilbus.estimation.normal_equations import Fitting, Place, solved
+from soilbus.estimation.normal_equations import Fitting, Place
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
 

@@ -29,8 +29,9 @@ from numpy.typing import NDArray
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.coordinates import BOUND, Coordinates
 from soilbus.estimation.denoised import DenoisedProblem
+from soilbus.estimation.earlier import solved
 from soilbus.estimation.gauss_newton import Fit, fit_window, settled
-from soilbus.estimation.normal_equations import Fitting, Place, solved
+from soilbus.estimation.normal_equations import Fitting, Place
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.terra.wheel import Soil
@@ -187,7 +188,7 @@ def _held(
     fitting = Fitting(problem, SoilPrior(median, log_std), before.given(_N, u))
     latents = problem.carried(near.optimum.latents, Soil(*soil.tolist()), gains)
     fit = _converged(fitting, Place(soil, gains, latents, np.inf, 1))
-    return None if fit is None else Node(u, fit, deviation**2 + fitting.surplus)
+    return None if fit is None else Node(u, fit, deviation**2 + fitting.earlier.surplus)
 
 
 def told_of_k_c(along: Ridge, prior: SoilPrior, before: Belief) -> Array | None:

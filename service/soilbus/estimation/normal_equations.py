@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.coordinates import TYPICAL_DEPTH, Coordinates, at_edges, share_of_step
+from soilbus.estimation.earlier import Earlier, Known, solved
 from soilbus.estimation.linearised import Latents, Linearised
 from soilbus.estimation.moments import Moments, moments_along_share
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
@@ -93,23 +93,8 @@ class Point:
         return float(step @ self.information @ step)
 
 
-class Known(NamedTuple):
-    """What was known before, as a parabola of coordinates and active gains: information, half its gradient, cost.
-
-    of_data: of the gradient, what data told of which k_c is Gaussian.
-    """
-
-    information: Array
-    gradient: Array
-    cost: float
-    of_data: Array
-
-
 class Fitting:
-    """A window's residuals together with what was known before: free coordinates (F), active gains (A).
-
-    surplus is what data and the prior of k_c cost together at least, which no cost counts.
-    """
+    """A window's residuals together with what was known before (`earlier`): free coordinates (F), active gains (A)."""
 
     def __init__(
         self, problem: WindowProblem, prior: SoilPrior, before: Belief, with_gains: bool = True, first: int = 0
@@ -127,15 +112,7 @@ class Fitting:
         self._of_gains = np.zeros((7 + len(before.gains), len(self._identity)))
         self._of_gains[7 + self.active] = self._identity[len(self.free) :]
         self._by_sensors = with_gains and first == 0
-        kept = np.concatenate([self.free, _SOIL + self.active])
-        inverse = solved(before.covariance[kept[:, None], kept], np.zeros(len(kept)))
-        if inverse is None:
-            raise ValueError("what was known before has no proper covariance")
-        self._mean = np.concatenate([np.log(before.soil[self.free]), before.gains[self.active]])
-        self._precision = inverse[1]
-        self._of_data = before.k_c_off is not None and _K_C in self.free
-        self.surplus = self._least_before() if self._of_data else 0.0
-        self._none = np.zeros(len(kept))
+        self.earlier = Earlier(before, prior, self.active)
         self._last: tuple[Array, Array, Known] | None = None
 
     def given(self, before: Belief) -> Fitting:
@@ -193,57 +170,16 @@ class Fitting:
     def before_at(self, place: Place) -> Known:
         """What was known before, seen from a place; asked again from the last one's soil and gains, it is at hand."""
         if self._last is None or self._last[0] is not place.soil or self._last[1] is not place.gains:
-            self._last = place.soil, place.gains, self._before_at(place)
+            by_logs = self._identity.copy()
+            by_logs[: len(self.free), : len(self.free)] = self._log_directions(place.soil)[self.free]
+            self._last = place.soil, place.gains, self.earlier.seen_from(place.soil, place.gains, by_logs)
         return self._last[2]
-
-    def _before_at(self, place: Place) -> Known:
-        off = self._off(place)
-        by_known = self._by_known(place)
-        pull = self._precision @ off
-        information, gradient, cost = by_known.T @ self._precision @ by_known, by_known.T @ pull, float(off @ pull)
-        if not self._of_data:
-            return Known(information, gradient, cost, self._none)
-        of_data = gradient.copy()
-        log_off, precision = self._of_prior(place)
-        information[_K_C, _K_C] += precision
-        gradient[_K_C] += precision * log_off
-        return Known(information, gradient, cost + precision * log_off**2 - self.surplus, of_data)
-
-    def _off(self, place: Place) -> Array:
-        """How far (F + A,) the free parameters' logarithms and the active gains are from what was known.
-
-        Of what data alone told it is not the logarithm of k_c, but k_c in units of the soil's known before.
-        """
-        off = np.concatenate([np.log(place.soil[self.free]), place.gains[self.active]]) - self._mean
-        if self._of_data:
-            off[_K_C] = place.soil[_K_C] / self.before.soil[_K_C] - 1.0 - self.before.k_c_off
-        return np.asarray(off)
-
-    def _of_prior(self, place: Place) -> tuple[float, float]:
-        """How far log k_c is from its prior's median, and that prior's precision."""
-        prior = self.coordinates.prior
-        return math.log(place.soil[_K_C] / prior.median[_K_C]), float(prior.log_std[_K_C] ** -2)
-
-    def _least_before(self) -> float:
-        """Least cost that what data told of k_c and its prior have together."""
-        prior, variance = self.coordinates.prior, float(self.before.covariance[_K_C, _K_C])
-        share = np.exp(prior.log_std[_K_C] * np.linspace(-4.0, 4.0, 161)) * prior.median[_K_C] / self.before.soil[_K_C]
-        off = share - 1.0 - self.before.k_c_off
-        log_off = np.log(share * self.before.soil[_K_C] / prior.median[_K_C]) / prior.log_std[_K_C]
-        return float(np.min(off**2 / variance + log_off**2))
 
     def directions(self, place: Place) -> Array:
         """What a column of Linearised.rows (1 + 6 + G) has of each coordinate and active gain (F + A)."""
         directions = self._of_gains.copy()
         directions[1:7, : len(self.free)] = place.soil[:, None] * self._log_directions(place.soil)
         return directions
-
-    def _by_known(self, place: Place) -> Array:
-        free, by_known = len(self.free), self._identity.copy()
-        by_known[:free, :free] = self._log_directions(place.soil)[self.free]
-        if self._of_data:
-            by_known[_K_C] *= place.soil[_K_C] / self.before.soil[_K_C]
-        return by_known
 
     def moved(self, place: Place, point: Point, step: Array) -> Place:
         """The place after a step (F + A,), with the latents that the linear model foresees."""
@@ -318,17 +254,15 @@ class Fitting:
         by_changes[others, others + 2] = 1.0
         by_changes[[_K_C, _K_PHI], 3:] = by_share[_K_C, 1:]
         by_changes[[_K_C, _K_PHI], [1, 2]] = 1.0
-        of_prior, precision, log_off = by_changes[_K_C].copy(), 0.0, 0.0
-        if self._of_data:
-            log_off, precision = self._of_prior(place)
-            by_changes[_K_C, [0, 1]] = 1.0, 0.0
-            by_changes[_K_C] *= place.soil[_K_C] / self.before.soil[_K_C]
-        quadratic = by_changes.T @ self._precision @ by_changes + precision * np.outer(of_prior, of_prior)
+        by_k_c = by_changes[_K_C].copy()
+        by_k_c[[0, 1]] = 1.0, 0.0
+        slopes = self.earlier.slopes(place.soil, by_changes, by_k_c)
+        quadratic = slopes.T @ self.earlier.precision @ slopes
         of_data = np.concatenate([[0], others + 2])
         quadratic[of_data[:, None], of_data] += by_share.T @ (point.information - point.known) @ by_share
         k_c, k_phi = place.soil[[_K_C, _K_PHI]]
         share = k_c / (k_c + k_phi * self.coordinates.width)
-        pull = by_changes.T @ self._precision @ self._off(place) + precision * log_off * of_prior
+        pull = slopes.T @ self.earlier.precision @ self.earlier.off(place.soil, place.gains)
         gradient = np.zeros(len(quadratic))
         gradient[:3] = pull[2] * share / (1.0 - share) - pull[1], *pull[1:3]  # the data pull as much the other way
         return moments_along_share(quadratic, gradient, share)
@@ -371,15 +305,3 @@ def _solution(information: Array, right: Array) -> Array | None:
         )
     except np.linalg.LinAlgError:
         return None
-
-
-def solved(information: Array, gradient: Array) -> tuple[Array, Array] | None:
-    """information^-1 gradient and information^-1, (F,) and (F, F); None where it is singular."""
-    scale = 1.0 / np.sqrt(information.diagonal())
-    scales = scale[:, None] * scale
-    try:
-        inverse = np.linalg.inv(information * scales)
-    except np.linalg.LinAlgError:
-        return None
-    inverse = inverse * scales
-    return (inverse @ gradient, inverse) if np.isfinite(inverse).all() else None

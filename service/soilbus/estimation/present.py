@@ -31,8 +31,9 @@ from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.bends import along_bends
+from soilbus.estimation.earlier import Known, solved
 from soilbus.estimation.gauss_newton import Fit
-from soilbus.estimation.normal_equations import Fitting, Known, Place, solved
+from soilbus.estimation.normal_equations import Fitting, Place
 
 Array = NDArray[np.float64]
 
