@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
 from multiprocessing import get_context
+from typing import TextIO
 
 from soilbus.allocator import keep_freed_memory
 from soilbus.simulator.drive import SimulationError
@@ -37,13 +39,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if chosen.list:
         print("\n".join(f"{case.half:7}{case.id}" for case in wanted))
         return 0
-    trials = []
-    out = open(chosen.json, "w") if chosen.json else None  # noqa: SIM115
-    for case, trial in _trials(wanted, chosen.processes):
+    with open(chosen.json, "w") if chosen.json else nullcontext() as out:
+        trials = list(_told(_trials(wanted, chosen.processes), out))
+    print(report(trials))
+    return 0
+
+
+def _told(found: Iterable[tuple[Case, Trial | None]], out: TextIO | None) -> Iterator[Trial]:
+    """The trials of cases that can be driven, each printed in a line, and written to `out` as JSON."""
+    for case, trial in found:
         if trial is None:
             print(f"{case.id}: cannot be driven", flush=True)
             continue
-        trials.append(trial)
         names = " + ".join(" or ".join(f"{n} {p:.2f}" for n, p in one.items()) for one in trial.sets)
         print(
             f"{trial.half:7}{trial.id} [{trial.visible:.0f}]: {trial.verdict} {names}"
@@ -52,8 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         if out is not None:
             print(json.dumps(trial.as_json()), file=out, flush=True)
-    print(report(trials))
-    return 0
+        yield trial
 
 
 def _trials(wanted: Sequence[Case], count: int) -> Iterator[tuple[Case, Trial | None]]:
