@@ -19,7 +19,7 @@ PAGE = 4096
 
 class Hour(NamedTuple):
     """One hour of a run: windows and valid ones, relative error (rms) and error over std (rms, worst) of the
-    bearing pressure of the valid ones, resident memory [bytes] at its end."""
+    bearing pressure of the valid ones, resident memory [bytes] kept near its end."""
 
     windows: int
     valid: int
@@ -44,11 +44,11 @@ class Estimates:
             off = result.bearing.value - self.truth
             self.errors.append((off / self.truth, off / result.bearing.std))
 
-    def hour(self) -> Hour:
-        """What was noted, which is forgotten."""
+    def hour(self, memory: int) -> Hour:
+        """What was noted, which is forgotten, with the memory kept [bytes]."""
         relative, z = np.array(self.errors or [(math.nan, math.nan)]).T
         done = Hour(
-            self.windows, len(self.errors), _rms(relative), _rms(z), float(np.abs(z).max()), resident_memory(),
+            self.windows, len(self.errors), _rms(relative), _rms(z), float(np.abs(z).max()), memory,
         )  # fmt: skip
         self.windows, self.errors = 0, []
         return done

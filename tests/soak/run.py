@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
@@ -19,13 +20,16 @@ from soilbus.daemon.warm_up import warm_up
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import soil_named
 
-from .books import Beat, Estimates, Hour, unaccounted
+from .books import Beat, Estimates, Hour, resident_memory, unaccounted
 from .traffic import SOIL, traffic_beside
 from .wire import Wire
 
 HOUR = 3600.0
 SLACK = 0.03
 """How much later than its beat [s] a frame may go: the loop waits up to 20 ms for a frame."""
+LOOK = 150.0
+"""How long before an hour's end [s] its memory is looked at: the least of what is resident is what is kept, as free
+memory goes back once a minute and what one window needs comes and goes."""
 
 
 class Soak(NamedTuple):
@@ -65,9 +69,12 @@ def soak(duration: float, seed: int, each_hour: Callable[[Hour], None] = lambda 
     end = clock.now + duration
     while clock.now < end:
         until = min(clock.now + hour, end)
+        kept = math.inf
         while clock.now < until:
             service.step()
-        hours.append(estimates.hour())
+            if clock.now >= until - LOOK:
+                kept = min(kept, resident_memory())
+        hours.append(estimates.hour(int(kept)))
         each_hour(hours[-1])
     service.intake.ingest()
     return _told(service, wire, database, hours, beat)
