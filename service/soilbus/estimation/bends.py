@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from soilbus.estimation.curve import rim_differences, sides
 from soilbus.estimation.gauss_newton import Fit, fit_window, settled
 from soilbus.estimation.linearised import Bend
-from soilbus.estimation.normal_equations import Fitting, Place
+from soilbus.estimation.normal_equations import Fitting
 from soilbus.estimation.posterior import PARAMETERS
 from soilbus.estimation.readings import Readings
 from soilbus.estimation.residuals import WindowProblem
@@ -81,19 +81,17 @@ def bending(fitting: Fitting, fit: Fit | None) -> Way | None:
     if fit is None or not fit.converged or not sides(problem.rig).any():
         return None
     optimum = fit.optimum
-    place = Place(optimum.soil, optimum.gains, optimum.latents, fit.cost, 0)
-    known, directions = fitting.before_at(place), fitting.directions(place)
+    around = fitting.around(optimum)
+    if around is None:
+        return None
     std, by_bends = bends(fitting.problem)
     by_curve, weighed = along_bends(fitting, fit)
     rows = optimum.at.rows.reshape(*weighed.shape, -1)
     across = by_bends.T @ (weighed[:, None] @ rows)[:, 0]
-    mixed = across @ directions
-    normal = directions.T @ optimum.at.normal
-    right = np.column_stack([normal[:, 0] + known.gradient, mixed.T])
-    explained = mixed @ np.linalg.solve(normal @ directions + known.information, right)
-    gradient = across[:, 0] - explained[:, 0]
+    of_gradient, of_information = around.explained(across @ around.directions)
+    gradient = across[:, 0] - of_gradient
     own = (by_curve * weighed).sum(axis=1)
-    information = by_bends.T @ (own[:, None] * by_bends) - explained[:, 1:] + np.eye(len(std))
+    information = by_bends.T @ (own[:, None] * by_bends) - of_information + np.eye(len(std))
     bend = -np.linalg.solve(information, gradient)
     fall = -float(gradient @ bend)
     if not fall > BENT:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,8 @@ from soilbus.estimation.readings import Readings
 from soilbus.estimation.window import Rig, pairs
 
 Array = NDArray[np.float64]
+
+_SOIL = len(PARAMETERS)
 
 
 def sides(rig: Rig) -> Array:
@@ -48,33 +51,45 @@ def rim_difference(readings: Readings) -> float:
     return math.sqrt(float(np.mean(known**2))) if len(known) else 0.0
 
 
-def with_curve(belief: Belief, readings: Readings) -> Belief:
+class Curve(NamedTuple):
+    """A window's curve as one more unknown, as large as the rim speeds allow.
+
+    side (6 + G,): derivatives of soil and gains by it, as `sides`; std: how large it may be, as a relative speed;
+    of_gains: variance of the mean speed gain of a side, by the sensors alone.
+    """
+
+    side: Array
+    std: float
+    of_gains: float
+
+
+def curve_of(readings: Readings) -> Curve:
+    """The curve that a window may be driven on."""
+    side = np.zeros(_SOIL + len(readings.gain_std))
+    first = readings.gain_names.index(f"speed.{readings.rig.wheels[0]}")
+    side[_SOIL + first : _SOIL + first + readings.n_wheels] = sides(readings.rig)
+    count = max(np.count_nonzero(side), 1)
+    return Curve(side, rim_difference(readings), float(np.sum((side[_SOIL:] * readings.gain_std) ** 2)) / count**2)
+
+
+def with_curve(belief: Belief, curve: Curve) -> Belief:
     """What is known before a window whose curve is not: as sharp as the rim speeds allow, either way."""
-    along = rim_difference(readings) * _by_side(readings)
-    return replace(belief, covariance=belief.covariance + np.outer(along, along))
+    return replace(belief, covariance=belief.covariance + np.outer(curve.side, curve.side * curve.std**2))
 
 
-def without_curve(belief: Belief, readings: Readings) -> Belief:
+def without_curve(belief: Belief, curve: Curve) -> Belief:
     """What a window leaves known for later ones: its curve is not theirs, and hides what the speed sensors have of it.
 
     Of that only its prior is left.
     """
-    curve, side = with_curve(belief, readings), _by_side(readings)
+    side = curve.side
     count = np.count_nonzero(side)
     if not count:
         return belief
-    variance = float(np.sum((side[len(PARAMETERS) :] * readings.gain_std) ** 2))
-    mean_along = curve.covariance @ side / count
-    spread = float(side @ mean_along) / count + variance / count**2
+    covariance = with_curve(belief, curve).covariance
+    mean_along = covariance @ side / count
+    spread = float(side @ mean_along) / count + curve.of_gains
     if not spread > 0.0:
         return belief
-    step = -mean_along / spread * float(side[len(PARAMETERS) :] @ belief.gains) / count
-    return belief.moved(step, curve.covariance - np.outer(mean_along, mean_along) / spread)
-
-
-def _by_side(readings: Readings) -> Array:
-    """Derivatives (6 + G) of soil and gains by a curve: those of the speed gains, as `sides`."""
-    along = np.zeros(len(PARAMETERS) + len(readings.gain_std))
-    names = [f"speed.{wheel}" for wheel in readings.rig.wheels]
-    along[len(PARAMETERS) + np.array([readings.gain_names.index(name) for name in names])] = sides(readings.rig)
-    return along
+    step = -mean_along / spread * float(side[_SOIL:] @ belief.gains) / count
+    return belief.moved(step, covariance - np.outer(mean_along, mean_along) / spread)

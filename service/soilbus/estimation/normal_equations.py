@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.coordinates import TYPICAL_DEPTH, Coordinates, at_edges, share_of_step
 from soilbus.estimation.earlier import Earlier, Known, solved
-from soilbus.estimation.linearised import Latents, Linearised
+from soilbus.estimation.linearised import Latents, Linearised, Optimum
 from soilbus.estimation.moments import Moments, moments_along_share
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
@@ -93,6 +94,23 @@ class Point:
         return float(step @ self.information @ step)
 
 
+class Around(NamedTuple):
+    """A window that is linear about an optimum: what its data and what was known before tell there.
+
+    directions (1 + 6 + G, F + A): as Fitting.directions; known: what was known before; step (F + A,), to be taken
+    off, and covariance (F + A, F + A): to the minimum of the parabola, and there.
+    """
+
+    directions: Array
+    known: Known
+    step: Array
+    covariance: Array
+
+    def explained(self, mixed: Array) -> tuple[Array, Array]:
+        """Of gradient (K,) and information (K, K) of further unknowns, what soil and gains take up; mixed (K, F + A)."""
+        return mixed @ self.step, mixed @ self.covariance @ mixed.T
+
+
 class Fitting:
     """A window's residuals together with what was known before (`earlier`): free coordinates (F), active gains (A)."""
 
@@ -114,6 +132,7 @@ class Fitting:
         self._by_sensors = with_gains and first == 0
         self.earlier = Earlier(before, prior, self.active)
         self._last: tuple[Array, Array, Known] | None = None
+        self._around: tuple[Optimum, Around | None] | None = None
 
     def given(self, before: Belief) -> Fitting:
         """The same with something else known before."""
@@ -174,6 +193,16 @@ class Fitting:
             by_logs[: len(self.free), : len(self.free)] = self._log_directions(place.soil)[self.free]
             self._last = place.soil, place.gains, self.earlier.seen_from(place.soil, place.gains, by_logs)
         return self._last[2]
+
+    def around(self, optimum: Optimum) -> Around | None:
+        """The linear window about an optimum, at hand when asked for it again; None where it tells nothing."""
+        if self._around is None or self._around[0] is not optimum:
+            place = Place(optimum.soil, optimum.gains, optimum.latents, math.nan, 0)
+            directions, known = self.directions(place), self.before_at(place)
+            by_unknowns = directions.T @ optimum.at.normal
+            solution = solved(by_unknowns @ directions + known.information, by_unknowns[:, 0] + known.gradient)
+            self._around = optimum, None if solution is None else Around(directions, known, *solution)
+        return self._around[1]
 
     def directions(self, place: Place) -> Array:
         """What a column of Linearised.rows (1 + 6 + G) has of each coordinate and active gain (F + A)."""

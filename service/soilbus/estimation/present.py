@@ -31,9 +31,9 @@ from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.bends import along_bends
-from soilbus.estimation.earlier import Known, solved
+from soilbus.estimation.earlier import solved
 from soilbus.estimation.gauss_newton import Fit
-from soilbus.estimation.normal_equations import Fitting, Place
+from soilbus.estimation.normal_equations import Around, Fitting, Place
 
 Array = NDArray[np.float64]
 
@@ -64,13 +64,12 @@ def at_present(fitting: Fitting, fit: Fit, window: float, drift: float) -> Fit:
     """
     if not (drift or fit.bend):
         return fit
-    optimum = fit.optimum
+    optimum, still = fit.optimum, fitting.around(fit.optimum)
+    if still is None:
+        return fit
     place, free = Place(optimum.soil, optimum.gains, optimum.latents, fit.cost, 0), len(fitting.free)
-    directions, before = fitting.directions(place), fitting.before_at(place)
-    constant = directions.T @ optimum.at.normal
-    still = solved(constant @ directions + before.information, constant[:, 0] + before.gradient)
-    likely = _changes(_joint(fitting, fit, directions, before, window, drift), len(directions.T), free, drift)
-    if still is None or not likely:
+    likely = _changes(_joint(fitting, fit, still, window, drift), len(still.step), free, drift)
+    if not likely:
         return fit
     step, covariance = _averaged(likely)
     covariance[:free, :free] += np.eye(free) * drift**2 / (3.0 * PIECES)  # the end of the last piece is not its mean
@@ -80,7 +79,7 @@ def at_present(fitting: Fitting, fit: Fit, window: float, drift: float) -> Fit:
     mode = fitting.believed(now, covariance)
 
     def moved(belief: Belief) -> Belief:
-        return mode if belief is fit.mode else fitting.changed(belief, still[0] - step, covariance - still[1])
+        return mode if belief is fit.mode else fitting.changed(belief, still.step - step, covariance - still.covariance)
 
     return replace(
         fit,
@@ -102,12 +101,12 @@ def _changes(joint: Array, told: int, free: int, drift: float) -> list[Change]:
     return [change for change in both if change is not None]
 
 
-def _joint(fitting: Fitting, fit: Fit, directions: Array, before: Known, window: float, drift: float) -> Array:
+def _joint(fitting: Fitting, fit: Fit, still: Around, window: float, drift: float) -> Array:
     """Cost, half its gradient and information of the last piece's soil, gains, bends, and of a steady change (F,).
 
     The last, of the coordinates in the time of a window, as if nothing were known of it beforehand.
     """
-    at, t = fit.optimum.at, fit.optimum.t
+    at, t, directions, before = fit.optimum.at, fit.optimum.t, still.directions, still.known
     free, told, m = len(fitting.free), directions.shape[1], at.by_latents.shape[1]
     ago = (t - t[-1]) / window
     soil, steady = slice(1, 1 + free), slice(-free, None)

@@ -12,7 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 from soilbus.estimation.gauss_newton import Fit
-from soilbus.estimation.normal_equations import Fitting, Place
+from soilbus.estimation.normal_equations import Fitting
+from soilbus.terra.wheel import Soil
 
 OFF_SCALE = 25.0
 """Fall of the cost, if sinkages were measured on another scale, from which that is no noise."""
@@ -25,21 +26,18 @@ def sinkages_off_scale(fitting: Fitting, fit: Fit) -> bool:
     large, as if there were none: the fall of the cost is a little underestimated.
     """
     problem, optimum = fitting.problem, fit.optimum
-    if not problem.with_sinkage:
+    around = fitting.around(optimum)
+    if not problem.with_sinkage or around is None:
         return False
-    at, place = optimum.at, Place(optimum.soil, optimum.gains, optimum.latents, fit.cost, 0)
+    at, soil = optimum.at, Soil(*optimum.soil.tolist())
     (n, m), wheels = at.by_latents.shape[:2], problem.n_wheels
-    sinkage = np.where(problem.has_sinkage, problem.sinkages(place.as_soil(), place.gains, place.latents), 0.0)
-    directions, known = fitting.directions(place), fitting.before_at(place)
+    sinkage = np.where(problem.has_sinkage, problem.sinkages(soil, optimum.gains, optimum.latents), 0.0)
     weighed = at.weighed.reshape(n, m, -1)[:, m - wheels :]
     of_wheels = np.einsum("iw,iwk->wk", sinkage, weighed)
-    gradient, mixed = of_wheels[:, 0], of_wheels @ directions
-    normal = directions.T @ at.normal
-    right = np.column_stack([normal[:, 0] + known.gradient, mixed.T])
-    explained = mixed @ np.linalg.solve(normal @ directions + known.information, right)
-    gradient = gradient - explained[:, 0]
+    of_gradient, of_information = around.explained(of_wheels @ around.directions)
+    gradient = of_wheels[:, 0] - of_gradient
     square = np.divide(sinkage**2, problem.sinkage_var, where=problem.has_sinkage, out=np.zeros((n, wheels)))
-    information = np.diag(square.sum(axis=0)) - explained[:, 1:]
+    information = np.diag(square.sum(axis=0)) - of_information
     scales = np.vstack([np.ones(wheels), np.eye(wheels)[sinkage.any(axis=0)]])
     fall = (scales @ gradient) ** 2 / np.einsum("sw,wv,sv->s", scales, information, scales)
     return bool(fall.max() > OFF_SCALE)

@@ -22,7 +22,7 @@ from soilbus.estimation.belief import Belief
 from soilbus.estimation.bends import bending, on_the_way, straightened
 from soilbus.estimation.completed import CompletedProblem
 from soilbus.estimation.coordinates import Coordinates
-from soilbus.estimation.curve import with_curve, without_curve
+from soilbus.estimation.curve import curve_of, with_curve, without_curve
 from soilbus.estimation.effect_parameters import Free
 from soilbus.estimation.gauss_newton import Fit, Foreseen, fit_window, foreseen, resume
 from soilbus.estimation.marginal import with_whole
@@ -247,13 +247,14 @@ class Tracker:
             self._good_until = end
             learned = end - tracked.since >= LEARNED * self.settings.window and fit.is_gaussian
             if learned and tracked.ground in (Ground.SAME, Ground.NEW):
-                self._beliefs.append((end, without_curve(fit.mode.apart_from(self._here), problem)))
-                self._newest = without_curve(fit.whole, problem)
+                curve = curve_of(problem)
+                self._beliefs.append((end, without_curve(fit.mode.apart_from(self._here), curve)))
+                self._newest = without_curve(fit.whole, curve)
         return tracked
 
     def _known_at(self, t: float, problem: WindowProblem) -> Belief:
         """What windows that had ended by t [s] tell of the soil from t on, and of the sensors on whatever curve."""
-        return with_curve(self._told_by(t, problem), problem)
+        return with_curve(self._told_by(t, problem), curve_of(problem))
 
     def _told_by(self, t: float, problem: WindowProblem) -> Belief:
         ended = self._ended(t)
