@@ -68,8 +68,8 @@ def curve_of(readings: Readings) -> Curve:
     side = np.zeros(_SOIL + len(readings.gain_std))
     first = readings.gain_names.index(f"speed.{readings.rig.wheels[0]}")
     side[_SOIL + first : _SOIL + first + readings.n_wheels] = sides(readings.rig)
-    count = max(np.count_nonzero(side), 1)
-    return Curve(side, rim_difference(readings), float(np.sum((side[_SOIL:] * readings.gain_std) ** 2)) / count**2)
+    of_mean = side[_SOIL:] * readings.gain_std / max(np.count_nonzero(side), 1)
+    return Curve(side, rim_difference(readings), float(of_mean @ of_mean))
 
 
 def with_curve(belief: Belief, curve: Curve) -> Belief:

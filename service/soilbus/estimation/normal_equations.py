@@ -107,7 +107,7 @@ class Around(NamedTuple):
     covariance: Array
 
     def explained(self, mixed: Array) -> tuple[Array, Array]:
-        """Of gradient (K,) and information (K, K) of further unknowns, what soil and gains take up; mixed (K, F + A)."""
+        """What soil and gains take up of gradient (K,) and information (K, K) of further unknowns; mixed (K, F + A)."""
         return mixed @ self.step, mixed @ self.covariance @ mixed.T
 
 
