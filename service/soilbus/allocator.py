@@ -10,6 +10,8 @@ from contextlib import contextmanager
 import numpy as np
 
 _C = ctypes.CDLL(None)
+SMALL, KEPT = 1024, 7
+"""Bytes of the blocks that numpy keeps, and how many of each size (its NBUCKETS and NCACHE)."""
 
 
 def keep_freed_memory() -> None:
@@ -33,6 +35,16 @@ def give_back_freed_memory() -> None:
     trim = getattr(_C, "malloc_trim", None)
     if trim is not None:
         trim(0)
+
+
+def take_small_blocks() -> None:
+    """Let numpy have now all the small blocks that it will ever keep: 3.5 MB.
+
+    Of each size below a kilobyte it keeps as many freed ones as KEPT, for good.  Taken one by one, as arrays of
+    one size after another come by, they would make the process grow for a day, and lie scattered between other blocks.
+    """
+    blocks = [np.empty(size, np.uint8) for size in range(1, SMALL) for _ in range(KEPT)]
+    del blocks
 
 
 @contextmanager

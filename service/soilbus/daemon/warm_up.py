@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from cantools.database.can import Database
 
+from soilbus.allocator import take_small_blocks
 from soilbus.can.publish import Publisher
 from soilbus.config import Config
 from soilbus.daemon.outputs import hop_frames
@@ -36,4 +37,5 @@ def warm_up(config: Config, database: Database, ours: Database) -> list[WindowRe
     for result in results:
         for message, values in hop_frames(result):
             publisher.frame(message, values)
+    take_small_blocks()
     return results
