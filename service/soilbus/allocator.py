@@ -7,9 +7,9 @@ import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import numpy as np
-
 _C = ctypes.CDLL(None)
+_C.malloc.restype, _C.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]
+_C.free.restype, _C.free.argtypes = None, [ctypes.c_void_p]
 
 
 def keep_freed_memory() -> None:
@@ -20,8 +20,7 @@ def keep_freed_memory() -> None:
     faults it in again, which doubles its time.  The block is never touched, so it costs
     no memory; elsewhere this does nothing.
     """
-    block = np.empty(31 * 2**20, dtype=np.uint8)
-    del block
+    _C.free(_C.malloc(31 * 2**20))
 
 
 def give_back_freed_memory() -> None:
