@@ -10,6 +10,8 @@ from contextlib import contextmanager
 _C = ctypes.CDLL(None)
 _C.malloc.restype, _C.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]
 _C.free.restype, _C.free.argtypes = None, [ctypes.c_void_p]
+_BLOCK = 100_000
+"""Bytes of a block as an evaluation takes it, of the columns of one window."""
 
 
 def keep_freed_memory() -> None:
@@ -23,15 +25,18 @@ def keep_freed_memory() -> None:
     _C.free(_C.malloc(31 * 2**20))
 
 
-def give_back_freed_memory() -> None:
+def give_back_freed_memory(keep: int = 0) -> None:
     """Hand what is free in glibc's heaps to the kernel (malloc_trim(3)); elsewhere this does nothing.
 
     What a rare hard window took would stay with the process for ever: it lies between blocks
-    that are in use.  It takes about a millisecond, and the next evaluations as long to get theirs again.
+    that are in use.  `keep` bytes are taken from the kernel again at once, for the calling thread's
+    next evaluation, which else would wait for them page by page.  It all takes a millisecond or two.
     """
     trim = getattr(_C, "malloc_trim", None)
     if trim is not None:
         trim(0)
+        blocks = [bytearray(_BLOCK) for _ in range(keep // _BLOCK)]
+        del blocks
 
 
 @contextmanager

@@ -21,7 +21,7 @@ from soilbus.report.whole_file import NotWritten, whole_file
 
 if TYPE_CHECKING:
     from soilbus.config import Config
-    from soilbus.daemon.pipeline import WindowResult
+    from soilbus.daemon.result import WindowResult
 
 DONE, FAILED, WRONG_USAGE = 0, 1, 2
 
