@@ -99,6 +99,7 @@ class Service:
         self._interrupted = self._started  # monotonic time at which inputs failed last
         self._epoch = self.intake.epoch
         self._last_frame = -1e9  # monotonic arrival time
+        self._heard_out = self._started  # monotonic time at which no frame was left with the kernel
         self._last_stamp = 0.0  # the bus's own time
         self._next_tick = self._started
         self._due = dict.fromkeys(("SoilbusStatus", "SoilbusIdentity", "BusHealth"), self._started)
@@ -160,6 +161,7 @@ class Service:
                 return
             message = self.bus.receive(max(0.0, min(self._next_tick - now, longest)))
             if message is None:
+                self._heard_out = self.clock()
                 return
             self._last_stamp = message.timestamp
             feed(
@@ -179,7 +181,7 @@ class Service:
 
     def _hand_out(self, now: float) -> None:
         """Give the windows that have ended to the worker; what it cannot keep up with is dropped."""
-        for task in self.intake.due(max(self._last_stamp, self.bus_time(now) - GRACE)):
+        for task in self.intake.due(max(self._last_stamp, self.bus_time(self._heard_out) - GRACE)):
             ended = now - max(0.0, self.bus_time(now) - task.end)
             self.deadline_misses += self._backlog.add(task, ended, self.intake.epoch, now)
 
