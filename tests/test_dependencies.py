@@ -18,6 +18,7 @@ EXTRAS = PROJECT["project"]["optional-dependencies"]
 ALL = sorted(
     {*PROJECT["build-system"]["requires"], *PROJECT["project"]["dependencies"], *chain.from_iterable(EXTRAS.values())}
 )
+LOADED_BY_THE_WORKER = ("soilbus.daemon.estimator", "soilbus.daemon.keeper", "soilbus.daemon.warm_up")
 OF_THE_DAEMON = {"numpy", "cantools", "can", "crccheck", "pydantic"}
 
 
@@ -54,5 +55,14 @@ def imported(module: str, seen: set[str]) -> set[str]:
 
 
 def test_the_daemon_imports_no_more_than_it_may() -> None:
-    foreign = imported("soilbus.daemon.start", set()) - sys.stdlib_module_names
+    modules = ("soilbus.daemon.start", *LOADED_BY_THE_WORKER)
+    foreign = set().union(*(imported(module, set()) for module in modules)) - sys.stdlib_module_names
     assert foreign <= OF_THE_DAEMON
+
+
+def test_a_service_is_ready_before_what_only_its_worker_needs_is_loaded() -> None:
+    seen: set[str] = set()
+    imported("soilbus.daemon.start", seen)
+    assert seen.isdisjoint(LOADED_BY_THE_WORKER)
+    assert "soilbus.estimation.tracker" not in seen
+    assert imported("soilbus.cli", set()) <= sys.stdlib_module_names  # the rest comes without a collector in the way

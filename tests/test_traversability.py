@@ -17,11 +17,12 @@ from soilbus.capability.limits import Limits, largest_pull
 from soilbus.capability.wheels import wheel_table
 from soilbus.config import Traversability as Settings
 from soilbus.estimation.posterior import Posterior
+from soilbus.judgement import judge
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.effects.steady import CompletedModel
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import FAST_NODES, Soil, WheelModel
-from soilbus.traversability import State, Status, judge
+from soilbus.traversability import State, Status
 from statics import WEIGHT, brute
 
 RIG = rig_of(reference_configuration())

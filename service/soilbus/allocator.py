@@ -7,11 +7,13 @@ import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import numpy as np
-
 _C = ctypes.CDLL(None)
 SMALL, KEPT = 1024, 7
 """Bytes of the blocks that numpy keeps, and how many of each size (its NBUCKETS and NCACHE)."""
+_C.malloc.restype, _C.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]
+_C.free.restype, _C.free.argtypes = None, [ctypes.c_void_p]
+_BLOCK = 100_000
+"""Bytes of a block as an evaluation takes it, of the columns of one window."""
 
 
 def keep_freed_memory() -> None:
@@ -22,19 +24,21 @@ def keep_freed_memory() -> None:
     faults it in again, which doubles its time.  The block is never touched, so it costs
     no memory; elsewhere this does nothing.
     """
-    block = np.empty(31 * 2**20, dtype=np.uint8)
-    del block
+    _C.free(_C.malloc(31 * 2**20))
 
 
-def give_back_freed_memory() -> None:
+def give_back_freed_memory(keep: int = 0) -> None:
     """Hand what is free in glibc's heaps to the kernel (malloc_trim(3)); elsewhere this does nothing.
 
     What a rare hard window took would stay with the process for ever: it lies between blocks
-    that are in use.  It takes about a millisecond, and the next evaluations as long to get theirs again.
+    that are in use.  `keep` bytes are taken from the kernel again at once, for the calling thread's
+    next evaluation, which else would wait for them page by page.  It all takes a millisecond or two.
     """
     trim = getattr(_C, "malloc_trim", None)
     if trim is not None:
         trim(0)
+        blocks = [bytearray(_BLOCK) for _ in range(keep // _BLOCK)]
+        del blocks
 
 
 def take_small_blocks() -> None:
@@ -43,6 +47,8 @@ def take_small_blocks() -> None:
     Of each size below a kilobyte it keeps as many freed ones as KEPT, for good.  Taken one by one, as arrays of
     one size after another come by, they would make the process grow for a day, and lie scattered between other blocks.
     """
+    import numpy as np
+
     blocks = [np.empty(size, np.uint8) for size in range(1, SMALL) for _ in range(KEPT)]
     del blocks
 

@@ -13,7 +13,6 @@ from soilbus.config import Effect as EffectSetting
 from soilbus.estimation.effect_parameters import Free
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.window import Rig, SensorNoise
-from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active, Effect, Parameter
 from soilbus.terra.vehicle import Chassis
 from soilbus.terra.wheel import FAST_NODES, WheelModel
@@ -63,6 +62,10 @@ def effects_of(config: Config, wheels: Sequence[str] | None = None) -> tuple[Act
     ConfigError with a line for each effect and parameter that the catalogue lacks, value out of
     range or no number, effect given twice, or shear law that the effect cannot be added to.
     """
+    if not config.model.effects:
+        return ()
+    from soilbus.terra.effects.catalogue import CATALOGUE  # a start without effects need not wait for it
+
     of_all = [wheel.name for wheel in config.wheel]
     faults: list[str] = []
     found: dict[str, Active] = {}
@@ -161,6 +164,8 @@ def _active(setting: EffectSetting, shear_law: str, wheels: Sequence[str]) -> Ac
 
 
 def _effect(name: str) -> Effect:
+    from soilbus.terra.effects.catalogue import CATALOGUE
+
     if name not in CATALOGUE:
         raise ConfigError([f"no effect is named {name}; known: {', '.join(CATALOGUE)}"])
     return CATALOGUE[name]

@@ -17,12 +17,11 @@ from typing import TYPE_CHECKING
 
 from soilbus.allocator import keep_freed_memory, loading
 from soilbus.arguments import command_line
-from soilbus.config import Config, ConfigError
-from soilbus.config_file import load_config
 from soilbus.report.whole_file import NotWritten, whole_file
 
 if TYPE_CHECKING:
-    from soilbus.daemon.pipeline import WindowResult
+    from soilbus.config import Config
+    from soilbus.daemon.result import WindowResult
 
 DONE, FAILED, WRONG_USAGE = 0, 1, 2
 
@@ -37,6 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.INFO, format="soilbus: %(message)s", stream=sys.stderr)
     logging.getLogger("can").setLevel(logging.CRITICAL)  # a bus that is away is ours to tell of, once
     keep_freed_memory()
+    with loading():
+        from soilbus.config import ConfigError
     try:
         _WORK[args.command](args)
         sys.stdout.flush()
@@ -55,6 +56,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _configured(args: argparse.Namespace) -> Config:
+    from soilbus.config_file import load_config
+
     return load_config(args.config, args.set)
 
 

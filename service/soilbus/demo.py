@@ -20,7 +20,7 @@ from rich.console import Console
 from soilbus.can.bus import BusError, open_bus
 from soilbus.can.dbc_files import filters_of, output_database
 from soilbus.config import Config
-from soilbus.daemon.pipeline import WindowResult
+from soilbus.daemon.result import WindowResult
 from soilbus.daemon.start import start_service
 from soilbus.report.dashboard import show
 from soilbus.report.readings import Readings

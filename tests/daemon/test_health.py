@@ -85,7 +85,8 @@ class Bench:
         self.estimator = pipeline.estimator
         bus = LiveBus(self.open, self.clock, self.clock.sleep)
         self.service = Service(
-            CONFIG, pipeline, bus, Publisher(OUT), self.systemd, worker or InlineExecutor(), self.clock
+            CONFIG, pipeline, bus, Publisher(OUT), self.systemd, worker or InlineExecutor(), self.clock,
+            waiting=self.clock.wait_for,
         )  # fmt: skip
 
     def open(self):

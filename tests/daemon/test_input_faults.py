@@ -21,9 +21,9 @@ from log_edits import Edit, Log, Stream
 from soilbus.can.dbc_files import load_databases
 from soilbus.config import Config
 from soilbus.config_file import load_config
-from soilbus.daemon.estimator import WindowResult
 from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.replay import read_frames
+from soilbus.daemon.result import WindowResult
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

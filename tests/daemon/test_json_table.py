@@ -6,8 +6,8 @@ import json
 import re
 from pathlib import Path
 
-from soilbus.daemon.estimator import WindowResult
 from soilbus.daemon.outputs import json_line
+from soilbus.daemon.result import WindowResult
 from soilbus.simulator.reference import reference_configuration
 from soilbus.traversability import Status, Traversability
 

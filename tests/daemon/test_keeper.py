@@ -65,7 +65,9 @@ def service_with(keeper: Keeper | None, clock: FakeClock, messages=()) -> tuple[
     bus = LiveBus(lambda: wire, clock, clock.sleep)
     pipeline = Pipeline(CONFIG, DATABASE)
     publisher = Publisher(output_database(CONFIG))
-    return Service(CONFIG, pipeline, bus, publisher, Notifier(), InlineExecutor(), clock, keeper=keeper), wire
+    return Service(
+        CONFIG, pipeline, bus, publisher, Notifier(), InlineExecutor(), clock, opened_keeper=lambda: keeper
+    ), wire
 
 
 def run(service: Service, clock: FakeClock, seconds: float) -> None:

@@ -32,7 +32,7 @@ def started(monkeypatch):
 
     def of(config):
         services.append(start.start_service(config, wait=False))
-        services[-1]._workers.shutdown(wait=True)
+        services[-1]._backlog._workers.shutdown(wait=True)
         return services[-1], rehearsals
 
     yield of
@@ -51,12 +51,18 @@ def test_all_that_a_valid_window_takes_is_rehearsed(path):
 def test_a_start_rehearses_and_knows_nothing_of_it(started):
     service, rehearsals = started(reference_configuration(VIRTUAL))
     assert [len(results) for results in rehearsals] == [WINDOWS]
-    assert service._newest() is None
+    assert service._solver.newest is None
     assert service.intake.last_seen == {}
     assert service.intake.admission.counts.received.total() == 0
     counters = {name: service.publisher.frame(name, {}).data for name in ("Traversability", "SoilStrength")}
     fresh = start.Publisher(output_database(service.config))
     assert counters == {name: fresh.frame(name, {}).data for name in counters}
+
+
+def test_an_effect_that_cannot_be_is_told_at_the_start_and_not_by_the_worker():
+    config = reference_configuration([*VIRTUAL, 'model.effects=[{name="lugs", hight=0.03}]'])
+    with pytest.raises(ConfigError, match="lugs has no parameter hight"):
+        start.start_service(config, wait=False)
 
 
 def test_a_vehicle_that_cannot_be_simulated_starts_all_the_same(started):

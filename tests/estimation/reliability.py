@@ -18,13 +18,14 @@ from soilbus.config import Config
 from soilbus.estimation.coordinates import TYPICAL_DEPTH
 from soilbus.estimation.gauss_newton import fit_window
 from soilbus.estimation.residuals import WindowProblem
-from soilbus.estimation.soil_class import PRIOR_UNKNOWN, UNKNOWN, SoilClasses
+from soilbus.estimation.soil_class import PRIOR_UNKNOWN, SoilClasses
 from soilbus.estimation.tracker import TRUST
 from soilbus.estimation.window import BinStore
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.terra.soils import UNKNOWN
 from soilbus.terra.wheel import Soil
 
 WIDE_COHESION = ("soil.c.value=5000", "soil.c.std=8000")

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from drives import task_of, windows
 
-from soilbus.daemon.estimator import WindowEstimator, WindowResult
+from soilbus.daemon.estimator import WindowEstimator
+from soilbus.daemon.result import WindowResult
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing

@@ -12,9 +12,9 @@ from soilbus.assembly import prior_of
 from soilbus.estimation.coordinates import Coordinates
 from soilbus.estimation.gauss_newton import fit_window, near
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
-from soilbus.estimation.soil_class import PRIOR_UNKNOWN, UNKNOWN, WITHIN, SoilClasses, foretelling, guessed
+from soilbus.estimation.soil_class import PRIOR_UNKNOWN, WITHIN, SoilClasses, foretelling, guessed
 from soilbus.simulator.reference import reference_configuration
-from soilbus.terra.soils import KINDS, SOILS
+from soilbus.terra.soils import KINDS, SOILS, UNKNOWN
 from soilbus.terra.wheel import Soil
 
 WIDTH = 0.32

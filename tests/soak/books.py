@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.can.channels import Reason
-from soilbus.daemon.pipeline import WindowResult
+from soilbus.daemon.result import WindowResult
 from soilbus.traversability import Status
 
 PAGE = 4096

@@ -161,7 +161,8 @@ class Drive:
         self.worker = Worker()
         self.wire.good, self.wire.stamps = {}, {}
         self.service = Service(
-            config, pipeline, bus, Publisher(OUT), Notifier(), self.worker, self.clock, self.take, keeper
+            config, pipeline, bus, Publisher(OUT), Notifier(), self.worker, self.clock, self.take, lambda: keeper,
+            self.clock.wait_for,
         )  # fmt: skip
 
     def stop(self) -> None:

@@ -22,14 +22,16 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import lru_cache
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from soilbus.capability.assessment import OverSlip
 from soilbus.capability.trend import LAG, SWING, Capacity, Demand, Line, Peaks, Trend
 from soilbus.estimation.window import Rig, Window, inertia_of, pull_given
 from soilbus.terra.vehicle import slip_ratio
+
+if TYPE_CHECKING:
+    from soilbus.capability.assessment import OverSlip
 
 CREEP = 4.0
 """Time constant [s] of forgetting slip that creeps, and the pull that it gives."""

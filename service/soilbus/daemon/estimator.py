@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from soilbus.capability.wheels import WheelTable
 from soilbus.config import Config
 from soilbus.daemon.gap import GapWatch, squares
 from soilbus.daemon.intake import WindowTask
-from soilbus.daemon.positions import Position
+from soilbus.daemon.result import WindowResult
 from soilbus.estimation.effect_parameters import active_at
 from soilbus.estimation.gauss_newton import Fit
 from soilbus.estimation.posterior import Estimate, Posterior
@@ -28,10 +28,11 @@ from soilbus.estimation.tracked import MIN_ROWS, Ground, Settings, Tracked
 from soilbus.estimation.tracker import Tracker
 from soilbus.estimation.window import Rig, Window
 from soilbus.hysteresis import Held, settled
+from soilbus.judgement import judge
 from soilbus.terra.effects.effect import Active, Surroundings, true_draft
 from soilbus.terra.effects.steady import CompletedModel
 from soilbus.traversability import State as Way
-from soilbus.traversability import Status, Traversability, judge
+from soilbus.traversability import Status, Traversability
 
 MIN_NEW_SOIL = 0.15
 """Share of a window that a new soil must fill before its estimate is valid."""
@@ -39,39 +40,6 @@ STUCK_RIM_SPEED = 2.5
 """Least rim speed of a vehicle that is stuck, in units of the least speed at which slip is judged."""
 AMBIGUOUS = 2.0
 """Standard deviations of bearing pressure or tan phi by which another optimum makes a window ambiguous."""
-
-
-@dataclass(frozen=True, slots=True)
-class WindowResult:
-    """What one window says; t is its end [s], index counts windows since the start.
-
-    slip and sinkage [m] are means over the window by wheel name, None where unknown.
-    rejected counts refused samples of the window by reason.  posterior is None where
-    status is invalid.  soil_class is the probability of each known soil and of `unknown`,
-    the largest first.  position is in the middle of the data that count: of the window, or
-    of its part on a new soil.  failure is the kind of a solve that failed, None where none did.
-    watch warns of immobilisation.  gaps: reduced chi-square of the channels that have not
-    fitted for minutes, the worst first.
-    """
-
-    t: float
-    index: int
-    status: Status
-    reason: str
-    posterior: Posterior | None
-    bearing: Estimate | None
-    slip: dict[str, float | None]
-    sinkage: dict[str, float | None]
-    traversability: Traversability
-    chi2: float | None
-    samples: int
-    rejected: dict[str, int]
-    iterations: int = 0
-    soil_class: dict[str, float] | None = None
-    position: Position | None = None
-    failure: str | None = None
-    gaps: Mapping[str, float] = field(default_factory=dict)
-    watch: Watch = Watch()  # noqa: RUF009, immutable
 
 
 @dataclass(frozen=True, slots=True)

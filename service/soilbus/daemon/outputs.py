@@ -5,17 +5,19 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cantools.database.can import Database
 
-from soilbus.capability.assessment import Capability
 from soilbus.capability.immobilisation import Watch
 from soilbus.config import Config, ConfigError
-from soilbus.daemon.pipeline import WindowResult
+from soilbus.daemon.result import WindowResult
 from soilbus.daemon.states import state_after
-from soilbus.estimation.posterior import Estimate
-from soilbus.estimation.soil_class import UNKNOWN
+from soilbus.terra.soils import UNKNOWN
+
+if TYPE_CHECKING:
+    from soilbus.capability.assessment import Capability
+    from soilbus.estimation.posterior import Estimate
 
 WINDOW_MODULUS = 251
 """The frames' 8-bit window number counts 0..250."""

@@ -5,11 +5,18 @@ No bus and no clock in here.
 
 from __future__ import annotations
 
+from functools import cached_property
+from typing import TYPE_CHECKING
+
 from cantools.database.can import Database
 
+from soilbus.assembly import completion_of
 from soilbus.config import Config
-from soilbus.daemon.estimator import WindowEstimator, WindowResult
 from soilbus.daemon.intake import Intake
+from soilbus.daemon.result import WindowResult
+
+if TYPE_CHECKING:
+    from soilbus.daemon.estimator import WindowEstimator
 
 
 class Pipeline:
@@ -24,9 +31,20 @@ class Pipeline:
     def __init__(self, config: Config, database: Database) -> None:
         self.config, self.database = config, database
         self.intake = Intake(config, database)
-        self.estimator = WindowEstimator(config)
         self.admission = self.intake.admission
         self.feed = self.intake.admission.feed
+        completion_of(config)  # its faults are told now, and not when the estimator is made
+
+    @cached_property
+    def estimator(self) -> WindowEstimator:
+        """Loaded and made when it is first asked for: a service listens while its worker does that."""
+        return self.new_estimator()
+
+    def new_estimator(self) -> WindowEstimator:
+        """Another one, that knows nothing."""
+        from soilbus.daemon.estimator import WindowEstimator
+
+        return WindowEstimator(self.config)
 
     @property
     def next_end(self) -> float:

@@ -18,9 +18,10 @@ import can
 
 from soilbus.can.candump import Frame, candump_batches, frame_of
 from soilbus.config import Config
-from soilbus.daemon.estimator import Undecided, WindowEstimator, WindowResult
+from soilbus.daemon.estimator import Undecided, WindowEstimator
 from soilbus.daemon.intake import Intake, WindowTask
 from soilbus.daemon.pipeline import Pipeline
+from soilbus.daemon.result import WindowResult
 
 _T = TypeVar("_T")
 

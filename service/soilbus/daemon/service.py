@@ -5,32 +5,35 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from importlib.metadata import PackageNotFoundError, version
-from typing import NamedTuple
+from typing import TYPE_CHECKING
 
 from soilbus.can.bus import LiveBus
 from soilbus.can.bus_state import BusState
 from soilbus.can.publish import Publisher
-from soilbus.capability.assessment import OverSlip
 from soilbus.capability.immobilisation import Watch, watched
 from soilbus.config import Config
+from soilbus.daemon.backlog import Backlog, wait_for
 from soilbus.daemon.bus_health import health_frame, health_text
-from soilbus.daemon.estimator import WindowEstimator
 from soilbus.daemon.health import Health
 from soilbus.daemon.intake import Latest
-from soilbus.daemon.keeper import Keeper
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.outputs import TICK, WINDOW_MODULUS, forecast_frame, hop_frames, slip_frames
-from soilbus.daemon.pipeline import Pipeline, WindowResult
+from soilbus.daemon.pipeline import Pipeline
+from soilbus.daemon.result import WindowResult
 from soilbus.daemon.solver import INTERNAL, Solver
 from soilbus.daemon.states import ServiceState, state_after
 from soilbus.daemon.totals import totals
-from soilbus.estimation.belief import Belief
 from soilbus.traversability import State as Way
 from soilbus.traversability import Status
+
+if TYPE_CHECKING:
+    from soilbus.capability.assessment import OverSlip
+    from soilbus.daemon.estimator import WindowEstimator
+    from soilbus.daemon.keeper import Keeper
 
 log = logging.getLogger(__name__)
 
@@ -40,10 +43,11 @@ GRACE = 0.2
 """A window that no later frame has closed is closed this long after its end [s]."""
 MAX_DRAIN = 4000
 """Frames taken in one go before the loop looks at its clock again."""
-POLL, PROMPT = 0.02, 0.003
-"""Longest wait for a frame [s], and while the worker has a window: then its result may come any moment."""
-MAX_PENDING = 3
-"""Windows that may wait for the worker."""
+POLL = 0.02
+"""Longest wait for a frame [s]."""
+UNDISTURBED = 0.04
+"""So long [s] at most the loop waits for a window's result and leaves frames with the kernel: the two share one
+interpreter, and each frame taken halts the worker.  The kernel has room for those of 75 ms of a full bus by default."""
 LONGEST_CURVE = 60.0
 """Age [s] up to which a valid window's pull over slip serves to watch for immobilisation."""
 FOREIGN_HOLD = 3.0
@@ -52,22 +56,14 @@ INTERRUPTIONS = frozenset(("bus_down", "no_frames", "input_missing", "input_stal
 """Reasons, beside a bus-off and a fault, for which no window that ended before is believed any more."""
 
 
-class Pending(NamedTuple):
-    """A window that the worker has, ended at a monotonic time [s] in an epoch of the intake."""
-
-    future: Future[WindowResult]
-    at: float
-    epoch: int
-
-
 class Service:
     """One vehicle on one bus.
 
     The loop receives and publishes; `workers` (one thread) estimates beside it, so that a
-    hard window neither delays a frame nor loses one.  `clock` is monotonic [s]; frame
-    stamps only space the samples.  `step` makes one round and returns; `run` repeats it
-    until `stop`.  A keeper begins with what another run knew of the sensors, and keeps what
-    this one knows.
+    hard window neither delays a frame nor loses one.  `clock` is monotonic [s], and `waiting` by it
+    (as in Backlog); frame stamps only space the samples.  `step` makes one round and returns; `run` repeats it
+    until `stop`.  What `opened_keeper` returns begins with what another run knew of the sensors,
+    and keeps what this one knows; the worker opens it, and makes the estimator, before the first window.
     """
 
     def __init__(
@@ -80,32 +76,30 @@ class Service:
         workers: Executor,
         clock: Callable[[], float] = time.monotonic,
         on_window: Callable[[WindowResult], None] | None = None,
-        keeper: Keeper | None = None,
+        opened_keeper: Callable[[], Keeper | None] = lambda: None,
+        waiting: Callable[[Future[WindowResult], float], None] = wait_for,
     ) -> None:
         self.config, self.bus, self.publisher = config, bus, publisher
         self.intake = pipeline.intake
-        self._solver = Solver(pipeline.estimator, lambda: WindowEstimator(config))
-        self._keeper = keeper
-        if keeper is not None and keeper.recalled is not None:
-            pipeline.estimator.tracker.recall(*keeper.recalled)
+        self._pipeline, self._opened_keeper = pipeline, opened_keeper
+        self._solver = Solver(self._first_estimator, pipeline.new_estimator)
+        self._keeper: Keeper | None = None
         self.notifier, self.clock, self.on_window = notifier, clock, on_window
         self.result: WindowResult | None = None
         self.deadline_misses = 0
         self.failures: Counter[str] = Counter()
         """Failed solves by kind, since the start."""
-        self.windows = 0
-        """Windows solved since the start."""
         self._watch = Watch()
         self._curve: tuple[OverSlip | None, float] = None, -math.inf
-        self._workers = workers
-        self._pending: deque[Pending] = deque()
         self._stopping = False
         self._started = clock()
-        self._solved_at = self._started
+        self._backlog = Backlog(workers, self._solver.solve, self._started, waiting)
+        workers.submit(lambda: self._solver.estimator)  # where it raises, the first window does again, and says so
         self._ended = -math.inf  # monotonic time of the end of the present result's window
         self._interrupted = self._started  # monotonic time at which inputs failed last
         self._epoch = self.intake.epoch
         self._last_frame = -1e9  # monotonic arrival time
+        self._heard_out = self._started  # monotonic time at which no frame was left with the kernel
         self._last_stamp = 0.0  # the bus's own time
         self._next_tick = self._started
         self._due = dict.fromkeys(("SoilbusStatus", "SoilbusIdentity", "BusHealth"), self._started)
@@ -113,6 +107,19 @@ class Service:
         self._next_watchdog = self._started
         self._health, self._fault = Health(self._started), ""
         self._state: tuple[ServiceState, str] = (ServiceState.STARTING, "none")
+
+    def _first_estimator(self) -> WindowEstimator:
+        """In the worker: the estimator, with what was known before."""
+        estimator, keeper = self._pipeline.estimator, self._opened_keeper()
+        if keeper is not None and keeper.recalled is not None:
+            estimator.tracker.recall(*keeper.recalled)
+        self._keeper = keeper
+        return estimator
+
+    @property
+    def windows(self) -> int:
+        """Windows solved since the start."""
+        return self._backlog.solved
 
     def stop(self) -> None:
         """Let `run` return after the present round; safe to call from a signal handler."""
@@ -126,10 +133,10 @@ class Service:
         self.notifier.stopping()
         self.result = None
         self._publish_ten_hertz(self.clock())
-        self._workers.shutdown(wait=False, cancel_futures=True)
+        self._backlog.close()
         self.bus.close()
         if self._keeper is not None:
-            self._keeper.close(self._newest(), self._totals())
+            self._keeper.close(self._solver.newest, self._totals())
 
     def step(self) -> None:
         """Receive until the next tick, then hand out, collect and publish what is due."""
@@ -145,11 +152,16 @@ class Service:
             self._tick(now)
 
     def _receive(self) -> None:
-        feed = self.intake.admission.feed
-        longest = PROMPT if self._pending else POLL
+        feed, longest, now = self.intake.admission.feed, POLL, self.clock()
+        if self._backlog and self.bus.is_open:
+            self._backlog.wait(min(self._next_tick - now, UNDISTURBED))
+            longest, now = 0.0, self.clock()
         for _ in range(MAX_DRAIN):
-            message = self.bus.receive(max(0.0, min(self._next_tick - self.clock(), longest)))
+            if self._backlog.has_result:
+                return
+            message = self.bus.receive(max(0.0, min(self._next_tick - now, longest)))
             if message is None:
+                self._heard_out = self.clock()
                 return
             self._last_stamp = message.timestamp
             feed(
@@ -159,12 +171,9 @@ class Service:
                 message.data,
                 message.is_remote_frame,
             )
-            self._last_frame = self.clock()
-            if message.timestamp >= self.intake.next_end or self._last_frame >= self._next_tick or self._result_waits():
+            now = self._last_frame = self.clock()
+            if message.timestamp >= self.intake.next_end or now >= self._next_tick:
                 return
-
-    def _result_waits(self) -> bool:
-        return bool(self._pending) and self._pending[0].future.done()
 
     def bus_time(self, now: float) -> float:
         """The bus's own time at the monotonic time `now` [s]."""
@@ -172,22 +181,13 @@ class Service:
 
     def _hand_out(self, now: float) -> None:
         """Give the windows that have ended to the worker; what it cannot keep up with is dropped."""
-        for task in self.intake.due(max(self._last_stamp, self.bus_time(now) - GRACE)):
-            if not self._pending:
-                self._solved_at = now
+        for task in self.intake.due(max(self._last_stamp, self.bus_time(self._heard_out) - GRACE)):
             ended = now - max(0.0, self.bus_time(now) - task.end)
-            self._pending.append(Pending(self._workers.submit(self._solver.solve, task), ended, self.intake.epoch))
-            while len(self._pending) > MAX_PENDING and self._pending[1].future.cancel():
-                del self._pending[1]
-                self.deadline_misses += 1
+            self.deadline_misses += self._backlog.add(task, ended, self.intake.epoch, now)
 
     def _collect(self, now: float) -> None:
         """Publish the windows that are solved, in their order."""
-        while self._result_waits():
-            pending = self._pending.popleft()
-            result = pending.future.result()
-            self._solved_at = now
-            self.windows += 1
+        for result, pending in self._backlog.results(now):
             if result.failure is not None:
                 self.failures[result.failure] += 1
             if pending.epoch == self.intake.epoch:
@@ -230,18 +230,14 @@ class Service:
             self._next_watchdog = now + interval
             self.notifier.watchdog()
         if self._keeper is not None:
-            self._keeper.tick(now, self._newest(), self._totals)
+            self._keeper.tick(now, self._solver.newest, self._totals)
 
     def _look_after_health(self, now: float) -> None:
-        solving_since = self._solved_at if self._pending else None
         hears = self.bus.is_open and now - self._last_frame <= SILENCE
-        fault = self._health.fault(now, solving_since, hears, self.bus.counts.sent) or ""
+        fault = self._health.fault(now, self._backlog.solving_since, hears, self.bus.counts.sent) or ""
         if fault and fault != self._fault:
             log.error("fault: %s; systemd is not told any more that all is well", fault)
         self._fault = fault
-
-    def _newest(self) -> Belief | None:
-        return self._solver.estimator.tracker.newest
 
     def _totals(self) -> dict[str, int]:
         return totals(

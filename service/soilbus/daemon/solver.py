@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-from soilbus.allocator import give_back_freed_memory
-from soilbus.daemon.estimator import WindowEstimator, WindowResult
 from soilbus.daemon.intake import WindowTask
+from soilbus.daemon.result import WindowResult
 from soilbus.traversability import Status, Traversability
+
+if TYPE_CHECKING:
+    from soilbus.daemon.estimator import WindowEstimator
+    from soilbus.estimation.belief import Belief
 
 log = logging.getLogger(__name__)
 
@@ -16,16 +20,30 @@ INTERNAL = "internal"
 """Reason and kind of failure of a window at which the estimator raised."""
 REPEATED = 3
 """Such windows in a row from which the service is in fault."""
-TIDIED = 60
-"""After each so many windows memory that is free is given back."""
 
 
 class Solver:
-    """Solves windows with an estimator; `anew` makes another one, that knows nothing."""
+    """Solves windows with an estimator.
 
-    def __init__(self, estimator: WindowEstimator, anew: Callable[[], WindowEstimator]) -> None:
-        self.estimator, self._anew = estimator, anew
+    `first` makes it, in the worker, when it is first needed; `anew` makes another one, that knows nothing.
+    """
+
+    def __init__(self, first: Callable[[], WindowEstimator], anew: Callable[[], WindowEstimator]) -> None:
+        self._first, self._anew = first, anew
+        self._estimator: WindowEstimator | None = None
         self._in_a_row = 0
+
+    @property
+    def estimator(self) -> WindowEstimator:
+        """The present estimator."""
+        if self._estimator is None:
+            self._estimator = self._first()
+        return self._estimator
+
+    @property
+    def newest(self) -> Belief | None:
+        """What the present estimator knows; None as long as there is none."""
+        return None if self._estimator is None else self._estimator.tracker.newest
 
     @property
     def in_fault(self) -> bool:
@@ -45,11 +63,9 @@ class Solver:
             if self._in_a_row <= REPEATED:
                 log.error("window %d failed: %s", task.index, _where(error))
             if self._in_a_row % REPEATED == 0:
-                self.estimator = self._anew()
+                self._estimator = self._anew()
             return _failed(task)
         self._in_a_row = 0
-        if task.index % TIDIED == 0:
-            give_back_freed_memory()
         return result
 
 

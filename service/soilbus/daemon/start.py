@@ -7,20 +7,25 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cantools.database.can import Database
 
+from soilbus.allocator import loading
 from soilbus.can.bus import BusError, LiveBus, open_bus
 from soilbus.can.dbc_files import filters_of, load_databases, output_database
 from soilbus.can.publish import Publisher
 from soilbus.config import Config
-from soilbus.daemon.keeper import Keeper
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.outputs import check_cycle_times
-from soilbus.daemon.pipeline import Pipeline, WindowResult
+from soilbus.daemon.pipeline import Pipeline
+from soilbus.daemon.result import WindowResult
 from soilbus.daemon.service import Service
-from soilbus.daemon.store import Owner
+
+if TYPE_CHECKING:
+    from soilbus.daemon.keeper import Keeper
 
 SWITCH_INTERVAL = 0.0005
 
@@ -53,25 +58,38 @@ def start_service(
     # The loop must get its turn between the estimator's steps, or the socket overflows.
     sys.setswitchinterval(SWITCH_INTERVAL)
     workers = ThreadPoolExecutor(max_workers=1, thread_name_prefix="estimate")
+    workers.submit(_load)
+    service = Service(
+        config, pipeline, bus, publisher, Notifier.from_environment(), workers, on_window=on_window,
+        opened_keeper=partial(_keeper, pipeline, os.environ),
+    )  # fmt: skip
     if rehearse:
         workers.submit(_rehearse, config, pipeline.database, ours)  # where it raises, the first window is late, no more
-    keeper = _keeper(pipeline, os.environ)
-    return Service(
-        config, pipeline, bus, publisher, Notifier.from_environment(), workers, on_window=on_window, keeper=keeper
-    )
+    return service
+
+
+def _load() -> None:
+    """In the worker: what only it needs is loaded there, while the service is ready and listens already."""
+    with loading():
+        import soilbus.daemon.estimator
+        import soilbus.daemon.keeper
+        import soilbus.daemon.warm_up  # noqa: F401
 
 
 def _rehearse(config: Config, database: Database, ours: Database) -> None:
-    """In the worker: what only this needs is loaded when the service is ready."""
+    """In the worker: a few windows of a drive that is made up."""
     from soilbus.daemon.warm_up import warm_up
 
     warm_up(config, database, ours)
 
 
 def _keeper(pipeline: Pipeline, environ: Mapping[str, str]) -> Keeper | None:
-    """Keeps the state in the folder that systemd made for it; None where there is none."""
+    """In the worker: keeps the state in the folder that systemd made for it; None where there is none."""
     folder = environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if not folder:
         return None
+    from soilbus.daemon.keeper import Keeper
+    from soilbus.daemon.store import Owner
+
     writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="store")
     return Keeper(Path(folder), Owner.of(pipeline.config, pipeline.intake.channels, pipeline.database), writer)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from soilbus.daemon.estimator import WindowResult
+from soilbus.daemon.result import WindowResult
 from soilbus.traversability import Status
 
 

@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 
 from soilbus.assembly import completion_of, model_of, rig_of
 from soilbus.config import Column, Config, Table
-from soilbus.daemon.estimator import WindowEstimator, WindowResult
+from soilbus.daemon.estimator import WindowEstimator
 from soilbus.daemon.intake import WindowTask, column_means
 from soilbus.daemon.positions import PositionTrack
 from soilbus.daemon.recordings import Recordings
 from soilbus.daemon.replay import LogError
+from soilbus.daemon.result import WindowResult
 from soilbus.diagnosis.records import Record, TooLittle, record_of_rows
 from soilbus.estimation.readings import MAX_SLIP, MIN_SLIP
 from soilbus.estimation.window import Rig, Window, window_of_samples

@@ -12,7 +12,8 @@ from soilbus.allocator import take_small_blocks
 from soilbus.can.publish import Publisher
 from soilbus.config import Config
 from soilbus.daemon.outputs import hop_frames
-from soilbus.daemon.pipeline import Pipeline, WindowResult
+from soilbus.daemon.pipeline import Pipeline
+from soilbus.daemon.result import WindowResult
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.scenario import excited

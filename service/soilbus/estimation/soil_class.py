@@ -27,12 +27,11 @@ from soilbus.estimation.coordinates import Coordinates
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.terra.entry_angle import entry_angle_for_load
-from soilbus.terra.soils import KINDS, SOILS
+from soilbus.terra.soils import KINDS, SOILS, UNKNOWN
 from soilbus.terra.wheel import Soil, sinkage, state_on, wheel_forces
 
 Array = NDArray[np.float64]
 
-UNKNOWN = "unknown"
 PRIOR_UNKNOWN = 0.5
 """Probability of `unknown` before any window; the kinds of the table share the rest evenly."""
 WITHIN = {"k_c": 0.5, "k_phi": 0.25, "n": 0.16, "phi": 0.10, "c": 0.45, "K": 0.45}

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from soilbus.config import Config, ConfigError
-from soilbus.daemon.estimator import WindowResult
+from soilbus.daemon.result import WindowResult
 from soilbus.estimation.posterior import Estimate
 
 DECIMALS = 7

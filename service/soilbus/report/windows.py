@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from soilbus.daemon.pipeline import Pipeline, WindowResult
+from soilbus.daemon.pipeline import Pipeline
+from soilbus.daemon.result import WindowResult
 from soilbus.report.page import html_table, page, picture
 from soilbus.traversability import Status
 

@@ -31,6 +31,7 @@ from soilbus.estimation.marginal import cold_fit
 from soilbus.estimation.readings import gain_names
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import BinStore, Rig, Window
+from soilbus.judgement import judge
 from soilbus.simulator.draft_trials import true_largest_draft
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.monte_carlo import MAX_PHI, NORMAL_95, Each, missed
@@ -38,7 +39,7 @@ from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import KINDS, soil_named
 from soilbus.terra.wheel import Soil, WheelModel
-from soilbus.traversability import State, Status, Traversability, judge
+from soilbus.traversability import State, Status, Traversability
 
 Array = NDArray[np.float64]
 

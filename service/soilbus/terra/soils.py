@@ -49,6 +49,8 @@ SOILS |= {"loam": SOILS["xi_sandy_loam"], "wet_clay": SOILS["xi_wet_clay"]}  # t
 
 KINDS = (*_WONG, "xi_wet_clay")
 """Names of the soils that differ; Xi's sandy loam is Wong's with 15 % of moisture."""
+UNKNOWN = "unknown"
+"""In their place: a soil that is none of them."""
 
 
 def soil_named(name: str) -> Soil:

@@ -1,0 +1,47 @@
+"""What one window says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from soilbus.capability.immobilisation import Watch
+from soilbus.daemon.positions import Position
+from soilbus.traversability import Status, Traversability
+
+if TYPE_CHECKING:
+    from soilbus.estimation.posterior import Estimate, Posterior
+
+
+@dataclass(frozen=True, slots=True)
+class WindowResult:
+    """What one window says; t is its end [s], index counts windows since the start.
+
+    slip and sinkage [m] are means over the window by wheel name, None where unknown.
+    rejected counts refused samples of the window by reason.  posterior is None where
+    status is invalid.  soil_class is the probability of each known soil and of `unknown`,
+    the largest first.  position is in the middle of the data that count: of the window, or
+    of its part on a new soil.  failure is the kind of a solve that failed, None where none did.
+    watch warns of immobilisation.  gaps: reduced chi-square of the channels that have not
+    fitted for minutes, the worst first.
+    """
+
+    t: float
+    index: int
+    status: Status
+    reason: str
+    posterior: Posterior | None
+    bearing: Estimate | None
+    slip: dict[str, float | None]
+    sinkage: dict[str, float | None]
+    traversability: Traversability
+    chi2: float | None
+    samples: int
+    rejected: dict[str, int]
+    iterations: int = 0
+    soil_class: dict[str, float] | None = None
+    position: Position | None = None
+    failure: str | None = None
+    gaps: Mapping[str, float] = field(default_factory=dict)
+    watch: Watch = Watch()  # noqa: RUF009, immutable

@@ -1,0 +1,84 @@
+"""Posterior -> traversability: what the vehicle can do here, against what is asked of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.capability.assessment import Capability, Demand, assess
+from soilbus.capability.uncertain_model import UncertainModel
+from soilbus.capability.wheels import WheelTable
+from soilbus.config import Traversability as Settings
+from soilbus.estimation.posterior import Posterior
+from soilbus.estimation.window import Rig
+from soilbus.terra.effects.steady import CompletedModel
+from soilbus.terra.wheel import WheelModel
+from soilbus.traversability import State, Status, Traversability, state_of
+
+
+def judge(
+    posterior: Posterior | None,
+    status: Status,
+    demand: Demand | None,
+    rig: Rig,
+    model: WheelModel | CompletedModel | UncertainModel,
+    torque_limit: NDArray[np.float64],
+    settings: Settings,
+    last: WheelTable | None = None,
+) -> tuple[Traversability, WheelTable | None]:
+    """Traversability of the ground of one window, and the wheels' table to start the next one from.
+
+    torque_limit (W,) [N m] holds nan where a motor's limit is not known.  Only a valid
+    posterior and a known demand can lead to go.
+    """
+    available = float(torque_limit.sum()) if np.isfinite(torque_limit).all() and len(torque_limit) else None
+    if posterior is None or status is Status.INVALID or rig.chassis is None:
+        return Traversability(torque_available=available), None
+    able, table = assess(
+        posterior, rig, model, demand, torque_limit, settings.max_slip, settings.max_sinkage, last
+    )  # fmt: skip
+    if able is None:
+        return Traversability(State.NO_GO, 0.0, torque_available=available, limit="sinkage"), None
+    way = Traversability(
+        torque_available=available,
+        max_draft=able.max_draft,
+        max_grade=able.max_grade,
+        limit=able.limit,
+        capability=able,
+    )
+    if demand is None:
+        return way, table
+    pull, depth = probability_of_pull(able, demand, settings), probability_of_depth(able, settings)
+    forecast = able.forecast
+    return replace(
+        way,
+        state=state_of(min(pull, depth), status, settings),
+        probability=min(pull, depth),
+        torque_required=None if forecast is None else forecast.torque.value,
+        slip_needed=None if forecast is None else forecast.slip.value,
+        limit=able.limit if pull <= depth else "sinkage",
+    ), table
+
+
+def probability_of_pull(able: Capability, demand: Demand, settings: Settings) -> float:
+    """That the wheels give the demand and its margin on the present slope."""
+    if able.likely_pull is None:
+        return 0.0
+    needed = demand.pull + settings.margin * max(demand.pull, 0.0)
+    return _above(able.likely_pull.value - needed, math.hypot(able.likely_pull.std, demand.std))
+
+
+def probability_of_depth(able: Capability, settings: Settings) -> float:
+    """That the deepest wheel stays within the sinkage limit under the demand; 1 where no slip gives the demand."""
+    if able.forecast is None:
+        return 1.0
+    deepest = able.forecast.likely_depth
+    return _above(settings.max_sinkage - deepest.value, deepest.std)
+
+
+def _above(margin: float, std: float) -> float:
+    """Probability that a Gaussian with this mean and std is above zero."""
+    return 0.5 * math.erfc(-margin / (max(std, 1e-9) * math.sqrt(2.0)))
