@@ -9,9 +9,7 @@ are those of Xi et al. 2024.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import cache
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,16 +73,12 @@ def fixed_shares(q: Quadrature) -> tuple[Array, Array]:
     return on_branches(*gauss(q.nodes, q.power), q.peak, q.exit)
 
 
-def split_nodes(splits: Sequence[Array], q: Quadrature) -> tuple[Array, Array]:
-    """Nodes x and weights on 0..1, (M + 2, N) for each panel between places (N,) on 0..1."""
+def split_nodes(split: Array, q: Quadrature, start: Any = 0.0) -> tuple[Array, Array]:
+    """Nodes x and weights from a start to 1, (M + 2, N) for each of the panels before and after a place (N,)."""
     x, xw = gauss(q.nodes + 2, 3)  # shear is steep where it changes sign
     u, w = gauss(q.nodes + 2, 2)  # the branch may start just before the split
-    edges = [*np.sort(np.stack(splits), axis=0), np.ones(np.shape(splits[0]))]
-    widths = [after - before for before, after in pairwise(edges)]
-    return (
-        np.concatenate([edges[0] * x, *(start + width * u for start, width in zip(edges, widths, strict=False))]),
-        np.concatenate([edges[0] * xw, *(width * w for width in widths)]),
-    )
+    before, after = split - start, 1.0 - split
+    return np.concatenate([start + before * x, split + after * u]), np.concatenate([before * xw, after * w])
 
 
 def place_of_turn(theta: Array, slip: Array, peak: Any, q: Quadrature) -> Array:

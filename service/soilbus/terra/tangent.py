@@ -12,7 +12,7 @@ from soilbus.terra.wheel import INPUTS, wheel_forces_and_derivatives
 from soilbus.terra.wheel_state import WheelModel, WheelState
 
 _FAINT = 1e-9
-"""Stiffness of a pan that is none, but that parts the nodes as any pan does."""
+"""Stiffness of a pan that is none, but that is integrated as any pan is."""
 _SHAPES = {
     "peak": ("peak_c1", "peak_c2"),
     "leave": ("exit_ratio", "exit_angle"),
