@@ -47,8 +47,9 @@ from soilbus.terra.wheel import (
 Array = NDArray[np.float64]
 
 STEP = 1e-6
-"""Step of the differences: relative, but for effects' parameters in standard deviations."""
-LOAD_ROUNDS = 6
+"""Step of differences by parameters of effects that mix instants, in prior std."""
+LOAD_ROUNDS, LITTLE_TURN = 6, 0.01
+"""Steps to the entry angles that carry the loads, and the relative one that is the last."""
 _LATENTS = ("entry_angle", "load", "speed", "ground_speed")
 _SOIL = Soil._fields
 
@@ -131,11 +132,11 @@ class CompletedProblem(WindowProblem):
 
         off = excess(angle)
         with np.errstate(all="ignore"):
-            slope = (excess(angle * (1.0 + STEP)) - off) / STEP
+            slope = (2.0 * soil.n + 1.0) * base.load  # of small angles, by the angle's logarithm
             for _ in range(LOAD_ROUNDS):
                 step = np.where(slope > 0.0, -off / slope, 0.0)
                 turned = np.clip(angle * np.exp(np.clip(step, -0.5, 0.5)), MIN_ENTRY_ANGLE, MAX_ENTRY_ANGLE * 0.98)
-                if np.abs(step).max(initial=0.0) < 1e-3:
+                if np.abs(step).max(initial=0.0) < LITTLE_TURN:
                     angle = turned
                     break
                 still_off = excess(turned)

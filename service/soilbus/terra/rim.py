@@ -122,11 +122,15 @@ def rim_at(theta: Array, share: Array, r_K: Any) -> Rim:
     cos = np.sqrt(1.0 - sin * sin)  # no contact reaches a right angle
     sin1, cos1 = np.sin(theta), np.cos(theta)
     depth = np.maximum(cos[0] - cos1, 1e-300)
-    travel, travel_rate = sin1 - sin, cos1 - cos * share
-    return Rim(
-        sin, cos, depth, (sin1 - sin[0] * share[0]) / depth, r_K * travel, r_K * (theta - angle - travel),
-        r_K * travel_rate, r_K * (1.0 - share - travel_rate),
-    )  # fmt: skip
+    travel, creep = sin1 - sin, np.subtract(theta, angle, out=angle)
+    travel_rate, creep_rate = cos * share, 1.0 - share
+    np.subtract(cos1, travel_rate, out=travel_rate)
+    creep -= travel
+    creep_rate -= travel_rate
+    for lengths in (travel, creep, travel_rate, creep_rate):
+        lengths *= r_K
+    deepening = (sin1 - sin[0] * share[0]) / depth
+    return Rim(sin, cos, depth, deepening, travel, creep, travel_rate, creep_rate)
 
 
 def rim_of_fixed_shares(theta: Array, q: Quadrature, r_K: Any, one_off: bool = False) -> Rim:
