@@ -161,31 +161,16 @@ class CompletedProblem(WindowProblem):
         varied = Latents(**{name: Dual(getattr(latents, name), {name: UNIT}) for name in _LATENTS})  # type: ignore[arg-type]
         wheels = self._wheels(_varied(soil), active, varied, varied.entry_angle)
         contact = self._contact(wheels, active, forces_along(wheels.state, wheels.model))
-        told = self._told(contact, active, varied)
+        load, drawbar, torque, depth = self._told(contact, active, varied)
         around = self._surroundings(latents)
-        late = self._late(active, pulls, contact.forces[2], around)
+        torque = torque + self._late(active, pulls, contact.forces[2], around)
         pull = self._pull(contact.forces[1].only(int), active, around)
-        shape, P = (self.n, self.n_wheels), len(self.free)
-        at, by_latents, by_soil = (np.zeros((4, *more, *shape)) for more in ((), (len(_LATENTS),), (6,)))
-        by_effects, pull_by_effects = np.zeros((4, P, *shape)), np.zeros((P, self.n))
-        for one, values, of_latents, of_soil, of_effects in zip(told, at, by_latents, by_soil, by_effects, strict=True):
-            values[:] = value_of(one)
-            for quantity, d in one.by.items() if isinstance(one, Dual) else ():
-                if isinstance(quantity, int):
-                    of_effects[quantity] = d
-                elif quantity in _LATENTS:
-                    of_latents[_LATENTS.index(quantity)] = d
-                else:
-                    of_soil[_SOIL.index(quantity)] = d
-        if late is not None:
-            at[2] += late.value
-            for quantity, d in late.by.items():
-                if isinstance(quantity, int):
-                    by_effects[2, quantity] += d
-                else:
-                    by_soil[2, _SOIL.index(quantity)] += d
+        at, by_latents, by_soil, by_effects = _gathered(
+            (load, drawbar, torque, depth), len(self.free), (self.n, self.n_wheels)
+        )
         np.divide(by_soil[:, 1], self.rig.width, out=by_soil[:, 0])  # both act through K_L = k_c/b + k_phi
-        for i in range(P):
+        pull_by_effects = np.zeros((len(self.free), self.n))
+        for i in range(len(self.free)):
             pull_by_effects[i] = slope_of(pull, i)
         by_angle, by_load, by_speed, by_ground = by_latents.swapaxes(0, 1)
         slope, off = by_angle[0], -at[0]
@@ -282,7 +267,7 @@ class CompletedProblem(WindowProblem):
         )
         return by_draft, by_acceleration
 
-    def _late(self, active: Sequence[Active], pulls: Array, torque: Any, around: Surroundings) -> Dual | None:
+    def _late(self, active: Sequence[Active], pulls: Array, torque: Any, around: Surroundings) -> Any:
         """What other instants add to the readings of torques (N, W), by the soil and the effects' parameters.
 
         It is taken from smoothed torques, and not followed through their latents: each instant
@@ -290,7 +275,7 @@ class CompletedProblem(WindowProblem):
         """
         mixing = [a for a in active if a.effect.torque is not None and a.effect.mixes_instants]
         if not mixing:
-            return None
+            return 0.0
         parts = {q: d for q, d in torque.by.items() if q not in _LATENTS}
         smooth = smoothed(self.t, torque.value)
         by = {q: smoothed(self.t, np.broadcast_to(d, smooth.shape)) for q, d in parts.items()}
@@ -324,6 +309,22 @@ class CompletedProblem(WindowProblem):
             duration=self.duration,
             length=self.length,
         )
+
+
+def _gathered(told: Sequence[Any], n_effects: int, shape: tuple[int, int]) -> tuple[Array, Array, Array, Array]:
+    """Values (M, N, W), their derivatives by latents (M, 4, N, W), soil (M, 6, N, W) and parameters (M, P, N, W)."""
+    kinds = (), (len(_LATENTS),), (len(_SOIL),), (n_effects,)
+    at, by_latents, by_soil, by_effects = (np.zeros((len(told), *kind, *shape)) for kind in kinds)
+    for i, one in enumerate(told):
+        at[i] = value_of(one)
+        for quantity, d in one.by.items() if isinstance(one, Dual) else ():
+            if isinstance(quantity, int):
+                by_effects[i, quantity] = d
+            elif quantity in _LATENTS:
+                by_latents[i, _LATENTS.index(quantity)] = d
+            else:
+                by_soil[i, _SOIL.index(quantity)] = d
+    return at, by_latents, by_soil, by_effects
 
 
 def _added(effect: Effect, around: Surroundings, torque: Array, values: Values) -> Array:
