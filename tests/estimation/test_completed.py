@@ -1,6 +1,8 @@
-"""The completed model's derivatives along the contact's tangent are those of the contact itself."""
+"""What the completed model tells, and its derivatives, for each effect of the catalogue."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,9 +15,8 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.effects.effect import forces_with
 from soilbus.terra.soils import SOILS
-from soilbus.terra.tangent import Tangent
-from soilbus.terra.wheel import wheel_forces
 
 SOIL = SOILS["loam"]
 PULL = 0.3
@@ -35,18 +36,73 @@ def problems() -> dict[str, CompletedProblem]:
     return found
 
 
-@pytest.mark.parametrize("name", CATALOGUE)
-def test_the_tangent_serves_as_well_as_the_contact(problems, monkeypatch, name):
-    effect = CATALOGUE[name]
+@pytest.fixture(params=CATALOGUE)
+def at(request, problems):
+    """A problem with one effect, gains and latents at which the wheels just carry their loads."""
+    effect = CATALOGUE[request.param]
     plain = problems[effect.base_law or "exponential"]
     free = parameters_of(effect, plain.n_wheels)
     problem = plain.completed([effect], free)
     gains = np.concatenate([np.zeros(problem.n_sensors), np.full(len(free), PULL)])
     latents = problem.carried(problem.start(SOIL), SOIL, gains)
-    fast = problem._response(SOIL, gains, latents)
-    monkeypatch.setattr(Tangent, "at", lambda self, state, model: wheel_forces(state, model))
-    slow = problem._response(SOIL, gains, latents)
-    for field, told, expected in zip(fast._fields, fast, slow, strict=True):
-        for one, other in zip(*(a.reshape(-1, *a.shape[-2:]) for a in (told, expected)), strict=True):
-            scale = np.abs(other).max(initial=1e-12)
-            assert np.abs(one - other).max(initial=0.0) < 1e-4 * scale, field
+    for _ in range(4):
+        there = problem._response(SOIL, gains, latents)
+        latents = replace(latents, entry_angle=latents.entry_angle + there.off / there.load_slope)
+    return problem, gains, latents
+
+
+def told(problem, soil, gains, latents):
+    """Drawbar pull, torque and sinkage (3, N, W), and what the wheels must pull besides (N,)."""
+    response = problem._response(soil, gains, latents)
+    return response.value, response.pull
+
+
+def moved(problem, gains, latents):
+    """By derivative of a response, with a step: what it then is of."""
+    for i, name in enumerate(SOIL._fields):
+        step = 1e-5 * getattr(SOIL, name)
+        yield ("by_soil", i), step, lambda way, n=name, d=step: (
+            SOIL._replace(**{n: getattr(SOIL, n) + way * d}), gains, latents
+        )  # fmt: skip
+    for i in range(len(problem.free)):
+        nudge = 1e-4 * (np.arange(len(gains)) == problem.n_sensors + i)
+        yield ("by_effects", i), 1e-4, lambda way, d=nudge: (SOIL, gains + way * d, latents)
+    if problem.effects[0].mixes_instants:
+        return  # what other instants add is not followed through their latents
+    for field, name in (("by_load", "load"), ("by_speed", "speed"), ("by_ground", "ground_speed")):
+        value = getattr(latents, name)
+        step = 1e-5 * float(value.mean())
+        yield (field,), step, lambda way, n=name, v=value, d=step: (
+            SOIL, gains, replace(latents, **{n: v + way * d})
+        )  # fmt: skip
+
+
+def test_derivatives_are_those_of_what_is_told(at):
+    problem, gains, latents = at
+    response = problem._response(SOIL, gains, latents)
+    for (field, *place), step, change in moved(problem, gains, latents):
+        (up, pull_up), (down, pull_down) = (told(problem, *change(way)) for way in (1.0, -1.0))
+        ours, expected = getattr(response, field), (up - down) / (2.0 * step)
+        ours = ours[:, place[0]] if place else ours
+        for one, other, size in zip(ours, expected, response.value, strict=True):
+            scale = np.abs(other).max() + 1e-6 * np.abs(size).max() / step * 1e-3
+            assert np.abs(one - other).max() < 2e-4 * scale, (field, place)
+        if field == "by_effects":
+            of_pull = (pull_up - pull_down) / (2.0 * step)
+            assert response.pull_by_effects[place[0]] == pytest.approx(of_pull, rel=1e-4, abs=1e-6)
+
+
+def test_what_is_told_is_what_the_hooks_make_of_the_forces(at):
+    problem, gains, latents = at
+    (active,) = problem.active(gains[problem.n_sensors :])
+    response = problem._response(SOIL, gains, latents)
+    around = problem._surroundings(latents)
+    state = problem._wheels(SOIL, [], latents, latents.entry_angle).state
+    forces = forces_with([active], state, problem.model, around)
+    load = forces[0] + (0.0 if active.effect.load is None else active.effect.load(around, active.values))
+    assert load == pytest.approx(latents.load, rel=1e-9)
+    assert response.value[0] == pytest.approx(forces[1], rel=1e-9)
+    if active.effect.torque is None:
+        assert response.value[1] == pytest.approx(forces[2], rel=1e-9)
+    elif not active.effect.mixes_instants:
+        assert response.value[1] == pytest.approx(active.effect.torque(forces[2], around, active.values), rel=1e-9)

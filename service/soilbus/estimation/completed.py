@@ -1,28 +1,39 @@
 """A window's residuals under a wheel-soil model that effects complete.
 
 The parameters of the effects take their place beside the gain errors of the sensors: each
-as (parameter - value) / std, zero with variance one before any data.  Derivatives are
-differences of the effects' hooks, which are any small functions; the integrals between the
-hooks are taken along their tangent, so that there is one integration for all of them.
+as (parameter - value) / std, zero with variance one before any data.  Soil, latents and
+parameters go through the effects' hooks with their derivatives (see terra.dual), and there
+is one integration for all of them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from functools import partial
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.effect_parameters import Free, active_at
+from soilbus.estimation.effect_parameters import Free, active_at, varied_at
 from soilbus.estimation.linearised import Latents
 from soilbus.estimation.residuals import MAX_TURN, Response, WindowProblem
 from soilbus.estimation.smoothing import smoothed
 from soilbus.estimation.window import Rig, Window
-from soilbus.terra.effects.effect import Active, Effect, Surroundings, reactions_with, true_draft, wheel_with
+from soilbus.terra.dual import UNIT, Dual, slope_of, value_of
+from soilbus.terra.effects.effect import (
+    Active,
+    Effect,
+    Forces,
+    Surroundings,
+    Values,
+    reactions_with,
+    true_draft,
+    wheel_with,
+)
 from soilbus.terra.stress import lumped_modulus
-from soilbus.terra.tangent import Tangent, shape_of_change, tangent
+from soilbus.terra.tangent import forces_along
 from soilbus.terra.wheel import (
     MAX_ENTRY_ANGLE,
     MIN_ENTRY_ANGLE,
@@ -36,15 +47,18 @@ from soilbus.terra.wheel import (
 Array = NDArray[np.float64]
 
 STEP = 1e-6
-"""Step of the differences: relative, but for effects' parameters in standard deviations."""
-LOAD_ROUNDS = 6
+"""Step of differences by parameters of effects that mix instants, in prior std."""
+LOAD_ROUNDS, LITTLE_TURN = 6, 0.01
+"""Steps to the entry angles that carry the loads, and the relative one that is the last."""
+_LATENTS = ("entry_angle", "load", "speed", "ground_speed")
+_SOIL = Soil._fields
 
 
 class _Contact(NamedTuple):
-    """Load, drawbar pull and torque between wheels and ground (3, N, W), sinkage (N, W), what effects depend on."""
+    """Load, drawbar pull and torque between wheels and ground, sinkage (N, W), what effects depend on."""
 
-    forces: Array
-    depth: Array
+    forces: Forces
+    depth: Any
     around: Surroundings
 
 
@@ -109,19 +123,20 @@ class CompletedProblem(WindowProblem):
         if not self.effects:
             return base
         active = self.active(np.zeros(len(self.free)) if gains is None else gains[self.n_sensors :])
-        angle, nothing = base.entry_angle, np.zeros_like(base.load)
+        angle = base.entry_angle
 
         def excess(angle: Array) -> Array:
-            contact = self._contact(self._wheels(soil, active, base, angle), active)
-            return np.asarray(self._told(contact, active, base, nothing)[0])
+            wheels = self._wheels(soil, active, base, angle)
+            contact = self._contact(wheels, active, wheel_forces(wheels.state, wheels.model))
+            return np.asarray(self._excess(contact, active, base))
 
         off = excess(angle)
         with np.errstate(all="ignore"):
-            slope = (excess(angle * (1.0 + STEP)) - off) / STEP
+            slope = (2.0 * soil.n + 1.0) * base.load  # of small angles, by the angle's logarithm
             for _ in range(LOAD_ROUNDS):
                 step = np.where(slope > 0.0, -off / slope, 0.0)
                 turned = np.clip(angle * np.exp(np.clip(step, -0.5, 0.5)), MIN_ENTRY_ANGLE, MAX_ENTRY_ANGLE * 0.98)
-                if np.abs(step).max(initial=0.0) < 1e-3:
+                if np.abs(step).max(initial=0.0) < LITTLE_TURN:
                     angle = turned
                     break
                 still_off = excess(turned)
@@ -135,43 +150,29 @@ class CompletedProblem(WindowProblem):
         if not self.effects:
             return super().sinkages(soil, gains, latents)
         active = self.active(gains[self.n_sensors :])
-        return _depth(self._wheels(soil, active, latents, latents.entry_angle).state)
+        state = self._wheels(soil, active, latents, latents.entry_angle).state
+        return np.broadcast_to(sinkage(state.entry_angle, state.radius), latents.load.shape)
 
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         if not self.effects:
             return super()._response(soil, gains, latents)
         pulls = gains[self.n_sensors :]
-        active, angle = self.active(pulls), latents.entry_angle
-        here = self._wheels(soil, active, latents, angle)
-        others = self._beside(soil, pulls, latents)
-        shape = [shape_of_change(here.model, other.model) for _, _, other in others.values() if other is not None]
-        near = tangent(here.state, here.model, frozenset().union(*shape))
-        contact = self._contact(here, active, near)
-        late = self._from_other_instants(active, contact)
-        at = self._told(contact, active, latents, late)
-        pull = self._pull(contact, active)
-
-        def by_moving(moved: Latents, step: Any) -> Array:
-            contact = self._contact(self._wheels(soil, active, moved, moved.entry_angle), active, near)
-            return np.asarray((self._told(contact, active, moved, late) - at) / step)
-
-        by_latents = {}
-        for name in ("entry_angle", "load", "speed", "ground_speed"):
-            value = getattr(latents, name)
-            step = STEP * np.abs(value)
-            by_latents[name] = by_moving(_with(latents, name, value + step), step if step.ndim == 2 else step[:, None])
-        by_angle = by_latents["entry_angle"]
-        by_soil = self._by_soil(soil, active, latents, at, near)
-        by_effects = np.zeros((4, len(self.free), self.n, self.n_wheels))
+        active = varied_at(self.effects, self.free, pulls, self.n_wheels)
+        varied = Latents(**{name: Dual(getattr(latents, name), {name: UNIT}) for name in _LATENTS})  # type: ignore[arg-type]
+        wheels = self._wheels(_varied(soil), active, varied, varied.entry_angle)
+        contact = self._contact(wheels, active, forces_along(wheels.state, wheels.model))
+        load, drawbar, torque, depth = self._told(contact, active, varied)
+        around = self._surroundings(latents)
+        torque = torque + self._late(active, pulls, contact.forces[2], around)
+        pull = self._pull(contact.forces[1].only(int), active, around)
+        at, by_latents, by_soil, by_effects = _gathered(
+            (load, drawbar, torque, depth), len(self.free), (self.n, self.n_wheels)
+        )
+        np.divide(by_soil[:, 1], self.rig.width, out=by_soil[:, 0])  # both act through K_L = k_c/b + k_phi
         pull_by_effects = np.zeros((len(self.free), self.n))
-        for i, (step_of_effect, other, wheels) in others.items():
-            moved = contact if wheels is None else self._contact(wheels, other, near)
-            effect = self._named[self.free[i].effect]
-            if wheels is not None or effect.torque is not None or effect.load is not None:
-                told = self._told(moved, other, latents, self._from_other_instants(other, moved))
-                by_effects[:, i] = (told - at) / step_of_effect
-            if wheels is not None or effect.draft is not None or effect.resistance is not None:
-                pull_by_effects[i] = (self._pull(moved, other) - pull) / step_of_effect
+        for i in range(len(self.free)):
+            pull_by_effects[i] = slope_of(pull, i)
+        by_angle, by_load, by_speed, by_ground = by_latents.swapaxes(0, 1)
         slope, off = by_angle[0], -at[0]
         along = by_angle[1:] / slope  # what a load more turns into, by way of the entry angle
 
@@ -182,85 +183,58 @@ class CompletedProblem(WindowProblem):
         value = at[1:] + along * off
         return Response(
             value=value,
-            by_load=held(by_latents["load"]),
-            by_speed=held(by_latents["speed"]),
-            by_ground=held(by_latents["ground_speed"]),
+            by_load=held(by_load),
+            by_speed=held(by_speed),
+            by_ground=held(by_ground),
             by_soil=held(by_soil),
-            load_by_slip=by_latents["speed"][0] * self.rig.radius * latents.speed**2 / latents.ground_speed[:, None],
+            load_by_slip=by_speed[0] * self.rig.radius * latents.speed**2 / latents.ground_speed[:, None],
             load_by_soil=by_soil[0],
             load_by_effects=by_effects[0],
             load_slope=slope,
             off=off,
             by_effects=held(by_effects),
-            pull=pull,
+            pull=np.asarray(value_of(pull)),
             pull_by_effects=pull_by_effects,
         )
-
-    def _beside(
-        self, soil: Soil, pulls: Array, latents: Latents
-    ) -> dict[int, tuple[float, list[Active], _Wheels | None]]:
-        """For each free parameter a step, the effects after it, and the wheels then, None where they stay."""
-        others = {}
-        for i in np.flatnonzero(self.gain_std[self.n_sensors :] > 0.0).tolist():
-            shifted = pulls.copy()
-            inward = STEP if self.free[i].within(pulls[i] + STEP) else -STEP
-            shifted[i] += inward
-            active, effect = self.active(shifted), self._named[self.free[i].effect]
-            stays = effect.wheel is None and effect.forces is None
-            others[i] = inward, active, None if stays else self._wheels(soil, active, latents, latents.entry_angle)
-        return others
-
-    def _by_soil(self, soil: Soil, active: Sequence[Active], latents: Latents, at: Array, near: Tangent) -> Array:
-        """Derivatives (4, 6, N, W) by k_c, k_phi, n, phi, c, K at held entry angles."""
-        out = np.empty((4, 6, self.n, self.n_wheels))
-        for i, name in enumerate(Soil._fields[1:], 1):
-            step = STEP * max(abs(getattr(soil, name)), 1e-9)
-            changed = soil._replace(**{name: getattr(soil, name) + step})
-            contact = self._contact(self._wheels(changed, active, latents, latents.entry_angle), active, near)
-            told = self._told(contact, active, latents, self._from_other_instants(active, contact))
-            np.divide(told - at, step, out=out[:, i])
-        np.divide(out[:, 1], self.rig.width, out=out[:, 0])  # both act through K_L = k_c/b + k_phi
-        return out
 
     def _wheels(self, soil: Soil, active: Sequence[Active], latents: Latents, angle: Array) -> _Wheels:
         """The wheels at given entry angles."""
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
         K_L = lumped_modulus(soil.k_c, soil.k_phi, self.rig.width)
-        tan_phi = float(np.tan(soil.phi))
-        state = WheelState(angle, slip, self.rig.radius, self.rig.width, K_L, soil.n, tan_phi, soil.c, soil.K)
+        state = WheelState(angle, slip, self.rig.radius, self.rig.width, K_L, soil.n, np.tan(soil.phi), soil.c, soil.K)
         around = self._surroundings(latents)
         return _Wheels(*wheel_with(active, state, self.model, around), around)
 
-    def _contact(self, wheels: _Wheels, active: Sequence[Active], near: Tangent | None = None) -> _Contact:
-        """What happens between wheels and ground; only a small step away from `near`."""
-        state, model, around = wheels
-        forces = wheel_forces(state, model) if near is None else near.at(state, model)
-        return _Contact(reactions_with(active, forces, state, around), _depth(state), around)
+    def _contact(self, wheels: _Wheels, active: Sequence[Active], forces: Forces) -> _Contact:
+        """What happens between wheels and ground, from the integrated forces."""
+        state, _, around = wheels
+        return _Contact(reactions_with(active, forces, state, around), sinkage(state.entry_angle, state.radius), around)
 
-    def _told(self, contact: _Contact, active: Sequence[Active], latents: Latents, late: Array) -> Array:
-        """Load that the soil carries beyond what it must, drawbar pull, torque reading and sinkage (4, N, W).
+    def _excess(self, contact: _Contact, active: Sequence[Active], latents: Latents) -> Any:
+        """Load (N, W) that the soil carries beyond what it must."""
+        excess = contact.forces[0] - latents.load
+        for effect, values in active:
+            if effect.load is not None:
+                excess = excess + effect.load(contact.around, values)
+        return excess
 
-        late (N, W) is what other instants add to the torque readings.  It is taken from a
-        smoothed torque, and not followed through their latents: each instant is solved for by itself.
+    def _told(self, contact: _Contact, active: Sequence[Active], latents: Latents) -> tuple[Any, Any, Any, Any]:
+        """Load that the soil carries beyond what it must, drawbar pull, torque reading and sinkage (N, W).
+
+        Without what other instants add to the torque readings.
         """
-        (load, pull, torque), depth, around = contact
-        wheels = np.empty((4, *load.shape))
-        np.subtract(load, latents.load, out=wheels[0])
+        _, pull, torque = contact.forces
         for effect, values in active:
             if effect.torque is not None and not effect.mixes_instants:
-                torque = effect.torque(torque, around, values)
-            if effect.load is not None:
-                wheels[0] += effect.load(around, values)
-        wheels[1], wheels[3] = pull, depth
-        np.add(torque, late, out=wheels[2])
-        return wheels
+                torque = effect.torque(torque, contact.around, values)
+        return self._excess(contact, active, latents), pull, torque, contact.depth
 
-    def _pull(self, contact: _Contact, active: Sequence[Active]) -> Array:
-        """What the wheels must pull besides what the readings ask for (N,) [N]."""
-        missing, draft = self._unread(active, contact.around, contact.forces[1].sum(axis=1))
-        return np.asarray(missing + draft - self.draft)
+    def _pull(self, pull: Dual, active: Sequence[Active], around: Surroundings) -> Any:
+        """What the wheels, which pull so much (N, W), must pull besides what the readings ask for (N,) [N]."""
+        missing, draft = self._unread(active, around, pull.sum(axis=1))
+        return missing + draft - self.draft
 
-    def _unread(self, active: Sequence[Active], around: Surroundings, pull: Array) -> tuple[Array, Array]:
+    def _unread(self, active: Sequence[Active], around: Surroundings, pull: Any) -> tuple[Any, Any]:
         """Resistances (N,) in no reading, and drafts (N,) without what effects add to theirs.
 
         Both go by the draft and the acceleration that the whole balance tells, not by their
@@ -268,9 +242,9 @@ class CompletedProblem(WindowProblem):
         make a greater draft, and a smaller mass, look better (errors in variables).
         """
 
-        def resistance(around: Surroundings) -> Array:
+        def resistance(around: Surroundings) -> Any:
             told = [effect.resistance(around, values) for effect, values in active if effect.resistance is not None]
-            return np.asarray(sum(told, np.zeros(self.n)))
+            return sum(told, np.zeros(self.n))
 
         draft = true_draft(active, self.draft, around)
         off = self.demand - self.draft + draft + resistance(around) - pull
@@ -280,7 +254,7 @@ class CompletedProblem(WindowProblem):
         if errors:
             true = draft - by_draft * off
             draft = self.draft - sum(error(true, told, values) for error, values in errors)
-        return resistance(told), np.asarray(draft)
+        return resistance(told), draft
 
     @property
     def _shares(self) -> tuple[Array, Array]:
@@ -293,17 +267,31 @@ class CompletedProblem(WindowProblem):
         )
         return by_draft, by_acceleration
 
-    def _from_other_instants(self, active: Sequence[Active], contact: _Contact) -> Array:
-        """What effects that mix instants add to the torque readings (N, W)."""
-        torque, around = contact.forces[2], contact.around
-        late: Array = np.zeros_like(torque)
-        mixing = [(e, v) for e, v in active if e.torque is not None and e.mixes_instants]
+    def _late(self, active: Sequence[Active], pulls: Array, torque: Any, around: Surroundings) -> Any:
+        """What other instants add to the readings of torques (N, W), by the soil and the effects' parameters.
+
+        It is taken from smoothed torques, and not followed through their latents: each instant
+        is solved for by itself.
+        """
+        mixing = [a for a in active if a.effect.torque is not None and a.effect.mixes_instants]
         if not mixing:
-            return late
-        smooth = smoothed(self.t, torque)
+            return 0.0
+        parts = {q: d for q, d in torque.by.items() if q not in _LATENTS}
+        smooth = smoothed(self.t, torque.value)
+        by = {q: smoothed(self.t, np.broadcast_to(d, smooth.shape)) for q, d in parts.items()}
+        late = Dual(np.zeros_like(smooth), {q: np.zeros_like(smooth) for q in by})
         for effect, values in mixing:
-            if effect.torque is not None:
-                late += effect.torque(smooth, around, values) - smooth
+            plain = {name: value_of(value) for name, value in values.items()}
+            added = partial(_added, effect, around)
+            here = added(smooth, plain)
+            late.value += here
+            for q, d in by.items():
+                late.by[q] += added(d, plain)
+            for name, value in values.items():
+                for i, std in value.by.items() if isinstance(value, Dual) else ():
+                    step = STEP if self.free[i].within(pulls[i] + STEP) else -STEP
+                    moved = (added(smooth, {**plain, name: value.value + step * std}) - here) / step
+                    late.by[i] = late.by.get(i, 0.0) + moved
         return late
 
     def _surroundings(self, latents: Latents) -> Surroundings:
@@ -323,11 +311,28 @@ class CompletedProblem(WindowProblem):
         )
 
 
-def _depth(state: WheelState) -> Array:
-    """Sinkage [m] (N, W) of wheels."""
-    return np.broadcast_to(sinkage(state.entry_angle, state.radius), np.shape(state.entry_angle))
+def _gathered(told: Sequence[Any], n_effects: int, shape: tuple[int, int]) -> tuple[Array, Array, Array, Array]:
+    """Values (M, N, W), their derivatives by latents (M, 4, N, W), soil (M, 6, N, W) and parameters (M, P, N, W)."""
+    kinds = (), (len(_LATENTS),), (len(_SOIL),), (n_effects,)
+    at, by_latents, by_soil, by_effects = (np.zeros((len(told), *kind, *shape)) for kind in kinds)
+    for i, one in enumerate(told):
+        at[i] = value_of(one)
+        for quantity, d in one.by.items() if isinstance(one, Dual) else ():
+            if isinstance(quantity, int):
+                by_effects[i, quantity] = d
+            elif quantity in _LATENTS:
+                by_latents[i, _LATENTS.index(quantity)] = d
+            else:
+                by_soil[i, _SOIL.index(quantity)] = d
+    return at, by_latents, by_soil, by_effects
 
 
-def _with(latents: Latents, name: str, value: Array) -> Latents:
-    parts = {n: getattr(latents, n) for n in ("load", "speed", "ground_speed", "entry_angle")}
-    return Latents(**(parts | {name: value}))
+def _added(effect: Effect, around: Surroundings, torque: Array, values: Values) -> Array:
+    """What an effect that mixes instants adds to torques (N, W)."""
+    return np.asarray(effect.torque(torque, around, values) - torque) if effect.torque else np.zeros_like(torque)
+
+
+def _varied(soil: Soil) -> Soil:
+    """A soil of which all but k_c carry derivatives by themselves."""
+    varied = {name: Dual(getattr(soil, name), {name: UNIT}) for name in _SOIL[1:]}
+    return soil._replace(**varied)  # type: ignore[arg-type]

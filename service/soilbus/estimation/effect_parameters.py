@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.terra.dual import Dual
 from soilbus.terra.effects.effect import Active, Effect, Parameter
 
 Array = NDArray[np.float64]
@@ -53,14 +54,34 @@ def active_at(effects: Sequence[Effect], free: Sequence[Free], pulls: Array, n_w
 
     Those of which every parameter is zero and absent there are left out: they would do nothing, at a cost.
     """
-    values: dict[str, dict[str, Any]] = {e.name: {} for e in effects}
-    for f, u in zip(free, pulls.tolist(), strict=True):
-        of_effect = values[f.effect]
-        if f.wheel is None:
-            of_effect[f.parameter.name] = f.at(u)
-        else:
-            of_effect.setdefault(f.parameter.name, np.zeros(n_wheels))[f.wheel] = f.at(u)
+    values = _values(effects, free, [f.at(u) for f, u in zip(free, pulls.tolist(), strict=True)], n_wheels)
     return [Active(e, values[e.name]) for e in effects if not _absent(e, values[e.name])]
+
+
+def varied_at(effects: Sequence[Effect], free: Sequence[Free], pulls: Array, n_wheels: int) -> list[Active]:
+    """The same with values that carry their derivatives by the pulls, each by its place, where these may vary."""
+    numbers = [
+        Dual(f.at(u), {i: f.std}) if f.std > 0.0 else f.at(u)
+        for i, (f, u) in enumerate(zip(free, pulls.tolist(), strict=True))
+    ]
+    values, varied = _values(effects, free, numbers, n_wheels), {f.effect for f in free if f.std > 0.0}
+    return [Active(e, values[e.name]) for e in effects if e.name in varied or not _absent(e, values[e.name])]
+
+
+def _values(
+    effects: Sequence[Effect], free: Sequence[Free], numbers: Sequence[Any], n_wheels: int
+) -> dict[str, dict[str, Any]]:
+    """Parameters by effect and name; of those that every wheel has for itself one for each wheel (W,)."""
+    values: dict[str, dict[str, Any]] = {e.name: {} for e in effects}
+    for f, number in zip(free, numbers, strict=True):
+        of_effect, name = values[f.effect], f.parameter.name
+        if f.wheel is None:
+            of_effect[name] = number
+        else:
+            alone = np.zeros(n_wheels)
+            alone[f.wheel] = 1.0
+            of_effect[name] = of_effect.get(name, 0.0) + alone * number
+    return values
 
 
 def _absent(effect: Effect, values: dict[str, Any]) -> bool:

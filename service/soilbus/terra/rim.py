@@ -9,9 +9,7 @@ are those of Xi et al. 2024.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import cache
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,16 +73,12 @@ def fixed_shares(q: Quadrature) -> tuple[Array, Array]:
     return on_branches(*gauss(q.nodes, q.power), q.peak, q.exit)
 
 
-def split_nodes(splits: Sequence[Array], q: Quadrature) -> tuple[Array, Array]:
-    """Nodes x and weights on 0..1, (M + 2, N) for each panel between places (N,) on 0..1."""
+def split_nodes(split: Array, q: Quadrature, start: Any = 0.0) -> tuple[Array, Array]:
+    """Nodes x and weights from a start to 1, (M + 2, N) for each of the panels before and after a place (N,)."""
     x, xw = gauss(q.nodes + 2, 3)  # shear is steep where it changes sign
     u, w = gauss(q.nodes + 2, 2)  # the branch may start just before the split
-    edges = [*np.sort(np.stack(splits), axis=0), np.ones(np.shape(splits[0]))]
-    widths = [after - before for before, after in pairwise(edges)]
-    return (
-        np.concatenate([edges[0] * x, *(start + width * u for start, width in zip(edges, widths, strict=False))]),
-        np.concatenate([edges[0] * xw, *(width * w for width in widths)]),
-    )
+    before, after = split - start, 1.0 - split
+    return np.concatenate([start + before * x, split + after * u]), np.concatenate([before * xw, after * w])
 
 
 def place_of_turn(theta: Array, slip: Array, peak: Any, q: Quadrature) -> Array:
@@ -128,11 +122,15 @@ def rim_at(theta: Array, share: Array, r_K: Any) -> Rim:
     cos = np.sqrt(1.0 - sin * sin)  # no contact reaches a right angle
     sin1, cos1 = np.sin(theta), np.cos(theta)
     depth = np.maximum(cos[0] - cos1, 1e-300)
-    travel, travel_rate = sin1 - sin, cos1 - cos * share
-    return Rim(
-        sin, cos, depth, (sin1 - sin[0] * share[0]) / depth, r_K * travel, r_K * (theta - angle - travel),
-        r_K * travel_rate, r_K * (1.0 - share - travel_rate),
-    )  # fmt: skip
+    travel, creep = sin1 - sin, np.subtract(theta, angle, out=angle)
+    travel_rate, creep_rate = cos * share, 1.0 - share
+    np.subtract(cos1, travel_rate, out=travel_rate)
+    creep -= travel
+    creep_rate -= travel_rate
+    for lengths in (travel, creep, travel_rate, creep_rate):
+        lengths *= r_K
+    deepening = (sin1 - sin[0] * share[0]) / depth
+    return Rim(sin, cos, depth, deepening, travel, creep, travel_rate, creep_rate)
 
 
 def rim_of_fixed_shares(theta: Array, q: Quadrature, r_K: Any, one_off: bool = False) -> Rim:

@@ -14,7 +14,6 @@ from soilbus.terra.rim import (
     fixed_shares,
     gauss,
     on_branches,
-    place_of_depth,
     place_of_turn,
     rim_at,
     rim_of_fixed_shares,
@@ -50,35 +49,32 @@ class Stress(NamedTuple):
 
 
 def stresses(state: WheelState, model: WheelModel, skid: bool) -> Stress:
+    """Of the soil alone, without its pan."""
     theta, slip, r, _, K_L, n, _, _, K = state
     q = model.quadrature
     if model.exit_angle:
         q = q._replace(exit=model.leave(theta))
-    if skid or model.peak_c2 or model.pan_stiffness or model.exit_angle:
-        peak = np.asarray(model.peak_c1 + model.peak_c2 * slip)
-        splits = [place_of_turn(theta, slip, peak, q)] if skid else []
-        if model.pan_stiffness:
-            splits.append(place_of_depth(theta, model.pan_depth / r, peak))
-        x, w = split_nodes(splits, q) if splits else gauss(q.nodes, q.power)
+    if skid or model.peak_c2 or model.exit_angle:
+        peak = peak_of(model, slip)
+        x, w = gauss(q.nodes, q.power)
+        if skid:
+            x, w = split_nodes(place_of_turn(theta, slip, peak, q), q)
         share, weight = on_branches(x, w, peak, q.exit)
         rim = rim_at(theta, share, r / K)
     else:
         share, weight = fixed_shares.__wrapped__(q) if model.one_off else fixed_shares(q)
         rim = rim_of_fixed_shares(theta, q, r / K, model.one_off)
     log_z = np.log(r * rim.depth)
-    sigma = np.exp(n * log_z + np.log(K_L))  # the rear takes the front's stress (eqs. 5-9)
-    normal = steep = sigma * weight
-    by_sill = None
-    if model.pan_stiffness:
-        below = r * rim.depth > model.pan_depth
-        sill = model.pan_stiffness * K_L * model.pan_depth**n * below * weight
-        steep = normal * (1.0 + model.pan_stiffness * below)
-        normal = steep - sill
-        by_sill = -sill * np.log(max(model.pan_depth, 1e-300))
+    normal = np.exp(n * log_z + np.log(K_L)) * weight  # the rear takes the front's stress (eqs. 5-9)
     j_K = slip * rim.travel
     j_K += rim.creep
-    g, dg = _mobilised(j_K, model)
-    return Stress(rim, q.exit, share, weight, log_z, normal, steep, by_sill, normal * g, weight * g, g, dg, j_K)
+    g, dg = mobilised(j_K, model)
+    return Stress(rim, q.exit, share, weight, log_z, normal, normal, None, normal * g, weight * g, g, dg, j_K)
+
+
+def peak_of(model: WheelModel, slip: Array) -> Array:
+    """Angle of greatest stress over entry angle (N,)."""
+    return np.asarray(model.peak_c1 + model.peak_c2 * slip)
 
 
 def leaving(theta: Array, model: WheelModel) -> Array:
@@ -86,7 +82,7 @@ def leaving(theta: Array, model: WheelModel) -> Array:
     return np.where(model.leave(theta) > -LONGEST, -model.exit_angle / theta**2, 0.0)
 
 
-def _mobilised(j_K: Array, model: WheelModel) -> tuple[Any, Any]:
+def mobilised(j_K: Array, model: WheelModel) -> tuple[Any, Any]:
     """Mobilised share of the shear strength and its derivative by j/K."""
     share, slope = SHEAR_LAWS[model.shear_law](j_K)
     if not model.exponential_share:
@@ -142,7 +138,7 @@ def integrals(fields: Array, n_normal: int, rim: Rim) -> Array:
 
 def by_peak(at: Stress, state: WheelState, model: WheelModel, tau: Array, mobilising: Array) -> Array:
     """Derivatives (3, N) of the integrals by the ratio of the angle of greatest stress to the entry angle."""
-    rim, peak = at.rim, model.peak_c1 + model.peak_c2 * state.slip
+    rim, peak = at.rim, peak_of(model, state.slip)
     turn = state.entry_angle * (1.0 - at.share[0]) / (1.0 - peak)
     spread = np.stack([-1.0 / (1.0 - peak), np.broadcast_to(1.0 / (peak - at.leave), np.shape(peak))])[:, None]
     shallower = state.n * rim.sin[0] * turn / rim.depth
@@ -159,7 +155,7 @@ def by_peak(at: Stress, state: WheelState, model: WheelModel, tau: Array, mobili
 def by_leave(at: Stress, state: WheelState, model: WheelModel, tau: Array, mobilising: Array) -> Array:
     """Derivatives (3, N) of the integrals by the ratio of the exit angle to the entry angle: of the rear branch."""
     sin, cos = at.rim.sin[1], at.rim.cos[1]
-    length = model.peak_c1 + model.peak_c2 * state.slip - at.leave
+    length = peak_of(model, state.slip) - at.leave
     turn = state.entry_angle * (at.leave + length - at.share[1]) / length
     glide = state.radius / state.K * ((1.0 - state.slip) * cos - 1.0)
     normal = -at.normal[1] / length
@@ -173,15 +169,3 @@ def by_exponential_share(at: Stress, state: WheelState, model: WheelModel) -> Ar
     """Derivatives (3, N) of the integrals by the share of the strength that is mobilised exponentially."""
     more = SHEAR_LAWS["exponential"](at.j_K)[0] - SHEAR_LAWS[model.shear_law](at.j_K)[0]
     return integrals(((state.tan_phi * at.normal + state.c * at.weight) * more)[None], 0, at.rim)[:, 0]
-
-
-def by_pan(at: Stress, state: WheelState, model: WheelModel) -> tuple[Array, Array]:
-    """Derivatives (3, N) of the integrals by stiffness and by depth of a pan; nodes lie well for one with stiffness."""
-    below = state.K_L * at.weight * (state.radius * at.rim.depth > model.pan_depth)
-    sill = model.pan_depth**state.n
-    stiffer = below * (np.exp(state.n * at.log_z) - sill)
-    deeper = -model.pan_stiffness * state.n * sill / model.pan_depth * below
-    rubbed = state.tan_phi * at.shear_share
-    fields = np.stack([stiffer, deeper, rubbed * stiffer, rubbed * deeper])
-    added = integrals(fields, 2, at.rim)
-    return added[:, 0] + added[:, 2], added[:, 1] + added[:, 3]

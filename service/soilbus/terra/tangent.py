@@ -1,18 +1,18 @@
-"""How a wheel's forces change with all that effects may change about it, to first order."""
+"""Forces of a wheel together with their derivatives by all that its state and its contact's shape depend on."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import fields, replace
 
 import numpy as np
 
+from soilbus.terra.dual import Dual, value_of
 from soilbus.terra.stress import Array
 from soilbus.terra.wheel import INPUTS, wheel_forces_and_derivatives
 from soilbus.terra.wheel_state import WheelModel, WheelState
 
 _FAINT = 1e-9
-"""Stiffness of a pan that is none, but that parts the nodes as any pan does."""
+"""Stiffness of a pan that is none, but that is integrated as any pan is."""
 _SHAPES = {
     "peak": ("peak_c1", "peak_c2"),
     "leave": ("exit_ratio", "exit_angle"),
@@ -23,39 +23,49 @@ _SHAPES = {
 """Fields of a model on which each of SHAPE depends."""
 
 
-@dataclass(frozen=True, slots=True)
-class Tangent:
-    """Wheels with forces (3, ...) and their derivatives (3, ...) by name: INPUTS, radius and some of SHAPE."""
+def forces_along(state: WheelState, model: WheelModel) -> tuple[Dual, Dual, Dual]:
+    """Load [N], drawbar pull [N] and torque [N m], with derivatives by what fields of the state and the model carry.
 
-    state: WheelState
-    model: WheelModel
-    forces: Array
-    by: dict[str, Array]
+    ValueError where a field carries derivatives that none by the forces are known for.
+    """
+    here = WheelState(*(value_of(a) for a in state))
+    varied = {f.name: value for f in fields(model) if isinstance(value := getattr(model, f.name), Dual)}
+    there = replace(model, **{name: field.value for name, field in varied.items()}) if varied else model
+    shape = {name for name, of in _SHAPES.items() if not varied.keys().isdisjoint(of)}
+    if unknown := varied.keys() - {field for name in shape for field in _SHAPES[name]}:
+        raise ValueError(f"no derivatives by {', '.join(sorted(unknown))}")
+    if isinstance(state.width, Dual):
+        raise ValueError("no derivatives by width")
+    forces, by = _derivatives(here, there, shape, of_radius=isinstance(state.radius, Dual))
+    changes = {name: getattr(state, name) for name in (*INPUTS, "radius")}
+    if "peak" in shape:
+        changes["peak"] = model.peak_c1 + model.peak_c2 * here.slip
+    if "leave" in shape:
+        changes["leave"] = model.leave(here.entry_angle)
+    changes |= {name: field for name, field in varied.items() if name in shape}
+    slopes: dict[object, Array] = {}
+    for name, change in changes.items():
+        for quantity, d in change.by.items() if isinstance(change, Dual) else ():
+            part = by[name] * d
+            slopes[quantity] = slopes[quantity] + part if quantity in slopes else part
+    load, pull, torque = (Dual(forces[i], {q: d[i] for q, d in slopes.items()}) for i in range(3))
+    return load, pull, torque
 
-    def at(self, state: WheelState, model: WheelModel) -> Array:
-        """Forces (3, ...) of wheels as wide that are a small step away.
 
-        KeyError where the model differs in what was not asked for, ValueError in what has no derivative.
-        """
-        forces = self.forces.copy()
-        for name in (*INPUTS, "radius"):
-            _add(forces, self.by[name], getattr(state, name), getattr(self.state, name))
-        if model != self.model:
-            for name, change in _changes(self.model, model, self.state).items():
-                forces += self.by[name] * change
-        return forces
-
-
-def tangent(state: WheelState, model: WheelModel, shape: frozenset[str] = frozenset()) -> Tangent:
-    """Forces with derivatives by INPUTS and these of SHAPE, by the radius and, where there is a pan, by its depth."""
+def _derivatives(
+    state: WheelState, model: WheelModel, shape: set[str], of_radius: bool
+) -> tuple[Array, dict[str, Array]]:
+    """Forces (3, ...) and their derivatives (3, ...) by INPUTS, these of SHAPE and, where asked for, the radius."""
     integrated = model
-    if model.pan_stiffness or "pan_stiffness" in shape:
-        shape |= {"pan_depth"}
-        integrated = model if model.pan_stiffness else replace(model, pan_stiffness=_FAINT)
-    asked = sorted(shape)
-    forces, columns = wheel_forces_and_derivatives(state, integrated, asked)
-    by = {name: columns[:, i] for i, name in enumerate((*INPUTS, *asked))}
-    return Tangent(state, model, forces, by | {"radius": _by_radius(state, model, forces, by)})
+    asked = shape | {"pan_depth"} if of_radius and (model.pan_stiffness or "pan_stiffness" in shape) else shape
+    if "pan_stiffness" in shape and not model.pan_stiffness:
+        integrated = replace(model, pan_stiffness=_FAINT)
+    names = sorted(asked)
+    forces, columns = wheel_forces_and_derivatives(state, integrated, names)
+    by = {name: columns[:, i] for i, name in enumerate((*INPUTS, *names))}
+    if of_radius:
+        by["radius"] = _by_radius(state, model, forces, by)
+    return forces, by
 
 
 def _by_radius(state: WheelState, model: WheelModel, forces: Array, by: dict[str, Array]) -> Array:
@@ -66,31 +76,3 @@ def _by_radius(state: WheelState, model: WheelModel, forces: Array, by: dict[str
     if "pan_depth" in by:
         lengths -= model.pan_depth * by["pan_depth"]
     return np.asarray(lengths / state.radius)
-
-
-def shape_of_change(one: WheelModel, other: WheelModel) -> frozenset[str]:
-    """Which of SHAPE differ between two models; ValueError where something else does."""
-    unlike = {f.name for f in fields(one) if getattr(one, f.name) != getattr(other, f.name)} - {"one_off"}
-    found = frozenset(name for name, of in _SHAPES.items() if unlike & set(of))
-    rest = unlike - {field for name in found for field in _SHAPES[name]}
-    if rest:
-        raise ValueError(f"no derivatives by {', '.join(sorted(rest))}")
-    return found
-
-
-def _changes(one: WheelModel, other: WheelModel, state: WheelState) -> dict[str, Any]:
-    """By how much each of SHAPE changes from one model to another."""
-    out: dict[str, Any] = {}
-    for name in shape_of_change(one, other):
-        if name == "peak":
-            out[name] = other.peak_c1 - one.peak_c1 + (other.peak_c2 - one.peak_c2) * state.slip
-        elif name == "leave":
-            out[name] = other.leave(state.entry_angle) - one.leave(state.entry_angle)
-        else:
-            out[name] = getattr(other, name) - getattr(one, name)
-    return out
-
-
-def _add(forces: Array, by: Array, value: Any, here: Any) -> None:
-    if value is not here and np.any(value != here):
-        forces += by * (value - here)

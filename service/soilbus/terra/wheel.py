@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.terra.pan import by_pan, pan_stresses, reaching
 from soilbus.terra.stress import Array, lumped_modulus
 from soilbus.terra.stresses import (
     Stress,
     by_exponential_share,
     by_leave,
-    by_pan,
     by_peak,
     dot,
     entering,
@@ -101,9 +101,9 @@ def sinkage(entry_angle: Any, radius: Any) -> Any:
 
 
 def in_chunks(
-    integrate: Callable[[WheelState, WheelModel, bool], Array], n_rows: int, state: WheelState, model: WheelModel
+    integrate: Callable[[Stress, WheelState, WheelModel], Array], n_rows: int, state: WheelState, model: WheelModel
 ) -> Array:
-    """(n_rows, ...) of an integrator of samples, which gets the state as rows (N,) or floats, and whether they skid."""
+    """(n_rows, ...) of an integrator of stresses, which gets the state as rows (N,) or floats."""
     shape = np.broadcast(*state).shape
     n_samples = math.prod(shape)
     fields = [np.asarray(a, float) for a in state]
@@ -112,21 +112,30 @@ def in_chunks(
         if a.ndim or i < 2 else float(a)  # entry angle and slip always by sample
         for i, a in enumerate(fields)
     ))  # fmt: skip
-    skid, chunk = rows.slip < 0.0, max(_CHUNK // model.nodes, 1)
+    skid = rows.slip < 0.0
     out = np.empty((n_rows, n_samples))
-    if not skid.any():
-        if n_samples <= chunk:
-            return integrate(rows, model, False).reshape(n_rows, *shape)
-        for i in range(0, n_samples, chunk):
-            run = slice(i, i + chunk)
-            out[:, run] = integrate(_samples(rows, run), model, False)
-        return out.reshape(n_rows, *shape)
-    for skidding in (False, True):  # skidding wheels need split panels
-        members = np.flatnonzero(skid == skidding)
-        for i in range(0, len(members), chunk):
-            index = members[i : i + chunk]
-            out[:, index] = integrate(_samples(rows, index), model, skidding)
+    for run, skidding in _runs(skid, model.nodes):
+        samples = _samples(rows, run)
+        out[:, run] = integrate(stresses(samples, model, skidding), samples, model)
+    if model.pan_stiffness:
+        frictional = rows._replace(c=0.0)
+        for run, skidding in _runs(skid, model.nodes, reaching(rows, model)):
+            samples = _samples(frictional, run)
+            out[:, run] += integrate(pan_stresses(samples, model, skidding), samples, model)
     return out.reshape(n_rows, *shape)
+
+
+def _runs(
+    skid: NDArray[np.bool_], nodes: int, chosen: NDArray[np.bool_] | None = None
+) -> Iterator[tuple[slice | NDArray[np.intp], bool]]:
+    """Samples, chosen ones or all (N,), in chunks, and whether they skid: those that do need split panels."""
+    chunk = max(_CHUNK // nodes, 1)
+    if chosen is None and not skid.any():
+        yield from ((slice(i, i + chunk), False) for i in range(0, len(skid), chunk))
+        return
+    for skidding in (False, True):
+        members = np.flatnonzero(skid == skidding if chosen is None else chosen & (skid == skidding))
+        yield from ((members[i : i + chunk], skidding) for i in range(0, len(members), chunk))
 
 
 def _samples(rows: WheelState, chosen: slice | NDArray[np.intp]) -> WheelState:
@@ -134,9 +143,8 @@ def _samples(rows: WheelState, chosen: slice | NDArray[np.intp]) -> WheelState:
     return WheelState(*(a if isinstance(a, float) else a[chosen] for a in rows))
 
 
-def load_and_slope(state: WheelState, model: WheelModel, skid: bool) -> Array:
+def load_and_slope(at: Stress, state: WheelState, model: WheelModel) -> Array:
     """Load and its derivative by the entry angle (2, N)."""
-    at = stresses(state, model, skid)
     tau, mobilising = sheared(at, state)
     normal, shear = entering(at, state, tau, mobilising)
     sin, cos = at.rim.sin, at.rim.cos
@@ -147,9 +155,8 @@ def load_and_slope(state: WheelState, model: WheelModel, skid: bool) -> Array:
     return np.asarray(np.stack([load, slope]) * (state.radius * state.width * state.entry_angle))
 
 
-def _forces(state: WheelState, model: WheelModel, skid: bool) -> Array:
+def _forces(at: Stress, state: WheelState, model: WheelModel) -> Array:
     """W, DP and T (3, N)."""
-    at = stresses(state, model, skid)
     normal, rubbed, stuck = integrals(np.stack([at.normal, at.rubbed, at.stuck]), 1, at.rim).swapaxes(0, 1)
     return unit_of(state) * _whole(normal, rubbed, stuck, state)
 
@@ -159,9 +166,8 @@ def _whole(by_normal: Array, by_rubbed: Array, by_stuck: Array, state: WheelStat
     return np.asarray(by_normal + (state.tan_phi * by_rubbed + state.c * by_stuck))
 
 
-def _forces_and_jacobian(state: WheelState, model: WheelModel, skid: bool, shape: Sequence[str] = ()) -> Array:
+def _forces_and_jacobian(at: Stress, state: WheelState, model: WheelModel, shape: Sequence[str] = ()) -> Array:
     """W, DP and T and their derivatives by INPUTS and some of SHAPE (3 + 21 + 3 D, N)."""
-    at = stresses(state, model, skid)
     tau, mobilising = sheared(at, state)
     fields = np.empty((9, *at.normal.shape))
     fields[0], fields[3], fields[4] = at.normal, at.rubbed, at.stuck
@@ -203,7 +209,8 @@ def _by_shape(
     at: Stress, state: WheelState, model: WheelModel, tau: Array, mobilising: Array, shape: Sequence[str]
 ) -> Iterator[Array]:
     """Derivatives (3, N) of the integrals by each of these."""
-    pan = by_pan(at, state, model) if {"pan_stiffness", "pan_depth"} & set(shape) else ()
+    own = at.by_sill is not None and {"pan_stiffness", "pan_depth"} & set(shape)  # the soil alone knows of no pan
+    pan = by_pan(at, state, model) if own else (np.zeros((3, 1)),) * 2
     for name in shape:
         if name == "peak":
             yield by_peak(at, state, model, tau, mobilising)
@@ -215,9 +222,8 @@ def _by_shape(
             yield pan[name == "pan_depth"]
 
 
-def _forces_and_slopes(state: WheelState, model: WheelModel, skid: bool) -> Array:
+def _forces_and_slopes(at: Stress, state: WheelState, model: WheelModel) -> Array:
     """W, DP and T and their derivatives by entry angle and slip (3 + 6, N)."""
-    at = stresses(state, model, skid)
     tau, mobilising = sheared(at, state)
     fields = np.empty((5, *at.normal.shape))
     fields[0], fields[2] = at.normal, tau

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.terra.dual import Dual
 from soilbus.terra.effects.effect import Surroundings
 from soilbus.terra.stress import Array
 
@@ -24,20 +25,24 @@ def share_of_way(around: Surroundings) -> Any:
     return np.zeros(np.shape(around.t))
 
 
-def through_knots(share: Any, heights: Sequence[float]) -> Array:
+def through_knots(share: Any, heights: Sequence[Any]) -> Any:
     """The natural cubic spline through heights at equally spaced shares 0..1 of the way, level beyond.
 
     Linear in the heights; twice as near to a smooth profile as straight lines between as many knots.
     """
-    y = np.asarray(heights, float)
-    last = len(y) - 1
-    place = np.clip(np.asarray(share, float), 0.0, 1.0) * last
-    left = np.minimum(np.nan_to_num(place).astype(int), last - 1)
+    return sum(height * of_knot for height, of_knot in zip(heights, _splines(share, len(heights)), strict=True))
+
+
+def _splines(share: Any, knots: int) -> Array:
+    """The splines (knots, ...) that are one at one knot and zero at all others."""
+    place = np.clip(np.asarray(share, float), 0.0, 1.0) * (knots - 1)
+    left = np.minimum(np.nan_to_num(place).astype(int), knots - 2)
     to_left = place - left
     to_right = 1.0 - to_left
-    bend = _bending(len(y)) @ y
-    line = to_right * y[left] + to_left * y[left + 1]
-    return np.asarray(line + (to_right**3 - to_right) * bend[left] + (to_left**3 - to_left) * bend[left + 1])
+    bend = _bending(knots)
+    curved = (to_right**3 - to_right) * bend.T[:, left] + (to_left**3 - to_left) * bend.T[:, left + 1]
+    straight = np.eye(knots)
+    return np.asarray(curved + to_right * straight[:, left] + to_left * straight[:, left + 1])
 
 
 @cache
@@ -51,9 +56,9 @@ def _bending(knots: int) -> Array:
     return np.asarray(np.linalg.solve(system, differences))
 
 
-def instants(values: Any) -> Array:
+def instants(values: Any) -> Any:
     """One value for each instant (N,) of what all wheels share: (N,), (N, 1) or (N, W)."""
-    array: Array = np.asarray(values, float)
+    array = values if isinstance(values, Dual) else np.asarray(values, float)
     return array[:, 0] if array.ndim == 2 else array
 
 

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from soilbus.terra.effects.effect import Effect, Parameter, Surroundings, Values
-from soilbus.terra.stress import Array
+from soilbus.terra.effects.effect import Effect, Forces, Parameter, Surroundings, Values
 from soilbus.terra.wheel import WheelModel, WheelState, sinkage
 
 
@@ -74,12 +73,12 @@ EXPONENTIAL_SHEAR = Effect(
 )
 
 
-def _bulldozing(forces: Array, state: WheelState, around: Surroundings, values: Values) -> Array:
+def _bulldozing(forces: Forces, state: WheelState, around: Surroundings, values: Values) -> Forces:
     """Drawbar pull less b (density z^2 / 2 + cohesive_factor c z + moved v^2 z)."""
     z = sinkage(state.entry_angle, state.radius)
-    moved = values["cohesive_factor"] * state.c + values["moved"] * np.asarray(around.ground_speed) ** 2
+    moved = values["cohesive_factor"] * state.c + values["moved"] * around.ground_speed**2
     ahead = state.width * z * (values["density"] * z / 2.0 + moved)
-    return np.stack([forces[0], forces[1] - ahead, forces[2]])
+    return forces[0], forces[1] - ahead, forces[2]
 
 
 BULLDOZING = Effect(
@@ -108,10 +107,10 @@ def _lugged_soil(
     return state._replace(c=state.c * (1.0 + 2.0 * ratio), tan_phi=state.tan_phi * friction), model
 
 
-def _lugged_arm(forces: Array, state: WheelState, around: Surroundings, values: Values) -> Array:
+def _lugged_arm(forces: Forces, state: WheelState, around: Surroundings, values: Values) -> Forces:
     """Shear acts at the radius r + h share."""
     arm = 1.0 + values["height"] * values["share"] / state.radius
-    return np.stack([forces[0], forces[1], forces[2] * arm])
+    return forces[0], forces[1], forces[2] * arm
 
 
 LUGS = Effect(
@@ -146,12 +145,12 @@ def _substitute_circle(
     return state._replace(radius=circle, slip=slip), model
 
 
-def _flattened_arm(forces: Array, state: WheelState, around: Surroundings, values: Values) -> Array:
+def _flattened_arm(forces: Forces, state: WheelState, around: Surroundings, values: Values) -> Forces:
     """Torque at the arm of the rolling radius, by virtual work, instead of that of the substitute circle."""
     circle, delta = state.radius, _deflection(state, around, values)
     z = sinkage(state.entry_angle, circle)
     nominal = (z * (circle + delta) + delta**2 / 2.0) / (z + delta)  # whose substitute circle it is
-    return np.stack([forces[0], forces[1], forces[2] * (_rolling(nominal, delta) / circle)])
+    return forces[0], forces[1], forces[2] * (_rolling(nominal, delta) / circle)
 
 
 def _deflection(state: WheelState, around: Surroundings, values: Values) -> Any:

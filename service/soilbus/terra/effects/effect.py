@@ -3,8 +3,10 @@
 An effect has parameters, each with a value at which the effect is absent and a prior
 range, and up to five hooks, all pure functions.  `wheel` and `forces` are elementwise, for
 arrays of any shape that broadcast with those of Surroundings; the others work on instants
-(N,) and wheels (N, W).  Effects are off by default and may be combined in any order of the
-catalogue: first every `wheel`, then the integrals, then every `forces`.
+(N,) and wheels (N, W).  Loads, speeds, forces, soil and parameters that they are given may
+be Duals (see terra.dual): they keep to functions that these know.  Effects are off by
+default and may be combined in any order of the catalogue: first every `wheel`, then the
+integrals, then every `forces`.
 """
 
 from __future__ import annotations
@@ -12,6 +14,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from soilbus.terra.stress import Array
 from soilbus.terra.wheel import WheelModel, WheelState, wheel_forces
@@ -21,6 +25,8 @@ DRAFT_ROUNDS = 3
 
 Values = Mapping[str, Any]
 """Parameters of an effect by name: floats, or one for each wheel (W,)."""
+Forces = Sequence[Any] | Array
+"""Load W [N], drawbar pull DP [N] and torque T [N m], three arrays alike."""
 
 
 class Surroundings(NamedTuple):
@@ -64,10 +70,10 @@ class Parameter:
 
 
 WheelHook = Callable[[WheelState, WheelModel, Surroundings, Values], tuple[WheelState, WheelModel]]
-ForcesHook = Callable[[Array, WheelState, Surroundings, Values], Array]
-TorqueHook = Callable[[Array, Surroundings, Values], Array]
-DraftHook = Callable[[Array, Surroundings, Values], Array]
-ErrorHook = Callable[[Surroundings, Values], Array]
+ForcesHook = Callable[[Forces, WheelState, Surroundings, Values], Forces]
+TorqueHook = Callable[[Any, Surroundings, Values], Any]
+DraftHook = Callable[[Any, Surroundings, Values], Any]
+ErrorHook = Callable[[Surroundings, Values], Any]
 
 
 @dataclass(frozen=True)
@@ -85,7 +91,7 @@ class Effect:
     hitch, reading less truth, of true drafts (N,).  load: errors [N] (N, W) of the wheel
     load cells.  resistance: force [N] (N,) that holds the vehicle back and is in no reading.
     base_law: the shear law of models to which the effect can be added, None for any.
-    mixes_instants: `torque` needs other instants than its own.
+    mixes_instants: `torque` needs other instants than its own, adds them up, and is given plain arrays.
     of_record: its parameters describe the ground of one record and mean nothing in another.
     """
 
@@ -131,18 +137,18 @@ def wheel_with(
 def forces_with(active: Sequence[Active], state: WheelState, model: WheelModel, around: Surroundings) -> Array:
     """Load W [N], drawbar pull DP [N] and torque T [N m] of wheels with these effects: array (3, ...)."""
     state, model = wheel_with(active, state, model, around)
-    return reactions_with(active, wheel_forces(state, model), state, around)
+    return np.stack(list(reactions_with(active, wheel_forces(state, model), state, around)))
 
 
-def reactions_with(active: Sequence[Active], forces: Array, state: WheelState, around: Surroundings) -> Array:
-    """The same from the integrated forces (3, ...) of a state that already has these effects."""
+def reactions_with(active: Sequence[Active], forces: Forces, state: WheelState, around: Surroundings) -> Forces:
+    """The same from the integrated forces of a state that already has these effects."""
     for effect, values in active:
         if effect.forces is not None:
             forces = effect.forces(forces, state, around, values)
     return forces
 
 
-def true_draft(active: Sequence[Active], reading: Array, around: Surroundings) -> Array:
+def true_draft(active: Sequence[Active], reading: Any, around: Surroundings) -> Any:
     """Draft [N] (N,) for which the load cell at the hitch, with the errors of these effects, gives the reading (N,)."""
     errors = [(effect.draft, values) for effect, values in active if effect.draft is not None]
     draft = reading

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from soilbus.terra.effects.along import instants, stretches
@@ -13,8 +15,8 @@ _LOAD_CELLS = (
 )
 
 
-def _draft_offset(draft: Array, around: Surroundings, values: Values) -> Array:
-    return np.full(np.shape(draft), float(values["offset"]))
+def _draft_offset(draft: Any, around: Surroundings, values: Values) -> Any:
+    return values["offset"] + np.zeros(np.shape(draft))
 
 
 DRAFT_OFFSET = Effect(
@@ -27,8 +29,8 @@ DRAFT_OFFSET = Effect(
 )
 
 
-def _draft_gain(draft: Array, around: Surroundings, values: Values) -> Array:
-    return np.asarray(values["gain"] * draft)
+def _draft_gain(draft: Any, around: Surroundings, values: Values) -> Any:
+    return values["gain"] * draft
 
 
 DRAFT_GAIN = Effect(
@@ -65,8 +67,8 @@ TORQUE_LAG = Effect(
 )
 
 
-def _wheel_load_offset(around: Surroundings, values: Values) -> Array:
-    return np.asarray(values["offset"] + values["drift"] * np.asarray(around.t) + np.zeros(np.shape(around.load)))
+def _wheel_load_offset(around: Surroundings, values: Values) -> Any:
+    return values["offset"] + values["drift"] * np.asarray(around.t) + np.zeros(np.shape(around.load))
 
 
 WHEEL_LOAD_OFFSET = Effect(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -107,9 +108,9 @@ DRIFT_KNOTS = 7
 """Between the ends of the way: a soft border half way is no longer than two of them are apart."""
 
 
-def _drift_of(name: str, share: np.ndarray, values: Values) -> np.ndarray:
+def _drift_of(name: str, share: np.ndarray, values: Values) -> Any:
     bends = [0.0, *(values[f"{name}_{i + 1}"] for i in range(DRIFT_KNOTS)), 0.0]
-    return np.asarray(values[name] * (np.clip(share, 0.0, 1.0) - 0.5) + through_knots(share, bends))
+    return values[name] * (np.clip(share, 0.0, 1.0) - 0.5) + through_knots(share, bends)
 
 
 def _soil_drift(

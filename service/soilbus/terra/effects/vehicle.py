@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from soilbus.terra.dual import value_of
 from soilbus.terra.effects.along import instants, share_of_way, stretches, through_knots
 from soilbus.terra.effects.effect import Effect, Parameter, Surroundings, Values
-from soilbus.terra.stress import Array
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import WheelModel, WheelState
 
 
-def _drive_line(torque: Array, around: Surroundings, values: Values) -> Array:
+def _drive_line(torque: Any, around: Surroundings, values: Values) -> Any:
     """At the motor: T + (share |T| + drag + viscous |omega|) in the direction of rotation."""
-    speed = np.asarray(around.wheel_speed)
+    speed = around.wheel_speed
     way = np.where(speed < 0.0, -1.0, 1.0)
-    return np.asarray(torque + way * (values["share"] * np.abs(torque) + values["drag"]) + values["viscous"] * speed)
+    return torque + way * (values["share"] * np.abs(torque) + values["drag"]) + values["viscous"] * speed
 
 
 DRIVETRAIN_LOSS = Effect(
@@ -36,11 +38,11 @@ SLOPE_KNOTS = 16
 """One every ten metres of a drive of two minutes: fields undulate over twenty and more."""
 
 
-def _unmeasured_slope(around: Surroundings, values: Values) -> Array:
+def _unmeasured_slope(around: Surroundings, values: Values) -> Any:
     """m g sin of a slope that changes smoothly between knots."""
-    departures = [0.0, *(float(values[f"slope_{i}"]) for i in range(1, SLOPE_KNOTS))]
+    departures = [0.0, *(values[f"slope_{i}"] for i in range(1, SLOPE_KNOTS))]
     slope = values["slope_0"] + through_knots(instants(share_of_way(around)), departures)
-    return np.asarray(around.mass * GRAVITY * np.sin(slope))
+    return around.mass * GRAVITY * np.sin(slope)
 
 
 GRADE = Effect(
@@ -76,20 +78,20 @@ ROLLING_RADIUS = Effect(
 )
 
 
-def _moving_mass(around: Surroundings, values: Values) -> Array:
+def _moving_mass(around: Surroundings, values: Values) -> Any:
     """mass_share m a."""
-    return np.asarray(values["mass_share"] * around.mass * instants(around.acceleration))
+    return values["mass_share"] * around.mass * instants(around.acceleration)
 
 
-def _spinning_wheels(torque: Array, around: Surroundings, values: Values) -> Array:
-    """T + wheel_inertia d omega / dt."""
+def _spinning_wheels(torque: Any, around: Surroundings, values: Values) -> Any:
+    """T + wheel_inertia d omega / dt; the rate is other instants' as much as its own, which hardly counts in it."""
     t = instants(around.t)
-    speed = np.broadcast_to(around.wheel_speed, np.shape(torque))
+    speed = np.broadcast_to(value_of(around.wheel_speed), np.shape(torque))
     rate = np.zeros(speed.shape)
     for run in stretches(t):
         if len(run) >= 3:
             rate[run] = np.gradient(speed[run], t[run], axis=0)
-    return np.asarray(torque + values["wheel_inertia"] * rate)
+    return torque + values["wheel_inertia"] * rate
 
 
 INERTIA = Effect(
