@@ -7,11 +7,10 @@ from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from soilbus.estimation.scene import DEVIATIONS, FALSE_SLIP, Scene
-from soilbus.estimation.series import change, change_variance, median, moving_sum, running_sum, smooth
+from soilbus.estimation.series import change, change_variance, median, moving_sum, neighbours, running_sum, smooth
 from soilbus.estimation.window import pull_given, zero_if_unknown
 from soilbus.terra.vehicle import GRAVITY
 
@@ -84,7 +83,7 @@ def _scales(gained: Array, told: Array, n: int, late: int) -> Array:
     one counts with which they are most alike.
     """
     nothing = np.full(late, np.nan)
-    moved = sliding_window_view(np.concatenate([nothing, told, nothing]), len(told))
+    moved = neighbours(np.concatenate([nothing, told, nothing]), len(told))
     known = np.isfinite(gained) & np.isfinite(moved)
     one, other = np.where(known, gained, 0.0), np.where(known, moved, 0.0)
     both, of_one, of_other, count = np.stack([one * other, one * one, other * other, known]) @ _stretches(len(told), n)
@@ -116,7 +115,7 @@ def _jumps(scene: Scene) -> bool:
     at_once, about = (max(round(span / scene.bin), 1) for span in (AT_ONCE, ABOUT))
     jump = np.abs(change(window.ground_speed, at_once))
     told = np.abs(scene.bin * moving_sum(zero_if_unknown(window.acceleration), at_once))
-    most = sliding_window_view(np.pad(told, about), 2 * about + 1).max(axis=1)
+    most = neighbours(np.pad(told, about), 2 * about + 1).max(axis=1)
     with np.errstate(invalid="ignore"):
         return bool((scene.driving[at_once:] & (jump > JUMP) & (most < UNEXPLAINED * jump)).any())
 

@@ -38,6 +38,14 @@ def moving_sum(values: Array, lag: int) -> Array:
     return running_sum((values[1:] + values[:-1]) / 2.0, lag)
 
 
+def neighbours(values: Array, n: int) -> Array:
+    """Each n neighbours of (N,), (N - n + 1, n).
+
+    Not numpy's view of them: each call leaves a used place in Python's table of strings, which after hours doubles.
+    """
+    return np.asarray(values[np.arange(len(values) - n + 1)[:, None] + np.arange(n)])
+
+
 def median(values: Array) -> float:
     """Median of what is known; nan of nothing."""
     known = values[np.isfinite(values)]
