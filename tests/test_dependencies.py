@@ -60,7 +60,7 @@ def test_the_daemon_imports_no_more_than_it_may() -> None:
     assert foreign <= OF_THE_DAEMON
 
 
-def test_a_service_is_ready_before_what_only_its_worker_needs_is_loaded() -> None:
+def test_what_only_the_worker_needs_is_in_nobody_elses_way() -> None:
     seen: set[str] = set()
     imported("soilbus.daemon.start", seen)
     assert seen.isdisjoint(LOADED_BY_THE_WORKER)

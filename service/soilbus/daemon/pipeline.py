@@ -37,7 +37,7 @@ class Pipeline:
 
     @cached_property
     def estimator(self) -> WindowEstimator:
-        """Loaded and made when it is first asked for: a service listens while its worker does that."""
+        """Made when it is first asked for, by the worker that uses it."""
         return self.new_estimator()
 
     def new_estimator(self) -> WindowEstimator:

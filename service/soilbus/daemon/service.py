@@ -43,11 +43,11 @@ GRACE = 0.2
 """A window that no later frame has closed is closed this long after its end [s]."""
 MAX_DRAIN = 4000
 """Frames taken in one go before the loop looks at its clock again."""
-POLL = 0.02
-"""Longest wait for a frame [s]."""
+POLL, PROMPT = 0.02, 0.003
+"""Longest wait for a frame [s], and while the worker has a window: then its result may come any moment."""
 UNDISTURBED = 0.04
-"""So long [s] at most the loop waits for a window's result and leaves frames with the kernel: the two share one
-interpreter, and each frame taken halts the worker.  The kernel has room for those of 75 ms of a full bus by default."""
+"""So long [s] after the worker got a window frames are left with the kernel: the two share one interpreter, and each
+frame taken halts the worker.  No longer, for the kernel has room for those of 75 ms of a full bus by default."""
 LONGEST_CURVE = 60.0
 """Age [s] up to which a valid window's pull over slip serves to watch for immobilisation."""
 FOREIGN_HOLD = 3.0
@@ -99,6 +99,7 @@ class Service:
         self._interrupted = self._started  # monotonic time at which inputs failed last
         self._epoch = self.intake.epoch
         self._last_frame = -1e9  # monotonic arrival time
+        self._handed_out = -math.inf  # monotonic time at which the worker got a window last
         self._heard_out = self._started  # monotonic time at which no frame was left with the kernel
         self._last_stamp = 0.0  # the bus's own time
         self._next_tick = self._started
@@ -154,8 +155,8 @@ class Service:
     def _receive(self) -> None:
         feed, longest, now = self.intake.admission.feed, POLL, self.clock()
         if self._backlog and self.bus.is_open:
-            self._backlog.wait(min(self._next_tick - now, UNDISTURBED))
-            longest, now = 0.0, self.clock()
+            self._backlog.wait(min(self._next_tick, self._handed_out + UNDISTURBED) - now)
+            longest, now = PROMPT, self.clock()
         for _ in range(MAX_DRAIN):
             if self._backlog.has_result:
                 return
@@ -184,6 +185,7 @@ class Service:
         for task in self.intake.due(max(self._last_stamp, self.bus_time(self._heard_out) - GRACE)):
             ended = now - max(0.0, self.bus_time(now) - task.end)
             self.deadline_misses += self._backlog.add(task, ended, self.intake.epoch, now)
+            self._handed_out = now
 
     def _collect(self, now: float) -> None:
         """Publish the windows that are solved, in their order."""

@@ -58,7 +58,7 @@ def start_service(
     # The loop must get its turn between the estimator's steps, or the socket overflows.
     sys.setswitchinterval(SWITCH_INTERVAL)
     workers = ThreadPoolExecutor(max_workers=1, thread_name_prefix="estimate")
-    workers.submit(_load)
+    _load()
     service = Service(
         config, pipeline, bus, publisher, Notifier.from_environment(), workers, on_window=on_window,
         opened_keeper=partial(_keeper, pipeline, os.environ),
@@ -69,11 +69,14 @@ def start_service(
 
 
 def _load() -> None:
-    """In the worker: what only it needs is loaded there, while the service is ready and listens already."""
+    """What only the worker needs, loaded before the first frame may come.
+
+    Loaded in the worker while the service listens already, it would keep the interpreter for itself for
+    so long that on a slow machine the kernel runs out of room for frames.
+    """
     with loading():
         import soilbus.daemon.estimator
-        import soilbus.daemon.keeper
-        import soilbus.daemon.warm_up  # noqa: F401
+        import soilbus.daemon.keeper  # noqa: F401
 
 
 def _rehearse(config: Config, database: Database, ours: Database) -> None:
