@@ -51,7 +51,7 @@ def test_what_is_written_is_the_model_that_was_fitted(record, tmp_path):
     of_wheels = [
         told["wheel_load_offset"][f"{name}_{w}"] for name in ("offset", "drift") for w in rig_of(config).wheels
     ]
-    expected = [told["draft_offset"]["offset"], *of_wheels]
+    expected = [*told["draft_offset"].values(), *of_wheels]
     np.testing.assert_allclose([(f.value, f.std) for f in free], [(e.value, e.std) for e in expected], rtol=1e-5)
     assert "# soil_drift (" in (tmp_path / "out.toml").read_text()
     assert "is left out" in notes[0]

@@ -114,7 +114,9 @@ def test_runs_end_at_gaps_and_where_time_goes_back():
 def test_the_hitchs_load_cell_has_zero_and_span():
     draft = np.array([-500.0, 0.0, 4000.0])
     offset, gain = CATALOGUE["draft_offset"], CATALOGUE["draft_gain"]
-    assert offset.draft(draft, AROUND, {"offset": 250.0}).tolist() == [250.0, 250.0, 250.0]
+    still, minutes = (AROUND._replace(t=np.array(t)[:, None]) for t in ([0.0, 0.0, 0.0], [0.0, 60.0, 180.0]))
+    assert offset.draft(draft, still, {"offset": 250.0, "drift": 0.5}).tolist() == [250.0, 250.0, 250.0]
+    assert offset.draft(draft, minutes, {"offset": 250.0, "drift": 0.5}).tolist() == [250.0, 280.0, 340.0]
     assert gain.draft(draft, AROUND, {"gain": -0.1}) == pytest.approx([50.0, 0.0, -400.0])
 
 

@@ -13,18 +13,22 @@ from soilbus.terra.stress import Array
 _LOAD_CELLS = (
     "zero and span of load cells: OIML R 60 (2021); draft cells 6.5 to 7.2 % off in the field: Cogent Eng. 2024"
 )
+_WANDERING = "; zero with temperature and in time: OIML R 60 (2021), 5.5 and 5.6"
 
 
 def _draft_offset(draft: Any, around: Surroundings, values: Values) -> Any:
-    return values["offset"] + np.zeros(np.shape(draft))
+    return values["offset"] + values["drift"] * instants(around.t) + np.zeros(np.shape(draft))
 
 
 DRAFT_OFFSET = Effect(
     name="draft_offset",
-    physics="The load cell at the hitch has lost its zero: it adds the same force to every draft.",
-    source=_LOAD_CELLS,
+    physics="The load cell at the hitch has lost its zero: it adds a force, which may wander, to every draft.",
+    source=_LOAD_CELLS + _WANDERING,
     tells="a stretch with the implement lifted: the draft must then read zero",
-    parameters=(Parameter("offset", "N", 0.0, 300.0, -5000.0, 5000.0),),
+    parameters=(
+        Parameter("offset", "N", 0.0, 300.0, -5000.0, 5000.0),
+        Parameter("drift", "N/s", 0.0, 0.5, -30.0, 30.0),
+    ),
     draft=_draft_offset,
 )
 
@@ -74,7 +78,7 @@ def _wheel_load_offset(around: Surroundings, values: Values) -> Any:
 WHEEL_LOAD_OFFSET = Effect(
     name="wheel_load_offset",
     physics="The load cell of a wheel has lost its zero: it adds a force to every load, that may wander as it warms.",
-    source=_LOAD_CELLS + "; zero with temperature and in time: OIML R 60 (2021), 5.5 and 5.6",
+    source=_LOAD_CELLS + _WANDERING,
     tells="weighing the vehicle standing, before and after: the loads must add up to its weight",
     parameters=(
         Parameter("offset", "N", 0.0, 200.0, -3000.0, 3000.0),

@@ -13,7 +13,7 @@ RADIUS = 0.56
 
 
 def for_wheel(effect: Effect, load: float, radius: float) -> Effect:
-    """The effect with parameters [N, N m, m, m/N] as a wheel of this load [N] and radius [m] lets expect them.
+    """The effect with parameters [N, N/s, N m, m, m/N] as a wheel of this load [N] and radius [m] lets expect them.
 
     Load cells are chosen by the load, lugs and the depth that a wheel feels grow with the
     radius, the drag of seals with circumference times arm.  Everything else of an effect is
@@ -21,7 +21,7 @@ def for_wheel(effect: Effect, load: float, radius: float) -> Effect:
     300 N could never be told on a wheel that carries 80 N.
     """
     force, length = load / LOAD, radius / RADIUS
-    of_unit = {"N": force, "N m": length**2, "m": length, "m/N": length / force}
+    of_unit = {"N": force, "N/s": force, "N m": length**2, "m": length, "m/N": length / force}
     return replace(effect, parameters=tuple(_times(p, of_unit.get(p.unit, 1.0)) for p in effect.parameters))
 
 
