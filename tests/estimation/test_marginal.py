@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 
 from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.estimation.belief import Belief
 from soilbus.estimation.bound import cramer_rao
-from soilbus.estimation.gauss_newton import fit_window
-from soilbus.estimation.marginal import UNLIKELY, cold_fit, ridge
+from soilbus.estimation.marginal import cold_fit
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import BinStore
-from soilbus.simulator.monte_carlo import ROUGHLY_KNOWN, SLIP, missed, tasks_of
+from soilbus.simulator.monte_carlo import ROUGHLY_KNOWN, SLIP
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario
@@ -42,22 +40,3 @@ def test_without_noise_a_window_that_tells_k_c_says_the_truth(seed):
     z_ref, b_ref = config.estimator.z_ref, config.estimator.b_ref
     pressure, least = (of.bearing_pressure(z_ref, b_ref) for of in (told, bound))
     assert abs(pressure.value - least.value) < 0.15 * least.std
-
-
-def test_the_ridge_ends_where_neither_density_nor_weight_is_left():
-    # Much k_c fits this window far less well than little, and would be told far better by it.
-    task = tasks_of(reference_configuration(), "wet_clay", 2.0, 141, 7001)[140]
-    config, soil = task.config, SOILS["wet_clay"]
-    rig, drive = rig_of(config), simulate(config, Scenario(2.0, (Patch(0.0, "wet_clay", soil),), slip=SLIP), task.seed)
-    store = BinStore(rig, config.estimator.bin, 0.0)
-    store.add({name: (drive.channels[name].t, drive.channels[name].value) for name in rig.channels})
-    problem = WindowProblem(store.window(0.0, 2.0), rig, model_of(config), config.estimator.min_speed)
-    prior = missed(prior_of(config), soil, np.random.default_rng([task.seed, 1]))
-    before = Belief.of(prior, problem.gain_std)
-    nodes = ridge(problem, prior, before, fit_window(problem, prior)).nodes
-    least, heaviest = min(node.unlikelihood for node in nodes), min(node.lightness for node in nodes)
-    to_much = nodes[0]
-    assert to_much.fit.mode.soil[0] > 10.0 * cold_fit(problem, prior).mode.soil[0]
-    assert to_much.unlikelihood > least + UNLIKELY
-    assert to_much.lightness > heaviest + UNLIKELY
-    assert any(n.unlikelihood > least + UNLIKELY and n.lightness < heaviest + UNLIKELY for n in nodes[1:])

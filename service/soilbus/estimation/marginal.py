@@ -48,7 +48,7 @@ MAX_STEPS = 12
 MAX_TRIES = 3
 """Times that a descent is resumed."""
 UNLIKELY = 9.0
-"""-2 log of a probability, and of a weight, relative to the greatest, where the ridge has ended."""
+"""-2 log of a probability, relative to the greatest, where the ridge has ended."""
 FINE = 400
 """Values of n that are averaged."""
 _SOIL = len(PARAMETERS)
@@ -66,11 +66,6 @@ class Node(NamedTuple):
     def unlikelihood(self) -> float:
         """-2 log of the posterior density of n."""
         return self.fit.evidence + self.known
-
-    @property
-    def lightness(self) -> float:
-        """-2 log of the weight that the mean of k_c gives n: of its density over the variance of log k_c there."""
-        return self.unlikelihood + 2.0 * math.log(self.fit.mode.covariance[_K_C, _K_C])
 
     @property
     def misfit(self) -> float:
@@ -156,16 +151,15 @@ def _along(
 ) -> list[Node]:
     """Nodes to one side; slope (6 + G,) is how logarithms of the soil and gains change with that of n at the top."""
     nodes: list[Node] = []
-    last, least, heaviest = top, top.unlikelihood, top.lightness
+    last, least = top, top.unlikelihood
     for _ in range(MAX_STEPS):
         node = _held(problem, prior, before, last.fit, last.u + way * step, slope)
         if node is None:
             break
         nodes.append(node)
         slope = (_place(node.fit) - _place(last.fit)) / (node.u - last.u)
-        last, step = node, step * GROWTH
-        least, heaviest = min(least, node.unlikelihood), min(heaviest, node.lightness)
-        if node.unlikelihood > least + UNLIKELY and node.lightness > heaviest + UNLIKELY:
+        last, least, step = node, min(least, node.unlikelihood), step * GROWTH
+        if node.unlikelihood > least + UNLIKELY:
             break
     return nodes
 
