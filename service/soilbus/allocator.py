@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 _C = ctypes.CDLL(None)
-SMALL, KEPT = 1024, 7
-"""Bytes of the blocks that numpy keeps, and how many of each size (its NBUCKETS and NCACHE)."""
 _C.malloc.restype, _C.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]
 _C.free.restype, _C.free.argtypes = None, [ctypes.c_void_p]
+SMALL, OF_EACH = 1024, 7
+"""Bytes from which numpy keeps no freed blocks, and how many it keeps of each size below (NBUCKETS, NCACHE)."""
 _BLOCK = 100_000
 """Bytes of a block as an evaluation takes it, of the columns of one window."""
 
@@ -44,12 +44,12 @@ def give_back_freed_memory(keep: int = 0) -> None:
 def take_small_blocks() -> None:
     """Let numpy have now all the small blocks that it will ever keep: 3.5 MB.
 
-    Of each size below a kilobyte it keeps as many freed ones as KEPT, for good.  Taken one by one, as arrays of
+    Of each size below a kilobyte it keeps as many freed ones as OF_EACH, for good.  Taken one by one, as arrays of
     one size after another come by, they would make the process grow for a day, and lie scattered between other blocks.
     """
     import numpy as np
 
-    blocks = [np.empty(size, np.uint8) for size in range(1, SMALL) for _ in range(KEPT)]
+    blocks = [np.empty(size, np.uint8) for size in range(1, SMALL) for _ in range(OF_EACH)]
     del blocks
 
 
