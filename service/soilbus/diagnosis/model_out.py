@@ -14,7 +14,7 @@ def effect_tables(completion: Completion) -> tuple[list[dict[str, Any]], list[st
     """A table for each effect, {name, parameter = {value, std}}, and notes on those left out.
 
     A parameter that every wheel has for itself is a table by wheel.  Left out is what
-    describes the ground of the recording only: it means nothing on other ground.
+    describes the recording only: its ground, how a zero wandered in it.
     """
     tables: list[dict[str, Any]] = []
     notes: list[str] = []
@@ -22,14 +22,15 @@ def effect_tables(completion: Completion) -> tuple[list[dict[str, Any]], list[st
     wheels = completion.checks[-1].problem.rig.wheels
     for effect in completion.effects:
         found = {name: _told(estimate) for name, estimate in values[effect.name].items()}
-        if effect.of_record:
-            told = ", ".join(f"{name} = {value['value']:g}" for name, value in found.items())
-            notes.append(f"{effect.name} ({told}) describes the ground of the recording only and is left out")
-        elif effect.each_wheel:
-            by_wheel = {p.name: {w: found[f"{p.name}_{w}"] for w in wheels} for p in effect.parameters}
-            tables.append({"name": effect.name, **by_wheel})
-        else:
-            tables.append({"name": effect.name, **found})
+        kept = [p for p in effect.parameters if not (effect.of_record or p.of_record)]
+        names = {p: [f"{p.name}_{w}" for w in wheels] if effect.each_wheel else [p.name] for p in effect.parameters}
+        gone = ", ".join(f"{n} = {found[n]['value']:g}" for p in effect.parameters if p not in kept for n in names[p])
+        if gone:
+            notes.append(f"{effect.name} ({gone}) describes the recording only and is left out")
+        if effect.each_wheel:
+            tables.append({"name": effect.name} | {p.name: {w: found[f"{p.name}_{w}"] for w in wheels} for p in kept})
+        elif kept:
+            tables.append({"name": effect.name} | {p.name: found[p.name] for p in kept})
     return tables, notes
 
 

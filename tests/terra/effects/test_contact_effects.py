@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
 from adaptive import adaptive_forces, exponential, rational
 from soilbus.terra.effects.catalogue import CATALOGUE
@@ -120,7 +121,7 @@ def test_a_soft_tyre_touches_where_its_undeformed_circle_enters_the_soil():
     effect = CATALOGUE["tyre_deflection"]
     state = state_on(soil_named("loam"), 0.35, 0.15, 0.5, 0.3)
     around, compliance = one_wheel(AROUND, load=8e3), 4e-6
-    changed, _ = wheel_with([Active(effect, {"compliance": compliance})], state, MODEL, around)
+    changed, _ = wheel_with([Active(effect, {"compliance": compliance, "behind": 0.0})], state, MODEL, around)
     delta = 0.032
     z, half_chord = sinkage(0.35, changed.radius), changed.radius * math.sin(0.35)
     hub_above_surface = 0.5 - delta - z
@@ -134,7 +135,7 @@ def test_a_soft_tyre_touches_where_its_undeformed_circle_enters_the_soil():
 def test_a_soft_tyres_torque_acts_at_its_rolling_radius():
     state = state_on(soil_named("loam"), 0.35, 0.15, 0.5, 0.3)
     around, delta = one_wheel(AROUND, load=8e3), 0.032
-    effect = Active(CATALOGUE["tyre_deflection"], {"compliance": delta / 8e3})
+    effect = Active(CATALOGUE["tyre_deflection"], {"compliance": delta / 8e3, "behind": 0.0})
     changed, model = wheel_with([effect], state, MODEL, around)
     rigid = adaptive_forces(changed, model)
     W, DP, T = forces_with([effect], state, MODEL, around)
@@ -142,15 +143,44 @@ def test_a_soft_tyres_torque_acts_at_its_rolling_radius():
     assert pytest.approx(rigid[2] / changed.radius * (0.5 - delta / 3.0), rel=1e-6) == T
 
 
+@pytest.mark.parametrize("slip", [0.15, -0.3])
+def test_the_flat_behind_the_axle_is_a_plate_that_has_slipped(slip):
+    """A plate of half the flat's length under the pressure of its depth, in the shear of its front edge.
+
+    The displacement there is integrated along the rim; a chord is shorter by a centimetre's share.
+    """
+    state = state_on(soil_named("loam"), 0.35, slip, 0.5, 0.3)
+    around, delta, share = one_wheel(AROUND, load=8e3), 0.032, 0.7
+    with_flat, without = (
+        forces_with(
+            [Active(CATALOGUE["tyre_deflection"], {"compliance": delta / 8e3, "behind": behind})], state, MODEL, around
+        )
+        for behind in (share, 0.0)
+    )
+    circle, slip = wheel_with(
+        [Active(CATALOGUE["tyre_deflection"], {"compliance": delta / 8e3, "behind": share})], state, MODEL, around
+    )[0][2::-1][:2]
+    z = circle * (1.0 - math.cos(0.35))
+    pressure = state.K_L * z**state.n
+    area = 0.3 * share * math.sqrt(0.5**2 - (0.5 - delta) ** 2)
+    j, _ = quad(lambda theta: circle * (1.0 - (1.0 - slip) * math.cos(theta)), 0.0, 0.35)
+    shear = (state.c + pressure * state.tan_phi) * math.copysign(-math.expm1(-abs(j) / state.K), j)
+    added = with_flat - without
+    chord = added[0] / (area * pressure)
+    assert 0.9 < chord < 1.0
+    assert added[1] == pytest.approx(chord * area * shear, rel=1e-9)
+    assert added[2] == pytest.approx(chord * area * shear * (0.5 - delta / 3.0), rel=1e-9)
+
+
 def test_a_stiff_tyre_is_a_rigid_wheel_and_a_softer_one_sinks_less():
     state, around = wheels_around("loam", seed=6, slip=(0.02, 0.6))
     effect = CATALOGUE["tyre_deflection"]
 
     def forces(compliance: float) -> np.ndarray:
-        return forces_with([Active(effect, {"compliance": compliance})], state, MODEL, around)
+        return forces_with([Active(effect, {"compliance": compliance, "behind": 0.5})], state, MODEL, around)
 
     rigid = wheel_forces(state, MODEL)
-    small, smaller = (np.max(np.abs(forces(x) - rigid)) for x in (1e-9, 1e-10))
+    small, smaller = (np.max(np.abs(forces(x) - rigid)) for x in (1e-10, 1e-11))
     assert smaller == pytest.approx(small / 10.0, rel=0.01)  # linear in the limit
     assert np.all(forces(3e-6)[0] > rigid[0])
 
@@ -159,7 +189,10 @@ def test_a_deflection_stops_where_the_rim_strikes_through():
     state, around = wheels_around("loam", seed=6)
     at_limit, beyond = (
         wheel_with(
-            [Active(CATALOGUE["tyre_deflection"], {"compliance": 2e-5})], state, MODEL, around._replace(load=load)
+            [Active(CATALOGUE["tyre_deflection"], {"compliance": 2e-5, "behind": 0.0})],
+            state,
+            MODEL,
+            around._replace(load=load),
         )
         for load in (0.3 * WIDTH / 2e-5, 9e4)
     )

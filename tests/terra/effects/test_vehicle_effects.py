@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
 from soilbus.terra.effects.along import stretches
@@ -114,10 +115,23 @@ def test_runs_end_at_gaps_and_where_time_goes_back():
 def test_the_hitchs_load_cell_has_zero_and_span():
     draft = np.array([-500.0, 0.0, 4000.0])
     offset, gain = CATALOGUE["draft_offset"], CATALOGUE["draft_gain"]
-    still, minutes = (AROUND._replace(t=np.array(t)[:, None]) for t in ([0.0, 0.0, 0.0], [0.0, 60.0, 180.0]))
-    assert offset.draft(draft, still, {"offset": 250.0, "drift": 0.5}).tolist() == [250.0, 250.0, 250.0]
-    assert offset.draft(draft, minutes, {"offset": 250.0, "drift": 0.5}).tolist() == [250.0, 280.0, 340.0]
+    values = {"offset": 250.0, "drift": 0.0, "settling": 0.01}
+    assert offset.draft(draft, AROUND._replace(t=np.zeros((3, 1))), values).tolist() == [250.0, 250.0, 250.0]
     assert gain.draft(draft, AROUND, {"gain": -0.1}) == pytest.approx([50.0, 0.0, -400.0])
+
+
+@pytest.mark.parametrize("settling", [5e-4, 0.01, 0.2])
+def test_a_zero_at_the_hitch_settles_as_what_warms_up(settling):
+    """Newton's law: the rate fades at `settling`; integrated step by step, to the zero at the end of the record."""
+    t = np.array([0.0, 60.0, 180.0])
+    around = AROUND._replace(t=t[:, None], duration=180.0)
+    error = CATALOGUE["draft_offset"].draft(np.zeros(3), around, {"offset": 250.0, "drift": 0.5, "settling": settling})
+    found = solve_ivp(
+        lambda _, zero_and_rate: (zero_and_rate[1], -settling * zero_and_rate[1]), (0.0, 180.0), (error[0], 0.5),
+        t_eval=t, rtol=1e-10, atol=1e-9,
+    )  # fmt: skip
+    assert error == pytest.approx(found.y[0], rel=1e-7)
+    assert error[-1] == 250.0
 
 
 def test_each_wheels_load_cell_has_its_own_zero():
@@ -129,10 +143,10 @@ def test_each_wheels_load_cell_has_its_own_zero():
     assert [e.name for e in CATALOGUE.values() if e.each_wheel] == ["wheel_load_offset"]
 
 
-def test_a_wheels_zero_wanders_from_the_start_of_the_record():
+def test_a_wheels_zero_wanders_until_the_end_of_the_record():
     drift = np.array([0.0, 2.0, -0.5, 0.0])
     values = {"offset": np.array([100.0, 0.0, 0.0, 50.0]), "drift": drift}
-    around = AROUND._replace(t=np.array([[0.0], [10.0], [60.0]]), load=np.zeros((3, 4)))
+    around = AROUND._replace(t=np.array([[0.0], [10.0], [60.0]]), load=np.zeros((3, 4)), duration=60.0)
     error = CATALOGUE["wheel_load_offset"].load(around, values)
-    assert error[0].tolist() == [100.0, 0.0, 0.0, 50.0]
+    assert error[-1].tolist() == [100.0, 0.0, 0.0, 50.0]
     assert np.diff(error[:, 1:3], axis=0).tolist() == [[20.0, -5.0], [100.0, -25.0]]

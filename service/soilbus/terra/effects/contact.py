@@ -127,6 +127,7 @@ LUGS = Effect(
     forces=_lugged_arm,
 )
 
+_EVENLY = 0.01  # m
 _MOST_DEFLECTION = 0.3  # of the width; then the rim strikes through
 
 
@@ -145,12 +146,31 @@ def _substitute_circle(
     return state._replace(radius=circle, slip=slip), model
 
 
-def _flattened_arm(forces: Forces, state: WheelState, around: Surroundings, values: Values) -> Forces:
-    """Torque at the arm of the rolling radius, by virtual work, instead of that of the substitute circle."""
+def _flattened_forces(forces: Forces, state: WheelState, around: Surroundings, values: Values) -> Forces:
+    """What the flat behind the axle adds; torque at the arm of the rolling radius, by virtual work.
+
+    The substitute circle ends at the axle.  Behind it, a share of the flat's half length
+    carries the pressure of the deepest point and has slipped as far as the soil there.
+    """
     circle, delta = state.radius, _deflection(state, around, values)
     z = sinkage(state.entry_angle, circle)
     nominal = (z * (circle + delta) + delta**2 / 2.0) / (z + delta)  # whose substitute circle it is
-    return forces[0], forces[1], forces[2] * (_rolling(nominal, delta) / circle)
+    area = state.width * values["behind"] * _half_flat(nominal, delta)
+    pressure = state.K_L * z**state.n
+    j_K = circle / state.K * (state.entry_angle - (1.0 - state.slip) * np.sin(state.entry_angle))
+    mobilised = np.exp(-np.maximum(-j_K, 0.0)) - np.exp(-np.maximum(j_K, 0.0))  # backwards where the wheel skids
+    sheared = (state.c + pressure * state.tan_phi) * mobilised
+    arm = _rolling(nominal, delta)
+    return (
+        forces[0] + area * pressure,
+        forces[1] + area * sheared,
+        (forces[2] / circle + area * sheared) * arm,
+    )
+
+
+def _half_flat(radius: Any, deflection: Any) -> Any:
+    """Half the length [m] of the flat, a chord; short of a centimetre it grows evenly with the deflection."""
+    return np.sqrt(2.0 * radius * deflection + _EVENLY**2) - _EVENLY
 
 
 def _deflection(state: WheelState, around: Surroundings, values: Values) -> Any:
@@ -165,9 +185,13 @@ TYRE_DEFLECTION = Effect(
     name="tyre_deflection",
     physics="The tyre flattens under load: it touches the ground like a greater wheel, and rolls like a smaller one.",
     source="substitute circle: Bekker 1969; Schmid 1995 (J. Terramechanics 32:3); Harnisch et al. 2005 (Vehicle System"
-    " Dynamics 43 suppl.:384); rolling radius less a third of the deflection: Wong 2008, ch. 1",
+    " Dynamics 43 suppl.:384); rolling radius less a third of the deflection: Wong 2008, ch. 1; flat of the half"
+    " length sqrt(2 r delta) on both sides of the axle: ch. 2; even pressure: Fujimoto 1977 (J. Terramechanics 14:191)",
     tells="firm ground at several loads (the rolling radius shrinks), a sinkage sensor, another tyre pressure",
-    parameters=(Parameter("compliance", "m/N", 0.0, 4e-6, 0.0, 2e-5),),
+    parameters=(
+        Parameter("compliance", "m/N", 0.0, 4e-6, 0.0, 2e-5, starts=(2e-6,)),
+        Parameter("behind", "1", 0.0, 0.5, 0.0, 1.0),
+    ),
     wheel=_substitute_circle,
-    forces=_flattened_arm,
+    forces=_flattened_forces,
 )

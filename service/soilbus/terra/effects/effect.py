@@ -58,6 +58,7 @@ class Parameter:
 
     `starts`: further values that a search does well to begin at, where the sensitivity at
     `neutral` alone may be blind (the depth of a pan below all sinkages of a record).
+    `of_record`: it describes one record and means nothing in another.
     """
 
     name: str
@@ -67,6 +68,7 @@ class Parameter:
     low: float
     high: float
     starts: tuple[float, ...] = ()
+    of_record: bool = False
 
 
 WheelHook = Callable[[WheelState, WheelModel, Surroundings, Values], tuple[WheelState, WheelModel]]

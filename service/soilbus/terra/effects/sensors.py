@@ -17,7 +17,10 @@ _WANDERING = "; zero with temperature and in time: OIML R 60 (2021), 5.5 and 5.6
 
 
 def _draft_offset(draft: Any, around: Surroundings, values: Values) -> Any:
-    return values["offset"] + values["drift"] * instants(around.t) + np.zeros(np.shape(draft))
+    """Towards the zero at the end of the record, at a rate that starts as `drift` and fades by `settling`."""
+    rate, t = values["settling"], instants(around.t)
+    to_go = (np.exp(-rate * around.duration) - np.exp(-rate * t)) / rate
+    return values["offset"] + values["drift"] * to_go + np.zeros(np.shape(draft))
 
 
 DRAFT_OFFSET = Effect(
@@ -27,7 +30,8 @@ DRAFT_OFFSET = Effect(
     tells="a stretch with the implement lifted: the draft must then read zero",
     parameters=(
         Parameter("offset", "N", 0.0, 300.0, -5000.0, 5000.0),
-        Parameter("drift", "N/s", 0.0, 0.5, -30.0, 30.0),
+        Parameter("drift", "N/s", 0.0, 0.5, -30.0, 30.0, of_record=True),
+        Parameter("settling", "1/s", 0.01, 0.02, 5e-4, 0.2, of_record=True),
     ),
     draft=_draft_offset,
 )
@@ -72,7 +76,9 @@ TORQUE_LAG = Effect(
 
 
 def _wheel_load_offset(around: Surroundings, values: Values) -> Any:
-    return values["offset"] + values["drift"] * np.asarray(around.t) + np.zeros(np.shape(around.load))
+    """Towards the zero at the end of the record."""
+    to_go = np.asarray(around.t) - around.duration
+    return values["offset"] + values["drift"] * to_go + np.zeros(np.shape(around.load))
 
 
 WHEEL_LOAD_OFFSET = Effect(
@@ -82,7 +88,7 @@ WHEEL_LOAD_OFFSET = Effect(
     tells="weighing the vehicle standing, before and after: the loads must add up to its weight",
     parameters=(
         Parameter("offset", "N", 0.0, 200.0, -3000.0, 3000.0),
-        Parameter("drift", "N/s", 0.0, 0.5, -30.0, 30.0),
+        Parameter("drift", "N/s", 0.0, 0.5, -30.0, 30.0, of_record=True),
     ),
     each_wheel=True,
     load=_wheel_load_offset,
