@@ -38,7 +38,8 @@ def adaptive_forces(
     strength at j/K >= 0, for the shear law.
     """
     theta1, slip, r, b, K_L, n, tan_phi, c, K = (float(v) for v in state)
-    theta_m = (model.peak_c1 + model.peak_c2 * slip) * theta1  # eq. 4
+    ahead = model.peak_c1 + model.peak_c2 * slip / (1.0 + model.peak_bend * abs(slip))  # eq. 4 without a bend
+    theta_m = min(max(ahead, 0.05), 0.8) * theta1
     theta2 = max(model.exit_ratio * theta1 + model.exit_angle, -LONGEST * theta1)
     share = mobilised or (exponential if model.shear_law == "exponential" else rational)
 

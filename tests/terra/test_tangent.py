@@ -40,6 +40,8 @@ def by_difference(change, step):
         (PLAIN, "peak_c1", 1e-5),
         (PLAIN, "peak_c2", 1e-5),
         (replace(PLAIN, peak_c1=0.4, peak_c2=0.2), "peak_c2", 1e-5),
+        (replace(PLAIN, peak_c1=0.3, peak_c2=1.2, peak_bend=4.0), "peak_c2", 1e-5),
+        (replace(PLAIN, peak_c1=0.3, peak_c2=1.2, peak_bend=4.0), "peak_bend", 1e-4),
         (PLAIN, "exit_ratio", 1e-5),
         (PLAIN, "exit_angle", 1e-5),
         (REBOUNDING, "exit_angle", 1e-5),

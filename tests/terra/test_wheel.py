@@ -56,6 +56,7 @@ MODELS = {
     "exponential": WheelModel(),
     "rational": WheelModel(shear_law="rational"),
     "peak shift": WheelModel(peak_c1=0.35, peak_c2=0.3),
+    "peak that levels off": WheelModel(peak_c1=0.3, peak_c2=1.2, peak_bend=4.0),
     "rut recovery": WheelModel(exit_ratio=-0.4),
     "everything": WheelModel("rational", 0.25, 0.35, -0.25),
     "exit angle": WheelModel("rational", 0.4, 0.2, -0.1, exit_angle=-0.1),
@@ -90,6 +91,11 @@ def error(state: WheelState, model: WheelModel, nodes: int) -> np.ndarray:
         size = np.array([true[0], true[0], true[0] * part.radius if part.slip < 0.0 else true[2]])
         worst = np.maximum(worst, np.abs(ours[:, i] - true) / size)
     return worst
+
+
+@pytest.mark.parametrize("state", SITUATIONS.values(), ids=SITUATIONS)
+def test_a_peak_of_stress_goes_no_farther_than_it_may(state):
+    assert np.all(error(state, WheelModel(peak_c1=0.3, peak_c2=5.0), EXACT_NODES) < 2e-6)
 
 
 @pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
@@ -327,11 +333,10 @@ def test_good_loads_among_bad_ones():
     assert found[np.isfinite(found)] == pytest.approx(alone, rel=1e-12)
 
 
-@pytest.mark.parametrize("peak_c2", [0.0, 0.3])
-def test_slopes_are_the_first_columns_of_the_derivatives(peak_c2):
+@pytest.mark.parametrize("model", [WheelModel(), WheelModel(peak_c2=0.3), MODELS["peak that levels off"]])
+def test_slopes_are_the_first_columns_of_the_derivatives(model):
     slip = np.linspace(-0.2, 0.6, 9)  # skid and drive
     state = state_on(SOILS["wet_clay"], np.linspace(0.2, 0.6, 9), slip, 0.5, 0.3)
-    model = WheelModel(peak_c2=peak_c2)
     forces, jacobian = wheel_forces_and_derivatives(state, model)
     same, slopes = wheel_forces_and_slopes(state, model)
     assert same == pytest.approx(forces, rel=1e-12)

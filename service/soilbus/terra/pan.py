@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from soilbus.terra.rim import gauss, on_branches, place_of_depth, place_of_turn, rim_at, split_nodes
 from soilbus.terra.stress import Array
-from soilbus.terra.stresses import Stress, integrals, mobilised, peak_of
+from soilbus.terra.stresses import Stress, integrals, mobilised
 from soilbus.terra.wheel_state import WheelModel, WheelState
 
 POWER, FEWER = 2, 2
@@ -28,7 +28,7 @@ def reaching(state: WheelState, model: WheelModel) -> NDArray[np.bool_]:
 def pan_stresses(state: WheelState, model: WheelModel, skid: bool) -> Stress:
     """What the pan adds under wheels that reach it; cohesion is to be left out of the state."""
     theta, slip, r, _, K_L, n, _, _, K = state
-    q, peak, start = model.quadrature._replace(exit=model.leave(theta)), peak_of(model, slip), _start(state, model)
+    q, peak, start = model.quadrature._replace(exit=model.leave(theta)), model.peak(slip), _start(state, model)
     if skid:
         x, w = split_nodes(np.maximum(place_of_turn(theta, slip, peak, q), start), q, start)
     else:
@@ -60,4 +60,4 @@ def by_pan(at: Stress, state: WheelState, model: WheelModel) -> tuple[Array, Arr
 
 def _start(state: WheelState, model: WheelModel) -> Array:
     """Where on 0..1 (N,) the rim reaches the pan; 1 where it does not."""
-    return place_of_depth(state.entry_angle, model.pan_depth / state.radius, peak_of(model, state.slip))
+    return place_of_depth(state.entry_angle, model.pan_depth / state.radius, model.peak(state.slip))

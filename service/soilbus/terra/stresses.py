@@ -20,7 +20,7 @@ from soilbus.terra.rim import (
     split_nodes,
 )
 from soilbus.terra.stress import SHEAR_LAWS, Array
-from soilbus.terra.wheel_state import LONGEST, WheelModel, WheelState
+from soilbus.terra.wheel_state import LONGEST, PEAK, WheelModel, WheelState
 
 
 class Stress(NamedTuple):
@@ -55,7 +55,7 @@ def stresses(state: WheelState, model: WheelModel, skid: bool) -> Stress:
     if model.exit_angle:
         q = q._replace(exit=model.leave(theta))
     if skid or model.peak_c2 or model.exit_angle:
-        peak = peak_of(model, slip)
+        peak = model.peak(slip)
         x, w = gauss(q.nodes, q.power)
         if skid:
             x, w = split_nodes(place_of_turn(theta, slip, peak, q), q)
@@ -72,9 +72,11 @@ def stresses(state: WheelState, model: WheelModel, skid: bool) -> Stress:
     return Stress(rim, q.exit, share, weight, log_z, normal, normal, None, normal * g, weight * g, g, dg, j_K)
 
 
-def peak_of(model: WheelModel, slip: Array) -> Array:
-    """Angle of greatest stress over entry angle (N,)."""
-    return np.asarray(model.peak_c1 + model.peak_c2 * slip)
+def peaking(slip: Array, model: WheelModel) -> Array:
+    """Derivative (N,) by the slip of the angle of greatest stress over the entry angle."""
+    share = model.peak(slip)
+    slope = model.peak_c2 / (1.0 + model.peak_bend * np.abs(slip)) ** 2
+    return np.where((share > PEAK[0]) & (share < PEAK[1]), slope, 0.0)
 
 
 def leaving(theta: Array, model: WheelModel) -> Array:
@@ -138,7 +140,7 @@ def integrals(fields: Array, n_normal: int, rim: Rim) -> Array:
 
 def by_peak(at: Stress, state: WheelState, model: WheelModel, tau: Array, mobilising: Array) -> Array:
     """Derivatives (3, N) of the integrals by the ratio of the angle of greatest stress to the entry angle."""
-    rim, peak = at.rim, peak_of(model, state.slip)
+    rim, peak = at.rim, model.peak(state.slip)
     turn = state.entry_angle * (1.0 - at.share[0]) / (1.0 - peak)
     spread = np.stack([-1.0 / (1.0 - peak), np.broadcast_to(1.0 / (peak - at.leave), np.shape(peak))])[:, None]
     shallower = state.n * rim.sin[0] * turn / rim.depth
@@ -155,7 +157,7 @@ def by_peak(at: Stress, state: WheelState, model: WheelModel, tau: Array, mobili
 def by_leave(at: Stress, state: WheelState, model: WheelModel, tau: Array, mobilising: Array) -> Array:
     """Derivatives (3, N) of the integrals by the ratio of the exit angle to the entry angle: of the rear branch."""
     sin, cos = at.rim.sin[1], at.rim.cos[1]
-    length = peak_of(model, state.slip) - at.leave
+    length = model.peak(state.slip) - at.leave
     turn = state.entry_angle * (at.leave + length - at.share[1]) / length
     glide = state.radius / state.K * ((1.0 - state.slip) * cos - 1.0)
     normal = -at.normal[1] / length

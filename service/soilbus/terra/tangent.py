@@ -14,7 +14,7 @@ from soilbus.terra.wheel_state import WheelModel, WheelState
 _FAINT = 1e-9
 """Stiffness of a pan that is none, but that is integrated as any pan is."""
 _SHAPES = {
-    "peak": ("peak_c1", "peak_c2"),
+    "peak": ("peak_c1", "peak_c2", "peak_bend"),
     "leave": ("exit_ratio", "exit_angle"),
     "exponential_share": ("exponential_share",),
     "pan_stiffness": ("pan_stiffness",),
@@ -39,7 +39,7 @@ def forces_along(state: WheelState, model: WheelModel) -> tuple[Dual, Dual, Dual
     forces, by = _derivatives(here, there, shape, of_radius=isinstance(state.radius, Dual))
     changes = {name: getattr(state, name) for name in (*INPUTS, "radius")}
     if "peak" in shape:
-        changes["peak"] = model.peak_c1 + model.peak_c2 * here.slip
+        changes["peak"] = model.peak(here.slip)
     if "leave" in shape:
         changes["leave"] = model.leave(here.entry_angle)
     changes |= {name: field for name, field in varied.items() if name in shape}

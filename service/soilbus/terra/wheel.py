@@ -25,6 +25,7 @@ from soilbus.terra.stresses import (
     entering,
     integrals,
     leaving,
+    peaking,
     sheared,
     stresses,
     unit_of,
@@ -183,7 +184,7 @@ def _forces_and_jacobian(at: Stress, state: WheelState, model: WheelModel, shape
     ).swapaxes(0, 1)
     turned[2] += dot(at.normal, np.broadcast_to(at.share, at.normal.shape))
     if model.peak_c2:
-        by_slip = by_slip + model.peak_c2 * by_peak(at, state, model, tau, mobilising)
+        by_slip = by_slip + peaking(state.slip, model) * by_peak(at, state, model, tau, mobilising)
     if model.exit_angle:
         turned += leaving(state.entry_angle, model) * by_leave(at, state, model, tau, mobilising)
     whole, unit = _whole(by_normal, by_rubbed, by_stuck, state), unit_of(state)
@@ -232,7 +233,7 @@ def _forces_and_slopes(at: Stress, state: WheelState, model: WheelModel) -> Arra
     pressing, pressed, rubbing, turned, by_slip = integrals(fields, 2, at.rim).swapaxes(0, 1)
     turned[2] += dot(at.normal, np.broadcast_to(at.share, at.normal.shape))
     if model.peak_c2:
-        by_slip = by_slip + model.peak_c2 * by_peak(at, state, model, tau, mobilising)
+        by_slip = by_slip + peaking(state.slip, model) * by_peak(at, state, model, tau, mobilising)
     if model.exit_angle:
         turned += leaving(state.entry_angle, model) * by_leave(at, state, model, tau, mobilising)
     whole, unit = pressing + rubbing, unit_of(state)

@@ -19,14 +19,17 @@ FAST_NODES = 8
 
 LONGEST = 0.95
 """Share of the entry angle that the exit angle never exceeds behind the axle: no rut comes up all the way."""
+PEAK = 0.05, 0.8
+"""Shares of the entry angle between which the greatest stress stays; Wong & Reece measured up to 0.43 + 0.32."""
 
 
 @dataclass(frozen=True, slots=True)
 class WheelModel:
     """The choices that make a wheel-soil model.
 
-    The angle of greatest stress is (peak_c1 + peak_c2 slip) times the entry angle (eq. 4),
-    the exit angle exit_ratio times it and exit_angle [rad] more (0: the rut does not recover;
+    The angle of greatest stress is peak_c1 + peak_c2 slip / (1 + peak_bend |slip|) times the
+    entry angle (eq. 4 where it does not bend), a share that stays between those of PEAK; the
+    exit angle is exit_ratio times it and exit_angle [rad] more (0: the rut does not recover;
     behind the axle both are negative), but no farther behind than LONGEST times the entry
     angle.  exponential_share of the shear strength is mobilised by the exponential law
     whatever shear_law says.  From the depth pan_depth [m] on the pressure grows by
@@ -43,12 +46,18 @@ class WheelModel:
     pan_depth: float = 0.0
     pan_stiffness: float = 0.0
     exit_angle: float = 0.0
+    peak_bend: float = 0.0
     one_off: bool = False
 
     @property
     def quadrature(self) -> Quadrature:
         """Nodes for a wheel without slip."""
         return Quadrature(self.nodes, 3 if self.nodes >= EXACT_NODES else 2, self.peak_c1, self.exit_ratio)
+
+    def peak(self, slip: Any) -> Any:
+        """Angle of greatest stress over entry angle, like the slips."""
+        share = self.peak_c1 + self.peak_c2 * slip / (1.0 + self.peak_bend * np.abs(slip))
+        return np.minimum(np.maximum(share, PEAK[0]), PEAK[1])
 
     def leave(self, entry_angle: Array) -> Array:
         """Exit angle over entry angle (N,)."""

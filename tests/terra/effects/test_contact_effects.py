@@ -43,6 +43,12 @@ def test_the_peak_of_stress_moves_as_wong_and_reece_say(state):
 
 
 @EACH_WHEEL
+def test_a_peak_of_stress_levels_off_with_slip(state):
+    true = adaptive_forces(state, WheelModel("rational", peak_c1=0.3, peak_c2=1.2, peak_bend=4.0))
+    same(with_effect("stress_peak_shift", state, c1=-0.2, c2=1.2, bend=4.0), true)
+
+
+@EACH_WHEEL
 def test_a_rut_that_recovers_carries_behind_the_axle(state):
     true = adaptive_forces(state, WheelModel("rational", exit_ratio=-0.35))
     ours = with_effect("rut_recovery", state, recovery=0.35)

@@ -14,19 +14,21 @@ from soilbus.terra.wheel import WheelModel, WheelState, sinkage
 def _stress_peak_shift(
     state: WheelState, model: WheelModel, around: Surroundings, values: Values
 ) -> tuple[WheelState, WheelModel]:
-    """theta_m / theta_1 = peak_c1 + c1 + (peak_c2 + c2) s."""
+    """theta_m / theta_1 = peak_c1 + c1 + (peak_c2 + c2) s / (1 + bend |s|)."""
     c1, c2 = model.peak_c1 + values["c1"], model.peak_c2 + values["c2"]
-    return state, replace(model, peak_c1=c1, peak_c2=c2, one_off=True)
+    return state, replace(model, peak_c1=c1, peak_c2=c2, peak_bend=values["bend"], one_off=True)
 
 
 STRESS_PEAK_SHIFT = Effect(
     name="stress_peak_shift",
     physics="The greatest pressure does not sit half way round the contact, and it moves forward with slip.",
-    source="theta_m = (c1 + c2 s) theta_1, c1 0.18 to 0.43, c2 0.32 in sand: Wong & Reece 1967 (J. Terramech. 4:81)",
+    source="theta_m = (c1 + c2 s) theta_1, c1 0.18 to 0.43, c2 0.32 in sand: Wong & Reece 1967 (J. Terramech. 4:81);"
+    " that it levels off is ours: it cannot pass the entry angle, and shear stops growing once it is mobilised",
     tells="slips from 0.05 to beyond 0.4 with a sinkage sensor; a push that changes with slip is no draft offset",
     parameters=(
-        Parameter("c2", "1", 0.0, 0.2, -0.1, 0.35),
+        Parameter("c2", "1", 0.0, 0.2, -0.1, 2.0),
         Parameter("c1", "1", 0.0, 0.12, -0.3, 0.1),
+        Parameter("bend", "1", 0.0, 3.0, 0.0, 15.0, starts=(5.0,)),
     ),
     wheel=_stress_peak_shift,
 )
