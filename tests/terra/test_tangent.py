@@ -46,6 +46,8 @@ def by_difference(change, step):
         (PLAIN, "exit_angle", 1e-5),
         (REBOUNDING, "exit_angle", 1e-5),
         (REBOUNDING, "exit_ratio", 1e-5),
+        (PLAIN, "exit_slip", 1e-5),
+        (replace(REBOUNDING, exit_slip=-0.5), "exit_slip", 1e-5),
         (WheelModel("rational", nodes=NODES), "exponential_share", 1e-4),
         (WheelModel("rational", nodes=NODES, exponential_share=0.6), "exponential_share", 1e-4),
         (PANNED, "pan_stiffness", 1e-3),

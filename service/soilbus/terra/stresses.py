@@ -52,9 +52,9 @@ def stresses(state: WheelState, model: WheelModel, skid: bool) -> Stress:
     """Of the soil alone, without its pan."""
     theta, slip, r, _, K_L, n, _, _, K = state
     q = model.quadrature
-    if model.exit_angle:
-        q = q._replace(exit=model.leave(theta))
-    if skid or model.peak_c2 or model.exit_angle:
+    if model.exit_varies:
+        q = q._replace(exit=model.leave(theta, slip))
+    if skid or model.peak_c2 or model.exit_varies:
         peak = model.peak(slip)
         x, w = gauss(q.nodes, q.power)
         if skid:
@@ -79,9 +79,10 @@ def peaking(slip: Array, model: WheelModel) -> Array:
     return np.where((share > PEAK[0]) & (share < PEAK[1]), slope, 0.0)
 
 
-def leaving(theta: Array, model: WheelModel) -> Array:
-    """Its derivative (N,) by the entry angle."""
-    return np.where(model.leave(theta) > -LONGEST, -model.exit_angle / theta**2, 0.0)
+def leaving(theta: Array, slip: Array, model: WheelModel) -> tuple[Array, Array]:
+    """Derivatives (N,) by entry angle and slip of the exit angle over the entry angle."""
+    free = model.leave(theta, slip) > -LONGEST
+    return np.where(free, -model.exit_angle / theta**2, 0.0), np.where(free & (slip > 0.0), model.exit_slip, 0.0)
 
 
 def mobilised(j_K: Array, model: WheelModel) -> tuple[Any, Any]:

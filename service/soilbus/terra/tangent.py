@@ -15,7 +15,7 @@ _FAINT = 1e-9
 """Stiffness of a pan that is none, but that is integrated as any pan is."""
 _SHAPES = {
     "peak": ("peak_c1", "peak_c2", "peak_bend"),
-    "leave": ("exit_ratio", "exit_angle"),
+    "leave": ("exit_ratio", "exit_angle", "exit_slip"),
     "exponential_share": ("exponential_share",),
     "pan_stiffness": ("pan_stiffness",),
     "pan_depth": ("pan_depth",),
@@ -41,7 +41,7 @@ def forces_along(state: WheelState, model: WheelModel) -> tuple[Dual, Dual, Dual
     if "peak" in shape:
         changes["peak"] = model.peak(here.slip)
     if "leave" in shape:
-        changes["leave"] = model.leave(here.entry_angle)
+        changes["leave"] = model.leave(here.entry_angle, here.slip)
     changes |= {name: field for name, field in varied.items() if name in shape}
     slopes: dict[object, Array] = {}
     for name, change in changes.items():

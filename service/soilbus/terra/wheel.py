@@ -152,7 +152,8 @@ def load_and_slope(at: Stress, state: WheelState, model: WheelModel) -> Array:
     load = dot(at.normal, cos) + dot(tau, sin)
     slope = dot(normal, cos) + dot(shear, sin) + load / state.entry_angle
     if model.exit_angle:
-        slope = slope + leaving(state.entry_angle, model) * by_leave(at, state, model, tau, mobilising)[0]
+        rate, _ = leaving(state.entry_angle, state.slip, model)
+        slope = slope + rate * by_leave(at, state, model, tau, mobilising)[0]
     return np.asarray(np.stack([load, slope]) * (state.radius * state.width * state.entry_angle))
 
 
@@ -185,8 +186,11 @@ def _forces_and_jacobian(at: Stress, state: WheelState, model: WheelModel, shape
     turned[2] += dot(at.normal, np.broadcast_to(at.share, at.normal.shape))
     if model.peak_c2:
         by_slip = by_slip + peaking(state.slip, model) * by_peak(at, state, model, tau, mobilising)
-    if model.exit_angle:
-        turned += leaving(state.entry_angle, model) * by_leave(at, state, model, tau, mobilising)
+    if model.exit_varies:
+        later = by_leave(at, state, model, tau, mobilising)
+        by_entry, of_slip = leaving(state.entry_angle, state.slip, model)
+        turned += by_entry * later
+        by_slip = by_slip + of_slip * later
     whole, unit = _whole(by_normal, by_rubbed, by_stuck, state), unit_of(state)
     columns = (
         pressed + turned + whole / state.entry_angle,
@@ -234,8 +238,11 @@ def _forces_and_slopes(at: Stress, state: WheelState, model: WheelModel) -> Arra
     turned[2] += dot(at.normal, np.broadcast_to(at.share, at.normal.shape))
     if model.peak_c2:
         by_slip = by_slip + peaking(state.slip, model) * by_peak(at, state, model, tau, mobilising)
-    if model.exit_angle:
-        turned += leaving(state.entry_angle, model) * by_leave(at, state, model, tau, mobilising)
+    if model.exit_varies:
+        later = by_leave(at, state, model, tau, mobilising)
+        by_entry, of_slip = leaving(state.entry_angle, state.slip, model)
+        turned += by_entry * later
+        by_slip = by_slip + of_slip * later
     whole, unit = pressing + rubbing, unit_of(state)
     out = np.empty((9, len(state.entry_angle)))
     np.multiply(unit, whole, out=out[:3])

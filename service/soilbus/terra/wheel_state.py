@@ -29,8 +29,9 @@ class WheelModel:
 
     The angle of greatest stress is peak_c1 + peak_c2 slip / (1 + peak_bend |slip|) times the
     entry angle (eq. 4 where it does not bend), a share that stays between those of PEAK; the
-    exit angle is exit_ratio times it and exit_angle [rad] more (0: the rut does not recover;
-    behind the axle both are negative), but no farther behind than LONGEST times the entry
+    exit angle is exit_ratio + exit_slip s times it, s the slip where the wheel drives, and
+    exit_angle [rad] more (0: the rut does not recover;
+    behind the axle all are negative), but no farther behind than LONGEST times the entry
     angle.  exponential_share of the shear strength is mobilised by the exponential law
     whatever shear_law says.  From the depth pan_depth [m] on the pressure grows by
     pan_stiffness times what the soil alone would add (0: no hard pan).  one_off: a model
@@ -46,6 +47,7 @@ class WheelModel:
     pan_depth: float = 0.0
     pan_stiffness: float = 0.0
     exit_angle: float = 0.0
+    exit_slip: float = 0.0
     peak_bend: float = 0.0
     one_off: bool = False
 
@@ -59,9 +61,15 @@ class WheelModel:
         share = self.peak_c1 + self.peak_c2 * slip / (1.0 + self.peak_bend * np.abs(slip))
         return np.minimum(np.maximum(share, PEAK[0]), PEAK[1])
 
-    def leave(self, entry_angle: Array) -> Array:
+    @property
+    def exit_varies(self) -> bool:
+        """Whether the exit angle is another share of each entry angle."""
+        return bool(self.exit_angle or self.exit_slip)
+
+    def leave(self, entry_angle: Array, slip: Any) -> Any:
         """Exit angle over entry angle (N,)."""
-        return np.maximum(self.exit_ratio + self.exit_angle / entry_angle, -LONGEST)
+        ratio = self.exit_ratio + self.exit_slip * np.maximum(slip, 0.0)
+        return np.maximum(ratio + self.exit_angle / entry_angle, -LONGEST)
 
 
 class WheelState(NamedTuple):

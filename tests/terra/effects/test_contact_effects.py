@@ -66,6 +66,12 @@ def test_a_rut_may_come_up_by_an_angle_of_its_own(state, angle):
 
 
 @EACH_WHEEL
+def test_soil_carried_behind_a_slipping_wheel_is_left_later(state):
+    true = adaptive_forces(state, WheelModel("rational", exit_ratio=-0.1, exit_slip=-0.5))
+    same(with_effect("rut_recovery", state, recovery=0.1, carried=0.5), true)
+
+
+@EACH_WHEEL
 @pytest.mark.parametrize("share", [0.3, 1.0])
 def test_a_share_of_the_exponential_law(state, share):
     true = adaptive_forces(state, MODEL, mobilised=lambda x: share * exponential(x) + (1.0 - share) * rational(x))

@@ -37,20 +37,22 @@ STRESS_PEAK_SHIFT = Effect(
 def _rut_recovery(
     state: WheelState, model: WheelModel, around: Surroundings, values: Values
 ) -> tuple[WheelState, WheelModel]:
-    """theta_2 = -(recovery theta_1 + angle)."""
-    ratio, angle = model.exit_ratio - values["recovery"], model.exit_angle - values["angle"]
-    return state, replace(model, exit_ratio=ratio, exit_angle=angle, one_off=True)
+    """theta_2 = -((recovery + carried s) theta_1 + angle)."""
+    ratio, by_slip = model.exit_ratio - values["recovery"], model.exit_slip - values["carried"]
+    angle = model.exit_angle - values["angle"]
+    return state, replace(model, exit_ratio=ratio, exit_slip=by_slip, exit_angle=angle, one_off=True)
 
 
 RUT_RECOVERY = Effect(
     name="rut_recovery",
     physics="The rut springs back behind the axle and pushes the wheel forward: contact ends behind the lowest point.",
-    source="exit angle behind the axle: Wong & Reece 1967 (J. Terramechanics 4:81); Ishigami et al. 2007"
-    " (J. Field Robotics 24:233)",
+    source="exit angle behind the axle: Wong & Reece 1967 (J. Terramechanics 4:81); the farther the more soil a"
+    " slipping wheel carries behind itself: Ishigami et al. 2007 (J. Field Robotics 24:233)",
     tells="rut depth behind the wheel against sinkage under it; loads from light to heavy",
     parameters=(
         Parameter("recovery", "1", 0.0, 0.2, 0.0, 0.6),
         Parameter("angle", "rad", 0.0, 0.08, 0.0, 0.3),
+        Parameter("carried", "1", 0.0, 0.3, 0.0, 2.0),
     ),
     wheel=_rut_recovery,
 )
