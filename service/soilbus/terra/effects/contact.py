@@ -131,7 +131,7 @@ LUGS = Effect(
     forces=_lugged_arm,
 )
 
-_EVENLY = 0.01  # m
+_EVENLY = 0.04  # m
 _MOST_DEFLECTION = 0.3  # of the width; then the rim strikes through
 
 
@@ -173,7 +173,7 @@ def _flattened_forces(forces: Forces, state: WheelState, around: Surroundings, v
 
 
 def _half_flat(radius: Any, deflection: Any) -> Any:
-    """Half the length [m] of the flat, a chord; short of a centimetre it grows evenly with the deflection."""
+    """Half the length [m] of the flat, near a chord; while it is short it grows evenly with the deflection."""
     return np.sqrt(2.0 * radius * deflection + _EVENLY**2) - _EVENLY
 
 
@@ -193,8 +193,8 @@ TYRE_DEFLECTION = Effect(
     " length sqrt(2 r delta) on both sides of the axle: ch. 2; even pressure: Fujimoto 1977 (J. Terramechanics 14:191)",
     tells="firm ground at several loads (the rolling radius shrinks), a sinkage sensor, another tyre pressure",
     parameters=(
-        Parameter("compliance", "m/N", 0.0, 4e-6, 0.0, 2e-5, starts=(2e-6,)),
-        Parameter("behind", "1", 0.0, 0.5, 0.0, 1.0),
+        Parameter("compliance", "m/N", 0.0, 4e-6, 0.0, 2e-5),
+        Parameter("behind", "1", 0.0, 0.5, 0.0, 1.0, starts=(0.5,)),
     ),
     wheel=_substitute_circle,
     forces=_flattened_forces,
