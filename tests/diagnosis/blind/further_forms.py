@@ -65,12 +65,12 @@ def _twice_filtered(torque: Array, around: Any, values: Any) -> Array:
 
 
 def _creeping(around: Any, values: Any) -> Array:
-    """One cell's zero, that wanders as the cell gets warm in the sun: ever more slowly."""
-    warmth = -np.expm1(-around.t / _WARMING)
+    """One cell's zero, that wanders as the cell gets warm in the sun: its skin soon, its core slowly."""
+    warmth = 1.0 - 0.5 * np.exp(-around.t / _WARMING[0]) - 0.5 * np.exp(-around.t / _WARMING[1])
     return values["size"] * (0.6 + 0.8 * warmth) * np.array([0.0, 0.0, 1.0, 0.0]) + 0.0 * around.load
 
 
-_WARMING = 60.0  # s
+_WARMING = 25.0, 120.0  # s
 
 
 FORMS = (

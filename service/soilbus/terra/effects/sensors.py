@@ -13,14 +13,22 @@ from soilbus.terra.stress import Array
 _LOAD_CELLS = (
     "zero and span of load cells: OIML R 60 (2021); draft cells 6.5 to 7.2 % off in the field: Cogent Eng. 2024"
 )
-_WANDERING = "; zero with temperature and in time: OIML R 60 (2021), 5.5 and 5.6"
+_WANDERING = "; zero with temperature and in time: OIML R 60 (2021), 5.5 and 5.6; warming by Newton's law of cooling"
+_WANDERS = (
+    Parameter("drift", "N/s", 0.0, 0.5, -30.0, 30.0, of_record=True),
+    Parameter("settling", "1/s", 0.01, 0.02, 5e-4, 0.2, of_record=True),
+)
+
+
+def _zero(t: Any, duration: float, values: Values) -> Any:
+    """Towards that at the end of the record, at a rate that starts as `drift` and fades by `settling`."""
+    rate = values["settling"]
+    to_go = (np.exp(-rate * duration) - np.exp(-rate * t)) / rate
+    return values["offset"] + values["drift"] * to_go
 
 
 def _draft_offset(draft: Any, around: Surroundings, values: Values) -> Any:
-    """Towards the zero at the end of the record, at a rate that starts as `drift` and fades by `settling`."""
-    rate, t = values["settling"], instants(around.t)
-    to_go = (np.exp(-rate * around.duration) - np.exp(-rate * t)) / rate
-    return values["offset"] + values["drift"] * to_go + np.zeros(np.shape(draft))
+    return _zero(instants(around.t), around.duration, values) + np.zeros(np.shape(draft))
 
 
 DRAFT_OFFSET = Effect(
@@ -30,8 +38,7 @@ DRAFT_OFFSET = Effect(
     tells="a stretch with the implement lifted: the draft must then read zero",
     parameters=(
         Parameter("offset", "N", 0.0, 300.0, -5000.0, 5000.0),
-        Parameter("drift", "N/s", 0.0, 0.5, -30.0, 30.0, of_record=True),
-        Parameter("settling", "1/s", 0.01, 0.02, 5e-4, 0.2, of_record=True),
+        *_WANDERS,
     ),
     draft=_draft_offset,
 )
@@ -76,9 +83,7 @@ TORQUE_LAG = Effect(
 
 
 def _wheel_load_offset(around: Surroundings, values: Values) -> Any:
-    """Towards the zero at the end of the record."""
-    to_go = np.asarray(around.t) - around.duration
-    return values["offset"] + values["drift"] * to_go + np.zeros(np.shape(around.load))
+    return _zero(np.asarray(around.t), around.duration, values) + np.zeros(np.shape(around.load))
 
 
 WHEEL_LOAD_OFFSET = Effect(
@@ -88,7 +93,7 @@ WHEEL_LOAD_OFFSET = Effect(
     tells="weighing the vehicle standing, before and after: the loads must add up to its weight",
     parameters=(
         Parameter("offset", "N", 0.0, 200.0, -3000.0, 3000.0),
-        Parameter("drift", "N/s", 0.0, 0.5, -30.0, 30.0, of_record=True),
+        *_WANDERS,
     ),
     each_wheel=True,
     load=_wheel_load_offset,
