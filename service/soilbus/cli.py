@@ -34,6 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
     args = command_line().parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="soilbus: %(message)s", stream=sys.stderr)
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # what it does for itself is no news
     logging.getLogger("can").setLevel(logging.CRITICAL)  # a bus that is away is ours to tell of, once
     keep_freed_memory()
     with loading():

@@ -140,7 +140,8 @@ def test_each_wheel_has_its_own_values():
     text = '[{name="wheel_load_offset",offset={FL={value=100.0,std=20.0},RR=50.0}}]'
     config = reference_configuration([f"model.effects={text}"])
     _, free = completion_of(config)
-    offsets, drifts = free[:4], free[4:]
+    offsets, drifts, rates = free[:4], free[4:8], free[8:]
+    assert all(f.std == 0.0 for f in rates)
     assert [(f.wheel, f.value, f.std) for f in offsets] == [
         (0, 100.0, 20.0), (1, 0.0, 0.0), (2, 0.0, 0.0), (3, 50.0, 0.0)
     ]  # fmt: skip

@@ -79,7 +79,12 @@ def test_a_further_effect_beside_a_great_one_is_doubted():
 
 
 def test_every_further_start_is_of_the_catalogue():
-    assert {e.name for e in CATALOGUE.values() for p in e.parameters if p.starts} == {"hardpan", "lugs"}
+    assert {e.name for e in CATALOGUE.values() for p in e.parameters if p.starts} == {
+        "hardpan",
+        "lugs",
+        "stress_peak_shift",
+        "tyre_deflection",
+    }
 
 
 def test_a_great_gap_that_is_left_is_not_explained():

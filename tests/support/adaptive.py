@@ -38,7 +38,9 @@ def adaptive_forces(
     strength at j/K >= 0, for the shear law.
     """
     theta1, slip, r, b, K_L, n, tan_phi, c, K = (float(v) for v in state)
-    ahead = model.peak_c1 + model.peak_c2 * slip / (1.0 + model.peak_bend * abs(slip))  # eq. 4 without a bend
+    ahead = model.peak_c1 + model.peak_c2 * slip / (
+        1.0 - (1.0 - abs(slip)) * model.peak_bend / (1.0 + model.peak_bend)
+    )  # eq. 4 without a bend
     theta_m = min(max(ahead, 0.05), 0.8) * theta1
     theta2 = max((model.exit_ratio + model.exit_slip * max(slip, 0.0)) * theta1 + model.exit_angle, -LONGEST * theta1)
     share = mobilised or (exponential if model.shear_law == "exponential" else rational)

@@ -56,7 +56,7 @@ MODELS = {
     "exponential": WheelModel(),
     "rational": WheelModel(shear_law="rational"),
     "peak shift": WheelModel(peak_c1=0.35, peak_c2=0.3),
-    "peak that levels off": WheelModel(peak_c1=0.3, peak_c2=1.2, peak_bend=4.0),
+    "peak that levels off": WheelModel(peak_c1=0.3, peak_c2=0.3, peak_bend=4.0),
     "rut recovery": WheelModel(exit_ratio=-0.4),
     "everything": WheelModel("rational", 0.25, 0.35, -0.25),
     "exit with slip": WheelModel("rational", 0.4, 0.2, -0.1, exit_slip=-0.6),

@@ -75,7 +75,7 @@ def stresses(state: WheelState, model: WheelModel, skid: bool) -> Stress:
 def peaking(slip: Array, model: WheelModel) -> Array:
     """Derivative (N,) by the slip of the angle of greatest stress over the entry angle."""
     share = model.peak(slip)
-    slope = model.peak_c2 / (1.0 + model.peak_bend * np.abs(slip)) ** 2
+    slope = model.peak_c2 * (1.0 + model.peak_bend) / (1.0 + model.peak_bend * np.abs(slip)) ** 2
     return np.where((share > PEAK[0]) & (share < PEAK[1]), slope, 0.0)
 
 

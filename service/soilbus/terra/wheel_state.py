@@ -27,8 +27,9 @@ PEAK = 0.05, 0.8
 class WheelModel:
     """The choices that make a wheel-soil model.
 
-    The angle of greatest stress is peak_c1 + peak_c2 slip / (1 + peak_bend |slip|) times the
-    entry angle (eq. 4 where it does not bend), a share that stays between those of PEAK; the
+    The angle of greatest stress is peak_c1 + peak_c2 s (1 + peak_bend) / (1 + peak_bend |s|)
+    times the entry angle at the slip s (eq. 4 where it does not bend; at s = 1 always c1 + c2),
+    a share that stays between those of PEAK; the
     exit angle is exit_ratio + exit_slip s times it, s the slip where the wheel drives, and
     exit_angle [rad] more (0: the rut does not recover;
     behind the axle all are negative), but no farther behind than LONGEST times the entry
@@ -58,7 +59,7 @@ class WheelModel:
 
     def peak(self, slip: Any) -> Any:
         """Angle of greatest stress over entry angle, like the slips."""
-        share = self.peak_c1 + self.peak_c2 * slip / (1.0 + self.peak_bend * np.abs(slip))
+        share = self.peak_c1 + self.peak_c2 * slip * (1.0 + self.peak_bend) / (1.0 + self.peak_bend * np.abs(slip))
         return np.minimum(np.maximum(share, PEAK[0]), PEAK[1])
 
     @property

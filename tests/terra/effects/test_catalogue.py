@@ -141,3 +141,15 @@ def test_effects_add_up_in_one_wheel():
     first, _ = wheel_with(pair[:1], state, MODELS["rational"], around)
     assert both.radius == pytest.approx(first.radius * np.where(REAR, 1.02, 0.96), rel=1e-12)
     assert np.all(first.radius > state.radius)
+
+
+STARTS = [(effect, p, value) for effect in CATALOGUE.values() for p in effect.parameters for value in p.starts]
+
+
+@pytest.mark.parametrize(("effect", "parameter", "value"), STARTS, ids=[f"{e.name}.{p.name}" for e, p, _ in STARTS])
+def test_a_further_start_changes_nothing_while_the_effect_is_absent(effect, parameter, value):
+    """Else its score would foresee the mending of what the start itself has broken."""
+    state, around = wheels_around("loam", seed=4)
+    plain = wheel_forces(state, WheelModel())
+    started = forces_with([Active(effect, effect.neutral | {parameter.name: value})], state, WheelModel(), around)
+    np.testing.assert_allclose(started, plain, rtol=1e-12)

@@ -14,7 +14,7 @@ from soilbus.terra.wheel import WheelModel, WheelState, sinkage
 def _stress_peak_shift(
     state: WheelState, model: WheelModel, around: Surroundings, values: Values
 ) -> tuple[WheelState, WheelModel]:
-    """theta_m / theta_1 = peak_c1 + c1 + (peak_c2 + c2) s / (1 + bend |s|)."""
+    """theta_m / theta_1 = peak_c1 + c1 + (peak_c2 + c2) s (1 + bend) / (1 + bend |s|)."""
     c1, c2 = model.peak_c1 + values["c1"], model.peak_c2 + values["c2"]
     return state, replace(model, peak_c1=c1, peak_c2=c2, peak_bend=values["bend"], one_off=True)
 
@@ -26,7 +26,7 @@ STRESS_PEAK_SHIFT = Effect(
     " that it levels off is ours: it cannot pass the entry angle, and shear stops growing once it is mobilised",
     tells="slips from 0.05 to beyond 0.4 with a sinkage sensor; a push that changes with slip is no draft offset",
     parameters=(
-        Parameter("c2", "1", 0.0, 0.2, -0.1, 2.0),
+        Parameter("c2", "1", 0.0, 0.2, -0.1, 0.35),
         Parameter("c1", "1", 0.0, 0.12, -0.3, 0.1),
         Parameter("bend", "1", 0.0, 3.0, 0.0, 15.0, starts=(5.0,)),
     ),
