@@ -292,11 +292,13 @@ def test_priors_of_effects_grow_with_the_wheel_and_only_where_they_have_its_unit
     def std(effect: Effect) -> list[float]:
         return [p.std for p in effect.parameters]
 
-    for name, factor in (("draft_offset", 2.0), ("slip_sinkage", 1.0), ("tyre_deflection", 1.5)):
+    for name, factors in (
+        ("draft_offset", (2.0, 2.0, 1.0)), ("slip_sinkage", (1.0, 1.0)), ("tyre_deflection", (1.5, 1.0)),
+    ):  # fmt: skip
         effect = CATALOGUE[name]
         larger = for_wheel(effect, 2.0 * LOAD, 3.0 * RADIUS)
-        assert std(larger) == pytest.approx([factor * s for s in std(effect)])
-        assert larger.parameters[0].high == pytest.approx(factor * effect.parameters[0].high)
+        assert std(larger) == pytest.approx([f * s for f, s in zip(factors, std(effect), strict=True)])
+        assert larger.parameters[0].high == pytest.approx(factors[0] * effect.parameters[0].high)
     depth = for_wheel(CATALOGUE["hardpan"], LOAD, 0.1 * RADIUS).parameters[1]
     assert depth.starts[0] == pytest.approx(0.1 * CATALOGUE["hardpan"].parameters[1].starts[0])
 
