@@ -88,9 +88,9 @@ def effects_of(config: Config, wheels: Sequence[str] | None = None) -> tuple[Act
 def completion_of(config: Config) -> tuple[tuple[Effect, ...], tuple[Free, ...]]:
     """The effects that complete the estimator's model, and what is known of their parameters.
 
-    Those of model.effects but for the ones that describe the ground of one recording
-    (Effect.of_record).  A parameter's value is the prior's mean and its std the prior's; one
-    without std is held.  Wheels count as in rig_of.  ConfigError as `effects_of`.
+    Those of model.effects but for what describes one recording: effects of_record are left
+    out, such parameters stay neutral.  Another parameter's value is the prior's mean and its
+    std the prior's; one without std is held.  Wheels count as in rig_of.  ConfigError as `effects_of`.
     """
     wheels = rig_of(config).wheels
     settings = {setting.name: setting.model_extra or {} for setting in config.model.effects}
@@ -99,6 +99,10 @@ def completion_of(config: Config) -> tuple[tuple[Effect, ...], tuple[Free, ...]]
     for effect, values in active:
         for parameter in effect.parameters:
             given = settings[effect.name].get(parameter.name)
+            if parameter.of_record:
+                of_wheels = range(len(wheels)) if effect.each_wheel else (None,)
+                free += [Free(effect.name, parameter, i, parameter.neutral, 0.0) for i in of_wheels]
+                continue
             if not effect.each_wheel:
                 free.append(Free(effect.name, parameter, None, values[parameter.name], _std(given)))
                 continue

@@ -137,7 +137,7 @@ def test_values_in_the_decision_are_those_of_the_window():
 
 
 def test_each_wheel_has_its_own_values():
-    text = '[{name="wheel_load_offset",offset={FL={value=100.0,std=20.0},RR=50.0}}]'
+    text = '[{name="wheel_load_offset",offset={FL={value=100.0,std=20.0},RR=50.0},drift={value=0.5,std=0.1}}]'
     config = reference_configuration([f"model.effects={text}"])
     _, free = completion_of(config)
     offsets, drifts, rates = free[:4], free[4:8], free[8:]
@@ -145,4 +145,7 @@ def test_each_wheel_has_its_own_values():
     assert [(f.wheel, f.value, f.std) for f in offsets] == [
         (0, 100.0, 20.0), (1, 0.0, 0.0), (2, 0.0, 0.0), (3, 50.0, 0.0)
     ]  # fmt: skip
-    assert [(f.parameter.name, f.wheel, f.value, f.std) for f in drifts] == [("drift", w, 0.0, 0.0) for w in range(4)]
+    assert [(f.parameter.name, f.wheel, f.value, f.std) for f in drifts] == [
+        ("drift", w, 0.0, 0.0)
+        for w in range(4)  # how a zero wandered is of one record
+    ]

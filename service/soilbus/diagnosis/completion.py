@@ -257,7 +257,9 @@ def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects
     """What one recording tells of the next: all but the soil and what belongs to one recording only."""
     after = known.of_another_soil(prior)
     own = {effect.name for effect in effects if effect.of_record}
-    gone = [problem.n_sensors + i for i, free in enumerate(problem.free) if free.effect in own]
+    gone = [
+        problem.n_sensors + i for i, free in enumerate(problem.free) if free.effect in own or free.parameter.of_record
+    ]
     gains, covariance = after.gains.copy(), after.covariance.copy()
     for i in gone:
         covariance[_SOIL + i] = covariance[:, _SOIL + i] = 0.0
