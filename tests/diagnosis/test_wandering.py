@@ -1,0 +1,37 @@
+"""A zero that wanders does so otherwise in every recording; what stays of it is the zero at the end of the last."""
+
+from __future__ import annotations
+
+from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.diagnosis.completion import complete
+from soilbus.diagnosis.records import record_of
+from soilbus.estimation.window import BinStore
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import excited
+from soilbus.terra.effects.catalogue import CATALOGUE
+
+DURATION = 40.0
+
+
+def wandering(rate: float, seed: int):
+    """A drive on loam during which the zero at the hitch wanders at a rate [N/s] to 300 N at its end."""
+    config = reference_configuration()
+    store = BinStore(rig_of(config), 0.1, 0.0)
+    channels = simulate(config, excited("loam", DURATION), seed=seed).channels
+    columns = {name: (c.t, c.value) for name, c in channels.items() if name in rig_of(config).channels}
+    t, draft = columns["draft"]
+    store.add(columns | {"draft": (t, draft + 300.0 + rate * (t - DURATION))})
+    return record_of(f"{seed}", store.window(0.0, DURATION), rig_of(config), model_of(config), 0.2, 0.15)
+
+
+def test_each_recording_has_a_wander_of_its_own():
+    records = [wandering(6.0, 3), wandering(-6.0, 4)]
+    found = complete(records, prior_of(reference_configuration()), [CATALOGUE["draft_offset"]])
+    assert found.gap < 1.1
+    first, second = (found.fits[i].mode.gains[found.checks[i].problem.n_sensors :] for i in range(2))
+    drift = [f.parameter.name for f in found.free].index("drift")
+    assert first[drift] > 4.0  # in prior std of 0.5 N/s
+    assert second[drift] < -4.0
+    offset = found.parameters()["draft_offset"]["offset"]
+    assert abs(offset.value - 300.0) < 3.0 * offset.std
