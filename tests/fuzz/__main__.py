@@ -37,7 +37,9 @@ PACKAGES = ["soilbus", "cantools"]
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse, fuzz, tell."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
-    parser.add_argument("--target", required=True, help="frames, windows, service, dbc, config, model, log-...")
+    parser.add_argument(
+        "--target", required=True, help="frames, windows, service, dbc, config, model, state, logs, log-..."
+    )
     parser.add_argument("--seconds", type=int, default=60, help="of processor time (60)")
     parser.add_argument("--seed", type=int, default=1, help="of the random numbers (1)")
     parser.add_argument("--plain", action="store_true", help="seeded mutations, not guided by coverage")

@@ -319,6 +319,19 @@ def _log_seeds(suffix: str) -> Callable[[], list[bytes]]:
     return seeds
 
 
+LOGS = (".log", ".log.gz", ".asc", ".blf", ".csv")
+
+
+def check_logs(data: bytes) -> int:
+    """A log of the kind that the first byte picks."""
+    return _log(LOGS[data[0] % len(LOGS)])(data[1:]) if data else 0
+
+
+def _all_log_seeds() -> list[bytes]:
+    packed = {".log.gz": gzip.compress(_log_seeds(".log")()[0], mtime=0)}
+    return [bytes([i]) + (packed.get(suffix) or _log_seeds(suffix)()[0]) for i, suffix in enumerate(LOGS)]
+
+
 @cache
 def _some_frames() -> bytes:
     return good_stream()[1]
@@ -359,6 +372,7 @@ TARGETS: dict[str, Target] = {
     "config": Target(check_config, lambda: [TRACTOR.read_bytes()]),
     "model": Target(check_model, _model_seeds),
     "state": Target(check_state, _state_seeds),
+    "logs": Target(check_logs, _all_log_seeds),
     "log-candump": Target(_log(".log"), _log_seeds(".log")),
     "log-gz": Target(_log(".log.gz"), lambda: [gzip.compress(_log_seeds(".log")()[0], mtime=0)]),
     "log-asc": Target(_log(".asc"), _log_seeds(".asc")),
