@@ -33,9 +33,9 @@ def _unloading(forces: Array, state: WheelState, around: Any, values: Any) -> Ar
 def _transported(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
     """The faster the rim slips the more soil it carries behind itself, on which it leaves the ground the later.
 
-    All that it shears off it carries once the slip is greater than a fifth.
+    What it tears off and how fast it flings that backwards both grow with the slip.
     """
-    share = values["size"] * (0.3 + 1.2 * np.minimum(np.maximum(state.slip, 0.0) / 0.2, 1.0) ** 2)
+    share = values["size"] * (0.5 + 3.0 * np.maximum(state.slip, 0.0) ** 2)
     return forces + change(state, leave=-np.arccos(1.0 - share * (1.0 - np.cos(state.entry_angle))))
 
 
@@ -68,12 +68,12 @@ def _twice_filtered(torque: Array, around: Any, values: Any) -> Array:
 
 
 def _creeping(around: Any, values: Any) -> Array:
-    """One cell's zero, that wanders as the cell gets warm in the sun, from one side first: by what its ends differ."""
-    warmth = np.exp(-around.t / _WARMING[1]) - np.exp(-around.t / _WARMING[0])
-    return values["size"] * (0.6 + 0.8 * warmth) * np.array([0.0, 0.0, 1.0, 0.0]) + 0.0 * around.load
+    """One cell's zero, that creeps with the logarithm of time, as what is loaded does."""
+    crept = np.log1p(around.t / _CREEP)
+    return values["size"] * (0.6 + 0.25 * crept) * np.array([0.0, 0.0, 1.0, 0.0]) + 0.0 * around.load
 
 
-_WARMING = 20.0, 60.0  # s
+_CREEP = 5.0  # s
 
 
 FORMS = (
@@ -117,7 +117,7 @@ FORMS = (
     Form(
         "wheel_load_offset",
         "creeping",
-        "zero that wanders with warmth",
+        "zero that creeps",
         "N",
         (150.0, 180.0),
         900.0,
