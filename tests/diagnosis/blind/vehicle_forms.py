@@ -121,9 +121,9 @@ def _constant_error(draft: Array, around: Any, values: Any) -> Array:
 
 
 def _warming_up(draft: Array, around: Any, values: Any) -> Array:
-    """The zero is off by half as much more while the cell gets warm: its beam soon, what it is bolted to slowly."""
+    """The zero is off by a quarter more while the cell gets warm: its beam soon, what it is bolted to slowly."""
     t = np.ravel(around.t)
-    return values["size"] * (1.0 + 0.25 * (np.exp(-t / 10.0) + np.exp(-t / 90.0)))
+    return values["size"] * (1.0 + 0.12 * (np.exp(-t / 10.0) + np.exp(-t / 90.0)))
 
 
 def _steeper(draft: Array, around: Any, values: Any) -> Array:
