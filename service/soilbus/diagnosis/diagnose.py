@@ -41,7 +41,7 @@ FITTED = 6
 THINNED = 4
 CLEAR = 100.0
 """Foreseen fall of -2 log evidence from which a few instants tell which candidates to fit."""
-BEHIND_UNSETTLED = 150.0
+BEHIND_UNSETTLED = 250.0
 """Cost on a few instants above the least one's from which a candidate is given up, converged or not."""
 STEPS = 12
 """Steps of the soil, and then of everything, in which a candidate that explains much is fitted."""
