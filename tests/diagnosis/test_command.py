@@ -73,7 +73,7 @@ def test_the_hidden_effect_is_named_and_the_gap_closes(diagnosed):
     effect = found["effects"][0]
     assert effect["probability"] > 0.95
     for name, told in effect["parameters"].items():
-        assert abs(told["value"] - HIDDEN[name]) < 3.0 * told["std"] < 0.2
+        assert abs(told["value"] - HIDDEN.get(name, 0.0)) < 3.0 * told["std"] < 0.2
     assert found["gap"]["before"] > found["gap"]["limit"] > found["gap"]["after"]
     assert found["gap"]["noise_floor"] == 1.0
     assert (
@@ -130,7 +130,7 @@ def test_model_out_is_the_configuration_with_the_effect(diagnosed):
 
 def test_check_says_what_is_estimated(diagnosed, capsys):
     assert main(["check", "--config", str(diagnosed.model)]) == 0
-    assert "multipass: estimated: stiffness, density\n" in capsys.readouterr().out
+    assert "multipass: estimated: stiffness, density, shear\n" in capsys.readouterr().out
 
 
 def test_replay_with_the_completed_model_is_valid_where_the_plain_model_fails(diagnosed, tmp_path):

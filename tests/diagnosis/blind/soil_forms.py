@@ -37,10 +37,13 @@ def _reece(state: WheelState, model: Any, around: Any, values: Any) -> Any:
 
 
 def _compacted(state: WheelState, model: Any, around: Any, values: Any) -> Any:
-    """Ruts are stiffer, in pressing and in shearing."""
-    rear = np.asarray(around.rear, float)
-    more = 1.0 + values["size"] * rear
+    """Ruts are stiffer, in pressing and in shearing, the more so the more the wheels before slipped."""
+    worked = -np.expm1(-np.maximum(state.slip, 0.0) / _WORKED)
+    more = 1.0 + values["size"] * np.asarray(around.rear, float) * (0.5 + 0.5 * worked)
     return state._replace(K_L=state.K_L * more, K=state.K / np.sqrt(more)), model
+
+
+_WORKED = 0.1  # slip
 
 
 def _denser(state: WheelState, model: Any, around: Any, values: Any) -> Any:
@@ -144,7 +147,15 @@ FORMS = (
         by_hooks(wheel=_reece),
         by_sinkage=True,
     ),
-    Form("multipass", "stiffness", "Holm 1969, with K", "1", (0.04, 0.4), 1.5, by_hooks(wheel=_compacted)),
+    Form(
+        "multipass",
+        "stiffness",
+        "Holm 1969, with K and slip: Senatore & Sandu 2011",
+        "1",
+        (0.04, 0.4),
+        1.5,
+        by_hooks(wheel=_compacted),
+    ),
     Form(
         "multipass",
         "density",

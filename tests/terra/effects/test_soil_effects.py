@@ -76,10 +76,10 @@ def test_bearing_grows_with_a_power_of_the_speed():
 
 
 def test_only_rear_wheels_run_in_ruts():
-    values = {"stiffness": math.log(2.5), "density": math.log(1.2)}
+    values = {"stiffness": math.log(2.5), "density": math.log(1.2), "shear": math.log(1.6)}
     effect = Active(CATALOGUE["multipass"], values)
     ours, plain = forces_with([effect], STATE, MODEL, AROUND), wheel_forces(STATE, MODEL)
-    packed = STATE._replace(K_L=2.5 * STATE.K_L, c=1.2 * STATE.c, tan_phi=1.2 * STATE.tan_phi)
+    packed = STATE._replace(K_L=2.5 * STATE.K_L, c=1.2 * STATE.c, tan_phi=1.2 * STATE.tan_phi, K=STATE.K / 1.6)
     assert np.array_equal(ours[..., ~REAR], plain[..., ~REAR])
     assert ours[..., REAR] == pytest.approx(wheel_forces(packed, MODEL)[..., REAR], rel=1e-10)
 

@@ -64,21 +64,23 @@ RATE_STIFFENING = Effect(
 def _multipass(
     state: WheelState, model: WheelModel, around: Surroundings, values: Values
 ) -> tuple[WheelState, WheelModel]:
-    """Rear wheels: K_L exp(stiffness); c and tan phi exp(density)."""
+    """Rear wheels: K_L exp(stiffness); c and tan phi exp(density); K exp(-shear)."""
     rear = np.asarray(around.rear, float)
     strength = np.exp(values["density"] * rear)
-    K_L = state.K_L * np.exp(values["stiffness"] * rear)
-    return state._replace(K_L=K_L, c=state.c * strength, tan_phi=state.tan_phi * strength), model
+    K_L, K = state.K_L * np.exp(values["stiffness"] * rear), state.K * np.exp(-values["shear"] * rear)
+    return state._replace(K_L=K_L, c=state.c * strength, tan_phi=state.tan_phi * strength, K=K), model
 
 
 MULTIPASS = Effect(
     name="multipass",
     physics="Rear wheels run in ruts that the front wheels have compacted: there the soil is stiffer and stronger.",
-    source="Holm 1969 (J. Terramechanics 6); density form: Wong, Theory of Ground Vehicles (4th ed. 2008), ch. 2",
+    source="Holm 1969 (J. Terramechanics 6); density form: Wong, Theory of Ground Vehicles (4th ed. 2008), ch. 2;"
+    " a smaller shear deformation modulus besides: Senatore & Sandu 2011 (J. Terramechanics 48:265)",
     tells="driving one axle beside the other's ruts (crab steering, reversing), a sinkage sensor at both axles",
     parameters=(
         Parameter("stiffness", "1", 0.0, 0.5, -0.7, 2.5),
         Parameter("density", "1", 0.0, 0.1, -0.3, 0.6),
+        Parameter("shear", "1", 0.0, 0.3, -0.7, 2.0),
     ),
     wheel=_multipass,
 )
