@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 from .trial import Trial
 
@@ -62,6 +62,9 @@ def shares(trials: Sequence[Trial]) -> Iterator[str]:
             float(np.median(np.abs([getattr(t, f"bearing_{w}") for t in done]))) for w in ("before", "after")
         )
         yield f"bearing pressure, median error: {100 * before:.1f} % -> {100 * after:.1f} %  (<= 2 %)"
+        errors = np.array([(t.bearing_after, t.bearing_sd) for t in done])
+        expected, z = np.median(errors[:, 1]) * norm.ppf(0.75), np.median(np.abs(errors[:, 0] / errors[:, 1]))
+        yield f"  of normal errors of the told sd: {100 * expected:.1f} %; error over told sd: {z:.2f}  (0.67)"
     if trials:
         seconds = [t.seconds for t in trials]
         median, nearly_all = np.quantile(seconds, (0.5, 0.95))

@@ -14,7 +14,7 @@ from soilbus.diagnosis.completion import Completion, complete
 from soilbus.diagnosis.diagnose import Diagnosis, diagnose
 from soilbus.diagnosis.records import Record, record_of
 from soilbus.diagnosis.score import further_scores, scores
-from soilbus.estimation.posterior import SoilPrior
+from soilbus.estimation.posterior import Estimate, SoilPrior
 from soilbus.estimation.window import BinStore
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Effect
@@ -29,7 +29,7 @@ class Trial:
     named: names added, the one that explains most first; sets: for each of them all names
     with probabilities.  visible: by how much the true effect lowers the penalised cost, of
     two effects the less visible one beside the other (nan for what the catalogue lacks).
-    bearing_*: relative errors of the bearing pressure.
+    bearing_*: relative errors of the bearing pressure; bearing_sd the told relative deviation in the end.
     """
 
     id: str
@@ -48,6 +48,7 @@ class Trial:
     rows: int
     bearing_before: float
     bearing_after: float
+    bearing_sd: float
     seconds: float
 
     def as_json(self) -> dict[str, Any]:
@@ -72,6 +73,7 @@ def tried(case: Case) -> Trial:
     begin = time.process_time()
     found = diagnose([record], prior, list(CATALOGUE.values()))
     seconds = time.process_time() - begin
+    after = _bearing(case, found.completed)
     return Trial(
         id=case.id,
         kind=case.kind,
@@ -87,8 +89,9 @@ def tried(case: Case) -> Trial:
         gap_before=found.base.gap,
         gap_after=found.completed.gap,
         rows=found.base.checked_rows,
-        bearing_before=_bearing_error(case, found.base),
-        bearing_after=_bearing_error(case, found.completed),
+        bearing_before=_bearing_error(case, _bearing(case, found.base)),
+        bearing_after=_bearing_error(case, after),
+        bearing_sd=after.std / after.value,
         seconds=seconds,
     )
 
@@ -128,7 +131,11 @@ def _cost(completion: Completion) -> float:
     return completion.cost + sum(check.at.chi2 for check in completion.checks)
 
 
-def _bearing_error(case: Case, completion: Completion) -> float:
+def _bearing(case: Case, completion: Completion) -> Estimate:
     settings = case.config.estimator
-    found = completion.fits[0].posterior.bearing_pressure(settings.z_ref, settings.b_ref).value
-    return float(np.log(found / case.soil.bearing_pressure(settings.z_ref, settings.b_ref)))
+    return completion.fits[0].posterior.bearing_pressure(settings.z_ref, settings.b_ref)
+
+
+def _bearing_error(case: Case, told: Estimate) -> float:
+    settings = case.config.estimator
+    return float(np.log(told.value / case.soil.bearing_pressure(settings.z_ref, settings.b_ref)))
