@@ -15,7 +15,7 @@ _LOAD_CELLS = (
 )
 _WANDERING = "; zero with temperature and in time: OIML R 60 (2021), 5.5 and 5.6; warming by Newton's law of cooling"
 _WANDERS = (
-    Parameter("drift", "N/s", 0.0, 0.5, -30.0, 30.0, of_record=True),
+    Parameter("drift", "N/s", 0.0, 2.0, -50.0, 50.0, of_record=True),
     Parameter("settling", "1/s", 0.01, 0.02, 5e-4, 0.2, starts=(0.06,), of_record=True),
 )
 
