@@ -184,13 +184,9 @@ def _forces_and_jacobian(at: Stress, state: WheelState, model: WheelModel, shape
         fields, 3, at.rim
     ).swapaxes(0, 1)
     turned[2] += dot(at.normal, np.broadcast_to(at.share, at.normal.shape))
-    if model.peak_c2:
-        by_slip = by_slip + peaking(state.slip, model) * by_peak(at, state, model, tau, mobilising)
-    if model.exit_varies:
-        later = by_leave(at, state, model, tau, mobilising)
-        by_entry, of_slip = leaving(state.entry_angle, state.slip, model)
-        turned += by_entry * later
-        by_slip = by_slip + of_slip * later
+    by_entry, of_slip = _reshaped(at, state, model, tau, mobilising)
+    turned += by_entry
+    by_slip += of_slip
     whole, unit = _whole(by_normal, by_rubbed, by_stuck, state), unit_of(state)
     columns = (
         pressed + turned + whole / state.entry_angle,
@@ -208,6 +204,19 @@ def _forces_and_jacobian(at: Stress, state: WheelState, model: WheelModel, shape
     for column, derivative in enumerate(columns):
         np.multiply(unit, derivative, out=jacobian[:, column])
     return out
+
+
+def _reshaped(at: Stress, state: WheelState, model: WheelModel, tau: Array, mobilising: Array) -> tuple[Any, Any]:
+    """What it adds to the derivatives (3, N) by entry angle and slip that the contact changes its shape with them."""
+    by_entry: Any = 0.0
+    by_slip: Any = 0.0
+    if model.peak_c2:
+        by_slip = peaking(state.slip, model) * by_peak(at, state, model, tau, mobilising)
+    if model.exit_varies:
+        later = by_leave(at, state, model, tau, mobilising)
+        of_entry, of_slip = leaving(state.entry_angle, state.slip, model)
+        by_entry, by_slip = of_entry * later, by_slip + of_slip * later
+    return by_entry, by_slip
 
 
 def _by_shape(
@@ -236,13 +245,9 @@ def _forces_and_slopes(at: Stress, state: WheelState, model: WheelModel) -> Arra
     np.multiply(mobilising, at.rim.travel, out=fields[4])
     pressing, pressed, rubbing, turned, by_slip = integrals(fields, 2, at.rim).swapaxes(0, 1)
     turned[2] += dot(at.normal, np.broadcast_to(at.share, at.normal.shape))
-    if model.peak_c2:
-        by_slip = by_slip + peaking(state.slip, model) * by_peak(at, state, model, tau, mobilising)
-    if model.exit_varies:
-        later = by_leave(at, state, model, tau, mobilising)
-        by_entry, of_slip = leaving(state.entry_angle, state.slip, model)
-        turned += by_entry * later
-        by_slip = by_slip + of_slip * later
+    by_entry, of_slip = _reshaped(at, state, model, tau, mobilising)
+    turned += by_entry
+    by_slip += of_slip
     whole, unit = pressing + rubbing, unit_of(state)
     out = np.empty((9, len(state.entry_angle)))
     np.multiply(unit, whole, out=out[:3])
