@@ -98,17 +98,13 @@ def completion_of(config: Config) -> tuple[tuple[Effect, ...], tuple[Free, ...]]
     free: list[Free] = []
     for effect, values in active:
         for parameter in effect.parameters:
-            given = settings[effect.name].get(parameter.name)
-            if parameter.of_record:
-                of_wheels = range(len(wheels)) if effect.each_wheel else (None,)
-                free += [Free(effect.name, parameter, i, parameter.neutral, 0.0) for i in of_wheels]
-                continue
+            given, value = settings[effect.name].get(parameter.name), values[parameter.name]
             if not effect.each_wheel:
-                free.append(Free(effect.name, parameter, None, values[parameter.name], _std(given)))
+                free.append(Free(effect.name, parameter, None, *_known(parameter, value, given)))
                 continue
             for i, name in enumerate(wheels):
                 of_wheel = given.get(name) if isinstance(given, Mapping) and _by_wheel(given) else given
-                free.append(Free(effect.name, parameter, i, float(values[parameter.name][i]), _std(of_wheel)))
+                free.append(Free(effect.name, parameter, i, *_known(parameter, value[i], of_wheel)))
     return tuple(effect for effect, _ in active), tuple(free)
 
 
@@ -195,6 +191,12 @@ def _within(given: Any, parameter: Parameter) -> float:
     if not parameter.low <= value <= parameter.high:
         raise ConfigError([f"{value:g} is not within {parameter.low:g}..{parameter.high:g}"])
     return value
+
+
+def _known(parameter: Parameter, value: Any, given: Any) -> tuple[float, float]:
+    """Value and std of the prior; of what describes one record nothing is known in another."""
+    std = _std(given)
+    return (parameter.neutral, 0.0) if parameter.of_record else (float(value), std)
 
 
 def _std(given: Any) -> float:

@@ -1,9 +1,10 @@
 """A model with some effects, fitted to the recordings of one vehicle.
 
-The vehicle's gain errors and the parameters of its effects are the same in all recordings,
-the soil is each recording's own.  So one recording after the other is fitted, each with
-what those before it told of gains and effects; the evidences of the parts add up to that
-of the whole, as do those of the blocks learned from and of the blocks held out.
+The vehicle's gain errors and the parameters of its effects are the same in all recordings;
+the soil is each recording's own, and so is what an effect says of one record only.  So one
+recording after the other is fitted, each with what those before it told of gains and
+effects; the evidences of the parts add up to that of the whole, as do those of the blocks
+learned from and of the blocks held out.
 """
 
 from __future__ import annotations

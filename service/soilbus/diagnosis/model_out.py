@@ -22,15 +22,18 @@ def effect_tables(completion: Completion) -> tuple[list[dict[str, Any]], list[st
     wheels = completion.checks[-1].problem.rig.wheels
     for effect in completion.effects:
         found = {name: _told(estimate) for name, estimate in values[effect.name].items()}
-        kept = [p for p in effect.parameters if not (effect.of_record or p.of_record)]
-        names = {p: [f"{p.name}_{w}" for w in wheels] if effect.each_wheel else [p.name] for p in effect.parameters}
-        gone = ", ".join(f"{n} = {found[n]['value']:g}" for p in effect.parameters if p not in kept for n in names[p])
+        kept: dict[str, Any] = {}
+        gone: list[str] = []
+        for p in effect.parameters:
+            names = {w: f"{p.name}_{w}" for w in wheels} if effect.each_wheel else {"": p.name}
+            if effect.of_record or p.of_record:
+                gone += [f"{name} = {found[name]['value']:g}" for name in names.values()]
+            else:
+                kept[p.name] = {w: found[n] for w, n in names.items()} if effect.each_wheel else found[p.name]
         if gone:
-            notes.append(f"{effect.name} ({gone}) describes the recording only and is left out")
-        if effect.each_wheel:
-            tables.append({"name": effect.name} | {p.name: {w: found[f"{p.name}_{w}"] for w in wheels} for p in kept})
-        elif kept:
-            tables.append({"name": effect.name} | {p.name: found[p.name] for p in kept})
+            notes.append(f"{effect.name} ({', '.join(gone)}) describes the recording only and is left out")
+        if kept:
+            tables.append({"name": effect.name, **kept})
     return tables, notes
 
 

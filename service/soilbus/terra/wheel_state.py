@@ -29,11 +29,10 @@ class WheelModel:
 
     The angle of greatest stress is peak_c1 + peak_c2 s (1 + peak_bend) / (1 + peak_bend |s|)
     times the entry angle at the slip s (eq. 4 where it does not bend; at s = 1 always c1 + c2),
-    a share that stays between those of PEAK; the
-    exit angle is exit_ratio + exit_slip s times it, s the slip where the wheel drives, and
-    exit_angle [rad] more (0: the rut does not recover;
-    behind the axle all are negative), but no farther behind than LONGEST times the entry
-    angle.  exponential_share of the shear strength is mobilised by the exponential law
+    a share that stays between those of PEAK.  The exit angle is exit_ratio + exit_slip s
+    times it, s the slip where the wheel drives, and exit_angle [rad] more (0: the rut does
+    not recover; behind the axle all are negative), but no farther behind than LONGEST times
+    the entry angle.  exponential_share of the shear strength is mobilised by the exponential law
     whatever shear_law says.  From the depth pan_depth [m] on the pressure grows by
     pan_stiffness times what the soil alone would add (0: no hard pan).  one_off: a model
     whose shape no other call will share, so that nothing of it is kept.

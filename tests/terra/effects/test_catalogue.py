@@ -153,3 +153,8 @@ def test_a_further_start_changes_nothing_while_the_effect_is_absent(effect, para
     plain = wheel_forces(state, WheelModel())
     started = forces_with([Active(effect, effect.neutral | {parameter.name: value})], state, WheelModel(), around)
     np.testing.assert_allclose(started, plain, rtol=1e-12)
+    if effect.draft is not None:
+        draft = np.linspace(-500.0, 4000.0, len(around.t))
+        assert not np.any(effect.draft(draft, around, effect.neutral | {parameter.name: value}))
+    if effect.load is not None:
+        assert not np.any(effect.load(around, effect.neutral | {parameter.name: value}))

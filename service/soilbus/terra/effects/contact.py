@@ -131,7 +131,8 @@ LUGS = Effect(
     forces=_lugged_arm,
 )
 
-_EVENLY = 0.04  # m
+_EVENLY = 0.04
+"""Length [m] short of which a flat grows evenly with the deflection: a chord's slope has no bound at none."""
 _MOST_DEFLECTION = 0.3  # of the width; then the rim strikes through
 
 
@@ -154,7 +155,8 @@ def _flattened_forces(forces: Forces, state: WheelState, around: Surroundings, v
     """What the flat behind the axle adds; torque at the arm of the rolling radius, by virtual work.
 
     The substitute circle ends at the axle.  Behind it, a share of the flat's half length
-    carries the pressure of the deepest point and has slipped as far as the soil there.
+    carries the pressure of the deepest point and has slipped as far as the soil there; its
+    shear is Janosi and Hanamoto's whatever the model's law.
     """
     circle, delta = state.radius, _deflection(state, around, values)
     z = sinkage(state.entry_angle, circle)
