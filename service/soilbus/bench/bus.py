@@ -68,15 +68,16 @@ def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
     """
     _check_quiet(channel)
     ready, libraries = zip(*((_time_to_ready(channel), _time_of_libraries()) for _ in range(STARTS)), strict=True)
-    with TemporaryDirectory() as folder, _daemon(channel, Path(folder)) as daemon, others(channel):
+    with TemporaryDirectory() as folder, _daemon(channel, Path(folder)) as daemon:
         ear, traffic = Ear(channel), Traffic(channel, 1.5 * seconds)
-        ear.start()
-        traffic.start()
-        time.sleep(seconds)
-        late = ear.latencies()
-        shares = _shares(daemon, channel, 0.5 * seconds)
-        traffic.wait()
-        time.sleep(SETTLED)
+        with others(channel):
+            ear.start()
+            traffic.start()
+            time.sleep(seconds)
+            late = ear.latencies()
+            shares = _shares(daemon, channel, 0.5 * seconds)
+            traffic.wait()
+            time.sleep(SETTLED)
         ear.stop()
         memory = _peak_memory(daemon)
     if not len(late):

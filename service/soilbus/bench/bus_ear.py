@@ -20,7 +20,11 @@ Array = NDArray[np.float64]
 
 
 class Ear:
-    """Hears the mapped messages and the daemon's on a channel, with the kernel's time stamps."""
+    """Hears the mapped messages and the daemon's on a channel, with the kernel's time stamps.
+
+    To be made while the channel is quiet: a socket hears all frames until it has its filters, and one
+    of others would pass for the first mapped one.
+    """
 
     def __init__(self, channel: str) -> None:
         self._config = reference_configuration()
