@@ -7,11 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
-from scipy.stats import norm
+from scipy.interpolate import CubicSpline
+from scipy.linalg import block_diag
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal, norm
 
 from soilbus.diagnosis.sizes import SCALES, correction, evidence_of_any_size
 from soilbus.diagnosis.verdict import PLAUSIBLE, hopeless, is_real, pays, probabilities
-from soilbus.estimation.effect_parameters import Free
+from soilbus.estimation.effect_parameters import Free, parameters_of
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Parameter
 
@@ -54,7 +57,48 @@ def test_a_small_effect_of_many_parameters_pays_less_for_them():
     free = [SIZE] * 8
     covariance = np.eye(8) * 0.02**2
     small, usual = (correction(np.full(8, size), covariance, free) for size in (0.08, 1.0))
-    assert small < -10.0 < usual < 2.0 * np.log(len(SCALES))
+    assert small < -10.0 < usual < 2.0 * np.log(len(SCALES) * (1 + len(free)))  # scales, and cases: all or one alone
+
+
+@pytest.mark.parametrize("name", ["grade", "soil_drift", "wheel_load_offset", "inertia"])
+def test_simpler_cases_of_an_effect_have_their_share_of_the_evidence(name):
+    """Against the marginal likelihood of every case of it, with matrices of its own for curves of fewer knots."""
+    rng = np.random.default_rng(31)
+    free = parameters_of(CATALOGUE[name], 4)
+    design = rng.normal(size=(60, len(free)))
+    y = rng.normal(size=60) + design @ rng.normal(0.0, 0.3, len(free))
+
+    def marginal(columns: np.ndarray, sized: np.ndarray) -> list[float]:
+        cases = [columns * np.where(sized, scale, 1.0) for scale in SCALES]
+        return [multivariate_normal.logpdf(y, np.zeros(60), np.eye(60) + c @ c.T) for c in cases]
+
+    likelihoods = [marginal(design @ rows.T, sized) for rows, sized in simpler_by_hand(name)]
+    found = logsumexp([logsumexp(each) - np.log(len(SCALES)) for each in likelihoods]) - np.log(len(likelihoods))
+    absent = multivariate_normal.logpdf(y, np.zeros(60), np.eye(60))
+    told = evidence_of_any_size(design.T @ design, design.T @ y, free)
+    assert told == pytest.approx(-2.0 * (found - absent), abs=1e-6)
+
+
+def simpler_by_hand(name: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Rows of each case's parameters in all of the effect's, and which have a size."""
+    if name == "inertia":
+        return [(np.eye(2)[rows], np.ones(len(rows), bool)) for rows in ([0, 1], [0], [1])]
+    if name == "wheel_load_offset":  # offsets of four wheels, their drifts, how fast these settle
+        wheels = [list(range(12)), *([w, w + 4, w + 8] for w in range(4))]
+        return [(np.eye(12)[rows], np.array([i < 8 for i in rows])) for rows in wheels]
+    if name == "grade":
+        curves = [through(np.arange(0, 16, every), np.arange(1, 16), [0]) for every in (1, 3, 5, 15)]
+        return [(block_diag([[1.0]], c), np.ones(1 + len(c), bool)) for c in curves]
+    curves = [through(np.arange(0, 9, every), np.arange(1, 8), [0, 8]) for every in (1, 2, 4, 8)]
+    return [(block_diag([[1.0]], c, [[1.0]], c), np.ones(2 + 2 * len(c), bool)) for c in curves]
+
+
+def through(few: np.ndarray, many: np.ndarray, zero: list[int]) -> np.ndarray:
+    """Heights at many knots of natural splines that are one at one of a few and zero at the others (free, many)."""
+    heights = [np.eye(len(few))[i] for i, knot in enumerate(few.tolist()) if knot not in zero]
+    if len(few) == 2:
+        return np.array([np.interp(many, few, h) for h in heights]).reshape(-1, len(many))
+    return np.array([CubicSpline(few, h, bc_type="natural")(many) for h in heights])
 
 
 def test_alike_names_share_the_probability_and_form_errors_leave_some_to_others():

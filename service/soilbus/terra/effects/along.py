@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.terra.dual import Dual
-from soilbus.terra.effects.effect import Surroundings
+from soilbus.terra.effects.effect import Knot, Parameter, Surroundings
 from soilbus.terra.stress import Array
 
 _GAP = 3.0  # times the median step
@@ -30,10 +30,15 @@ def through_knots(share: Any, heights: Sequence[Any]) -> Any:
 
     Linear in the heights; twice as near to a smooth profile as straight lines between as many knots.
     """
-    return sum(height * of_knot for height, of_knot in zip(heights, _splines(share, len(heights)), strict=True))
+    return sum(height * of_knot for height, of_knot in zip(heights, splines(share, len(heights)), strict=True))
 
 
-def _splines(share: Any, knots: int) -> Array:
+def curve_of(name: str, unit: str, knots: range, intervals: int, std: float, most: float) -> tuple[Parameter, ...]:
+    """The heights of a curve at these of its knots 0..intervals, each with this prior std, as parameters name_1 ..."""
+    return tuple(Parameter(f"{name}_{i}", unit, 0.0, std, -most, most, knot=Knot(name, i, intervals)) for i in knots)
+
+
+def splines(share: Any, knots: int) -> Array:
     """The splines (knots, ...) that are one at one knot and zero at all others."""
     place = np.clip(np.asarray(share, float), 0.0, 1.0) * (knots - 1)
     left = np.minimum(np.nan_to_num(place).astype(int), knots - 2)

@@ -52,6 +52,14 @@ class Surroundings(NamedTuple):
     length: float = 0.0
 
 
+class Knot(NamedTuple):
+    """Which knot of which curve along the way: `number` of 0..intervals; knots that are no parameters are zero."""
+
+    curve: str
+    number: int
+    intervals: int
+
+
 @dataclass(frozen=True, slots=True)
 class Parameter:
     """One parameter of an effect: absent at `neutral`, prior sd `std` about it, confined to low..high; SI unit.
@@ -59,6 +67,7 @@ class Parameter:
     `starts`: further values that a search does well to begin at, where the sensitivity at
     `neutral` alone may be blind (the depth of a pan below all sinkages of a record).
     `of_record`: it describes one record and means nothing in another.
+    `knot`: it is the height of a curve there.
     """
 
     name: str
@@ -69,6 +78,7 @@ class Parameter:
     high: float
     starts: tuple[float, ...] = ()
     of_record: bool = False
+    knot: Knot | None = None
 
 
 WheelHook = Callable[[WheelState, WheelModel, Surroundings, Values], tuple[WheelState, WheelModel]]

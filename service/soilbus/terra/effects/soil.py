@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from soilbus.terra.effects.along import share_of_way, through_knots
+from soilbus.terra.effects.along import curve_of, share_of_way, through_knots
 from soilbus.terra.effects.effect import Effect, Parameter, Surroundings, Values
 from soilbus.terra.wheel import WheelModel, WheelState
 
@@ -132,9 +132,9 @@ SOIL_DRIFT = Effect(
     tells="driving the same way back: what belongs to the place comes again, what belongs to time does not",
     parameters=(
         Parameter("stiffness", "1", 0.0, 0.4, -3.0, 3.0),
-        *(Parameter(f"stiffness_{i + 1}", "1", 0.0, 0.2, -1.5, 1.5) for i in range(DRIFT_KNOTS)),
+        *curve_of("stiffness", "1", range(1, DRIFT_KNOTS + 1), DRIFT_KNOTS + 1, 0.2, 1.5),
         Parameter("strength", "1", 0.0, 0.15, -1.0, 1.0),
-        *(Parameter(f"strength_{i + 1}", "1", 0.0, 0.08, -0.5, 0.5) for i in range(DRIFT_KNOTS)),
+        *curve_of("strength", "1", range(1, DRIFT_KNOTS + 1), DRIFT_KNOTS + 1, 0.08, 0.5),
     ),
     wheel=_soil_drift,
     of_record=True,

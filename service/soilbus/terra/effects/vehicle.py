@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from soilbus.terra.dual import value_of
-from soilbus.terra.effects.along import instants, share_of_way, stretches, through_knots
+from soilbus.terra.effects.along import curve_of, instants, share_of_way, stretches, through_knots
 from soilbus.terra.effects.effect import Effect, Parameter, Surroundings, Values
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import WheelModel, WheelState
@@ -50,7 +50,10 @@ GRADE = Effect(
     physics="The field is not level, and gravity holds back or pushes what no sensor has told of.",
     source="weight along the slope, m g sin(slope): Wong 2008, ch. 3; natural cubic spline between knots",
     tells="driving both ways on the slope, or a pitch sensor; a slope that never changes is a draft offset",
-    parameters=tuple(Parameter(f"slope_{i}", "rad", 0.0, 0.03, -0.3, 0.3) for i in range(SLOPE_KNOTS)),
+    parameters=(
+        Parameter("slope_0", "rad", 0.0, 0.03, -0.3, 0.3),
+        *curve_of("slope", "rad", range(1, SLOPE_KNOTS), SLOPE_KNOTS - 1, 0.03, 0.3),
+    ),
     resistance=_unmeasured_slope,
     of_record=True,
 )
