@@ -14,7 +14,7 @@ from soilbus.terra.wheel import WheelModel, WheelState
 REFERENCE_SPEED = 1.0
 """Ground speed [m/s] for which the soil's own K_L holds."""
 TYPICAL_DEPTH = 0.05
-"""Depth [m] at which a change of n with slip leaves the pressure as it is, so that the two parameters act apart."""
+"""Depth [m] at which a change of n leaves the pressure as it is, so that n and stiffness act apart."""
 _LEAST_SPEED = 0.05
 _LEAST_EXPONENT = 0.05
 
@@ -64,23 +64,30 @@ RATE_STIFFENING = Effect(
 def _multipass(
     state: WheelState, model: WheelModel, around: Surroundings, values: Values
 ) -> tuple[WheelState, WheelModel]:
-    """Rear wheels: K_L exp(stiffness); c and tan phi exp(density); K exp(-shear)."""
+    """Rear wheels: K_L exp(stiffness); c and tan phi exp(density); K exp(-shear); n exp(-reloading).
+
+    At TYPICAL_DEPTH the last does nothing to the pressure.
+    """
     rear = np.asarray(around.rear, float)
     strength = np.exp(values["density"] * rear)
-    K_L, K = state.K_L * np.exp(values["stiffness"] * rear), state.K * np.exp(-values["shear"] * rear)
-    return state._replace(K_L=K_L, c=state.c * strength, tan_phi=state.tan_phi * strength, K=K), model
+    n = state.n * np.exp(-values["reloading"] * rear)
+    K_L = state.K_L * np.exp(values["stiffness"] * rear + (state.n - n) * np.log(TYPICAL_DEPTH))
+    K = state.K * np.exp(-values["shear"] * rear)
+    return state._replace(n=n, K_L=K_L, c=state.c * strength, tan_phi=state.tan_phi * strength, K=K), model
 
 
 MULTIPASS = Effect(
     name="multipass",
     physics="Rear wheels run in ruts that the front wheels have compacted: there the soil is stiffer and stronger.",
     source="Holm 1969 (J. Terramechanics 6); density form: Wong, Theory of Ground Vehicles (4th ed. 2008), ch. 2;"
-    " a smaller shear deformation modulus besides: Senatore & Sandu 2011 (J. Terramechanics 48:265)",
+    " a smaller shear deformation modulus besides: Senatore & Sandu 2011 (J. Terramechanics 48:265);"
+    " soil that has been loaded before resists at once, and gains less with depth: repetitive loading, Wong 2008, ch. 2",
     tells="driving one axle beside the other's ruts (crab steering, reversing), a sinkage sensor at both axles",
     parameters=(
         Parameter("stiffness", "1", 0.0, 0.5, -0.7, 2.5),
         Parameter("density", "1", 0.0, 0.1, -0.3, 0.6),
         Parameter("shear", "1", 0.0, 0.3, -0.7, 2.0),
+        Parameter("reloading", "1", 0.0, 0.2, -0.7, 2.0),
     ),
     wheel=_multipass,
 )
