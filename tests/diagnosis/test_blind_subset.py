@@ -12,7 +12,7 @@ from .blind.trial import tried
 
 VISIBLE = (
     "single/multipass:density/medium/", "single/rate_stiffening:penetration/medium/", "single/soil_drift:ramp/medium/",
-    "single/torque_lag:filter/medium/", "single/inertia:flywheel/medium/", "single/hardpan:graded/large/",
+    "single/torque_lag:averaged/medium/", "single/inertia:flywheel/medium/", "single/hardpan:graded/large/",
     "single/rolling_radius:one_axle/medium/", "single/rut_recovery:constant/large/",
 )  # fmt: skip
 

@@ -130,7 +130,7 @@ def test_model_out_is_the_configuration_with_the_effect(diagnosed):
 
 def test_check_says_what_is_estimated(diagnosed, capsys):
     assert main(["check", "--config", str(diagnosed.model)]) == 0
-    assert "multipass: estimated: stiffness, density, shear\n" in capsys.readouterr().out
+    assert "multipass: estimated: stiffness, density, shear, reloading\n" in capsys.readouterr().out
 
 
 def test_replay_with_the_completed_model_is_valid_where_the_plain_model_fails(diagnosed, tmp_path):

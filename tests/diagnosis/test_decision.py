@@ -129,10 +129,11 @@ def test_values_in_the_decision_are_those_of_the_window():
     effects, free = completion_of(config)
     assert [effect.name for effect in effects] == ["multipass"]  # the drift is of one record
     assert [(f.name, f.value, f.std) for f in free] == [
-        ("multipass.stiffness", 0.4, 0.1), ("multipass.density", 0.05, 0.0), ("multipass.shear", 0.0, 0.0)
+        ("multipass.stiffness", 0.4, 0.1), ("multipass.density", 0.05, 0.0),
+        ("multipass.shear", 0.0, 0.0), ("multipass.reloading", 0.0, 0.0),
     ]  # fmt: skip
-    (active,) = active_at(effects, free, np.array([1.5, 0.0, 0.0]), 4)
-    assert active.values == pytest.approx({"stiffness": 0.55, "density": 0.05, "shear": 0.0})
+    (active,) = active_at(effects, free, np.array([1.5, 0.0, 0.0, 0.0]), 4)
+    assert active.values == pytest.approx({"stiffness": 0.55, "density": 0.05, "shear": 0.0, "reloading": 0.0})
     Pipeline(config, load_databases(config))
 
 

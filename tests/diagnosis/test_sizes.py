@@ -38,7 +38,7 @@ def test_the_evidence_is_that_of_a_mixture_of_prior_scales(information, best):
 
         return quad(density, top - 12.0 * sd, top + 12.0 * sd, epsabs=0.0)[0] * np.exp(height)
 
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         expected = np.array([of(scale) for scale in SCALES])
     if not np.isfinite(expected).all():
         return

@@ -63,10 +63,11 @@ class _Contact(NamedTuple):
 
 
 class _Wheels(NamedTuple):
-    """Wheels as the effects' hooks leave them, and what effects depend on."""
+    """Wheels as the effects' hooks leave them, their sinkages (N, W), and what effects depend on."""
 
     state: WheelState
     model: WheelModel
+    depth: Any
     around: Surroundings
 
 
@@ -150,8 +151,7 @@ class CompletedProblem(WindowProblem):
         if not self.effects:
             return super().sinkages(soil, gains, latents)
         active = self.active(gains[self.n_sensors :])
-        state = self._wheels(soil, active, latents, latents.entry_angle).state
-        return np.broadcast_to(sinkage(state.entry_angle, state.radius), latents.load.shape)
+        return np.broadcast_to(self._wheels(soil, active, latents, latents.entry_angle).depth, latents.load.shape)
 
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         if not self.effects:
@@ -198,17 +198,18 @@ class CompletedProblem(WindowProblem):
         )
 
     def _wheels(self, soil: Soil, active: Sequence[Active], latents: Latents, angle: Array) -> _Wheels:
-        """The wheels at given entry angles."""
+        """The wheels at given entry angles: these and the circles that effects make of the wheels give the sinkages."""
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
         K_L = lumped_modulus(soil.k_c, soil.k_phi, self.rig.width)
         state = WheelState(angle, slip, self.rig.radius, self.rig.width, K_L, soil.n, np.tan(soil.phi), soil.c, soil.K)
         around = self._surroundings(latents)
-        return _Wheels(*wheel_with(active, state, self.model, around), around)
+        state, model = wheel_with(active, state, self.model, around)
+        return _Wheels(state, model, sinkage(angle, state.radius), around)
 
     def _contact(self, wheels: _Wheels, active: Sequence[Active], forces: Forces) -> _Contact:
         """What happens between wheels and ground, from the integrated forces."""
-        state, _, around = wheels
-        return _Contact(reactions_with(active, forces, state, around), sinkage(state.entry_angle, state.radius), around)
+        forces = reactions_with(active, forces, wheels.state, wheels.around)
+        return _Contact(forces, wheels.depth, wheels.around)
 
     def _excess(self, contact: _Contact, active: Sequence[Active], latents: Latents) -> Any:
         """Load (N, W) that the soil carries beyond what it must."""

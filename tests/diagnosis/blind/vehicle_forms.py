@@ -34,6 +34,18 @@ def _delayed(torque: Array, around: Any, values: Any) -> Array:
     return np.stack([np.interp(t - values["size"], t, of_wheel) for of_wheel in torque.T], axis=1)
 
 
+def _averaged(torque: Array, around: Any, values: Any) -> Array:
+    """The mean of so many seconds before, as of a node that samples faster than it sends."""
+    t = np.ravel(around.t)
+    longer = np.concatenate([[t[0] - values["size"]], t])
+    out = []
+    for of_wheel in torque.T:
+        since = np.concatenate([of_wheel[:1], of_wheel])
+        sums = np.concatenate([[0.0], np.cumsum(np.diff(longer) * (since[1:] + since[:-1]) / 2.0)])
+        out.append((sums[1:] - np.interp(t - values["size"], longer, sums)) / values["size"])
+    return np.stack(out, axis=1)
+
+
 def filtered(torque: Array, around: Any, values: Any) -> Array:
     """Through a first-order low pass of this time constant."""
     share = -np.expm1(-float(around.t[1, 0] - around.t[0, 0]) / values["size"])
@@ -173,7 +185,7 @@ FORMS = (
         "drivetrain_loss", "viscous", "churning oil", "N m s", (1.2, 1.2), 50.0, by_hooks(torque=_viscous), other=False
     ),
     Form("torque_lag", "delay", "as from a queue", "s", (0.01, 0.01), 0.4, by_hooks(torque=_delayed), other=False),
-    Form("torque_lag", "filter", "first-order low pass", "s", (0.011, 0.011), 0.4, by_hooks(torque=filtered)),
+    Form("torque_lag", "averaged", "mean of a time before", "s", (0.022, 0.022), 0.8, by_hooks(torque=_averaged)),
     Form(
         "grade",
         "sines",

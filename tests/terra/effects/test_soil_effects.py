@@ -12,7 +12,7 @@ from adaptive import adaptive_forces
 from soilbus.terra.effects.along import share_of_way, through_knots
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active, forces_with, wheel_with
-from soilbus.terra.effects.soil import DRIFT_KNOTS
+from soilbus.terra.effects.soil import DRIFT_KNOTS, TYPICAL_DEPTH
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import (
@@ -40,7 +40,7 @@ def test_the_sinkage_exponent_grows_with_slip(slip):
     """Ding et al. 2010: sigma = K z^(n0 + n1 s), here with the same pressure at 5 cm whatever n1."""
     state = state_on(soil_named("loam"), 0.4, slip, 0.5, 0.3)
     ours = forces_with(
-        [Active(CATALOGUE["slip_sinkage"], {"exponent": 0.5, "softening": 0.0})], state, MODEL, one_wheel(AROUND)
+        [Active(CATALOGUE["slip_sinkage"], {"exponent": 0.5, "softening": 0.0, "dug": 0.0})], state, MODEL, one_wheel(AROUND)
     )
     true = adaptive_forces(state, MODEL, pressure=lambda z: state.K_L * 0.05**0.7 * (z / 0.05) ** (0.7 + 0.5 * slip))
     assert np.max(np.abs(ours - true)) < 1e-6 * true[0]
@@ -76,10 +76,12 @@ def test_bearing_grows_with_a_power_of_the_speed():
 
 
 def test_only_rear_wheels_run_in_ruts():
-    values = {"stiffness": math.log(2.5), "density": math.log(1.2), "shear": math.log(1.6)}
+    values = {"stiffness": math.log(2.5), "density": math.log(1.2), "shear": math.log(1.6), "reloading": math.log(1.3)}
     effect = Active(CATALOGUE["multipass"], values)
     ours, plain = forces_with([effect], STATE, MODEL, AROUND), wheel_forces(STATE, MODEL)
-    packed = STATE._replace(K_L=2.5 * STATE.K_L, c=1.2 * STATE.c, tan_phi=1.2 * STATE.tan_phi, K=STATE.K / 1.6)
+    n = STATE.n / 1.3
+    K_L = 2.5 * STATE.K_L * TYPICAL_DEPTH**STATE.n / TYPICAL_DEPTH**n
+    packed = STATE._replace(n=n, K_L=K_L, c=1.2 * STATE.c, tan_phi=1.2 * STATE.tan_phi, K=STATE.K / 1.6)
     assert np.array_equal(ours[..., ~REAR], plain[..., ~REAR])
     assert ours[..., REAR] == pytest.approx(wheel_forces(packed, MODEL)[..., REAR], rel=1e-10)
 

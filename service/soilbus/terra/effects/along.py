@@ -1,4 +1,4 @@
-"""The way and the time of a record: shares of it, curves through knots, stretches without a gap."""
+"""The way and the time of a record: shares of it, curves through knots, stretches without a gap, low passes."""
 
 from __future__ import annotations
 
@@ -81,3 +81,24 @@ def _stretches(times: bytes) -> tuple[NDArray[np.intp], ...]:
     usual = float(np.median(forward)) if len(forward) else 0.0
     cuts: NDArray[np.intp] = np.flatnonzero((step <= 0.0) | (step > _GAP * usual)) + 1
     return tuple(np.split(np.arange(len(t)), cuts.tolist()))
+
+
+def through_low_pass(t: Array, values: Array, time_constant: float) -> Array:
+    """Values (N, ...) at times (N,) [s] after a first-order lag [s], that has settled at the first one.
+
+    Exact where they go in straight lines from one time to the next.
+    """
+    if time_constant <= 0.0:
+        return values
+    with np.errstate(over="ignore"):
+        span = np.diff(t) / time_constant
+    kept, mean = np.exp(-span), -np.expm1(-span) / span
+    of_last = np.concatenate([[0.0], kept]).reshape(-1, *[1] * (values.ndim - 1))
+    first, second = values[:-1].T, values[1:].T
+    out = np.concatenate([values[:1], (first * (mean - kept) + second * (1.0 - mean)).T])
+    reach = 1
+    while reach < len(t):  # what each instant keeps of the one `reach` before it: a scan in log2(N) rounds
+        out[reach:] += of_last[reach:] * out[:-reach]
+        of_last[reach:] = of_last[reach:] * of_last[:-reach]
+        reach *= 2
+    return out

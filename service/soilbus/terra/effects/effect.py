@@ -139,7 +139,7 @@ class Active(NamedTuple):
 def wheel_with(
     active: Sequence[Active], state: WheelState, model: WheelModel, around: Surroundings
 ) -> tuple[WheelState, WheelModel]:
-    """State and model of wheels with these effects: its radius, not the nominal one, gives the sinkage."""
+    """State and model of wheels with these effects: its radius, and the entry angle before them, give the sinkage."""
     for effect, values in active:
         if effect.wheel is not None:
             state, model = effect.wheel(state, model, around, values)

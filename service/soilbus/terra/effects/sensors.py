@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from soilbus.terra.effects.along import instants, stretches
+from soilbus.terra.effects.along import instants, stretches, through_low_pass
 from soilbus.terra.effects.effect import Effect, Parameter, Surroundings, Values
 from soilbus.terra.stress import Array
 
@@ -59,7 +59,7 @@ DRAFT_GAIN = Effect(
 
 
 def _late(torque: Array, around: Surroundings, values: Values) -> Array:
-    """T(t - delay), on straight lines between instants and on beyond the first one of a run."""
+    """T(t - delay), on straight lines between instants and on beyond the first one of a run, through a low pass."""
     t, late = instants(around.t), np.array(torque, float)
     for run in stretches(t):
         if len(run) >= 2:
@@ -67,16 +67,20 @@ def _late(torque: Array, around: Surroundings, values: Values) -> Array:
             before = np.clip(np.searchsorted(t[run], then, side="right") - 1, 0, len(run) - 2)
             first, second = run[before], run[before + 1]
             part = ((then - t[first]) / (t[second] - t[first]))[:, None]
-            late[run] = (1.0 - part) * torque[first] + part * torque[second]
+            queued = (1.0 - part) * torque[first] + part * torque[second]
+            late[run] = through_low_pass(t[run], queued, values["time_constant"])
     return late
 
 
 TORQUE_LAG = Effect(
     name="torque_lag",
     physics="The torque comes late: filtered or queued on its way, it belongs to a moment that has passed.",
-    source="pure delay of a channel: Ljung, System Identification (2nd ed. 1999)",
+    source="delay and first-order lag of a channel: Ljung, System Identification (2nd ed. 1999)",
     tells="quick changes of draft or speed; driving evenly hides it",
-    parameters=(Parameter("delay", "s", 0.0, 0.2, 0.0, 0.6),),
+    parameters=(
+        Parameter("delay", "s", 0.0, 0.2, 0.0, 0.6),
+        Parameter("time_constant", "s", 0.0, 0.2, 0.0, 2.0),
+    ),
     torque=_late,
     mixes_instants=True,
 )

@@ -9,7 +9,7 @@ import numpy as np
 
 from soilbus.terra.effects.along import curve_of, share_of_way, through_knots
 from soilbus.terra.effects.effect import Effect, Parameter, Surroundings, Values
-from soilbus.terra.wheel import WheelModel, WheelState
+from soilbus.terra.wheel import WheelModel, WheelState, sinkage
 
 REFERENCE_SPEED = 1.0
 """Ground speed [m/s] for which the soil's own K_L holds."""
@@ -17,27 +17,36 @@ TYPICAL_DEPTH = 0.05
 """Depth [m] at which a change of n leaves the pressure as it is, so that n and stiffness act apart."""
 _LEAST_SPEED = 0.05
 _LEAST_EXPONENT = 0.05
+_LEAST_CONTACT = 0.1  # of the sinkage: a wheel cannot throw away all of its ground
 
 
 def _slip_sinkage(
     state: WheelState, model: WheelModel, around: Surroundings, values: Values
 ) -> tuple[WheelState, WheelModel]:
-    """n + exponent s, K_L exp(-softening s), for slips s > 0; at TYPICAL_DEPTH the exponent does nothing."""
+    """n + exponent s, K_L exp(-softening s), contact below a layer dug s, for slips s > 0.
+
+    At TYPICAL_DEPTH the exponent does nothing.
+    """
     slip = np.maximum(state.slip, 0.0)
     n = np.maximum(state.n + values["exponent"] * slip, np.minimum(state.n, _LEAST_EXPONENT))
     softer = values["softening"] * slip + (n - state.n) * np.log(TYPICAL_DEPTH)
-    return state._replace(n=n, K_L=state.K_L * np.exp(-softer)), model
+    whole = sinkage(state.entry_angle, 1.0)
+    left = np.maximum(whole - values["dug"] * slip / state.radius, _LEAST_CONTACT * whole)
+    angle = 2.0 * np.arctan(np.sqrt(left / (2.0 - left)))
+    return state._replace(entry_angle=angle, n=n, K_L=state.K_L * np.exp(-softer)), model
 
 
 SLIP_SINKAGE = Effect(
     name="slip_sinkage",
     physics="A slipping wheel digs: it carries soil away from under itself and sinks deeper than its load asks.",
     source="n = n0 + n1 s: Ding et al. 2010 (J. Central South Univ. Technol. 17:129); sinkage times a function of slip,"
-    " which a softer K_L gives: Lyasko 2010 (J. Terramechanics 47:21)",
+    " which a softer K_L gives: Lyasko 2010 (J. Terramechanics 47:21); a layer that is thrown back, below which the"
+    " wheel meets the soil, deeper with slip: Reece 1965 (Trans. ASAE 8)",
     tells="a sinkage sensor, and slips from 0.05 to beyond 0.4 at one load",
     parameters=(
         Parameter("softening", "1", 0.0, 0.6, -2.0, 4.0),
         Parameter("exponent", "1", 0.0, 0.3, -0.5, 1.5),
+        Parameter("dug", "m", 0.0, 0.02, 0.0, 0.3),
     ),
     wheel=_slip_sinkage,
 )
@@ -118,8 +127,9 @@ DRIFT_KNOTS = 7
 
 
 def _drift_of(name: str, share: np.ndarray, values: Values) -> Any:
+    """Nothing at the middle of the way: the soil's own parameters are those of there."""
     bends = [0.0, *(values[f"{name}_{i + 1}"] for i in range(DRIFT_KNOTS)), 0.0]
-    return values[name] * (np.clip(share, 0.0, 1.0) - 0.5) + through_knots(share, bends)
+    return values[name] * (np.clip(share, 0.0, 1.0) - 0.5) + through_knots(share, bends) - bends[len(bends) // 2]
 
 
 def _soil_drift(

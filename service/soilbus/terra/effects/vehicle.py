@@ -14,22 +14,30 @@ from soilbus.terra.wheel import WheelModel, WheelState
 
 
 def _drive_line(torque: Any, around: Surroundings, values: Values) -> Any:
-    """At the motor: T + (share |T| + drag + viscous |omega|) in the direction of rotation."""
+    """At the motor: T + ((share |T| + drag) (|omega| / omega_0)^-fading + viscous |omega|), as it turns."""
     speed = around.wheel_speed
     way = np.where(speed < 0.0, -1.0, 1.0)
-    return torque + way * (values["share"] * np.abs(torque) + values["drag"]) + values["viscous"] * speed
+    faster = np.maximum(np.abs(speed), _LEAST_RATE) / REFERENCE_RATE
+    friction = (values["share"] * np.abs(torque) + values["drag"]) * np.exp(-values["fading"] * np.log(faster))
+    return torque + way * friction + values["viscous"] * speed
 
+
+REFERENCE_RATE = 2.5
+"""Wheel speed [rad/s] at which a friction that falls with speed is what share and drag say."""
+_LEAST_RATE = 0.1
 
 DRIVETRAIN_LOSS = Effect(
     name="drivetrain_loss",
     physics="Gears and bearings between motor and wheel take torque that never reaches the ground.",
     source="loss in proportion to load, a drag without load, churning with speed: Niemann & Winter,"
-    " Maschinenelemente 2 (2003); ISO/TR 14179-1:2001",
+    " Maschinenelemente 2 (2003); friction that falls with speed as the film of oil builds up: Stribeck 1902;"
+    " ISO/TR 14179-1:2001",
     tells="wheels turning off the ground (the drag alone), or torque cells at the wheels",
     parameters=(
         Parameter("share", "1", 0.0, 0.06, 0.0, 0.4),
         Parameter("drag", "N m", 0.0, 20.0, 0.0, 400.0),
         Parameter("viscous", "N m s", 0.0, 5.0, 0.0, 200.0),
+        Parameter("fading", "1", 0.0, 0.3, 0.0, 1.5, starts=(0.6,)),
     ),
     torque=_drive_line,
 )
