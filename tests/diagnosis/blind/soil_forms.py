@@ -55,9 +55,22 @@ def _denser(state: WheelState, model: Any, around: Any, values: Any) -> Any:
 
 
 def _in_the_rut(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
-    """Rear wheels load soil again that has borne the pressure at the depth of the rut already."""
+    """Rear wheels load soil again that has borne the pressure at the depth of the rut: stiff up to there, then anew."""
     rut = values["size"] * values["sinkage"] * np.asarray(around.rear, float)
-    return forces + change(state, pressure=lambda depth: state.K_L * (depth + rut) ** state.n)
+    borne, stiff = state.K_L * rut**state.n, _STIFFER * state.K_L * values["sinkage"] ** (state.n - 1.0)
+
+    def pressure(depth: Any) -> Any:
+        return np.where(
+            depth * stiff < borne,
+            depth * stiff,
+            state.K_L * np.maximum(depth - borne / stiff + rut, 0.0) ** state.n,
+        )
+
+    return forces + change(state, pressure=pressure)
+
+
+_STIFFER = 8.0
+"""Slope of loading again over that of a chord to the plain sinkage."""
 
 
 def _logarithm(state: WheelState, model: Any, around: Any, values: Any) -> Any:
@@ -167,7 +180,14 @@ FORMS = (
         other=False,
     ),
     Form(
-        "multipass", "rut", "reloading: Wong 2008, ch. 2", "sinkages", (0.02, 0.045), 0.6, by_hooks(forces=_in_the_rut)
+        "multipass",
+        "rut",
+        "reloading: Wong 2008, ch. 2",
+        "sinkages",
+        (0.02, 0.045),
+        0.6,
+        by_hooks(forces=_in_the_rut),
+        other=False,
     ),
     Form(
         "rate_stiffening", "log", "logarithm of the loading rate", "1", (0.012, 0.02), 0.25, by_hooks(wheel=_logarithm)
@@ -185,5 +205,5 @@ FORMS = (
     Form("hardpan", "graded", "denser with depth", "1", (0.3, 0.33), 2.0, by_hooks(forces=_graded)),
     Form("soil_drift", "ramp", "straight line in each parameter", "1", (0.006, 0.009), 0.6, _ramp),
     Form("soil_drift", "border", "tanh", "1", (0.004, 0.006), 0.6, by_hooks(wheel=_border)),
-    Form("soil_drift", "undulating", "sine", "1", (0.005, 0.007), 0.6, by_hooks(wheel=_undulating)),
+    Form("soil_drift", "undulating", "sine", "1", (0.005, 0.007), 0.6, by_hooks(wheel=_undulating), other=False),
 )

@@ -40,7 +40,10 @@ def test_the_sinkage_exponent_grows_with_slip(slip):
     """Ding et al. 2010: sigma = K z^(n0 + n1 s), here with the same pressure at 5 cm whatever n1."""
     state = state_on(soil_named("loam"), 0.4, slip, 0.5, 0.3)
     ours = forces_with(
-        [Active(CATALOGUE["slip_sinkage"], {"exponent": 0.5, "softening": 0.0, "dug": 0.0})], state, MODEL, one_wheel(AROUND)
+        [Active(CATALOGUE["slip_sinkage"], {"exponent": 0.5, "softening": 0.0, "dug": 0.0})],
+        state,
+        MODEL,
+        one_wheel(AROUND),
     )
     true = adaptive_forces(state, MODEL, pressure=lambda z: state.K_L * 0.05**0.7 * (z / 0.05) ** (0.7 + 0.5 * slip))
     assert np.max(np.abs(ours - true)) < 1e-6 * true[0]
