@@ -12,7 +12,8 @@ from adaptive import adaptive_forces
 from soilbus.terra.effects.along import share_of_way, through_knots
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active, forces_with, wheel_with
-from soilbus.terra.effects.soil import DRIFT_KNOTS, TYPICAL_DEPTH
+from soilbus.terra.effects.soil import DRIFT_KNOTS, SLIP_SINKAGE, TYPICAL_DEPTH
+from soilbus.terra.effects.steady import CompletedModel, Wheel
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import (
@@ -58,9 +59,30 @@ def test_softening_gives_sinkage_times_a_function_of_slip():
     assert z / z0 == pytest.approx(math.exp(0.9 * s / state.n), rel=1e-12)
 
 
+@pytest.mark.parametrize("slip", [0.05, 0.3])
+def test_a_wheel_meets_the_soil_below_the_layer_that_it_throws_back(slip):
+    """Reece 1965: the contact is that of a wheel less deep by what is dug; the wheel has sunk as deep as before."""
+    state = state_on(soil_named("loam"), 0.45, slip, 0.5, 0.3)
+    around, dug = one_wheel(AROUND), 0.06
+    ours = forces_with([Active(CATALOGUE["slip_sinkage"], SLIP_SINKAGE.neutral | {"dug": dug})], state, MODEL, around)
+    left = 0.5 * (1.0 - math.cos(0.45)) - dug * slip
+    met = adaptive_forces(state._replace(entry_angle=math.acos(1.0 - left / 0.5)), MODEL)
+    assert np.max(np.abs(ours - met)) < 1e-8 * met[0]
+    wheel = Wheel(np.array(0.5), np.array(0.3), False, np.array(5000.0))
+    completed = CompletedModel.of(MODEL, [Active(SLIP_SINKAGE, SLIP_SINKAGE.neutral | {"dug": dug})], 1.0)
+    assert completed.sinkage(np.array(0.45), wheel) == pytest.approx(0.5 * (1.0 - math.cos(0.45)), rel=1e-12)
+
+
+def test_a_wheel_does_not_throw_away_all_of_its_ground():
+    state = state_on(soil_named("loam"), 0.2, 0.9, 0.5, 0.3)
+    angle = changed("slip_sinkage", state, one_wheel(AROUND), dug=0.3).entry_angle
+    assert 1.0 - math.cos(angle) == pytest.approx(0.1 * (1.0 - math.cos(0.2)), rel=1e-9)
+
+
 def test_skid_does_not_dig():
     state = STATE._replace(slip=-np.abs(STATE.slip))
-    dug = changed("slip_sinkage", state, exponent=1.0, softening=2.0)
+    dug = changed("slip_sinkage", state, exponent=1.0, softening=2.0, dug=0.1)
+    assert dug.entry_angle == pytest.approx(np.broadcast_to(state.entry_angle, dug.entry_angle.shape), rel=1e-12)
     assert np.array_equal(dug.K_L, np.broadcast_to(state.K_L, dug.K_L.shape))
     assert np.all(dug.n == state.n)
 
@@ -139,15 +161,16 @@ def test_a_wheel_that_reaches_the_pan_hardly_sinks_further():
 
 
 def test_the_soil_drifts_along_the_way():
-    values = {"stiffness": 0.8, "stiffness_1": 0.3, "stiffness_2": -0.2, "stiffness_3": 0.1, "strength": -0.4,
+    """By curves that are zero where the way is half done: the soil's own parameters are those of there."""
+    values = {"stiffness": 0.8, "stiffness_1": 0.3, "stiffness_2": -0.2, "stiffness_4": 0.1, "strength": -0.4,
               "strength_2": 0.15}  # fmt: skip
     soil = changed("soil_drift", **values)
     u = AROUND.distance / AROUND.length
     knots = np.linspace(0.0, 1.0, DRIFT_KNOTS + 2)
-    rest = [0.0] * (DRIFT_KNOTS - 3)
-    bend = CubicSpline(knots, [0.0, 0.3, -0.2, 0.1, *rest, 0.0], bc_type="natural")(u)
+    rest = [0.0] * (DRIFT_KNOTS - 4)
+    bend = CubicSpline(knots, [0.0, 0.3, -0.2, 0.0, 0.1, *rest, 0.0], bc_type="natural")(u) - 0.1
     assert np.log(soil.K_L / STATE.K_L) == pytest.approx((0.8 * (u - 0.5) + bend) * np.ones(4), rel=1e-10)
-    bend = CubicSpline(knots, [0.0, 0.0, 0.15, 0.0, *rest, 0.0], bc_type="natural")(u)
+    bend = CubicSpline(knots, [0.0, 0.0, 0.15, 0.0, 0.0, *rest, 0.0], bc_type="natural")(u)
     for strength in (soil.tan_phi / STATE.tan_phi, soil.c / STATE.c):
         assert np.log(strength) == pytest.approx((-0.4 * (u - 0.5) + bend) * np.ones(1), rel=1e-10)
     assert CATALOGUE["soil_drift"].of_record

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
+from scipy.signal import lsim, lti
 
-from soilbus.terra.effects.along import stretches
+from soilbus.terra.effects.along import stretches, through_low_pass
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active, wheel_with
+from soilbus.terra.effects.vehicle import REFERENCE_RATE
 from soilbus.terra.vehicle import slip_ratio
 from soilbus.terra.wheel import WheelModel
 from wheels_around import RADIUS, REAR, wheels_around
@@ -32,6 +34,17 @@ def test_a_drive_line_takes_torque_driving_and_braking():
     assert reading == pytest.approx(np.array([[565.0, -165.0], [565.0, 435.0]]))
     churned = torque_of("drivetrain_loss", torque, around, viscous=4.0)
     assert churned == pytest.approx(np.array([[508.0, -192.0], [508.0, 492.0]]))
+
+
+def test_friction_of_a_drive_line_falls_with_speed():
+    """At the reference rate it is what share and drag say, at four times that 4^-0.5 of it; churning is not touched."""
+    torque = np.array([[500.0, 500.0, -200.0]])
+    around = AROUND._replace(wheel_speed=REFERENCE_RATE * np.array([[1.0, 4.0, -4.0]]))
+    lost = torque_of("drivetrain_loss", torque, around, share=0.1, drag=15.0, viscous=2.0, fading=0.5) - torque
+    churned = 2.0 * around.wheel_speed
+    assert lost - churned == pytest.approx(np.array([[65.0, 32.5, -17.5]]))
+    still = AROUND._replace(wheel_speed=np.zeros((1, 3)))
+    assert np.isfinite(torque_of("drivetrain_loss", torque, still, share=0.1, fading=1.5)).all()
 
 
 def test_a_constant_slope_holds_back_as_the_weight_along_it():
@@ -97,11 +110,32 @@ def test_a_late_torque_is_the_torque_of_an_earlier_moment(delay):
     assert late[begun, 0] == pytest.approx(500.0 + 200.0 * np.sin(1.3 * (T[begun] - delay)), abs=0.5)
 
 
+@pytest.mark.parametrize("lag", [1e-4, 0.04, 0.3, 2.0])
+def test_a_filtered_torque_is_that_of_a_first_order_lag(lag):
+    """scipy's lsim of 1 / (lag s + 1) between straight lines, from rest at the first torque; after a delay besides."""
+    torque = np.stack([500.0 + 200.0 * np.sin(1.3 * T), np.random.default_rng(2).normal(400.0, 100.0, len(T))], axis=1)
+    around = AROUND._replace(t=T[:, None])
+    late = torque_of("torque_lag", torque, around, time_constant=lag)
+    alone = np.stack([lsim(lti([1.0], [lag, 1.0]), of_wheel - of_wheel[0], T)[1] for of_wheel in torque.T], axis=1)
+    assert late == pytest.approx(torque[0] + alone, abs=1e-6)
+    both = torque_of("torque_lag", torque, around, delay=0.25, time_constant=lag)
+    queued = torque_of("torque_lag", torque, around, delay=0.25)
+    assert both == pytest.approx(torque_of("torque_lag", queued, around, time_constant=lag), rel=1e-12)
+
+
+def test_a_low_pass_is_the_same_however_finely_it_is_looked_at():
+    t = np.cumsum(np.random.default_rng(5).uniform(0.05, 0.2, 60))
+    values = np.random.default_rng(6).normal(size=60)
+    fine = np.sort(np.concatenate([t, t[:-1] + 0.3 * np.diff(t)]))
+    whole, divided = through_low_pass(t, values, 0.4), through_low_pass(fine, np.interp(fine, t, values), 0.4)
+    assert divided[np.isin(fine, t)] == pytest.approx(whole, rel=1e-10)
+
+
 def test_nothing_is_late_or_fast_across_a_gap():
     """Two runs with a minute between: each as if alone."""
     t = np.concatenate([T[:50], T[:50] + 65.0])
     torque, around = np.repeat([200.0, 900.0], 50)[:, None], AROUND._replace(t=t[:, None])
-    assert torque_of("torque_lag", torque, around, delay=0.4) == pytest.approx(torque, rel=1e-12)
+    assert torque_of("torque_lag", torque, around, delay=0.4, time_constant=0.3) == pytest.approx(torque, rel=1e-12)
     around = around._replace(wheel_speed=np.repeat([1.0, 3.0], 50)[:, None])
     assert torque_of("inertia", torque, around, wheel_inertia=30.0) == pytest.approx(torque, rel=1e-12)
 

@@ -90,7 +90,7 @@ MULTIPASS = Effect(
     physics="Rear wheels run in ruts that the front wheels have compacted: there the soil is stiffer and stronger.",
     source="Holm 1969 (J. Terramechanics 6); density form: Wong, Theory of Ground Vehicles (4th ed. 2008), ch. 2;"
     " a smaller shear deformation modulus besides: Senatore & Sandu 2011 (J. Terramechanics 48:265);"
-    " soil that has been loaded before resists at once, and gains less with depth: repetitive loading, Wong 2008, ch. 2",
+    " soil that has been loaded before resists at once and gains less with depth: repetitive loading, Wong 2008",
     tells="driving one axle beside the other's ruts (crab steering, reversing), a sinkage sensor at both axles",
     parameters=(
         Parameter("stiffness", "1", 0.0, 0.5, -0.7, 2.5),
