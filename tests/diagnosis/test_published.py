@@ -73,12 +73,13 @@ def test_the_smooth_wheels_soil_is_strained_by_the_lugged_wheel(points, ding, er
 
 
 @pytest.mark.parametrize("errors", [2.0, 3.0])
-def test_lugs_explain_the_lugged_wheel_as_well_as_another_shape_of_the_stress(points, errors):
-    """With errors that Ding's smooth wheel itself asks for the evidences are too near to tell; only lugs leave the
+def test_lugs_explain_the_lugged_wheel_better_than_another_shape_of_the_stress_but_not_by_much(points, errors):
+    """With errors that Ding's smooth wheel itself asks for the odds are below one to three; and only lugs leave the
     soil nearer to what the smooth wheel had."""
     beside = lugs_beside_a_shifted_peak(errors, points)
     lugs, shifted, nothing = (beside[name] for name in ("lugs", "stress_peak_shift", "nothing"))
-    assert abs(lugs.fall - shifted.fall) < TEMPERATURE < lugs.fall
+    assert lugs.fall > TEMPERATURE
+    assert shifted.fall < lugs.fall < shifted.fall + 2.0 * TEMPERATURE
     assert lugs.strain < 0.5 * nothing.strain
     assert shifted.strain > 0.8 * nothing.strain
 

@@ -30,9 +30,8 @@ class Findings:
 
     def soils(self) -> list[tuple[str, Posterior, Posterior]]:
         """Name, soil before and soil after of the first part of each log."""
-        base, completed = self.diagnosis.base.fits, self.diagnosis.completed.fits
-        first = [(self.recordings.records[i].name, base[i], completed[i]) for i in self.recordings.first]
-        return [(name, before.posterior, after.posterior) for name, before, after in first]
+        names, found = [record.name for record in self.recordings.records], self.diagnosis
+        return [(names[i], found.soil_before(i), found.soil_after(i)) for i in self.recordings.first]
 
 
 def diagnose_logs(config: Config, logs: Sequence[Path], say: Callable[[str], None] | None = None) -> Findings:

@@ -14,7 +14,7 @@ from soilbus.diagnosis.completion import Completion, complete
 from soilbus.diagnosis.diagnose import Diagnosis, diagnose
 from soilbus.diagnosis.records import Record, record_of
 from soilbus.diagnosis.score import further_scores, scores
-from soilbus.estimation.posterior import Estimate, SoilPrior
+from soilbus.estimation.posterior import Estimate, Posterior, SoilPrior
 from soilbus.estimation.window import BinStore
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Effect
@@ -73,7 +73,7 @@ def tried(case: Case) -> Trial:
     begin = time.process_time()
     found = diagnose([record], prior, list(CATALOGUE.values()))
     seconds = time.process_time() - begin
-    after = _bearing(case, found.completed)
+    before, after = (_bearing(case, soil) for soil in (found.soil_before(0), found.soil_after(0)))
     return Trial(
         id=case.id,
         kind=case.kind,
@@ -89,7 +89,7 @@ def tried(case: Case) -> Trial:
         gap_before=found.base.gap,
         gap_after=found.completed.gap,
         rows=found.base.checked_rows,
-        bearing_before=_bearing_error(case, _bearing(case, found.base)),
+        bearing_before=_bearing_error(case, before),
         bearing_after=_bearing_error(case, after),
         bearing_sd=after.std / after.value,
         seconds=seconds,
@@ -131,9 +131,9 @@ def _cost(completion: Completion) -> float:
     return completion.cost + sum(check.at.chi2 for check in completion.checks)
 
 
-def _bearing(case: Case, completion: Completion) -> Estimate:
+def _bearing(case: Case, soil: Posterior) -> Estimate:
     settings = case.config.estimator
-    return completion.fits[0].posterior.bearing_pressure(settings.z_ref, settings.b_ref)
+    return soil.bearing_pressure(settings.z_ref, settings.b_ref)
 
 
 def _bearing_error(case: Case, told: Estimate) -> float:

@@ -12,7 +12,7 @@ from adaptive import adaptive_forces
 from soilbus.terra.effects.along import share_of_way, through_knots
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active, forces_with, wheel_with
-from soilbus.terra.effects.soil import DRIFT_KNOTS, SLIP_SINKAGE, TYPICAL_DEPTH
+from soilbus.terra.effects.soil import DRIFT_KNOTS, SLIP_SINKAGE, TYPICAL_PRESSURE
 from soilbus.terra.effects.steady import CompletedModel, Wheel
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
@@ -105,7 +105,8 @@ def test_only_rear_wheels_run_in_ruts():
     effect = Active(CATALOGUE["multipass"], values)
     ours, plain = forces_with([effect], STATE, MODEL, AROUND), wheel_forces(STATE, MODEL)
     n = STATE.n / 1.3
-    K_L = 2.5 * STATE.K_L * TYPICAL_DEPTH**STATE.n / TYPICAL_DEPTH**n
+    depth = (TYPICAL_PRESSURE / STATE.K_L) ** (1.0 / STATE.n)
+    K_L = 2.5 * TYPICAL_PRESSURE / depth**n
     packed = STATE._replace(n=n, K_L=K_L, c=1.2 * STATE.c, tan_phi=1.2 * STATE.tan_phi, K=STATE.K / 1.6)
     assert np.array_equal(ours[..., ~REAR], plain[..., ~REAR])
     assert ours[..., REAR] == pytest.approx(wheel_forces(packed, MODEL)[..., REAR], rel=1e-10)

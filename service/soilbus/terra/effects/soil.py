@@ -14,7 +14,9 @@ from soilbus.terra.wheel import WheelModel, WheelState, sinkage
 REFERENCE_SPEED = 1.0
 """Ground speed [m/s] for which the soil's own K_L holds."""
 TYPICAL_DEPTH = 0.05
-"""Depth [m] at which a change of n leaves the pressure as it is, so that n and stiffness act apart."""
+"""Depth [m] at which a change of n with slip leaves the pressure as it is, so that the two parameters act apart."""
+TYPICAL_PRESSURE = 1e5
+"""Pressure [Pa] at which a change of n in ruts does: that of tyres, whatever the soil."""
 _LEAST_SPEED = 0.05
 _LEAST_EXPONENT = 0.05
 _LEAST_CONTACT = 0.1  # of the sinkage: a wheel cannot throw away all of its ground
@@ -73,16 +75,17 @@ RATE_STIFFENING = Effect(
 def _multipass(
     state: WheelState, model: WheelModel, around: Surroundings, values: Values
 ) -> tuple[WheelState, WheelModel]:
-    """Rear wheels: K_L exp(stiffness); c and tan phi exp(density); K exp(-shear); n exp(-reloading).
+    """Rear wheels: p_0 (K_L z^n / p_0)^exp(-reloading) exp(stiffness); c and tan phi exp(density); K exp(-shear).
 
-    At TYPICAL_DEPTH the last does nothing to the pressure.
+    The power does nothing at TYPICAL_PRESSURE p_0.
     """
     rear = np.asarray(around.rear, float)
-    strength = np.exp(values["density"] * rear)
-    n = state.n * np.exp(-values["reloading"] * rear)
-    K_L = state.K_L * np.exp(values["stiffness"] * rear + (state.n - n) * np.log(TYPICAL_DEPTH))
+    strength, power = np.exp(values["density"] * rear), np.exp(-values["reloading"] * rear)
+    K_L = TYPICAL_PRESSURE * np.exp(power * np.log(state.K_L / TYPICAL_PRESSURE) + values["stiffness"] * rear)
     K = state.K * np.exp(-values["shear"] * rear)
-    return state._replace(n=n, K_L=K_L, c=state.c * strength, tan_phi=state.tan_phi * strength, K=K), model
+    return state._replace(
+        n=power * state.n, K_L=K_L, c=state.c * strength, tan_phi=state.tan_phi * strength, K=K
+    ), model
 
 
 MULTIPASS = Effect(
