@@ -43,7 +43,7 @@ SLIP_SINKAGE = Effect(
     physics="A slipping wheel digs: it carries soil away from under itself and sinks deeper than its load asks.",
     source="n = n0 + n1 s: Ding et al. 2010 (J. Central South Univ. Technol. 17:129); sinkage times a function of slip,"
     " which a softer K_L gives: Lyasko 2010 (J. Terramechanics 47:21); a layer that is thrown back, below which the"
-    " wheel meets the soil, deeper with slip: Reece 1965 (Trans. ASAE 8)",
+    " wheel meets the soil, deeper with slip: Reece 1965, Principles of Soil-Vehicle Mechanics (Proc. IMechE 180)",
     tells="a sinkage sensor, and slips from 0.05 to beyond 0.4 at one load",
     parameters=(
         Parameter("softening", "1", 0.0, 0.6, -2.0, 4.0),
