@@ -277,23 +277,23 @@ class CompletedProblem(WindowProblem):
         mixing = [a for a in active if a.effect.torque is not None and a.effect.mixes_instants]
         if not mixing:
             return 0.0
-        parts = {q: d for q, d in torque.by.items() if q not in _LATENTS}
-        smooth = smoothed(self.t, torque.value)
-        by = {q: smoothed(self.t, np.broadcast_to(d, smooth.shape)) for q, d in parts.items()}
-        late = Dual(np.zeros_like(smooth), {q: np.zeros_like(smooth) for q in by})
+        shape = torque.value.shape
+        by = {q: np.broadcast_to(d, shape) for q, d in torque.by.items() if q not in _LATENTS}
+        smooth = smoothed(self.t, np.concatenate([torque.value, *by.values()], axis=1))  # value, then derivatives
+        late, changes = np.zeros_like(smooth), dict[Any, Array]()
         for effect, values in mixing:
             plain = {name: value_of(value) for name, value in values.items()}
             added = partial(_added, effect, around)
             here = added(smooth, plain)
-            late.value += here
-            for q, d in by.items():
-                late.by[q] += added(d, plain)
+            late += here
             for name, value in values.items():
                 for i, std in value.by.items() if isinstance(value, Dual) else ():
                     step = STEP if self.free[i].within(pulls[i] + STEP) else -STEP
-                    moved = (added(smooth, {**plain, name: value.value + step * std}) - here) / step
-                    late.by[i] = late.by.get(i, 0.0) + moved
-        return late
+                    there = added(smooth[:, : shape[1]], {**plain, name: value.value + step * std})
+                    changes[i] = changes.get(i, 0.0) + (there - here[:, : shape[1]]) / step
+        told, *slopes = np.split(late, 1 + len(by), axis=1)
+        changes |= {q: changes.get(q, 0.0) + d for q, d in zip(by, slopes, strict=True)}
+        return Dual(told, changes)
 
     def _surroundings(self, latents: Latents) -> Surroundings:
         chassis = self.rig.chassis

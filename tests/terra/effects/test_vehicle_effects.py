@@ -125,9 +125,10 @@ def test_a_filtered_torque_is_that_of_a_first_order_lag(lag):
 
 def test_a_low_pass_is_the_same_however_finely_it_is_looked_at():
     t = np.cumsum(np.random.default_rng(5).uniform(0.05, 0.2, 60))
-    values = np.random.default_rng(6).normal(size=60)
+    values = np.random.default_rng(6).normal(size=(60, 1))
     fine = np.sort(np.concatenate([t, t[:-1] + 0.3 * np.diff(t)]))
-    whole, divided = through_low_pass(t, values, 0.4), through_low_pass(fine, np.interp(fine, t, values), 0.4)
+    between = np.interp(fine, t, values[:, 0])[:, None]
+    whole, divided = through_low_pass(t, values, 0.4), through_low_pass(fine, between, 0.4)
     assert divided[np.isin(fine, t)] == pytest.approx(whole, rel=1e-10)
 
 

@@ -14,6 +14,7 @@ from soilbus.terra.effects.effect import Knot, Parameter, Surroundings
 from soilbus.terra.stress import Array
 
 _GAP = 3.0  # times the median step
+_FORGOTTEN = 1e-15  # share of what was, that a low pass keeps
 
 
 def share_of_way(around: Surroundings) -> Any:
@@ -83,21 +84,37 @@ def _stretches(times: bytes) -> tuple[NDArray[np.intp], ...]:
     return tuple(np.split(np.arange(len(t)), cuts.tolist()))
 
 
+def earlier(t: Array, delay: float) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
+    """Between which two instants of its run lies the moment so long [s] before each one (N,), and how far from the
+    first to the second; beyond the first two of a run on their straight line."""
+    first, second, part = np.arange(len(t)), np.arange(len(t)), np.zeros(len(t))
+    for run in stretches(t):
+        if len(run) >= 2:
+            then = t[run] - delay
+            first[run] = run[0] + np.clip(np.searchsorted(t[run], then, side="right") - 1, 0, len(run) - 2)
+            second[run] = first[run] + 1
+            part[run] = (then - t[first[run]]) / (t[second[run]] - t[first[run]])
+    return first, second, part
+
+
 def through_low_pass(t: Array, values: Array, time_constant: float) -> Array:
-    """Values (N, ...) at times (N,) [s] after a first-order lag [s], that has settled at the first one.
+    """Values (N, W) at times (N,) [s] after a first-order lag [s], that has settled at the first one of each run.
 
     Exact where they go in straight lines from one time to the next.
     """
     if time_constant <= 0.0:
         return values
+    begins = [int(run[0]) for run in stretches(t)]
+    span = np.ones((len(t), 1))
     with np.errstate(over="ignore"):
-        span = np.diff(t) / time_constant
-    kept, mean = np.exp(-span), -np.expm1(-span) / span
-    of_last = np.concatenate([[0.0], kept]).reshape(-1, *[1] * (values.ndim - 1))
-    first, second = values[:-1].T, values[1:].T
-    out = np.concatenate([values[:1], (first * (mean - kept) + second * (1.0 - mean)).T])
+        span[1:, 0] = np.diff(t) / time_constant
+    span[begins] = 1.0
+    of_last, mean = np.exp(-span), -np.expm1(-span) / span
+    before = np.concatenate([values[:1], values[:-1]])
+    out = before * (mean - of_last) + values * (1.0 - mean)
+    out[begins], of_last[begins] = values[begins], 0.0
     reach = 1
-    while reach < len(t):  # what each instant keeps of the one `reach` before it: a scan in log2(N) rounds
+    while (of_last[reach:] > _FORGOTTEN).any():  # what each instant keeps of the one `reach` before it: few rounds
         out[reach:] += of_last[reach:] * out[:-reach]
         of_last[reach:] = of_last[reach:] * of_last[:-reach]
         reach *= 2

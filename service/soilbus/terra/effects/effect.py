@@ -103,7 +103,8 @@ class Effect:
     hitch, reading less truth, of true drafts (N,).  load: errors [N] (N, W) of the wheel
     load cells.  resistance: force [N] (N,) that holds the vehicle back and is in no reading.
     base_law: the shear law of models to which the effect can be added, None for any.
-    mixes_instants: `torque` needs other instants than its own, adds them up, and is given plain arrays.
+    mixes_instants: `torque` needs other instants than its own, adds them up, alike in each of however many columns,
+    and is given plain arrays.
     of_record: its parameters describe the ground of one record and mean nothing in another.
     """
 

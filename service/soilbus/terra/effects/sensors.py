@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from soilbus.terra.effects.along import instants, stretches, through_low_pass
+from soilbus.terra.effects.along import earlier, instants, through_low_pass
 from soilbus.terra.effects.effect import Effect, Parameter, Surroundings, Values
 from soilbus.terra.stress import Array
 
@@ -60,16 +60,11 @@ DRAFT_GAIN = Effect(
 
 def _late(torque: Array, around: Surroundings, values: Values) -> Array:
     """T(t - delay), on straight lines between instants and on beyond the first one of a run, through a low pass."""
-    t, late = instants(around.t), np.array(torque, float)
-    for run in stretches(t):
-        if len(run) >= 2:
-            then = t[run] - values["delay"]
-            before = np.clip(np.searchsorted(t[run], then, side="right") - 1, 0, len(run) - 2)
-            first, second = run[before], run[before + 1]
-            part = ((then - t[first]) / (t[second] - t[first]))[:, None]
-            queued = (1.0 - part) * torque[first] + part * torque[second]
-            late[run] = through_low_pass(t[run], queued, values["time_constant"])
-    return late
+    t = instants(around.t)
+    first, second, part = earlier(t, values["delay"])
+    part = part[:, None]
+    queued = (1.0 - part) * torque[first] + part * torque[second]
+    return through_low_pass(t, queued, values["time_constant"])
 
 
 TORQUE_LAG = Effect(
