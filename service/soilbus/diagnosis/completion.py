@@ -251,8 +251,7 @@ def _fitted(
         return None
     fitting, gains = Fitting(problem, prior, before), np.where(problem.gain_std > 0.0, start.gains, 0.0)
     end = Place(fit.optimum.soil, problem.allowed(fit.optimum.gains), fit.optimum.latents, fit.cost, 0)
-    slowly = descended(fitting, end, fitting.start(start.soil, gains=problem.allowed(gains)), hopeless) or fit
-    return slowly if slowly.converged or slowly.cost < hopeless else None
+    return descended(fitting, end, fitting.start(start.soil, gains=problem.allowed(gains))) or fit
 
 
 def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects: Sequence[Effect]) -> Belief:

@@ -25,11 +25,10 @@ NEAR = 2.0
 """Cost for each residual below which one linear step brings the latents to their best."""
 
 
-def descended(fitting: Fitting, end: Place, start: Place, hopeless: float = np.inf) -> Fit | None:
+def descended(fitting: Fitting, end: Place, start: Place) -> Fit | None:
     """The optimum below where the fast descent ended, or below its start where that costs less.
 
-    Not converged where steps as good as the last one would not bring the cost below `hopeless`; None where the
-    numbers are not finite.
+    None where the numbers are not finite.
     """
     with np.errstate(all="ignore"):
         at_start = fitting.point(start)
@@ -39,8 +38,7 @@ def descended(fitting: Fitting, end: Place, start: Place, hopeless: float = np.i
         if here is None:
             return None
         damping, falling, steps = 1e-2, np.inf, 0
-        within_reach = True
-        while falling > ENOUGH and damping < MOST_DAMPING and steps < MAX_STEPS and within_reach:
+        while falling > ENOUGH and damping < MOST_DAMPING and steps < MAX_STEPS:
             step = here[1].step(damping)
             there = None if step is None else _relaxed(fitting, fitting.moved(*here, step))
             steps += 1
@@ -49,8 +47,7 @@ def descended(fitting: Fitting, end: Place, start: Place, hopeless: float = np.i
             else:
                 falling, damping = here[1].cost - there[1].cost, damping * EASED
                 here = there
-                within_reach = here[1].cost - falling * (MAX_STEPS - steps) < hopeless
-        return _fit(fitting, *here, steps, converged=steps < MAX_STEPS and within_reach)
+        return _fit(fitting, *here, steps, converged=steps < MAX_STEPS)
 
 
 def _relaxed(fitting: Fitting, place: Place) -> tuple[Place, Point] | None:
