@@ -12,6 +12,7 @@ from soilbus.daemon.diagnose import Findings
 from soilbus.daemon.recordings import Recordings
 from soilbus.diagnosis.completion import complete
 from soilbus.diagnosis.diagnose import Addition, Diagnosis
+from soilbus.diagnosis.gap import Gap
 from soilbus.diagnosis.learned import WARNING, Correction, Term
 from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.verdict import Verdict
@@ -41,7 +42,7 @@ def findings() -> Findings:
     assert base is not None
     assert completed is not None
     where = (Disagreement("draft", "", "slip 0.20..0.35", 312.0, 0.0), Disagreement("load", "FL", "gain", 0.031, 1e-5))
-    diagnosis = Diagnosis(Verdict.AMBIGUOUS, where, (OFFSET,), base, completed, ())
+    diagnosis = Diagnosis(Verdict.AMBIGUOUS, where, (OFFSET,), base, completed, (), Gap(1.234, 900), Gap(1.012, 900))
     recordings = Recordings((record,), (0,), 1234, {"bad_checksum": 7}, ("<a & b>.log, part 2",))
     return Findings(diagnosis, recordings, CONFIG, 1.5)
 

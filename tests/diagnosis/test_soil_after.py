@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from soilbus.diagnosis.diagnose import FORM_LEFT_IN_SOIL, Diagnosis
+from soilbus.diagnosis.gap import Gap
 from soilbus.diagnosis.verdict import Verdict
 from soilbus.estimation.posterior import Posterior
 from soilbus.terra.soils import soil_named
@@ -18,7 +19,7 @@ COVARIANCE = np.diag([0.3, 0.02, 0.01, 0.005, 0.1, 0.02]) ** 2
 
 def diagnosis(before: Posterior, after: Posterior) -> Diagnosis:
     base, completed = (SimpleNamespace(fits=[SimpleNamespace(posterior=p)]) for p in (before, after))
-    return Diagnosis(Verdict.NAMED, (), (), base, completed, ())
+    return Diagnosis(Verdict.NAMED, (), (), base, completed, (), Gap(1.5, 900), Gap(1.0, 900))
 
 
 def test_a_soil_that_stays_is_as_sure_as_the_fit_says():

@@ -11,6 +11,7 @@ import numpy as np
 
 from soilbus.diagnosis.completion import Completion
 from soilbus.diagnosis.fits import Fits
+from soilbus.diagnosis.gap import Gap, gap_of
 from soilbus.diagnosis.learned import Correction, corrections
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.score import Score, further_scores, scores
@@ -86,7 +87,8 @@ class Diagnosis:
     """What was found; base is the present model, completed the one with the effects added.
 
     additions are in the order of what they explain beside each other, the most first.
-    learned describes what is left where the verdict is unknown.
+    learned describes what is left where the verdict is unknown.  The gaps are those of all
+    blocks, each held out in turn.
     """
 
     verdict: Verdict
@@ -95,6 +97,8 @@ class Diagnosis:
     base: Completion
     completed: Completion
     learned: tuple[Correction, ...]
+    gap_before: Gap
+    gap_after: Gap
 
     def soil_before(self, record: int) -> Posterior:
         """The soil of a recording as the present model tells it."""
@@ -137,9 +141,12 @@ def diagnose(
         if len(additions) > 1:
             additions, present = _reconsidered(whole, few, base, present, additions, candidates)
     additions.sort(key=lambda addition: -addition.falls[addition.effect.name])
-    verdict = _verdict(base, present, additions)
+    progress("holding out every block in turn")
+    before = gap_of(records, prior, base)
+    after = gap_of(records, prior, present) if additions else before
+    verdict = _verdict(before, after, additions)
     learned = corrections(list(records), present) if verdict is Verdict.UNKNOWN else []
-    return Diagnosis(verdict, tuple(where), tuple(additions), base, present, tuple(learned))
+    return Diagnosis(verdict, tuple(where), tuple(additions), base, present, tuple(learned), before, after)
 
 
 def _round(
@@ -335,8 +342,8 @@ def _without(fits: Fits, present: Completion, effect: Effect) -> Completion | No
     return fits.of([e for e in present.effects if e.name != effect.name], [starts], STEPS)
 
 
-def _verdict(base: Completion, completed: Completion, additions: Sequence[Addition]) -> Verdict:
-    if is_real(base.gap, completed.gap, completed.checked_rows):
+def _verdict(before: Gap, after: Gap, additions: Sequence[Addition]) -> Verdict:
+    if is_real(before.value, after.value, min(before.rows, after.rows)):
         return Verdict.UNKNOWN
     if not additions:
         return Verdict.NONE

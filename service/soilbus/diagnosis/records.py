@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,8 @@ BLOCK = 4.0
 """Length of a time block [s]: long beside a sensor's lag, short beside a sweep of slip."""
 CHECKED = 3
 """Every so manieth block is held out."""
+HELD_OUT = CHECKED - 1
+"""Which of them."""
 FEWEST = 12
 """Instants that each part of a recording must have."""
 FEWEST_ROWS = 5
@@ -35,17 +37,29 @@ class Record:
 
     known is what an earlier fit on the same soil left behind of soil, gains and the
     parameters that the model has; it counts in place of the prior in the first recording.
+    whole are all instants and fold (N,) which of CHECKED folds each is in, the last one held
+    out; None where others cannot be held out in its place.
     """
 
     name: str
     learned: CompletedProblem
     checked: CompletedProblem
     known: Belief | None = None
+    whole: CompletedProblem | None = None
+    fold: NDArray[np.intp] | None = None
 
     def completed(self, effects: Sequence[Effect], free: Sequence[Free], known: Belief | None = None) -> Record:
         """The same under a model with these effects and parameters, of which so much is known."""
         learned, checked = (part.completed(effects, free) for part in (self.learned, self.checked))
-        return Record(self.name, learned, checked, known)
+        whole = None if self.whole is None else self.whole.completed(effects, free)
+        return Record(self.name, learned, checked, known, whole, self.fold)
+
+    def with_held_out(self, fold: int) -> Record | None:
+        """The same with another fold held out; None where that cannot be."""
+        if self.whole is None or self.fold is None:
+            return None
+        learned, checked = (self.whole.part(np.flatnonzero(part)) for part in (self.fold != fold, self.fold == fold))
+        return replace(self, learned=learned, checked=checked)
 
     def thinned(self, every: int) -> Record:
         """The same with every so manieth instant; a table of few rows stays whole."""
@@ -57,12 +71,12 @@ class Record:
 def record_of(name: str, window: Window, rig: Rig, model: WheelModel, min_speed: float, max_turn: float) -> Record:
     """One recording divided into blocks; TooLittle where it has not enough usable instants."""
     problem = CompletedProblem(window, rig, model, min_speed, max_turn)
-    held_out = checked_instants(problem.since)
-    parts = np.flatnonzero(~held_out), np.flatnonzero(held_out)
+    fold = folds(problem.since)
+    parts = np.flatnonzero(fold != HELD_OUT), np.flatnonzero(fold == HELD_OUT)
     if min(map(len, parts)) < FEWEST:
         raise TooLittle(f"{name}: {problem.n} usable instants are too few to learn from some and check with others")
     learned, checked = (problem.part(part) for part in parts)
-    return Record(name, learned, checked)
+    return Record(name, learned, checked, whole=problem, fold=fold)
 
 
 def record_of_rows(name: str, window: Window, rig: Rig, model: WheelModel) -> Record:
@@ -81,8 +95,8 @@ def record_of_rows(name: str, window: Window, rig: Rig, model: WheelModel) -> Re
     return Record(name, learned, checked)
 
 
-def checked_instants(since: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which instants, so many seconds since the start (N,), are held out."""
+def folds(since: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Which fold instants, so many seconds since the start (N,), are in: blocks by turns."""
     span = float(since[-1] - since[0]) if len(since) else 0.0
     length = min(BLOCK, span / (3 * CHECKED)) if span > 0.0 else BLOCK
-    return np.asarray((since / max(length, 1e-9)).astype(int) % CHECKED == CHECKED - 1)
+    return np.asarray((since / max(length, 1e-9)).astype(int) % CHECKED)

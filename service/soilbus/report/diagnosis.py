@@ -101,9 +101,10 @@ def _soils(findings: Findings) -> Iterator[str]:
 
 def _pictures(findings: Findings) -> Iterator[str]:
     base, completed = findings.diagnosis.base, findings.diagnosis.completed
-    yield picture(_residuals(base, f"before: gap {base.gap:.3f}"), "residuals before")
+    before, after = findings.diagnosis.gap_before, findings.diagnosis.gap_after
+    yield picture(_residuals(base, f"before: gap {before.value:.3f}"), "residuals before")
     if completed is not base:
-        yield picture(_residuals(completed, f"after: gap {completed.gap:.3f}"), "residuals after")
+        yield picture(_residuals(completed, f"after: gap {after.value:.3f}"), "residuals after")
 
 
 def _residuals(completion: Completion, title: str) -> Any:

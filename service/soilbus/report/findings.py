@@ -41,11 +41,11 @@ def findings_json(findings: Findings) -> str:
         "where": [_place(place) for place in diagnosis.where],
         "effects": [_effect(addition, findings.diagnosis.completed) for addition in diagnosis.additions],
         "gap": {
-            "before": diagnosis.base.gap,
-            "after": findings.diagnosis.completed.gap,
+            "before": diagnosis.gap_before.value,
+            "after": diagnosis.gap_after.value,
             "noise_floor": 1.0,
-            "limit": gap_limit(diagnosis.base.checked_rows),
-            "residuals": diagnosis.base.checked_rows,
+            "limit": gap_limit(diagnosis.gap_after.rows),
+            "residuals": diagnosis.gap_after.rows,
         },
         "soil_before": soils[0]["before"],
         "soil_after": soils[0]["after"],
@@ -138,17 +138,17 @@ def findings_text(findings: Findings) -> str:
 
 def gap_line(findings: Findings) -> str:
     """The gap before and after, beside what noise alone does."""
-    base, after = findings.diagnosis.base, findings.diagnosis.completed
+    before, after = findings.diagnosis.gap_before, findings.diagnosis.gap_after
     return (
-        f"gap {base.gap:.3f} -> {after.gap:.3f} (reduced chi-square of {base.checked_rows} held-out residuals; "
-        f"noise alone: 1, hardly ever above {gap_limit(base.checked_rows):.2f})"
+        f"gap {before.value:.3f} -> {after.value:.3f} (reduced chi-square of {after.rows} held-out residuals; "
+        f"noise alone: 1, hardly ever above {gap_limit(after.rows):.2f})"
     )
 
 
 def place_lines(findings: Findings) -> list[str]:
     """The places of disagreement, the clearest first."""
-    base, where = findings.diagnosis.base, findings.diagnosis.where
-    if not where and base.gap > gap_limit(base.checked_rows):
+    before, where = findings.diagnosis.gap_before, findings.diagnosis.where
+    if not where and before.value > gap_limit(before.rows):
         return ["too few held-out residuals in any region to tell where model and data disagree"]
     if not where:
         return ["no channel disagrees with the model anywhere by more than noise"]
