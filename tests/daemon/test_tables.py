@@ -293,7 +293,7 @@ def test_priors_of_effects_grow_with_the_wheel_and_only_where_they_have_its_unit
         return [p.std for p in effect.parameters]
 
     for name, factors in (
-        ("draft_offset", (2.0, 2.0, 1.0)), ("slip_sinkage", (1.0, 1.0)), ("tyre_deflection", (1.5, 1.0)),
+        ("draft_offset", (2.0, 2.0, 1.0)), ("slip_sinkage", (1.0, 1.0, 3.0)), ("tyre_deflection", (1.5, 1.0)),
     ):  # fmt: skip
         effect = CATALOGUE[name]
         larger = for_wheel(effect, 2.0 * LOAD, 3.0 * RADIUS)

@@ -19,7 +19,9 @@ def test_stubble_is_described_once_its_effect_is_in_the_model(field_recording, t
     found = json.loads(capsys.readouterr().out)
     assert found["verdict"] == "named"
     assert [effect["name"] for effect in found["effects"]] == ["rate_stiffening"]
-    assert found["gap"]["before"] > 3.0 > found["gap"]["limit"] > found["gap"]["after"]
+    before, after = (found["gap"][when] for when in ("before", "after"))
+    assert before > 3.0 > 1.15 > after
+    assert after - 1.0 < 0.05 * (before - 1.0)
     status, chi2 = {}, {}
     for name, config in (("plain", FIELD), ("completed", model)):
         assert main(["replay", "--config", str(config), log, "--json", str(tmp_path / name)]) == 0

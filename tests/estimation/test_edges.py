@@ -101,7 +101,7 @@ def test_angles_solved_anew_carry_the_loads_with_the_effects_as_they_are(simulat
     plain = CompletedProblem(case.window, rig_of(case.config), model_of(case.config), 0.2)
     effect = CATALOGUE["multipass"]
     problem = plain.completed([effect], parameters_of(effect, plain.n_wheels))
-    gains = np.concatenate([np.zeros(problem.n_sensors), [1.0, 0.5, 0.3]])
+    gains = np.concatenate([np.zeros(problem.n_sensors), [1.0, 0.5, 0.3, -0.8]])
     fitting = Fitting(problem, case.prior, Belief.of(case.prior, problem.gain_std))
     place = fitting.start(np.asarray(SOILS["loam"]), gains=gains)
     place.latents.entry_angle *= 1.1

@@ -19,6 +19,9 @@ from soilbus.estimation.gauss_newton import Start
 from soilbus.estimation.linearised import Latents
 from soilbus.estimation.posterior import SoilPrior
 
+CLEAR = 1.5
+"""Gap from which the noise of that of a third of the blocks does not matter."""
+
 
 class Gap(NamedTuple):
     """Reduced chi-square of held-out residuals, and how many they are."""
@@ -28,9 +31,11 @@ class Gap(NamedTuple):
 
 
 def gap_of(records: Sequence[Record], prior: SoilPrior, found: Completion) -> Gap:
-    """The gap of a model over all blocks; over those held out already where others cannot be, or a fit fails."""
+    """The gap of a model over all blocks; over those held out already where that tells enough, others cannot be, or
+    a fit fails.
+    """
     alone = Gap(found.gap, found.checked_rows)
-    if not found.converged:
+    if not found.converged or found.gap > CLEAR:
         return alone
     chi2, rows = found.gap * found.checked_rows, found.checked_rows
     for fold in range(HELD_OUT):

@@ -1,0 +1,69 @@
+"""The gap over all blocks, each held out in turn, against fits from scratch to each choice of blocks."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.diagnosis.completion import complete
+from soilbus.diagnosis.gap import CLEAR, gap_of
+from soilbus.diagnosis.records import CHECKED, HELD_OUT, record_of
+from soilbus.estimation.window import BinStore
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import excited
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.effects.effect import Active
+
+CONFIG = reference_configuration()
+PRIOR = prior_of(CONFIG)
+SECONDS = 36.0
+
+
+def record_with(effects=()):
+    rig, store = rig_of(CONFIG), BinStore(rig_of(CONFIG), 0.1, 0.0)
+    channels = simulate(CONFIG, excited("loam", SECONDS), 4, effects).channels
+    store.add({name: (c.t, c.value) for name, c in channels.items() if name in rig.channels})
+    return record_of("drive", store.window(0.0, SECONDS), rig, model_of(CONFIG), 0.2, 0.15)
+
+
+@pytest.fixture(scope="module")
+def record():
+    gain = CATALOGUE["draft_gain"]
+    return record_with((Active(gain, {"gain": 0.05}),))
+
+
+@pytest.mark.parametrize("effects", [(), ("draft_gain",)])
+def test_the_gap_is_that_of_fits_to_each_choice_of_blocks(record, effects):
+    catalogue = [CATALOGUE[name] for name in effects]
+    told = gap_of([record], PRIOR, complete([record], PRIOR, catalogue))
+    fits = [complete([record.with_held_out(fold)], PRIOR, catalogue) for fold in range(CHECKED)]
+    rows = [fit.checked_rows for fit in fits]
+    assert told.rows == sum(rows)
+    expected = sum(fit.gap * n for fit, n in zip(fits, rows, strict=True)) / sum(rows)
+    assert told.value == pytest.approx(expected, abs=2e-3)
+    assert abs(told.value - 1.0) < 4.0 * math.sqrt(2.0 / told.rows) or not effects
+
+
+def test_every_instant_is_held_out_once(record):
+    held_out = [record.with_held_out(fold).checked.t for fold in range(CHECKED)]
+    assert np.array_equal(np.sort(np.concatenate(held_out)), record.whole.t)
+    assert np.array_equal(held_out[HELD_OUT], record.checked.t)
+    for fold in range(CHECKED):
+        turned = record.with_held_out(fold)
+        assert not set(turned.learned.t.tolist()) & set(turned.checked.t.tolist())
+
+
+def test_where_no_others_can_be_held_out_the_gap_is_of_those_that_are(record):
+    """Tables, a model that did not converge, and a gap of which a third of the blocks tells enough."""
+    found = complete([record], PRIOR, ())
+    alone = (found.gap, found.checked_rows)
+    assert gap_of([replace(record, whole=None, fold=None)], PRIOR, found) == alone
+    creeping = replace(found, fits=tuple(replace(fit, converged=False) for fit in found.fits))
+    assert gap_of([record], PRIOR, creeping) == alone
+    clear = replace(found, checks=tuple(replace(check, chi2=2.0 * CLEAR * check.rows) for check in found.checks))
+    assert gap_of([record], PRIOR, clear) == (clear.gap, clear.checked_rows)
