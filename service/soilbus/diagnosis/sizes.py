@@ -77,14 +77,13 @@ def _cases(free: Sequence[Free]) -> Iterator[tuple[Array, NDArray[np.bool_]]]:
 
 def _with_fewer_knots(free: Sequence[Free], every: int) -> tuple[Array, NDArray[np.bool_]]:
     """Only every so manieth knot of the curves; those between follow the smooth curve through them."""
-    rows = []
+    rows, sized = [], []
     for i, f in enumerate(free):
         knot = f.parameter.knot
-        if knot is None:
-            rows.append(np.eye(len(free))[i])
-        elif knot.number % every == 0:
-            rows.append(np.array([_share_in(g, knot, every) for g in free]))
-    return np.array(rows).reshape(-1, len(free)), np.array([True] * len(rows))
+        if knot is None or knot.number % every == 0:
+            rows.append(np.eye(len(free))[i] if knot is None else [_share_in(g, knot, every) for g in free])
+            sized.append(f.parameter.neutral == 0.0)
+    return np.array(rows).reshape(-1, len(free)), np.array(sized, bool)
 
 
 def _share_in(other: Free, knot: Knot, every: int) -> float:
