@@ -125,6 +125,7 @@ def test_a_further_effect_beside_a_great_one_is_doubted():
 def test_every_further_start_is_of_the_catalogue():
     assert {e.name for e in CATALOGUE.values() for p in e.parameters if p.starts} == {
         "draft_offset",
+        "drivetrain_loss",
         "wheel_load_offset",
         "hardpan",
         "lugs",

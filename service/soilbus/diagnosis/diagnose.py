@@ -219,14 +219,12 @@ def _promising(
     most = max(-score.evidence / part for part, of in ((1.0, foreseen), (share, further)) for score in of)
     if before is None or most < CLEAR:
         return _of_scores([*foreseen, *_further(whole, present, candidates)], least_that_pays(explained))
-    starts = _starts(foreseen, further, again)
-    effects = {effect.name: effect for effect in candidates}
     tried: list[tuple[float, Effect, Sequence[Start]]] = []
     least = math.inf
-    for name in starts:
-        completion = few.of((*present.effects, effects[name]), starts[name], STEPS, least + BEHIND_UNSETTLED)
+    for found in _worth_trying(foreseen, further, again).values():
+        completion = _tried(few, before, found, least + BEHIND_UNSETTLED)
         if completion is not None:
-            tried.append((before.evidence - completion.evidence, effects[name], completion.as_starts()))
+            tried.append((before.evidence - completion.evidence, found[0].effect, completion.as_starts()))
             least = min(least, completion.cost)
     tried.sort(key=lambda item: -item[0])
     best = tried[0][0] / share if tried else 0.0
@@ -249,17 +247,23 @@ def _of_scores(found: Iterable[Score], least: float) -> _Promising:
     return _Promising(fitted, {s.effect.name: -s.evidence for s in chosen[len(fitted) :]})
 
 
-def _starts(
+def _worth_trying(
     foreseen: Sequence[Score], further: Sequence[Score], again: Collection[str] | None
-) -> dict[str, list[Sequence[Start]]]:
-    """Where fits of the candidates that count start, the best foreseen first; `again` as of _round()."""
+) -> dict[str, list[Score]]:
+    """Scores of the candidates that count by name, the best foreseen first; `again` as of _round()."""
     tried = foreseen[: TRIED if again is None else TRIED_AGAIN]
     named = [score for score in foreseen[len(tried) :] if again is not None and score.effect.name in again]
-    starts: dict[str, list[Sequence[Start]]] = {}
+    found: dict[str, list[Score]] = {}
     for score in (*tried, *named, *further):
         if score.evidence < WORTH_TRYING:
-            starts.setdefault(score.effect.name, []).append(score.starts)
-    return starts
+            found.setdefault(score.effect.name, []).append(score)
+    return found
+
+
+def _tried(few: Fits, present: Completion, found: Sequence[Score], hopeless: float) -> Completion | None:
+    """The best fit of one candidate to a few instants; from further starts only where more is foreseen of them."""
+    starts, foreseen = [s.starts for s in found], [present.evidence + s.evidence for s in found]
+    return few.of((*present.effects, found[0].effect), starts, STEPS, hopeless, foreseen)
 
 
 def _further(fits: Fits, present: Completion, candidates: Sequence[Effect]) -> list[Score]:
@@ -313,13 +317,12 @@ def _stays(
     fall, explained = (without.evidence - here.evidence) / share, base.evidence - present.evidence
     if fall < CLEAR:
         return None
-    starts = _starts(
+    found = _worth_trying(
         scores(few.records, few.prior, without, candidates), _further(few, without, candidates), addition.falls
     )
     for rival in candidates:
-        if rival.name in starts and rival.name != effect.name:
-            most = here.cost + BEHIND_UNSETTLED
-            completion = few.of((*without.effects, rival), starts[rival.name], STEPS, most)
+        if rival.name in found and rival.name != effect.name:
+            completion = _tried(few, without, found[rival.name], here.cost + BEHIND_UNSETTLED)
             if completion is not None and not hopeless((completion.evidence - here.evidence) / share, explained):
                 return None
     (chance,) = probabilities({effect.name: fall}, explained - fall).values()

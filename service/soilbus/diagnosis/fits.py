@@ -25,16 +25,20 @@ class Fits:
         starts: Sequence[Sequence[Start]] = (),
         most: int = MAX_ITERATIONS,
         hopeless: float = math.inf,
+        foreseen: Sequence[float] = (),
     ) -> Completion | None:
         """The best fit with these effects from any of the starts (one Start for each recording), or from anywhere.
 
-        Steps and `hopeless` as in complete(); None where all fits fail.
+        Steps and `hopeless` as in complete(); None where all fits fail.  A start of which no better evidence is
+        foreseen than a fit came to that converged is left out.
         """
         names = frozenset(effect.name for effect in effects)
         if names in self._converged:
             return self._converged[names]
         best: Completion | None = None
-        for start in starts or (None,):
+        for i, start in enumerate(starts or (None,)):
+            if best is not None and best.converged and i < len(foreseen) and best.evidence <= foreseen[i]:
+                continue
             found = complete(self.records, self.prior, effects, start, most, hopeless)
             if found is not None and (best is None or found.evidence < best.evidence):
                 best = found

@@ -37,7 +37,7 @@ DRIVETRAIN_LOSS = Effect(
         Parameter("share", "1", 0.0, 0.06, 0.0, 0.4),
         Parameter("drag", "N m", 0.0, 20.0, 0.0, 400.0),
         Parameter("viscous", "N m s", 0.0, 5.0, 0.0, 200.0),
-        Parameter("fading", "1", 0.0, 0.3, 0.0, 1.5),
+        Parameter("fading", "1", 0.0, 0.3, 0.0, 1.5, starts=(0.6,)),
     ),
     torque=_drive_line,
 )
