@@ -87,8 +87,8 @@ class Diagnosis:
     """What was found; base is the present model, completed the one with the effects added.
 
     additions are in the order of what they explain beside each other, the most first.
-    learned describes what is left where the verdict is unknown.  The gaps are those of all
-    blocks, each held out in turn.
+    learned describes what is left where the verdict is unknown.  The gaps are those of
+    gap_of().
     """
 
     verdict: Verdict
@@ -105,8 +105,9 @@ class Diagnosis:
         return self.base.fits[record].posterior
 
     def soil_after(self, record: int) -> Posterior:
-        """As the completed model tells it, and as sure as that: effects whose formulas are not the field's leave
-        a share of what they have changed.
+        """As the completed model tells it, with FORM_LEFT_IN_SOIL of each change of a logarithm as a further deviation.
+
+        One for all parameters together: what the effects changed they may have changed too much or too little.
         """
         told, before = self.completed.fits[record].posterior, self.soil_before(record)
         left = FORM_LEFT_IN_SOIL * np.log(np.array(told.soil) / np.array(before.soil))

@@ -16,7 +16,6 @@ import numpy as np
 from soilbus.diagnosis.completion import Completion, complete
 from soilbus.diagnosis.records import HELD_OUT, Record
 from soilbus.estimation.gauss_newton import Start
-from soilbus.estimation.linearised import Latents
 from soilbus.estimation.posterior import SoilPrior
 
 CLEAR = 1.5
@@ -31,8 +30,10 @@ class Gap(NamedTuple):
 
 
 def gap_of(records: Sequence[Record], prior: SoilPrior, found: Completion) -> Gap:
-    """The gap of a model over all blocks; over those held out already where that tells enough, others cannot be, or
-    a fit fails.
+    """The gap of a model that was fitted to these records, over all blocks, each held out in turn.
+
+    Over those held out already where that tells enough (beyond CLEAR), where others cannot be
+    held out (tables), and where the model or a fit did not converge.
     """
     alone = Gap(found.gap, found.checked_rows)
     if not found.converged or found.gap > CLEAR:
@@ -57,13 +58,6 @@ def _start(record: Record, fold: int, end: Start) -> Start:
     if end.latents is None or end.checked is None or record.fold is None:
         return end._replace(latents=None, checked=None)
     held_out = record.fold == HELD_OUT
-    names = ("load", "speed", "ground_speed", "entry_angle")
-    whole = {}
-    for name in names:
-        learned, checked = getattr(end.latents, name), getattr(end.checked, name)
-        whole[name] = np.empty((len(held_out), *learned.shape[1:]))
-        whole[name][~held_out], whole[name][held_out] = learned, checked
-    latents, checked = (
-        Latents(**{name: whole[name][part] for name in names}) for part in (record.fold != fold, record.fold == fold)
-    )
-    return end._replace(latents=latents, checked=checked)
+    places = np.concatenate([np.flatnonzero(~held_out), np.flatnonzero(held_out)])
+    whole = end.latents.followed_by(len(end.latents.load), end.checked).part(np.argsort(places))
+    return end._replace(latents=whole.part(record.fold != fold), checked=whole.part(record.fold == fold))

@@ -29,6 +29,12 @@ class Latents:
             np.concatenate([self.entry_angle[-shared:], new.entry_angle]),
         )
 
+    def part(self, instants: NDArray[np.intp] | NDArray[np.bool_]) -> Latents:
+        """Those of some instants, in this order."""
+        return Latents(
+            self.load[instants], self.speed[instants], self.ground_speed[instants], self.entry_angle[instants]
+        )
+
 
 @dataclass(slots=True)
 class Linearised:

@@ -85,8 +85,11 @@ def _stretches(times: bytes) -> tuple[NDArray[np.intp], ...]:
 
 
 def earlier(t: Array, delay: float) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-    """Between which two instants of its run lies the moment so long [s] before each one (N,), and how far from the
-    first to the second; beyond the first two of a run on their straight line."""
+    """Two instants of its run for each one (N,), and the share (N,) of the way from the first to the second at which
+    the moment so long [s] before it lies.
+
+    Negative before a run's first instant: on the straight line through its first two.
+    """
     first, second, part = np.arange(len(t)), np.arange(len(t)), np.zeros(len(t))
     for run in stretches(t):
         if len(run) >= 2:

@@ -12,6 +12,10 @@ from soilbus.terra.effects.effect import Effect, Parameter, Surroundings, Values
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import WheelModel, WheelState
 
+REFERENCE_RATE = 2.5
+"""Wheel speed [rad/s] at which a friction that falls with speed is what share and drag say."""
+_LEAST_RATE = 0.1
+
 
 def _drive_line(torque: Any, around: Surroundings, values: Values) -> Any:
     """At the motor: T + ((share |T| + drag) (|omega| / omega_0)^-fading + viscous |omega|), as it turns."""
@@ -21,10 +25,6 @@ def _drive_line(torque: Any, around: Surroundings, values: Values) -> Any:
     friction = (values["share"] * np.abs(torque) + values["drag"]) * np.exp(-values["fading"] * np.log(faster))
     return torque + way * friction + values["viscous"] * speed
 
-
-REFERENCE_RATE = 2.5
-"""Wheel speed [rad/s] at which a friction that falls with speed is what share and drag say."""
-_LEAST_RATE = 0.1
 
 DRIVETRAIN_LOSS = Effect(
     name="drivetrain_loss",
