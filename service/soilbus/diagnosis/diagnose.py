@@ -51,6 +51,8 @@ WORTH_TRYING = -2.0
 WORTH_FITTING = 0.2
 """Share of what an effect must explain, and of what the best is foreseen to, from which it is fitted where little
 is foreseen: of less the score is as good."""
+ASTRAY = 3.0
+"""Gap of a model that is off by so much that further steps of a fit decide nothing."""
 SAME = 1.0
 """Difference of -2 log evidence that is none."""
 FORM_LEFT_IN_SOIL = 0.125
@@ -187,8 +189,8 @@ def _round(
 
 
 def _converged(whole: Fits, present: Completion, completion: Completion) -> Completion:
-    """The same, or where further steps from there lead if they were too few and it is better than the present."""
-    if completion.converged or completion.evidence > present.evidence:
+    """The same, or where further steps from there lead if they were too few, and it is near and better than the present."""
+    if completion.converged or completion.evidence > present.evidence or completion.gap > ASTRAY:
         return completion
     further = whole.of(completion.effects, [completion.as_starts()])
     return completion if further is None or further.evidence > completion.evidence else further

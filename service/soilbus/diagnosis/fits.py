@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 from soilbus.diagnosis.completion import Completion, complete
 from soilbus.diagnosis.records import Record
@@ -13,11 +13,12 @@ from soilbus.terra.effects.effect import Effect
 
 
 class Fits:
-    """Recordings with what is known of models fitted to them: those that converged are not fitted again."""
+    """Recordings with what is known of models fitted to them: those that converged, or began there, are not fitted again."""
 
     def __init__(self, records: Sequence[Record], prior: SoilPrior) -> None:
         self.records, self.prior = tuple(records), prior
         self._converged: dict[frozenset[str], Completion] = {}
+        self._begun: dict[tuple[Hashable, ...], Completion | None] = {}
 
     def of(
         self,
@@ -39,9 +40,17 @@ class Fits:
         for i, start in enumerate(starts or (None,)):
             if best is not None and best.converged and i < len(foreseen) and best.evidence <= foreseen[i]:
                 continue
-            found = complete(self.records, self.prior, effects, start, most, hopeless)
+            begun = (names, _key(start), most, hopeless)
+            if begun not in self._begun:
+                self._begun[begun] = complete(self.records, self.prior, effects, start, most, hopeless)
+            found = self._begun[begun]
             if found is not None and (best is None or found.evidence < best.evidence):
                 best = found
         if best is not None and best.converged:
             self._converged[names] = best
         return best
+
+
+def _key(starts: Sequence[Start] | None) -> Hashable:
+    """Where a fit begins, as a key."""
+    return starts and tuple((start.soil.tobytes(), start.gains.tobytes(), start.near) for start in starts)

@@ -16,8 +16,8 @@ from soilbus.estimation.linearised import Optimum
 from soilbus.estimation.normal_equations import Fitting, Place, Point
 
 MAX_STEPS = 15
-ENOUGH = 0.1
-"""Fall of the cost that ends the descent."""
+ENOUGH, ENOUGH_FAR = 0.1, 2e-3
+"""Fall of the cost that ends the descent, and that share of what the cost is above NEAR that does."""
 EASED, HELD_BACK = 0.3, 10.0
 """What a step that lowers the cost, and one that does not, makes of the damping."""
 MOST_DAMPING = 1e4
@@ -38,7 +38,7 @@ def descended(fitting: Fitting, end: Place, start: Place) -> Fit | None:
         if here is None:
             return None
         damping, falling, steps = 1e-2, np.inf, 0
-        while falling > ENOUGH and damping < MOST_DAMPING and steps < MAX_STEPS:
+        while falling > _enough(fitting, here[1]) and damping < MOST_DAMPING and steps < MAX_STEPS:
             step = here[1].step(damping)
             there = None if step is None else _relaxed(fitting, fitting.moved(*here, step))
             steps += 1
@@ -61,6 +61,10 @@ def _relaxed(fitting: Fitting, place: Place) -> tuple[Place, Point] | None:
     place = fitting.moved(place, point, np.zeros(len(point.gradient)))
     point = fitting.point(place)
     return None if point is None else (place, point)
+
+
+def _enough(fitting: Fitting, point: Point) -> float:
+    return max(ENOUGH, ENOUGH_FAR * (point.cost - NEAR * fitting.problem.n_rows))
 
 
 def _fit(fitting: Fitting, place: Place, point: Point, steps: int, converged: bool) -> Fit | None:
