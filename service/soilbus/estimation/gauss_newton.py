@@ -296,7 +296,7 @@ def continued(
             place = fitting.near(start.soil, gains, start.latents)
             end = settled_within(place, MAX_RESUMED, refusals=1)
             fit = _fit_at(fitting, end)
-            if fit is not None and (fit.converged or fit.chi2 < PLAUSIBLE):
+            if fit is not None:
                 return fit
         moving = Fitting(problem, prior, before, first=first)
         near = approach(moving, start.soil, most, LITTLE, gains, hopeless=AS_MEASURED * hopeless)
