@@ -9,7 +9,6 @@ learned from and of the blocks held out.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -23,7 +22,7 @@ from soilbus.estimation.belief import Belief
 from soilbus.estimation.completed import CompletedProblem
 from soilbus.estimation.coordinates import at_edges
 from soilbus.estimation.effect_parameters import Free, parameters_of
-from soilbus.estimation.gauss_newton import MAX_ITERATIONS, Fit, Start, continued, fit_window
+from soilbus.estimation.gauss_newton import Effort, Fit, Start, continued, fit_window
 from soilbus.estimation.linearised import Latents, Linearised
 from soilbus.estimation.normal_equations import Fitting, Place
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
@@ -133,12 +132,9 @@ def complete(
     prior: SoilPrior,
     effects: Sequence[Effect],
     starts: Sequence[Start] | None = None,
-    most: int = MAX_ITERATIONS,
-    hopeless: float = math.inf,
+    effort: Effort = Effort(),
 ) -> Completion | None:
-    """A model with these effects fitted to all recordings; None where a fit fails.
-
-    Each fit has at most so many steps; a fit that will not cost less than `hopeless` is given up, and None.
+    """A model with these effects fitted to all recordings; None where a fit fails, or is given up.
 
     Parameters of effects that the records' model has already keep the prior they have
     there; one that would leave its range is held at the edge.
@@ -147,7 +143,7 @@ def complete(
     known = {e.name: [f for f in present.free if f.effect == e.name] for e in present.effects}
     free = tuple(f for effect in effects for f in known.get(effect.name) or parameters_of(effect, present.n_wheels))
     near = None if starts is None else [start.checked for start in starts]
-    fitted = _fits(records, prior, effects, free, starts, most, hopeless)
+    fitted = _fits(records, prior, effects, free, starts, effort)
     for _ in range(len(free)):
         inside = (
             None if fitted is None else _held_at_edges(records[0].learned.completed(effects, free), fitted[1], free)
@@ -155,7 +151,7 @@ def complete(
         if fitted is None or inside is None:
             break
         free, starts = inside, [_start(fit) for fit in fitted[1]]
-        fitted = _fits(records, prior, effects, free, starts, most, hopeless)
+        fitted = _fits(records, prior, effects, free, starts, effort)
     if fitted is None:
         return None
     befores, fits = fitted
@@ -174,8 +170,7 @@ def _fits(
     effects: Sequence[Effect],
     free: tuple[Free, ...],
     starts: Sequence[Start] | None,
-    most: int,
-    hopeless: float,
+    effort: Effort,
 ) -> tuple[list[Belief], list[Fit]] | None:
     """What was known before each recording, and its fit."""
     befores: list[Belief] = []
@@ -183,7 +178,7 @@ def _fits(
     for i, record in enumerate(records):
         problem = record.learned.completed(effects, free)
         before = _of_next(fits[-1].mode, prior, problem, effects) if fits else _of_first(record, prior, problem)
-        fit = _fitted(problem, prior, before, None if starts is None else starts[i], most, hopeless)
+        fit = _fitted(problem, prior, before, None if starts is None else starts[i], effort)
         if fit is None:
             return None
         befores.append(before)
@@ -236,7 +231,7 @@ def _of_first(record: Record, prior: SoilPrior, problem: CompletedProblem) -> Be
 
 
 def _fitted(
-    problem: CompletedProblem, prior: SoilPrior, before: Belief, start: Start | None, most: int, hopeless: float
+    problem: CompletedProblem, prior: SoilPrior, before: Belief, start: Start | None, effort: Effort
 ) -> Fit | None:
     """From the given start, or from anywhere; a fit that has not converged goes on from where it is, slowly."""
     if start is None:
@@ -244,14 +239,14 @@ def _fitted(
         if fit is None or fit.converged:
             return fit
         start = Start(fit.mode.soil, fit.mode.gains)
-    fit = continued(problem, prior, before, start, problem.n_sensors, most, hopeless)
+    fit = continued(problem, prior, before, start, problem.n_sensors, effort)
     if fit is None or fit.converged:
         return fit
-    if fit.cost > hopeless:
+    if fit.cost > effort.hopeless:
         return None
     fitting, gains = Fitting(problem, prior, before), np.where(problem.gain_std > 0.0, start.gains, 0.0)
     end = Place(fit.optimum.soil, problem.allowed(fit.optimum.gains), fit.optimum.latents, fit.cost, 0)
-    return descended(fitting, end, fitting.start(start.soil, gains=problem.allowed(gains))) or fit
+    return descended(fitting, end, fitting.start(start.soil, gains=problem.allowed(gains)), effort.enough) or fit
 
 
 def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects: Sequence[Effect]) -> Belief:

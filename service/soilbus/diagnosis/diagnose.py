@@ -28,7 +28,7 @@ from soilbus.diagnosis.verdict import (
     probabilities,
 )
 from soilbus.diagnosis.where import Disagreement, disagreements
-from soilbus.estimation.gauss_newton import Start
+from soilbus.estimation.gauss_newton import Effort, Start
 from soilbus.estimation.posterior import Posterior, SoilPrior
 from soilbus.terra.effects.effect import Effect
 
@@ -46,6 +46,8 @@ BEHIND_UNSETTLED = 250.0
 """Cost on a few instants above the least one's from which a candidate is given up, converged or not."""
 STEPS = 12
 """Steps of the soil, and then of everything, in which a candidate that explains much is fitted."""
+ROUGH = Effort(STEPS, enough=0.02)
+"""The same where few instants tell which candidates to fit to all."""
 WORTH_TRYING = -2.0
 """Foreseen change of -2 log evidence above which a candidate does not count."""
 WORTH_FITTING = 0.2
@@ -168,7 +170,7 @@ def _round(
     promising = _promising(whole, few, present, candidates, explained, again)
     behind = math.inf
     for effect, starts in promising.fits:
-        completion = whole.of((*present.effects, effect), [starts], STEPS, behind)
+        completion = whole.of((*present.effects, effect), [starts], Effort(STEPS, behind))
         if completion is not None:
             tried[effect.name] = effect, completion
             reach = hopeless_from(explained + present.evidence - completion.evidence)
@@ -215,7 +217,7 @@ def _promising(
 
     Where little is foreseen a few instants tell nothing, and scores are as good as fits.
     """
-    before = few.of(present.effects, [present.as_starts()], STEPS)
+    before = few.of(present.effects, [present.as_starts()], ROUGH)
     foreseen = scores(whole.records, whole.prior, present, candidates)
     further = [] if before is None else _further(few, before, candidates)
     share = 1.0 if before is None else before.rows / present.rows
@@ -266,7 +268,7 @@ def _worth_trying(
 def _tried(few: Fits, present: Completion, found: Sequence[Score], hopeless: float) -> Completion | None:
     """The best fit of one candidate to a few instants; from further starts only where more is foreseen of them."""
     starts, foreseen = [s.starts for s in found], [present.evidence + s.evidence for s in found]
-    return few.of((*present.effects, found[0].effect), starts, STEPS, hopeless, foreseen)
+    return few.of((*present.effects, found[0].effect), starts, ROUGH._replace(hopeless=hopeless), foreseen)
 
 
 def _further(fits: Fits, present: Completion, candidates: Sequence[Effect]) -> list[Score]:
@@ -313,7 +315,7 @@ def _stays(
 ) -> Addition | None:
     """The addition beside the present others, where a few instants tell that it, and no other, belongs there."""
     effect, others = addition.effect, _others(addition, present)
-    here, without = few.of(present.effects, [present.as_starts()], STEPS), _without(few, present, effect)
+    here, without = few.of(present.effects, [present.as_starts()], ROUGH), _without(few, present, effect)
     if here is None or without is None:
         return None
     share = here.rows / present.rows
@@ -345,7 +347,7 @@ def _without(fits: Fits, present: Completion, effect: Effect) -> Completion | No
         start._replace(gains=np.concatenate([start.gains[:n_sensors], start.gains[kept]]))
         for start in present.as_starts()
     ]
-    return fits.of([e for e in present.effects if e.name != effect.name], [starts], STEPS)
+    return fits.of([e for e in present.effects if e.name != effect.name], [starts], Effort(STEPS))
 
 
 def _verdict(before: Gap, after: Gap, additions: Sequence[Addition]) -> Verdict:

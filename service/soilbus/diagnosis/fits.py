@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Hashable, Sequence
 
 from soilbus.diagnosis.completion import Completion, complete
 from soilbus.diagnosis.records import Record
-from soilbus.estimation.gauss_newton import MAX_ITERATIONS, Start
+from soilbus.estimation.gauss_newton import Effort, Start
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
 
@@ -24,13 +23,12 @@ class Fits:
         self,
         effects: Sequence[Effect],
         starts: Sequence[Sequence[Start]] = (),
-        most: int = MAX_ITERATIONS,
-        hopeless: float = math.inf,
+        effort: Effort = Effort(),
         foreseen: Sequence[float] = (),
     ) -> Completion | None:
         """The best fit with these effects from any of the starts (one Start for each recording), or from anywhere.
 
-        Steps and `hopeless` as in complete(); None where all fits fail.  A start of which no better evidence is
+        None where all fits fail.  A start of which no better evidence is
         foreseen than a fit came to that converged is left out.
         """
         names = frozenset(effect.name for effect in effects)
@@ -40,9 +38,9 @@ class Fits:
         for i, start in enumerate(starts or (None,)):
             if best is not None and best.converged and i < len(foreseen) and best.evidence <= foreseen[i]:
                 continue
-            begun = (names, _key(start), most, hopeless)
+            begun = (names, _key(start), effort)
             if begun not in self._begun:
-                self._begun[begun] = complete(self.records, self.prior, effects, start, most, hopeless)
+                self._begun[begun] = complete(self.records, self.prior, effects, start, effort)
             found = self._begun[begun]
             if found is not None and (best is None or found.evidence < best.evidence):
                 best = found

@@ -16,8 +16,10 @@ from soilbus.estimation.linearised import Optimum
 from soilbus.estimation.normal_equations import Fitting, Place, Point
 
 MAX_STEPS = 15
-ENOUGH, ENOUGH_FAR = 0.1, 2e-3
-"""Fall of the cost that ends the descent, and that share of what the cost is above NEAR that does."""
+SLOWLY = 30.0
+"""How many times the fall that is not worth a step one that is left has been seen to be where steps are slow."""
+ENOUGH_FAR = 2e-3
+"""Share of what the cost is above NEAR that is no fall worth a step."""
 EASED, HELD_BACK = 0.3, 10.0
 """What a step that lowers the cost, and one that does not, makes of the damping."""
 MOST_DAMPING = 1e4
@@ -25,10 +27,10 @@ NEAR = 2.0
 """Cost for each residual below which one linear step brings the latents to their best."""
 
 
-def descended(fitting: Fitting, end: Place, start: Place) -> Fit | None:
+def descended(fitting: Fitting, end: Place, start: Place, enough: float) -> Fit | None:
     """The optimum below where the fast descent ended, or below its start where that costs less.
 
-    None where the numbers are not finite.
+    `enough` is a fall of the cost that is not worth a step.  None where the numbers are not finite.
     """
     with np.errstate(all="ignore"):
         at_start = fitting.point(start)
@@ -38,7 +40,7 @@ def descended(fitting: Fitting, end: Place, start: Place) -> Fit | None:
         if here is None:
             return None
         damping, falling, steps = 1e-2, np.inf, 0
-        while falling > _enough(fitting, here[1]) and damping < MOST_DAMPING and steps < MAX_STEPS:
+        while falling > _enough(fitting, here[1], enough) and damping < MOST_DAMPING and steps < MAX_STEPS:
             step = here[1].step(damping)
             there = None if step is None else _relaxed(fitting, fitting.moved(*here, step))
             steps += 1
@@ -63,8 +65,8 @@ def _relaxed(fitting: Fitting, place: Place) -> tuple[Place, Point] | None:
     return None if point is None else (place, point)
 
 
-def _enough(fitting: Fitting, point: Point) -> float:
-    return max(ENOUGH, ENOUGH_FAR * (point.cost - NEAR * fitting.problem.n_rows))
+def _enough(fitting: Fitting, point: Point, enough: float) -> float:
+    return max(SLOWLY * enough, ENOUGH_FAR * (point.cost - NEAR * fitting.problem.n_rows))
 
 
 def _fit(fitting: Fitting, place: Place, point: Point, steps: int, converged: bool) -> Fit | None:

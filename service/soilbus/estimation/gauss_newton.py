@@ -73,6 +73,18 @@ class Start(NamedTuple):
     checked: Latents | None = None
 
 
+class Effort(NamedTuple):
+    """What a fit is worth that is compared with others by cost.
+
+    most: steps of either kind; hopeless: a cost such that a fit that will stay above it is
+    given up; enough: foreseen fall of the cost that is not worth a further step.
+    """
+
+    most: int = MAX_ITERATIONS
+    hopeless: float = math.inf
+    enough: float = COMPARED
+
+
 class Rival(NamedTuple):
     """Another optimum than a fit's, by mode and curvature, and its share of the probability of both (Laplace)."""
 
@@ -279,17 +291,15 @@ def continued(
     before: Belief,
     start: Start,
     first: int,
-    most: int = MAX_ITERATIONS,
-    hopeless: float = np.inf,
+    effort: Effort,
 ) -> Fit | None:
     """Descent from a start, of whose gains those from the `first` on move with the soil from the beginning.
 
     Where a fit of the same model ended is near the optimum: everything moves from there,
-    unless that goes wrong.  At most so many steps of either kind, and no more than it
-    takes to see that the cost will stay above `hopeless`.
+    unless the numbers stop being finite.
     """
-    fitting = Fitting(problem, prior, before)
-    settled_within = partial(settle, fitting, left_over=COMPARED, hopeless=hopeless, in_all=MAX_ASTRAY, enough=COMPARED)
+    fitting, (most, hopeless, enough) = Fitting(problem, prior, before), effort
+    settled_within = partial(settle, fitting, left_over=enough, hopeless=hopeless, in_all=MAX_ASTRAY, enough=enough)
     gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
     with np.errstate(all="ignore"):
         if start.near:
