@@ -42,11 +42,13 @@ FITTED = 6
 THINNED = 4
 CLEAR = 100.0
 """Foreseen fall of -2 log evidence from which a few instants tell which candidates to fit."""
+BEHIND = 20.0
+"""-2 log evidence on a few instants by which a candidate is behind for good: what it explains of all is foreseen."""
 BEHIND_UNSETTLED = 250.0
 """Cost on a few instants above the least one's from which a candidate is given up, converged or not."""
 STEPS = 12
 """Steps of the soil, and then of everything, in which a candidate that explains much is fitted."""
-ROUGH = Effort(STEPS, enough=0.02)
+ROUGH = Effort(STEPS, enough=0.02, little=5e-3)
 """The same where few instants tell which candidates to fit to all."""
 WORTH_TRYING = -2.0
 """Foreseen change of -2 log evidence above which a candidate does not count."""
@@ -184,6 +186,7 @@ def _round(
     if not pays(falls[best], explained, present.gap, present.checked_rows, present.rows):
         return None
     falls |= {name: min(fall, falls[best]) for name, fall in promising.foreseen.items()}
+    falls |= {name: falls[best] - behind for name, behind in promising.behind.items()}
     chances = probabilities(falls, explained)
     others = {n: p for n, p in chances.items() if n != best and p >= PLAUSIBLE}
     effect, completion = tried[best]
@@ -199,10 +202,14 @@ def _converged(whole: Fits, present: Completion, completion: Completion) -> Comp
 
 
 class _Promising(NamedTuple):
-    """Candidates worth a fit of all data, with where it starts, and falls of -2 log evidence foreseen of others."""
+    """Candidates worth a fit of all data, with where it starts.
+
+    Of others falls of -2 log evidence that are foreseen, or how far behind the best one they will be.
+    """
 
     fits: Sequence[tuple[Effect, Sequence[Start]]]
     foreseen: dict[str, float]
+    behind: dict[str, float]
 
 
 def _promising(
@@ -224,20 +231,22 @@ def _promising(
     most = max(-score.evidence / part for part, of in ((1.0, foreseen), (share, further)) for score in of)
     if before is None or most < CLEAR:
         return _of_scores([*foreseen, *_further(whole, present, candidates)], least_that_pays(explained))
-    tried: list[tuple[float, Effect, Sequence[Start]]] = []
+    tried: list[tuple[float, Effect, Completion]] = []
     least = math.inf
     for found in _worth_trying(foreseen, further, again).values():
         completion = _tried(few, before, found, least + BEHIND_UNSETTLED)
         if completion is not None:
-            tried.append((before.evidence - completion.evidence, found[0].effect, completion.as_starts()))
+            tried.append((before.evidence - completion.evidence, found[0].effect, completion))
             least = min(least, completion.cost)
     tried.sort(key=lambda item: -item[0])
-    best = tried[0][0] / share if tried else 0.0
+    best = tried[0][0] if tried else 0.0
+    settled = all(completion.converged for _, _, completion in tried[:1])
     kept = [
-        (effect, starts) for fall, effect, starts in tried
-        if fall > 0.0 and not hopeless(best - fall / share, explained + best)
-    ]  # fmt: skip
-    return _Promising(kept[:FITTED], {})
+        (fall, effect, completion) for fall, effect, completion in tried
+        if fall > 0.0 and not hopeless((best - fall) / share, explained + best / share)
+    ][:FITTED]  # fmt: skip
+    behind = {e.name: (best - f) / share for f, e, c in kept if settled and c.converged and best - f > BEHIND}
+    return _Promising([(e, c.as_starts()) for _, e, c in kept if e.name not in behind], {}, behind)
 
 
 def _of_scores(found: Iterable[Score], least: float) -> _Promising:
@@ -249,7 +258,7 @@ def _of_scores(found: Iterable[Score], least: float) -> _Promising:
     chosen = list(best.values())[:FITTED]
     enough = WORTH_FITTING * max([least, *(-s.evidence for s in chosen)])
     fitted = [(s.effect, s.starts) for s in chosen if -s.evidence > enough]
-    return _Promising(fitted, {s.effect.name: -s.evidence for s in chosen[len(fitted) :]})
+    return _Promising(fitted, {s.effect.name: -s.evidence for s in chosen[len(fitted) :]}, {})
 
 
 def _worth_trying(

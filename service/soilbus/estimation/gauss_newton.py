@@ -77,12 +77,14 @@ class Effort(NamedTuple):
     """What a fit is worth that is compared with others by cost.
 
     most: steps of either kind; hopeless: a cost such that a fit that will stay above it is
-    given up; enough: foreseen fall of the cost that is not worth a further step.
+    given up; enough: foreseen fall of the cost that is not worth a further step; little:
+    relative fall that is not, as long as the latents are as measured.
     """
 
     most: int = MAX_ITERATIONS
     hopeless: float = math.inf
     enough: float = COMPARED
+    little: float = LITTLE
 
 
 class Rival(NamedTuple):
@@ -298,7 +300,7 @@ def continued(
     Where a fit of the same model ended is near the optimum: everything moves from there,
     unless the numbers stop being finite.
     """
-    fitting, (most, hopeless, enough) = Fitting(problem, prior, before), effort
+    fitting, (most, hopeless, enough, little) = Fitting(problem, prior, before), effort
     settled_within = partial(settle, fitting, left_over=enough, hopeless=hopeless, in_all=MAX_ASTRAY, enough=enough)
     gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
     with np.errstate(all="ignore"):
@@ -309,7 +311,7 @@ def continued(
             if fit is not None:
                 return fit
         moving = Fitting(problem, prior, before, first=first)
-        near = approach(moving, start.soil, most, LITTLE, gains, hopeless=AS_MEASURED * hopeless)
+        near = approach(moving, start.soil, most, little, gains, hopeless=AS_MEASURED * hopeless)
         if near is None:
             return None
         return _fit_at(fitting, settled_within(near, most))
