@@ -145,7 +145,7 @@ def diagnose(
             break
         addition, present = found
         additions.append(addition)
-        if len(additions) > 1:
+        if len(additions) > 1 and present.gap < ASTRAY:
             additions, present = _reconsidered(whole, few, base, present, additions, candidates)
     additions.sort(key=lambda addition: -addition.falls[addition.effect.name])
     progress("holding out every block in turn")
