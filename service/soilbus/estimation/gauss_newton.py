@@ -170,39 +170,39 @@ def fit_window(problem: WindowProblem, prior: SoilPrior, before: Belief | None =
     thin = Fitting(problem.thinned(THINNED), prior, before, with_gains=False)
     with np.errstate(all="ignore"):
         ends = _ends(thin)
-        best = _best(fitting, thin, ends)
+        best, led = _best(fitting, ends)
         if best is None or best.chi2 > PLAUSIBLE:
             return best
         if not best.converged:
             near = approach(Fitting(problem, prior, before, with_gains=False), best.mode.soil, MAX_ITERATIONS, 0.0)
             best = best if near is None else _fit_at(fitting, settle(fitting, near, MAX_ITERATIONS)) or best
-        return _with_rival(fitting, thin, best, ends) if best.converged else best
+        return _with_rival(fitting, thin, best, ends, led) if best.converged else best
 
 
-def _best(fitting: Fitting, thin: Fitting, ends: Sequence[Place]) -> Fit | None:
-    """The first of the optima on a few instants, the best first, that leads to one of all."""
+def _best(fitting: Fitting, ends: Sequence[Place]) -> tuple[Fit | None, Place | None]:
+    """Where the first of the optima on a few instants, the best first, leads that leads to one of all, and that one."""
     unlike = [end for i, end in enumerate(ends) if i == 0 or end.cost > ends[i - 1].cost * (1.0 + SAME_END)]
-    best: Fit | None = None
+    best, led = None, None
     for end in unlike[:MAX_SETTLED]:
         most = MAX_ITERATIONS if end.cost < HOPELESS * THINNED else MAX_HOPELESS
         start = replace(fitting.start(end.soil), trials=end.trials)
         fit = _fit_at(fitting, settle(fitting, start, most))
         if fit is not None and (best is None or (fit.converged, -fit.cost) > (best.converged, -best.cost)):
-            best = fit
+            best, led = fit, end
         if best is not None and best.converged:
-            return best
-    return best
+            break
+    return best, led
 
 
-def _with_rival(fitting: Fitting, thin: Fitting, found: Fit, ends: Sequence[Place]) -> Fit:
+def _with_rival(fitting: Fitting, thin: Fitting, found: Fit, ends: Sequence[Place], led: Place | None) -> Fit:
     """The more likely of an optimum and another one, with the other as its rival.
 
-    The other is one of the ends on a few instants, or the one across from what was found.
+    The other is one of the ends on a few instants, but what `led` here, or the one across from what was found.
     That stays alone where there is no other, or none that is nearly as likely and that its
     standard deviations exclude.  Optima are compared, and mixed, as each is about its mode:
     moments along k_c's share would count the other one already.
     """
-    end = _other_end(fitting, thin, found, ends) if np.ptp(fitting.problem.rig.width) > 0.0 else None
+    end = _other_end(fitting, thin, found, ends, led) if np.ptp(fitting.problem.rig.width) > 0.0 else None
     if end is None:
         return found
     other = _fit_at(fitting, settle(fitting, fitting.start(end.soil), MAX_ITERATIONS))
@@ -215,7 +215,9 @@ def _with_rival(fitting: Fitting, thin: Fitting, found: Fit, ends: Sequence[Plac
     return replace(better, belief=better.mode, rival=Rival(worse.mode, share))
 
 
-def _other_end(fitting: Fitting, thin: Fitting, found: Fit, ends: Sequence[Place]) -> Place | None:
+def _other_end(
+    fitting: Fitting, thin: Fitting, found: Fit, ends: Sequence[Place], led: Place | None
+) -> Place | None:
     """Where a descent on a few instants ended about as low as at what was found, and far from it."""
     ill_told = math.sqrt(found.mode.covariance[_K_C, _K_C]) > ILL_TOLD
     apart = len({end.soil.tobytes() for end in ends}) > 1
@@ -230,8 +232,11 @@ def _other_end(fitting: Fitting, thin: Fitting, found: Fit, ends: Sequence[Place
     def is_elsewhere(end: Place) -> bool:
         return end.cost < FAR_ABOVE * here.cost and off(end) > FAR**2
 
-    own = min(ends, key=off)  # which led to what was found
-    known = next((end for end in ends if is_elsewhere(end) and off(end) > off(own)), None)
+    def led_here(end: Place) -> bool:
+        return led is not None and np.array_equal(end.soil, led.soil)
+
+    nearest = min(map(off, ends))
+    known = next((end for end in ends if is_elsewhere(end) and off(end) > nearest and not led_here(end)), None)
     start = fitting.coordinates.across(found.mode.soil) if ill_told and known is None else None
     if start is None:
         return known
@@ -293,7 +298,7 @@ def continued(
     before: Belief,
     start: Start,
     first: int,
-    effort: Effort,
+    effort: Effort = Effort(),
 ) -> Fit | None:
     """Descent from a start, of whose gains those from the `first` on move with the soil from the beginning.
 
