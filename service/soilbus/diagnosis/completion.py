@@ -77,6 +77,11 @@ class Completion:
         """-2 log of the likelihood of all data, whatever soils, gains and parameters may be, up to a constant."""
         return sum(fit.evidence for fit in self.fits) + self.predicted + self.sizes
 
+    def foreseen(self, rows: int) -> float:
+        """The evidence from so many residuals like these: what they leave grows, what is paid for parameters does not."""
+        left = self.cost + self.gap * self.checked_rows
+        return self.evidence + (rows / self.rows - 1.0) * left
+
     @property
     def predicted(self) -> float:
         """-2 log of the likelihood of the held-out blocks after the others, up to the same."""

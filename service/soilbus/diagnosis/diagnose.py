@@ -42,8 +42,12 @@ FITTED = 6
 THINNED = 4
 CLEAR = 100.0
 """Foreseen fall of -2 log evidence from which a few instants tell which candidates to fit."""
-BEHIND = 20.0
-"""-2 log evidence on a few instants by which a candidate is behind for good: what it explains of all is foreseen."""
+BEHIND = 150.0
+"""-2 log evidence by which a candidate is behind for good, foreseen from a few instants: it is not fitted to all.
+
+Three deviations: of a difference d on every THINNED-th instant the deviation is 2 sqrt(d), and 2 sqrt(THINNED x)
+of x foreseen.
+"""
 BEHIND_UNSETTLED = 250.0
 """Cost on a few instants above the least one's from which a candidate is given up, converged or not."""
 STEPS = 12
@@ -227,8 +231,8 @@ def _promising(
     before = few.of(present.effects, [present.as_starts()], ROUGH)
     foreseen = scores(whole.records, whole.prior, present, candidates)
     further = [] if before is None else _further(few, before, candidates)
-    share = 1.0 if before is None else before.rows / present.rows
-    most = max(-score.evidence / part for part, of in ((1.0, foreseen), (share, further)) for score in of)
+    times = 1.0 if before is None else present.rows / before.rows
+    most = max(part * -score.evidence for part, of in ((1.0, foreseen), (times, further)) for score in of)
     if before is None or most < CLEAR:
         return _of_scores([*foreseen, *_further(whole, present, candidates)], least_that_pays(explained))
     tried: list[tuple[float, Effect, Completion]] = []
@@ -236,16 +240,17 @@ def _promising(
     for found in _worth_trying(foreseen, further, again).values():
         completion = _tried(few, before, found, least + BEHIND_UNSETTLED)
         if completion is not None:
-            tried.append((before.evidence - completion.evidence, found[0].effect, completion))
+            fall = before.foreseen(present.rows) - completion.foreseen(present.rows)
+            tried.append((fall, found[0].effect, completion))
             least = min(least, completion.cost)
     tried.sort(key=lambda item: -item[0])
     best = tried[0][0] if tried else 0.0
     settled = all(completion.converged for _, _, completion in tried[:1])
     kept = [
         (fall, effect, completion) for fall, effect, completion in tried
-        if fall > 0.0 and not hopeless((best - fall) / share, explained + best / share)
+        if fall > 0.0 and not hopeless(best - fall, explained + best)
     ][:FITTED]  # fmt: skip
-    behind = {e.name: (best - f) / share for f, e, c in kept if settled and c.converged and best - f > BEHIND}
+    behind = {e.name: best - f for f, e, c in kept if settled and c.converged and best - f > BEHIND}
     return _Promising([(e, c.as_starts()) for _, e, c in kept if e.name not in behind], {}, behind)
 
 
@@ -327,8 +332,8 @@ def _stays(
     here, without = few.of(present.effects, [present.as_starts()], ROUGH), _without(few, present, effect)
     if here is None or without is None:
         return None
-    share = here.rows / present.rows
-    fall, explained = (without.evidence - here.evidence) / share, base.evidence - present.evidence
+    fall = without.foreseen(present.rows) - here.foreseen(present.rows)
+    explained = base.evidence - present.evidence
     if fall < CLEAR:
         return None
     found = _worth_trying(
@@ -337,7 +342,9 @@ def _stays(
     for rival in candidates:
         if rival.name in found and rival.name != effect.name:
             completion = _tried(few, without, found[rival.name], here.cost + BEHIND_UNSETTLED)
-            if completion is not None and not hopeless((completion.evidence - here.evidence) / share, explained):
+            if completion is None:
+                continue
+            if not hopeless(completion.foreseen(present.rows) - here.foreseen(present.rows), explained):
                 return None
     (chance,) = probabilities({effect.name: fall}, explained - fall).values()
     return Addition(effect, chance, {}, {effect.name: fall}, others)
