@@ -6,7 +6,7 @@ that a small function of much costs little more than its value.
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from typing import Any
 
 import numpy as np
@@ -88,6 +88,16 @@ class Dual(NDArrayOperatorsMixin):
     def _each(self, linear: Any) -> Dual:
         shape = self.shape
         return Dual(linear(self.value), {q: linear(np.broadcast_to(d, shape)) for q, d in self.by.items()})
+
+
+def weighed_sum(weights: Any, numbers: Sequence[Any]) -> Any:
+    """The sum (...) of weights (K, ...) times K numbers, that may carry derivatives by numbers."""
+    value = np.tensordot([value_of(x) for x in numbers], weights, 1)
+    by: dict[Any, Any] = {}
+    for x, weight in zip(numbers, weights, strict=True):
+        for quantity, d in x.by.items() if isinstance(x, Dual) else ():
+            by[quantity] = by[quantity] + weight * d if quantity in by else weight * d
+    return Dual(value, by) if by else value
 
 
 def value_of(x: Any) -> Any:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.terra.dual import Dual
+from soilbus.terra.dual import Dual, weighed_sum
 from soilbus.terra.effects.effect import Knot, Parameter, Surroundings
 from soilbus.terra.stress import Array
 
@@ -31,7 +31,7 @@ def through_knots(share: Any, heights: Sequence[Any]) -> Any:
 
     Linear in the heights; twice as near to a smooth profile as straight lines between as many knots.
     """
-    return sum(height * of_knot for height, of_knot in zip(heights, splines(share, len(heights)), strict=True))
+    return weighed_sum(splines(share, len(heights)), heights)
 
 
 def curve_of(name: str, unit: str, knots: range, intervals: int, std: float, most: float) -> tuple[Parameter, ...]:
@@ -41,7 +41,14 @@ def curve_of(name: str, unit: str, knots: range, intervals: int, std: float, mos
 
 def splines(share: Any, knots: int) -> Array:
     """The splines (knots, ...) that are one at one knot and zero at all others."""
-    place = np.clip(np.asarray(share, float), 0.0, 1.0) * (knots - 1)
+    shares = np.asarray(share, float)
+    return _splines(shares.tobytes(), knots).reshape(knots, *shares.shape)
+
+
+@lru_cache(maxsize=16)
+def _splines(shares: bytes, knots: int) -> Array:
+    """The same (knots, N) at shares as bytes: a fit asks for those of the same few records a thousand times."""
+    place = np.clip(np.frombuffer(shares), 0.0, 1.0) * (knots - 1)
     left = np.minimum(np.nan_to_num(place).astype(int), knots - 2)
     to_left = place - left
     to_right = 1.0 - to_left
@@ -75,7 +82,7 @@ def stretches(t: Array) -> tuple[NDArray[np.intp], ...]:
 
 @lru_cache(maxsize=16)
 def _stretches(times: bytes) -> tuple[NDArray[np.intp], ...]:
-    """As stretches(), of times as bytes: a fit asks for those of the same few records a thousand times."""
+    """As stretches(), of times as bytes; kept as splines are."""
     t = np.frombuffer(times)
     step = np.diff(t)
     forward = step[step > 0.0]
