@@ -45,7 +45,7 @@ def test_the_depth_of_a_pan_is_found_where_the_score_is_blind():
     record, prior = recorded(effects=[Active(pan, {"stiffness": 6.0, "depth": 0.02})])
     base = complete([record], prior, ())
     (blind,) = scores([record], prior, base, [pan])
-    best = further_scores([record], prior, base, pan)[0]
+    best = further_scores([record], prior, base, [pan])[0]
     assert blind.fall < 5.0 < 50.0 < best.fall
     found = complete([record], prior, (pan,), best.starts).parameters()["hardpan"]
     assert found["depth"].value == pytest.approx(0.02, abs=4.0 * found["depth"].std + 0.001)

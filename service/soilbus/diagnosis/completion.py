@@ -22,7 +22,7 @@ from soilbus.estimation.belief import Belief
 from soilbus.estimation.completed import CompletedProblem
 from soilbus.estimation.coordinates import at_edges
 from soilbus.estimation.effect_parameters import Free, parameters_of
-from soilbus.estimation.gauss_newton import Effort, Fit, Start, continued, fit_window
+from soilbus.estimation.gauss_newton import THOROUGH, Effort, Fit, Start, continued, fit_window
 from soilbus.estimation.linearised import Latents, Linearised
 from soilbus.estimation.normal_equations import Fitting, Place
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
@@ -78,7 +78,7 @@ class Completion:
         return sum(fit.evidence for fit in self.fits) + self.predicted + self.sizes
 
     def foreseen(self, rows: int) -> float:
-        """The evidence from so many residuals like these: what they leave grows, what is paid for parameters does not."""
+        """The evidence from so many residuals like these: only what the model leaves of them grows with their number."""
         left = self.cost + self.gap * self.checked_rows
         return self.evidence + (rows / self.rows - 1.0) * left
 
@@ -137,7 +137,7 @@ def complete(
     prior: SoilPrior,
     effects: Sequence[Effect],
     starts: Sequence[Start] | None = None,
-    effort: Effort = Effort(),
+    effort: Effort = THOROUGH,
 ) -> Completion | None:
     """A model with these effects fitted to all recordings; None where a fit fails, or is given up.
 

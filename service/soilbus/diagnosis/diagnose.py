@@ -198,7 +198,7 @@ def _round(
 
 
 def _converged(whole: Fits, present: Completion, completion: Completion) -> Completion:
-    """The same, or where further steps from there lead if they were too few, and it is near and better than the present."""
+    """The same, or where further steps lead if they were too few, and it is better than the present and not astray."""
     if completion.converged or completion.evidence > present.evidence or completion.gap > ASTRAY:
         return completion
     further = whole.of(completion.effects, [completion.as_starts()])
@@ -230,11 +230,13 @@ def _promising(
     """
     before = few.of(present.effects, [present.as_starts()], ROUGH)
     foreseen = scores(whole.records, whole.prior, present, candidates)
-    further = [] if before is None else _further(few, before, candidates)
+    further = [] if before is None else further_scores(few.records, few.prior, before, candidates)
     times = 1.0 if before is None else present.rows / before.rows
     most = max(part * -score.evidence for part, of in ((1.0, foreseen), (times, further)) for score in of)
     if before is None or most < CLEAR:
-        return _of_scores([*foreseen, *_further(whole, present, candidates)], least_that_pays(explained))
+        return _of_scores(
+            [*foreseen, *further_scores(whole.records, whole.prior, present, candidates)], least_that_pays(explained)
+        )
     tried: list[tuple[float, Effect, Completion]] = []
     least = math.inf
     for found in _worth_trying(foreseen, further, again).values():
@@ -285,11 +287,6 @@ def _tried(few: Fits, present: Completion, found: Sequence[Score], hopeless: flo
     return few.of((*present.effects, found[0].effect), starts, ROUGH._replace(hopeless=hopeless), foreseen)
 
 
-def _further(fits: Fits, present: Completion, candidates: Sequence[Effect]) -> list[Score]:
-    """The best of each candidate's scores from where its parameters may start besides."""
-    return [s for e in candidates for s in further_scores(fits.records, fits.prior, present, e)[:1]]
-
-
 def _reconsidered(
     whole: Fits,
     few: Fits,
@@ -336,9 +333,8 @@ def _stays(
     explained = base.evidence - present.evidence
     if fall < CLEAR:
         return None
-    found = _worth_trying(
-        scores(few.records, few.prior, without, candidates), _further(few, without, candidates), addition.falls
-    )
+    of = few.records, few.prior, without, candidates
+    found = _worth_trying(scores(*of), further_scores(*of), addition.falls)
     for rival in candidates:
         if rival.name in found and rival.name != effect.name:
             completion = _tried(few, without, found[rival.name], here.cost + BEHIND_UNSETTLED)

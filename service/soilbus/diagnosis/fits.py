@@ -6,13 +6,13 @@ from collections.abc import Hashable, Sequence
 
 from soilbus.diagnosis.completion import Completion, complete
 from soilbus.diagnosis.records import Record
-from soilbus.estimation.gauss_newton import Effort, Start
+from soilbus.estimation.gauss_newton import THOROUGH, Effort, Start
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
 
 
 class Fits:
-    """Recordings with what is known of models fitted to them: those that converged, or began there, are not fitted again."""
+    """Recordings and the models fitted to them: none again that converged, or from where it was fitted before."""
 
     def __init__(self, records: Sequence[Record], prior: SoilPrior) -> None:
         self.records, self.prior = tuple(records), prior
@@ -23,7 +23,7 @@ class Fits:
         self,
         effects: Sequence[Effect],
         starts: Sequence[Sequence[Start]] = (),
-        effort: Effort = Effort(),
+        effort: Effort = THOROUGH,
         foreseen: Sequence[float] = (),
     ) -> Completion | None:
         """The best fit with these effects from any of the starts (one Start for each recording), or from anywhere.

@@ -7,8 +7,9 @@ would fall if the effect were added (Rao's score test, Bayesian with the prior's
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from typing import NamedTuple
 
 import numpy as np
@@ -73,29 +74,50 @@ def scores(
     return sorted(found, key=lambda score: score.evidence)
 
 
-def further_scores(records: Sequence[Record], prior: SoilPrior, present: Completion, effect: Effect) -> list[Score]:
-    """Scores of an effect from where its parameters may start besides, the best first.
+def further_scores(
+    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect]
+) -> list[Score]:
+    """The best score of each candidate from where its parameters may start besides, of those that have such starts.
 
     Where the effect is absent nothing depends on such a parameter (the depth of a pan), and
     the score is blind to it: so it is taken at each of several values (Davies 1977,
     Biometrika 64:247).
     """
-    found = []
+    found: dict[str, Score] = {}
+    for moves in zip_longest(*(_moves(effect) for effect in candidates)):
+        by_name = {move.effect.name: move for move in moves if move is not None}
+        for score in scores(records, prior, present, [move.moved for move in by_name.values()]):
+            move, best = by_name[score.effect.name], found.get(score.effect.name)
+            if best is None or score.evidence < best.evidence:
+                starts = tuple(_offset(start, move.offsets) for start in score.starts)
+                found[score.effect.name] = replace(score, effect=move.effect, starts=starts)
+    return list(found.values())
+
+
+class _Move(NamedTuple):
+    """An effect, the same with one parameter's neutral value moved, and by how many std of each parameter (P,)."""
+
+    effect: Effect
+    moved: Effect
+    offsets: list[float]
+
+
+def _moves(effect: Effect) -> Iterator[_Move]:
+    """One for each value at which a parameter may start besides."""
     for parameter in effect.parameters:
         for value in parameter.starts:
             moved = tuple(replace(p, neutral=value) if p is parameter else p for p in effect.parameters)
-            (score,) = scores(records, prior, present, [replace(effect, parameters=moved)])
             offsets = [
                 (value - parameter.neutral) / parameter.std if p is parameter else 0.0 for p in effect.parameters
             ]
-            starts = tuple(
-                Start(
-                    start.soil, np.concatenate([start.gains[: -len(offsets)], start.gains[-len(offsets) :] + offsets])
-                )
-                for start in score.starts
-            )
-            found.append(replace(score, effect=effect, starts=starts))
-    return sorted(found, key=lambda score: score.evidence)
+            yield _Move(effect, replace(effect, parameters=moved), offsets)
+
+
+def _offset(start: Start, offsets: Sequence[float]) -> Start:
+    """Where a fit of the effect begins that was moved so far."""
+    gains = start.gains.copy()
+    gains[-len(offsets) :] += offsets
+    return Start(start.soil, gains)
 
 
 def _normal(

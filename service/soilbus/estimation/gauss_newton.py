@@ -87,6 +87,9 @@ class Effort(NamedTuple):
     little: float = LITTLE
 
 
+THOROUGH = Effort()
+
+
 class Rival(NamedTuple):
     """Another optimum than a fit's, by mode and curvature, and its share of the probability of both (Laplace)."""
 
@@ -215,9 +218,7 @@ def _with_rival(fitting: Fitting, thin: Fitting, found: Fit, ends: Sequence[Plac
     return replace(better, belief=better.mode, rival=Rival(worse.mode, share))
 
 
-def _other_end(
-    fitting: Fitting, thin: Fitting, found: Fit, ends: Sequence[Place], led: Place | None
-) -> Place | None:
+def _other_end(fitting: Fitting, thin: Fitting, found: Fit, ends: Sequence[Place], led: Place | None) -> Place | None:
     """Where a descent on a few instants ended about as low as at what was found, and far from it."""
     ill_told = math.sqrt(found.mode.covariance[_K_C, _K_C]) > ILL_TOLD
     apart = len({end.soil.tobytes() for end in ends}) > 1
@@ -298,7 +299,7 @@ def continued(
     before: Belief,
     start: Start,
     first: int,
-    effort: Effort = Effort(),
+    effort: Effort = THOROUGH,
 ) -> Fit | None:
     """Descent from a start, of whose gains those from the `first` on move with the soil from the beginning.
 

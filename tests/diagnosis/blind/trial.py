@@ -122,7 +122,7 @@ def _with(hidden: Sequence[str], left_out: str, record: Record, prior: SoilPrior
 
 def _added(effect: Effect, record: Record, prior: SoilPrior, present: Completion) -> Completion:
     """The model with one effect more, from every start; itself where that fits worse."""
-    scored = [*scores([record], prior, present, [effect]), *further_scores([record], prior, present, effect)[:1]]
+    scored = [*scores([record], prior, present, [effect]), *further_scores([record], prior, present, [effect])]
     tries = [complete([record], prior, (*present.effects, effect), score.starts) for score in scored]
     return min((more for more in (present, *tries) if more is not None), key=_cost)
 
