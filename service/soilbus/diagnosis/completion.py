@@ -78,7 +78,7 @@ class Completion:
         return sum(fit.evidence for fit in self.fits) + self.predicted + self.sizes
 
     def foreseen(self, rows: int) -> float:
-        """The evidence from so many residuals like these: only what the model leaves of them grows with their number."""
+        """The evidence from so many residuals like these: what the model leaves of them grows with them alone."""
         left = self.cost + self.gap * self.checked_rows
         return self.evidence + (rows / self.rows - 1.0) * left
 
