@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
 
 from soilbus.diagnosis.sizes import SCALES, correction, evidence_of_any_size
-from soilbus.diagnosis.verdict import PLAUSIBLE, hopeless, is_real, pays, probabilities
+from soilbus.diagnosis.verdict import PLAUSIBLE, hopeless, is_real, price, probabilities
 from soilbus.estimation.effect_parameters import Free, parameters_of
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Parameter
@@ -116,10 +116,9 @@ def test_a_further_effect_beside_a_great_one_is_doubted():
     alone, beside = (probabilities({"a": 60.0}, explained)["a"] for explained in (0.0, 5e4))
     assert alone > 0.99
     assert 0.5 < beside < 0.6
-    assert pays(60.0, 0.0, 1.0, 3000, 10000)
-    assert pays(20.0, 0.0, 1.0, 3000, 10000)
-    assert not pays(20.0, 400.0, 1.0, 3000, 10000)
-    assert not pays(60.0, 1e5, 1.0, 3000, 10000)
+    assert price(0.0, 1.0, 3000, 10000) < 20.0
+    assert 20.0 < price(400.0, 1.0, 3000, 10000) < 60.0
+    assert price(1e5, 1.0, 3000, 10000) > 60.0
 
 
 def test_every_further_start_is_of_the_catalogue():

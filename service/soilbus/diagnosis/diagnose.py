@@ -24,7 +24,7 @@ from soilbus.diagnosis.verdict import (
     hopeless_from,
     is_real,
     least_that_pays,
-    pays,
+    price,
     probabilities,
 )
 from soilbus.diagnosis.where import Disagreement, disagreements
@@ -61,6 +61,8 @@ WORTH_FITTING = 0.2
 is foreseen: of less the score is as good."""
 ASTRAY = 3.0
 """Gap of a model that is off by so much that further steps of a fit decide nothing."""
+SHARE_OF_PRICE = 0.3
+"""Share of what an effect must explain that its fit to the blocks learned from must, after one that did not."""
 SAME = 1.0
 """Difference of -2 log evidence that is none."""
 FORM_LEFT_IN_SOIL = 0.125
@@ -174,23 +176,29 @@ def _round(
     """
     tried: dict[str, tuple[Effect, Completion]] = {}
     promising = _promising(whole, few, present, candidates, explained, again)
-    behind = math.inf
+    asked = price(explained, present.gap, present.checked_rows, present.rows)
+    behind = worthless = math.inf
+    beaten = set[str]()
     for effect, starts in promising.fits:
-        completion = whole.of((*present.effects, effect), [starts], Effort(STEPS, behind))
+        completion = whole.of((*present.effects, effect), [starts], Effort(STEPS, min(behind, worthless)))
         if completion is not None:
             tried[effect.name] = effect, completion
-            reach = hopeless_from(explained + present.evidence - completion.evidence)
-            behind = min(behind, completion.cost + reach)
+            fall = present.evidence - completion.evidence
+            behind = min(behind, completion.cost + hopeless_from(explained + fall))
+            worthless = present.cost - SHARE_OF_PRICE * asked if fall < asked else math.inf
+        elif behind < worthless:
+            beaten.add(effect.name)
     if not tried:
         return None
     best = min(tried, key=lambda name: tried[name][1].evidence)
     tried[best] = tried[best][0], _converged(whole, present, tried[best][1])
     falls = {name: present.evidence - completion.evidence for name, (_, completion) in tried.items()}
     best = max(falls, key=lambda name: falls[name])
-    if not pays(falls[best], explained, present.gap, present.checked_rows, present.rows):
+    if falls[best] < asked:
         return None
     falls |= {name: min(fall, falls[best]) for name, fall in promising.foreseen.items()}
-    falls |= {name: falls[best] - behind for name, behind in promising.behind.items()}
+    foretold = promising.behind.keys() - tried.keys() - beaten
+    falls |= {name: falls[best] - promising.behind[name] for name in foretold}
     chances = probabilities(falls, explained)
     others = {n: p for n, p in chances.items() if n != best and p >= PLAUSIBLE}
     effect, completion = tried[best]
@@ -208,7 +216,7 @@ def _converged(whole: Fits, present: Completion, completion: Completion) -> Comp
 class _Promising(NamedTuple):
     """Candidates worth a fit of all data, with where it starts.
 
-    Of others falls of -2 log evidence that are foreseen, or how far behind the best one they will be.
+    Falls of -2 log evidence that scores foretell of others, and how far behind the best one a few instants put each.
     """
 
     fits: Sequence[tuple[Effect, Sequence[Start]]]
@@ -252,8 +260,9 @@ def _promising(
         (fall, effect, completion) for fall, effect, completion in tried
         if fall > 0.0 and not hopeless(best - fall, explained + best)
     ][:FITTED]  # fmt: skip
-    behind = {e.name: best - f for f, e, c in kept if settled and c.converged and best - f > BEHIND}
-    return _Promising([(e, c.as_starts()) for _, e, c in kept if e.name not in behind], {}, behind)
+    for_good = {e.name for fall, e, c in kept if settled and c.converged and best - fall > BEHIND}
+    fits = [(e, c.as_starts()) for _, e, c in kept if e.name not in for_good]
+    return _Promising(fits, {}, {e.name: best - fall for fall, e, _ in kept})
 
 
 def _of_scores(found: Iterable[Score], least: float) -> _Promising:

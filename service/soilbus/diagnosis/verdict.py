@@ -98,17 +98,17 @@ def gap_limit(rows: int) -> float:
     return max(LEAST_GAP, 1.0 + REAL_GAP * math.sqrt(2.0 / max(rows, 1)))
 
 
-def pays(fall: float, explained: float, gap: float, checked_rows: int, rows: int) -> bool:
-    """Whether an effect is worth adding that lowers -2 log evidence so far, where others explain so much already.
+def price(explained: float, gap: float, checked_rows: int, rows: int) -> float:
+    """Fall of -2 log evidence beyond which an effect is worth adding, where others explain so much already.
 
     gap is the present one, on so many residuals.
     """
     excess = (gap - 1.0) * rows if gap > gap_limit(checked_rows) else 0.0
-    return fall > max(least_that_pays(explained), WORTH * excess)
+    return max(least_that_pays(explained), WORTH * excess)
 
 
 def least_that_pays(explained: float) -> float:
-    """Fall of -2 log evidence from which an effect is added at all, where others explain so much already."""
+    """The least that it ever is."""
     return max(PAYS_BESIDE if explained > 0.0 else PAYS, ADDS * explained)
 
 
