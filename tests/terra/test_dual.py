@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soilbus.terra.dual import UNIT, Dual, slope_of, value_of
+from soilbus.terra.dual import UNIT, Dual, slope_of, value_of, weighed_sum
 
 X, Y = np.array([0.3, 0.8, 1.7]), np.array([[0.9], [1.2]])
 FUNCTIONS = {
@@ -38,6 +38,17 @@ def test_an_array_before_it_leaves_it_whole():
     ours = X * Dual(2.0, {"k": 0.5})
     assert isinstance(ours, Dual)
     np.testing.assert_array_equal(ours.by["k"], 0.5 * X)
+
+
+def test_a_weighed_sum_is_the_sum_of_products():
+    weights = np.random.default_rng(4).standard_normal((4, 3, 2))
+    numbers = [Dual(2.0, {0: 0.5, 1: -1.0}), 3.0, Dual(-1.0, {1: 4.0}), 0.0]
+    ours, expected = weighed_sum(weights, numbers), sum(n * w for n, w in zip(numbers, weights, strict=True))
+    np.testing.assert_allclose(ours.value, expected.value, rtol=1e-14)
+    assert ours.by.keys() == {0, 1}
+    for quantity in (0, 1):
+        np.testing.assert_allclose(ours.by[quantity], expected.by[quantity], rtol=1e-14)
+    np.testing.assert_allclose(weighed_sum(weights, [1.0, 2.0, 0.0, 1.0]), weights[0] + 2.0 * weights[1] + weights[3])
 
 
 def test_what_does_not_depend_on_a_quantity_carries_nothing_of_it():

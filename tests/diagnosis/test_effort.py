@@ -1,0 +1,101 @@
+"""A diagnosis fits no more than it needs to: what few instants and scores foretell, and what is not fitted again."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.diagnosis import fits as fits_module
+from soilbus.diagnosis.completion import complete
+from soilbus.diagnosis.diagnose import THINNED
+from soilbus.diagnosis.fits import Fits
+from soilbus.diagnosis.records import record_of
+from soilbus.diagnosis.score import further_scores, scores
+from soilbus.estimation.gauss_newton import Effort
+from soilbus.estimation.window import BinStore
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import excited
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.effects.effect import Active
+
+CONFIG = reference_configuration()
+PRIOR = prior_of(CONFIG)
+DURATION = 60.0
+SLIP_SINKAGE, LUGS = CATALOGUE["slip_sinkage"], CATALOGUE["lugs"]
+
+
+@pytest.fixture(scope="module")
+def record():
+    rig = rig_of(CONFIG)
+    store = BinStore(rig, 0.1, 0.0)
+    hidden = Active(SLIP_SINKAGE, {"exponent": 0.3, "softening": 0.0, "dug": 0.0})
+    channels = simulate(CONFIG, excited("loam", DURATION), 11, (hidden,)).channels
+    store.add({name: (c.t, c.value) for name, c in channels.items() if name in rig.channels})
+    return record_of("x", store.window(0.0, DURATION), rig, model_of(CONFIG), 0.2, 0.15)
+
+
+@pytest.fixture(scope="module")
+def base(record):
+    return complete([record], PRIOR, ())
+
+
+def fall_of(effect, record, foretold_for=None):
+    """Of -2 log evidence by an effect; foretold for so many residuals."""
+    before = complete([record], PRIOR, ())
+    (score,) = scores([record], PRIOR, before, [effect])
+    after = complete([record], PRIOR, [effect], score.starts)
+    rows = foretold_for or before.rows
+    return before.foreseen(rows) - after.foreseen(rows)
+
+
+def test_a_few_instants_foretell_what_an_effect_explains_of_all(record):
+    true = fall_of(SLIP_SINKAGE, record)
+    rows = complete([record], PRIOR, ()).rows
+    foretold = fall_of(SLIP_SINKAGE, record.thinned(THINNED), rows)
+    assert true > 100.0
+    assert foretold == pytest.approx(true, abs=3.0 * 2.0 * math.sqrt(THINNED * true))
+
+
+def test_what_is_foreseen_for_the_rows_there_are_is_the_evidence(base):
+    assert base.foreseen(base.rows) == pytest.approx(base.evidence)
+
+
+def test_scores_from_further_starts_are_the_same_together_as_alone(record, base):
+    candidates = list(CATALOGUE.values())
+    together = {score.effect.name: score for score in further_scores([record], PRIOR, base, candidates)}
+    assert together.keys() == {e.name for e in candidates if any(p.starts for p in e.parameters)}
+    for name, score in together.items():
+        (alone,) = further_scores([record], PRIOR, base, [CATALOGUE[name]])
+        assert score.effect is CATALOGUE[name]
+        assert score.evidence == pytest.approx(alone.evidence, rel=1e-6, abs=1e-6)
+        assert score.starts[0].gains == pytest.approx(alone.starts[0].gains, rel=1e-6, abs=1e-9)
+
+
+def test_a_model_is_fitted_once_from_one_start(record, base, monkeypatch):
+    calls = []
+
+    def counted(*args):
+        calls.append(args)
+        return complete(*args)
+
+    monkeypatch.setattr(fits_module, "complete", counted)
+    fits, hopeless = Fits([record], PRIOR), Effort(hopeless=0.5 * base.cost)
+    (score,) = scores([record], PRIOR, base, [LUGS])
+    assert fits.of([LUGS], [score.starts], hopeless) is None is fits.of([LUGS], [score.starts], hopeless)
+    assert len(calls) == 1
+    settled = fits.of([LUGS], [score.starts])
+    assert settled.converged
+    assert len(calls) == 2
+    assert fits.of([LUGS], [score.starts], hopeless) is settled is fits.of([LUGS])
+    assert len(calls) == 2
+
+
+def test_a_fit_that_will_stay_above_a_hopeless_cost_is_given_up(record, base):
+    (score,) = scores([record], PRIOR, base, [SLIP_SINKAGE])
+    found = complete([record], PRIOR, [SLIP_SINKAGE], score.starts)
+    assert complete([record], PRIOR, [SLIP_SINKAGE], score.starts, Effort(hopeless=found.cost - 5.0)) is None
+    kept = complete([record], PRIOR, [SLIP_SINKAGE], score.starts, Effort(hopeless=found.cost + 5.0))
+    assert kept.cost == pytest.approx(found.cost, abs=0.1)
