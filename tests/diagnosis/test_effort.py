@@ -24,7 +24,7 @@ from soilbus.terra.effects.effect import Active
 CONFIG = reference_configuration()
 PRIOR = prior_of(CONFIG)
 DURATION = 60.0
-SLIP_SINKAGE, LUGS = CATALOGUE["slip_sinkage"], CATALOGUE["lugs"]
+SLIP_SINKAGE = CATALOGUE["slip_sinkage"]
 
 
 @pytest.fixture(scope="module")
@@ -82,14 +82,16 @@ def test_a_model_is_fitted_once_from_one_start(record, base, monkeypatch):
         return complete(*args)
 
     monkeypatch.setattr(fits_module, "complete", counted)
-    fits, hopeless = Fits([record], PRIOR), Effort(hopeless=0.5 * base.cost)
-    (score,) = scores([record], PRIOR, base, [LUGS])
-    assert fits.of([LUGS], [score.starts], hopeless) is None is fits.of([LUGS], [score.starts], hopeless)
+    fits, hopeless = Fits([record], PRIOR), Effort(hopeless=0.3 * base.cost)
+    (score,) = scores([record], PRIOR, base, [SLIP_SINKAGE])
+    assert (
+        fits.of([SLIP_SINKAGE], [score.starts], hopeless) is None is fits.of([SLIP_SINKAGE], [score.starts], hopeless)
+    )
     assert len(calls) == 1
-    settled = fits.of([LUGS], [score.starts])
+    settled = fits.of([SLIP_SINKAGE], [score.starts])
     assert settled.converged
     assert len(calls) == 2
-    assert fits.of([LUGS], [score.starts], hopeless) is settled is fits.of([LUGS])
+    assert fits.of([SLIP_SINKAGE], [score.starts], hopeless) is settled is fits.of([SLIP_SINKAGE])
     assert len(calls) == 2
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import minima
 import numpy as np
 import pytest
 
 from soilbus.assembly import prior_of
+from soilbus.estimation import exact
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.exact import samples
 from soilbus.estimation.gauss_newton import fit_window
@@ -29,23 +32,48 @@ def ill_told():
 
 def test_the_average_along_n_has_the_moments_of_the_exact_posterior(ill_told):
     problem, prior, before, fit = ill_told
-    exact = samples(problem, prior, before, fit, 500, np.random.default_rng(1))
-    assert exact.share.sum() == pytest.approx(1.0)
-    assert exact.effective > 60.0
-    mean = exact.share @ exact.logs
-    std = np.sqrt(exact.share @ (exact.logs - mean) ** 2)
+    found = samples(problem, prior, before, fit, 500, np.random.default_rng(1))
+    assert found.share.sum() == pytest.approx(1.0)
+    assert found.effective > 60.0
+    mean, std = moments(found)
     whole = with_whole(problem, prior, before, fit).whole
     along = ridge(problem, prior, before, fit)
-    told = np.interp(exact.logs[:, 2], [node.u for node in along.nodes], told_of_k_c(along, prior, before))
+    told = np.interp(found.logs[:, 2], [node.u for node in along.nodes], told_of_k_c(along, prior, before))
     assert told.max() > 2.0 * told.min()  # k_c is said as its error counts, so this is worth a look
-    mean[0] = (exact.share / told) @ exact.logs[:, 0] / (exact.share / told).sum()
-    std = np.sqrt(exact.share @ (exact.logs - mean) ** 2)
-    chance = 3.5 / np.sqrt(exact.effective)
+    mean[0] = (found.share / told) @ found.logs[:, 0] / (found.share / told).sum()
+    std = np.sqrt(found.share @ (found.logs - mean) ** 2)
+    chance = 3.5 / np.sqrt(found.effective)
     assert np.abs((np.log(whole.soil) - mean) / std).max() < 0.1 + chance
     # The average is never surer; how much less sure where k_c may be next to nothing, is its own choice.
     ratio = np.sqrt(np.diag(whole.covariance)[:6]) / std
     assert ratio.min() > 1.0 - 0.1 - chance / np.sqrt(2.0)
     assert ratio.max() < 1.5
+
+
+def test_where_moments_leave_the_share_of_k_c_no_deviation_the_draws_are_by_the_curvature(ill_told, monkeypatch):
+    problem, prior, before, fit = ill_told
+    along = ridge(problem, prior, before, fit)
+
+    def without_deviation(node):
+        """As at a share of k_c next to nothing: its logarithm and that of k_phi go together."""
+        covariance = node.fit.belief.covariance.copy()
+        covariance[0], covariance[:, 0] = covariance[1], covariance[:, 1]
+        covariance[0, 0] = covariance[1, 1]
+        return node._replace(fit=replace(node.fit, belief=replace(node.fit.belief, covariance=covariance)))
+
+    flat = along._replace(nodes=[without_deviation(node) for node in along.nodes])
+    told = samples(problem, prior, before, fit, 500, np.random.default_rng(1))
+    monkeypatch.setattr(exact, "ridge", lambda *_: flat)
+    again = samples(problem, prior, before, fit, 500, np.random.default_rng(2))
+    (mean, std), (other, _) = (moments(found) for found in (told, again))
+    chance = 3.5 * np.sqrt(1.0 / told.effective + 1.0 / again.effective)
+    assert again.effective > 30.0
+    assert np.abs((other - mean) / std).max() < chance
+
+
+def moments(found):
+    mean = found.share @ found.logs
+    return mean, np.sqrt(found.share @ (found.logs - mean) ** 2)
 
 
 def test_without_a_ridge_there_are_no_samples(ill_told):

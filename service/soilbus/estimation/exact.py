@@ -29,6 +29,8 @@ TAILS = 5.0
 """Degrees of freedom of Student's t that the draws follow given n."""
 WIDER = 1.2
 """Their covariance over that of the fit with this n."""
+SINGULAR = 1e-9
+"""Least eigenvalue of a matrix of correlations up to which it is singular."""
 FLATTER = 0.5
 """Power of the density of n that n is drawn from."""
 _K_C, _K_PHI, _N, _PHI = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "phi"))
@@ -88,18 +90,12 @@ def _drawn(nodes: list[Node], coordinates: Coordinates, count: int, rng: np.rand
     u = np.array([node.u for node in nodes])
     fine = np.linspace(u[0], u[-1], FINE)
     weight = density(u, FLATTER * np.array([node.unlikelihood for node in nodes]), fine)
-    beliefs = [node.fit.belief for node in nodes]
-    centre = np.array([coordinates.position(b.soil)[others] for b in beliefs])
-    root = []
-    for b in beliefs:
-        back = np.linalg.inv(coordinates.log_directions(b.soil)[free])
-        covariance = (back @ b.covariance[np.ix_(free, free)] @ back.T)[np.ix_(others, others)]
-        root.append(np.linalg.cholesky(WIDER * covariance))
+    normals = [_normal(node, coordinates, others) for node in nodes]
+    centre, roots = np.array([normal[0] for normal in normals]), np.array([normal[1] for normal in normals])
     cell = rng.choice(FINE, count, p=weight)
     log_n = np.clip(fine[cell] + (fine[1] - fine[0]) * (rng.random(count) - 0.5), u[0], u[-1])
     below = np.clip(np.searchsorted(u, log_n) - 1, 0, len(u) - 2)
     share = (log_n - u[below]) / (u[below + 1] - u[below])
-    roots = np.array(root)
     roots = roots[below] * (1.0 - share)[:, None, None] + roots[below + 1] * share[:, None, None]
     normal = rng.standard_normal((count, len(others))) * np.sqrt(TAILS / rng.chisquare(TAILS, count))[:, None]
     position = np.empty((count, len(free)))
@@ -108,6 +104,21 @@ def _drawn(nodes: list[Node], coordinates: Coordinates, count: int, rng: np.rand
     position[:, others] += np.einsum("mij,mj->mi", roots, normal)
     tails = -0.5 * (TAILS + len(others)) * np.log1p((normal**2).sum(1) / TAILS)
     return _Drawn(position, np.log(weight[cell]) + tails - np.log(np.einsum("mii->mi", roots)).sum(1))
+
+
+def _normal(node: Node, coordinates: Coordinates, others: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Centre (O,) and lower root (O, O) of the covariance to draw the other coordinates from.
+
+    By the fit's moments, or by its curvature where they leave k_c's share no deviation.
+    """
+    free = coordinates.free
+    for belief in (node.fit.belief, node.fit.mode):
+        back = np.linalg.inv(coordinates.log_directions(belief.soil)[free])
+        covariance = (back @ belief.covariance[np.ix_(free, free)] @ back.T)[np.ix_(others, others)]
+        std = np.sqrt(covariance.diagonal())
+        if np.linalg.eigvalsh(covariance / std / std[:, None])[0] > SINGULAR:
+            break
+    return coordinates.position(belief.soil)[others], np.asarray(np.linalg.cholesky(WIDER * covariance))
 
 
 def _soil_at(position: Array, coordinates: Coordinates) -> Array:
