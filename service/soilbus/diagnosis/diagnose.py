@@ -174,20 +174,9 @@ def _round(
 
     `again` are names that were fitted in an earlier round for the same place.
     """
-    tried: dict[str, tuple[Effect, Completion]] = {}
     promising = _promising(whole, few, present, candidates, explained, again)
     asked = price(explained, present.gap, present.checked_rows, present.rows)
-    behind = worthless = math.inf
-    beaten = set[str]()
-    for effect, starts in promising.fits:
-        completion = whole.of((*present.effects, effect), [starts], Effort(STEPS, min(behind, worthless)))
-        if completion is not None:
-            tried[effect.name] = effect, completion
-            fall = present.evidence - completion.evidence
-            behind = min(behind, completion.cost + hopeless_from(explained + fall))
-            worthless = present.cost - SHARE_OF_PRICE * asked if fall < asked else math.inf
-        elif behind < worthless:
-            beaten.add(effect.name)
+    tried, at_most = _fitted(whole, present, promising, explained, asked)
     if not tried:
         return None
     best = min(tried, key=lambda name: tried[name][1].evidence)
@@ -197,12 +186,31 @@ def _round(
     if falls[best] < asked:
         return None
     falls |= {name: min(fall, falls[best]) for name, fall in promising.foreseen.items()}
-    foretold = promising.behind.keys() - tried.keys() - beaten
-    falls |= {name: falls[best] - promising.behind[name] for name in foretold}
+    foretold = {name: falls[best] - behind for name, behind in promising.behind.items() if name not in tried}
+    falls |= {name: min(fall, at_most.get(name, fall)) for name, fall in foretold.items()}
     chances = probabilities(falls, explained)
     others = {n: p for n, p in chances.items() if n != best and p >= PLAUSIBLE}
     effect, completion = tried[best]
     return Addition(effect, chances[best], others, falls, frozenset(present.names)), completion
+
+
+def _fitted(
+    whole: Fits, present: Completion, promising: _Promising, explained: float, asked: float
+) -> tuple[dict[str, tuple[Effect, Completion]], dict[str, float]]:
+    """Candidates with their fits to all data by name, and falls of -2 log evidence that those given up stay below."""
+    fitted: dict[str, tuple[Effect, Completion]] = {}
+    at_most: dict[str, float] = {}
+    behind = worthless = math.inf
+    for effect, starts in promising.fits:
+        completion = whole.of((*present.effects, effect), [starts], Effort(STEPS, min(behind, worthless)))
+        if completion is None:
+            at_most[effect.name] = max(present.cost - min(behind, worthless), 0.0)
+            continue
+        fitted[effect.name] = effect, completion
+        fall = present.evidence - completion.evidence
+        behind = min(behind, completion.cost + hopeless_from(explained + fall))
+        worthless = present.cost - SHARE_OF_PRICE * asked if fall < asked else math.inf
+    return fitted, at_most
 
 
 def _converged(whole: Fits, present: Completion, completion: Completion) -> Completion:
