@@ -7,19 +7,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from soilbus.diagnosis.diagnose import FORM_LEFT_IN_SOIL, Diagnosis
+from soilbus.diagnosis.diagnose import Addition, Diagnosis, _form_left
 from soilbus.diagnosis.gap import Gap
 from soilbus.diagnosis.verdict import Verdict
 from soilbus.estimation.posterior import Posterior
+from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.soils import soil_named
 
 LOAM = soil_named("loam")
 COVARIANCE = np.diag([0.3, 0.02, 0.01, 0.005, 0.1, 0.02]) ** 2
 
 
-def diagnosis(before: Posterior, after: Posterior) -> Diagnosis:
+def diagnosis(before: Posterior, after: Posterior, left: float = 0.125) -> Diagnosis:
     base, completed = (SimpleNamespace(fits=[SimpleNamespace(posterior=p)]) for p in (before, after))
-    return Diagnosis(Verdict.NAMED, (), (), base, completed, (), Gap(1.5, 900), Gap(1.0, 900))
+    added = Addition(CATALOGUE["grade"], 1.0, {}, {"grade": 90.0}, form_left=left)
+    return Diagnosis(Verdict.NAMED, (), (added,), base, completed, (), Gap(1.5, 900), Gap(1.0, 900))
 
 
 def test_a_soil_that_stays_is_as_sure_as_the_fit_says():
@@ -35,7 +37,17 @@ def test_a_share_of_the_change_is_doubted():
     found = diagnosis(Posterior(before, COVARIANCE), Posterior(LOAM, COVARIANCE))
     fit, told = (p.bearing_pressure(0.02, 0.3) for p in (Posterior(LOAM, COVARIANCE), found.soil_after(0)))
     assert told.value == fit.value
-    doubt = FORM_LEFT_IN_SOIL * np.log(1.5) * told.value
+    doubt = 0.125 * np.log(1.5) * told.value
     assert told.std == pytest.approx(np.hypot(fit.std, doubt), rel=1e-9)
     assert found.soil_after(0).parameters()["phi"] == Posterior(LOAM, COVARIANCE).parameters()["phi"]
     assert found.soil_before(0).soil == before
+
+
+def test_an_effect_whose_formula_is_doubted_more_leaves_more_in_proportion_to_its_probability():
+    candidates = list(CATALOGUE.values())
+    tyre, other = CATALOGUE["tyre_deflection"].form_left, CATALOGUE["rut_recovery"].form_left
+    assert tyre > 4.0 * other
+    assert _form_left({"rut_recovery": 0.9}, candidates) == other
+    assert _form_left({"rut_recovery": 0.3, "tyre_deflection": 0.3}, candidates) == pytest.approx(
+        np.sqrt((tyre**2 + other**2) / 2.0)
+    )

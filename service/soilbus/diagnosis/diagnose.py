@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -65,9 +65,6 @@ SHARE_OF_PRICE = 0.3
 """Share of what an effect must explain that its fit to the blocks learned from must, after one that did not."""
 SAME = 1.0
 """Difference of -2 log evidence that is none."""
-FORM_LEFT_IN_SOIL = 0.125
-"""Share of what effects change of the soil's parameters by which these are off (standard deviation), as no effect's
-formula is the field's.  Of the blind tune halves of seeds 109 to 111."""
 
 
 class NotFitted(Exception):
@@ -78,7 +75,8 @@ class NotFitted(Exception):
 class Addition:
     """One round: the effect added, its probability, and the other names with theirs; falls of -2 log evidence.
 
-    beside are the names of the effects beside which it was named.
+    beside are the names of the effects beside which it was named; form_left is that of all these effects, by their
+    probabilities (root mean square).
     """
 
     effect: Effect
@@ -86,6 +84,7 @@ class Addition:
     alternatives: dict[str, float]
     falls: dict[str, float]
     beside: frozenset[str] = frozenset()
+    form_left: float = Effect.form_left
 
     def beside_another(self, effect: Effect, other: Effect) -> Addition:
         """The same with one effect beside it in place of another."""
@@ -117,12 +116,13 @@ class Diagnosis:
         return self.base.fits[record].posterior
 
     def soil_after(self, record: int) -> Posterior:
-        """As the completed model tells it, with FORM_LEFT_IN_SOIL of each change of a logarithm as a further deviation.
+        """As the completed model tells it, with a share of each change of a logarithm as a further deviation.
 
         One for all parameters together: what the effects changed they may have changed too much or too little.
         """
         told, before = self.completed.fits[record].posterior, self.soil_before(record)
-        left = FORM_LEFT_IN_SOIL * np.log(np.array(told.soil) / np.array(before.soil))
+        share = max((addition.form_left for addition in self.additions), default=0.0)
+        left = share * np.log(np.array(told.soil) / np.array(before.soil))
         return Posterior(told.soil, told.log_covariance + np.outer(left, left))
 
 
@@ -191,7 +191,14 @@ def _round(
     chances = probabilities(falls, explained)
     others = {n: p for n, p in chances.items() if n != best and p >= PLAUSIBLE}
     effect, completion = tried[best]
-    return Addition(effect, chances[best], others, falls, frozenset(present.names)), completion
+    form_left = _form_left({n: p for n, p in chances.items() if n == best or n in others}, candidates)
+    return Addition(effect, chances[best], others, falls, frozenset(present.names), form_left), completion
+
+
+def _form_left(chances: Mapping[str, float], candidates: Iterable[Effect]) -> float:
+    """Root mean square, by their probabilities, of what the formulas of these effects leave in the soil."""
+    left = {effect.name: effect.form_left for effect in candidates}
+    return math.sqrt(sum(p * left[name] ** 2 for name, p in chances.items()) / sum(chances.values()))
 
 
 def _fitted(
@@ -360,7 +367,7 @@ def _stays(
             if not hopeless(completion.foreseen(present.rows) - here.foreseen(present.rows), explained):
                 return None
     (chance,) = probabilities({effect.name: fall}, explained - fall).values()
-    return Addition(effect, chance, {}, {effect.name: fall}, others)
+    return Addition(effect, chance, {}, {effect.name: fall}, others, effect.form_left)
 
 
 def _others(addition: Addition, present: Completion) -> frozenset[str]:

@@ -200,4 +200,5 @@ TYRE_DEFLECTION = Effect(
     ),
     wheel=_substitute_circle,
     forces=_flattened_forces,
+    form_left=1.0,
 )
