@@ -65,6 +65,13 @@ def test_a_record_holds_the_bins_of_the_windows_of_replay(log):
         np.testing.assert_allclose(rows(whole, same), rows(window, inner), rtol=1e-9)
 
 
+def test_a_log_whose_windows_nobody_takes_is_read_a_second_at_a_time(log):
+    """And not frame by frame from the end of the first window on."""
+    times = list(fed(listener(), [log]))
+    assert len(times) <= SECONDS + 3
+    assert times == sorted(times)
+
+
 @pytest.mark.parametrize("by", [1000.0, -1000.0])
 def test_a_silence_and_a_set_clock_begin_another_part(log, tmp_path, by):
     first, second = parts(listener(), joined(log, tmp_path / "two.log", by))

@@ -125,7 +125,8 @@ def _tasks(intake: Intake, logs: Sequence[Path], progress: Callable[[int, float]
 def fed(intake: Intake, logs: Sequence[Path], progress: Callable[[int, float], None] | None = None) -> Iterator[float]:
     """Feeds the frames of the logs to an intake; LogError as read_log().
 
-    Yields the time [s] when a window has ended, every second of the recording, and at its end.
+    Yields the time [s] when a window has ended (once, whether it is taken or not), every second of the recording, and
+    at its end.
     """
     feed = intake.admission.feed
     last = 0.0
@@ -140,7 +141,7 @@ def fed(intake: Intake, logs: Sequence[Path], progress: Callable[[int, float], N
             last = t
             if last >= due or last < due - 2.0:
                 yield last
-                due = min(intake.next_end, last + 1.0)
+                due = min(intake.next_end, last + 1.0) if intake.next_end > last else last + 1.0
                 if progress is not None:
                     progress(n, last)
             feed(t, identifier, extended, data, remote)
