@@ -94,7 +94,7 @@ def _guided(name, target, seconds: int, seed: int, corpus: Path | None) -> int:
     ]  # fmt: skip
     atheris.Setup([sys.argv[0], *flags, str(folder)], target.one)
     signal.signal(signal.SIGPROF, lambda *_: os.kill(os.getpid(), signal.SIGUSR1))  # libFuzzer's end with figures
-    signal.setitimer(signal.ITIMER_PROF, seconds)
+    signal.setitimer(signal.ITIMER_PROF, seconds, 1.0)  # again, should one be lost
     atheris.Fuzz()
     return 0
 
