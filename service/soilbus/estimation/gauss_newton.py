@@ -36,7 +36,7 @@ THINNED = 24
 MAX_KINDS = 2
 """Known soils that the search starts from where the first starts did not agree."""
 MAX_APPROACH = 10
-AS_MEASURED = 4.0
+AS_MEASURED = 2.5
 """How many times the cost of an optimum that with the latents as measured may be, at the most."""
 MAX_SETTLED = 2
 MAX_HOPELESS = 5
@@ -317,7 +317,7 @@ def continued(
             if fit is not None:
                 return fit
         moving = Fitting(problem, prior, before, first=first)
-        near = approach(moving, start.soil, most, little, gains, hopeless=AS_MEASURED * hopeless)
+        near = approach(moving, start.soil, most // 2, little, gains, hopeless=AS_MEASURED * hopeless)
         if near is None:
             return None
         return _fit_at(fitting, settled_within(near, most))
