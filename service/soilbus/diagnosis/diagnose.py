@@ -33,12 +33,15 @@ from soilbus.estimation.posterior import Posterior, SoilPrior
 from soilbus.terra.effects.effect import Effect
 
 MAX_EFFECTS = 3
-TRIED = 8
-"""Candidates of a round, those of further starts besides, that are fitted to a few instants."""
+TRIED, FURTHER = 6, 4
+"""Candidates of a round that are fitted to a few instants: the best by their scores, and by those of further starts.
+
+Of 77 rounds of the tune halves of seeds 112 and 113 the one that was named was among the best four or three.
+"""
 TRIED_AGAIN = 4
 """The same of a round that names an effect anew, besides those that were fitted when it was named first."""
-FITTED = 6
-"""Those of them that are fitted to all."""
+COUNTED, FITTED = 6, 3
+"""Those of them that count, by what few instants foretell, and those that are fitted to all."""
 THINNED = 4
 CLEAR = 100.0
 """Foreseen fall of -2 log evidence from which a few instants tell which candidates to fit."""
@@ -153,6 +156,7 @@ def diagnose(
         additions.append(addition)
         if len(additions) > 1 and present.gap < ASTRAY:
             additions, present = _reconsidered(whole, few, base, present, additions, candidates)
+    present = _converged(whole, base, present)
     additions.sort(key=lambda addition: -addition.falls[addition.effect.name])
     progress("holding out every block in turn")
     before = gap_of(records, prior, base)
@@ -180,7 +184,8 @@ def _round(
     if not tried:
         return None
     best = min(tried, key=lambda name: tried[name][1].evidence)
-    tried[best] = tried[best][0], _converged(whole, present, tried[best][1])
+    if present.evidence - tried[best][1].evidence < asked:
+        tried[best] = tried[best][0], _converged(whole, present, tried[best][1])
     falls = {name: present.evidence - completion.evidence for name, (_, completion) in tried.items()}
     best = max(falls, key=lambda name: falls[name])
     if falls[best] < asked:
@@ -274,10 +279,10 @@ def _promising(
     kept = [
         (fall, effect, completion) for fall, effect, completion in tried
         if fall > 0.0 and not hopeless(best - fall, explained + best)
-    ][:FITTED]  # fmt: skip
+    ][:COUNTED]  # fmt: skip
     for_good = {e.name for fall, e, c in kept if settled and c.converged and best - fall > BEHIND}
     fits = [(e, c.as_starts()) for _, e, c in kept if e.name not in for_good]
-    return _Promising(fits, {}, {e.name: best - fall for fall, e, _ in kept})
+    return _Promising(fits[:FITTED], {}, {e.name: best - fall for fall, e, _ in kept})
 
 
 def _of_scores(found: Iterable[Score], least: float) -> _Promising:
@@ -286,7 +291,7 @@ def _of_scores(found: Iterable[Score], least: float) -> _Promising:
     for score in sorted(found, key=lambda score: score.evidence):
         if score.evidence < WORTH_TRYING:
             best.setdefault(score.effect.name, score)
-    chosen = list(best.values())[:FITTED]
+    chosen = list(best.values())[:COUNTED]
     enough = WORTH_FITTING * max([least, *(-s.evidence for s in chosen)])
     fitted = [(s.effect, s.starts) for s in chosen if -s.evidence > enough]
     return _Promising(fitted, {s.effect.name: -s.evidence for s in chosen[len(fitted) :]}, {})
@@ -299,7 +304,7 @@ def _worth_trying(
     tried = foreseen[: TRIED if again is None else TRIED_AGAIN]
     named = [score for score in foreseen[len(tried) :] if again is not None and score.effect.name in again]
     found: dict[str, list[Score]] = {}
-    for score in (*tried, *named, *further):
+    for score in (*tried, *named, *sorted(further, key=lambda score: score.evidence)[:FURTHER]):
         if score.evidence < WORTH_TRYING:
             found.setdefault(score.effect.name, []).append(score)
     return found

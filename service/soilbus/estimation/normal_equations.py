@@ -23,7 +23,7 @@ Indices = NDArray[np.intp]
 
 LONG_TURN = 0.2
 """Relative change of an entry angle from which the angles are solved again, not extrapolated."""
-LONG_TURN_WITH_EFFECTS = 0.03
+LONG_TURN_WITH_EFFECTS = 0.1
 """The same where effects have a part in the load: they may bend where the soil alone does not."""
 WELL_TOLD = 0.5
 """Sd of the logarithm of K_L at a typical depth from which on k_c and k_phi are each as known before."""
