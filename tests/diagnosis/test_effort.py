@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import islice
 
 import pytest
 
@@ -13,13 +14,18 @@ from soilbus.diagnosis.diagnose import THINNED
 from soilbus.diagnosis.fits import Fits
 from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.score import further_scores, scores
-from soilbus.estimation.gauss_newton import Effort
+from soilbus.estimation import gauss_newton
+from soilbus.estimation.descent import settle
+from soilbus.estimation.gauss_newton import Effort, fit_window
 from soilbus.estimation.window import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active
+
+from .blind.cases import cases
+from .blind.trial import record_of_case
 
 CONFIG = reference_configuration()
 PRIOR = prior_of(CONFIG)
@@ -93,6 +99,21 @@ def test_a_model_is_fitted_once_from_one_start(record, base, monkeypatch):
     assert len(calls) == 2
     assert fits.of([SLIP_SINKAGE], [score.starts], hopeless) is settled is fits.of([SLIP_SINKAGE])
     assert len(calls) == 2
+
+
+def test_no_descent_of_a_window_begins_where_another_did(monkeypatch):
+    """What led to the optimum was taken for its rival on this one."""
+    case = next(islice(cases("pair", 11), 14, None))
+    problem, prior = record_of_case(case).learned, prior_of(case.config)
+    began = []
+
+    def counted(fitting, near, *args, **kwargs):
+        began.append((fitting.problem.n, near.soil.tobytes()))
+        return settle(fitting, near, *args, **kwargs)
+
+    monkeypatch.setattr(gauss_newton, "settle", counted)
+    assert fit_window(problem, prior) is not None
+    assert len(began) == len(set(began))
 
 
 def test_a_fit_that_will_stay_above_a_hopeless_cost_is_given_up(record, base):

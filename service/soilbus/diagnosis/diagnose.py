@@ -41,7 +41,7 @@ Of 77 rounds of the tune halves of seeds 112 and 113 the one that was named was 
 TRIED_AGAIN = 4
 """The same of a round that names an effect anew, besides those that were fitted when it was named first."""
 COUNTED, FITTED = 6, 3
-"""Those of them that count, by what few instants foretell, and those that are fitted to all."""
+"""Those of them that count, if only by what few instants foretell, and those that are fitted to all."""
 THINNED = 4
 CLEAR = 100.0
 """Foreseen fall of -2 log evidence from which a few instants tell which candidates to fit."""

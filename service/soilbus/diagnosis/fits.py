@@ -28,8 +28,8 @@ class Fits:
     ) -> Completion | None:
         """The best fit with these effects from any of the starts (one Start for each recording), or from anywhere.
 
-        None where all fits fail.  A start of which no better evidence is
-        foreseen than a fit came to that converged is left out.
+        None where all fits fail.  A start of which no better evidence is foreseen than a fit came to that converged
+        is left out.
         """
         names = frozenset(effect.name for effect in effects)
         if names in self._converged:

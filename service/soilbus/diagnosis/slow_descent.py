@@ -17,7 +17,7 @@ from soilbus.estimation.normal_equations import Fitting, Place, Point
 
 MAX_STEPS = 15
 SLOWLY = 30.0
-"""How many times the fall that is not worth a step one that is left has been seen to be where steps are slow."""
+"""Fall of the cost that is not worth a slow step, over that which is not worth a fast one: a tenth decides nothing."""
 ENOUGH_FAR = 2e-3
 """Share of what the cost is above NEAR that is no fall worth a step."""
 EASED, HELD_BACK = 0.3, 10.0

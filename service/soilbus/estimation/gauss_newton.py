@@ -76,9 +76,9 @@ class Start(NamedTuple):
 class Effort(NamedTuple):
     """What a fit is worth that is compared with others by cost.
 
-    most: steps of either kind; hopeless: a cost such that a fit that will stay above it is
-    given up; enough: foreseen fall of the cost that is not worth a further step; little:
-    relative fall that is not, as long as the latents are as measured.
+    most: steps, half as many as long as the latents are as measured; hopeless: a cost such
+    that a fit that will stay above it is given up; enough: foreseen fall of the cost that is
+    not worth a further step; little: relative fall that is not while latents are as measured.
     """
 
     most: int = MAX_ITERATIONS
