@@ -9,8 +9,8 @@ import pytest
 
 from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.diagnosis import fits as fits_module
+from soilbus.diagnosis.candidates import THINNED
 from soilbus.diagnosis.completion import complete
-from soilbus.diagnosis.diagnose import THINNED
 from soilbus.diagnosis.fits import Fits
 from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.score import further_scores, scores

@@ -5,16 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
+from soilbus.diagnosis.candidates import (
+    BEHIND_UNSETTLED,
+    CLEAR,
+    ROUGH,
+    STEPS,
+    THINNED,
+    Promising,
+    fitted_to_few,
+    promising,
+    worth_trying,
+)
 from soilbus.diagnosis.completion import Completion
 from soilbus.diagnosis.fits import Fits
 from soilbus.diagnosis.gap import Gap, gap_of
 from soilbus.diagnosis.learned import Correction, corrections
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.score import Score, further_scores, scores
+from soilbus.diagnosis.score import further_scores, scores
 from soilbus.diagnosis.verdict import (
     PAYS,
     PLAUSIBLE,
@@ -23,45 +33,15 @@ from soilbus.diagnosis.verdict import (
     hopeless,
     hopeless_from,
     is_real,
-    least_that_pays,
     price,
     probabilities,
 )
 from soilbus.diagnosis.where import Disagreement, disagreements
-from soilbus.estimation.gauss_newton import Effort, Start
+from soilbus.estimation.gauss_newton import Effort
 from soilbus.estimation.posterior import Posterior, SoilPrior
 from soilbus.terra.effects.effect import Effect
 
 MAX_EFFECTS = 3
-TRIED, FURTHER = 6, 4
-"""Candidates of a round that are fitted to a few instants: the best by their scores, and by those of further starts.
-
-Of 77 rounds of the tune halves of seeds 112 and 113 the one that was named was among the best four or three.
-"""
-TRIED_AGAIN = 4
-"""The same of a round that names an effect anew, besides those that were fitted when it was named first."""
-COUNTED, FITTED = 6, 3
-"""Those of them that count, if only by what few instants foretell, and those that are fitted to all."""
-THINNED = 4
-CLEAR = 100.0
-"""Foreseen fall of -2 log evidence from which a few instants tell which candidates to fit."""
-BEHIND = 150.0
-"""-2 log evidence by which a candidate is behind for good, foreseen from a few instants: it is not fitted to all.
-
-Three deviations: of a difference d on every THINNED-th instant the deviation is 2 sqrt(d), and 2 sqrt(THINNED x)
-of x foreseen.
-"""
-BEHIND_UNSETTLED = 250.0
-"""Cost on a few instants above the least one's from which a candidate is given up, converged or not."""
-STEPS = 12
-"""Steps of the soil, and then of everything, in which a candidate that explains much is fitted."""
-ROUGH = Effort(STEPS, enough=0.02, little=5e-3)
-"""The same where few instants tell which candidates to fit to all."""
-WORTH_TRYING = -2.0
-"""Foreseen change of -2 log evidence above which a candidate does not count."""
-WORTH_FITTING = 0.2
-"""Share of what an effect must explain, and of what the best is foreseen to, from which it is fitted where little
-is foreseen: of less the score is as good."""
 ASTRAY = 3.0
 """Gap of a model that is off by so much that further steps of a fit decide nothing."""
 SHARE_OF_PRICE = 0.3
@@ -178,24 +158,24 @@ def _round(
 
     `again` are names that were fitted in an earlier round for the same place.
     """
-    promising = _promising(whole, few, present, candidates, explained, again)
+    counted = promising(whole, few, present, candidates, explained, again)
     asked = price(explained, present.gap, present.checked_rows, present.rows)
-    tried, at_most = _fitted(whole, present, promising, explained, asked)
-    if not tried:
+    fitted, at_most = _fitted(whole, present, counted, explained, asked)
+    if not fitted:
         return None
-    best = min(tried, key=lambda name: tried[name][1].evidence)
-    if present.evidence - tried[best][1].evidence < asked:
-        tried[best] = tried[best][0], _converged(whole, present, tried[best][1])
-    falls = {name: present.evidence - completion.evidence for name, (_, completion) in tried.items()}
+    best = min(fitted, key=lambda name: fitted[name][1].evidence)
+    if present.evidence - fitted[best][1].evidence < asked:
+        fitted[best] = fitted[best][0], _converged(whole, present, fitted[best][1])
+    falls = {name: present.evidence - completion.evidence for name, (_, completion) in fitted.items()}
     best = max(falls, key=lambda name: falls[name])
     if falls[best] < asked:
         return None
-    falls |= {name: min(fall, falls[best]) for name, fall in promising.foreseen.items()}
-    foretold = {name: falls[best] - behind for name, behind in promising.behind.items() if name not in tried}
+    falls |= {name: min(fall, falls[best]) for name, fall in counted.foreseen.items()}
+    foretold = {name: falls[best] - behind for name, behind in counted.behind.items() if name not in fitted}
     falls |= {name: min(fall, at_most.get(name, fall)) for name, fall in foretold.items()}
     chances = probabilities(falls, explained)
     others = {n: p for n, p in chances.items() if n != best and p >= PLAUSIBLE}
-    effect, completion = tried[best]
+    effect, completion = fitted[best]
     form_left = _form_left({n: p for n, p in chances.items() if n == best or n in others}, candidates)
     return Addition(effect, chances[best], others, falls, frozenset(present.names), form_left), completion
 
@@ -207,13 +187,13 @@ def _form_left(chances: Mapping[str, float], candidates: Iterable[Effect]) -> fl
 
 
 def _fitted(
-    whole: Fits, present: Completion, promising: _Promising, explained: float, asked: float
+    whole: Fits, present: Completion, counted: Promising, explained: float, asked: float
 ) -> tuple[dict[str, tuple[Effect, Completion]], dict[str, float]]:
     """Candidates with their fits to all data by name, and falls of -2 log evidence that those given up stay below."""
     fitted: dict[str, tuple[Effect, Completion]] = {}
     at_most: dict[str, float] = {}
     behind = worthless = math.inf
-    for effect, starts in promising.fits:
+    for effect, starts in counted.fits:
         completion = whole.of((*present.effects, effect), [starts], Effort(STEPS, min(behind, worthless)))
         if completion is None:
             at_most[effect.name] = max(present.cost - min(behind, worthless), 0.0)
@@ -231,89 +211,6 @@ def _converged(whole: Fits, present: Completion, completion: Completion) -> Comp
         return completion
     further = whole.of(completion.effects, [completion.as_starts()])
     return completion if further is None or further.evidence > completion.evidence else further
-
-
-class _Promising(NamedTuple):
-    """Candidates worth a fit of all data, with where it starts.
-
-    Falls of -2 log evidence that scores foretell of others, and how far behind the best one a few instants put each.
-    """
-
-    fits: Sequence[tuple[Effect, Sequence[Start]]]
-    foreseen: dict[str, float]
-    behind: dict[str, float]
-
-
-def _promising(
-    whole: Fits,
-    few: Fits,
-    present: Completion,
-    candidates: Sequence[Effect],
-    explained: float,
-    again: Collection[str] | None,
-) -> _Promising:
-    """The few candidates that count: foreseen by scores, tried on a few instants.
-
-    Where little is foreseen a few instants tell nothing, and scores are as good as fits.
-    """
-    before = few.of(present.effects, [present.as_starts()], ROUGH)
-    foreseen = scores(whole.records, whole.prior, present, candidates)
-    further = [] if before is None else further_scores(few.records, few.prior, before, candidates)
-    times = 1.0 if before is None else present.rows / before.rows
-    most = max(part * -score.evidence for part, of in ((1.0, foreseen), (times, further)) for score in of)
-    if before is None or most < CLEAR:
-        return _of_scores(
-            [*foreseen, *further_scores(whole.records, whole.prior, present, candidates)], least_that_pays(explained)
-        )
-    tried: list[tuple[float, Effect, Completion]] = []
-    least = math.inf
-    for found in _worth_trying(foreseen, further, again).values():
-        completion = _tried(few, before, found, least + BEHIND_UNSETTLED)
-        if completion is not None:
-            fall = before.foreseen(present.rows) - completion.foreseen(present.rows)
-            tried.append((fall, found[0].effect, completion))
-            least = min(least, completion.cost)
-    tried.sort(key=lambda item: -item[0])
-    best = tried[0][0] if tried else 0.0
-    settled = all(completion.converged for _, _, completion in tried[:1])
-    kept = [
-        (fall, effect, completion) for fall, effect, completion in tried
-        if fall > 0.0 and not hopeless(best - fall, explained + best)
-    ][:COUNTED]  # fmt: skip
-    for_good = {e.name for fall, e, c in kept if settled and c.converged and best - fall > BEHIND}
-    fits = [(e, c.as_starts()) for _, e, c in kept if e.name not in for_good]
-    return _Promising(fits[:FITTED], {}, {e.name: best - fall for fall, e, _ in kept})
-
-
-def _of_scores(found: Iterable[Score], least: float) -> _Promising:
-    """The best score of each candidate that counts; those that come near what they must explain are fitted."""
-    best: dict[str, Score] = {}
-    for score in sorted(found, key=lambda score: score.evidence):
-        if score.evidence < WORTH_TRYING:
-            best.setdefault(score.effect.name, score)
-    chosen = list(best.values())[:COUNTED]
-    enough = WORTH_FITTING * max([least, *(-s.evidence for s in chosen)])
-    fitted = [(s.effect, s.starts) for s in chosen if -s.evidence > enough]
-    return _Promising(fitted, {s.effect.name: -s.evidence for s in chosen[len(fitted) :]}, {})
-
-
-def _worth_trying(
-    foreseen: Sequence[Score], further: Sequence[Score], again: Collection[str] | None
-) -> dict[str, list[Score]]:
-    """Scores of the candidates that count by name, the best foreseen first; `again` as of _round()."""
-    tried = foreseen[: TRIED if again is None else TRIED_AGAIN]
-    named = [score for score in foreseen[len(tried) :] if again is not None and score.effect.name in again]
-    found: dict[str, list[Score]] = {}
-    for score in (*tried, *named, *sorted(further, key=lambda score: score.evidence)[:FURTHER]):
-        if score.evidence < WORTH_TRYING:
-            found.setdefault(score.effect.name, []).append(score)
-    return found
-
-
-def _tried(few: Fits, present: Completion, found: Sequence[Score], hopeless: float) -> Completion | None:
-    """The best fit of one candidate to a few instants; from further starts only where more is foreseen of them."""
-    starts, foreseen = [s.starts for s in found], [present.evidence + s.evidence for s in found]
-    return few.of((*present.effects, found[0].effect), starts, ROUGH._replace(hopeless=hopeless), foreseen)
 
 
 def _reconsidered(
@@ -363,10 +260,10 @@ def _stays(
     if fall < CLEAR:
         return None
     of = few.records, few.prior, without, candidates
-    found = _worth_trying(scores(*of), further_scores(*of), addition.falls)
+    found = worth_trying(scores(*of), further_scores(*of), addition.falls)
     for rival in candidates:
         if rival.name in found and rival.name != effect.name:
-            completion = _tried(few, without, found[rival.name], here.cost + BEHIND_UNSETTLED)
+            completion = fitted_to_few(few, without, found[rival.name], here.cost + BEHIND_UNSETTLED)
             if completion is None:
                 continue
             if not hopeless(completion.foreseen(present.rows) - here.foreseen(present.rows), explained):

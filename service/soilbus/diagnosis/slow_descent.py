@@ -66,6 +66,7 @@ def _relaxed(fitting: Fitting, place: Place) -> tuple[Place, Point] | None:
 
 
 def _enough(fitting: Fitting, point: Point, enough: float) -> float:
+    """Fall of the cost at a point below which a step was the last."""
     return max(SLOWLY * enough, ENOUGH_FAR * (point.cost - NEAR * fitting.problem.n_rows))
 
 
