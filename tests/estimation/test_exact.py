@@ -11,12 +11,15 @@ import pytest
 from soilbus.assembly import prior_of
 from soilbus.estimation import exact
 from soilbus.estimation.belief import Belief
+from soilbus.estimation.bound import cramer_rao
+from soilbus.estimation.coordinates import Coordinates
 from soilbus.estimation.exact import samples
 from soilbus.estimation.gauss_newton import fit_window
-from soilbus.estimation.marginal import ridge, told_of_k_c, with_whole
+from soilbus.estimation.marginal import counted, ridge, told_of_soil, with_whole
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Swing
+from soilbus.terra.wheel import Soil
 
 STILL = Swing(0.0, 1e-9)
 
@@ -35,17 +38,24 @@ def test_the_average_along_n_has_the_moments_of_the_exact_posterior(ill_told):
     found = samples(problem, prior, before, fit, 500, np.random.default_rng(1))
     assert found.share.sum() == pytest.approx(1.0)
     assert found.effective > 60.0
-    mean, std = moments(found)
     whole = with_whole(problem, prior, before, fit).whole
     along = ridge(problem, prior, before, fit)
-    told = np.interp(found.logs[:, 2], [node.u for node in along.nodes], told_of_k_c(along, prior, before))
-    assert told.max() > 2.0 * told.min()  # k_c is said as its error counts, so this is worth a look
-    mean[0] = (found.share / told) @ found.logs[:, 0] / (found.share / told).sum()
-    std = np.sqrt(found.share @ (found.logs - mean) ** 2)
+    nodes = told_of_soil(along, prior, before)
+    u = [node.u for node in along.nodes]
+    told = np.array([np.interp(found.logs[:, 2], u, column) for column in nodes.T]).T
+    assert told[:, 0].max() > 2.0 * told[:, 0].min()  # k_c is said as its error counts, so this is worth a look
+    # Where errors count alike and spread evenly: k_phi is what the bearing capacity and the others leave.
+    coordinates = Coordinates(prior, float(problem.rig.width.mean()))
+    position = np.array([coordinates.position(soil) for soil in np.exp(found.logs)])
+    of_all, of_k_c = counted(found.share, told, coordinates.free)
+    mean = of_all @ position
+    mean[0] = of_k_c @ position[:, 0]
+    std = np.sqrt(found.share @ (position - mean) ** 2)
     chance = 3.5 / np.sqrt(found.effective)
-    assert np.abs((np.log(whole.soil) - mean) / std).max() < 0.1 + chance
+    assert np.abs((coordinates.position(whole.soil) - mean) / std).max() < 0.1 + chance
     # The average is never surer; how much less sure where k_c may be next to nothing, is its own choice.
-    ratio = np.sqrt(np.diag(whole.covariance)[:6]) / std
+    back = np.linalg.inv(coordinates.log_directions(whole.soil))
+    ratio = np.sqrt(np.diag(back @ whole.covariance[:6, :6] @ back.T)) / std
     assert ratio.min() > 1.0 - 0.1 - chance / np.sqrt(2.0)
     assert ratio.max() < 1.5
 
@@ -74,6 +84,17 @@ def test_where_moments_leave_the_share_of_k_c_no_deviation_the_draws_are_by_the_
 def moments(found):
     mean = found.share @ found.logs
     return mean, np.sqrt(found.share @ (found.logs - mean) ** 2)
+
+
+def test_each_soil_has_the_bound_of_a_window_on_it(ill_told):
+    problem, prior, before, fit = ill_told
+    found = samples(problem, prior, before, fit, 300, np.random.default_rng(1))
+    calm = ridge(problem, prior, before, fit).problem
+    for i in np.argsort(found.share)[-20:]:
+        bound = cramer_rao(calm, prior, Soil(*np.exp(found.logs[i]).tolist())).log_covariance
+        std, told = (np.sqrt(each.diagonal()) for each in (bound, found.bound[i]))
+        assert told == pytest.approx(std, rel=0.05)
+        assert (np.abs(found.bound[i] - bound) <= 0.1 * std[:, None] * std).all()
 
 
 def test_without_a_ridge_there_are_no_samples(ill_told):

@@ -14,6 +14,7 @@ from soilbus.assembly import prior_of
 from soilbus.cli import main
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.report.monte_carlo import monte_carlo_report
+from soilbus.simulator.attainable import Attainable
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.monte_carlo import (
     MAX_PHI,
@@ -45,15 +46,23 @@ def made_up(n, spread=1.0, shift=0.0, held=(), seed=0):
 
 
 def test_what_is_attainable_is_told_beside_what_is_attained():
-    windows = [replace(w, exact=w.error / 1.3, effective=float(i)) for i, w in enumerate(made_up(400))]
-    cell = summary("loam", 2.0, True, [*windows, *made_up(3, spread=50.0)])
+    tilts = np.array([0.8, 1.5, 1.2])[:, None]
+    made = made_up(400)
+    shown = [
+        replace(w, exact=Attainable(w.error / 1.3, tilts**2 * np.full(7, i + 1.0), np.full((3, 7), i + 1.0), float(i)))
+        for i, w in enumerate(made)
+    ]
+    cell = summary("loam", 2.0, True, [*shown, *made_up(3, spread=50.0)])
     assert cell.exact.windows == 400
+    assert cell.exact.least == pytest.approx(np.full(7, 1.5))
     assert cell.exact.share == pytest.approx(np.full(7, 1.3))
     assert cell.exact.scatter == pytest.approx(np.zeros(7), abs=1e-12)
     assert cell.exact.best == pytest.approx(cell.exact.ours / 1.3)
+    assert cell.exact.ours == pytest.approx(summary("loam", 2.0, True, made).rms)
     assert cell.exact.effective == 199.5
-    assert "1.30+-0.00" in monte_carlo_report([cell])
-    assert as_json(cell)["quantities"]["n"]["exact"] == pytest.approx(cell.exact.best[2])
+    assert f"1.50 {cell.exact.best[2]:.2f} 1.30+-0.00" in monte_carlo_report([cell])
+    of_n = as_json(cell)["quantities"]["n"]
+    assert (of_n["least"], of_n["best"]) == pytest.approx((1.5, cell.exact.best[2]))
 
 
 def test_soils_around_a_named_one_are_drawn_until_the_tractor_gets_on(monkeypatch):

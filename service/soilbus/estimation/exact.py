@@ -9,6 +9,7 @@ takes hundreds of evaluations: for judging the estimator, not for the service.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ from soilbus.estimation.belief import Belief
 from soilbus.estimation.coordinates import MAX_PHI, Coordinates
 from soilbus.estimation.gauss_newton import Fit
 from soilbus.estimation.marginal import FINE, Node, density, ridge
-from soilbus.estimation.normal_equations import Fitting, Place
+from soilbus.estimation.normal_equations import Fitting, Place, Point
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.terra.wheel import Soil
@@ -37,10 +38,14 @@ _K_C, _K_PHI, _N, _PHI = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n
 
 
 class Samples(NamedTuple):
-    """Logarithms (M, 6) of soils and their shares (M,) of the posterior probability."""
+    """Logarithms (M, 6) of soils and their shares (M,) of the posterior probability.
+
+    bound (M, 6, 6) is the Cramér-Rao bound of the logarithms where the window is of that soil.
+    """
 
     logs: Array
     share: Array
+    bound: Array
 
     @property
     def effective(self) -> float:
@@ -63,16 +68,22 @@ def samples(
         fitting = Fitting(along.problem, prior, before)
         log_share = np.full(count, -np.inf)
         logs = np.empty((count, len(PARAMETERS)))
+        bound = np.zeros((count, len(PARAMETERS), len(PARAMETERS)))
         for i in range(count):
             soil = _soil_at(position[i], coordinates)
             logs[i] = np.log(soil)
             if soil[_K_PHI] > 0.0 and soil[_PHI] < MAX_PHI:
                 near = nodes[int(np.argmin(np.abs(u - logs[i, _N])))]
+                place, point = _point_at(fitting, soil, near)
+                if point is None:
+                    continue
                 jacobian = np.linalg.slogdet(coordinates.log_directions(soil)[coordinates.free])[1]
-                log_share[i] = jacobian - 0.5 * _unlikelihood(fitting, soil, near) - drawn.log_density[i]
+                log_share[i] = jacobian - 0.5 * _unlikelihood(fitting, point) - drawn.log_density[i]
+                covariance = np.asarray(np.linalg.inv(point.information))
+                bound[i] = fitting.believed(place, covariance).posterior.log_covariance
     share = np.exp(np.where(np.isfinite(log_share), log_share, -np.inf) - np.nanmax(log_share))
     kept = share > 0.0
-    return Samples(logs[kept], share[kept] / share[kept].sum())
+    return Samples(logs[kept], share[kept] / share[kept].sum(), bound[kept])
 
 
 class _Drawn(NamedTuple):
@@ -131,16 +142,19 @@ def _soil_at(position: Array, coordinates: Coordinates) -> Array:
     return soil if inside else np.where(np.arange(len(soil)) == _K_PHI, 0.0, soil)
 
 
-def _unlikelihood(fitting: Fitting, soil: Array, near: Node) -> float:
-    """-2 log posterior density of a soil's logarithms up to a constant, whatever the gains (Laplace, all but exact)."""
-    problem, optimum, nothing = fitting.problem, near.fit.optimum, np.zeros(len(PARAMETERS))
+def _point_at(fitting: Fitting, soil: Array, near: Node) -> tuple[Place, Point | None]:
+    """The window at a soil (6,), with the latents that are likeliest there."""
+    problem, optimum = fitting.problem, near.fit.optimum
     latents = problem.carried(optimum.latents, Soil(*soil.tolist()), optimum.gains)
     place = Place(soil, optimum.gains, latents, np.inf, 1)
     at = problem.linearise(place.as_soil(), place.gains, latents)
-    latents = problem.updated(at, latents, nothing, np.zeros(len(place.gains)))
-    point = fitting.point(Place(soil, optimum.gains, latents, np.inf, 1))
-    if point is None:
-        return np.inf
+    latents = problem.updated(at, latents, np.zeros(len(PARAMETERS)), np.zeros(len(place.gains)))
+    place = replace(place, latents=latents)
+    return place, fitting.point(place)
+
+
+def _unlikelihood(fitting: Fitting, point: Point) -> float:
+    """-2 log posterior density of a soil's logarithms up to a constant, whatever the gains (Laplace, all but exact)."""
     gains = slice(len(fitting.free), None)
     information, gradient = point.information[gains, gains], point.gradient[gains]
     fall = float(gradient @ np.linalg.solve(information, gradient))

@@ -51,6 +51,11 @@ UNLIKELY = 9.0
 """-2 log of a probability, relative to the greatest, where the ridge has ended."""
 FINE = 400
 """Values of n that are averaged."""
+COUNTS, COUNTS_OF_K_C = 1.0, 2.0
+"""Powers of the sd that a window on some soil would leave at best by which an error on that soil counts less.
+
+With 2 the mean square error is least in units of what is attainable on each soil, with 0 that of the logarithm.
+"""
 _SOIL = len(PARAMETERS)
 _K_C, _K_PHI, _N = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n"))
 
@@ -98,7 +103,7 @@ def with_whole(problem: WindowProblem, prior: SoilPrior, before: Belief, found: 
         if along is None:
             return found
         coordinates = Coordinates(prior, float(problem.rig.width.mean()))
-        told = told_of_k_c(along, prior, before) if len(along.nodes) > 2 else None
+        told = told_of_soil(along, prior, before) if len(along.nodes) > 2 else None
         whole = along.top.belief if told is None else _averaged(along.nodes, told, coordinates, before)
     finite = np.isfinite(whole.soil).all() and np.isfinite(whole.covariance).all()
     if not finite or found.rival is not None:  # beside its rival an optimum is told as it was found
@@ -191,8 +196,11 @@ def _held(
     return None if fit is None else Node(u, fit, deviation**2 + fitting.earlier.surplus)
 
 
-def told_of_k_c(along: Ridge, prior: SoilPrior, before: Belief) -> Array | None:
-    """Variance (nodes,) of log k_c that a window on the soil of each node could have at best; None: not to be told."""
+def told_of_soil(along: Ridge, prior: SoilPrior, before: Belief) -> Array | None:
+    """Variance (nodes, F) of the coordinates that a window on the soil of each node could leave at best.
+
+    None where it is not to be told.
+    """
     fitting = Fitting(along.problem, prior, before)
     variance = []
     for node in along.nodes:
@@ -201,16 +209,26 @@ def told_of_k_c(along: Ridge, prior: SoilPrior, before: Belief) -> Array | None:
         inverse = None if point is None else solved(point.information, point.gradient)
         if inverse is None:
             return None
-        variance.append(inverse[1][_K_C, _K_C])
+        variance.append(inverse[1].diagonal()[: len(fitting.free)])
     return np.array(variance)
+
+
+def counted(centre: Array, told: Array, free: Indices) -> tuple[Array, Array]:
+    """Shares (M,) of places as errors there count, for all coordinates and for k_c, by those (M,) of probability.
+
+    told (M, F) is the variance that is left there at best.  For all it is that of n: what is well known of the
+    others together with n so stays it.
+    """
+    of_all = centre * told[:, int(np.searchsorted(free, _N))] ** (-0.5 * COUNTS)
+    of_k_c = centre * told[:, _K_C] ** (-0.5 * COUNTS_OF_K_C)
+    return of_all / of_all.sum(), of_k_c / of_k_c.sum()
 
 
 def _averaged(nodes: list[Node], told: Array, coordinates: Coordinates, before: Belief) -> Belief:
     """Mean of all nodes and of what lies between them, by straight lines, and its spread about that.
 
-    But for k_c, of which soils of the ridge let a window tell as unlike as by a factor of ten: there it is
-    the soil whose mean square error is least in units of the variance that each of them would leave,
-    `told` (nodes,).
+    Soils of the ridge let a window tell its soil as unlike as by a factor of ten: the mean is where the mean
+    square error is least if each counts by what is left there at best (`counted`), `told` (nodes, F).
     """
     n, free = len(PARAMETERS), coordinates.free
     active = n + np.flatnonzero(np.diag(before.covariance)[n:] > 0.0)
@@ -219,18 +237,18 @@ def _averaged(nodes: list[Node], told: Array, coordinates: Coordinates, before: 
     fine = np.linspace(u[0], u[-1], FINE)
     probable = density(u, np.array([node.unlikelihood for node in nodes]), fine)
     weight = confidence(u, np.array([node.misfit for node in nodes]), fine)
-    k_c_told = np.interp(fine, u, told)
-    known = 1.0 - _next(fine, probable, k_c_told) / before.variance_of_k_c(coordinates.prior)
+    share = np.array([np.interp(fine, u, one) for one in np.eye(len(u))])
+    left = _next(fine, probable, told[:, _K_C] @ share)
+    known = 1.0 - left / before.variance_of_k_c(coordinates.prior)
     place = np.array([[*coordinates.position(b.soil), *b.gains[active - n]] for b in beliefs])
     unbiased = np.array([_unbiased_k_c(node, before, coordinates.prior) for node in nodes])
     place[:, _K_C] += known * (unbiased - place[:, _K_C])
-    along = np.array([np.interp(fine, u, column) for column in place.T])
+    along = place.T @ share
     own = np.array([_in_coordinates(b.covariance, coordinates.log_directions(b.soil), free, active) for b in beliefs])
-    share = np.array([np.interp(fine, u, one) for one in np.eye(len(u))])
     centre = known * weight + (1.0 - known) * probable
-    mean = along @ centre
-    of_k_c = centre / k_c_told
-    mean[_K_C] = along[_K_C] @ of_k_c / of_k_c.sum()
+    of_all, of_k_c = counted(centre, share.T @ told, free)
+    mean = along @ of_all
+    mean[_K_C] = along[_K_C] @ of_k_c
     off = along - mean[:, None]
     doubt = longer_side(fine - fine @ probable, weight)  # how unlike both distributions are counts, too
     spread = doubt * (off * weight) @ off.T

@@ -12,10 +12,10 @@ from soilbus.simulator.monte_carlo import DURATIONS, SOILS, Cell, Exact
 MAX_RMS = 1.15
 COVERAGE = (0.93, 0.97)
 MAX_CHI2_OFF = 0.03
-ATTAINABLE = """Each quantity: what the mean of the exact posterior attains on these windows (RMS error over the
-Cramér-Rao bound), and our RMS error over that.  No estimate has a smaller mean square error on average
-over the soils that the windows and what was known allow; but one that is weighed by how well each of
-these soils would be told, as ours of k_c, may be nearer to the bound.  samples: median number of effective ones.
+ATTAINABLE = """Each quantity, in root mean square errors over the bound: what any estimate must allow on some of the
+soils that the windows and what was known allow, by the information that a window would hold on each of these; what
+the estimate that has the least on average over them attains here; and ours over that.  Where the first is
+above {most}, none can be within the target on all of them.  samples: median number of effective ones.
 """
 
 
@@ -40,13 +40,19 @@ def monte_carlo_report(cells: Sequence[Cell]) -> str:
     if not exact:
         return text
     head = ("soil", "window", "sinkage", *names, "windows", "samples")
-    return text + "\n" + table(head, [_attainable(*pair, names) for pair in exact]) + "\n" + ATTAINABLE
+    return (
+        text
+        + "\n"
+        + table(head, [_attainable(*pair, names) for pair in exact])
+        + "\n"
+        + ATTAINABLE.format(most=MAX_RMS)
+    )
 
 
 def _attainable(cell: Cell, exact: Exact, names: Sequence[str]) -> tuple[str, ...]:
-    columns = zip(exact.best.tolist(), exact.share.tolist(), exact.scatter.tolist(), strict=True)
+    columns = zip(*(c.tolist() for c in (exact.least, exact.best, exact.share, exact.scatter)), strict=True)
     figures = dict(zip(cell.quantities, columns, strict=True))
-    told = ["{:.2f} {:.2f}+-{:.2f}".format(*figures[name]) if name in figures else "held" for name in names]
+    told = ["{:.2f} {:.2f} {:.2f}+-{:.2f}".format(*figures[name]) if name in figures else "held" for name in names]
     fitted = "measured" if cell.sinkage else "none"
     return (cell.soil, f"{cell.duration:g} s", fitted, *told, str(exact.windows), f"{exact.effective:.0f}")
 

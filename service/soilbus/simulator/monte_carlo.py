@@ -7,9 +7,9 @@ estimated from nothing else, as the first window after a start is.  Errors, stan
 deviations and bounds are those of logarithms.
 
 The bound is local: it knows how the window would change with a soil next to the true one.
-Where the soils that the window allows are not next to it, an estimate may miss it, and the mean
-of the exact posterior (`exact`) says how far one does that has the least error on average over
-these soils.  For the same reason no interval holds each single soil 95 times in 100, but soils
+Where the soils that the window allows are not next to it, an estimate may miss it: what is at least
+missed follows from the bounds of all these soils and how probable they are (`exact`, see `attainable`).
+For the same reason no interval holds each single soil 95 times in 100, but soils
 that lie about it as they may (`around`).
 """
 
@@ -43,6 +43,7 @@ from soilbus.estimation.marginal import with_whole
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import BinStore
+from soilbus.simulator.attainable import Attainable, attainable
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -56,8 +57,6 @@ DURATIONS = (2.0, 10.0, 60.0)
 SLIP = Swing(0.05, 0.40)
 ROUGHLY_KNOWN = ("soil.c.value=3000", "soil.c.std=750", "soil.K.value=0.02", "soil.K.std=0.005")
 """Settings with which cohesion and shear modulus are known to 25 %."""
-EXACT_UP_TO = 10.0
-"""Duration [s] of windows from which on exact posteriors take too long, and Gaussian ones are as good."""
 MAX_PHI = 1.2
 """A prior that is off by more than this friction angle [rad] is drawn again: the model ends at a right angle."""
 MAX_DRAWN = 20
@@ -85,9 +84,8 @@ class Task(NamedTuple):
 class Trial:
     """One window: error, std and bound (6 + 1,) of the parameters' logarithms and the bearing pressure's.
 
-    What is held has no error and no bound.  All of it is nan where the fit failed.  exact (7,)
-    is the error of the exact posterior's mean and effective how many independent samples it is worth;
-    None and nan where none were drawn.
+    What is held has no error and no bound.  All of it is nan where the fit failed.  exact is None
+    where no exact posterior was drawn from.
     """
 
     error: Array
@@ -96,8 +94,7 @@ class Trial:
     chi2: float
     converged: bool
     seconds: float
-    exact: Array | None = None
-    effective: float = math.nan
+    exact: Attainable | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,16 +127,18 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Exact:
-    """The exact posteriors of some windows, beside the estimates: root mean squares (Q,) of errors over the bounds.
+    """What could be attained in some windows, in units of the bounds, of each quantity (Q,).
 
-    ours are the estimates', best those of the posteriors' means; share is ours over best and
-    scatter its standard deviation by chance, for the windows are the same.  effective is the median of how
-    many independent samples a posterior is told by.
+    least: no estimate has a root mean square error below this on all soils that the windows allow.
+    best: that of the estimate with the least one on average over these soils, at the true one.  ours: that of
+    ours; share is ours over best and scatter its standard deviation by chance, for the windows are the
+    same.  effective is the median of how many independent samples a posterior is told by.
     """
 
     windows: int
-    ours: Array
+    least: Array
     best: Array
+    ours: Array
     share: Array
     scatter: Array
     effective: float
@@ -168,7 +167,7 @@ def monte_carlo(
 ) -> Iterator[Cell]:
     """Cells of all soils and durations, each with and without sinkage sensors (the same drives).
 
-    With so many samples of the exact posterior of each window up to EXACT_UP_TO; with a soil of its
+    With so many samples of the exact posterior of each window; with a soil of its
     own for each drive, log-normal `around` the named one.  `each` is the built-in map, or that
     of `processes`.  The same seed gives the same windows.  Raises KeyError for an unknown soil
     and SimulationError where the tractor cannot drive on one.
@@ -205,8 +204,7 @@ def tasks_of(
     of_cell = config.model_copy(update={"estimator": of_window})
     key = [seed, zlib.crc32(soil.encode()), round(1e3 * duration)]
     seeds = np.random.SeedSequence(key).generate_state(windows)
-    drawn = exact if duration <= EXACT_UP_TO else 0
-    return [Task(of_cell, soil, duration, int(s), drawn, around) for s in seeds]
+    return [Task(of_cell, soil, duration, int(s), exact, around) for s in seeds]
 
 
 def trials(task: Task) -> tuple[Trial, Trial]:
@@ -262,10 +260,10 @@ def _trial(recording: Recording, task: Task, prior: SoilPrior, soil: Soil, sinka
     posterior = samples(noisy, prior, before, found, drawn, np.random.default_rng([seed, 2]))
     if posterior is None:
         return trial
-    z_ref, b_ref = config.estimator.z_ref, config.estimator.b_ref
-    bearing = [math.log(Soil(*one).bearing_pressure(z_ref, b_ref)) for one in np.exp(posterior.logs).tolist()]
-    exact = np.append(posterior.share @ posterior.logs, posterior.share @ np.array(bearing)) - truth
-    return replace(trial, exact=exact, effective=posterior.effective)
+    soils = zip(np.exp(posterior.logs).tolist(), posterior.bound, strict=True)
+    told = [_logarithms(Posterior(Soil(*soil), covariance), config) for soil, covariance in soils]
+    value, bound_of_each = (np.array(column) for column in zip(*told, strict=True))
+    return replace(trial, exact=attainable(value, posterior.share, bound_of_each, truth))
 
 
 def _problem(
@@ -324,19 +322,21 @@ def summary(soil: str, duration: float, sinkage: bool, windows: Sequence[Trial])
 
 def _exact(windows: Sequence[Trial], free: NDArray[np.bool_]) -> Exact | None:
     """The figures of windows whose exact posteriors are known; None without any."""
-    if not windows:
+    known = [(trial, trial.exact) for trial in windows if trial.exact is not None]
+    if not known:
         return None
-    bound = np.array([trial.bound for trial in windows])[:, free]
-    ours = (np.array([trial.error for trial in windows])[:, free] / bound) ** 2
-    best = (np.array([trial.exact for trial in windows])[:, free] / bound) ** 2
+    ours = np.array([trial.error / trial.bound for trial, _ in known])[:, free] ** 2
+    best = np.array([exact.error / trial.bound for trial, exact in known])[:, free] ** 2
+    risk, weight = (sum(getattr(exact, of) for _, exact in known)[:, free] for of in ("risk", "weight"))
     square = ours.sum(0) / best.sum(0)
     return Exact(
-        windows=len(windows),
-        ours=np.sqrt(ours.mean(0)),
+        windows=len(known),
+        least=np.sqrt((risk / weight).max(axis=0)),
         best=np.sqrt(best.mean(0)),
+        ours=np.sqrt(ours.mean(0)),
         share=np.sqrt(square),
         scatter=0.5 * np.sqrt(square) * np.sqrt(((ours - square * best) ** 2).sum(0)) / ours.sum(0),
-        effective=float(np.median([trial.effective for trial in windows])),
+        effective=float(np.median([exact.effective for _, exact in known])),
     )
 
 
@@ -348,7 +348,7 @@ def as_json(cell: Cell) -> dict[str, Any]:
 
     columns = {"rms": cell.rms, "bias": cell.bias, "coverage": cell.coverage, "bound": cell.bound}
     if cell.exact is not None:
-        columns |= {"rms_beside_exact": cell.exact.ours, "exact": cell.exact.best}
+        columns |= {"least": cell.exact.least, "best": cell.exact.best, "rms_beside_best": cell.exact.ours}
     return {
         "soil": cell.soil, "duration": cell.duration, "sinkage": cell.sinkage, "windows": cell.windows,
         "failed": cell.failed, "not_converged": cell.not_converged, "chi2": number(cell.chi2), "seconds": cell.seconds,
