@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -61,3 +62,24 @@ def test_small_blocks_that_numpy_keeps_are_taken_at_the_start(when, least, most)
     # The C library keeps freed blocks of its own for each thread, 0.24 MB, and counts them as used.
     done = subprocess.run([sys.executable, "-c", SIZES, when], capture_output=True, text=True, check=True, timeout=60.0)
     assert least < int(done.stdout) < most
+
+
+THREADS = """
+import sys
+from soilbus.cli import main
+main(sys.argv[1:])
+from threadpoolctl import threadpool_info
+print(*(pool["num_threads"] for pool in threadpool_info()))
+"""
+
+
+@pytest.mark.parametrize(("told", "threads"), [(None, 1), ("2", 2)])
+def test_a_command_works_in_one_thread_unless_told_otherwise(told, threads, tmp_path):
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    environment |= {} if told is None else {"OMP_NUM_THREADS": told}
+    (tmp_path / "empty.toml").write_text("")
+    command = [sys.executable, "-c", THREADS, "montecarlo", "--config", str(tmp_path / "empty.toml")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60.0, env=environment)
+    pools = done.stdout.split()
+    assert pools
+    assert set(pools) == {str(min(threads, len(os.sched_getaffinity(0))))}

@@ -16,7 +16,6 @@ that lie about it as they may (`around`).
 from __future__ import annotations
 
 import math
-import os
 import time
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -31,7 +30,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.allocator import keep_freed_memory
+from soilbus.allocator import keep_freed_memory, keep_to_one_thread
 from soilbus.assembly import completion_of, model_of, prior_of, rig_of
 from soilbus.config import Config
 from soilbus.estimation.belief import Belief
@@ -189,7 +188,7 @@ def processes(count: int) -> Iterator[Each]:
     if count < 2:
         yield map
         return
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # read by numpy when the new processes load it
+    keep_to_one_thread()
     with ProcessPoolExecutor(count, get_context("spawn"), initializer=keep_freed_memory) as pool:
         yield partial(pool.map, chunksize=4)
 
