@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import guest
+import soilbus  # noqa: F401  # before numpy, which it keeps to one thread
 from availability import unavailable
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]

@@ -1,10 +1,9 @@
-"""Hints to the allocators, the C library's and Python's collector of garbage, and to the linear algebra."""
+"""Hints to the allocators: the C library's, and Python's collector of garbage."""
 
 from __future__ import annotations
 
 import ctypes
 import gc
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -15,15 +14,6 @@ SMALL, OF_EACH = 1024, 7
 """Bytes from which numpy keeps no freed blocks, and how many it keeps of each size below (NBUCKETS, NCACHE)."""
 _BLOCK = 100_000
 """Bytes of a block as an evaluation takes it, of the columns of one window."""
-
-
-def keep_to_one_thread() -> None:
-    """Let the linear algebra work in the calling thread alone, unless OMP_NUM_THREADS says otherwise.
-
-    Our matrices are too small to be shared out: threads that wait for their part take 1.7 times the processor time,
-    and more wall time.  It is read when numpy is loaded, so this comes before, here and in new processes.
-    """
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 def keep_freed_memory() -> None:

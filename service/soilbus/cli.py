@@ -15,7 +15,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from soilbus.allocator import keep_freed_memory, keep_to_one_thread, loading
+from soilbus.allocator import keep_freed_memory, loading
 from soilbus.arguments import command_line
 from soilbus.report.whole_file import NotWritten, whole_file
 
@@ -36,7 +36,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.INFO, format="soilbus: %(message)s", stream=sys.stderr)
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # what it does for itself is no news
     logging.getLogger("can").setLevel(logging.CRITICAL)  # a bus that is away is ours to tell of, once
-    keep_to_one_thread()
     keep_freed_memory()
     with loading():
         from soilbus.config import ConfigError

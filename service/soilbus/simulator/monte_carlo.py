@@ -30,7 +30,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.allocator import keep_freed_memory, keep_to_one_thread
+from soilbus.allocator import keep_freed_memory
 from soilbus.assembly import completion_of, model_of, prior_of, rig_of
 from soilbus.config import Config
 from soilbus.estimation.belief import Belief
@@ -188,7 +188,6 @@ def processes(count: int) -> Iterator[Each]:
     if count < 2:
         yield map
         return
-    keep_to_one_thread()
     with ProcessPoolExecutor(count, get_context("spawn"), initializer=keep_freed_memory) as pool:
         yield partial(pool.map, chunksize=4)
 
