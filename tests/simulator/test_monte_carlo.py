@@ -46,23 +46,28 @@ def made_up(n, spread=1.0, shift=0.0, held=(), seed=0):
 
 
 def test_what_is_attainable_is_told_beside_what_is_attained():
-    tilts = np.array([0.8, 1.5, 1.2])[:, None]
+    rng = np.random.default_rng(3)
+    least = np.array([0.8, 1.5, 1.2])[:, None]
     made = made_up(400)
-    shown = [
-        replace(w, exact=Attainable(w.error / 1.3, tilts**2 * np.full(7, i + 1.0), np.full((3, 7), i + 1.0), float(i)))
-        for i, w in enumerate(made)
-    ]
+    shown = []
+    for i, window in enumerate(made):
+        weight = rng.uniform(0.1, 2.0) * np.ones((3, 7))
+        risk = weight * least**2 * rng.exponential(1.0, 7)
+        shown.append(replace(window, exact=Attainable(window.error / 1.3, risk, weight, float(i))))
     cell = summary("loam", 2.0, True, [*shown, *made_up(3, spread=50.0)])
     assert cell.exact.windows == 400
-    assert cell.exact.least == pytest.approx(np.full(7, 1.5))
+    # the mean of n exponential numbers scatters by 1 / sqrt(n); unlike weights leave fewer of them, uniform ones 3/4
+    assert cell.exact.least_scatter == pytest.approx(np.full(7, 1.5 * 0.5 / np.sqrt(0.77 * 400)), rel=0.2)
+    assert (np.abs(cell.exact.least - 1.5) < 3.5 * cell.exact.least_scatter).all()
     assert cell.exact.share == pytest.approx(np.full(7, 1.3))
     assert cell.exact.scatter == pytest.approx(np.zeros(7), abs=1e-12)
     assert cell.exact.best == pytest.approx(cell.exact.ours / 1.3)
     assert cell.exact.ours == pytest.approx(summary("loam", 2.0, True, made).rms)
     assert cell.exact.effective == 199.5
-    assert f"1.50 {cell.exact.best[2]:.2f} 1.30+-0.00" in monte_carlo_report([cell])
+    figures = (cell.exact.least[2], cell.exact.least_scatter[2], cell.exact.best[2])
+    assert "{:.2f}+-{:.2f} {:.2f} 1.30+-0.00".format(*figures) in monte_carlo_report([cell])
     of_n = as_json(cell)["quantities"]["n"]
-    assert (of_n["least"], of_n["best"]) == pytest.approx((1.5, cell.exact.best[2]))
+    assert tuple(of_n[name] for name in ("least", "least_scatter", "best")) == pytest.approx(figures)
 
 
 def test_soils_around_a_named_one_are_drawn_until_the_tractor_gets_on(monkeypatch):

@@ -17,6 +17,7 @@ soils that the windows and what was known allow, by the information that a windo
 the estimate that has the least on average over them attains here; and ours over that.  Where the first is
 above {most}, none can be within the target on all of them.  samples: median number of effective ones.
 """
+_TOLD = "{:.2f}+-{:.2f} {:.2f} {:.2f}+-{:.2f}"
 
 
 def with_progress(cells: Iterable[Cell]) -> Iterator[Cell]:
@@ -50,9 +51,11 @@ def monte_carlo_report(cells: Sequence[Cell]) -> str:
 
 
 def _attainable(cell: Cell, exact: Exact, names: Sequence[str]) -> tuple[str, ...]:
-    columns = zip(*(c.tolist() for c in (exact.least, exact.best, exact.share, exact.scatter)), strict=True)
-    figures = dict(zip(cell.quantities, columns, strict=True))
-    told = ["{:.2f} {:.2f} {:.2f}+-{:.2f}".format(*figures[name]) if name in figures else "held" for name in names]
+    told_of = exact.least, exact.least_scatter, exact.best, exact.share, exact.scatter
+    figures = dict(zip(cell.quantities, zip(*(column.tolist() for column in told_of), strict=True), strict=True))
+    told = [
+        "{:.2f}+-{:.2f} {:.2f} {:.2f}+-{:.2f}".format(*figures[name]) if name in figures else "held" for name in names
+    ]
     fitted = "measured" if cell.sinkage else "none"
     return (cell.soil, f"{cell.duration:g} s", fitted, *told, str(exact.windows), f"{exact.effective:.0f}")
 

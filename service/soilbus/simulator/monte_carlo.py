@@ -128,14 +128,16 @@ class Cell:
 class Exact:
     """What could be attained in some windows, in units of the bounds, of each quantity (Q,).
 
-    least: no estimate has a root mean square error below this on all soils that the windows allow.
-    best: that of the estimate with the least one on average over these soils, at the true one.  ours: that of
-    ours; share is ours over best and scatter its standard deviation by chance, for the windows are the
-    same.  effective is the median of how many independent samples a posterior is told by.
+    least: no estimate has a root mean square error below this on all soils that the windows allow, and
+    its standard deviation by chance.  best: that of the estimate with the least one on average over these soils,
+    at the true one.  ours: that of ours; share is ours over best and scatter its standard deviation by
+    chance, for the windows are the same.  effective is the median of how many independent samples a
+    posterior is told by.
     """
 
     windows: int
     least: Array
+    least_scatter: Array
     best: Array
     ours: Array
     share: Array
@@ -325,11 +327,15 @@ def _exact(windows: Sequence[Trial], free: NDArray[np.bool_]) -> Exact | None:
         return None
     ours = np.array([trial.error / trial.bound for trial, _ in known])[:, free] ** 2
     best = np.array([exact.error / trial.bound for trial, exact in known])[:, free] ** 2
-    risk, weight = (sum(getattr(exact, of) for _, exact in known)[:, free] for of in ("risk", "weight"))
+    risk, weight = (np.array([getattr(exact, of) for _, exact in known])[..., free] for of in ("risk", "weight"))
+    average = risk.sum(axis=0) / weight.sum(axis=0)
+    off = np.sqrt(((risk - average * weight) ** 2).sum(axis=0)) / weight.sum(axis=0)
+    tilt = average.argmax(axis=0), np.arange(average.shape[1])
     square = ours.sum(0) / best.sum(0)
     return Exact(
         windows=len(known),
-        least=np.sqrt((risk / weight).max(axis=0)),
+        least=np.sqrt(average[tilt]),
+        least_scatter=0.5 * off[tilt] / np.sqrt(average[tilt]),
         best=np.sqrt(best.mean(0)),
         ours=np.sqrt(ours.mean(0)),
         share=np.sqrt(square),
@@ -346,7 +352,8 @@ def as_json(cell: Cell) -> dict[str, Any]:
 
     columns = {"rms": cell.rms, "bias": cell.bias, "coverage": cell.coverage, "bound": cell.bound}
     if cell.exact is not None:
-        columns |= {"least": cell.exact.least, "best": cell.exact.best, "rms_beside_best": cell.exact.ours}
+        columns |= {"least": cell.exact.least, "least_scatter": cell.exact.least_scatter}
+        columns |= {"best": cell.exact.best, "rms_beside_best": cell.exact.ours}
     return {
         "soil": cell.soil, "duration": cell.duration, "sinkage": cell.sinkage, "windows": cell.windows,
         "failed": cell.failed, "not_converged": cell.not_converged, "chi2": number(cell.chi2), "seconds": cell.seconds,
