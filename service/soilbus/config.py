@@ -27,11 +27,16 @@ SignalName = Annotated[str, Field(pattern=r"^[^.\s]+\.[^.\s]+$")]
 
 
 class ConfigError(Exception):
-    """The configuration cannot be used; `faults` holds one line for each fault."""
+    """The configuration cannot be used; `faults` holds one line for each fault, whatever the names in it hold."""
 
     def __init__(self, faults: Iterable[str]) -> None:
-        self.faults = list(faults)
+        self.faults = [_printable(fault) for fault in faults]
         super().__init__("\n".join(self.faults))
+
+
+def _printable(text: str) -> str:
+    """The text with line breaks and other control characters as Python writes them."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 class _Section(BaseModel):

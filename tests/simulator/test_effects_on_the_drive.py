@@ -185,6 +185,7 @@ def test_effects_come_in_the_order_of_the_catalogue_whoever_wrote_them():
     ("effects", "says"),
     [
         ("{name='cheese'}", "no effect is named cheese; known: slip_sinkage, "),
+        ('{name="che\\nese\\u001b[2J"}', r"no effect is named che\nese\x1b[2J; known: "),
         ("{name='slip_sinkage', smell=1.0}", "slip_sinkage has no parameter smell; known: "),
         ("{name='slip_sinkage'}, {name='slip_sinkage'}", "two effects are named slip_sinkage"),
         ("{name='exponential_shear'}", "exponential_shear can be added to shear_law = rational only"),
@@ -200,6 +201,7 @@ def test_effects_that_cannot_be_are_one_line_each(effects, says):
     with pytest.raises(ConfigError) as error:
         drive(reference_configuration([f"model.effects=[{text}]"]), DRIVE, 5)
     (line,) = error.value.faults
+    assert line.isprintable()
     assert line.startswith("model.effects: ")
     assert says in line
 
