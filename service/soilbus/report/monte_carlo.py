@@ -41,21 +41,14 @@ def monte_carlo_report(cells: Sequence[Cell]) -> str:
     if not exact:
         return text
     head = ("soil", "window", "sinkage", *names, "windows", "samples")
-    return (
-        text
-        + "\n"
-        + table(head, [_attainable(*pair, names) for pair in exact])
-        + "\n"
-        + ATTAINABLE.format(most=MAX_RMS)
-    )
+    rows = [_attainable(*pair, names) for pair in exact]
+    return text + "\n" + table(head, rows) + "\n" + ATTAINABLE.format(most=MAX_RMS)
 
 
 def _attainable(cell: Cell, exact: Exact, names: Sequence[str]) -> tuple[str, ...]:
     told_of = exact.least, exact.least_scatter, exact.best, exact.share, exact.scatter
     figures = dict(zip(cell.quantities, zip(*(column.tolist() for column in told_of), strict=True), strict=True))
-    told = [
-        "{:.2f}+-{:.2f} {:.2f} {:.2f}+-{:.2f}".format(*figures[name]) if name in figures else "held" for name in names
-    ]
+    told = [_TOLD.format(*figures[name]) if name in figures else "held" for name in names]
     fitted = "measured" if cell.sinkage else "none"
     return (cell.soil, f"{cell.duration:g} s", fitted, *told, str(exact.windows), f"{exact.effective:.0f}")
 
