@@ -47,7 +47,7 @@ def test_the_average_along_n_has_the_moments_of_the_exact_posterior(ill_told):
     # Where errors count alike and spread evenly: k_phi is what the bearing capacity and the others leave.
     coordinates = Coordinates(prior, float(problem.rig.width.mean()))
     position = np.array([coordinates.position(soil) for soil in np.exp(found.logs)])
-    of_all, of_k_c = counted(found.share, told, coordinates.free)
+    of_all, of_k_c = counted(found.share, told)
     mean = of_all @ position
     mean[0] = of_k_c @ position[:, 0]
     std = np.sqrt(found.share @ (position - mean) ** 2)

@@ -12,9 +12,9 @@ import pytest
 import soilbus.simulator.monte_carlo as of_room
 from soilbus.assembly import prior_of
 from soilbus.cli import main
+from soilbus.estimation.attainable import Attainable
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.report.monte_carlo import monte_carlo_report
-from soilbus.simulator.attainable import Attainable
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.monte_carlo import (
     MAX_PHI,

@@ -197,11 +197,12 @@ def _held(
 
 
 def told_of_soil(along: Ridge, prior: SoilPrior, before: Belief) -> Array | None:
-    """Variance (nodes, F) of the coordinates that a window on the soil of each node could leave at best.
+    """Variance (nodes, 2) of log k_c and log n that a window on the soil of each node could leave at best.
 
     None where it is not to be told.
     """
     fitting = Fitting(along.problem, prior, before)
+    columns = np.searchsorted(fitting.free, [_K_C, _N])
     variance = []
     for node in along.nodes:
         place = Place(node.fit.optimum.soil, node.fit.optimum.gains, node.fit.optimum.latents, np.inf, 1)
@@ -209,18 +210,18 @@ def told_of_soil(along: Ridge, prior: SoilPrior, before: Belief) -> Array | None
         inverse = None if point is None else solved(point.information, point.gradient)
         if inverse is None:
             return None
-        variance.append(inverse[1].diagonal()[: len(fitting.free)])
+        variance.append(inverse[1].diagonal()[columns])
     return np.array(variance)
 
 
-def counted(centre: Array, told: Array, free: Indices) -> tuple[Array, Array]:
+def counted(centre: Array, told: Array) -> tuple[Array, Array]:
     """Shares (M,) of places as errors there count, for all coordinates and for k_c, by those (M,) of probability.
 
-    told (M, F) is the variance that is left there at best.  For all it is that of n: what is well known of the
-    others together with n so stays it.
+    told (M, 2) is the variance of log k_c and log n that is left there at best.  All but k_c go by that of n: what is
+    well known of the others together with n so stays it.
     """
-    of_all = centre * told[:, int(np.searchsorted(free, _N))] ** (-0.5 * COUNTS)
-    of_k_c = centre * told[:, _K_C] ** (-0.5 * COUNTS_OF_K_C)
+    of_all = centre * told[:, 1] ** (-0.5 * COUNTS)
+    of_k_c = centre * told[:, 0] ** (-0.5 * COUNTS_OF_K_C)
     return of_all / of_all.sum(), of_k_c / of_k_c.sum()
 
 
@@ -228,7 +229,7 @@ def _averaged(nodes: list[Node], told: Array, coordinates: Coordinates, before: 
     """Mean of all nodes and of what lies between them, by straight lines, and its spread about that.
 
     Soils of the ridge let a window tell its soil as unlike as by a factor of ten: the mean is where the mean
-    square error is least if each counts by what is left there at best (`counted`), `told` (nodes, F).
+    square error is least if each counts by what is left there at best (`counted`), `told` (nodes, 2).
     """
     n, free = len(PARAMETERS), coordinates.free
     active = n + np.flatnonzero(np.diag(before.covariance)[n:] > 0.0)
@@ -238,7 +239,7 @@ def _averaged(nodes: list[Node], told: Array, coordinates: Coordinates, before: 
     probable = density(u, np.array([node.unlikelihood for node in nodes]), fine)
     weight = confidence(u, np.array([node.misfit for node in nodes]), fine)
     share = np.array([np.interp(fine, u, one) for one in np.eye(len(u))])
-    left = _next(fine, probable, told[:, _K_C] @ share)
+    left = _next(fine, probable, told[:, 0] @ share)
     known = 1.0 - left / before.variance_of_k_c(coordinates.prior)
     place = np.array([[*coordinates.position(b.soil), *b.gains[active - n]] for b in beliefs])
     unbiased = np.array([_unbiased_k_c(node, before, coordinates.prior) for node in nodes])
@@ -246,7 +247,7 @@ def _averaged(nodes: list[Node], told: Array, coordinates: Coordinates, before: 
     along = place.T @ share
     own = np.array([_in_coordinates(b.covariance, coordinates.log_directions(b.soil), free, active) for b in beliefs])
     centre = known * weight + (1.0 - known) * probable
-    of_all, of_k_c = counted(centre, share.T @ told, free)
+    of_all, of_k_c = counted(centre, share.T @ told)
     mean = along @ of_all
     mean[_K_C] = along[_K_C] @ of_k_c
     off = along - mean[:, None]

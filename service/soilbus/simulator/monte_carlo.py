@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from soilbus.allocator import keep_freed_memory
 from soilbus.assembly import completion_of, model_of, prior_of, rig_of
 from soilbus.config import Config
+from soilbus.estimation.attainable import Attainable, attainable
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.bound import cramer_rao
 from soilbus.estimation.completed import CompletedProblem
@@ -42,7 +43,6 @@ from soilbus.estimation.marginal import with_whole
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import BinStore
-from soilbus.simulator.attainable import Attainable, attainable
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
