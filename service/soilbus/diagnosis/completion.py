@@ -61,12 +61,15 @@ class Checked:
 class Completion:
     """A model with effects as fitted: one Fit and one Checked for each recording.
 
-    before holds what was known when each recording's turn came; sizes what it changes of the
-    evidence that nobody knows how great effects are (see `sizes`).
+    free are the parameters as fitted, those held at the edge of their ranges without a
+    deviation; beforehand the same as nothing was held yet.  before holds what was known when
+    each recording's turn came; sizes what it changes of the evidence that nobody knows how
+    great effects are (see `sizes`).
     """
 
     effects: tuple[Effect, ...]
     free: tuple[Free, ...]
+    beforehand: tuple[Free, ...]
     before: tuple[Belief, ...]
     fits: tuple[Fit, ...]
     checks: tuple[Checked, ...]
@@ -113,8 +116,18 @@ class Completion:
         return all(fit.converged for fit in self.fits)
 
     def as_starts(self) -> tuple[Start, ...]:
-        """Where these fits ended."""
-        return tuple(_start(fit, check.latents) for fit, check in zip(self.fits, self.checks, strict=True))
+        """Where these fits ended, for fits that hold nothing yet."""
+        starts = (_start(fit, check.latents) for fit, check in zip(self.fits, self.checks, strict=True))
+        return tuple(start._replace(gains=self.unheld(start.gains)) for start in starts)
+
+    def unheld(self, gains: Array) -> Array:
+        """Gains (G,) of these fits by the prior deviations that the parameters have beforehand."""
+        n_sensors = len(gains) - len(self.free)
+        pulls = [
+            first.pull_at(f.at(u)) if f.std < first.std else u
+            for f, first, u in zip(self.free, self.beforehand, gains[n_sensors:].tolist(), strict=True)
+        ]
+        return np.concatenate([gains[:n_sensors], pulls])
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -146,7 +159,10 @@ def complete(
     """
     present = records[0].learned
     known = {e.name: [f for f in present.free if f.effect == e.name] for e in present.effects}
-    free = tuple(f for effect in effects for f in known.get(effect.name) or parameters_of(effect, present.n_wheels))
+    beforehand = tuple(
+        f for effect in effects for f in known.get(effect.name) or parameters_of(effect, present.n_wheels)
+    )
+    free = beforehand
     near = None if starts is None else [start.checked for start in starts]
     fitted = _fits(records, prior, effects, free, starts, effort)
     for _ in range(len(free)):
@@ -166,7 +182,7 @@ def complete(
     ]
     added = [effect for effect in effects if effect not in present.effects]
     sizes = sum(_sizes(effect, free, fits, checks) for effect in added)
-    return Completion(tuple(effects), free, tuple(befores), tuple(fits), tuple(checks), sizes)
+    return Completion(tuple(effects), free, beforehand, tuple(befores), tuple(fits), tuple(checks), sizes)
 
 
 def _fits(

@@ -48,7 +48,7 @@ class _Normal:
     """Normal equations of one recording: those of the present model solved for, the effects' left over.
 
     by_effects (P,) is the gradient, left (P, P) the information without the prior's,
-    answer (F + A, P) how the present parameters follow the effects'.
+    answer (F + A, P) how the present parameters follow the effects'; present is that model.
     """
 
     fitting: Fitting
@@ -58,6 +58,7 @@ class _Normal:
     left: Array
     answer: Array
     checked: Latents
+    present: Completion
 
 
 def scores(
@@ -148,7 +149,7 @@ def _normal(
     answer = inverse[1] @ information[base, new]
     left = information[new, new] - np.eye(P) - information[new, base] @ answer
     by_effects = point.gradient[new] - answer.T @ point.gradient[base]
-    return _Normal(fitting, place, point.at, by_effects, left, answer, present.checks[i].latents)
+    return _Normal(fitting, place, point.at, by_effects, left, answer, present.checks[i].latents, present)
 
 
 def _score(effect: Effect, columns: NDArray[np.intp], free: Sequence[Free], normals: Sequence[_Normal]) -> Score:
@@ -209,9 +210,10 @@ def _start(normal: _Normal, columns: NDArray[np.intp], step: Array) -> Start:
     soil = fitting.coordinates.moved(place.soil, follow[:n_free])
     gains = place.gains[:n_known].copy()
     gains[fitting.active[fitting.active < n_known]] += follow[n_free:]
+    start = Start(soil, np.concatenate([normal.present.unheld(gains), step]), checked=normal.checked)
     if share < 1.0:
-        return Start(soil, np.concatenate([gains, step]), checked=normal.checked)
+        return start
     change = np.zeros(len(place.gains))
     change[:n_known], change[n_known + columns] = gains - place.gains[:n_known], step
     latents = fitting.problem.updated(normal.at, place.latents, soil - place.soil, change)
-    return Start(soil, np.concatenate([gains, step]), True, latents, normal.checked)
+    return start._replace(near=True, latents=latents)

@@ -23,6 +23,8 @@ ENOUGH_FAR = 2e-3
 EASED, HELD_BACK = 0.3, 10.0
 """What a step that lowers the cost, and one that does not, makes of the damping."""
 MOST_DAMPING = 1e4
+FOLLOWED = 2
+"""Linearisations that bring latents as measured to their best."""
 NEAR = 2.0
 """Cost for each residual below which one linear step brings the latents to their best."""
 
@@ -33,10 +35,7 @@ def descended(fitting: Fitting, end: Place, start: Place, enough: float) -> Fit 
     `enough` is a fall of the cost that is not worth a step.  None where the numbers are not finite.
     """
     with np.errstate(all="ignore"):
-        at_start = fitting.point(start)
-        if at_start is not None and at_start.cost < end.cost:
-            end = start
-        here = _relaxed(fitting, end)
+        here = _begun(fitting, start, end.cost) or _relaxed(fitting, end)
         if here is None:
             return None
         damping, falling, steps = 1e-2, np.inf, 0
@@ -58,11 +57,30 @@ def _relaxed(fitting: Fitting, place: Place) -> tuple[Place, Point] | None:
     Where residuals are no longer many standard deviations the linear model has brought them there.
     """
     point = fitting.point(place)
-    if point is None or point.cost < NEAR * fitting.problem.n_rows:
-        return None if point is None else (place, point)
+    if point is None:
+        return None
+    return (place, point) if point.cost < NEAR * fitting.problem.n_rows else _followed(fitting, place, point)
+
+
+def _begun(fitting: Fitting, start: Place, below: float) -> tuple[Place, Point] | None:
+    """The start and its normal equations where it costs less than what is to be gone below, latents and all.
+
+    With latents as measured it seems to cost too little, which then no step would lower.
+    """
+    point = fitting.point(start)
+    here = None if point is None else (start, point)
+    for _ in range(FOLLOWED):
+        if here is None or here[1].cost >= below:
+            return None
+        here = _followed(fitting, *here)
+    return here if here is not None and here[1].cost < below else None
+
+
+def _followed(fitting: Fitting, place: Place, point: Point) -> tuple[Place, Point] | None:
+    """The place with its latents where the linear model there says that they fit best."""
     place = fitting.moved(place, point, np.zeros(len(point.gradient)))
-    point = fitting.point(place)
-    return None if point is None else (place, point)
+    there = fitting.point(place)
+    return None if there is None else (place, there)
 
 
 def _enough(fitting: Fitting, point: Point, enough: float) -> float:

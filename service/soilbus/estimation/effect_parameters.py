@@ -36,7 +36,11 @@ class Free:
 
     def allowed(self, pull: float) -> float:
         """So many prior std, kept inside the parameter's range."""
-        return pull if self.within(pull) or self.std == 0.0 else (self.at(pull) - self.value) / self.std
+        return pull if self.within(pull) or self.std == 0.0 else self.pull_at(self.at(pull))
+
+    def pull_at(self, value: float) -> float:
+        """How many prior std a value is from the prior value; the inverse of at()."""
+        return (value - self.value) / self.std
 
     def at(self, pull: float) -> float:
         """The parameter's value so many prior std from its prior value, kept inside its range."""
