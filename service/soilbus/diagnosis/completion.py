@@ -266,8 +266,8 @@ def _fitted(
     if fit.cost > effort.hopeless:
         return None
     fitting, gains = Fitting(problem, prior, before), np.where(problem.gain_std > 0.0, start.gains, 0.0)
-    end = Place(fit.optimum.soil, problem.allowed(fit.optimum.gains), fit.optimum.latents, fit.cost, 0)
-    return descended(fitting, end, fitting.start(start.soil, gains=problem.allowed(gains)), effort.enough) or fit
+    begun = None if start.near else fitting.start(start.soil, gains=problem.allowed(gains))
+    return descended(fitting, fit, begun, effort.nothing) or fit
 
 
 def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects: Sequence[Effect]) -> Belief:

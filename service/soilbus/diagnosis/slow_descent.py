@@ -1,91 +1,172 @@
-"""A slower descent for models that are far from the truth, where the fast one goes astray.
+"""A slower descent for models whose optimum lies far away, or along a valley that bends, where the fast one goes astray.
 
 The cost of a soil with gains and effects depends on where the latents are, and one linear
 step does not bring them to their best where residuals are many standard deviations: then
 the fast descent refuses good steps and creeps.  Here the latents follow at every place
 before its cost counts, and no step is taken that does not lower it (Levenberg-Marquardt on
 what is left: variable projection, Golub & Pereyra 1973, SIAM J. Numer. Anal. 10:413).
+Nearer the optimum steps bend as the residuals do (geodesic acceleration: Transtrum & Sethna
+2012, arXiv:1201.5885).
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from soilbus.estimation.gauss_newton import Fit
-from soilbus.estimation.linearised import Optimum
+from soilbus.estimation.linearised import Linearised, Optimum
 from soilbus.estimation.normal_equations import Fitting, Place, Point
 
+Array = NDArray[np.float64]
+
 MAX_STEPS = 15
-SLOWLY = 30.0
-"""Fall of the cost that is not worth a slow step, over that which is not worth a fast one: a tenth decides nothing."""
 ENOUGH_FAR = 2e-3
 """Share of what the cost is above NEAR that is no fall worth a step."""
-EASED, HELD_BACK = 0.3, 10.0
-"""What a step that lowers the cost, and one that does not, makes of the damping."""
+DAMPING, EASED, HELD_BACK = 1e-2, 0.3, 10.0
+"""The damping of the first step, and what one that lowers the cost, and one that does not, makes of it."""
 MOST_DAMPING = 1e4
 FOLLOWED = 2
 """Linearisations that bring latents as measured to their best."""
 NEAR = 2.0
 """Cost for each residual below which one linear step brings the latents to their best."""
+MAX_TRIED = 3
+"""Shares of a full step that are tried before damping."""
+GOOD = 0.3
+"""Share of the foretold fall that a good step brings."""
+BENT, SHORTER = 4.0, 0.5
+"""How far a bent step goes over how far a straight one could, and how much shorter it is if that was too far."""
 
 
-def descended(fitting: Fitting, end: Place, start: Place, enough: float) -> Fit | None:
-    """The optimum below where the fast descent ended, or below its start where that costs less.
+class _Here(NamedTuple):
+    """A place and the normal equations there."""
 
-    `enough` is a fall of the cost that is not worth a step.  None where the numbers are not finite.
+    place: Place
+    point: Point
+
+
+def descended(fitting: Fitting, fast: Fit, start: Place | None, nothing: float) -> Fit | None:
+    """The optimum below where the fast descent ended, or below its start, if given, where that costs less.
+
+    `nothing` is a fall of the cost that is not worth a step.  None where the numbers are not finite.
     """
+    end = fast.optimum
     with np.errstate(all="ignore"):
-        here = _begun(fitting, start, end.cost) or _relaxed(fitting, end)
+        here = None if start is None else _begun(fitting, start, fast.cost)
+        if here is None:
+            gains = fitting.problem.allowed(end.gains)
+            here = _relaxed(fitting, Place(end.soil, gains, end.latents, fast.cost, 0), end.at)
         if here is None:
             return None
-        damping, falling, steps = 1e-2, np.inf, 0
-        while falling > _enough(fitting, here[1], enough) and damping < MOST_DAMPING and steps < MAX_STEPS:
-            step = here[1].step(damping)
-            there = None if step is None else _relaxed(fitting, fitting.moved(*here, step))
-            steps += 1
-            if there is None or there[1].cost >= here[1].cost:
-                damping *= HELD_BACK
-            else:
-                falling, damping = here[1].cost - there[1].cost, damping * EASED
-                here = there
+        valley, damping, falling, steps = _Valley(fitting), DAMPING, np.inf, 0
+        while falling > _enough(fitting, here.point, nothing) and damping < MOST_DAMPING and steps < MAX_STEPS:
+            there, tried = valley.along(here, nothing) if _is_near(fitting, here.point) else (None, 0)
+            steps += tried
+            if there is here:
+                break
+            if there is None:
+                step = here.point.step(damping)
+                there = None if step is None else _relaxed(fitting, fitting.moved(*here, step))
+                steps += 1
+                if there is None or there.point.cost >= here.point.cost:
+                    damping *= HELD_BACK
+                    continue
+                damping *= EASED
+            falling, here = here.point.cost - there.point.cost, there
         return _fit(fitting, *here, steps, converged=steps < MAX_STEPS)
 
 
-def _relaxed(fitting: Fitting, place: Place) -> tuple[Place, Point] | None:
-    """The place with latents where they fit best, and the normal equations there.
+@dataclass(slots=True)
+class _Valley:
+    """Steps along a valley that bends.
+
+    share: of a full step that the next one takes; bend (R,): second derivative of the
+    residuals along a full step as the last ones foretell it, None where they do not.
+    """
+
+    fitting: Fitting
+    share: float = 1.0
+    bend: Array | None = None
+
+    def along(self, here: _Here, nothing: float) -> tuple[_Here | None, int]:
+        """The place after a part of a full step, None where no part lowers the cost, and how many were tried.
+
+        The same place where less than `nothing` is foreseen.
+        """
+        place, point = here
+        full = point.step()
+        length = 0.0 if full is None else point.length(full)
+        if full is None or length < nothing:
+            return here, 0
+        least: _Here | None = None
+        for tried in range(1, MAX_TRIED + 1):
+            share = self.share
+            step = share * full if self.bend is None else self.fitting.turned(place, point, share, self.bend)
+            there = None if step is None else _at(self.fitting, self.fitting.moved(place, point, step))
+            if step is None or there is None:
+                self.share, self.bend = SHORTER * share, None
+                continue
+            foretold, fall = share * (2.0 - share) * length, point.cost - there.point.cost
+            bend = self.fitting.bend(place, point, step, there.point) / share**2
+            if fall > GOOD * foretold:
+                left = 1.0 - share
+                self.share = min(share / left, 1.0) if left > 0.0 else 1.0
+                self.bend = bend * left**2 if left > 0.0 else None
+                return there, tried
+            if fall > 0.0 and (least is None or there.point.cost < least.point.cost):
+                least = there
+            straight = share * (length / (foretold - fall) * share) ** (1.0 / 3.0)
+            self.share = min(share, BENT * straight) if self.bend is None else SHORTER * share
+            self.bend = bend
+        return least, MAX_TRIED
+
+
+def _at(fitting: Fitting, place: Place) -> _Here | None:
+    point = fitting.point(place)
+    return None if point is None else _Here(place, point)
+
+
+def _is_near(fitting: Fitting, point: Point) -> bool:
+    """Whether one linear step brings the latents to their best."""
+    return point.cost < NEAR * fitting.problem.n_rows
+
+
+def _relaxed(fitting: Fitting, place: Place, at: Linearised | None = None) -> _Here | None:
+    """The place, which may be linearised already, with latents where they fit best, and the normal equations there.
 
     Where residuals are no longer many standard deviations the linear model has brought them there.
     """
-    point = fitting.point(place)
+    point = fitting.point(place) if at is None else fitting.with_before(place, at)
     if point is None:
         return None
-    return (place, point) if point.cost < NEAR * fitting.problem.n_rows else _followed(fitting, place, point)
+    here = _Here(place, point)
+    return here if _is_near(fitting, point) else _followed(fitting, here)
 
 
-def _begun(fitting: Fitting, start: Place, below: float) -> tuple[Place, Point] | None:
+def _begun(fitting: Fitting, start: Place, below: float) -> _Here | None:
     """The start and its normal equations where it costs less than what is to be gone below, latents and all.
 
     With latents as measured it seems to cost too little, which then no step would lower.
     """
-    point = fitting.point(start)
-    here = None if point is None else (start, point)
+    here = _at(fitting, start)
     for _ in range(FOLLOWED):
-        if here is None or here[1].cost >= below:
+        if here is None or here.point.cost >= below:
             return None
-        here = _followed(fitting, *here)
-    return here if here is not None and here[1].cost < below else None
+        here = _followed(fitting, here)
+    return here if here is not None and here.point.cost < below else None
 
 
-def _followed(fitting: Fitting, place: Place, point: Point) -> tuple[Place, Point] | None:
+def _followed(fitting: Fitting, here: _Here) -> _Here | None:
     """The place with its latents where the linear model there says that they fit best."""
-    place = fitting.moved(place, point, np.zeros(len(point.gradient)))
-    there = fitting.point(place)
-    return None if there is None else (place, there)
+    return _at(fitting, fitting.moved(*here, np.zeros(len(here.point.gradient))))
 
 
-def _enough(fitting: Fitting, point: Point, enough: float) -> float:
+def _enough(fitting: Fitting, point: Point, nothing: float) -> float:
     """Fall of the cost at a point below which a step was the last."""
-    return max(SLOWLY * enough, ENOUGH_FAR * (point.cost - NEAR * fitting.problem.n_rows))
+    return max(nothing, ENOUGH_FAR * (point.cost - NEAR * fitting.problem.n_rows))
 
 
 def _fit(fitting: Fitting, place: Place, point: Point, steps: int, converged: bool) -> Fit | None:

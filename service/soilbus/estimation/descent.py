@@ -33,6 +33,8 @@ SLOWLY = 0.5
 MAX_STRIDE = 8.0
 MAX_REFUSED = 5
 """Steps taken back one after the other after which a fit has failed: what is left is noise of the linear model."""
+IDLE, NEARLY = 2, 1.0
+"""Steps in a row that do not lower the cost, and how little they must foresee, after which no further one will."""
 FAR = 10.0
 """Standard deviations on a few instants beyond which an end is not the optimum looked at."""
 
@@ -121,11 +123,13 @@ def settle(
     hopeless: float = np.inf,
     in_all: float = np.inf,
     enough: float = CONVERGED,
+    nothing: float = 0.0,
 ) -> Settled | None:
     """Steps of soil, gains and latents together from a place near the optimum.
 
     `before` is the squared length of the step that led there, if it was one of these; a step
-    of less than `enough` is the last.
+    of less than `enough` is the last, and one after which the cost twice fell by less than
+    `nothing` though little more was foreseen: along a bent valley steps overshoot for ever.
     Given up after more `refusals` in a row, or more `in_all`, and where the foreseen cost is above `hopeless`.
     None where the numbers stop being finite.
 
@@ -137,7 +141,8 @@ def settle(
     iterations, converged = near.trials, False
     last_step: Array | None = None
     last_share = 1.0
-    worse = np.inf
+    worse = lowest = np.inf
+    idle = 0
     for _ in range(most):
         iterations += 1
         point = fitting.point(near)
@@ -164,6 +169,9 @@ def settle(
         near = fitting.moved(near, point, share * full)
         last_step, last_share = full, share
         converged = length < enough or (share == 1.0 and length * length < left_over * before)
+        idle = idle + 1 if length < NEARLY and lowest - point.cost < nothing else 0
+        lowest = min(lowest, point.cost)
+        converged = converged or idle == IDLE
         before = length if share == 1.0 else 0.0
         if converged or point.cost - length > hopeless:
             break

@@ -29,7 +29,9 @@ MAX_ITERATIONS = 30
 MAX_RESUMED = 10
 COMPARED = 3e-3
 """Foreseen fall of the cost that ends fits which are compared by cost: differences below a tenth decide nothing."""
-MAX_ASTRAY = 2
+SLOWLY = 100.0
+"""Fall of the cost that decides nothing, over the foreseen one that ends fits: where steps are slow it takes many."""
+MAX_ASTRAY = 0
 """Refused steps in all of a fit with effects that has a slower descent to fall back on."""
 THINNED = 24
 """Instants of a window that the search for good starts looks at."""
@@ -85,6 +87,11 @@ class Effort(NamedTuple):
     hopeless: float = math.inf
     enough: float = COMPARED
     little: float = LITTLE
+
+    @property
+    def nothing(self) -> float:
+        """Fall of the cost that decides nothing."""
+        return SLOWLY * self.enough
 
 
 THOROUGH = Effort()
@@ -307,12 +314,13 @@ def continued(
     unless the numbers stop being finite.
     """
     fitting, (most, hopeless, enough, little) = Fitting(problem, prior, before), effort
-    settled_within = partial(settle, fitting, left_over=enough, hopeless=hopeless, in_all=MAX_ASTRAY, enough=enough)
+    compared = {"left_over": enough, "enough": enough, "nothing": effort.nothing}
+    settled_within = partial(settle, fitting, hopeless=hopeless, in_all=MAX_ASTRAY, **compared)
     gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
     with np.errstate(all="ignore"):
         if start.near:
             place = fitting.near(start.soil, gains, start.latents)
-            end = settled_within(place, MAX_RESUMED, refusals=1)
+            end = settled_within(place, MAX_RESUMED, refusals=0)
             fit = _fit_at(fitting, end)
             if fit is not None:
                 return fit

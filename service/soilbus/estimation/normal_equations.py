@@ -64,14 +64,16 @@ class Point:
     edges: Array
     at: Linearised
 
-    def step(self, damping: float = 0.0) -> Array | None:
+    def step(self, damping: float = 0.0, gradient: Array | None = None) -> Array | None:
         """Step (F + A,) to the minimum, held back in proportion to the diagonal; None where there is none.
 
         A step that would go beyond an edge goes along it, to where the cost then is least.
+        With another gradient it is that of the parabola with that slope here.
         """
+        gradient = self.gradient if gradient is None else gradient
         curved = self.information + self.bend
         curved.flat[:: len(curved) + 1] *= 1.0 + damping
-        solution = _solution(curved, np.concatenate([self.gradient[None], self.edges]).T)
+        solution = _solution(curved, np.concatenate([gradient[None], self.edges]).T)
         if solution is None:
             return None
         step = -solution[:, 0]
@@ -219,6 +221,23 @@ class Fitting:
         gain_step[self.active] = step[free:]
         latents = self.problem.updated(point.at, place.latents, soil - place.soil, gain_step)
         return self._reached(place, point, soil, place.gains + gain_step, latents)
+
+    def bend(self, place: Place, point: Point, step: Array, there: Point) -> Array:
+        """Second derivative of the residuals (R,) along a step (F + A,) that led from the place to `there`."""
+        straight = point.at.rows @ (self.directions(place) @ step)
+        return np.asarray(2.0 * (there.at.rows[:, 0] - point.at.rows[:, 0] - straight))
+
+    def turned(self, place: Place, point: Point, share: float, bend: Array) -> Array | None:
+        """A share of the full step that bends (R,) as the valley does (F + A,); None where there is no step.
+
+        Geodesic acceleration: Transtrum & Sethna 2012, arXiv:1201.5885.
+        """
+        turning = self.directions(place).T @ (point.at.weighed.T @ bend)
+        return point.step(gradient=share * point.gradient + 0.5 * share**2 * turning)
+
+    def reached(self, place: Place, step: Array) -> Array:
+        """As much of a step (F + A,) as can be taken."""
+        return self._reach(place, step) * step
 
     def _edges(self, place: Place) -> Array:
         """Directions (E, F + A) in which no step from there can go."""
