@@ -11,9 +11,10 @@ from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.daemon.diagnose import Findings
 from soilbus.daemon.recordings import Recordings
 from soilbus.diagnosis.completion import complete
-from soilbus.diagnosis.diagnose import Addition, Diagnosis
+from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.gap import Gap
 from soilbus.diagnosis.learned import WARNING, Correction, Term
+from soilbus.diagnosis.naming import Addition
 from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.verdict import Verdict
 from soilbus.diagnosis.where import Disagreement

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from soilbus.diagnosis.completion import Completion
@@ -45,6 +45,46 @@ WORTH_FITTING = 0.2
 is foreseen: of less the score is as good."""
 
 
+class Standing(NamedTuple):
+    """A model that an effect may be added to: as fitted, the fits it is one of, and the same fitted to few instants.
+
+    The numbers are of all instants, or as the few foretell them: -2 log evidence, cost and gap, residuals held out
+    and in all.
+    """
+
+    known: Completion
+    fits: Fits
+    few: Completion | None
+    evidence: float
+    cost: float
+    gap: float
+    checked_rows: int
+    rows: int
+
+    @classmethod
+    def of(cls, known: Completion, whole: Fits, few: Fits) -> Standing:
+        """A model fitted to all, and from there to the few."""
+        told = known.evidence, known.cost, known.gap, known.checked_rows, known.rows
+        return cls(known, whole, few.of(known.effects, [known.as_starts()], ROUGH), *told)
+
+    @classmethod
+    def foretold(cls, known: Completion, few: Fits, rows: int) -> Standing:
+        """A model fitted to the few alone, of so many residuals in all."""
+        times = rows / known.rows
+        told = known.foreseen(rows), times * known.cost, known.gap, round(times * known.checked_rows), rows
+        return cls(known, few, known, *told)
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """What the model has already."""
+        return self.known.effects
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of the effects."""
+        return frozenset(self.known.names)
+
+
 class Promising(NamedTuple):
     """Candidates worth a fit of all data, with where it starts.
 
@@ -57,36 +97,23 @@ class Promising(NamedTuple):
 
 
 def promising(
-    whole: Fits,
-    few: Fits,
-    present: Completion,
-    candidates: Sequence[Effect],
-    explained: float,
-    again: Collection[str] | None,
+    few: Fits, present: Standing, candidates: Sequence[Effect], explained: float, again: Collection[str] | None
 ) -> Promising:
     """The few candidates that count beside the present model, which explains so much (fall of -2 log evidence).
 
     Foreseen by scores, tried on a few instants; where little is foreseen these tell nothing, and scores are as good
     as fits.  `again` are names that were fitted in an earlier round for the same place.
     """
-    before = few.of(present.effects, [present.as_starts()], ROUGH)
-    foreseen = scores(whole.records, whole.prior, present, candidates)
-    further = [] if before is None else further_scores(few.records, few.prior, before, candidates)
-    times = 1.0 if before is None else present.rows / before.rows
-    most = max(part * -score.evidence for part, of in ((1.0, foreseen), (times, further)) for score in of)
-    if before is None or most < CLEAR:
-        return _of_scores(
-            [*foreseen, *further_scores(whole.records, whole.prior, present, candidates)], least_that_pays(explained)
-        )
-    trials: list[_Trial] = []
-    least = math.inf
-    for found in worth_trying(foreseen, further, again).values():
-        completion = fitted_to_few(few, before, found, least + BEHIND_UNSETTLED)
-        if completion is not None:
-            fall = before.foreseen(present.rows) - completion.foreseen(present.rows)
-            trials.append(_Trial(found[0].effect, completion, fall))
-            least = min(least, completion.cost)
-    return _of_trials(sorted(trials, key=lambda trial: -trial.fall), explained)
+    before, of_known = present.few, (present.fits.records, present.fits.prior, present.known, candidates)
+    foreseen = scores(*of_known)
+    if before is not None:
+        further = further_scores(few.records, few.prior, before, candidates)
+        of_all = ((present.rows / fit.rows, found) for fit, found in ((present.known, foreseen), (before, further)))
+        most = max(times * -score.evidence for times, found in of_all for score in found)
+        if most >= CLEAR or present.known is before:
+            trials = _trials(few, before, worth_trying(foreseen, further, again), present.rows)
+            return _of_trials(trials, explained)
+    return _of_scores([*foreseen, *further_scores(*of_known)], least_that_pays(explained))
 
 
 class _Trial(NamedTuple):
@@ -95,6 +122,18 @@ class _Trial(NamedTuple):
     effect: Effect
     completion: Completion
     fall: float
+
+
+def _trials(few: Fits, before: Completion, found: Mapping[str, Sequence[Score]], rows: int) -> list[_Trial]:
+    """The fits to the few of those found, the best first, with falls foretold of so many residuals."""
+    trials: list[_Trial] = []
+    least = math.inf
+    for of_one in found.values():
+        completion = fitted_to_few(few, before, of_one, least + BEHIND_UNSETTLED)
+        if completion is not None:
+            trials.append(_Trial(of_one[0].effect, completion, before.foreseen(rows) - completion.foreseen(rows)))
+            least = min(least, completion.cost)
+    return sorted(trials, key=lambda trial: -trial.fall)
 
 
 def _of_trials(trials: Sequence[_Trial], explained: float) -> Promising:

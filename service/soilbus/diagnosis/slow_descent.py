@@ -1,4 +1,4 @@
-"""A slower descent for models whose optimum lies far away, or along a valley that bends, where the fast one goes astray.
+"""A slower descent for models whose optimum is far away, or along a valley that bends, where the fast one goes astray.
 
 The cost of a soil with gains and effects depends on where the latents are, and one linear
 step does not bring them to their best where residuals are many standard deviations: then
@@ -35,8 +35,10 @@ NEAR = 2.0
 """Cost for each residual below which one linear step brings the latents to their best."""
 MAX_TRIED = 3
 """Shares of a full step that are tried before damping."""
-GOOD = 0.3
-"""Share of the foretold fall that a good step brings."""
+GOOD, AS_FORETOLD = 0.3, 0.85
+"""Shares of the foretold fall that a good step brings, and one that comes out as foretold."""
+SHORT, LONGER = 0.15, 2.0
+"""Share of a full step below which the next one is longer where it came out as foretold, and how much."""
 BENT, SHORTER = 4.0, 0.5
 """How far a bent step goes over how far a straight one could, and how much shorter it is if that was too far."""
 
@@ -67,6 +69,9 @@ def descended(fitting: Fitting, fast: Fit, start: Place | None, nothing: float) 
             steps += tried
             if there is here:
                 break
+            if there is None and (honest := _honest(fitting, here, nothing)) is not None:
+                here, steps = honest, steps + 1
+                continue
             if there is None:
                 step = here.point.step(damping)
                 there = None if step is None else _relaxed(fitting, fitting.moved(*here, step))
@@ -105,6 +110,9 @@ class _Valley:
         for tried in range(1, MAX_TRIED + 1):
             share = self.share
             step = share * full if self.bend is None else self.fitting.turned(place, point, share, self.bend)
+            if step is not None:
+                reach = self.fitting.reach(place, step)
+                share, step = reach * share, reach * step
             there = None if step is None else _at(self.fitting, self.fitting.moved(place, point, step))
             if step is None or there is None:
                 self.share, self.bend = SHORTER * share, None
@@ -113,7 +121,8 @@ class _Valley:
             bend = self.fitting.bend(place, point, step, there.point) / share**2
             if fall > GOOD * foretold:
                 left = 1.0 - share
-                self.share = min(share / left, 1.0) if left > 0.0 else 1.0
+                further = LONGER if share < SHORT and fall > AS_FORETOLD * foretold else 1.0
+                self.share = min(further * share / left, 1.0) if left > 0.0 else 1.0
                 self.bend = bend * left**2 if left > 0.0 else None
                 return there, tried
             if fall > 0.0 and (least is None or there.point.cost < least.point.cost):
@@ -162,6 +171,17 @@ def _begun(fitting: Fitting, start: Place, below: float) -> _Here | None:
 def _followed(fitting: Fitting, here: _Here) -> _Here | None:
     """The place with its latents where the linear model there says that they fit best."""
     return _at(fitting, fitting.moved(*here, np.zeros(len(here.point.gradient))))
+
+
+def _honest(fitting: Fitting, here: _Here, nothing: float) -> _Here | None:
+    """The same place with its latents at their best where that costs more: no step would lower what it seemed to cost.
+
+    None where it does not, or where every place that is tried is so anyway.
+    """
+    if not _is_near(fitting, here.point):
+        return None
+    there = _followed(fitting, here)
+    return there if there is not None and there.point.cost > here.point.cost + nothing else None
 
 
 def _enough(fitting: Fitting, point: Point, nothing: float) -> float:

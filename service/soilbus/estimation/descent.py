@@ -121,7 +121,6 @@ def settle(
     before: float = 0.0,
     refusals: int = MAX_REFUSED,
     hopeless: float = np.inf,
-    in_all: float = np.inf,
     enough: float = CONVERGED,
     nothing: float = 0.0,
 ) -> Settled | None:
@@ -130,14 +129,14 @@ def settle(
     `before` is the squared length of the step that led there, if it was one of these; a step
     of less than `enough` is the last, and one after which the cost twice fell by less than
     `nothing` though little more was foreseen: along a bent valley steps overshoot for ever.
-    Given up after more `refusals` in a row, or more `in_all`, and where the foreseen cost is above `hopeless`.
+    Given up after more `refusals` in a row, and where the foreseen cost is above `hopeless`.
     None where the numbers stop being finite.
 
     A step that makes things worse is taken back and tried again shorter: damping would
     hold back just the weak directions, along which the steps overshoot.
     """
     best: tuple[Place, Point] | None = None
-    share, length, refused, of_all = 1.0, np.inf, 0, 0
+    share, length, refused = 1.0, np.inf, 0
     iterations, converged = near.trials, False
     last_step: Array | None = None
     last_share = 1.0
@@ -153,8 +152,8 @@ def settle(
                 point = fitting.point(near)
             share = 0.4 * min(share, 1.0)
             before, last_step = 0.0, None  # nothing can be foreseen after a refused step
-            refused, of_all = refused + 1, of_all + 1
-            if refused > refusals or of_all > in_all:
+            refused += 1
+            if refused > refusals:
                 break
         else:
             share, refused = min(2.0 * share, 1.0), 0

@@ -31,8 +31,6 @@ COMPARED = 3e-3
 """Foreseen fall of the cost that ends fits which are compared by cost: differences below a tenth decide nothing."""
 SLOWLY = 100.0
 """Fall of the cost that decides nothing, over the foreseen one that ends fits: where steps are slow it takes many."""
-MAX_ASTRAY = 0
-"""Refused steps in all of a fit with effects that has a slower descent to fall back on."""
 THINNED = 24
 """Instants of a window that the search for good starts looks at."""
 MAX_KINDS = 2
@@ -311,24 +309,24 @@ def continued(
     """Descent from a start, of whose gains those from the `first` on move with the soil from the beginning.
 
     Where a fit of the same model ended is near the optimum: everything moves from there,
-    unless the numbers stop being finite.
+    unless the numbers stop being finite.  The first step that makes things worse ends it: a slower descent is better.
     """
     fitting, (most, hopeless, enough, little) = Fitting(problem, prior, before), effort
-    compared = {"left_over": enough, "enough": enough, "nothing": effort.nothing}
-    settled_within = partial(settle, fitting, hopeless=hopeless, in_all=MAX_ASTRAY, **compared)
+    compared = partial(
+        settle, fitting, left_over=enough, refusals=0, hopeless=hopeless, enough=enough, nothing=effort.nothing
+    )
     gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
     with np.errstate(all="ignore"):
         if start.near:
             place = fitting.near(start.soil, gains, start.latents)
-            end = settled_within(place, MAX_RESUMED, refusals=0)
-            fit = _fit_at(fitting, end)
+            fit = _fit_at(fitting, compared(place, MAX_RESUMED))
             if fit is not None:
                 return fit
         moving = Fitting(problem, prior, before, first=first)
         near = approach(moving, start.soil, most // 2, little, gains, hopeless=AS_MEASURED * hopeless)
         if near is None:
             return None
-        return _fit_at(fitting, settled_within(near, most))
+        return _fit_at(fitting, compared(near, most))
 
 
 @dataclass(frozen=True, slots=True)

@@ -154,7 +154,7 @@ class Fitting:
     def restarted(self, place: Place, point: Point, step: Array) -> Place:
         """The place after a step (F + A,) with latents as measured, as they are at this place already."""
         free, gains = len(self.free), place.gains.copy()
-        step = self._reach(place, step) * step
+        step = self.reach(place, step) * step
         gains[self.active] += step[free:]
         soil, gains = self.coordinates.moved(place.soil, step[:free]), self.problem.allowed(gains)
         angle = self.problem.turned(point.at, place.latents.entry_angle, soil - place.soil, gains - place.gains)
@@ -215,7 +215,7 @@ class Fitting:
     def moved(self, place: Place, point: Point, step: Array) -> Place:
         """The place after a step (F + A,), with the latents that the linear model foresees."""
         free = len(self.free)
-        step = self._reach(place, step) * step
+        step = self.reach(place, step) * step
         soil = self.coordinates.moved(place.soil, step[:free])
         gain_step = np.zeros(len(place.gains))
         gain_step[self.active] = step[free:]
@@ -235,10 +235,6 @@ class Fitting:
         turning = self.directions(place).T @ (point.at.weighed.T @ bend)
         return point.step(gradient=share * point.gradient + 0.5 * share**2 * turning)
 
-    def reached(self, place: Place, step: Array) -> Array:
-        """As much of a step (F + A,) as can be taken."""
-        return self._reach(place, step) * step
-
     def _edges(self, place: Place) -> Array:
         """Directions (E, F + A) in which no step from there can go."""
         of_soil = self.coordinates.edges(place.soil)
@@ -251,7 +247,7 @@ class Fitting:
         edges[len(of_soil) + np.arange(len(own)), len(self.free) + own] = at[own]
         return edges
 
-    def _reach(self, place: Place, step: Array) -> float:
+    def reach(self, place: Place, step: Array) -> float:
         """Share of a step (F + A,) that can be taken."""
         free = len(self.free)
         of_soil = self.coordinates.reach(place.soil, step[:free])

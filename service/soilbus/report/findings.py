@@ -10,8 +10,8 @@ from typing import Any
 from soilbus.config import Config
 from soilbus.daemon.diagnose import Findings
 from soilbus.diagnosis.completion import Completion
-from soilbus.diagnosis.diagnose import Addition
 from soilbus.diagnosis.learned import WARNING, Correction
+from soilbus.diagnosis.naming import Addition
 from soilbus.diagnosis.verdict import Verdict, gap_limit
 from soilbus.diagnosis.where import Disagreement
 from soilbus.estimation.posterior import Estimate, Posterior

@@ -1,0 +1,108 @@
+"""Which effect is missing beside a model: the promising ones fitted to all data, compared by evidence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from soilbus.diagnosis.candidates import STEPS, Promising, Standing, promising
+from soilbus.diagnosis.completion import Completion
+from soilbus.diagnosis.fits import Fits
+from soilbus.diagnosis.verdict import PLAUSIBLE, hopeless_from, price, probabilities
+from soilbus.estimation.gauss_newton import Effort
+from soilbus.terra.effects.effect import Effect
+
+ASTRAY = 3.0
+"""Gap of a model that is off by so much that further steps of a fit decide nothing."""
+SHARE_OF_PRICE = 0.3
+"""Share of what an effect must explain that its fit to the blocks learned from must, after one that did not."""
+
+
+@dataclass(frozen=True, slots=True)
+class Addition:
+    """One round: the effect added, its probability, and the other names with theirs; falls of -2 log evidence.
+
+    beside are the names of the effects beside which it was named; form_left is that of all these effects, by their
+    probabilities (root mean square).
+    """
+
+    effect: Effect
+    probability: float
+    alternatives: dict[str, float]
+    falls: dict[str, float]
+    beside: frozenset[str] = frozenset()
+    form_left: float = Effect.form_left
+
+    def beside_another(self, effect: Effect, other: Effect) -> Addition:
+        """The same with one effect beside it in place of another."""
+        if effect.name not in self.beside:
+            return self
+        return replace(self, beside=self.beside - {effect.name} | {other.name})
+
+
+def named(
+    whole: Fits,
+    few: Fits,
+    present: Standing,
+    candidates: Sequence[Effect],
+    explained: float,
+    again: Collection[str] | None = None,
+) -> tuple[Addition, Completion] | None:
+    """The best effect to add to the present model, which explains so much, and the model with it; None where none pays.
+
+    `again` are names that were fitted in an earlier round for the same place.
+    """
+    counted = promising(few, present, candidates, explained, again)
+    asked = price(explained, present.gap, present.checked_rows, present.rows)
+    fitted, at_most = _fitted(whole, present, counted, explained, asked)
+    if not fitted:
+        return None
+    best = min(fitted, key=lambda name: fitted[name][1].evidence)
+    if present.evidence - fitted[best][1].evidence < asked:
+        fitted[best] = fitted[best][0], converged(whole, present.evidence, fitted[best][1])
+    falls = {name: present.evidence - completion.evidence for name, (_, completion) in fitted.items()}
+    best = max(falls, key=lambda name: falls[name])
+    if falls[best] < asked:
+        return None
+    falls |= {name: min(fall, falls[best]) for name, fall in counted.foreseen.items()}
+    foretold = {name: falls[best] - behind for name, behind in counted.behind.items() if name not in fitted}
+    falls |= {name: min(fall, at_most.get(name, fall)) for name, fall in foretold.items()}
+    chances = probabilities(falls, explained)
+    others = {n: p for n, p in chances.items() if n != best and p >= PLAUSIBLE}
+    effect, completion = fitted[best]
+    form_left = _form_left({n: p for n, p in chances.items() if n == best or n in others}, candidates)
+    return Addition(effect, chances[best], others, falls, present.names, form_left), completion
+
+
+def _form_left(chances: Mapping[str, float], candidates: Iterable[Effect]) -> float:
+    """Root mean square, by their probabilities, of what the formulas of these effects leave in the soil."""
+    left = {effect.name: effect.form_left for effect in candidates}
+    return math.sqrt(sum(p * left[name] ** 2 for name, p in chances.items()) / sum(chances.values()))
+
+
+def _fitted(
+    whole: Fits, present: Standing, counted: Promising, explained: float, asked: float
+) -> tuple[dict[str, tuple[Effect, Completion]], dict[str, float]]:
+    """Candidates with their fits to all data by name, and falls of -2 log evidence that those given up stay below."""
+    fitted: dict[str, tuple[Effect, Completion]] = {}
+    at_most: dict[str, float] = {}
+    behind = worthless = math.inf
+    for effect, starts in counted.fits:
+        completion = whole.of((*present.effects, effect), [starts], Effort(STEPS, min(behind, worthless)))
+        if completion is None:
+            at_most[effect.name] = max(present.cost - min(behind, worthless), 0.0)
+            continue
+        fitted[effect.name] = effect, completion
+        fall = present.evidence - completion.evidence
+        behind = min(behind, completion.cost + hopeless_from(explained + fall))
+        worthless = present.cost - SHARE_OF_PRICE * asked if fall < asked else math.inf
+    return fitted, at_most
+
+
+def converged(whole: Fits, evidence: float, completion: Completion) -> Completion:
+    """The same, or where further steps lead if they were too few, and it is better than that and not astray."""
+    if completion.converged or completion.evidence > evidence or completion.gap > ASTRAY:
+        return completion
+    further = whole.of(completion.effects, [completion.as_starts()])
+    return completion if further is None or further.evidence > completion.evidence else further

@@ -1,0 +1,111 @@
+"""Effects that were named beside others than are there now, named anew: alone, one may have stood for two."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from soilbus.diagnosis.candidates import (
+    BEHIND_UNSETTLED,
+    CLEAR,
+    ROUGH,
+    STEPS,
+    Standing,
+    fitted_to_few,
+    worth_trying,
+)
+from soilbus.diagnosis.completion import Completion
+from soilbus.diagnosis.fits import Fits
+from soilbus.diagnosis.naming import Addition, named
+from soilbus.diagnosis.score import further_scores, scores
+from soilbus.diagnosis.verdict import PAYS, hopeless, probabilities
+from soilbus.estimation.gauss_newton import Effort
+from soilbus.terra.effects.effect import Effect
+
+SAME = 1.0
+"""Difference of -2 log evidence that is none."""
+
+
+def reconsidered(
+    whole: Fits,
+    few: Fits,
+    base: Completion,
+    present: Completion,
+    additions: Sequence[Addition],
+    candidates: Sequence[Effect],
+) -> tuple[list[Addition], Completion]:
+    """The additions and the model with them, each effect named beside those that are there now."""
+    chosen, looked = list(additions), set[frozenset[str]]()
+    while stale := [a for a in chosen if a.beside != (others := _others(a, present)) and others not in looked]:
+        addition = stale[0]
+        effect, others = addition.effect, _others(addition, present)
+        looked.add(others)
+        place = chosen.index(addition)
+        left = [candidate for candidate in candidates if candidate.name not in others]
+        here, without = few.of(present.effects, [present.as_starts()], ROUGH), _without(few, present, effect, ROUGH)
+        fall = 0.0 if here is None or without is None else _fall(without, here, present.rows)
+        fitted: Completion | None = None
+        if here is not None and without is not None and fall > CLEAR:
+            explained = base.evidence - present.evidence
+            if not _rivals(few, without, addition, left, here, explained, present.rows):
+                (chance,) = probabilities({effect.name: fall}, explained - fall).values()
+                chosen[place] = Addition(effect, chance, {}, {effect.name: fall}, others, effect.form_left)
+                continue
+            standing = Standing.foretold(without, few, present.rows)
+        else:
+            fitted = _without(whole, present, effect, Effort(STEPS))
+            if fitted is None:
+                continue
+            standing = Standing.of(fitted, whole, few)
+        found = named(whole, few, standing, left, base.evidence - standing.evidence, addition.falls)
+        if found is None and fitted is not None and fitted.evidence < present.evidence + PAYS:
+            present = fitted
+            del chosen[place]
+        elif found is not None and found[1].evidence < present.evidence + SAME:
+            if present.evidence - found[1].evidence < PAYS:  # what stands beside is named as well beside the other
+                chosen = [a.beside_another(effect, found[0].effect) for a in chosen]
+            chosen[place], present = found
+    order = {name: i for i, name in enumerate(present.names)}
+    return sorted(chosen, key=lambda addition: order[addition.effect.name]), present
+
+
+def _rivals(
+    few: Fits,
+    without: Completion,
+    addition: Addition,
+    candidates: Sequence[Effect],
+    here: Completion,
+    explained: float,
+    rows: int,
+) -> bool:
+    """Whether another effect may belong in the place of one, by fits to the few without it and with it (here)."""
+    of = few.records, few.prior, without, candidates
+    found = worth_trying(scores(*of), further_scores(*of), addition.falls)
+    for rival in candidates:
+        if rival.name in found and rival.name != addition.effect.name:
+            completion = fitted_to_few(few, without, found[rival.name], here.cost + BEHIND_UNSETTLED)
+            if completion is not None and not hopeless(_fall(completion, here, rows), explained):
+                return True
+    return False
+
+
+def _fall(before: Completion, after: Completion, rows: int) -> float:
+    """Fall of -2 log evidence between two fits to the few, foretold of so many residuals."""
+    return before.foreseen(rows) - after.foreseen(rows)
+
+
+def _others(addition: Addition, present: Completion) -> frozenset[str]:
+    """Names of the present model's effects but that one's."""
+    return frozenset(present.names) - {addition.effect.name}
+
+
+def _without(fits: Fits, present: Completion, effect: Effect, effort: Effort) -> Completion | None:
+    """The present model less one effect, fitted from where it stands."""
+    n_sensors = fits.records[0].learned.n_sensors
+    kept = [n_sensors + i for i, f in enumerate(present.free) if f.effect != effect.name]
+    starts = [
+        start._replace(gains=np.concatenate([start.gains[:n_sensors], start.gains[kept]]))
+        for start in present.as_starts()
+    ]
+    return fits.of([e for e in present.effects if e.name != effect.name], [starts], effort)
