@@ -263,11 +263,10 @@ def _fitted(
     fit = continued(problem, prior, before, start, problem.n_sensors, effort)
     if fit is None or fit.converged:
         return fit
-    if fit.cost > effort.hopeless:
-        return None
     fitting, gains = Fitting(problem, prior, before), np.where(problem.gain_std > 0.0, start.gains, 0.0)
     begun = None if start.near else fitting.start(start.soil, gains=problem.allowed(gains))
-    return descended(fitting, fit, begun, effort.nothing) or fit
+    slow = descended(fitting, fit, begun, effort)
+    return None if (slow or fit).cost > effort.hopeless else slow or fit
 
 
 def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects: Sequence[Effect]) -> Belief:

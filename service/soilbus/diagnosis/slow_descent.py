@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.gauss_newton import Fit
+from soilbus.estimation.gauss_newton import Effort, Fit
 from soilbus.estimation.linearised import Linearised, Optimum
 from soilbus.estimation.normal_equations import Fitting, Place, Point
 
@@ -50,12 +50,13 @@ class _Here(NamedTuple):
     point: Point
 
 
-def descended(fitting: Fitting, fast: Fit, start: Place | None, nothing: float) -> Fit | None:
+def descended(fitting: Fitting, fast: Fit, start: Place | None, effort: Effort) -> Fit | None:
     """The optimum below where the fast descent ended, or below its start, if given, where that costs less.
 
-    `nothing` is a fall of the cost that is not worth a step.  None where the numbers are not finite.
+    It ends where no more is foreseen than decides nothing, or what is foreseen is above what is hopeless.  None where
+    the numbers are not finite.
     """
-    end = fast.optimum
+    nothing, end = effort.nothing, fast.optimum
     with np.errstate(all="ignore"):
         here = None if start is None else _begun(fitting, start, fast.cost)
         if here is None:
@@ -65,10 +66,12 @@ def descended(fitting: Fitting, fast: Fit, start: Place | None, nothing: float) 
             return None
         valley, damping, falling, steps = _Valley(fitting), DAMPING, np.inf, 0
         while falling > _enough(fitting, here.point, nothing) and damping < MOST_DAMPING and steps < MAX_STEPS:
-            there, tried = valley.along(here, nothing) if _is_near(fitting, here.point) else (None, 0)
-            steps += tried
-            if there is here:
+            full = here.point.step()
+            length = 0.0 if full is None else here.point.length(full)
+            if full is None or length < nothing or here.point.cost - length > effort.hopeless:
                 break
+            there, tried = valley.along(here, full) if _is_near(fitting, here.point) else (None, 0)
+            steps += tried
             if there is None and (honest := _honest(fitting, here, nothing)) is not None:
                 here, steps = honest, steps + 1
                 continue
@@ -96,16 +99,10 @@ class _Valley:
     share: float = 1.0
     bend: Array | None = None
 
-    def along(self, here: _Here, nothing: float) -> tuple[_Here | None, int]:
-        """The place after a part of a full step, None where no part lowers the cost, and how many were tried.
-
-        The same place where less than `nothing` is foreseen.
-        """
+    def along(self, here: _Here, full: Array) -> tuple[_Here | None, int]:
+        """The place after a part of a full step (F + A,), None where none lowers the cost, and how many were tried."""
         place, point = here
-        full = point.step()
-        length = 0.0 if full is None else point.length(full)
-        if full is None or length < nothing:
-            return here, 0
+        length = point.length(full)
         least: _Here | None = None
         for tried in range(1, MAX_TRIED + 1):
             share = self.share
