@@ -58,10 +58,13 @@ def descended(fitting: Fitting, fast: Fit, start: Place | None, effort: Effort) 
     """
     nothing, end = effort.nothing, fast.optimum
     with np.errstate(all="ignore"):
+        gains = fitting.problem.allowed(end.gains)
+        ended = Place(end.soil, gains, end.latents, fast.cost, 0)
+        if _foreseen(fitting.with_before(ended, end.at)) > effort.hopeless:
+            return None
         here = None if start is None else _begun(fitting, start, fast.cost)
         if here is None:
-            gains = fitting.problem.allowed(end.gains)
-            here = _relaxed(fitting, Place(end.soil, gains, end.latents, fast.cost, 0), end.at)
+            here = _relaxed(fitting, ended, end.at)
         if here is None:
             return None
         valley, damping, falling, steps = _Valley(fitting), DAMPING, np.inf, 0
@@ -128,6 +131,12 @@ class _Valley:
             self.share = min(share, BENT * straight) if self.bend is None else SHORTER * share
             self.bend = bend
         return least, MAX_TRIED
+
+
+def _foreseen(point: Point | None) -> float:
+    """The cost after a full step, if all were linear."""
+    step = None if point is None else point.step()
+    return np.inf if point is None or step is None else point.cost - point.length(step)
 
 
 def _at(fitting: Fitting, place: Place) -> _Here | None:

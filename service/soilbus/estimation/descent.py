@@ -64,8 +64,8 @@ def approach(
 ) -> Place | None:
     """Levenberg-damped steps of the soil and the active gains, latents as measured, until they are short.
 
-    A descent that is foreseen to end at one of the `known` places ends there at once, one
-    that is foreseen to cost more than `hopeless` where it is.
+    A descent that is foreseen to end at one of the `known` places ends there at once; one
+    that is foreseen to cost more than `hopeless`, or that has no further step, is None.
     """
     place = fitting.start(soil, gains=gains)
     point = fitting.point(place)
@@ -75,7 +75,9 @@ def approach(
         if step is None:
             return None
         length = point.length(step)
-        if length < SETTLING or trials >= most or damping > 1e6 or point.cost - length > hopeless:
+        if point.cost - length > hopeless:
+            return None
+        if length < SETTLING or trials >= most or damping > 1e6:
             return replace(place, cost=point.cost, trials=trials)
         for end in known:
             if _leads_to(fitting, place, point, step, end):
