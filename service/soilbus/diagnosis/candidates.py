@@ -36,7 +36,7 @@ BEHIND_UNSETTLED = 250.0
 """Cost on a few instants above the least one's from which a candidate is given up, converged or not."""
 STEPS = 12
 """Steps of the soil, and then of everything, in which a candidate that explains much is fitted."""
-ROUGH = Effort(STEPS, enough=0.02, little=5e-3)
+ROUGH = Effort(STEPS, enough=0.1, little=5e-3)
 """The same where few instants tell which candidates to fit to all."""
 WORTH_TRYING = -2.0
 """Foreseen change of -2 log evidence above which a candidate does not count."""

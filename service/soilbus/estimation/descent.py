@@ -142,7 +142,8 @@ def settle(
     iterations, converged = near.trials, False
     last_step: Array | None = None
     last_share = 1.0
-    worse = lowest = np.inf
+    worse = np.inf
+    lowest: Settled | None = None
     idle = 0
     for _ in range(most):
         iterations += 1
@@ -170,12 +171,14 @@ def settle(
         near = fitting.moved(near, point, share * full)
         last_step, last_share = full, share
         converged = length < enough or (share == 1.0 and length * length < left_over * before)
-        idle = idle + 1 if length < NEARLY and lowest - point.cost < nothing else 0
-        lowest = min(lowest, point.cost)
-        converged = converged or idle == IDLE
         before = length if share == 1.0 else 0.0
         if converged or point.cost - length > hopeless:
             break
+        idle = idle + 1 if lowest is not None and lowest.point.cost - point.cost < nothing else 0
+        if lowest is None or point.cost < lowest.point.cost:
+            lowest = Settled(near, *best, length, iterations, converged=True)
+        if idle >= IDLE and lowest.length < NEARLY and nothing > 0.0:
+            return lowest._replace(iterations=iterations)
     if best is None:
         return None
     return Settled(near, *best, length, iterations, converged)
