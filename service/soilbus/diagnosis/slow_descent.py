@@ -33,6 +33,8 @@ FOLLOWED = 2
 """Linearisations that bring latents as measured to their best."""
 NEAR = 2.0
 """Cost for each residual below which one linear step brings the latents to their best."""
+EVEN = 1e-2
+"""Share of the cost that a further one changes where it does so elsewhere."""
 MAX_TRIED = 3
 """Shares of a full step that are tried before damping."""
 GOOD, AS_FORETOLD = 0.3, 0.85
@@ -56,31 +58,30 @@ def descended(fitting: Fitting, fast: Fit, start: Place | None, effort: Effort) 
     It ends where no more is foreseen than decides nothing, or what is foreseen is above what is hopeless.  None where
     the numbers are not finite.
     """
-    nothing, end = effort.nothing, fast.optimum
+    ground, end = _Ground(fitting), fast.optimum
     with np.errstate(all="ignore"):
-        gains = fitting.problem.allowed(end.gains)
-        ended = Place(end.soil, gains, end.latents, fast.cost, 0)
+        ended = Place(end.soil, fitting.problem.allowed(end.gains), end.latents, fast.cost, 0)
         if _foreseen(fitting.with_before(ended, end.at)) > effort.hopeless:
             return None
         here = None if start is None else _begun(fitting, start, fast.cost)
         if here is None:
-            here = _relaxed(fitting, ended, end.at)
+            here = ground.at(ended, end.at)
         if here is None:
             return None
         valley, damping, falling, steps = _Valley(fitting), DAMPING, np.inf, 0
-        while falling > _enough(fitting, here.point, nothing) and damping < MOST_DAMPING and steps < MAX_STEPS:
-            full = here.point.step()
-            length = 0.0 if full is None else here.point.length(full)
-            if full is None or length < nothing or here.point.cost - length > effort.hopeless:
+        while damping < MOST_DAMPING and steps < MAX_STEPS:
+            enough = _enough(fitting, here.point, effort.nothing)
+            foreseen = _foreseen(here.point)
+            if falling < enough or foreseen > min(here.point.cost - effort.nothing, effort.hopeless):
                 break
-            there, tried = valley.along(here, full) if _is_near(fitting, here.point) else (None, 0)
+            there, tried = valley.along(here) if ground.is_even(here.point) else (None, 0)
             steps += tried
-            if there is None and (honest := _honest(fitting, here, nothing)) is not None:
+            if there is None and (honest := ground.honest(here, enough)) is not None:
                 here, steps = honest, steps + 1
                 continue
             if there is None:
                 step = here.point.step(damping)
-                there = None if step is None else _relaxed(fitting, fitting.moved(*here, step))
+                there = None if step is None else ground.at(fitting.moved(*here, step))
                 steps += 1
                 if there is None or there.point.cost >= here.point.cost:
                     damping *= HELD_BACK
@@ -88,6 +89,40 @@ def descended(fitting: Fitting, fast: Fit, start: Place | None, effort: Effort) 
                 damping *= EASED
             falling, here = here.point.cost - there.point.cost, there
         return _fit(fitting, *here, steps, converged=steps < MAX_STEPS)
+
+
+@dataclass(slots=True)
+class _Ground:
+    """Places with their latents where they fit best; `even` where the linear model brings them there by itself."""
+
+    fitting: Fitting
+    even: bool = False
+
+    def is_even(self, point: Point) -> bool:
+        """Whether one linear step brings the latents to their best: where the last one did, and near the optimum."""
+        return self.even or point.cost < NEAR * self.fitting.problem.n_rows
+
+    def at(self, place: Place, at: Linearised | None = None) -> _Here | None:
+        """A place, which may be linearised already, with its latents at their best, and the normal equations there."""
+        point = self.fitting.point(place) if at is None else self.fitting.with_before(place, at)
+        if point is None:
+            return None
+        here = _Here(place, point)
+        if self.is_even(point):
+            return here
+        there = _followed(self.fitting, here)
+        self.even = there is not None and abs(there.point.cost - point.cost) < EVEN * point.cost
+        return there
+
+    def honest(self, here: _Here, enough: float) -> _Here | None:
+        """The same place with its latents at their best where that costs more: no step lowers what it seemed to cost.
+
+        None where it does not, or where every place that is tried is so anyway.
+        """
+        if not self.is_even(here.point):
+            return None
+        there, self.even = _followed(self.fitting, here), False
+        return there if there is not None and there.point.cost > here.point.cost + enough else None
 
 
 @dataclass(slots=True)
@@ -102,11 +137,13 @@ class _Valley:
     share: float = 1.0
     bend: Array | None = None
 
-    def along(self, here: _Here, full: Array) -> tuple[_Here | None, int]:
-        """The place after a part of a full step (F + A,), None where none lowers the cost, and how many were tried."""
+    def along(self, here: _Here) -> tuple[_Here | None, int]:
+        """The place after a part of a full step, None where none lowers the cost, and how many were tried."""
         place, point = here
-        length = point.length(full)
-        least: _Here | None = None
+        full = point.step()
+        if full is None:
+            return None, 0
+        length, least = point.length(full), None
         for tried in range(1, MAX_TRIED + 1):
             share = self.share
             step = share * full if self.bend is None else self.fitting.turned(place, point, share, self.bend)
@@ -144,23 +181,6 @@ def _at(fitting: Fitting, place: Place) -> _Here | None:
     return None if point is None else _Here(place, point)
 
 
-def _is_near(fitting: Fitting, point: Point) -> bool:
-    """Whether one linear step brings the latents to their best."""
-    return point.cost < NEAR * fitting.problem.n_rows
-
-
-def _relaxed(fitting: Fitting, place: Place, at: Linearised | None = None) -> _Here | None:
-    """The place, which may be linearised already, with latents where they fit best, and the normal equations there.
-
-    Where residuals are no longer many standard deviations the linear model has brought them there.
-    """
-    point = fitting.point(place) if at is None else fitting.with_before(place, at)
-    if point is None:
-        return None
-    here = _Here(place, point)
-    return here if _is_near(fitting, point) else _followed(fitting, here)
-
-
 def _begun(fitting: Fitting, start: Place, below: float) -> _Here | None:
     """The start and its normal equations where it costs less than what is to be gone below, latents and all.
 
@@ -177,17 +197,6 @@ def _begun(fitting: Fitting, start: Place, below: float) -> _Here | None:
 def _followed(fitting: Fitting, here: _Here) -> _Here | None:
     """The place with its latents where the linear model there says that they fit best."""
     return _at(fitting, fitting.moved(*here, np.zeros(len(here.point.gradient))))
-
-
-def _honest(fitting: Fitting, here: _Here, nothing: float) -> _Here | None:
-    """The same place with its latents at their best where that costs more: no step would lower what it seemed to cost.
-
-    None where it does not, or where every place that is tried is so anyway.
-    """
-    if not _is_near(fitting, here.point):
-        return None
-    there = _followed(fitting, here)
-    return there if there is not None and there.point.cost > here.point.cost + nothing else None
 
 
 def _enough(fitting: Fitting, point: Point, nothing: float) -> float:
