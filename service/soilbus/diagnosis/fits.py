@@ -11,8 +11,15 @@ from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
 
 
+NOTHING = 1.0
+"""Fall of the cost by which an effect explains nothing."""
+
+
 class Fits:
-    """Recordings and the models fitted to them: none again that converged, or from where it was fitted before."""
+    """Recordings and the models fitted to them.
+
+    None again that converged and is better than with fewer effects, or from where it was fitted before.
+    """
 
     def __init__(self, records: Sequence[Record], prior: SoilPrior) -> None:
         self.records, self.prior = tuple(records), prior
@@ -32,9 +39,9 @@ class Fits:
         is left out.
         """
         names = frozenset(effect.name for effect in effects)
-        if names in self._converged:
-            return self._converged[names]
-        best: Completion | None = None
+        best = self._converged.get(names)
+        if best is not None and not self._explains_nothing(names):
+            return best
         for i, start in enumerate(starts or (None,)):
             if best is not None and best.converged and i < len(foreseen) and best.evidence <= foreseen[i]:
                 continue
@@ -47,6 +54,11 @@ class Fits:
         if best is not None and best.converged:
             self._converged[names] = best
         return best
+
+    def _explains_nothing(self, names: frozenset[str]) -> bool:
+        """Whether a model costs no less than one with some of its effects: from elsewhere it may find its place."""
+        cost = self._converged[names].cost
+        return any(less < names and fit.cost < cost + NOTHING for less, fit in self._converged.items())
 
 
 def _key(starts: Sequence[Start] | None) -> Hashable:
