@@ -13,13 +13,11 @@ from soilbus.diagnosis.verdict import hopeless, least_that_pays
 from soilbus.estimation.gauss_newton import Effort, Start
 from soilbus.terra.effects.effect import Effect
 
-TRIED, FURTHER = 6, 4
+TRIED, FURTHER = 4, 4
 """Candidates of a round that are fitted to a few instants: the best by their scores, and by those of further starts.
 
 Of 77 rounds of the tune halves of seeds 112 and 113 the one that was named was among the best four or three.
 """
-TRIED_AGAIN = 4
-"""The same of a round that names an effect anew, besides those that were fitted when it was named first."""
 COUNTED, FITTED = 6, 3
 """Those of them that count, if only by what few instants foretell, and those that are fitted to all."""
 THINNED = 4
@@ -162,7 +160,7 @@ def worth_trying(
     foreseen: Sequence[Score], further: Sequence[Score], again: Collection[str] | None
 ) -> dict[str, list[Score]]:
     """Scores of the candidates that count by name, the best foreseen first; `again` as of promising()."""
-    first = foreseen[: TRIED if again is None else TRIED_AGAIN]
+    first = foreseen[:TRIED]
     named = [score for score in foreseen[len(first) :] if again is not None and score.effect.name in again]
     found: dict[str, list[Score]] = {}
     for score in (*first, *named, *sorted(further, key=lambda score: score.evidence)[:FURTHER]):
