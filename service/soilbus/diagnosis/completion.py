@@ -115,10 +115,21 @@ class Completion:
         """Whether every fit ended at its optimum."""
         return all(fit.converged for fit in self.fits)
 
-    def as_starts(self) -> tuple[Start, ...]:
-        """Where these fits ended, for fits that hold nothing yet."""
-        starts = (_start(fit, check.latents) for fit, check in zip(self.fits, self.checks, strict=True))
-        return tuple(start._replace(gains=self.unheld(start.gains)) for start in starts)
+    def as_starts(self, effects: Sequence[Effect] | None = None) -> tuple[Start, ...]:
+        """Where these fits ended, for fits that hold nothing yet; of other effects those they had not are absent."""
+        starts = [_start(fit, check.latents) for fit, check in zip(self.fits, self.checks, strict=True)]
+        problem = self.checks[0].problem
+        told = self.effects if effects is None else effects
+        return tuple(s._replace(gains=self._of_effects(self.unheld(s.gains), told, problem.n_wheels)) for s in starts)
+
+    def _of_effects(self, gains: Array, effects: Sequence[Effect], n_wheels: int) -> Array:
+        """Gains (G,) of the sensors and of these effects."""
+        n_sensors = len(gains) - len(self.free)
+        parts = [gains[:n_sensors]]
+        for effect in effects:
+            own = [n_sensors + i for i, f in enumerate(self.free) if f.effect == effect.name]
+            parts.append(gains[own] if own else np.zeros(len(parameters_of(effect, n_wheels))))
+        return np.concatenate(parts)
 
     def unheld(self, gains: Array) -> Array:
         """Gains (G,) of these fits by the prior deviations that the parameters have beforehand."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Sequence
 
 from soilbus.diagnosis.completion import Completion, complete
@@ -9,7 +10,6 @@ from soilbus.diagnosis.records import Record
 from soilbus.estimation.gauss_newton import THOROUGH, Effort, Start
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
-
 
 NOTHING = 1.0
 """Fall of the cost by which an effect explains nothing."""
@@ -40,25 +40,39 @@ class Fits:
         """
         names = frozenset(effect.name for effect in effects)
         best = self._converged.get(names)
-        if best is not None and not self._explains_nothing(names):
+        if best is not None and not _explains_nothing(best, self._with_fewer(names)):
             return best
         for i, start in enumerate(starts or (None,)):
             if best is not None and best.converged and i < len(foreseen) and best.evidence <= foreseen[i]:
                 continue
-            begun = (names, _key(start), effort)
-            if begun not in self._begun:
-                self._begun[begun] = complete(self.records, self.prior, effects, start, effort)
-            found = self._begun[begun]
-            if found is not None and (best is None or found.evidence < best.evidence):
-                best = found
+            best = _better(best, self._from(start, effects, effort))
+        with_fewer = self._with_fewer(names)
+        if with_fewer is not None and math.isinf(effort.hopeless) and _explains_nothing(best, with_fewer):
+            best = _better(best, self._from(with_fewer.as_starts(effects), effects, effort))
         if best is not None and best.converged:
             self._converged[names] = best
         return best
 
-    def _explains_nothing(self, names: frozenset[str]) -> bool:
-        """Whether a model costs no less than one with some of its effects: from elsewhere it may find its place."""
-        cost = self._converged[names].cost
-        return any(less < names and fit.cost < cost + NOTHING for less, fit in self._converged.items())
+    def _from(self, start: Sequence[Start] | None, effects: Sequence[Effect], effort: Effort) -> Completion | None:
+        """The fit from one start, at hand where it was asked for before."""
+        begun = (frozenset(effect.name for effect in effects), _key(start), effort)
+        if begun not in self._begun:
+            self._begun[begun] = complete(self.records, self.prior, effects, start, effort)
+        return self._begun[begun]
+
+    def _with_fewer(self, names: frozenset[str]) -> Completion | None:
+        """The fit that costs least of those with some of the effects: one with all of them can cost no more."""
+        fits = [fit for less, fit in self._converged.items() if less < names]
+        return min(fits, key=lambda fit: fit.cost, default=None)
+
+
+def _explains_nothing(fit: Completion | None, with_fewer: Completion | None) -> bool:
+    """Whether a model costs no less than one with some of its effects: from elsewhere they may find their place."""
+    return with_fewer is not None and (fit is None or fit.cost > with_fewer.cost - NOTHING)
+
+
+def _better(one: Completion | None, other: Completion | None) -> Completion | None:
+    return one if other is None or (one is not None and one.evidence <= other.evidence) else other
 
 
 def _key(starts: Sequence[Start] | None) -> Hashable:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from soilbus.diagnosis.candidates import (
     BEHIND_UNSETTLED,
     CLEAR,
@@ -101,11 +99,7 @@ def _others(addition: Addition, present: Completion) -> frozenset[str]:
 
 
 def _without(fits: Fits, present: Completion, effect: Effect, effort: Effort) -> Completion | None:
-    """The present model less one effect, fitted from where it stands."""
-    n_sensors = fits.records[0].learned.n_sensors
-    kept = [n_sensors + i for i, f in enumerate(present.free) if f.effect != effect.name]
-    starts = [
-        start._replace(gains=np.concatenate([start.gains[:n_sensors], start.gains[kept]]))
-        for start in present.as_starts()
-    ]
-    return fits.of([e for e in present.effects if e.name != effect.name], [starts], effort)
+    """The present model less one effect, fitted from where it stands but for the latents: they followed the effect."""
+    left = [e for e in present.effects if e.name != effect.name]
+    starts = [start._replace(near=False) for start in present.as_starts(left)]
+    return fits.of(left, [starts], effort)
