@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from soilbus.diagnosis.completion import Completion
 from soilbus.diagnosis.fits import Fits
-from soilbus.diagnosis.score import Score, further_scores, scores
+from soilbus.diagnosis.score import Score
 from soilbus.diagnosis.verdict import hopeless, least_that_pays
 from soilbus.estimation.gauss_newton import Effort, Start
 from soilbus.terra.effects.effect import Effect
@@ -102,16 +102,15 @@ def promising(
     Foreseen by scores, tried on a few instants; where little is foreseen these tell nothing, and scores are as good
     as fits.  `again` are names that were fitted in an earlier round for the same place.
     """
-    before, of_known = present.few, (present.fits.records, present.fits.prior, present.known, candidates)
-    foreseen = scores(*of_known)
+    before, foreseen = present.few, present.fits.scores(present.known, candidates)
     if before is not None:
-        further = further_scores(few.records, few.prior, before, candidates)
+        further = few.further_scores(before, candidates)
         of_all = ((present.rows / fit.rows, found) for fit, found in ((present.known, foreseen), (before, further)))
         most = max(times * -score.evidence for times, found in of_all for score in found)
         if most >= CLEAR or present.known is before:
             trials = _trials(few, before, worth_trying(foreseen, further, again), present.rows)
             return _of_trials(trials, explained)
-    return _of_scores([*foreseen, *further_scores(*of_known)], least_that_pays(explained))
+    return _of_scores([*foreseen, *present.fits.further_scores(present.known, candidates)], least_that_pays(explained))
 
 
 class _Trial(NamedTuple):

@@ -274,9 +274,7 @@ def _fitted(
     fit = continued(problem, prior, before, start, problem.n_sensors, effort)
     if fit is None or fit.converged:
         return fit
-    fitting, gains = Fitting(problem, prior, before), np.where(problem.gain_std > 0.0, start.gains, 0.0)
-    begun = None if start.near else fitting.start(start.soil, gains=problem.allowed(gains))
-    slow = descended(fitting, fit, begun, effort)
+    slow = descended(Fitting(problem, prior, before), fit, effort)
     return None if (slow or fit).cost > effort.hopeless else slow or fit
 
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 
 from soilbus.diagnosis.completion import Completion, complete
 from soilbus.diagnosis.records import Record
+from soilbus.diagnosis.score import Score, further_scores, scores
 from soilbus.estimation.gauss_newton import THOROUGH, Effort, Start
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
+
+_Scores = Callable[[Sequence[Record], SoilPrior, Completion, Sequence[Effect]], list[Score]]
 
 NOTHING = 1.0
 """Fall of the cost by which an effect explains nothing."""
@@ -25,6 +28,7 @@ class Fits:
         self.records, self.prior = tuple(records), prior
         self._converged: dict[frozenset[str], Completion] = {}
         self._begun: dict[tuple[Hashable, ...], Completion | None] = {}
+        self._scored: dict[Hashable, tuple[Completion, list[Score]]] = {}
 
     def of(
         self,
@@ -52,6 +56,20 @@ class Fits:
         if best is not None and best.converged:
             self._converged[names] = best
         return best
+
+    def scores(self, present: Completion, candidates: Sequence[Effect]) -> list[Score]:
+        """As score.scores() of a model fitted to these recordings, once."""
+        return self._once(scores, present, candidates)
+
+    def further_scores(self, present: Completion, candidates: Sequence[Effect]) -> list[Score]:
+        """As score.further_scores() of a model fitted to these recordings, once."""
+        return self._once(further_scores, present, candidates)
+
+    def _once(self, told: _Scores, present: Completion, candidates: Sequence[Effect]) -> list[Score]:
+        key = told, id(present), tuple(effect.name for effect in candidates)
+        if key not in self._scored:
+            self._scored[key] = present, told(self.records, self.prior, present, candidates)
+        return self._scored[key][1]
 
     def _from(self, start: Sequence[Start] | None, effects: Sequence[Effect], effort: Effort) -> Completion | None:
         """The fit from one start, at hand where it was asked for before."""

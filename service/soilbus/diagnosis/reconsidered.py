@@ -16,7 +16,6 @@ from soilbus.diagnosis.candidates import (
 from soilbus.diagnosis.completion import Completion
 from soilbus.diagnosis.fits import Fits
 from soilbus.diagnosis.naming import Addition, named
-from soilbus.diagnosis.score import further_scores, scores
 from soilbus.diagnosis.verdict import PAYS, hopeless, probabilities
 from soilbus.estimation.gauss_newton import Effort
 from soilbus.terra.effects.effect import Effect
@@ -78,8 +77,8 @@ def _rivals(
     rows: int,
 ) -> bool:
     """Whether another effect may belong in the place of one, by fits to the few without it and with it (here)."""
-    of = few.records, few.prior, without, candidates
-    found = worth_trying(scores(*of), further_scores(*of), addition.falls)
+    scores = few.scores(without, candidates), few.further_scores(without, candidates)
+    found = worth_trying(*scores, addition.falls)
     for rival in candidates:
         if rival.name in found and rival.name != addition.effect.name:
             completion = fitted_to_few(few, without, found[rival.name], here.cost + BEHIND_UNSETTLED)

@@ -29,8 +29,6 @@ ENOUGH_FAR = 2e-3
 DAMPING, EASED, HELD_BACK = 1e-2, 0.3, 10.0
 """The damping of the first step, and what one that lowers the cost, and one that does not, makes of it."""
 MOST_DAMPING = 1e4
-FOLLOWED = 2
-"""Linearisations that bring latents as measured to their best."""
 NEAR = 2.0
 """Cost for each residual below which one linear step brings the latents to their best."""
 EVEN = 1e-2
@@ -52,8 +50,8 @@ class _Here(NamedTuple):
     point: Point
 
 
-def descended(fitting: Fitting, fast: Fit, start: Place | None, effort: Effort) -> Fit | None:
-    """The optimum below where the fast descent ended, or below its start, if given, where that costs less.
+def descended(fitting: Fitting, fast: Fit, effort: Effort) -> Fit | None:
+    """The optimum below where the fast descent ended.
 
     It ends where no more is foreseen than decides nothing, or what is foreseen is above what is hopeless.  None where
     the numbers are not finite.
@@ -63,9 +61,7 @@ def descended(fitting: Fitting, fast: Fit, start: Place | None, effort: Effort) 
         ended = Place(end.soil, fitting.problem.allowed(end.gains), end.latents, fast.cost, 0)
         if _foreseen(fitting.with_before(ended, end.at)) > effort.hopeless:
             return None
-        here = None if start is None else _begun(fitting, start, fast.cost)
-        if here is None:
-            here = ground.at(ended, end.at)
+        here = ground.at(ended, end.at)
         if here is None:
             return None
         valley, damping, falling, steps = _Valley(fitting), DAMPING, np.inf, 0
@@ -179,19 +175,6 @@ def _foreseen(point: Point | None) -> float:
 def _at(fitting: Fitting, place: Place) -> _Here | None:
     point = fitting.point(place)
     return None if point is None else _Here(place, point)
-
-
-def _begun(fitting: Fitting, start: Place, below: float) -> _Here | None:
-    """The start and its normal equations where it costs less than what is to be gone below, latents and all.
-
-    With latents as measured it seems to cost too little, which then no step would lower.
-    """
-    here = _at(fitting, start)
-    for _ in range(FOLLOWED):
-        if here is None or here.point.cost >= below:
-            return None
-        here = _followed(fitting, here)
-    return here if here is not None and here.point.cost < below else None
 
 
 def _followed(fitting: Fitting, here: _Here) -> _Here | None:
