@@ -53,6 +53,8 @@ def named(
 
     `again` are names that were fitted in an earlier round for the same place.
     """
+    if not candidates:
+        return None
     counted = promising(few, present, candidates, explained, again)
     asked = price(explained, present.gap, present.checked_rows, present.rows)
     fitted, at_most = _fitted(whole, present, counted, explained, asked)

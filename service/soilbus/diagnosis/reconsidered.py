@@ -36,35 +36,50 @@ def reconsidered(
     chosen, looked = list(additions), set[frozenset[str]]()
     while stale := [a for a in chosen if a.beside != (others := _others(a, present)) and others not in looked]:
         addition = stale[0]
-        effect, others = addition.effect, _others(addition, present)
+        others = _others(addition, present)
         looked.add(others)
         place = chosen.index(addition)
         left = [candidate for candidate in candidates if candidate.name not in others]
-        here, without = few.of(present.effects, [present.as_starts()], ROUGH), _without(few, present, effect, ROUGH)
-        fall = 0.0 if here is None or without is None else _fall(without, here, present.rows)
-        fitted: Completion | None = None
-        if here is not None and without is not None and fall > CLEAR:
-            explained = base.evidence - present.evidence
-            if not _rivals(few, without, addition, left, here, explained, present.rows):
-                (chance,) = probabilities({effect.name: fall}, explained - fall).values()
-                chosen[place] = Addition(effect, chance, {}, {effect.name: fall}, others, effect.form_left)
-                continue
-            standing = Standing.foretold(without, few, present.rows)
-        else:
-            fitted = _without(whole, present, effect, Effort(STEPS))
-            if fitted is None:
-                continue
-            standing = Standing.of(fitted, whole, few)
-        found = named(whole, few, standing, left, base.evidence - standing.evidence, addition.falls)
-        if found is None and fitted is not None and fitted.evidence < present.evidence + PAYS:
-            present = fitted
+        told = _without_it(whole, few, base, present, addition, left)
+        if isinstance(told, Addition):
+            chosen[place] = told
+        if told is None or isinstance(told, Addition):
+            continue
+        found = named(whole, few, told, left, base.evidence - told.evidence, addition.falls)
+        if found is None and told.fits is whole and told.evidence < present.evidence + PAYS:
+            present = told.known
             del chosen[place]
         elif found is not None and found[1].evidence < present.evidence + SAME:
             if present.evidence - found[1].evidence < PAYS:  # what stands beside is named as well beside the other
-                chosen = [a.beside_another(effect, found[0].effect) for a in chosen]
+                chosen = [a.beside_another(addition.effect, found[0].effect) for a in chosen]
             chosen[place], present = found
     order = {name: i for i, name in enumerate(present.names)}
     return sorted(chosen, key=lambda addition: order[addition.effect.name]), present
+
+
+def _without_it(
+    whole: Fits,
+    few: Fits,
+    base: Completion,
+    present: Completion,
+    addition: Addition,
+    candidates: Sequence[Effect],
+) -> Addition | Standing | None:
+    """The model without one of its effects, or that addition where a few instants tell that it belongs there alone.
+
+    Where they tell clearly what it explains they foretell the model without it as well.  None where there is no fit.
+    """
+    effect, rows = addition.effect, present.rows
+    here, without = few.of(present.effects, [present.as_starts()], ROUGH), _without(few, present, effect, ROUGH)
+    fall = 0.0 if here is None or without is None else _fall(without, here, rows)
+    if here is None or without is None or fall < CLEAR:
+        fitted = _without(whole, present, effect, Effort(STEPS))
+        return None if fitted is None else Standing.of(fitted, whole, few)
+    explained = base.evidence - present.evidence
+    if _rivals(few, without, addition, candidates, here, explained, rows):
+        return Standing.foretold(without, few, rows)
+    (chance,) = probabilities({effect.name: fall}, explained - fall).values()
+    return Addition(effect, chance, {}, {effect.name: fall}, _others(addition, present), effect.form_left)
 
 
 def _rivals(
