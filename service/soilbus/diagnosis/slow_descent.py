@@ -39,6 +39,8 @@ GOOD, AS_FORETOLD = 0.3, 0.85
 """Shares of the foretold fall that a good step brings, and one that comes out as foretold."""
 SHORT, LONGER = 0.15, 2.0
 """Share of a full step below which the next one is longer where it came out as foretold, and how much."""
+LEAST = 1e-4
+"""Share of a full step that is none."""
 BENT, SHORTER = 4.0, 0.5
 """How far a bent step goes over how far a straight one could, and how much shorter it is if that was too far."""
 
@@ -146,9 +148,11 @@ class _Valley:
             if step is not None:
                 reach = self.fitting.reach(place, step)
                 share, step = reach * share, reach * step
-            there = None if step is None else _at(self.fitting, self.fitting.moved(place, point, step))
+            there = None
+            if step is not None and share > LEAST:
+                there = _at(self.fitting, self.fitting.moved(place, point, step))
             if step is None or there is None:
-                self.share, self.bend = SHORTER * share, None
+                self.share, self.bend = SHORTER * self.share, None
                 continue
             foretold, fall = share * (2.0 - share) * length, point.cost - there.point.cost
             bend = self.fitting.bend(place, point, step, there.point) / share**2
@@ -160,7 +164,7 @@ class _Valley:
                 return there, tried
             if fall > 0.0 and (least is None or there.point.cost < least.point.cost):
                 least = there
-            straight = share * (length / (foretold - fall) * share) ** (1.0 / 3.0)
+            straight = share * (length * share / (foretold - fall)) ** (1.0 / 3.0)  # the bend costs share^4
             self.share = min(share, BENT * straight) if self.bend is None else SHORTER * share
             self.bend = bend
         return least, MAX_TRIED

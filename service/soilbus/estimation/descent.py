@@ -177,7 +177,7 @@ def settle(
         idle = idle + 1 if lowest is not None and lowest.point.cost - point.cost < nothing else 0
         if lowest is None or point.cost < lowest.point.cost:
             lowest = Settled(near, *best, length, iterations, converged=True)
-        if idle >= IDLE and lowest.length < NEARLY and nothing > 0.0:
+        if nothing > 0.0 and idle >= IDLE and lowest.length < NEARLY:
             return lowest._replace(iterations=iterations)
     if best is None:
         return None

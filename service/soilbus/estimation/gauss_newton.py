@@ -28,9 +28,10 @@ _K_C = PARAMETERS.index("k_c")
 MAX_ITERATIONS = 30
 MAX_RESUMED = 10
 COMPARED = 2e-2
-"""Foreseen fall of the cost that ends fits which are compared by cost: differences below a tenth decide nothing."""
+"""Foreseen fall of the cost that ends fits which are compared by cost."""
 SLOWLY = 15.0
-"""Fall of the cost that decides nothing, over the foreseen one that ends fits: where steps are slow it takes many."""
+"""Fall of the cost that decides nothing, a few tenths, over that: near the end steps are cheap, in a valley they
+are not."""
 THINNED = 24
 """Instants of a window that the search for good starts looks at."""
 MAX_KINDS = 2
