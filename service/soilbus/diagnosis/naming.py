@@ -48,16 +48,17 @@ def named(
     candidates: Sequence[Effect],
     explained: float,
     again: Collection[str] | None = None,
+    at_hand: Completion | None = None,
 ) -> tuple[Addition, Completion] | None:
     """The best effect to add to the present model, which explains so much, and the model with it; None where none pays.
 
-    `again` are names that were fitted in an earlier round for the same place.
+    `again` are names that were fitted in an earlier round for the same place; at_hand is the model with one of them.
     """
     if not candidates:
         return None
     counted = promising(few, present, candidates, explained, again)
     asked = price(explained, present.gap, present.checked_rows, present.rows)
-    fitted, at_most = _fitted(whole, present, counted, explained, asked)
+    fitted, at_most = _fitted(whole, present, counted, explained, asked, at_hand)
     if not fitted:
         return None
     best = min(fitted, key=lambda name: fitted[name][1].evidence)
@@ -84,14 +85,17 @@ def _form_left(chances: Mapping[str, float], candidates: Iterable[Effect]) -> fl
 
 
 def _fitted(
-    whole: Fits, present: Standing, counted: Promising, explained: float, asked: float
+    whole: Fits, present: Standing, counted: Promising, explained: float, asked: float, at_hand: Completion | None
 ) -> tuple[dict[str, tuple[Effect, Completion]], dict[str, float]]:
     """Candidates with their fits to all data by name, and falls of -2 log evidence that those given up stay below."""
     fitted: dict[str, tuple[Effect, Completion]] = {}
     at_most: dict[str, float] = {}
     behind = worthless = math.inf
     for effect, starts in counted.fits:
-        completion = whole.of((*present.effects, effect), [starts], Effort(STEPS, min(behind, worthless)))
+        if at_hand is not None and present.names | {effect.name} == set(at_hand.names):
+            completion: Completion | None = at_hand
+        else:
+            completion = whole.of((*present.effects, effect), [starts], Effort(STEPS, min(behind, worthless)))
         if completion is None:
             at_most[effect.name] = max(present.cost - min(behind, worthless), 0.0)
             continue

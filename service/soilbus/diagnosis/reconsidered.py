@@ -45,7 +45,7 @@ def reconsidered(
             chosen[place] = told
         if told is None or isinstance(told, Addition):
             continue
-        found = named(whole, few, told, left, base.evidence - told.evidence, addition.falls)
+        found = named(whole, few, told, left, base.evidence - told.evidence, addition.falls, present)
         if found is None and told.fits is whole and told.evidence < present.evidence + PAYS:
             present = told.known
             del chosen[place]
