@@ -7,8 +7,9 @@ from types import SimpleNamespace
 import pytest
 
 from soilbus.diagnosis import fits as fits_module
-from soilbus.diagnosis.candidates import Standing
+from soilbus.diagnosis.candidates import Promising, Standing
 from soilbus.diagnosis.fits import Fits
+from soilbus.diagnosis.naming import _fitted
 from soilbus.estimation.gauss_newton import Effort
 from soilbus.terra.effects.catalogue import CATALOGUE
 
@@ -78,3 +79,14 @@ def test_few_instants_foretell_a_model_of_all():
     assert (standing.checked_rows, standing.rows) == (120, 400)
     assert standing.known is standing.few
     assert standing.names == {"lugs"}
+
+
+def test_the_model_at_hand_is_not_fitted_again():
+    beside = SimpleNamespace(names=frozenset({"hardpan"}), effects=(PAN,), evidence=100.0, cost=90.0)
+    at_hand = SimpleNamespace(names=("lugs", "hardpan"), evidence=50.0, cost=40.0)
+    counted = Promising([(LUGS, ())], {}, {})
+    no_fits = None
+    fitted, _ = _fitted(no_fits, beside, counted, explained=0.0, asked=30.0, at_hand=at_hand)
+    assert fitted == {"lugs": (LUGS, at_hand)}
+    with pytest.raises(AttributeError):
+        _fitted(no_fits, beside, counted, explained=0.0, asked=30.0, at_hand=None)
