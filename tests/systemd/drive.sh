@@ -21,6 +21,7 @@ note playing
 systemctl kill -s KILL $unit
 until [ "$(systemctl show -P NRestarts $unit)" = 1 ] && systemctl is-active -q $unit; do sleep 0.1; done
 note restarted
+until systemctl show -P StatusText $unit | grep -Eq '^(estimating|valid|degraded)'; do sleep 0.1; done # it hears the bus
 kill $! 2>/dev/null || true
 systemctl stop $unit
 note stopped
