@@ -19,6 +19,7 @@ within() { # SECONDS COMMAND...: until it succeeds; a note in OUT where it never
         sleep 0.2
     done
 }
+fault() { echo "$1 $(systemctl show -P MainPID $unit)" >/run/fault; }
 says() { text | grep -q "$1"; }
 restarted_since() { [ "$(restarts)" -gt "$1" ] && systemctl is-active -q $unit; }
 journal() { journalctl --no-pager -o cat -u $unit --after-cursor="$cursor" >"$out/$1.journal"; }
@@ -46,7 +47,7 @@ player=$!
 for fault in loop sender estimator; do
     within 40 says kPa
     before=$(restarts)
-    echo $fault >/run/fault
+    fault $fault
     if [ $fault != loop ]; then within 20 says fault && text >"$out/$fault"; fi
     within 60 restarted_since "$before"
     rm /run/fault
@@ -58,7 +59,7 @@ journal watchdog
 cursor
 before=$(restarts)
 within 40 says kPa
-echo defect >/run/fault
+fault defect
 within 20 says 'fault: internal'
 text >"$out/defect"
 rm /run/fault
