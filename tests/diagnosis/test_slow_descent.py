@@ -66,7 +66,7 @@ def test_steps_that_bend_follow_a_valley_that_does():
     banana = Banana()
     here, valley = begun(banana), _Valley(banana)
     while here.point.cost > 1e-6 and banana.asked < 100:
-        here, _ = valley.along(here)
+        here, _ = valley.along(here, here.point.step())
     damped, damping = Banana(), DAMPING
     there = begun(damped)
     while there.point.cost > 1e-6 and damped.asked < 1000:

@@ -128,7 +128,7 @@ def _trials(few: Fits, before: Completion, found: Mapping[str, Sequence[Score]],
     for of_one in found.values():
         completion = fitted_to_few(few, before, of_one, least + BEHIND_UNSETTLED)
         if completion is not None:
-            trials.append(_Trial(of_one[0].effect, completion, before.foreseen(rows) - completion.foreseen(rows)))
+            trials.append(_Trial(of_one[0].effect, completion, fall_foretold(before, completion, rows)))
             least = min(least, completion.cost)
     return sorted(trials, key=lambda trial: -trial.fall)
 
@@ -153,6 +153,11 @@ def _of_scores(found: Iterable[Score], least: float) -> Promising:
     enough = WORTH_FITTING * max([least, *(-s.evidence for s in chosen)])
     fitted = [(s.effect, s.starts) for s in chosen if -s.evidence > enough]
     return Promising(fitted, {s.effect.name: -s.evidence for s in chosen[len(fitted) :]}, {})
+
+
+def fall_foretold(before: Completion, after: Completion, rows: int) -> float:
+    """Fall of -2 log evidence between two fits to the few, foretold of so many residuals."""
+    return before.foreseen(rows) - after.foreseen(rows)
 
 
 def worth_trying(

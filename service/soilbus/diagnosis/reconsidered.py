@@ -10,6 +10,7 @@ from soilbus.diagnosis.candidates import (
     ROUGH,
     STEPS,
     Standing,
+    fall_foretold,
     fitted_to_few,
     worth_trying,
 )
@@ -71,7 +72,7 @@ def _without_it(
     """
     effect, rows = addition.effect, present.rows
     here, without = few.of(present.effects, [present.as_starts()], ROUGH), _without(few, present, effect, ROUGH)
-    fall = 0.0 if here is None or without is None else _fall(without, here, rows)
+    fall = 0.0 if here is None or without is None else fall_foretold(without, here, rows)
     if here is None or without is None or fall < CLEAR:
         fitted = _without(whole, present, effect, Effort(STEPS))
         return None if fitted is None else Standing.of(fitted, whole, few)
@@ -97,14 +98,9 @@ def _rivals(
     for rival in candidates:
         if rival.name in found and rival.name != addition.effect.name:
             completion = fitted_to_few(few, without, found[rival.name], here.cost + BEHIND_UNSETTLED)
-            if completion is not None and not hopeless(_fall(completion, here, rows), explained):
+            if completion is not None and not hopeless(fall_foretold(completion, here, rows), explained):
                 return True
     return False
-
-
-def _fall(before: Completion, after: Completion, rows: int) -> float:
-    """Fall of -2 log evidence between two fits to the few, foretold of so many residuals."""
-    return before.foreseen(rows) - after.foreseen(rows)
 
 
 def _others(addition: Addition, present: Completion) -> frozenset[str]:

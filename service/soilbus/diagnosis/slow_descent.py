@@ -61,31 +61,28 @@ def descended(fitting: Fitting, fast: Fit, effort: Effort) -> Fit | None:
     ground, end = _Ground(fitting), fast.optimum
     with np.errstate(all="ignore"):
         ended = Place(end.soil, fitting.problem.allowed(end.gains), end.latents, fast.cost, 0)
-        if _foreseen(fitting.with_before(ended, end.at)) > effort.hopeless:
+        point = fitting.with_before(ended, end.at)
+        if point is None or _foreseen(point, point.step()) > effort.hopeless:
             return None
         here = ground.at(ended, end.at)
         if here is None:
             return None
         valley, damping, falling, steps = _Valley(fitting), DAMPING, np.inf, 0
         while damping < MOST_DAMPING and steps < MAX_STEPS:
-            enough = _enough(fitting, here.point, effort.nothing)
-            foreseen = _foreseen(here.point)
-            if falling < enough or foreseen > min(here.point.cost - effort.nothing, effort.hopeless):
+            enough, full = _enough(fitting, here.point, effort.nothing), here.point.step()
+            worth = min(here.point.cost - effort.nothing, effort.hopeless)
+            if full is None or falling < enough or _foreseen(here.point, full) > worth:
                 break
-            there, tried = valley.along(here) if ground.is_even(here.point) else (None, 0)
+            there, tried = valley.along(here, full) if ground.is_even(here.point) else (None, 0)
             steps += tried
             if there is None and (honest := ground.honest(here, enough)) is not None:
                 here, steps = honest, steps + 1
                 continue
             if there is None:
-                step = here.point.step(damping)
-                there = None if step is None else ground.at(fitting.moved(*here, step))
-                steps += 1
-                if there is None or there.point.cost >= here.point.cost:
-                    damping *= HELD_BACK
-                    continue
-                damping *= EASED
-            falling, here = here.point.cost - there.point.cost, there
+                there, steps = ground.damped(here, damping), steps + 1
+                damping *= HELD_BACK if there is None else EASED
+            if there is not None:
+                falling, here = here.point.cost - there.point.cost, there
         return _fit(fitting, *here, steps, converged=steps < MAX_STEPS)
 
 
@@ -112,6 +109,12 @@ class _Ground:
         self.even = there is not None and abs(there.point.cost - point.cost) < EVEN * point.cost
         return there
 
+    def damped(self, here: _Here, damping: float) -> _Here | None:
+        """The place after a damped step, where it costs less."""
+        step = here.point.step(damping)
+        there = None if step is None else self.at(self.fitting.moved(*here, step))
+        return there if there is not None and there.point.cost < here.point.cost else None
+
     def honest(self, here: _Here, enough: float) -> _Here | None:
         """The same place with its latents at their best where that costs more: no step lowers what it seemed to cost.
 
@@ -135,12 +138,9 @@ class _Valley:
     share: float = 1.0
     bend: Array | None = None
 
-    def along(self, here: _Here) -> tuple[_Here | None, int]:
-        """The place after a part of a full step, None where none lowers the cost, and how many were tried."""
+    def along(self, here: _Here, full: Array) -> tuple[_Here | None, int]:
+        """The place after a part of a full step (F + A,), None where none lowers the cost, and how many were tried."""
         place, point = here
-        full = point.step()
-        if full is None:
-            return None, 0
         length, least = point.length(full), None
         for tried in range(1, MAX_TRIED + 1):
             share = self.share
@@ -170,10 +170,9 @@ class _Valley:
         return least, MAX_TRIED
 
 
-def _foreseen(point: Point | None) -> float:
-    """The cost after a full step, if all were linear."""
-    step = None if point is None else point.step()
-    return np.inf if point is None or step is None else point.cost - point.length(step)
+def _foreseen(point: Point, full: Array | None) -> float:
+    """The cost after a full step (F + A,), if all were linear; infinite where there is none."""
+    return np.inf if full is None else point.cost - point.length(full)
 
 
 def _at(fitting: Fitting, place: Place) -> _Here | None:

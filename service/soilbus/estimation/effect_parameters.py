@@ -39,7 +39,7 @@ class Free:
         return pull if self.within(pull) or self.std == 0.0 else self.pull_at(self.at(pull))
 
     def pull_at(self, value: float) -> float:
-        """How many prior std a value is from the prior value; the inverse of at()."""
+        """How many prior std a value is from the prior value, for a parameter that has a std; the inverse of at()."""
         return (value - self.value) / self.std
 
     def at(self, pull: float) -> float:
