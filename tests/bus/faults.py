@@ -18,6 +18,8 @@ from pathlib import Path
 
 import can
 
+from soilbus.can.bus import ask_for_buffer
+
 CHANNEL = "vcan7"
 SOILBUS = [sys.executable, "-c", "import sys; from soilbus.cli import main; sys.exit(main())"]
 STAMP = struct.Struct("@ll")
@@ -196,11 +198,12 @@ def full(bus: Bus) -> None:
 def overrun(bus: Bus, service: "subprocess.Popen[bytes]") -> None:
     """More frames of an input than the receive buffer holds, while nobody reads."""
     time.sleep(1.3)  # what came before is counted
-    burst = BEYOND + 2 * min(int(Path("/proc/sys/net/core/rmem_max").read_text()), 4 << 20) // 768
     bus.mark("overrun")
     service.send_signal(signal.SIGSTOP)
     time.sleep(0.1)
     with mouth() as own:
+        ask_for_buffer(own)
+        burst = BEYOND + own.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 768
         for _ in range(burst):
             bus.send(*bus.frames[0][1:], own)
     service.send_signal(signal.SIGCONT)

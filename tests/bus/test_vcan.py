@@ -20,8 +20,10 @@ from typing import Any, NamedTuple
 
 import can
 import cantools
+import numpy as np
 import pytest
 from cantools.database.can import Database, Signal
+from numpy.typing import NDArray
 
 from soilbus.simulator.reference import TRACTOR
 
@@ -32,6 +34,9 @@ SOILBUS = [sys.executable, "-c", "import sys; from soilbus.cli import main; sys.
 SECONDS = 24.6  # the last window ends well before the service is stopped
 HOP = 1.0
 FIRST_WINDOW = 10.0
+TRIES = 3
+HELD_UP = 0.3
+"""Seconds by which the player may be late: that is no service's doing."""
 
 SI = {"": 1.0, "N": 1.0, "rad": 1.0, "kPa": 1e3, "mm": 1e-3, "deg": math.pi / 180}
 SI |= {"kN/m^(n+1)": 1e3, "kN/m^(n+2)": 1e3}
@@ -61,8 +66,16 @@ class Run(NamedTuple):
     database: Database
     frames: dict[str, list[Frame]]  # ours, by message name
     windows: list[dict[str, Any]]  # what replay says
+    played: NDArray[np.float64]  # stamps of the recording's frames
     filters: list[tuple[int, int]]  # id and mask, with the extended flag, of the service's sockets
-    end: float
+
+    def ended(self) -> list[tuple[Frame, dict[str, Any]]]:
+        """SoilStrength of each window of the recording, with that window of replay.
+
+        Windows have the same numbers in both (the run is far shorter than the 251 numbers).
+        """
+        said = [(frame, self.windows[frame.values["Window"]]) for frame in self.frames["SoilStrength"]]
+        return [(frame, window) for frame, window in said if window["t"] < self.played[-1]]
 
 
 @pytest.fixture(scope="module")
@@ -74,23 +87,41 @@ def live(vcan_run, tool, field_recording, tmp_path_factory: pytest.TempPathFacto
 
 
 def _played(vcan_run, config: Path, out: Path) -> Run:
-    """out/played.log played to the service with this configuration, and what replay makes of the same bus."""
-    done = vcan_run([sys.executable, LIVE, config, out / "played.log", out], rw=[out], timeout=180.0)
-    assert done.returncode == 0, done.stdout
+    """out/played.log played to the service with this configuration, and what replay makes of the same bus.
+
+    Where the player itself was held up, it is played again: the machine stood still, and what was played is
+    another drive.
+    """
+    meant = np.array([frame.timestamp for frame in can.LogReader(out / "played.log")])
+    for _ in range(TRIES):
+        done = vcan_run([sys.executable, LIVE, config, out / "played.log", out], rw=[out], timeout=180.0)
+        assert done.returncode == 0, done.stdout
+        run = _heard(config, out)
+        assert len(run.played) == len(meant)
+        held_up = np.max(run.played - run.played[0] - (meant - meant[0]))
+        if held_up < HELD_UP:
+            return run
+    raise AssertionError(f"the player was held up by {held_up:.1f} s, and before in each of {TRIES} runs")
+
+
+def _heard(config: Path, out: Path) -> Run:
+    """What live.py left in out, and what replay makes of it."""
     subprocess.run(
         [*SOILBUS, "replay", "--config", config, out / "bus.log", "--json", out / "replay.jsonl"], check=True
     )
     database = cantools.database.load_file(REPO / "dbc/soilbus.dbc")
     frames = defaultdict(list)
     names = {message.frame_id: message.name for message in database.messages}
-    t = 0.0
+    played = []
     for frame in can.LogReader(out / "bus.log"):
-        t = frame.timestamp
         if name := frame.is_extended_id and names.get(frame.arbitration_id):
             values = database.decode_message(name, bytes(frame.data), decode_choices=False)
-            frames[name].append(Frame(t, frame.arbitration_id, bytes(frame.data), values))
+            frames[name].append(Frame(frame.timestamp, frame.arbitration_id, bytes(frame.data), values))
+        else:
+            played.append(frame.timestamp)
     windows = [json.loads(line) for line in (out / "replay.jsonl").read_text().splitlines()]
-    return Run(database, frames, windows, _filters((out / "filters").read_text()), t)
+    # the last frame that is not ours is live.py's
+    return Run(database, frames, windows, np.array(played[:-1]), _filters((out / "filters").read_text()))
 
 
 def _first(recording: Path, seconds: float, to: Path) -> None:
@@ -142,7 +173,7 @@ def test_the_service_estimates_with_the_model_that_diagnose_completed(vcan_run, 
     run = _played(vcan_run, completed, tmp_path)
     _carries_the_numbers_of_replay(run)
     truth = (5300.0 / 0.3 + 1.515e6) * 0.02**0.7  # the simulator's loam, Pa
-    for frame in run.frames["SoilStrength"]:
+    for frame, _ in run.ended():
         assert STATUS[frame.values["Status"]] == "valid"
         assert 0.7 < frame.values["Chi2"] < 1.3
         off = 1e3 * frame.values["BearingPressure"] - truth
@@ -150,8 +181,8 @@ def test_the_service_estimates_with_the_model_that_diagnose_completed(vcan_run, 
 
 
 def _carries_the_numbers_of_replay(run: Run) -> None:
-    ended = [(frame, _window_of(run, frame)) for frame in run.frames["SoilStrength"]]
-    assert [w["t"] for _, w in ended] == [w["t"] for w in run.windows[: len(ended)]]  # none missing, none twice
+    ended = run.ended()
+    assert [w["t"] for _, w in ended] == [w["t"] for w in run.windows if w["t"] < run.played[-1]]
     assert len(ended) >= (SECONDS - FIRST_WINDOW) / HOP - 1
     assert sum(window["status"] == "valid" for _, window in ended) >= 10
     wrong = []
@@ -167,7 +198,7 @@ def _carries_the_numbers_of_replay(run: Run) -> None:
 
 @pytest.mark.vcan
 def test_each_window_is_sent_within_its_hop(live: Run) -> None:
-    late = [frame.t - _window_of(live, frame)["t"] for frame in live.frames["SoilStrength"]]
+    late = [frame.t - window["t"] for frame, window in live.ended()]
     assert min(late) >= 0.0
     assert max(late) < HOP, late
 
@@ -179,11 +210,11 @@ def test_traversability_carries_the_verdict_of_replay(live: Run) -> None:
     assert {c: str(t) for c, t in verdict.get_signal_by_name("State").choices.items() if c < 4} == dict(
         enumerate(states)
     )
-    for soil in live.frames["SoilStrength"]:
-        window = _window_of(live, soil)["traversability"]
+    for soil, window in live.ended():
+        told = window["traversability"]
         frame = _sibling(live, "Traversability", soil)
-        assert states[frame.values["State"]] == window["state"]
-        assert _same(verdict.get_signal_by_name("Probability"), frame, window["probability"])
+        assert states[frame.values["State"]] == told["state"]
+        assert _same(verdict.get_signal_by_name("Probability"), frame, told["probability"])
 
 
 @pytest.mark.vcan
@@ -191,7 +222,7 @@ def test_frames_keep_their_cycle(live: Run) -> None:
     for name in ("WheelSlip", "Traversability", "SoilbusStatus"):
         cycle = live.database.get_message_by_name(name).cycle_time / 1000
         frames = live.frames[name]
-        duration = live.end - frames[0].t
+        duration = frames[-1].t - frames[0].t
         assert duration > SECONDS - 1
         assert len(frames) == pytest.approx(duration / cycle, rel=0.05, abs=2)
 
@@ -204,11 +235,6 @@ def test_counters_and_checksums_hold(live: Run) -> None:
         assert {(b - a) % 16 for a, b in itertools.pairwise(counters)} <= {1}, name
         for frame in frames:
             assert frame.data[7] == _crc8(frame.arbitration_id.to_bytes(4, "little") + frame.data[:7]), name
-
-
-def _window_of(live: Run, frame: Frame) -> dict[str, Any]:
-    """The window of replay with the frame's number (the run is far shorter than the 251 numbers)."""
-    return live.windows[frame.values["Window"]]
 
 
 def _sibling(live: Run, message: str, soil: Frame) -> Frame:

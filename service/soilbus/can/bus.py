@@ -8,6 +8,7 @@ import math
 import os
 import socket
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,7 @@ LONGEST_BACK_OFF = 1.0
 """Reopening is tried at least this often [s], so that a bus that is back is found in time."""
 
 RECEIVE_BUFFER = 4 * 2**20
+SO_RCVBUFFORCE = 33  # which Python does not name
 RETRY = 0.005
 """Longest wait for a frame [s] while frames of ours wait for room."""
 SAY_AGAIN = 60.0
@@ -65,17 +67,21 @@ def open_bus(settings: Mapping[str, Any], filters: Sequence[dict[str, Any]] | No
 
 
 def _prepare(bus: can.BusABC) -> None:
-    """As much receive buffer as the kernel lets us have (net.core.rmem_max).
-
-    Raises OSError for an interface that is down: the kernel binds to it all the same.
-    """
+    """Raises OSError for an interface that is down: the kernel binds to it all the same."""
     own = getattr(bus, "socket", None)
     if not isinstance(own, socket.socket):
         return
-    own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+    ask_for_buffer(own)
     if number := own.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
         bus.shutdown()
         raise OSError(number, os.strerror(number))
+
+
+def ask_for_buffer(own: socket.socket) -> None:
+    """As much receive buffer as we want for an administrator, for others as net.core.rmem_max allows."""
+    own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+    with suppress(OSError):  # it takes CAP_NET_ADMIN
+        own.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER)
 
 
 def _one_line(error: Exception) -> str:
