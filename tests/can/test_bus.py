@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import itertools
+import socket
+from pathlib import Path
 
 import can
 import pytest
 
 from fakes import FakeClock, ScriptedBus
-from soilbus.can.bus import LONGEST_BACK_OFF, RETRY, BusError, LiveBus, open_bus
+from soilbus.can.bus import (
+    LONGEST_BACK_OFF,
+    RECEIVE_BUFFER,
+    RETRY,
+    SO_RCVBUFFORCE,
+    BusError,
+    LiveBus,
+    ask_for_buffer,
+    open_bus,
+)
 from soilbus.can.publish import Frame
 
 FRAME = Frame(0x18FF609A, True, bytes(8))
@@ -38,6 +50,16 @@ def test_whether_waiting_helps_is_told_by_the_kernels_error(monkeypatch, number,
         open_bus({"interface": "socketcan", "channel": "can7"})
     assert caught.value.may_come is may_come
     assert "can7" in str(caught.value)
+
+
+def test_as_much_buffer_is_taken_as_this_user_may_have():
+    limit = int(Path("/proc/sys/net/core/rmem_max").read_text())
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as own:
+        with contextlib.suppress(PermissionError):
+            own.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, limit + 1)
+            limit = RECEIVE_BUFFER  # an administrator's
+        ask_for_buffer(own)
+        assert own.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == 2 * min(limit, RECEIVE_BUFFER)
 
 
 def test_frames_cross_a_virtual_bus_and_filters_hold():

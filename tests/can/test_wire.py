@@ -35,6 +35,9 @@ class Kernel(SimpleNamespace):
     def setsockopt(self, *option: int) -> None:
         self.options.append(option)
 
+    def getsockopt(self, *option: int) -> int:
+        return {(socket.SOL_SOCKET, socket.SO_RCVBUF): 425_984}[option]
+
     def recvmsg(self, *_):
         if not self.coming:
             raise BlockingIOError

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from concurrent.futures import Executor, Future
 
-from fakes import InlineExecutor
+import pytest
+
+from fakes import FakeClock, InlineExecutor
 from soilbus.allocator import give_back_freed_memory
 from soilbus.daemon.backlog import KEPT, MAX_PENDING, TIDIED, Backlog
 
@@ -58,6 +60,33 @@ def test_what_the_worker_cannot_keep_up_with_is_dropped_but_for_the_newest_and_t
         else:
             worker.do_next()
     assert [result for result, _ in backlog.results(1.0)] == [0, 4, 5]
+
+
+@pytest.mark.parametrize(("solved", "waited"), [(False, 0.04), (True, 0.0)])
+def test_the_loop_waits_for_a_result_and_no_longer(solved, waited):
+    clock, worker = FakeClock(), Later()
+    backlog = Backlog(worker, lambda task: task, clock(), clock.wait_for)
+    backlog.wait(0.04)
+    assert clock() == 1000.0  # for nothing
+    backlog.add(0, clock(), 0, clock())
+    if solved:
+        worker.do_next()
+    backlog.wait(0.04)
+    backlog.wait(-0.01)
+    assert clock() - 1000.0 == pytest.approx(waited)
+
+
+def test_a_real_result_ends_the_wait():
+    from concurrent.futures import ThreadPoolExecutor
+    from time import perf_counter, sleep
+
+    with ThreadPoolExecutor(max_workers=1) as worker:
+        backlog = Backlog(worker, lambda task: sleep(0.01), 0.0)
+        backlog.add(0, 0.0, 0, 0.0)
+        begin = perf_counter()
+        backlog.wait(60.0)
+        assert perf_counter() - begin < 30.0
+        assert backlog.has_result
 
 
 def test_free_memory_is_given_back_once_in_a_while_and_after_the_result_is_out(monkeypatch):

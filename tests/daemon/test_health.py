@@ -86,6 +86,7 @@ class Bench:
         bus = LiveBus(self.open, self.clock, self.clock.sleep)
         self.service = Service(
             CONFIG, pipeline, bus, Publisher(OUT), self.systemd, worker or InlineExecutor(), self.clock,
+            waiting=self.clock.wait_for,
         )  # fmt: skip
 
     def open(self):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import gc
+import threading
 from pathlib import Path
 
 import pytest
 
 from soilbus.allocator import loading
 from soilbus.can.dbc_files import load_databases, output_database
+from soilbus.can.wire import MessageWire
 from soilbus.config import ConfigError
 from soilbus.config_file import load_config
 from soilbus.daemon import start
@@ -63,6 +65,15 @@ def test_an_effect_that_cannot_be_is_told_at_the_start_and_not_by_the_worker():
     config = reference_configuration([*VIRTUAL, 'model.effects=[{name="lugs", hight=0.03}]'])
     with pytest.raises(ConfigError, match="lugs has no parameter hight"):
         start.start_service(config, wait=False)
+
+
+@pytest.mark.parametrize(("room", "where"), [(8 << 20, "estimate_0"), (425_984, "MainThread")])
+def test_the_estimator_is_loaded_while_the_bus_waits_where_it_has_room_for_seconds(started, monkeypatch, room, where):
+    threads = []
+    monkeypatch.setattr(MessageWire, "room", room)
+    monkeypatch.setattr(start, "_load", lambda: threads.append(threading.current_thread().name))
+    started(reference_configuration(VIRTUAL))
+    assert threads == [where]
 
 
 def test_a_vehicle_that_cannot_be_simulated_starts_all_the_same(started):

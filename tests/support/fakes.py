@@ -22,6 +22,11 @@ class FakeClock:
     def sleep(self, seconds: float) -> None:
         self.now += max(seconds, 0.0)
 
+    def wait_for(self, future: Future[Any], longest: float) -> None:
+        """Waits for what is never done while somebody waits."""
+        if not future.done():
+            self.sleep(longest)
+
 
 class InlineExecutor(Executor):
     """Does the work at once, in the caller's thread."""

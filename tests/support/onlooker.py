@@ -162,6 +162,7 @@ class Drive:
         self.wire.good, self.wire.stamps = {}, {}
         self.service = Service(
             config, pipeline, bus, Publisher(OUT), Notifier(), self.worker, self.clock, self.take, lambda: keeper,
+            self.clock.wait_for,
         )  # fmt: skip
 
     def stop(self) -> None:

@@ -139,6 +139,11 @@ class LiveBus:
         return self._wire is not None
 
     @property
+    def holds_seconds(self) -> bool:
+        """Whether the frames of a few seconds find room while nobody takes them."""
+        return self._wire is not None and self._wire.room >= RECEIVE_BUFFER
+
+    @property
     def counts(self) -> BusCounts:
         """What happened so far."""
         counts = self._counts

@@ -52,6 +52,8 @@ class Wire(Protocol):
 
     overruns: int
     """Frames that came and were dropped for want of room since it was opened."""
+    room: float
+    """Bytes of the buffer in which frames wait for us."""
 
     def recv(self, timeout: float) -> Received | can.Message | None:
         """The next frame, or None after `timeout` [s]."""
@@ -75,7 +77,7 @@ class SocketWire:
     """A raw CAN socket of the kernel."""
 
     def __init__(self, bus: can.BusABC, own: socket.socket) -> None:
-        self.overruns = 0
+        self.overruns, self.room = 0, float(own.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF))
         self._bus, self._socket = bus, own
         self._dropped = 0  # the kernel's count, modulo 2**32
         own.setblocking(False)
@@ -128,7 +130,7 @@ class SocketWire:
 class MessageWire:
     """Any other interface of python-can."""
 
-    overruns = 0  # none of them can tell
+    overruns, room = 0, math.inf  # none of them can tell
 
     def __init__(self, bus: can.BusABC) -> None:
         self._bus = bus

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor, Future, wait
 from typing import NamedTuple
 
 from soilbus.allocator import give_back_freed_memory
@@ -25,16 +25,25 @@ class Pending(NamedTuple):
     epoch: int
 
 
+def wait_for(future: Future[WindowResult], longest: float) -> None:
+    """Returns when the result is there, or after `longest` [s]."""
+    wait([future], longest)
+
+
 class Backlog:
-    """What `workers` (one thread) has to solve; it works beside the loop, which never waits for it."""
+    """What `workers` (one thread) has to solve; it works beside the loop, which never waits for it for long.
+
+    `waiting` waits for a future, so many seconds at most.
+    """
 
     def __init__(
         self,
         workers: Executor,
         solve: Callable[[WindowTask], WindowResult],
         now: float,
+        waiting: Callable[[Future[WindowResult], float], None] = wait_for,
     ) -> None:
-        self._workers, self._solve = workers, solve
+        self._workers, self._solve, self._waiting = workers, solve, waiting
         self._pending: deque[Pending] = deque()
         self._busy_since = now
         self.solved = 0
@@ -63,6 +72,11 @@ class Backlog:
             del self._pending[1]
             dropped += 1
         return dropped
+
+    def wait(self, longest: float) -> None:
+        """Until the oldest window is solved, `longest` [s] at most."""
+        if self._pending and longest > 0.0:
+            self._waiting(self._pending[0].future, longest)
 
     def results(self, now: float) -> Iterator[tuple[WindowResult, Pending]]:
         """The windows that are solved, in their order; once in a while the worker then tidies up."""

@@ -7,7 +7,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,7 @@ from soilbus.can.bus_state import BusState
 from soilbus.can.publish import Publisher
 from soilbus.capability.immobilisation import Watch, watched
 from soilbus.config import Config
-from soilbus.daemon.backlog import Backlog
+from soilbus.daemon.backlog import Backlog, wait_for
 from soilbus.daemon.bus_health import health_frame, health_text
 from soilbus.daemon.health import Health
 from soilbus.daemon.intake import Latest
@@ -45,6 +45,9 @@ MAX_DRAIN = 4000
 """Frames taken in one go before the loop looks at its clock again."""
 POLL, PROMPT = 0.02, 0.003
 """Longest wait for a frame [s], and while the worker has a window: then its result may come any moment."""
+UNDISTURBED = 0.04
+"""So long [s] after the worker got a window frames are left with the kernel: the two share one interpreter, and each
+frame taken halts the worker.  No longer, for the kernel has room for those of 75 ms of a full bus by default."""
 LONGEST_CURVE = 60.0
 """Age [s] up to which a valid window's pull over slip serves to watch for immobilisation."""
 FOREIGN_HOLD = 3.0
@@ -57,8 +60,8 @@ class Service:
     """One vehicle on one bus.
 
     The loop receives and publishes; `workers` (one thread) estimates beside it, so that a
-    hard window neither delays a frame nor loses one.  `clock` is monotonic [s]; frame
-    stamps only space the samples.  `step` makes one round and returns; `run` repeats it
+    hard window neither delays a frame nor loses one.  `clock` is monotonic [s], and `waiting` by it
+    (as in Backlog); frame stamps only space the samples.  `step` makes one round and returns; `run` repeats it
     until `stop`.  What `opened_keeper` returns begins with what another run knew of the sensors,
     and keeps what this one knows; the worker opens it, and makes the estimator, before the first window.
     """
@@ -74,6 +77,7 @@ class Service:
         clock: Callable[[], float] = time.monotonic,
         on_window: Callable[[WindowResult], None] | None = None,
         opened_keeper: Callable[[], Keeper | None] = lambda: None,
+        waiting: Callable[[Future[WindowResult], float], None] = wait_for,
     ) -> None:
         self.config, self.bus, self.publisher = config, bus, publisher
         self.intake = pipeline.intake
@@ -89,12 +93,13 @@ class Service:
         self._curve: tuple[OverSlip | None, float] = None, -math.inf
         self._stopping = False
         self._started = clock()
-        self._backlog = Backlog(workers, self._solver.solve, self._started)
+        self._backlog = Backlog(workers, self._solver.solve, self._started, waiting)
         workers.submit(lambda: self._solver.estimator)  # where it raises, the first window does again, and says so
         self._ended = -math.inf  # monotonic time of the end of the present result's window
         self._interrupted = self._started  # monotonic time at which inputs failed last
         self._epoch = self.intake.epoch
         self._last_frame = -1e9  # monotonic arrival time
+        self._handed_out = -math.inf  # monotonic time at which the worker got a window last
         self._heard_out = self._started  # monotonic time at which no frame was left with the kernel
         self._last_stamp = 0.0  # the bus's own time
         self._next_tick = self._started
@@ -148,8 +153,10 @@ class Service:
             self._tick(now)
 
     def _receive(self) -> None:
-        feed, now = self.intake.admission.feed, self.clock()
-        longest = PROMPT if self._backlog else POLL
+        feed, longest, now = self.intake.admission.feed, POLL, self.clock()
+        if self._backlog and self.bus.is_open:
+            self._backlog.wait(min(self._next_tick, self._handed_out + UNDISTURBED) - now)
+            longest, now = PROMPT, self.clock()
         for _ in range(MAX_DRAIN):
             if self._backlog.has_result:
                 return
@@ -178,6 +185,7 @@ class Service:
         for task in self.intake.due(max(self._last_stamp, self.bus_time(self._heard_out) - GRACE)):
             ended = now - max(0.0, self.bus_time(now) - task.end)
             self.deadline_misses += self._backlog.add(task, ended, self.intake.epoch, now)
+            self._handed_out = now
 
     def _collect(self, now: float) -> None:
         """Publish the windows that are solved, in their order."""

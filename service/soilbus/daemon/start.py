@@ -43,7 +43,6 @@ def start_service(
     Raises ConfigError for a configuration that cannot work, BusError for a bus that
     cannot be opened.
     """
-    _load()
     pipeline, ours = Pipeline(config, load_databases(config)), output_database(config)
     check_cycle_times(config, ours)
     publisher = Publisher(ours)
@@ -59,6 +58,10 @@ def start_service(
     # The loop must get its turn between the estimator's steps, or the socket overflows.
     sys.setswitchinterval(SWITCH_INTERVAL)
     workers = ThreadPoolExecutor(max_workers=1, thread_name_prefix="estimate")
+    if bus.holds_seconds:
+        workers.submit(_load)
+    else:
+        _load()
     service = Service(
         config, pipeline, bus, publisher, Notifier.from_environment(), workers, on_window=on_window,
         opened_keeper=partial(_keeper, pipeline, os.environ),
@@ -69,10 +72,10 @@ def start_service(
 
 
 def _load() -> None:
-    """What only the worker needs, loaded before the bus is open.
+    """What only the worker needs; it may load that while the service listens already.
 
-    Later it would keep the interpreter for itself for so long that on a slow machine the kernel runs out of
-    room for frames.
+    It keeps the interpreter for itself for so long then that on a slow machine the kernel runs out of
+    room for frames, where it has no more than by default.
     """
     with loading():
         import soilbus.daemon.estimator
