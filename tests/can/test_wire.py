@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import socket
 import struct
 import time
@@ -15,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from soilbus.can.publish import Frame
-from soilbus.can.wire import MessageWire, SocketWire, error_number, wire_of
+from soilbus.can.wire import STAMPED, MessageWire, SocketWire, error_number, wire_of
 
 STAMPS, OVERFLOWS, CONFIRM = 35, 40, 0x800
 
@@ -123,6 +124,18 @@ def test_a_frame_of_this_very_socket_is_passed_over():
     ear = wire(Kernel((bytes(16), [stamp()], CONFIRM), (bytes(16), [stamp()], 0)))
     assert ear.recv(0.0) is None
     assert ear.recv(0.0) is not None
+
+
+def test_all_is_heard_up_to_now_where_no_frame_waits():
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    with ours, theirs:
+        ours.setsockopt(socket.SOL_SOCKET, STAMPS, 1)
+        ear, before = wire(ours), time.time()
+        assert before - STAMPED <= ear.heard_until() <= ear.stamping_time() - STAMPED
+        theirs.send(bytes(16))
+        assert ear.heard_until() == -math.inf
+        stamped = ear.recv(0.0).timestamp
+        assert ear.heard_until() > stamped - STAMPED
 
 
 def test_a_real_socket_waits_as_long_as_asked_and_no_longer():

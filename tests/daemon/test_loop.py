@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import itertools
+import math
 from dataclasses import replace
 
 import can
@@ -13,6 +14,7 @@ from fakes import FakeClock, InlineExecutor, ScriptedBus
 from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
+from soilbus.can.wire import STAMPED, MessageWire
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.outputs import hop_frames
 from soilbus.daemon.pipeline import Pipeline
@@ -86,6 +88,34 @@ def test_frames_go_out_at_their_cycle_times(recording):
         assert max(gaps) < 1.5 * cycle, name
         assert sum(gaps) / len(gaps) == pytest.approx(cycle, rel=0.05), name
     assert len(bench.results) == len(bench.sent("SoilStrength")) >= 6
+
+
+def test_a_window_that_the_bus_can_end_waits_for_no_frame_and_says_the_same(recording, monkeypatch):
+    """Frames of the kernel are stamped by a clock that can be asked; here it is the scripted bus's."""
+    sparse = [message for message in recording if message.timestamp % 0.1 < 0.05]
+    benches = [Bench(sparse), Bench(sparse)]
+    benches[0].run(DURATION - 0.5)
+    told = benches[1].wire
+
+    def present(_) -> float:
+        return told.clock.now + told.offset
+
+    def heard_until(_) -> float:
+        waits = told.next < len(told.messages) and told.messages[told.next].timestamp <= present(_)
+        return -math.inf if waits else present(_) - STAMPED
+
+    monkeypatch.setattr(MessageWire, "stamping_time", present)
+    monkeypatch.setattr(MessageWire, "heard_until", heard_until)
+    benches[1].run(DURATION - 0.5)
+    assert len(benches[0].results) == 6
+    assert [r.t for r in benches[1].results] == [r.t for r in benches[0].results]
+    assert [str(r.posterior) for r in benches[1].results] == [str(r.posterior) for r in benches[0].results]
+    late = [
+        [f["at"] + told.offset - r.t for r, f in zip(bench.results, bench.sent("SoilStrength"), strict=True)]
+        for bench in benches
+    ]
+    assert max(late[1]) < STAMPED + 0.001
+    assert min(late[0]) > max(late[1])
 
 
 def test_a_good_drive_passes_the_states_in_order_and_ends_in_go(recording):

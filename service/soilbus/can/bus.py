@@ -219,6 +219,14 @@ class LiveBus:
         self._back_off = FIRST_BACK_OFF
         return message
 
+    def stamping_time(self) -> float:
+        """The present time [s] by the clock that stamps frames; nan where that is not known."""
+        return math.nan if self._wire is None else self._wire.stamping_time()
+
+    def heard_until(self) -> float:
+        """Stamp [s] before which no frame can come any more; -inf where that is not known."""
+        return -math.inf if self._wire is None else self._wire.heard_until()
+
     def _note_error(self, message: Received | can.Message) -> None:
         self._counts.error_frames += 1
         self._overruns_before += tells_overflow(message.arbitration_id, message.data)

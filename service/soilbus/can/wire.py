@@ -20,6 +20,8 @@ from soilbus.can.publish import Frame
 
 GATHER = 0.005
 """Pause [s] in which frames gather: the kernel has stamped them, and one waking for several is cheaper."""
+STAMPED = 0.001
+"""Seconds within which the kernel puts a frame that it has stamped into our socket."""
 SMALL_SEND_BUFFER = 1
 """The kernel makes its least of it, about six frames: no more than these can go stale in a stuck queue."""
 
@@ -57,6 +59,12 @@ class Wire(Protocol):
 
     def recv(self, timeout: float) -> Received | can.Message | None:
         """The next frame, or None after `timeout` [s]."""
+
+    def stamping_time(self) -> float:
+        """The present time [s] by the clock that stamps frames as they come; nan where that is not known."""
+
+    def heard_until(self) -> float:
+        """Stamp [s] before which no frame can be handed out any more; -inf where that is not known."""
 
     def send(self, frame: Frame) -> None:
         """Hand one frame to the driver, never waiting."""
@@ -117,6 +125,15 @@ class SocketWire:
             t, word & _IDENTIFIER, word & _EXTENDED != 0, word & _REMOTE != 0, word & _ERROR != 0, raw[8 : 8 + length]
         )  # fmt: skip
 
+    def stamping_time(self) -> float:
+        """As Wire."""
+        return time.time()
+
+    def heard_until(self) -> float:
+        """As Wire; a frame that is stamped is in the socket within STAMPED."""
+        now = time.time()
+        return -math.inf if self._poll.poll(0) else now - STAMPED
+
     def send(self, frame: Frame) -> None:
         """As Wire."""
         word = frame.arbitration_id | _EXTENDED if frame.extended else frame.arbitration_id
@@ -138,6 +155,14 @@ class MessageWire:
     def recv(self, timeout: float) -> can.Message | None:
         """As Wire."""
         return self._bus.recv(timeout)
+
+    def stamping_time(self) -> float:
+        """As Wire: devices have clocks of their own."""
+        return math.nan
+
+    def heard_until(self) -> float:
+        """As Wire."""
+        return -math.inf
 
     def send(self, frame: Frame) -> None:
         """As Wire."""

@@ -18,6 +18,7 @@ from soilbus.capability.immobilisation import Watch, watched
 from soilbus.config import Config
 from soilbus.daemon.backlog import Backlog, wait_for
 from soilbus.daemon.bus_health import health_frame, health_text
+from soilbus.daemon.bus_time import BusTime
 from soilbus.daemon.health import Health
 from soilbus.daemon.intake import Latest
 from soilbus.daemon.notify import Notifier
@@ -39,8 +40,6 @@ log = logging.getLogger(__name__)
 
 SILENCE = 1.0
 """Seconds without any frame after which the bus counts as silent."""
-GRACE = 0.2
-"""A window that no later frame has closed is closed this long after its end [s]."""
 MAX_DRAIN = 4000
 """Frames taken in one go before the loop looks at its clock again."""
 POLL, PROMPT = 0.02, 0.003
@@ -98,10 +97,8 @@ class Service:
         self._ended = -math.inf  # monotonic time of the end of the present result's window
         self._interrupted = self._started  # monotonic time at which inputs failed last
         self._epoch = self.intake.epoch
-        self._last_frame = -1e9  # monotonic arrival time
+        self._time = BusTime(bus, self._started)
         self._handed_out = -math.inf  # monotonic time at which the worker got a window last
-        self._heard_out = self._started  # monotonic time at which no frame was left with the kernel
-        self._last_stamp = 0.0  # the bus's own time
         self._next_tick = self._started
         self._due = dict.fromkeys(("SoilbusStatus", "SoilbusIdentity", "BusHealth"), self._started)
         self._lost = bus.counts.lost
@@ -160,11 +157,11 @@ class Service:
         for _ in range(MAX_DRAIN):
             if self._backlog.has_result:
                 return
-            message = self.bus.receive(max(0.0, min(self._next_tick - now, longest)))
+            wait = min(self._next_tick - now, self._time.wait(self.intake.next_end, now, longest))
+            message = self.bus.receive(max(0.0, wait))
             if message is None:
-                self._heard_out = self.clock()
+                self._time.took_nothing(self.clock())
                 return
-            self._last_stamp = message.timestamp
             feed(
                 message.timestamp,
                 message.arbitration_id,
@@ -172,18 +169,15 @@ class Service:
                 message.data,
                 message.is_remote_frame,
             )
-            now = self._last_frame = self.clock()
+            now = self.clock()
+            self._time.took(message.timestamp, now)
             if message.timestamp >= self.intake.next_end or now >= self._next_tick:
                 return
 
-    def bus_time(self, now: float) -> float:
-        """The bus's own time at the monotonic time `now` [s]."""
-        return self._last_stamp + max(0.0, now - self._last_frame) if self._last_frame > 0.0 else 0.0
-
     def _hand_out(self, now: float) -> None:
         """Give the windows that have ended to the worker; what it cannot keep up with is dropped."""
-        for task in self.intake.due(max(self._last_stamp, self.bus_time(self._heard_out) - GRACE)):
-            ended = now - max(0.0, self.bus_time(now) - task.end)
+        for task in self.intake.due(self._time.heard(self.intake.next_end, now)):
+            ended = now - max(0.0, self._time.at(now) - task.end)
             self.deadline_misses += self._backlog.add(task, ended, self.intake.epoch, now)
             self._handed_out = now
 
@@ -235,7 +229,7 @@ class Service:
             self._keeper.tick(now, self._solver.newest, self._totals)
 
     def _look_after_health(self, now: float) -> None:
-        hears = self.bus.is_open and now - self._last_frame <= SILENCE
+        hears = self.bus.is_open and now - self._time.last_frame <= SILENCE
         fault = self._health.fault(now, self._backlog.solving_since, hears, self.bus.counts.sent) or ""
         if fault and fault != self._fault:
             log.error("fault: %s; systemd is not told any more that all is well", fault)
@@ -251,9 +245,9 @@ class Service:
             return ServiceState.WAITING, "bus_down"
         if self.bus.state is BusState.OFF:
             return ServiceState.WAITING, f"bus_error {self.bus.state}"
-        if now - self._last_frame > SILENCE:
+        if now - self._time.last_frame > SILENCE:
             return ServiceState.LISTENING, "no_frames"
-        stale = self.intake.stale(self.bus_time(now))
+        stale = self.intake.stale(self._time.at(now))
         if stale:
             never = [name for name in stale if name not in self.intake.last_seen]
             reason = "input_missing " + " ".join(never) if never else "input_stale " + " ".join(stale)
@@ -285,13 +279,13 @@ class Service:
     def _present_curve(self, now: float) -> OverSlip | None:
         """Pull over slip of the last valid window, while it is young enough to extrapolate from."""
         known, t = self._curve
-        return known if self.bus_time(now) - t < LONGEST_CURVE else None
+        return known if self._time.at(now) - t < LONGEST_CURVE else None
 
     def _age(self, now: float) -> float:
         """Of the posterior [s], by the bus's time or ours, whichever says more: the stamps' clock may halt."""
         if self.result is None:
             return math.inf
-        by_stamps = self.bus_time(now) - self.result.t
+        by_stamps = self._time.at(now) - self.result.t
         return by_stamps if math.isnan(by_stamps) else max(by_stamps, now - self._ended)
 
     def _since_valid(self, now: float) -> float | None:
@@ -304,11 +298,11 @@ class Service:
         known = way is not Way.UNKNOWN and self.result is not None
         decided = self.result.traversability if known and self.result is not None else None
         window = self.result.index % WINDOW_MODULUS if self.result is not None else None
-        latest = self.intake.latest(self.bus_time(now)) if self.bus.is_open else Latest({}, None)
+        latest = self.intake.latest(self._time.at(now)) if self.bus.is_open else Latest({}, None)
         for message, values in slip_frames(latest.slip):
             self.bus.send(self.publisher.frame(message, values))
         self._watch = watched(
-            self._watch, self.bus_time(now), latest.slip.values(), latest.pull, self._present_curve(now), latest.inertia
+            self._watch, self._time.at(now), latest.slip.values(), latest.pull, self._present_curve(now), latest.inertia
         )  # fmt: skip
         self.bus.send(self.publisher.frame(*forecast_frame(self.result if known else None, self._watch)))
         limit = decided.limit if decided is not None else None

@@ -1,0 +1,78 @@
+"""The bus's own time, and when a window's end is heard."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import pytest
+
+from soilbus.can.wire import STAMPED
+from soilbus.daemon.bus_time import GRACE, LATE, BusTime
+
+STAMP, NOW = 1.7e9, 500.0
+END = STAMP + 0.5
+
+
+class Told(SimpleNamespace):
+    """A bus of which `until` is heard by its own clock; it is `present` there."""
+
+    until, present = -math.inf, math.nan
+
+    def heard_until(self) -> float:
+        return self.until
+
+    def stamping_time(self) -> float:
+        return self.present
+
+
+@pytest.fixture
+def bus() -> Told:
+    return Told()
+
+
+@pytest.fixture
+def of_bus(bus) -> BusTime:
+    """A frame was taken at NOW, and nothing 0.3 s later."""
+    time = BusTime(bus, NOW - 60.0)
+    assert time.at(NOW) == 0.0
+    time.took(STAMP, NOW)
+    time.took_nothing(NOW + 0.3)
+    return time
+
+
+def test_the_monotonic_clock_goes_on_where_the_stamps_end(of_bus):
+    assert of_bus.at(NOW + 0.25) == pytest.approx(STAMP + 0.25)
+    assert of_bus.at(NOW - 1.0) == STAMP
+
+
+def test_a_bus_that_cannot_tell_has_grace(of_bus):
+    assert of_bus.heard(END, NOW + 0.5) == pytest.approx(STAMP + 0.3 - GRACE)
+    of_bus.took_nothing(NOW + 0.5 + GRACE)
+    assert of_bus.heard(END, NOW + 0.5 + GRACE) >= END
+
+
+def test_a_bus_that_can_tell_has_none(of_bus, bus):
+    bus.until = END + 0.002
+    assert of_bus.heard(END, NOW + 0.498) == pytest.approx(END + 0.002)
+    bus.until = -math.inf  # frames wait
+    assert of_bus.heard(END, NOW + 0.498) < END
+
+
+@pytest.mark.parametrize("step", [3600.0, -3600.0])
+def test_a_clock_that_was_set_ends_no_window_that_has_not(of_bus, bus, step):
+    bus.until = STAMP + 0.4 + step
+    for now in (0.4, 0.48):
+        assert of_bus.heard(END, NOW + now) < END
+    assert of_bus.heard(END, NOW + 0.495) <= END - 0.005 + LATE
+
+
+def test_nobody_sleeps_past_an_end_that_the_bus_can_tell(of_bus, bus):
+    assert of_bus.wait(END, NOW + 0.49, 0.02) == 0.02
+    bus.present = END - 0.007
+    assert of_bus.wait(END, NOW + 0.49, 0.02) == pytest.approx(0.007 + STAMPED, abs=1e-6)
+    assert of_bus.wait(END, NOW + 0.49, 0.003) == 0.003
+    assert of_bus.wait(END, NOW + 0.40, 0.02) == 0.02  # far off: the bus is not even asked
+    bus.present = END + 3600.0
+    assert of_bus.wait(END, NOW + 0.49, 0.02) == 0.0
+    assert of_bus.wait(math.inf, NOW + 0.49, 0.02) == 0.02
