@@ -101,7 +101,8 @@ def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
             more=(
                 f"The floor: a process that only estimates and decides takes {1e3 * _most(alone):.1f} ms for 99 % of "
                 f"its windows with nothing beside, {1e3 * _most(beside):.1f} beside this traffic,",
-                f"and the frame that closes a window comes {1e3 * closing:.1f} ms after its last.",
+                f"and the next frame comes {1e3 * closing:.1f} ms after a window's last; no frame came for "
+                f"{1e3 * ear.longest_pause():.0f} ms at most, as when a machine stands still.",
             ),
         ),
         "bus_processor_ratio": shares,

@@ -68,6 +68,10 @@ class Ear:
         settings = self._config.estimator
         return closings(np.array(self._mapped), settings.window, settings.hop)
 
+    def longest_pause(self) -> float:
+        """The longest time [s] in which no mapped frame came."""
+        return float(np.diff(self._mapped).max(initial=0.0))
+
     def books(self) -> tuple[int, int]:
         """Frames that the daemon says it received, and that were dropped before it (up to 250)."""
         received = np.array([0.0] + [n for _, n in self._of("BusHealth", "Received")])
