@@ -21,7 +21,8 @@ from soilbus.can.publish import Frame
 GATHER = 0.005
 """Pause [s] in which frames gather: the kernel has stamped them, and one waking for several is cheaper."""
 STAMPED = 0.001
-"""Seconds within which the kernel puts a frame that it has stamped into our socket."""
+"""Seconds within which the kernel puts a frame that it has stamped into our socket; a later one counts from the
+next window on."""
 SMALL_SEND_BUFFER = 1
 """The kernel makes its least of it, about six frames: no more than these can go stale in a stuck queue."""
 
