@@ -32,7 +32,7 @@ from soilbus.simulator.reference import TRACTOR
 STARTS = 3
 QUIET = 1.0
 SETTLED = 2.5
-"""Seconds after the last frame until its count is on the bus."""
+"""Seconds after the last frame until its count is on the bus; where the daemon lags behind the count goes on."""
 
 _BARE = """
 import socket, sys
@@ -80,7 +80,7 @@ def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
             late = ear.latencies()
             shares = _shares(daemon, channel, 0.5 * seconds)
             traffic.wait()
-            time.sleep(SETTLED)
+            _wait_until_counted(ear)
         ear.stop()
         memory = _peak_memory(daemon)
     if not len(late):
@@ -115,6 +115,14 @@ def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
             more=("Processor time to READY=1: " + ", ".join(f"{used:.2f}" for _, used in ready) + " s.",),
         ),
     }  # fmt: skip
+
+
+def _wait_until_counted(ear: Ear) -> None:
+    """Until the daemon's count of frames goes on no more."""
+    before = -1
+    while (count := ear.books()[0]) != before:
+        before = count
+        time.sleep(SETTLED)
 
 
 def _most(times: NDArray[np.float64]) -> float:
