@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from time import perf_counter, sleep
 
 import pytest
 
@@ -77,9 +78,6 @@ def test_the_loop_waits_for_a_result_and_no_longer(solved, waited):
 
 
 def test_a_real_result_ends_the_wait():
-    from concurrent.futures import ThreadPoolExecutor
-    from time import perf_counter, sleep
-
     with ThreadPoolExecutor(max_workers=1) as worker:
         backlog = Backlog(worker, lambda task: sleep(0.01), 0.0)
         backlog.add(0, 0.0, 0, 0.0)

@@ -29,6 +29,8 @@ from soilbus.bench.figure import Figure
 from soilbus.can.bus import open_bus
 from soilbus.simulator.reference import TRACTOR
 
+Array = NDArray[np.float64]
+
 STARTS = 3
 QUIET = 1.0
 SETTLED = 2.5
@@ -85,26 +87,14 @@ def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
         memory = _peak_memory(daemon)
     if not len(late):
         raise NotMeasured(f"{channel}: no window was estimated in {seconds:g} s")
-    late = 1e3 * np.sort(np.minimum(late, seconds))
     received, overruns = ear.books()
-    closing = float(np.median(ear.closings()))
     return {
         "bus_lost": Figure(
             traffic.sent - received, 0.0, f"kernel's drop counter: {overruns}",
             f"of {traffic.sent} frames at our filters, {traffic.sent / (1.5 * seconds):.0f} of {FULL:.0f} a second",
             at_most=True, digits=0,
         ),
-        "bus_latency_ms": Figure(
-            _most(late), 50.0,
-            f"median {np.median(late):.1f}, worst {late[-1]:.0f}; floor {1e3 * (_most(beside) + closing):.1f} ms",
-            f"from a window's last frame to its SoilStrength, 99 % of {len(late)} windows", at_most=True,
-            more=(
-                f"The floor: a process that only estimates and decides takes {1e3 * _most(alone):.1f} ms for 99 % of "
-                f"its windows with nothing beside, {1e3 * _most(beside):.1f} beside this traffic,",
-                f"and the next frame comes {1e3 * closing:.1f} ms after a window's last; no frame came for "
-                f"{1e3 * ear.longest_pause():.0f} ms at most, as when a machine stands still.",
-            ),
-        ),
+        "bus_latency_ms": _latency(np.minimum(late, seconds), alone, beside, ear),
         "bus_processor_ratio": shares,
         "bus_memory_mb": Figure(memory / 1e6, 90.0, "", "most resident memory of the daemon", at_most=True),
         "bus_ready_s": Figure(
@@ -117,6 +107,23 @@ def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
     }  # fmt: skip
 
 
+def _latency(late: Array, alone: Array, beside: Array, ear: Ear) -> Figure:
+    """Of the windows' results (windows,) [s], beside what the work alone takes (times,) [s]."""
+    closing = float(np.median(ear.closings()))
+    return Figure(
+        1e3 * _most(late), 50.0,
+        f"median {1e3 * np.median(late):.1f}, worst {1e3 * late.max():.0f}; "
+        f"floor {1e3 * (_most(beside) + closing):.1f} ms",
+        f"from a window's last frame to its SoilStrength, 99 % of {len(late)} windows", at_most=True,
+        more=(
+            f"The floor: a process that only estimates and decides takes {1e3 * _most(alone):.1f} ms for 99 % of "
+            f"its windows with nothing beside, {1e3 * _most(beside):.1f} beside this traffic,",
+            f"and the next frame comes {1e3 * closing:.1f} ms after a window's last; no frame came for "
+            f"{1e3 * ear.longest_pause():.0f} ms at most, as when a machine stands still.",
+        ),
+    )  # fmt: skip
+
+
 def _wait_until_counted(ear: Ear) -> None:
     """Until the daemon's count of frames goes on no more."""
     before = -1
@@ -125,7 +132,7 @@ def _wait_until_counted(ear: Ear) -> None:
         time.sleep(SETTLED)
 
 
-def _most(times: NDArray[np.float64]) -> float:
+def _most(times: Array) -> float:
     """That of which 99 % are no longer."""
     return float(np.sort(times)[math.ceil(0.99 * len(times)) - 1])
 

@@ -34,6 +34,7 @@ def work_times(channel: str) -> tuple[Array, Array]:
     """Wall times (windows,) [s] of estimate and decision, with nothing beside and beside the bench's traffic.
 
     By a process of its own that hears nothing of the bus; without a run's first window, which searches for the soil.
+    The channel must be there, up and quiet.
     """
     with ProcessPoolExecutor(1, get_context("spawn"), initializer=_begin) as worker:
         alone = worker.submit(_worked).result()

@@ -26,6 +26,7 @@ LONGEST_BACK_OFF = 1.0
 """Reopening is tried at least this often [s], so that a bus that is back is found in time."""
 
 RECEIVE_BUFFER = 4 * 2**20
+"""Bytes asked for frames that wait for us; the kernel takes as many again for itself."""
 SO_RCVBUFFORCE = 33  # which Python does not name
 RETRY = 0.005
 """Longest wait for a frame [s] while frames of ours wait for room."""
@@ -78,7 +79,10 @@ def _prepare(bus: can.BusABC) -> None:
 
 
 def ask_for_buffer(own: socket.socket) -> None:
-    """As much receive buffer as we want for an administrator, for others as net.core.rmem_max allows."""
+    """Ask for RECEIVE_BUFFER (socket(7)): an administrator gets all of it, others what net.core.rmem_max allows.
+
+    Raises OSError for a socket that is closed.
+    """
     own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
     with suppress(OSError):  # it takes CAP_NET_ADMIN
         own.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER)
