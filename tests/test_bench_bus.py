@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soilbus.bench.bus_ear import closings, latencies
+from soilbus.bench.bus_ear import latencies
 from soilbus.bench.bus_load import FULL, OURS, Traffic
 from soilbus.cli import main
 from soilbus.daemon.intake import EDGE_LEAD
@@ -20,13 +20,6 @@ def test_latency_is_from_the_last_mapped_frame_of_the_window():
     assert latencies(mapped, results, 10.0, 1.0) == pytest.approx(told)
     assert latencies(mapped, results[[0, 2, 3]], 10.0, 1.0) == pytest.approx([0.01, np.inf, 0.03, 0.04])
     assert latencies(mapped, np.empty((0, 2)), 10.0, 1.0).size == 0
-
-
-def test_a_window_is_closed_by_the_first_frame_after_it():
-    mapped = 5.0 + np.arange(0.0, 14.0, 0.3)
-    end = 5.0 - EDGE_LEAD + 10.0 + np.arange(4.0)
-    assert closings(mapped, 10.0, 1.0) == pytest.approx([mapped[mapped >= e][0] - mapped[mapped < e][-1] for e in end])
-    assert closings(np.append(mapped[mapped < 15.4], 17.1), 10.0, 1.0)[[1, 2]] == pytest.approx([1.9, 1.9])
 
 
 def test_window_numbers_go_round():

@@ -15,7 +15,7 @@ BENCH = "import sys; from soilbus.cli import main; sys.exit(main())"
 def figures(vcan_run, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     out = tmp_path_factory.mktemp("bench")
     command = [sys.executable, "-c", BENCH, "bench", "--bus", "vcan0", "--seconds", "15", "--json", out / "bench.json"]
-    done = vcan_run(command, rw=[out], timeout=300.0)
+    done = vcan_run(command, rw=[out], timeout=180.0)
     assert done.returncode == 0, done.stdout
     return json.loads((out / "bench.json").read_text())["details"]
 

@@ -242,11 +242,11 @@ def test_a_defect_in_every_window_is_a_fault_until_an_estimator_that_knows_nothi
     broken(bench.estimator, range(1, 100))
     bench.run(WINDOW + REPEATED)
     assert "fault" not in {str(f["State"]) for f in bench.sent("SoilbusStatus")}
-    bench.run(1.2)
+    bench.run(0.9)  # until just before the next window ends
     last = bench.sent("SoilbusStatus")[-1]
     assert (str(last["State"]), str(last["Reason"])) == ("fault", "internal")
     assert bench.service._solver.estimator is not bench.estimator
-    bench.run(1.9)
+    bench.run(2.2)
     assert bench.sent("SoilbusStatus")[-1]["State"] == "valid"
     assert bench.service.failures["internal"] == REPEATED
     assert len([r for r in caplog.records if r.levelno >= logging.ERROR]) == REPEATED

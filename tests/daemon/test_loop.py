@@ -15,6 +15,7 @@ from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
 from soilbus.can.wire import STAMPED, MessageWire
+from soilbus.daemon.beat import EVE
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.outputs import hop_frames
 from soilbus.daemon.pipeline import Pipeline
@@ -88,6 +89,15 @@ def test_frames_go_out_at_their_cycle_times(recording):
         assert max(gaps) < 1.5 * cycle, name
         assert sum(gaps) / len(gaps) == pytest.approx(cycle, rel=0.05), name
     assert len(bench.results) == len(bench.sent("SoilStrength")) >= 6
+
+
+def test_before_each_window_ends_the_loop_has_just_done_its_work_and_then_leaves_the_worker_alone(recording):
+    bench = Bench(recording)
+    bench.run(DURATION)
+    beats = [f["at"] + bench.wire.offset for f in bench.sent("WheelSlip")]
+    for end in [result.t for result in bench.results][1:]:
+        assert EVE - 0.001 < end - max(beat for beat in beats if beat < end) < EVE + 0.02
+        assert min(beat for beat in beats if beat > end) - end > 0.08
 
 
 def test_a_window_that_the_bus_can_end_waits_for_no_frame_and_says_the_same(recording, monkeypatch):
@@ -270,7 +280,7 @@ def test_an_outage_between_two_beats_ends_go_too(recording):
     gone = bench.clock.now
     bench.wire.fail_receive.append(can.CanOperationError("Network is down", errno.ENETDOWN))
     bench.service._next_tick = gone + 0.15  # the bus is back before anybody has looked
-    bench.run(0.45)
+    bench.run(0.3)  # no window ends meanwhile
     assert bench.bus.counts.lost == 1
     states = [str(f["State"]) for f in bench.sent("Traversability", since=gone + 0.01)]
     assert states
@@ -323,7 +333,7 @@ def test_a_second_sender_under_our_identifiers_is_told_of_and_never_believed(rec
     health = bench.sent("BusHealth")[-1]
     assert (health["ForeignFrames"], bench.bus.counts.foreign) == (5, 5)
     assert bench.service.intake.admission.counts.unknown == 0
-    assert health["Received"] == bench.bus.counts.received % 4016 > 0
+    assert health["Received"] == sum(m.timestamp + start - begin <= health["at"] for m in recording) % 4016 > 0
     reasons = {round(f["at"] - start, 1): str(f["Reason"]) for f in bench.sent("SoilbusStatus")}
     told = [t for t, reason in reasons.items() if reason == "foreign_sender"]
     assert told

@@ -55,21 +55,29 @@ class Estimates:
 
 @dataclass
 class Beat:
-    """When one frame went out: counts those that left the grid of its period [s] since the first one."""
+    """When one frame went out: counts those that left the grid of its period [s].
+
+    The grid may follow by `slew` [s] from one frame to the next; `drift` is how far it went altogether.
+    """
 
     period: float
     slack: float
-    first: float | None = None
+    slew: float
+    due: float | None = None
     sent: int = 0
     off: int = 0
-    latest: float = 0.0
+    late: float = 0.0
+    drift: float = 0.0
 
     def add(self, t: float) -> None:
         """Take note of one sending at t [s]."""
-        self.first = t if self.first is None else self.first
-        self.latest = (t - self.first + self.slack / 2) % self.period - self.slack / 2
+        due = t if self.due is None else self.due
+        self.late = (t - due + self.period / 2) % self.period - self.period / 2
+        followed = min(max(self.late, -self.slew), self.slew)
+        self.due = t - self.late + followed
+        self.drift += followed
         self.sent += 1
-        self.off += self.latest > self.slack
+        self.off += abs(self.late) > self.slack
 
 
 def unaccounted(received: Counter, admitted: Counter, refused: Counter[tuple[str, Reason]], delivered: Counter) -> dict:

@@ -13,7 +13,9 @@ from fakes import FakeClock, InlineExecutor
 from soilbus.can.bus import LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
+from soilbus.daemon.beat import SLEW
 from soilbus.daemon.notify import Notifier
+from soilbus.daemon.outputs import TICK
 from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.service import Service
 from soilbus.daemon.warm_up import warm_up
@@ -34,7 +36,8 @@ memory goes back once a minute and what one window needs comes and goes."""
 
 class Soak(NamedTuple):
     """What a run showed: hours (the last may be short), frames received, admitted, refused by reason, unknown,
-    lost (by message), faults by kind, deadline misses, ten-hertz frames sent and how many left their beat."""
+    lost (by message), faults by kind, deadline misses, ten-hertz frames sent and how many left their beat,
+    how far [s] that shifted altogether, and how often windows were counted anew, to which it is brought into step."""
 
     hours: list[Hour]
     received: int
@@ -46,6 +49,8 @@ class Soak(NamedTuple):
     deadline_misses: int
     sent: int
     off_beat: int
+    drift: float
+    epochs: int
 
 
 def soak(duration: float, seed: int, each_hour: Callable[[Hour], None] = lambda hour: None, hour: float = HOUR) -> Soak:
@@ -63,7 +68,7 @@ def soak(duration: float, seed: int, each_hour: Callable[[Hour], None] = lambda 
         clock, estimates.add,
     )  # fmt: skip
     verdict = out.get_message_by_name("Traversability").frame_id
-    beat = Beat(0.1, SLACK)
+    beat = Beat(TICK, SLACK, SLEW)
     wire.on_send = lambda t, message: beat.add(t) if message.arbitration_id == verdict else None
     hours: list[Hour] = []
     end = clock.now + duration
@@ -106,4 +111,6 @@ def _told(service: Service, wire: Wire, database: Database, hours: list[Hour], b
         service.deadline_misses,
         beat.sent,
         beat.off,
+        beat.drift,
+        service.intake.epoch,
     )

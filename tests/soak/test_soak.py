@@ -6,6 +6,8 @@ from collections import Counter
 
 import pytest
 
+from soilbus.daemon.outputs import TICK
+
 from . import wire
 from .books import Hour
 from .run import Soak, soak
@@ -36,6 +38,7 @@ def test_frames_keep_their_beat(told):
     assert told.deadline_misses == 0
     assert told.off_beat <= told.faults["full"]  # once each: the newest frame goes out as soon as there is room
     assert told.sent > 0.8 * 3000
+    assert abs(told.drift) < TICK / 2 * told.epochs
 
 
 def test_valid_windows_stay_right(told):
@@ -60,7 +63,7 @@ def _forgetful(usual):
 
 def _fine(**changed) -> Soak:
     hours = [Hour(3600, 3500, 0.0045, 0.6, 2.0, 80_000_000 + 1000 * i) for i in range(8)]
-    told = Soak(hours, 10, 9, Counter(stuck=1), 3, {}, Counter(), 0, 100, 0)
+    told = Soak(hours, 10, 9, Counter(stuck=1), 3, {}, Counter(), 0, 100, 0, 0.04, 1)
     return told._replace(**changed)
 
 
@@ -75,6 +78,7 @@ def test_a_good_run_meets_every_demand():
         ({"admitted": 8}, "every frame accounted for"),
         ({"deadline_misses": 1}, "no deadline missed"),
         ({"off_beat": 1}, "every frame on its beat"),
+        ({"drift": 0.09}, "the beat drifts"),
         ({"hours": [_fine().hours[0], _fine().hours[0]._replace(memory=80_000_001 + int(GROWTH))]}, "memory grows"),
         ({"hours": [_fine().hours[0], _fine().hours[0]._replace(error=0.006)]}, "estimates as good"),
         ({"hours": [_fine().hours[0], _fine().hours[0]._replace(worst_z=5.1)]}, "no valid window"),

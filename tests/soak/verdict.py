@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from .run import Soak
+from soilbus.daemon.outputs import TICK
+
+from .run import SLACK, Soak
 
 GROWTH = 1e6
 """Of resident memory [bytes] after the first hour that is allowed."""
@@ -39,6 +41,10 @@ def demands(told: Soak) -> list[Demand]:
         ),
         Demand("no deadline missed", f"{told.deadline_misses} missed", told.deadline_misses == 0),
         Demand("every frame on its beat", f"{told.off_beat} of {told.sent} off it", told.off_beat == 0 < told.sent),
+        Demand(
+            "the beat drifts with the windows' ends only", f"{told.drift:+.3f} s in {told.epochs} beginnings",
+            abs(told.drift) <= TICK / 2 * told.epochs + SLACK,
+        ),
         Demand(
             f"memory grows by at most {GROWTH / 1e6:g} MB after the first hour", f"{growth / 1e6:+.2f} MB",
             growth <= GROWTH if long_enough else None,

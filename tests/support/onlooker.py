@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import errno
 import math
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -51,6 +52,10 @@ class Wire:
     clock: FakeClock
     moment: dict[int, list[can.Message]]
     offset: float = 1.7e9 - 1000.0
+    step: float = 0.0
+    """By so much [s] the clock that stamps frames has been set; only the next frame can tell of it."""
+    known_anew: Callable[[], None] = lambda: None
+    """Called when a frame has told that it was set back."""
     deaf: frozenset[str] = frozenset()
     spoilt: frozenset[str] = frozenset()
     repeated: frozenset[str] = frozenset()
@@ -90,6 +95,11 @@ class Wire:
                 return can.Message(timestamp=self.stamp(), arbitration_id=0x123, is_extended_id=False, data=b"\x5a" * 3)
 
     def stamp(self) -> float:
+        step, self.step = self.step, 0.0
+        self.offset += step
+        if step < -CLOCK_STEP:
+            self.good, self.stamps = {}, {}
+            self.known_anew()
         return self.clock.now + self.offset
 
     def frame(self, name: str, message: can.Message) -> can.Message:
@@ -142,7 +152,7 @@ class Drive:
 
     def __init__(self, moment, tracked) -> None:
         self.clock, self.tracked = FakeClock(), tracked
-        self.wire = Wire(self.clock, moment)
+        self.wire = Wire(self.clock, moment, known_anew=self.forget)
         self.folder = TemporaryDirectory()
         self.faults: list[str] = []
         self.go = 0
@@ -184,11 +194,11 @@ class Drive:
     def take(self, result) -> None:
         self.result, self.came = result, self.clock.now
 
+    def forget(self) -> None:
+        self.result = None
+
     def step_clock(self, by: float) -> None:
-        self.wire.offset += by
-        if by < -CLOCK_STEP:
-            self.result = None
-            self.wire.good, self.wire.stamps = {}, {}
+        self.wire.step += by
 
     def run(self, seconds: float) -> None:
         end = self.clock.now + seconds

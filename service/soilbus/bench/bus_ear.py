@@ -63,11 +63,6 @@ class Ear:
         settings = self._config.estimator
         return latencies(np.array(self._mapped), np.array(said), settings.window, settings.hop)
 
-    def closings(self) -> Array:
-        """Time [s] from the last mapped frame of each window to the next one."""
-        settings = self._config.estimator
-        return closings(np.array(self._mapped), settings.window, settings.hop)
-
     def longest_pause(self) -> float:
         """The longest time [s] in which no mapped frame came."""
         return float(np.diff(self._mapped).max(initial=0.0))
@@ -99,13 +94,3 @@ def latencies(mapped: Array, results: Array, window: float, hop: float) -> Array
     end = mapped[0] - EDGE_LEAD + window + hop * number
     late[number] = results[:, 0] - mapped[np.searchsorted(mapped, end) - 1]
     return late
-
-
-def closings(mapped: Array, window: float, hop: float) -> Array:
-    """From the last mapped frame of a window to the next one, which tells that it has ended, (windows,) [s].
-
-    mapped (N,) as in latencies().
-    """
-    end = np.arange(mapped[0] - EDGE_LEAD + window, mapped[-1], hop)
-    closing = np.searchsorted(mapped, end)
-    return np.asarray(mapped[closing] - mapped[closing - 1])

@@ -35,6 +35,11 @@ class BusTime:
         """The bus's own time at the monotonic time `now`."""
         return self._stamp + max(0.0, now - self.last_frame) if self.last_frame > 0.0 else 0.0
 
+    def present(self, now: float) -> float:
+        """The same, by the clock that stamps frames where it can be asked."""
+        stamping = self._bus.stamping_time()
+        return self.at(now) if math.isnan(stamping) else stamping
+
     def heard(self, end: float, now: float) -> float:
         """The bus's own time of which all is heard; asks the bus itself where a window may just have ended at `end`."""
         heard, latest = max(self._stamp, self.at(self._nothing_left) - GRACE), self.at(now) + LATE

@@ -17,6 +17,7 @@ from soilbus.can.publish import Publisher
 from soilbus.capability.immobilisation import Watch, watched
 from soilbus.config import Config
 from soilbus.daemon.backlog import Backlog, wait_for
+from soilbus.daemon.beat import next_tick
 from soilbus.daemon.bus_health import health_frame, health_text
 from soilbus.daemon.bus_time import BusTime
 from soilbus.daemon.health import Health
@@ -44,9 +45,9 @@ MAX_DRAIN = 4000
 """Frames taken in one go before the loop looks at its clock again."""
 POLL, PROMPT = 0.02, 0.003
 """Longest wait for a frame [s], and while the worker has a window: then its result may come any moment."""
-UNDISTURBED = 0.04
+UNDISTURBED, WITH_ROOM = 0.04, 0.08
 """So long [s] after the worker got a window frames are left with the kernel: the two share one interpreter, and each
-frame taken halts the worker.  No longer, for the kernel has room for those of 75 ms of a full bus by default."""
+frame taken halts the worker.  No longer where the kernel has its default's room, for those of 75 ms of a full bus."""
 LONGEST_CURVE = 60.0
 """Age [s] up to which a valid window's pull over slip serves to watch for immobilisation."""
 FOREIGN_HOLD = 3.0
@@ -146,13 +147,15 @@ class Service:
         if now >= self._next_tick:
             if now - self._next_tick > TICK:
                 self.deadline_misses += 1
-            self._next_tick = max(self._next_tick + TICK, now - TICK)
+            window_ends = now + self.intake.next_end - self._time.present(now)
+            self._next_tick = max(next_tick(self._next_tick, window_ends), now - TICK)
             self._tick(now)
 
     def _receive(self) -> None:
         feed, longest, now = self.intake.admission.feed, POLL, self.clock()
         if self._backlog and self.bus.is_open:
-            self._backlog.wait(min(self._next_tick, self._handed_out + UNDISTURBED) - now)
+            undisturbed = WITH_ROOM if self.bus.holds_seconds else UNDISTURBED
+            self._backlog.wait(min(self._next_tick, self._handed_out + undisturbed) - now)
             longest, now = PROMPT, self.clock()
         for _ in range(MAX_DRAIN):
             if self._backlog.has_result:
