@@ -36,6 +36,38 @@ def test_memory_that_is_free_between_blocks_in_use_is_given_back():
     assert before - after > 35e6
 
 
+THREADS_IN_TURN = """
+import ctypes, resource, sys, threading
+from soilbus.allocator import keep_freed_memory
+
+if sys.argv[1] == "shared":
+    keep_freed_memory()
+malloc, free = ctypes.CDLL(None).malloc, ctypes.CDLL(None).free
+malloc.restype, free.argtypes = ctypes.c_void_p, [ctypes.c_void_p]
+
+def used_for_a_moment():
+    blocks = [malloc(100_000) for _ in range(80)]
+    for block in blocks:
+        ctypes.memset(block, 1, 100_000)
+    for block in blocks:
+        free(block)
+
+worker = threading.Thread(target=used_for_a_moment)
+worker.start()
+worker.join()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+used_for_a_moment()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.parametrize(("kept", "least", "most"), [("shared", 0, 200), ("apart", 1500, 2500)])
+def test_what_one_thread_has_freed_another_takes_without_asking_the_kernel(kept, least, most):
+    command = [sys.executable, "-c", THREADS_IN_TURN, kept]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60.0)
+    assert least <= int(done.stdout) <= most
+
+
 SIZES = """
 import ctypes, sys
 import numpy as np

@@ -12,18 +12,24 @@ _C.malloc.restype, _C.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]
 _C.free.restype, _C.free.argtypes = None, [ctypes.c_void_p]
 SMALL, OF_EACH = 1024, 7
 """Bytes from which numpy keeps no freed blocks, and how many it keeps of each size below (NBUCKETS, NCACHE)."""
+_M_ARENA_MAX = -8  # malloc.h
 _BLOCK = 100_000
 """Bytes of a block as an evaluation takes it, of the columns of one window."""
 
 
 def keep_freed_memory() -> None:
-    """Let glibc keep freed memory instead of giving it back after every evaluation.
+    """Let glibc keep freed memory instead of giving it back after every evaluation, for whatever thread needs it next.
 
     Freeing one large block raises glibc's trim threshold (dynamic mmap threshold,
     mallopt(3)).  Without it each model evaluation gives some 2 MB back to the kernel and
     faults it in again, which doubles its time.  The block is never touched, so it costs
-    no memory; elsewhere this does nothing.
+    no memory; elsewhere this does nothing.  Threads would each have an arena of their own
+    (mallopt(3)), and the loop would wait page by page for memory that the worker has done with;
+    Python lets only one of them work at a time as it is.  To be called before there is a second one.
     """
+    mallopt = getattr(_C, "mallopt", None)
+    if mallopt is not None:
+        mallopt(_M_ARENA_MAX, 1)
     _C.free(_C.malloc(31 * 2**20))
 
 
