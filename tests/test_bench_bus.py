@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soilbus.bench.bus_ear import latencies
+from soilbus.bench.bus_ear import latencies, until_middle
 from soilbus.bench.bus_load import FULL, OURS, Traffic
 from soilbus.cli import main
 from soilbus.daemon.intake import EDGE_LEAD
@@ -20,6 +20,14 @@ def test_latency_is_from_the_last_mapped_frame_of_the_window():
     assert latencies(mapped, results, 10.0, 1.0) == pytest.approx(told)
     assert latencies(mapped, results[[0, 2, 3]], 10.0, 1.0) == pytest.approx([0.01, np.inf, 0.03, 0.04])
     assert latencies(mapped, np.empty((0, 2)), 10.0, 1.0).size == 0
+
+
+@pytest.mark.parametrize("now", [5.0, 14.2, 14.4951, 15.0, 222.7])
+def test_an_onlooker_listens_between_two_windows(now):
+    looks = now + until_middle(now, 5.0, 10.0, 1.0)
+    ends = 5.0 - EDGE_LEAD + 10.0 + np.arange(-20.0, 300.0)
+    assert now <= looks < now + 1.0
+    assert np.abs(ends - looks).min() == pytest.approx(0.5)
 
 
 def test_window_numbers_go_round():

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import threading
+import time
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.can.bus import open_bus
+from soilbus.can.bus import RECEIVE_BUFFER, open_bus
 from soilbus.can.dbc_files import filters_of, load_databases, output_database
 from soilbus.can.wire import wire_of
 from soilbus.daemon.bus_health import RECEIVED_MODULUS
@@ -17,6 +18,9 @@ from soilbus.daemon.outputs import WINDOW_MODULUS
 from soilbus.simulator.reference import reference_configuration
 
 Array = NDArray[np.float64]
+
+LITTLE_ROOM = 0.05
+"""Longest time [s] between two looks where the kernel does not keep the frames of seconds for us."""
 
 
 class Ear:
@@ -49,13 +53,21 @@ class Ear:
 
     def _listen(self) -> None:
         while self._on:
-            frame = self._wire.recv(0.1)
+            frame = self._wire.recv(0.0)
             if frame is None:
+                time.sleep(self._pause())
                 continue
             if frame.arbitration_id in self._said:
                 self._said[frame.arbitration_id].append((frame.timestamp, bytes(frame.data)))
             else:
                 self._mapped.append(frame.timestamp)
+
+    def _pause(self) -> float:
+        """Time [s] for which frames may gather: the kernel stamps them, and listening takes the daemon time."""
+        if not self._mapped:
+            return LITTLE_ROOM
+        pause = until_middle(time.time(), self._mapped[0], self._config.estimator.window, self._config.estimator.hop)
+        return pause if self._wire.room >= RECEIVE_BUFFER else min(pause, LITTLE_ROOM)
 
     def latencies(self) -> Array:
         """Time [s] from the last mapped frame of each window so far to the frame SoilStrength that tells of it."""
@@ -94,3 +106,8 @@ def latencies(mapped: Array, results: Array, window: float, hop: float) -> Array
     end = mapped[0] - EDGE_LEAD + window + hop * number
     late[number] = results[:, 0] - mapped[np.searchsorted(mapped, end) - 1]
     return late
+
+
+def until_middle(now: float, first: float, window: float, hop: float) -> float:
+    """Time [s] from `now` to the next middle between two windows' ends, where `first` is the first mapped frame's."""
+    return (first - EDGE_LEAD + window + hop / 2.0 - now) % hop
