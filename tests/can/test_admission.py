@@ -141,6 +141,24 @@ def test_time_may_stand_still_but_not_go_back() -> None:
     assert refused(a.take()) == {("Left", "time_backwards"): [1.0]}
 
 
+def test_a_frame_stamped_long_before_one_that_came_earlier_is_refused() -> None:
+    a = admission(LEFT, ("Guarded", "Value"))
+    for i, (guarded_at, left_at) in enumerate([(9.9, 9.91), (10.0, 9.92), (10.1, 9.6), (10.2, 9.7), (10.3, 10.21)]):
+        a.feed(guarded_at, 257, False, guarded(i, 5))
+        a.feed(left_at, 256, False, bytes([i, 0, 0, 0]))
+    out = a.take()
+    assert out.columns["Left"].t.tolist() == [9.91, 9.92, 10.21]  # 0.1 s is a bunch
+    assert out.columns["Value"].t.tolist() == [9.9, 10.0, 10.1, 10.2, 10.3]
+    assert refused(out) == {("Left", "time_backwards"): [9.6, 9.7]}
+    a.feed(10.0, 256, False, bytes([7, 0, 0, 0]))
+    a.feed(8.0, 256, False, bytes(4))  # the clock was set; what waits has no place in the new time
+    assert a.counts.clock_steps == 1
+    assert a.take().columns["Left"].t.tolist() == [8.0]
+    assert a.counts.received["Loads"] == a.counts.admitted["Loads"] + sum(
+        n for (name, _), n in a.counts.refused.items() if name == "Loads"
+    )
+
+
 def test_a_frame_that_comes_once_more_is_refused() -> None:
     a = admission(LEFT)
     for t, data in ((1.0, 1), (1.0004, 1), (1.0008, 2), (1.0012, 1), (1.0213, 1), (1.0214, 1)):

@@ -207,6 +207,10 @@ FAULTS = {
     "attitude 200 ms late": Fault(le.delayed(0.2, "Attitude"), GOOD, "none"),
     "motor 200 ms late": Fault(le.delayed(0.2, "McuFL"), BAD, lies("motor_speed.FL"), length=BORDER),
     "loads 1 s late": Fault(le.delayed(1.0, "AxleLoads"), BAD, "model_mismatch", length=BORDER),
+    "speeds stamped 50 ms early": Fault(le.stamped_early(0.05, "WheelSpeeds"), GOOD, "none", "time_backwards"),
+    "loads stamped 0.5 s early": Fault(
+        le.stamped_early(0.5, "AxleLoads"), BAD, "input_stale load.FL load.FR load.RL load.RR", "time_backwards"
+    ),
     # mounted or wired wrongly
     "torque sign": Fault(le.flipped(TORQUES[1]), BAD, lies("torque.FR")),
     "draft sign": Fault(le.flipped(DRAFT), BAD, lies("draft"), since=FROM_THE_START, length=12.2),

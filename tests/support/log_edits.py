@@ -223,6 +223,23 @@ def delayed(by: float, *messages: str) -> Edit:
     return edit
 
 
+class Restamped(Log):
+    """A log of which some messages' frames, in their old places, are stamped earlier from a time [s] on."""
+
+    def __init__(self, log: Log, messages: Iterable[str], since: float, by: float) -> None:
+        self.streams, self.since, self.by = log.streams, since, by
+        self.ids = {log.streams[message].message.frame_id for message in messages}
+
+    def frames(self) -> list[Frame]:
+        """As they come."""
+        return [(t - self.by if i in self.ids and t >= self.since else t, i, *rest) for t, i, *rest in super().frames()]
+
+
+def stamped_early(by: float, *messages: str) -> Edit:
+    """Frames come as they did, with stamps so much [s] behind those of the others."""
+    return lambda log, t: Restamped(log, messages, t, by)
+
+
 def swapped(a: str, b: str) -> Edit:
     """Two signals of the same layout exchanged (both messages at the same rate, as their frames come)."""
 

@@ -34,8 +34,10 @@ from soilbus.can.inbox import (
 from soilbus.can.j1939 import STANDARD_PGNS, SourceLock, group_mask, pgn_of, source_of
 from soilbus.can.validity import REASONS, CodeRule, in_si, judge_codes, judge_validity
 
+OUT_OF_ORDER = 0.1
+"""Seconds by which a frame may be stamped earlier than one that came before it: drivers hand frames over in bunches."""
 CLOCK_STEP = 1.0
-"""Backward jump [s] above which the clock was set and the new time is believed."""
+"""The same, above which the clock was set and the new time is believed."""
 LAST_TIME = 1e10
 """Stamps [s] beyond it, either way, are no times: a clock that ticks in seconds would not move any more."""
 MAX_LISTED_UNKNOWN = 1024
@@ -81,7 +83,7 @@ class Admission:
         self._inboxes: list[Inbox] = []
         self._by_key: dict[int, Inbox] = {}
         self._groups: dict[int, Inbox] = {}
-        self._earliest = math.inf  # an earlier stamp does not follow the last one; inf: there is none
+        self._earliest = math.inf  # an earlier stamp is out of order; inf: there is none yet
         by_message: dict[str, list[Channel]] = {}
         for channel in channels:
             by_message.setdefault(channel.message, []).append(channel)
@@ -106,7 +108,8 @@ class Admission:
                 return
         if not self._earliest <= t <= LAST_TIME and not self._is_time(inbox, t):
             return
-        self._earliest = t - CLOCK_STEP
+        if t - OUT_OF_ORDER > self._earliest:
+            self._earliest = t - OUT_OF_ORDER
         if remote:
             self._refuse_unheard(inbox, Reason.REMOTE_FRAME)
         else:
@@ -149,21 +152,28 @@ class Admission:
         return None
 
     def _is_time(self, inbox: Inbox, t: float) -> bool:
-        """Whether a stamp that does not follow the last one is of a clock that was set; else its frame is refused."""
+        """Whether a stamp that does not follow the last ones is of a clock that was set; else its frame is refused."""
         if t < -LAST_TIME or t > LAST_TIME:
             self._refuse_unheard(inbox, Reason.BAD_TIME)
             return False
-        if t < self._earliest < math.inf:
+        if self._earliest == math.inf:
+            self._earliest = -math.inf
+        elif t < self._earliest + OUT_OF_ORDER - CLOCK_STEP:
             self._step_clock()
+            self._earliest = -math.inf
+        elif t < self._earliest:
+            inbox.late.append(t)
+            return False
         return True
 
     def _step_clock(self) -> None:
         """Believe the new time; what was filed under the old one has no place in it."""
         self.counts.clock_steps += 1
         for inbox in self._inboxes:
-            self.counts.received[inbox.message.name] += len(inbox.frames)
-            if inbox.frames:
-                self.counts.refused[inbox.message.name, Reason.TIME_BACKWARDS] += len(inbox.frames)
+            gone = len(inbox.frames) + len(inbox.late)
+            self.counts.received[inbox.message.name] += gone
+            if gone:
+                self.counts.refused[inbox.message.name, Reason.TIME_BACKWARDS] += gone
             inbox.forget()
 
     def _open(self, inbox: Inbox, frames: list[Frame], out: Decoded) -> None:
@@ -171,6 +181,10 @@ class Admission:
         if frames:
             self.counts.received[inbox.message.name] += len(frames)
             batch = self._checked_batch(inbox, frames, out)
+        if inbox.late:
+            self.counts.received[inbox.message.name] += len(inbox.late)
+            self._refuse(inbox, np.array(inbox.late), Reason.TIME_BACKWARDS, out)
+            inbox.late = []
         if batch is None:
             for channel in inbox.channels:
                 out.columns[channel.name] = Column(_NONE, _NONE)
@@ -230,7 +244,8 @@ class Admission:
     def _refuse(self, inbox: Inbox, t: NDArray[np.float64], reason: Reason, out: Decoded) -> None:
         self.counts.refused[inbox.message.name, reason] += len(t)
         for channel in inbox.channels:
-            out.refused[channel.name, reason] = t
+            before = out.refused.get((channel.name, reason))
+            out.refused[channel.name, reason] = t if before is None else np.sort(np.concatenate([before, t]))
 
     def _refuse_unheard(self, inbox: Inbox, reason: Reason) -> None:
         """One frame that is not even filed."""

@@ -62,6 +62,8 @@ class Inbox:
     lock: SourceLock | None
     checksum_byte: int | None
     frames: list[Frame] = field(default_factory=list)
+    late: list[float] = field(default_factory=list)
+    """Stamps [s] of frames that came after others which are stamped much later."""
     last_t: float = -math.inf
     last_id: int = -1
     last_counter: int = -1
@@ -70,6 +72,7 @@ class Inbox:
     def forget(self) -> None:
         """As if no frame had ever come."""
         self.frames.clear()
+        self.late.clear()
         self.last_t, self.last_id, self.last_counter, self.last_frame = -math.inf, -1, -1, _NO_FRAME
         if self.lock is not None:
             self.lock.release()
