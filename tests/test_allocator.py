@@ -36,6 +36,25 @@ def test_memory_that_is_free_between_blocks_in_use_is_given_back():
     assert before - after > 35e6
 
 
+ROUNDS = """
+from soilbus.allocator import Tidying, _private_memory, keep_freed_memory
+
+keep_freed_memory()
+tidy, kept = Tidying(4_000_000, 1_000_000), []
+for grown in (0, 400_000, 400_000, 3_000_000):
+    kept += [bytearray(b"1" * 20_000) for _ in range(grown // 20_000)]
+    del [bytearray(b"1" * 100_000) for _ in range(80)][:]
+    tidy()
+    print(_private_memory())
+"""
+
+
+def test_what_stays_scattered_takes_the_place_of_spare_memory_and_growth_beyond_it_shows():
+    done = subprocess.run([sys.executable, "-c", ROUNDS], capture_output=True, text=True, check=True, timeout=60.0)
+    first, *later = map(int, done.stdout.split())
+    assert [size - first for size in later] == pytest.approx([0.0, 0.0, 2.8e6], abs=2e5)
+
+
 THREADS_IN_TURN = """
 import ctypes, resource, sys, threading
 from soilbus.allocator import keep_freed_memory

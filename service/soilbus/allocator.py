@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 _C = ctypes.CDLL(None)
 _C.malloc.restype, _C.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]
 _C.free.restype, _C.free.argtypes = None, [ctypes.c_void_p]
 SMALL, OF_EACH = 1024, 7
 """Bytes from which numpy keeps no freed blocks, and how many it keeps of each size below (NBUCKETS, NCACHE)."""
+_STATM = Path("/proc/self/statm")
 _M_ARENA_MAX = -8  # malloc.h
 _BLOCK = 100_000
 """Bytes of a block as an evaluation takes it, of the columns of one window."""
@@ -33,18 +36,45 @@ def keep_freed_memory() -> None:
     _C.free(_C.malloc(31 * 2**20))
 
 
-def give_back_freed_memory(keep: int = 0) -> None:
-    """Hand what is free in glibc's heaps to the kernel (malloc_trim(3)); elsewhere this does nothing.
+def give_back_freed_memory() -> bool:
+    """Hand what is free in glibc's heaps to the kernel (malloc_trim(3)); False where that is not to be had.
 
     What a rare hard window took would stay with the process for ever: it lies between blocks
-    that are in use.  `keep` bytes are taken from the kernel again at once, for the calling thread's
-    next evaluation, which else would wait for them page by page.  It all takes a millisecond or two.
+    that are in use.  It takes a millisecond or two.
     """
     trim = getattr(_C, "malloc_trim", None)
     if trim is not None:
         trim(0)
-        blocks = [bytearray(_BLOCK) for _ in range(keep // _BLOCK)]
+    return trim is not None
+
+
+class Tidying:
+    """Gives back freed memory from time to time, each time but for what leaves the process as large as the first time.
+
+    `needed` bytes at least are taken from the kernel again at once, for the calling thread's next evaluation,
+    which else would wait for them page by page; at first `spare` more.  As free memory that cannot be
+    given back gathers between blocks in use, for hours, it takes the place of these; growth beyond them shows.
+    """
+
+    def __init__(self, needed: int, spare: int) -> None:
+        self._needed, self._spare = needed, spare
+        self._size: int | None = None
+
+    def __call__(self) -> None:
+        """Tidy up; elsewhere than on Linux with glibc this does nothing."""
+        if not _STATM.exists() or not give_back_freed_memory():
+            return
+        private = _private_memory()
+        if self._size is None:
+            self._size = private + self._needed + self._spare
+        blocks = [bytearray(_BLOCK) for _ in range(max(self._needed, self._size - private) // _BLOCK)]
         del blocks
+
+
+def _private_memory() -> int:
+    """What of this process is resident and of no file [bytes] (proc_pid_statm(5))."""
+    _, resident, shared, *_ = map(int, _STATM.read_text().split())
+    return (resident - shared) * resource.getpagesize()
 
 
 def take_small_blocks() -> None:

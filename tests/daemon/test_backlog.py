@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from functools import partial
 from time import perf_counter, sleep
 
 import pytest
 
 from fakes import FakeClock, InlineExecutor
-from soilbus.allocator import give_back_freed_memory
-from soilbus.daemon.backlog import KEPT, MAX_PENDING, TIDIED, Backlog
+from soilbus.daemon.backlog import MAX_PENDING, TIDIED, Backlog
 
 
 class Later(Executor):
@@ -89,12 +89,11 @@ def test_a_real_result_ends_the_wait():
 
 def test_free_memory_is_given_back_once_in_a_while_and_after_the_result_is_out(monkeypatch):
     done: list[str] = []
-    monkeypatch.setattr("soilbus.daemon.backlog.give_back_freed_memory", lambda keep: done.append(f"{keep} kept"))
+    monkeypatch.setattr("soilbus.daemon.backlog.Tidying", lambda needed, spare: partial(done.append, "tidy"))
     backlog = Backlog(InlineExecutor(), lambda task: task, 0.0)
     for task in range(2 * TIDIED + 1):
         backlog.add(task, 0.0, 0, 0.0)
         for result, _ in backlog.results(0.0):
             done.append(f"window {result} out")
-    tidied = [i for i, what in enumerate(done) if what == f"{KEPT} kept"]
+    tidied = [i for i, what in enumerate(done) if what == "tidy"]
     assert [done[i - 1] for i in tidied] == [f"window {TIDIED - 1} out", f"window {2 * TIDIED - 1} out"]
-    assert give_back_freed_memory(KEPT) is None

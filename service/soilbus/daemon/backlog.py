@@ -7,14 +7,15 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, wait
 from typing import NamedTuple
 
-from soilbus.allocator import give_back_freed_memory
+from soilbus.allocator import Tidying
 from soilbus.daemon.intake import WindowTask
 from soilbus.daemon.result import WindowResult
 
 MAX_PENDING = 3
 """Windows that may wait for the worker."""
-TIDIED, KEPT = 60, 4_000_000
-"""After each so many windows memory that is free is given back, but for the bytes that the next window needs."""
+TIDIED, NEEDED, SPARE = 60, 4_000_000, 1_000_000
+"""After each so many windows memory that is free is given back, but for the bytes that the next window needs, and
+those that a day's scattered rests will take."""
 
 
 class Pending(NamedTuple):
@@ -46,6 +47,7 @@ class Backlog:
         self._workers, self._solve, self._waiting = workers, solve, waiting
         self._pending: deque[Pending] = deque()
         self._busy_since = now
+        self._tidy = Tidying(NEEDED, SPARE)
         self.solved = 0
         """Windows solved since the start."""
 
@@ -86,7 +88,7 @@ class Backlog:
             self.solved += 1
             yield pending.future.result(), pending
             if self.solved % TIDIED == 0:
-                self._workers.submit(give_back_freed_memory, KEPT)
+                self._workers.submit(self._tidy)
 
     def close(self) -> None:
         """Solve no more."""
