@@ -13,7 +13,7 @@ from soilbus.daemon.result import WindowResult
 
 MAX_PENDING = 3
 """Windows that may wait for the worker."""
-TIDIED, NEEDED, SPARE = 60, 4_000_000, 1_000_000
+TIDIED, NEEDED, SPARE = 60, 4_000_000, 2_500_000
 """After each so many windows memory that is free is given back, but for the bytes that the next window needs, and
 those that a day's scattered rests will take."""
 
