@@ -76,13 +76,8 @@ class Bench:
 def test_frames_go_out_at_their_cycle_times(recording):
     bench = Bench(recording)
     bench.run(DURATION)
-    for name, cycle in {
-        "WheelSlip": 0.1,
-        "Traversability": 0.1,
-        "TorqueDemand": 0.1,
-        "DemandForecast": 0.1,
-        "SoilbusStatus": 1.0,
-    }.items():
+    fast = dict.fromkeys(("WheelSlip", "Traversability", "TorqueDemand", "DemandForecast"), 0.1)
+    for name, cycle in (fast | {"SoilbusStatus": 1.0}).items():
         times = [f["at"] for f in bench.sent(name)]
         gaps = [b - a for a, b in itertools.pairwise(times)]
         assert len(times) >= DURATION / cycle - 2, name
@@ -95,7 +90,7 @@ def test_before_each_window_ends_the_loop_has_just_done_its_work_and_then_leaves
     bench = Bench(recording)
     bench.run(DURATION)
     beats = [f["at"] + bench.wire.offset for f in bench.sent("WheelSlip")]
-    for end in [result.t for result in bench.results][1:]:
+    for end in (result.t for result in bench.results[1:]):
         assert EVE - 0.001 < end - max(beat for beat in beats if beat < end) < EVE + 0.02
         assert min(beat for beat in beats if beat > end) - end > 0.08
 
@@ -323,10 +318,8 @@ def test_a_second_sender_under_our_identifiers_is_told_of_and_never_believed(rec
     ours = Publisher(output_database(reference_configuration()))
     forged = []
     for i in range(5):
-        frame = ours.frame("Traversability", {"State": "go"})
-        forged.append(
-            can.Message(timestamp=begin + 2.0 + 0.1 * i, arbitration_id=frame.arbitration_id, data=frame.data)
-        )
+        frame, at = ours.frame("Traversability", {"State": "go"}), begin + 2.0 + 0.1 * i
+        forged.append(can.Message(timestamp=at, arbitration_id=frame.arbitration_id, data=frame.data))
     bench = Bench(sorted([*recording, *forged], key=lambda m: m.timestamp))
     start = bench.clock.now
     bench.run(DURATION)

@@ -30,8 +30,8 @@ from soilbus.simulator.reference import TRACTOR
 
 Array = NDArray[np.float64]
 
-STARTS = 3
-CALLS = 1000
+STARTS, CALLS = 3, 1000
+"""How often a start and a system call are timed."""
 QUIET = 1.0
 SETTLED = 2.5
 """Seconds after the last frame until its count is on the bus; where the daemon lags behind the count goes on."""
