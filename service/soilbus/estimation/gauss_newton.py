@@ -12,7 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
-from soilbus.estimation.descent import FAR, LEFT_OVER_RESUMED, LITTLE, Settled, approach, settle
+from soilbus.estimation.descent import (
+    CONVERGED_RESUMED,
+    FAR,
+    LEFT_OVER_RESUMED,
+    LITTLE,
+    Settled,
+    approach,
+    settle,
+)
 from soilbus.estimation.linearised import Bend, Latents, Linearised, Optimum
 from soilbus.estimation.normal_equations import Fitting, Place
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
@@ -357,7 +365,8 @@ def resume(ahead: Foreseen) -> Fit | None:
         if point is not None and step is not None:
             near = fitting.moved(near, point, step)
         first = 0.0 if point is None or step is None else point.length(step)
-        return _fit_at(fitting, settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED, first))
+        end = settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED, first, enough=CONVERGED_RESUMED)
+        return _fit_at(fitting, end)
 
 
 def settled(fitting: Fitting, near: Place) -> Fit | None:
