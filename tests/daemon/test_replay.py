@@ -106,6 +106,7 @@ def test_an_estimator_beside_gives_the_same_results(tmp_path):
     with estimator_beside(config) as workers:
         assert workers is not None
         beside = results(workers)
+    assert any("warning=<Alert.NONE" in result for result in beside)  # watched, in replay too
     assert len(beside) == 4
     assert beside == results(None)
 

@@ -53,11 +53,11 @@ class Pipeline:
 
     def advance(self, now: float) -> list[WindowResult]:
         """Results of every window that ended at or before `now` [s]."""
-        return [self.estimator.solve_and_watch(task) for task in self.intake.due(now)]
+        return [self.estimator.solve(task) for task in self.intake.due(now)]
 
     def finish(self, now: float) -> list[WindowResult]:
         """Windows still open at the end of a recording that lasts until `now` [s]."""
-        return [self.estimator.solve_and_watch(task) for task in self.intake.finish(now)]
+        return [self.estimator.solve(task) for task in self.intake.finish(now)]
 
 
 __all__ = ["Pipeline", "WindowResult"]

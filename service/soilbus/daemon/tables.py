@@ -95,7 +95,7 @@ def replay_tables(config: Config, paths: Sequence[Path]) -> Iterator[WindowResul
     estimator = WindowEstimator(config)
     runs = (run for path in paths for run in runs_of(config, path))
     for index, run in enumerate(run for run in runs if len(run.window.t)):
-        yield estimator.solve_and_watch(_task(index, run, estimator.rig))
+        yield estimator.solve(_task(index, run, estimator.rig))
 
 
 def _task(index: int, run: Run, rig: Rig) -> WindowTask:

@@ -15,7 +15,8 @@ from soilbus.estimation.normal_equations import Fitting, Place, Point
 Array = NDArray[np.float64]
 
 CONVERGED, CONVERGED_RESUMED = 1e-6, 3e-3
-"""Squared length of a step in posterior standard deviations that ends the fit; what it leaves behind is much less."""
+"""Squared length of a step in posterior standard deviations that ends the fit, and one that is resumed from the
+window before: what such a step leaves behind is much less."""
 LEFT_OVER, LEFT_OVER_RESUMED = 2e-8, 1e-4
 """The same for what a full step leaves behind, foreseen from how fast the steps shrink."""
 SETTLING = 1.0
