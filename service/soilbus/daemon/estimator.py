@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from soilbus.assembly import completion_of, model_of, prior_of, rig_of
 from soilbus.capability.assessment import Demand, OverSlip
 from soilbus.capability.demand import present_demand
-from soilbus.capability.immobilisation import Moment, Watch, moments, watched
+from soilbus.capability.immobilisation import Watch, moments, watched
 from soilbus.capability.uncertain_model import UncertainModel
 from soilbus.capability.wheels import WheelTable
 from soilbus.config import Config
@@ -47,7 +47,7 @@ class Undecided:
     """A window's estimate with what the decision needs besides; its traversability is still unknown.
 
     demand is None where the draft is not known; torque_limit (W,) [N m]; stuck: the wheels
-    turn on the spot; moments: slips and pulls of the last hop; fresh: nothing of the window before
+    turn on the spot; driven: the window's data with the true draft; fresh: nothing of the window before
     may be carried over; model: with what the window leaves known of the effects' parameters.
     """
 
@@ -55,7 +55,7 @@ class Undecided:
     demand: Demand | None
     torque_limit: NDArray[np.float64]
     stuck: bool
-    moments: list[Moment]
+    driven: Window
     fresh: bool
     model: UncertainModel
 
@@ -92,8 +92,12 @@ class WindowEstimator:
         return self._tracker
 
     def solve(self, task: WindowTask) -> WindowResult:
-        """Estimate and decision of one window."""
+        """Estimate, decision and watch of one window."""
         return self.decide(self.estimate(task))
+
+    def solve_unwatched(self, task: WindowTask) -> WindowResult:
+        """Estimate and decision, for those who watch more often themselves; the result's watch stays unknown."""
+        return self._decided(self.estimate(task))
 
     def estimate(self, task: WindowTask) -> Undecided:
         """Soil and status of one window."""
@@ -128,23 +132,27 @@ class WindowEstimator:
         effects = self._effects(fit)
         model = self._present_model(task.window, tracked, effects)
         window = _with_true_draft(task.window, effects, self.rig)
-        last_hop = list(moments(window, self.rig, task.end - self._settings.hop, self._settings.min_speed))
         demand = present_demand(window, self.rig.chassis, self._settings.hop, self._draft_gain(tracked))
-        return Undecided(result, demand, task.torque_limit, stuck, last_hop, task.fresh, model)
+        return Undecided(result, demand, task.torque_limit, stuck, window, task.fresh, model)
 
     def decide(self, window: Undecided) -> WindowResult:
-        """The result with its traversability; windows in their order, here or in another process."""
+        """The result with its traversability and watch; windows in their order, here or in another process."""
+        result = self._decided(window)
+        self._look(window)
+        able = result.traversability.capability
+        if able is not None and result.status is Status.VALID:
+            self._curve = able.over_slip
+        return replace(result, watch=self._watch)
+
+    def _decided(self, window: Undecided) -> WindowResult:
+        """The result with its traversability."""
         way, self._wheels = judge(
             window.result.posterior, window.result.status, window.demand, self.rig, window.model, window.torque_limit,
             self.config.traversability, None if window.fresh else self._wheels,
         )  # fmt: skip
         if window.stuck:
             way = replace(way, state=Way.NO_GO, probability=0.0, limit="slip")
-        way = self._settle(way, window)
-        self._look(window)
-        if way.capability is not None and window.result.status is Status.VALID:
-            self._curve = way.capability.over_slip
-        return replace(window.result, traversability=way, watch=self._watch)
+        return replace(window.result, traversability=self._settle(way, window))
 
     def _settle(self, way: Traversability, window: Undecided) -> Traversability:
         """The state that the windows before allow, and how old the last valid one is."""
@@ -170,7 +178,8 @@ class WindowEstimator:
         """Watch the last hop with what was known of the soil before it."""
         if window.fresh:
             self._watch, self._curve = Watch(), None
-        for moment in window.moments:
+        since = window.result.t - self._settings.hop
+        for moment in moments(window.driven, self.rig, since, self._settings.min_speed):
             self._watch = watched(self._watch, moment.t, moment.slip, moment.pull, self._curve, moment.inertia)
 
     def _effects(self, fit: Fit | None) -> list[Active]:

@@ -24,7 +24,7 @@ class Pipeline:
 
     Feed frames in the order of their stamps, call `advance` with the present time (or
     `finish` at the end of a log) and take the windows that have ended.  A live service
-    may instead take `intake.due` and have `estimator.solve` work elsewhere.  Raises
+    may instead take `intake.due` and have `estimator.solve_unwatched` work elsewhere.  Raises
     ConfigError where configuration and database do not fit.
     """
 

@@ -23,8 +23,8 @@ class WindowResult:
     status is invalid.  soil_class is the probability of each known soil and of `unknown`,
     the largest first.  position is in the middle of the data that count: of the window, or
     of its part on a new soil.  failure is the kind of a solve that failed, None where none did.
-    watch warns of immobilisation.  gaps: reduced chi-square of the channels that have not
-    fitted for minutes, the worst first.
+    watch warns of immobilisation; unknown where the loop watches ten times a second itself.  gaps: reduced
+    chi-square of the channels that have not fitted for minutes, the worst first.
     """
 
     t: float

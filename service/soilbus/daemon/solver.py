@@ -51,13 +51,13 @@ class Solver:
         return self._in_a_row >= REPEATED
 
     def solve(self, task: WindowTask) -> WindowResult:
-        """The window's result; an invalid one where the estimator raised.
+        """The window's result, unwatched: the loop watches; an invalid one where the estimator raised.
 
         What the estimator knew stays, for it learns from whole windows only; not so after
         several failures in a row, for it may be what makes it fail.
         """
         try:
-            result = self.estimator.solve(task)
+            result = self.estimator.solve_unwatched(task)
         except Exception as error:
             self._in_a_row += 1
             if self._in_a_row <= REPEATED:
