@@ -203,14 +203,14 @@ def test_health_by_the_second():
 
 def broken(estimator, windows: range):
     """Has the estimator raise at these windows."""
-    usual = estimator.solve_unwatched
+    usual = estimator.estimate
 
-    def solve(task):
+    def estimate(task):
         if task.index in windows:
             raise ZeroDivisionError("what nobody\nthought of")
         return usual(task)
 
-    estimator.solve_unwatched = solve
+    estimator.estimate = estimate
 
 
 def test_one_defect_costs_one_window(drive, caplog):

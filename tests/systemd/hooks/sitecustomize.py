@@ -12,7 +12,7 @@ from soilbus.daemon.estimator import WindowEstimator
 from soilbus.daemon.service import Service
 
 health.LONGEST_SOLVE = health.LONGEST_MUTE = 3.0
-step, solve, send = Service.step, WindowEstimator.solve, LiveBus.send
+step, estimate, send = Service.step, WindowEstimator.estimate, LiveBus.send
 
 
 def fault() -> str:
@@ -30,16 +30,16 @@ def hanging_step(self):
     step(self)
 
 
-def broken_solve(self, task):
+def broken_estimate(self, task):
     while fault() == "estimator":
         time.sleep(0.05)
     if fault() == "defect":
         raise ZeroDivisionError("a defect")
-    return solve(self, task)
+    return estimate(self, task)
 
 
 def mute_send(self, frame):
     return fault() != "sender" and send(self, frame)
 
 
-Service.step, WindowEstimator.solve, LiveBus.send = hanging_step, broken_solve, mute_send
+Service.step, WindowEstimator.estimate, LiveBus.send = hanging_step, broken_estimate, mute_send
