@@ -30,7 +30,7 @@ LONGEST = 30
 LARGEST = 2048
 """Megabytes of address space beyond what the start takes."""
 ROUND = 300
-"""Seconds of processor time of one guided process: atheris keeps some 24 kB of every input, ours keep none."""
+"""Seconds of processor time of one guided process: atheris keeps 24 kB to 1 MB of every input, ours keep none."""
 PACKAGES = ["soilbus", "cantools"]
 
 
