@@ -189,6 +189,7 @@ FAULTS = {
     "torque zero": Fault(le.scaled(0.0, TORQUES[3]), BAD, lies("torque.RR")),
     "speed zero": Fault(le.scaled(0.0, SPEEDS[0]), BAD, lies("speed.FL")),
     "all speeds zero": Fault(le.scaled(0.0, *SPEEDS), BAD, lies(*of_all("speed"))),
+    "pitch zero": Fault(le.scaled(0.0, PITCH), BAD, lies("pitch")),
     "load zero": Fault(le.scaled(0.0, LOADS[2]), BAD, lies("load.RL")),
     "all loads zero": Fault(le.scaled(0.0, *LOADS), BAD, lies(*of_all("load"))),
     "draft zero": Fault(le.scaled(0.0, DRAFT), BAD, lies("draft")),
@@ -207,14 +208,25 @@ FAULTS = {
     "attitude 200 ms late": Fault(le.delayed(0.2, "Attitude"), GOOD, "none"),
     "motor 200 ms late": Fault(le.delayed(0.2, "McuFL"), BAD, lies("motor_speed.FL"), length=BORDER),
     "loads 1 s late": Fault(le.delayed(1.0, "AxleLoads"), BAD, "model_mismatch", length=BORDER),
+    "draft 1 s late": Fault(le.delayed(1.0, "DrawbarPin"), BAD, "model_mismatch", length=BORDER),
+    "ground speed 1 s late": Fault(le.delayed(1.0, RADAR), BAD, lies("ground_speed", "acceleration")),
+    "attitude 1 s late": Fault(le.delayed(1.0, "Attitude"), BAD, lies("acceleration")),
     "speeds stamped 50 ms early": Fault(le.stamped_early(0.05, "WheelSpeeds"), GOOD, "none", "time_backwards"),
     "loads stamped 0.5 s early": Fault(
         le.stamped_early(0.5, "AxleLoads"), BAD, "input_stale load.FL load.FR load.RL load.RR", "time_backwards"
     ),
     # mounted or wired wrongly
     "torque sign": Fault(le.flipped(TORQUES[1]), BAD, lies("torque.FR")),
+    "all torques sign": Fault(le.flipped(*TORQUES), BAD, lies(*of_all("torque"))),
+    "speed sign": Fault(le.flipped(SPEEDS[0]), BAD, "input_stale speed.FL", "error"),
+    "ground speed sign": Fault(le.flipped(GROUND), BAD, "input_stale ground_speed", "error"),
+    "load sign": Fault(le.flipped(LOADS[0]), BAD, "input_stale load.FL", "error"),
+    "sinkage sign": Fault(le.flipped(SINKS[0]), BAD, "model_mismatch", "implausible"),
     "draft sign": Fault(le.flipped(DRAFT), BAD, lies("draft"), since=FROM_THE_START, length=12.2),
     "acceleration sign": Fault(le.flipped(ACCELERATION), GOOD, "none", since=FAULT + 5.0),
+    "speeds swapped": Fault(
+        le.swapped(SPEEDS[0], SPEEDS[2]), BAD, lies("speed.FL", "speed.RL"), since=FROM_THE_START, length=12.2
+    ),
     "torques swapped": Fault(le.swapped(TORQUES[0], TORQUES[2]), BAD, "model_mismatch", length=BORDER),
     "loads swapped": Fault(le.swapped(LOADS[0], LOADS[1]), BAD, "model_mismatch", length=BORDER),
     "left and right swapped whole": Fault(
