@@ -29,7 +29,7 @@ LONGEST = 30
 """Seconds for one input."""
 LARGEST = 2048
 """Megabytes of address space beyond what the start takes."""
-ROUND = 300
+ROUND = 150
 """Seconds of processor time of one guided process: atheris keeps 24 kB to 1 MB of every input, ours keep none."""
 PACKAGES = ["soilbus", "cantools"]
 
