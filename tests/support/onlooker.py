@@ -1,4 +1,9 @@
-"""A service on a spoilt wire, and an onlooker who judges each verdict by what he knows of the wire's deliveries."""
+"""A service on a spoilt wire, and an onlooker who judges each verdict by what he knows of the wire's deliveries.
+
+The wire plays the last moments of a good drive over and over, at 10 Hz, and spoils them as told.  The soil comes
+from a tracker that says of each window what is true of the ground at its end: GO then hangs on
+what the wire delivers alone, as often as the service lets it.
+"""
 
 from __future__ import annotations
 
@@ -10,47 +15,111 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
 import can
+import numpy as np
 
 from fakes import FakeClock, InlineExecutor
+from feeding import feed_message
 from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
 from soilbus.config import Config
 from soilbus.daemon.estimator import WindowEstimator
+from soilbus.daemon.intake import WindowTask
 from soilbus.daemon.keeper import Keeper
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.service import Service
 from soilbus.daemon.store import Owner
+from soilbus.estimation.tracked import Tracked
+from soilbus.simulator.frames import frames
+from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import excited
+from soilbus.terra.soils import SOILS
 from soilbus.traversability import Status
 
 CONFIG = reference_configuration(["estimator.window=4.0", "traversability.max_age=2.0"])
 OUT = output_database(CONFIG)
 IN = load_databases(CONFIG)
+OWN = [(message.frame_id, message.is_extended_frame) for message in OUT.messages]
 VERDICT = OUT.get_message_by_name("Traversability").frame_id
 NEEDED = (
     "MotorFL", "MotorFR", "MotorRL", "MotorRR", "WheelSpeeds", "WheelLoads", "DrawbarPin", "Attitude",
     "GroundBasedSpeedAndDistance",
 )  # fmt: skip
+MOTORS = NEEDED[:4]
 CYCLE, TICK = 0.1, 0.1
-TIMEOUT, MAX_AGE = 1.0, 2.0
+TIMEOUT = 1.0
 SLACK = TICK + 0.06
 """The service looks at its inputs each tick; a window is handed out somewhat after its end."""
 CLOCK_STEP = 1.0
 MOMENTS = 4
 """Frames of each message that are repeated: a sensor that always says the same is not believed."""
+HOLD = 2
+"""Windows in a row that must speak for go after one that did not."""
+WEAK = 0.05
+"""Share of their torque that motors have left which cannot pull what is asked."""
+BUS_OFF = 0x040
+"""Class of the error frame that tells of it."""
+
+Moment = dict[int, list[can.Message]]
+
+
+def good_moment(seed: int = 3) -> Moment:
+    """The last frames of each message in a good drive."""
+    config = reference_configuration()
+    found: Moment = {}
+    for message in frames(simulate(config, excited("loam", 10.0), seed), config):
+        found.setdefault(message.arbitration_id, []).append(message)
+    return {i: messages[-MOMENTS:] for i, messages in found.items()}
+
+
+def good_tracked(seed: int = 3) -> Tracked:
+    """What the tracker says of a window of a good drive."""
+    config = reference_configuration()
+    pipeline = Pipeline(config, load_databases(config))
+    estimator, found = pipeline.estimator, []
+    usual = estimator.tracker.estimate
+    estimator.tracker.estimate = lambda *given: found.append(usual(*given)) or found[-1]
+    messages = list(frames(simulate(config, excited("loam", 12.0), seed), config))
+    for message in messages:
+        feed_message(pipeline.admission, message)
+    results = pipeline.finish(messages[-1].timestamp)
+    return next(t for t, r in zip(found, results, strict=True) if r.status is Status.VALID)
+
+
+def of_soft_ground(tracked: Tracked) -> Tracked:
+    """The same, as sure of it, of a ground that holds nothing."""
+    soft = np.array(SOILS["wet_clay"]) * [0.05, 0.05, 1.0, 0.3, 0.2, 1.0]
+    fit = dataclasses.replace(tracked.fit, belief=dataclasses.replace(tracked.fit.whole, soil=soft), averaged=None)
+    return dataclasses.replace(tracked, fit=dataclasses.replace(fit, rival=None))
+
+
+class Known(NamedTuple):
+    """The truth when a frame of this stamp was delivered; firm: neither ground nor motors forbid what is asked."""
+
+    stamp: float
+    at: float
+    soft: bool
+    firm: bool
+    blind: bool
+    raises: bool
+
+
+NOTHING = Known(-math.inf, -math.inf, soft=False, firm=False, blind=False, raises=False)
 
 
 @dataclass
 class Wire:
-    """A bus with a vehicle on it; deaf, spoilt and repeated name messages, blind tells the tracker to fail."""
+    """A bus with a vehicle on it; deaf, spoilt and repeated name messages."""
 
     clock: FakeClock
-    moment: dict[int, list[can.Message]]
+    moment: Moment
+    cycle: float = CYCLE
     offset: float = 1.7e9 - 1000.0
     step: float = 0.0
     """By so much [s] the clock that stamps frames has been set; only the next frame can tell of it."""
@@ -60,51 +129,97 @@ class Wire:
     spoilt: frozenset[str] = frozenset()
     repeated: frozenset[str] = frozenset()
     noisy: bool = False
-    blind: bool = False
     lost: bool = False
+    off: bool = False
+    """The controller is in bus-off: it has said so, and hears nothing."""
+    halted: bool = False
+    """The clock that stamps frames stands."""
+    forged: bool = False
+    """Another node says go under our identifier, ten times a second."""
+    blind: bool = False
+    soft: bool = False
+    raises: bool = False
+    """No model fits the ground; it holds nothing; it makes the estimator fail."""
+    power: float = 1.0
+    """Share of their torque that the motors have."""
+    mute: bool = False
+    """The motors do not say how much torque they have."""
     good: dict[str, float] = field(default_factory=dict)
     stamps: dict[str, float] = field(default_factory=dict)
-    verdicts: list[tuple[float, dict]] = field(default_factory=list)
+    powers: dict[str, float] = field(default_factory=dict)
+    """Share of its torque that each motor has told last."""
+    heard: list[Known] = field(default_factory=list)
+    """What was so at each delivery since the clock was set back last."""
+    forged_at: float = -math.inf
+    verdicts: list[tuple[float, dict[str, Any]]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         names = {m.frame_id: m.name for m in IN.messages}
         self.known = [(names.get(i, "?"), m) for i, m in sorted(self.moment.items())]
-        self.counter, self.next = 0, 0
-        self.base = self.clock.now
+        self.checked = {m.name for m in IN.messages if "Checksum" in {s.name for s in m.signals}}
+        self.counter = self.next = self.life = 0
+        self.base, self.halted_at, self.newest = self.clock.now, math.nan, -math.inf
+        self.told_off = False
 
     def recv(self, timeout=None):
         if self.lost:
             raise can.CanOperationError("Network is down", errno.ENETDOWN)
         while True:
+            if self.off and not self.told_off:
+                self.told_off = True
+                return can.Message(timestamp=self.stamp(), arbitration_id=BUS_OFF, is_error_frame=True, data=bytes(8))
             cycle, row = divmod(self.next, len(self.known))
-            due = self.base + CYCLE * cycle + 0.002 * row
+            due = self.base + self.cycle * cycle + 0.002 * row
             if due > self.clock.now + (timeout or 0.0):
                 self.clock.sleep(max(timeout or 0.0, 1e-4))
                 return None
             if due < self.clock.now - 0.5:  # nobody listened
-                self.base = self.clock.now - CYCLE * cycle
+                self.base = self.clock.now - self.cycle * cycle
                 continue
             self.next += 1
             self.counter = cycle % 16
             self.clock.now = max(self.clock.now, due)
+            if self.off:
+                continue
+            self.told_off = False
             name, messages = self.known[row]
-            message = messages[cycle % MOMENTS]
+            if self.forged and row == 0 and self.forged_at < self.clock.now - 0.5 * self.cycle:
+                self.next -= 1
+                self.forged_at = self.clock.now
+                return can.Message(timestamp=self.stamp(), arbitration_id=VERDICT, data=bytes(8))
             if name not in self.deaf:
-                return self.frame(name, message)
+                return self.frame(name, messages[cycle % len(messages)])
             if self.noisy:
                 return can.Message(timestamp=self.stamp(), arbitration_id=0x123, is_extended_id=False, data=b"\x5a" * 3)
 
     def stamp(self) -> float:
         step, self.step = self.step, 0.0
         self.offset += step
-        if step < -CLOCK_STEP:
-            self.good, self.stamps = {}, {}
+        if self.halted and math.isnan(self.halted_at):
+            self.halted_at = self.clock.now
+        if not self.halted:
+            self.halted_at = math.nan
+        stamp = (self.halted_at if self.halted else self.clock.now) + self.offset
+        if stamp < self.newest - CLOCK_STEP:
+            self.life, self.newest = self.life + 1, -math.inf
+            self.good, self.stamps, self.heard = {}, {}, []
             self.known_anew()
-        return self.clock.now + self.offset
+        self.newest = max(self.newest, stamp)
+        weak = len(self.powers) == len(MOTORS) and max(self.powers.values()) <= WEAK
+        firm = not (self.soft or weak)
+        self.heard.append(Known(stamp, self.clock.now, self.soft, firm, self.blind, self.raises))
+        return stamp
+
+    def until(self, stamp: float) -> Known:
+        """What was so when the last frame older than a stamp of the clock, as it is set now, was delivered."""
+        return next((known for known in reversed(self.heard) if known.stamp < stamp), NOTHING)
 
     def frame(self, name: str, message: can.Message) -> can.Message:
-        data, checked = bytearray(message.data), "Checksum" in {s.name for s in IN.get_message_by_name(name).signals}
+        data, checked = bytearray(message.data), name in self.checked
         good = name not in self.spoilt
+        if name in MOTORS:
+            limit = int.from_bytes(data[4:6], "little")
+            data[4:6] = b"\xff\xff" if self.mute else int(limit * self.power).to_bytes(2, "little")
         if checked:
             counter = 5 if name in self.repeated else self.counter
             good = good and name not in self.repeated
@@ -115,6 +230,8 @@ class Wire:
         stamp = self.stamp()
         if good and stamp >= self.stamps.get(name, -math.inf):
             self.good[name], self.stamps[name] = self.clock.now, stamp
+            if name in MOTORS and not self.mute:
+                self.powers[name] = self.power
         return can.Message(
             timestamp=stamp, arbitration_id=message.arbitration_id, is_extended_id=message.is_extended_id, data=data
         )
@@ -128,74 +245,136 @@ class Wire:
 
 
 class Worker(InlineExecutor):
-    """Does the work at once unless it hangs; what was left undone is then done first."""
+    """One thread: each piece of work takes `takes` [s], for ever while it hangs; all of it in its order.
 
-    def __init__(self) -> None:
-        self.hangs, self.left = False, []
+    `told` is called with what is handed in.
+    """
+
+    def __init__(self, clock: FakeClock, told: Callable[..., None]) -> None:
+        self.clock, self.told = clock, told
+        self.hangs, self.takes = False, 0.0
+        self.left: list[tuple[Future[Any], Callable[..., Any], tuple[Any, ...]]] = []
+        self.busy_until = -math.inf
 
     def submit(self, fn, /, *args, **kwargs):
-        if not self.hangs:
-            return super().submit(fn, *args, **kwargs)
+        self.told(*args)
+        if not self.left:
+            self.busy_until = self.clock.now + self.takes
         self.left.append((Future(), fn, args))
-        return self.left[-1][0]
+        found = self.left[-1][0]
+        self.work()
+        return found
+
+    def work(self) -> None:
+        """What is done by now."""
+        while self.left and not self.hangs and self.busy_until <= self.clock.now:
+            future, fn, args = self.left.pop(0)
+            if not future.set_running_or_notify_cancel():
+                continue
+            try:
+                future.set_result(fn(*args))
+            except Exception as error:
+                future.set_exception(error)
+            self.busy_until = max(self.busy_until, self.clock.now - TICK) + self.takes
 
     def wake(self) -> None:
-        self.hangs = False
-        for future, fn, args in self.left:
-            if future.set_running_or_notify_cancel():
-                future.set_result(fn(*args))
-        self.left.clear()
+        """Go on, and do at once what was left undone."""
+        self.hangs, self.takes, self.busy_until = False, 0.0, -math.inf
+        self.work()
+
+
+class Handed(NamedTuple):
+    """A window that the worker got: after how many steps back of the clock, when it ended, the truth at its last frame."""
+
+    life: int
+    ended: float
+    known: Known
+    fresh: bool
+
+
+NO_WINDOW = Handed(-1, -math.inf, NOTHING, True)
 
 
 class Drive:
-    """A service on a wire, and what an onlooker knows of its windows."""
+    """A service on a wire, and what an onlooker knows of its windows.
 
-    def __init__(self, moment, tracked) -> None:
-        self.clock, self.tracked = FakeClock(), tracked
-        self.wire = Wire(self.clock, moment, known_anew=self.forget)
+    `tracked` is what the tracker says of every window on firm ground; None: a real one, which finds out.
+    """
+
+    def __init__(self, moment: Moment, tracked: Tracked | None, config: Config = CONFIG, cycle: float = CYCLE) -> None:
+        self.clock, self.config = FakeClock(), config
+        self.max_age = config.traversability.max_age
+        self.tracked = tracked
+        self.of_soft = None if tracked is None else of_soft_ground(tracked)
+        self.wire = Wire(self.clock, moment, cycle, known_anew=self.forget)
         self.folder = TemporaryDirectory()
         self.faults: list[str] = []
         self.go = 0
+        self.last: dict[str, Any] = {}
+        self.interrupted = self.halted_until = -math.inf
         self.start()
 
     def start(self) -> None:
         """A service that begins with the state that the one before has left behind."""
-        config: Config = CONFIG
-        pipeline = Pipeline(config, IN)
-        self.content(pipeline.estimator)
-        owner = Owner.of(config, pipeline.intake.channels, IN)
+        pipeline = Pipeline(self.config, IN)
+        pipeline.new_estimator = lambda: self.content(WindowEstimator(self.config))
+        owner = Owner.of(self.config, pipeline.intake.channels, IN)
         keeper = Keeper(Path(self.folder.name), owner, InlineExecutor(), lambda: self.clock.now + self.wire.offset)
-        bus = LiveBus(self.open, self.clock, self.clock.sleep)
-        self.result = None
-        self.came = -math.inf
-        self.worker = Worker()
-        self.wire.good, self.wire.stamps = {}, {}
+        bus = LiveBus(self.open, self.clock, self.clock.sleep, OWN)
+        self.handed: dict[float, Handed] = {}
+        self.lives: dict[int, int] = {}
+        self.forget()
+        self.worker = Worker(self.clock, self.note)
+        self.wire.good, self.wire.stamps, self.wire.powers = {}, {}, {}
         self.service = Service(
-            config, pipeline, bus, Publisher(OUT), Notifier(), self.worker, self.clock, self.take, lambda: keeper,
-            self.clock.wait_for,
+            self.config, pipeline, bus, Publisher(OUT), Notifier(), self.worker, self.clock, self.take,
+            lambda: keeper, self.clock.wait_for,
         )  # fmt: skip
 
     def stop(self) -> None:
         self.service.stop()
         self.service.run()
 
-    def content(self, estimator: WindowEstimator) -> None:
-        def estimate(window, end):
-            estimator.tracker._newest = self.tracked.fit.whole
-            return dataclasses.replace(self.tracked, since=end - CONFIG.estimator.window, mismatch=self.wire.blind)
+    def content(self, estimator: WindowEstimator) -> WindowEstimator:
+        """An estimator whose tracker says of each window what is true of the ground at its end."""
 
-        estimator._tracker.estimate = estimate
+        def estimate(window, end):
+            known = self.handed[end].known
+            if known.raises:
+                raise ZeroDivisionError
+            tracked = self.of_soft if known.soft else self.tracked
+            assert tracked is not None
+            estimator.tracker._newest = tracked.fit.whole
+            return dataclasses.replace(tracked, since=end - self.config.estimator.window, mismatch=known.blind)
+
+        if self.tracked is not None:
+            estimator.tracker.estimate = estimate
+        return estimator
 
     def open(self):
         if self.wire.lost:
             raise BusError("bus can0: no such device", may_come=True)
         return self.wire
 
+    def note(self, task: object = None) -> None:
+        """The worker got something."""
+        if isinstance(task, WindowTask):
+            known = self.wire.until(task.end)
+            ended = min(known.at + task.end - known.stamp, self.clock.now)
+            self.handed[task.end] = Handed(self.wire.life, ended, known, task.fresh)
+            self.lives[task.index % 251] = self.wire.life
+
     def take(self, result) -> None:
-        self.result, self.came = result, self.clock.now
+        window = self.handed[result.t]
+        if window.fresh or result.traversability.probability is None:
+            self.in_a_row = math.inf  # nothing is held back by what is not known
+        self.in_a_row = self.in_a_row + 1 if window.known.firm and not window.known.blind else 0
+        if window.life == self.wire.life:
+            self.result, self.window = result, window
 
     def forget(self) -> None:
-        self.result = None
+        """The service begins anew, or must."""
+        self.result, self.window, self.in_a_row = None, NO_WINDOW, math.inf
 
     def step_clock(self, by: float) -> None:
         self.wire.step += by
@@ -203,27 +382,49 @@ class Drive:
     def run(self, seconds: float) -> None:
         end = self.clock.now + seconds
         while self.clock.now < end:
+            self.worker.work()
             self.service.step()
+            self.look()
             for at, verdict in self.wire.verdicts:
                 self.last = verdict
-                if str(verdict["State"]) == "go":
-                    self.go += 1
-                    self.faults += [f"go at {at - 1000.0:.2f} s although {why}" for why in self.objections(at, verdict)]
+                self.go += str(verdict["State"]) == "go"
+                said = f"{verdict['State']} at {at - 1000.0:.2f} s although"
+                self.faults += [f"{said} {why}" for why in self.objections(at, verdict)]
             self.wire.verdicts.clear()
 
-    def objections(self, at: float, verdict: dict):
-        for name in NEEDED:
-            if not at - self.wire.good.get(name, -math.inf) <= TIMEOUT + SLACK:
-                yield f"{name} is stale"
-        if self.wire.lost:
-            yield "the bus is down"
+    def look(self) -> None:
+        """Note what makes all earlier windows void."""
+        now = self.clock.now
+        if self.wire.halted:
+            self.halted_until = now + SLACK
+        patience = self.max_age if now < self.halted_until else TIMEOUT  # stamps that stand cannot say what is late
+        stale = any(not now - self.wire.good.get(name, -math.inf) <= patience + SLACK for name in NEEDED)
+        if stale or self.wire.lost or self.wire.off:
+            self.interrupted = now
+        self.interrupted = max(self.interrupted, self.wire.forged_at)
+
+    def objections(self, at: float, verdict: dict[str, Any]):
+        """Why a verdict must not be."""
+        window = verdict["Window"]
+        if isinstance(window, int | float) and self.lives.get(int(window)) != self.wire.life:
+            yield f"window {window} is of before the step of the clock"
+        if str(verdict["State"]) != "go":
+            return
+        if self.interrupted >= at - 1e-9:
+            yield "inputs are stale, or the bus is down or not ours alone"
         if self.result is None:
             yield "there is no window since the start or the step of the clock"
             return
-        if self.result.status is not Status.VALID:
+        age, known = at - self.window.ended, self.window.known
+        if self.window.ended <= self.interrupted:
+            yield "the last window is of before an interruption"
+        if not known.firm:
+            yield "the ground or the motors cannot bear it"
+        if known.blind or known.raises or self.result.status is not Status.VALID:
             yield f"the posterior is {self.result.status}"
-        for age in (at - self.came, at + self.wire.offset - self.result.t):
-            if age > MAX_AGE + SLACK:
-                yield f"the posterior is {age:.2f} s old"
-        if not (verdict["Age"] <= MAX_AGE and verdict["SinceValid"] <= MAX_AGE):
+        if self.in_a_row < HOLD:
+            yield f"only {self.in_a_row} window in a row speaks for it"
+        if age > self.max_age + SLACK:
+            yield f"the posterior is {age:.2f} s old"
+        if not all(isinstance(verdict[a], float) and verdict[a] <= self.max_age for a in ("Age", "SinceValid")):
             yield f"its own ages are {verdict['Age']} and {verdict['SinceValid']}"

@@ -1,0 +1,54 @@
+"""`PYTHONPATH=service:tests/support python -m tests.stories --stories 3000 --seed 1`: random stories, judged.
+
+Of each story the seed is counted on from --seed.  Each is told to a service whose tracker says the truth, the
+first --real of them also to one that must find it out by itself.  Exit code 1 if go was said where the truth forbids
+it, or not said again where it was due.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+from collections.abc import Sequence
+
+from .drives import cheap, real
+from .story import TO_ALL, TO_SOME, drawn, told
+
+HEALED = 10
+"""Of so many stories one goes on until go is due again."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse, tell, judge."""
+    parser = argparse.ArgumentParser(prog="python -m tests.stories", description=__doc__)
+    parser.add_argument("--stories", type=int, default=3000, help="how many (3000)")
+    parser.add_argument("--real", type=int, default=30, help="how many with a real estimator (30)")
+    parser.add_argument("--seed", type=int, default=1, help="of the first one (1)")
+    chosen = parser.parse_args(arguments)
+    logging.disable(logging.CRITICAL)
+    seeds = range(chosen.seed, chosen.seed + max(chosen.stories, chosen.real))
+    bad = go = go_of_real = 0
+    for seed in seeds[: chosen.stories]:
+        story = drawn(seed)
+        drive = told(cheap(), story, healed=seed % HEALED == 0)
+        go += drive.go
+        bad += _wrong(f"story {seed}", story, drive.faults)
+    for seed in seeds[: chosen.real]:
+        story = drawn(seed, (*TO_SOME, *TO_ALL))
+        drive = told(real(seed), story)
+        go_of_real += drive.go
+        bad += _wrong(f"real story {seed}", story, drive.faults)
+    print(
+        f"{chosen.stories} stories ({go} verdicts of go), {chosen.real} with a real estimator ({go_of_real}), {bad} wrong"
+    )
+    return int(bad > 0 or not go or (chosen.real >= 10 and not go_of_real))
+
+
+def _wrong(name: str, story: object, faults: Sequence[str]) -> bool:
+    if faults:
+        print(f"{name}: {story}\n    " + "\n    ".join(faults[:3]))
+    return bool(faults)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
