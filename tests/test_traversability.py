@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import norm
 
 from soilbus.assembly import rig_of
 from soilbus.capability.assessment import Demand, slip_grid
@@ -115,8 +116,25 @@ def test_the_margin_counts_for_pulling_only():
         decide(demand=Demand(5000.0, 100.0), config=careful).probability
         < decide(demand=Demand(5000.0, 100.0)).probability
     )
-    pushed = Demand(-3000.0, 100.0)
-    assert decide(demand=pushed, config=careful).probability == decide(demand=pushed).probability
+    mud = SOILS["wet_clay"]._replace(c=0.2 * SOILS["wet_clay"].c, phi=0.2 * SOILS["wet_clay"].phi)  # must be pushed
+    needs = decide(posterior=posterior_of(mud), demand=Demand(0.0, 0.0)).capability.likely_pull
+    assert needs.value < -1000.0
+    for margin in (0.0, 0.15, 0.5):
+        way = decide(posterior=posterior_of(mud), demand=Demand(needs.value, 100.0), config=Settings(margin=margin))
+        assert way.probability == pytest.approx(0.5, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("deepest", "state"),
+    [(0.045, State.NO_GO), (0.05, State.CAUTION), (0.055, State.CAUTION), (0.06, State.GO)],
+)
+def test_ground_that_holds_the_pull_but_not_the_depth_is_no_go(deepest, state):
+    """Loam takes four times the draft, but the wheels go 4.6 +- 0.6 cm deep."""
+    way = decide(config=Settings(max_sinkage=deepest), demand=Demand(1500.0, 20.0))
+    depth = way.capability.forecast.likely_depth
+    assert way.capability.likely_pull.value > 4.0 * 1500.0
+    assert way.probability == pytest.approx(norm.sf(depth.value, deepest, depth.std), abs=1e-6)
+    assert (way.state, way.limit) == (state, "sinkage")
 
 
 def test_weak_motors_limit():

@@ -59,3 +59,23 @@ def test_a_channel_counts_by_its_own_residuals_and_is_forgotten():
     assert watch.gaps() == {}
     watch.forget()
     assert watch.gaps() == {}
+
+
+def test_noise_alone_is_no_gap_however_few_residuals_there_are():
+    """One residual a second, in windows of ten seconds each second: each counts ten times and is still one."""
+    window, told = 10, []
+    for seed in range(100):
+        square = np.random.default_rng(seed).standard_normal(300) ** 2
+        watch = GapWatch(window=float(window), hop=1.0)
+        for end in range(window, len(square)):
+            watch.take(float(end), {"draft": Square(float(square[end - window : end].sum()), window)})
+            told += watch.gaps().values()
+    assert told == []
+
+
+def test_a_gap_beyond_noise_is_told_of_few_residuals_too():
+    square = 2.5 * np.random.default_rng(1).standard_normal(300) ** 2
+    watch = GapWatch(window=10.0, hop=1.0)
+    for end in range(10, len(square)):
+        watch.take(float(end), {"draft": Square(float(square[end - 10 : end].sum()), 10)})
+    assert watch.gaps()["draft"] == pytest.approx(2.5, rel=0.3)

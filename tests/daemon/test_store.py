@@ -170,7 +170,9 @@ def _indefinite(state):
         (sealed(lambda s: s["belief"]["soil"].update(phi=1.5)), "physical bounds"),
         (sealed(lambda s: s["belief"]["soil"].update(n=0.0)), "physical bounds"),
         (sealed(lambda s: s["belief"]["soil"].update(k_phi=1e30)), "physical bounds"),
+        (sealed(lambda s: s["belief"]["soil"].update(k_phi=1e-30)), "physical bounds"),
         (sealed(lambda s: s["belief"]["gains"].update({"torque.FL": 0.5})), "physical bounds"),
+        (sealed(lambda s: s["belief"]["gains"].update({"torque.FL": -0.5})), "physical bounds"),
         (sealed(lambda s: s["belief"]["gains"].update({"torque.FL": float("inf")})), "torque.FL"),
         (sealed(lambda s: _covariance(s, 2, 2, 0.0)), "positive definite"),
         (sealed(lambda s: _covariance(s, 2, 2, -1.0)), "positive definite"),
@@ -255,6 +257,21 @@ def test_what_is_no_file_is_refused_and_nothing_is_nothing(tmp_path: Path):
 def test_only_the_owner_may_read_it(tmp_path: Path):
     write_whole(tmp_path / "state.json", CONTENT)
     assert (tmp_path / "state.json").stat().st_mode & 0o777 == 0o600
+
+
+def test_nothing_is_written_through_a_link(tmp_path: Path):
+    """Somebody who may write in the folder leaves a link to a file of ours under the new file's name."""
+    path, other = tmp_path / "state.json", tmp_path / "other"
+    write_whole(path, CONTENT)
+    other.write_bytes(b"not to be touched")
+    (tmp_path / "state.json.new").symlink_to(other)
+    with pytest.raises(OSError, match="symbolic link"):
+        write_whole(path, b"new")
+    assert other.read_bytes() == b"not to be touched"
+    assert path.read_bytes() == CONTENT
+    write_whole(path, b"new")  # the link is gone
+    assert path.read_bytes() == b"new"
+    assert not path.is_symlink()
 
 
 def test_it_is_on_the_disk_before_it_has_the_name_and_the_name_is_too(tmp_path: Path, monkeypatch):

@@ -229,6 +229,17 @@ def test_a_radar_coarser_than_its_signal_is_not_frozen(good):
     assert judged(_changed(window, ground_speed=alive, speed=speed), None) == ("ground_speed",)
 
 
+@pytest.mark.parametrize(("every", "names"), [(45, ("ground_speed",)), (15, ("ground_speed",)), (4, ()), (2, ())])
+def test_how_often_readings_repeat_elsewhere_tells_coarse_from_frozen(every, names, good):
+    """Half the window alive, with one of `every` readings said twice, then the same reading for five seconds."""
+    window, _ = good
+    reading = window.ground_speed + 0.01 * np.random.default_rng(1).standard_normal(len(window.t))
+    reading[every:50:every] = reading[every - 1 : 49 : every]
+    reading[50:] = reading[50]
+    assert sum(np.diff(reading[:51]) == 0.0) == 49 // every
+    assert judged(_changed(window, ground_speed=reading)) == names
+
+
 @given(st.lists(st.booleans(), max_size=40), st.integers(1, 12))
 @settings(derandomize=True, deadline=None)
 def test_runs(holds, bins):

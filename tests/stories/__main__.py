@@ -38,9 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         drive = told(real(seed), story)
         go_of_real += drive.go
         bad += _wrong(f"real story {seed}", story, drive.faults)
-    print(
-        f"{chosen.stories} stories ({go} verdicts of go), {chosen.real} with a real estimator ({go_of_real}), {bad} wrong"
-    )
+    print(f"{chosen.stories} stories, {go} times go; {chosen.real} with a real estimator, {go_of_real}; {bad} wrong")
     return int(bad > 0 or not go or (chosen.real >= 10 and not go_of_real))
 
 

@@ -284,7 +284,7 @@ class Worker(InlineExecutor):
 
 
 class Handed(NamedTuple):
-    """A window that the worker got: after how many steps back of the clock, when it ended, the truth at its last frame."""
+    """A window that the worker got: after how many steps back of the clock, its end, and the truth at its last frame."""
 
     life: int
     ended: float

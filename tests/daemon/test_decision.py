@@ -1,0 +1,89 @@
+"""Windows in, states out: the decision as the service makes it, with a tracker that says what it is told to."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from feeding import feed_message
+from onlooker import good_tracked, of_soft_ground
+from soilbus.can.dbc_files import load_databases
+from soilbus.daemon.estimator import WindowEstimator
+from soilbus.daemon.intake import WindowTask
+from soilbus.daemon.pipeline import Pipeline
+from soilbus.estimation.tracked import Tracked
+from soilbus.simulator.frames import frames
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import excited
+from soilbus.traversability import State, Status
+
+CONFIG = reference_configuration()
+
+
+@pytest.fixture(scope="module")
+def tasks() -> list[WindowTask]:
+    """Windows of a good drive, from its frames."""
+    pipeline = Pipeline(CONFIG, load_databases(CONFIG))
+    for message in frames(simulate(CONFIG, excited("loam", 16.0), 3), CONFIG):
+        feed_message(pipeline.admission, message)
+    return pipeline.intake.finish(message.timestamp)
+
+
+@pytest.fixture(scope="module")
+def firm() -> Tracked:
+    return good_tracked()
+
+
+def decided(tasks, told):
+    """Results of the windows, of which the tracker says what is told."""
+    estimator = WindowEstimator(CONFIG)
+    found = []
+    for task, tracked in zip(tasks, told, strict=False):
+        estimator.tracker.estimate = lambda window, end, tracked=tracked: replace(
+            tracked, since=end - CONFIG.estimator.window * tracked.since
+        )
+        found.append(estimator.solve_unwatched(task))
+    return found
+
+
+def of(tracked: Tracked, share: float = 1.0, **changed) -> Tracked:
+    """What is said of windows of which the soil fills such a share."""
+    return replace(tracked, since=share, **changed)
+
+
+def states(tasks, told):
+    return [result.traversability.state for result in decided(tasks, told)]
+
+
+def test_a_better_state_needs_two_windows_in_a_row(tasks, firm):
+    good, bad = of(firm), of(of_soft_ground(firm))
+    assert states(tasks, [good, good]) == [State.GO, State.GO]
+    found = states(tasks, [bad, good, bad, good, good])
+    assert found[0] is found[2] is State.NO_GO
+    assert found[1] is found[3] is not State.GO
+    assert found[4] is State.GO
+
+
+def test_what_begins_anew_is_held_back_by_nothing(tasks, firm):
+    anew = [tasks[0], replace(tasks[1], fresh=True)]
+    assert states(anew, [of(of_soft_ground(firm)), of(firm)]) == [State.NO_GO, State.GO]
+
+
+def test_a_window_that_does_not_fit_is_the_less_sure(tasks, firm):
+    """A reduced chi-square of 4 makes every standard deviation twice as large."""
+    fit = replace(firm.fit, cost=4.0 * firm.fit.rows)
+    fits, misfits = decided(tasks[:1], [of(firm)])[0], decided(tasks[:1], [of(firm, fit=fit, mismatch=True)])[0]
+    assert (misfits.status, misfits.reason) == (Status.DEGRADED, "model_mismatch")
+    assert misfits.bearing.std / misfits.bearing.value == pytest.approx(
+        2.0 * fits.bearing.std / fits.bearing.value, rel=0.02
+    )
+    assert misfits.posterior.tan_phi().std == pytest.approx(2.0 * fits.posterior.tan_phi().std, rel=0.02)
+
+
+def test_a_little_of_a_new_soil_is_no_go(tasks, firm):
+    little, enough = decided(tasks[:1], [of(firm, 0.1)])[0], decided(tasks[:1], [of(firm, 0.3)])[0]
+    assert (little.status, little.reason) == (Status.NOT_EXCITED, "not_excited new_soil")
+    assert little.traversability.state is not State.GO
+    assert (enough.status, enough.traversability.state) == (Status.VALID, State.GO)

@@ -1,0 +1,68 @@
+"""What was known of soil and sensors fades while nothing tells them: an hour at the road leaves little of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from drives import B_REF, Z_REF, tracker_of, windows
+
+from soilbus.assembly import rig_of
+from soilbus.estimation.gauss_newton import Fit
+from soilbus.estimation.readings import gain_names
+from soilbus.estimation.window import Window
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
+
+CONFIG = reference_configuration(["estimator.hop=10.0"])
+LENGTH = CONFIG.estimator.window
+N_GAINS = len(gain_names(rig_of(CONFIG)))
+
+
+@pytest.fixture(scope="module")
+def told() -> list[tuple[Window, float]]:
+    """Four windows that tell the soil well."""
+    return list(windows(CONFIG, simulate(CONFIG, excited("loam", 40.0), 1)))
+
+
+@pytest.fixture(scope="module")
+def little() -> Window:
+    """A second and a half of steady pulling, which tells friction to 8 % only."""
+    scenario = Scenario(LENGTH, (Patch(0.0, "loam"),), Swing(1.3, 1.3), draft=Swing(2500.0, 2500.0))
+    window = next(windows(CONFIG, simulate(CONFIG, scenario, 2)))[0]
+    return window.rows((window.t > LENGTH - 1.5).nonzero()[0])
+
+
+def after(pause: float, told, little: Window) -> Fit:
+    """What the little says, so many seconds after what was told."""
+    tracker, end = tracker_of(CONFIG), 0.0
+    for window, end in told:
+        tracker.estimate(window, end)
+    end += pause + LENGTH
+    tracked = tracker.estimate(replace(little, t=little.t + (end - LENGTH)), end)
+    assert not tracked.mismatch
+    return tracked.fit
+
+
+def spreads(fit: Fit) -> tuple[float, float]:
+    """Relative std of bearing pressure and tan phi."""
+    found = fit.whole.posterior.bearing_pressure(Z_REF, B_REF), fit.whole.posterior.tan_phi()
+    return found[0].std / found[0].value, found[1].std / found[1].value
+
+
+def gain_stds(fit: Fit) -> list[float]:
+    return [fit.whole.gain(i).std for i in range(N_GAINS)]
+
+
+def test_the_soil_of_an_hour_ago_is_no_more_than_another_soil(told, little):
+    alone, soon, late = (spreads(after(*given, little)) for given in ((0.0, []), (60.0, told), (3600.0, told)))
+    assert soon[1] < 0.5 * alone[1]
+    assert late[1] > 0.6 * alone[1]
+    assert late[0] > 0.85 * alone[0]
+
+
+def test_gains_are_known_for_minutes_and_not_for_ever(told, little):
+    alone, soon, late = (gain_stds(after(*given, little)) for given in ((0.0, []), (60.0, told), (900.0, told)))
+    assert sum(soon) < 0.8 * sum(alone)
+    assert sum(late) > 0.9 * sum(alone)

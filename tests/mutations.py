@@ -1,0 +1,226 @@
+"""`python -m tests.mutations [WORD…]`: each guard taken out of a copy of service/, and the tests that must notice.
+
+Prints for each mutation whether it was killed; exit code 1 if one survived, if its text is gone from the code (the
+list must then be mended), or if its tests fail without it.  With words, only mutations whose names hold one of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCE = "service/soilbus"
+FAILED = 1
+"""Exit code of pytest where tests fail, and not the machinery."""
+
+
+class Mutation(NamedTuple):
+    """One place of a file below service/soilbus with other text in it, and the tests (pytest arguments) that kill it."""
+
+    name: str
+    file: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+
+
+STORIES = "tests/stories/test_stories.py"
+DECISION = "tests/daemon/test_decision.py"
+MUTATIONS = (
+    Mutation(
+        "a window of before an interruption counts", "daemon/service.py",
+        "self._ended <= self._interrupted or not", "not",
+        (f"{STORIES}::test_an_interruption_ends_what_was_known_before_it",),
+    ),
+    Mutation(
+        "a posterior counts at any age", "daemon/service.py",
+        "not self._age(now) <= self.config.traversability.max_age", "False",
+        (f"{STORIES}::test_a_window_that_is_solved_when_it_is_too_old_is_no_go",),
+    ),
+    Mutation(
+        "a posterior's age is by the stamps alone", "daemon/service.py",
+        "max(by_stamps, now - self._ended)", "by_stamps",
+        (f"{STORIES}::test_go_ends_with_the_age_by_our_own_clock_where_the_stamps_stand",),
+    ),
+    Mutation(
+        "a late result of the old epoch is taken", "daemon/service.py",
+        "if pending.epoch == self.intake.epoch:", "if True:",
+        (f"{STORIES}::test_what_the_worker_says_of_the_time_before_the_clock_was_set_is_not_taken",),
+    ),
+    Mutation(
+        "stale inputs do not interrupt", "daemon/service.py",
+        '"input_missing", "input_stale", ', "",
+        (f"{STORIES}::test_go_is_said_where_the_truth_allows_it_and_nowhere_else[range(0, 25)]",),
+    ),
+    Mutation(
+        "another sender does not interrupt", "daemon/service.py",
+        ', "foreign_sender"))', "))",
+        (f"{STORIES}::test_go_is_said_where_the_truth_allows_it_and_nowhere_else",),
+    ),
+    Mutation(
+        "hysteresis without a past", "daemon/estimator.py",
+        "settled(self._held, way", "settled(Held(), way",
+        (f"{DECISION}::test_a_better_state_needs_two_windows_in_a_row",),
+    ),
+    Mutation(
+        "a new ground does not end what was held", "daemon/estimator.py",
+        "self._held, self._valid_at = Held(), None", "self._valid_at = None",
+        (f"{DECISION}::test_what_begins_anew_is_held_back_by_nothing",),
+    ),
+    Mutation(
+        "a fit that leaves more than noise is as sure as any", "daemon/estimator.py",
+        "return max(fit.chi2, 1.0) if tracked.mismatch else 1.0", "return 1.0",
+        (f"{DECISION}::test_a_window_that_does_not_fit_is_the_less_sure",),
+    ),
+    Mutation(
+        "any bit of a new soil is enough", "daemon/estimator.py",
+        "return tracked.since > end - MIN_NEW_SOIL * self._settings.window", "return False",
+        (f"{DECISION}::test_a_little_of_a_new_soil_is_no_go",),
+    ),
+    Mutation(
+        "a torque limit is fresh for a minute", "daemon/intake.py",
+        "end - self._limit_t < DEFAULT_TIMEOUT", "end - self._limit_t < 60.0",
+        ("tests/daemon/test_intake.py::test_a_torque_limit_that_is_not_told_any_more",),
+    ),
+    Mutation(
+        "gains never drift", "estimation/tracker.py",
+        "gains = problem.gain_std**2 * min((elapsed + 1.0) / GAIN_MEMORY, 1.0)", "gains = 0.0 * problem.gain_std",
+        ("tests/estimation/test_drift.py::test_gains_are_known_for_minutes_and_not_for_ever",),
+    ),
+    Mutation(
+        "the soil never drifts", "estimation/tracker.py",
+        "return belief.drifted(self._drift(belief, elapsed), gains)",
+        "return belief.drifted(0.0 * self._drift(belief, elapsed), gains)",
+        ("tests/estimation/test_drift.py::test_the_soil_of_an_hour_ago_is_no_more_than_another_soil",),
+    ),
+    Mutation(
+        "a state is written through a link", "daemon/store.py",
+        "os.open(path, flags | os.O_NOFOLLOW, 0o600)", "os.open(path, flags, 0o600)",
+        ("tests/daemon/test_store.py::test_nothing_is_written_through_a_link",),
+    ),
+    Mutation(
+        "a state is read through a link", "daemon/store.py",
+        "os.O_NONBLOCK | os.O_NOFOLLOW", "os.O_NONBLOCK",
+        ("tests/daemon/test_store.py::test_what_is_no_file_is_refused_and_nothing_is_nothing",),
+    ),
+    Mutation(
+        "gains may be as negative as they like", "daemon/store.py",
+        "(np.abs(off) <= FAR * std).all()", "(off <= FAR * std).all()",
+        ("tests/daemon/test_store.py::test_each_fault_is_told_in_one_line",),
+    ),
+    Mutation(
+        "windows that overlap count as if they did not", "daemon/gap.py",
+        "math.sqrt(2.0 * self._overlap / rows)", "math.sqrt(2.0 / rows)",
+        ("tests/daemon/test_gap.py::test_noise_alone_is_no_gap_however_few_residuals_there_are",),
+    ),
+    Mutation(
+        "one repeated reading makes a sensor coarse", "estimation/plausibility.py",
+        "> COARSE * (np", "> 0.0 * (np",
+        ("tests/estimation/test_plausibility.py::test_how_often_readings_repeat_elsewhere_tells_coarse_from_frozen",),
+    ),
+    Mutation(
+        "no sensor is coarse", "estimation/plausibility.py",
+        "> COARSE * (np", "> 1.0 * (np",
+        ("tests/estimation/test_plausibility.py::test_how_often_readings_repeat_elsewhere_tells_coarse_from_frozen",),
+    ),
+    Mutation(
+        "readings that repeat for long count as repeated elsewhere", "estimation/plausibility.py",
+        "same[:, i].sum() - within > COARSE * (np.isfinite(value[:, i]).sum() - within)",
+        "same[:, i].sum() > COARSE * np.isfinite(value[:, i]).sum()",
+        ("tests/estimation/test_plausibility.py::test_how_often_readings_repeat_elsewhere_tells_coarse_from_frozen",),
+    ),
+    Mutation(
+        "the state follows from the pull alone", "judgement.py",
+        "state=state_of(min(pull, depth), status, settings)", "state=state_of(pull, status, settings)",
+        ("tests/test_traversability.py::test_ground_that_holds_the_pull_but_not_the_depth_is_no_go",),
+    ),
+    Mutation(
+        "a margin makes being pushed harder", "judgement.py",
+        "settings.margin * max(demand.pull, 0.0)", "settings.margin * abs(demand.pull)",
+        ("tests/test_traversability.py::test_the_margin_counts_for_pulling_only",),
+    ),
+    Mutation(
+        "a margin makes being pushed easier", "judgement.py",
+        "settings.margin * max(demand.pull, 0.0)", "settings.margin * demand.pull",
+        ("tests/test_traversability.py::test_the_margin_counts_for_pulling_only",),
+    ),
+    Mutation(
+        "peaks are forgotten at once", "capability/trend.py",
+        "return Peaks(t, value, self.now)", "return Peaks(t, value, value)",
+        ("tests/capability/test_trend.py::test_peaks_are_those_of_the_last_seconds",),
+    ),
+    Mutation(
+        "peaks are never forgotten", "capability/trend.py",
+        "return Peaks(t, value, self.now)", "return Peaks(t, value, self.greatest)",
+        ("tests/capability/test_trend.py::test_peaks_are_those_of_the_last_seconds",),
+    ),
+    Mutation(
+        "PDU format 240 has a destination", "can/j1939.py",
+        "< _PDU2 else", "<= _PDU2 else",
+        ("tests/can/test_j1939.py",),
+    ),
+    Mutation(
+        "PDU format 239 has none", "can/j1939.py",
+        "_PDU2 = 0xF0", "_PDU2 = 0xEF",
+        ("tests/can/test_j1939.py",),
+    ),
+)  # fmt: skip
+
+
+def is_there(mutation: Mutation) -> bool:
+    """Whether the text that the mutation replaces is in the code, once."""
+    return (ROOT / SOURCE / mutation.file).read_text(encoding="utf-8").count(mutation.old) == 1
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Mutate, test, tell."""
+    parser = argparse.ArgumentParser(prog="python -m tests.mutations", description=__doc__)
+    parser.add_argument("words", nargs="*", help="only mutations whose names hold one of these")
+    words = parser.parse_args(arguments).words
+    chosen = [m for m in MUTATIONS if not words or any(word in m.name for word in words)]
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder)
+        shutil.copytree(ROOT / "service", copy / "service", ignore=shutil.ignore_patterns("__pycache__"))
+        for beside in ("dbc", "systemd"):
+            (copy / beside).symlink_to(ROOT / beside)
+        told = {mutation.name: _told(mutation, copy) for mutation in chosen}
+        sound = _code(copy, sorted({test for mutation in chosen for test in mutation.tests}))
+    for name, what in told.items():
+        print(f"{what:<10} {name}")
+    if sound != 0:
+        print(f"their tests fail without any mutation (pytest ended with {sound})")
+    return int(sound != 0 or any(what != "killed" for what in told.values()))
+
+
+def _told(mutation: Mutation, copy: Path) -> str:
+    """What became of one mutation."""
+    if not is_there(mutation):
+        return "text gone"
+    file = copy / SOURCE / mutation.file
+    text = file.read_text(encoding="utf-8")
+    file.write_text(text.replace(mutation.old, mutation.new), encoding="utf-8")
+    try:
+        code = _code(copy, mutation.tests)
+    finally:
+        file.write_text(text, encoding="utf-8")
+    return {0: "survived", FAILED: "killed"}.get(code, "no test")
+
+
+def _code(copy: Path, tests: Sequence[str]) -> int:
+    """How pytest ends with the copy's code."""
+    paths = " ".join([str(copy / "service"), "tests/guest", "tests/support"])
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-o", f"pythonpath={paths}", *tests]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+    return subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.DEVNULL).returncode
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
