@@ -20,6 +20,7 @@ from soilbus.can.admission import Admission
 from soilbus.can.channels import Channel, Column, Decoded
 from soilbus.can.dbc_files import checked_messages
 from soilbus.can.mapping import POSITION_ROLES, channels_of
+from soilbus.capability.traction_loss import Motion, motion_of
 from soilbus.config import Config
 from soilbus.daemon.plausibility import Plausibility
 from soilbus.daemon.positions import PositionTrack
@@ -39,6 +40,8 @@ from soilbus.terra.vehicle import slip_ratio
 Array = NDArray[np.float64]
 
 DEFAULT_TIMEOUT = 1.0
+LIMIT_SAMPLES = 3
+"""Reported torque limits of which the median is in force: one wild sample moves nothing."""
 COVERAGE_BLOCK = 0.5
 MIN_COVERAGE = 0.95
 LONGEST_GAP = 60.0
@@ -75,7 +78,7 @@ class WindowTask:
 
 
 class Latest(NamedTuple):
-    """Slip ratio by wheel, pull [N] (draft, slope, inertia) of the last moments and the inertia in it.
+    """Slip ratio by wheel, pull [N] (draft, slope, inertia) of the last moments, the inertia in it, and the motion.
 
     None where unknown.
     """
@@ -83,6 +86,7 @@ class Latest(NamedTuple):
     slip: dict[str, float | None]
     pull: float | None
     inertia: float = 0.0
+    motion: Motion | None = None
 
 
 @dataclass(slots=True)
@@ -132,8 +136,8 @@ class Intake:
         self._binned = frozenset(self.rig.channels)
         limits = {w.name: w.max_torque for w in config.wheel}
         self._max_torque = np.array([limits[name] or math.nan for name in self.rig.wheels])
-        self._limit = np.full(len(self.rig.wheels), math.nan)
-        self._limit_t = np.full(len(self.rig.wheels), -math.inf)
+        self._decision = config.traversability
+        self._limits: dict[str, Array] = {}  # the last few reported of each wheel
         self._index = 0
         self.epoch = 0
         self._restart()
@@ -173,18 +177,26 @@ class Intake:
                 self.next_end = first - EDGE_LEAD + self._settings.window
         heard = {name: (c.t, c.value) for name, c in decoded.columns.items() if len(c.t)}
         self.last_seen |= {name: float(t[-1]) for name, (t, _) in heard.items()}
-        for name, (t, value) in heard.items():
+        for name, (_, value) in heard.items():
             if name.startswith("torque_limit."):
-                self._note_limit(name.removeprefix("torque_limit."), t, value)
+                self._note_limit(name.removeprefix("torque_limit."), value)
         self._positions.add(heard)
         self._plausibility.add(heard)
         if self._bins is not None:
             self._bins.add({name: samples for name, samples in heard.items() if name in self._binned})
 
-    def _note_limit(self, wheel: str, t: Array, value: Array) -> None:
-        if wheel in self.rig.wheels:
-            i = self.rig.wheels.index(wheel)
-            self._limit[i], self._limit_t[i] = value[-1], t[-1]
+    def _note_limit(self, wheel: str, value: Array) -> None:
+        self._limits[wheel] = np.append(self._limits.get(wheel, value[:0]), value)[-LIMIT_SAMPLES:]
+
+    @property
+    def torque_limit(self) -> Array:
+        """Greatest torque of each wheel (W,) [N m], nan where unknown: as reported last, else as configured.
+
+        What a motor has reported holds until it reports another limit, however long it is silent and whatever
+        becomes of the clock.  The median of the last few samples is not moved by a wild one.
+        """
+        reported = [np.median(self._limits[wheel]) if wheel in self._limits else math.nan for wheel in self.rig.wheels]
+        return np.where(np.isfinite(reported), reported, self._max_torque)
 
     def due(self, now: float) -> list[WindowTask]:
         """Every window that ended at or before `now` [s] and was not handed out yet."""
@@ -230,7 +242,6 @@ class Intake:
         covered = dict(zip(self.rig.channels, coverage(window).tolist(), strict=True))
         badly_covered = [c.name for c in self.needed if covered[c.name] < MIN_COVERAGE]
         poor = tuple(dict.fromkeys(self.stale(end) + badly_covered))
-        fresh_limit = end - self._limit_t < DEFAULT_TIMEOUT
         task = WindowTask(
             index=self._index,
             start=start,
@@ -239,7 +250,7 @@ class Intake:
             slip=self._slip(window),
             missing=missing if self.rig.wheels else (*missing, "wheels"),
             poor=poor,
-            torque_limit=np.where(fresh_limit, self._limit, self._max_torque),
+            torque_limit=self.torque_limit,
             track=self._positions.copy(),
             rejected=self.refusals.within(start, end),
             fresh=self._fresh,
@@ -270,7 +281,9 @@ class Intake:
             return Latest(self._slip(window), None)
         pull, inertia = pull_given(window, self.rig.chassis), inertia_of(window, self.rig.chassis)
         given = column_means(pull[:, None])[0]
-        return Latest(self._slip(window), given, 0.0 if given is None else float(inertia[np.isfinite(pull)].mean()))
+        motion = motion_of(forward(window), self.rig, self.torque_limit, self._decision)
+        part = 0.0 if given is None else float(inertia[np.isfinite(pull)].mean())
+        return Latest(self._slip(window), given, part, motion)
 
     def _slip(self, window: Window) -> dict[str, float | None]:
         window = forward(window)
