@@ -317,9 +317,8 @@ class Service:
             self._watch, self._time.at(now), latest.slip.values(), latest.pull, self._present_curve(now), latest.inertia
         )  # fmt: skip
         warning = with_loss(self._watch, self._loss)
-        self.bus.send(
-            self.publisher.frame(*forecast_frame(self.result if known and not self._loss.stuck else None, warning))
-        )
+        foreseeable = self.result if known and not self._loss.stuck else None
+        self.bus.send(self.publisher.frame(*forecast_frame(foreseeable, warning)))
         self.bus.send(
             self.publisher.frame(
                 "Traversability",
