@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import can
+import numpy as np
 import pytest
 
 from fakes import FakeClock, InlineExecutor, ScriptedBus
 from feeding import feed_message
-from in_vain import STANDS, TRIES, Story, halted_by_a_patch, stop_and_try
+from in_vain import STANDS, TRIES, Story, driven, halted_by_a_patch, stop_and_try
 from soilbus.can.bus import LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
@@ -17,15 +19,18 @@ from soilbus.daemon.notify import Notifier
 from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.result import WindowResult
 from soilbus.daemon.service import Service
+from soilbus.simulator.frames import frames
+from soilbus.simulator.recording import Recording
 from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.sensors import measure
 from soilbus.traversability import State, Status
 
 CONFIG = reference_configuration()
 IN, OUT = load_databases(CONFIG), output_database(CONFIG)
 
 
-def replayed(messages: Iterable[can.Message]) -> list[WindowResult]:
-    pipeline, results, due, last = Pipeline(CONFIG, IN), [], 0.0, 0.0
+def replayed(messages: Iterable[can.Message], config=CONFIG, database=IN) -> list[WindowResult]:
+    pipeline, results, due, last = Pipeline(config, database), [], 0.0, 0.0
     for message in messages:
         last = message.timestamp
         if not due - 1.0 <= last < due:
@@ -118,3 +123,56 @@ def test_a_vehicle_that_merely_stands_is_unknown_after_the_age_of_its_data():
     assert stood - by_speed + max_age - 0.6 < last < stood - by_speed + max_age + 0.3
     assert {state for at, state in states(sent) if at > last + 0.2} == {"unknown"}
     assert "immobilisation" not in {w for at, w in states(sent, "DemandForecast", "Warning") if at > stood}
+
+
+LIMITS_ID = 2566865920 & 0x1FFFFFFF
+LIMITS = """VERSION ""
+BU_: Tractor Service
+BO_ 2566865920 MotorLimits: 8 Tractor
+{signals}
+{values}
+"""
+
+
+@pytest.fixture(scope="module")
+def limits_apart(tmp_path_factory):
+    """The reference tractor with the limits of its motors in a frame of their own, and its database."""
+    names = [w.name for w in CONFIG.wheel]
+    signals = [f' SG_ {w} : {16 * i}|16@1+ (0.05,0) [0|3212.75] "N.m" Service' for i, w in enumerate(names)]
+    values = [f'VAL_ 2566865920 {w} 65279 "error" 65535 "not_available" ;' for w in names]
+    path = tmp_path_factory.mktemp("dbc") / "limits.dbc"
+    path.write_text(LIMITS.format(signals="\n".join(signals), values="\n".join(values)))
+    config = reference_configuration(
+        [f'dbc.input=["tractor.dbc", "{path}"]', *(f'wheel.{w}.torque_limit="MotorLimits.{w}"' for w in names)]
+    )
+    return config, load_databases(config)
+
+
+@pytest.mark.parametrize("lost", [b"\xff\xff", b"\xff\xfe", None], ids=["not available", "error", "no frame"])
+@pytest.mark.parametrize("clock", [0.0, -3600.0])
+def test_a_torque_limit_holds_until_another_one_is_reported(limits_apart, lost, clock):
+    # All motors derate after 13 s; from 15 s on no limit is heard of; at 28 s the full one is.
+    config, database = limits_apart
+    derates, silent, lifted = 13.0, 15.0, 28.0
+    done = driven(config, 41, 34.0, None)
+    t = done.columns["t"]
+    limit = np.where((t > derates) & (t < lifted), 100.0, 2400.0)
+    done = replace(done, columns=done.columns | {f"torque_limit.{w.name}": limit for w in config.wheel})
+    messages = []
+    recording = Recording(done.columns, measure(done, config, 41), 41)
+    for m in frames(recording, config, database, start=0.0):
+        if m.arbitration_id == LIMITS_ID and silent < m.timestamp < lifted:
+            if lost is None:
+                continue
+            m.data[:] = 4 * lost
+        m.timestamp += 1.7e9 + (clock if m.timestamp > silent + 0.5 else 0.0)
+        messages.append(m)
+    results = [(r.t - 1.7e9 - (clock if r.t < 1.7e9 else 0.0), r) for r in replayed(messages, config, database)]
+    go = [t for t, r in results if r.traversability.state is State.GO]
+    assert any(t < derates for t in go)
+    assert not [t for t in go if derates + 0.5 < t < lifted]
+    assert any(t > lifted + 2.5 for t in go)
+    held = [r.traversability for t, r in results if derates + 0.5 < t < lifted and r.status is Status.VALID]
+    assert len(held) >= 3
+    assert {way.state for way in held} == {State.NO_GO}
+    assert [way.torque_available for way in held] == pytest.approx([400.0] * len(held), rel=5e-3)

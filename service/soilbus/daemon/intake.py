@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -116,6 +117,43 @@ class Refusals:
         return {r: n for r, n in sorted(counts.items()) if n}
 
 
+class ReportedLimits:
+    """Greatest torque [N m] that each motor has reported, else the configured one (W,), nan where neither is known.
+
+    What a motor has reported holds until it reports another limit, however long it is silent and whatever becomes of
+    the clock.  The median of the last few samples is not moved by a wild one.
+    """
+
+    def __init__(self, wheels: Sequence[str], configured: Sequence[float]) -> None:
+        self._configured = dict(zip(wheels, configured, strict=True))
+        self._reported: dict[str, tuple[Array, Array]] = {}
+
+    def add(self, wheel: str, t: Array, value: Array) -> None:
+        """Samples (N,) of one wheel at the times t [s]."""
+        if wheel in self._configured:
+            old_t, old = self._reported.get(wheel, (t[:0], value[:0]))
+            self._reported[wheel] = np.append(old_t, t), np.append(old, value)
+
+    def at(self, t: float) -> Array:
+        """The limits (W,) in force at the time t [s]."""
+        return np.array([self._of(wheel, t) for wheel in self._configured])
+
+    def _of(self, wheel: str, now: float) -> float:
+        t, value = self._reported.get(wheel, (np.empty(0), np.empty(0)))
+        last = value[t <= now][-LIMIT_SAMPLES:]
+        return float(np.median(last)) if len(last) else self._configured[wheel]
+
+    def drop_before(self, end: float) -> None:
+        """Forget what is no longer among the last samples at the time `end` [s]."""
+        for wheel, (t, value) in self._reported.items():
+            first = max(int(np.count_nonzero(t <= end)) - LIMIT_SAMPLES, 0)
+            self._reported[wheel] = t[first:], value[first:]
+
+    def forget_times(self) -> None:
+        """The clock was set: what was reported was reported before all that follows."""
+        self._reported = {wheel: (np.full(len(t), -math.inf), value) for wheel, (t, value) in self._reported.items()}
+
+
 class Intake:
     """Admission, bins and freshness of one vehicle's channels.
 
@@ -135,9 +173,8 @@ class Intake:
         self._settings = config.estimator
         self._binned = frozenset(self.rig.channels)
         limits = {w.name: w.max_torque for w in config.wheel}
-        self._max_torque = np.array([limits[name] or math.nan for name in self.rig.wheels])
         self._decision = config.traversability
-        self._limits: dict[str, Array] = {}  # the last few reported of each wheel
+        self._limits = ReportedLimits(self.rig.wheels, [limits[name] or math.nan for name in self.rig.wheels])
         self._index = 0
         self.epoch = 0
         self._restart()
@@ -153,6 +190,7 @@ class Intake:
         self._fresh = True
         self._positions.forget()
         self._plausibility.forget()
+        self._limits.forget_times()
         self._lying: tuple[str, ...] = ()
         self.next_end = math.inf
         self.last_seen: dict[str, float] = {}
@@ -177,26 +215,13 @@ class Intake:
                 self.next_end = first - EDGE_LEAD + self._settings.window
         heard = {name: (c.t, c.value) for name, c in decoded.columns.items() if len(c.t)}
         self.last_seen |= {name: float(t[-1]) for name, (t, _) in heard.items()}
-        for name, (_, value) in heard.items():
+        for name, (t, value) in heard.items():
             if name.startswith("torque_limit."):
-                self._note_limit(name.removeprefix("torque_limit."), value)
+                self._limits.add(name.removeprefix("torque_limit."), t, value)
         self._positions.add(heard)
         self._plausibility.add(heard)
         if self._bins is not None:
             self._bins.add({name: samples for name, samples in heard.items() if name in self._binned})
-
-    def _note_limit(self, wheel: str, value: Array) -> None:
-        self._limits[wheel] = np.append(self._limits.get(wheel, value[:0]), value)[-LIMIT_SAMPLES:]
-
-    @property
-    def torque_limit(self) -> Array:
-        """Greatest torque of each wheel (W,) [N m], nan where unknown: as reported last, else as configured.
-
-        What a motor has reported holds until it reports another limit, however long it is silent and whatever
-        becomes of the clock.  The median of the last few samples is not moved by a wild one.
-        """
-        reported = [np.median(self._limits[wheel]) if wheel in self._limits else math.nan for wheel in self.rig.wheels]
-        return np.where(np.isfinite(reported), reported, self._max_torque)
 
     def due(self, now: float) -> list[WindowTask]:
         """Every window that ended at or before `now` [s] and was not handed out yet."""
@@ -250,7 +275,7 @@ class Intake:
             slip=self._slip(window),
             missing=missing if self.rig.wheels else (*missing, "wheels"),
             poor=poor,
-            torque_limit=self.torque_limit,
+            torque_limit=self._limits.at(end),
             track=self._positions.copy(),
             rejected=self.refusals.within(start, end),
             fresh=self._fresh,
@@ -261,6 +286,7 @@ class Intake:
         bins.drop_before(start + self._settings.hop)
         self._positions.drop_before((start + end) / 2.0 + self._settings.hop)
         self._plausibility.drop_before(start + self._settings.hop)
+        self._limits.drop_before(end)
         return task
 
     def stale(self, now: float) -> list[str]:
@@ -281,7 +307,7 @@ class Intake:
             return Latest(self._slip(window), None)
         pull, inertia = pull_given(window, self.rig.chassis), inertia_of(window, self.rig.chassis)
         given = column_means(pull[:, None])[0]
-        motion = motion_of(forward(window), self.rig, self.torque_limit, self._decision)
+        motion = motion_of(forward(window), self.rig, self._limits.at(now), self._decision)
         part = 0.0 if given is None else float(inertia[np.isfinite(pull)].mean())
         return Latest(self._slip(window), given, part, motion)
 
