@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.capability.assessment import Capability, Demand, assess
+from soilbus.capability.traction_loss import TractionLoss
 from soilbus.capability.uncertain_model import UncertainModel
 from soilbus.capability.wheels import WheelTable
+from soilbus.config import Config
 from soilbus.config import Traversability as Settings
 from soilbus.estimation.posterior import Posterior
 from soilbus.estimation.window import Rig
@@ -77,6 +80,62 @@ def probability_of_depth(able: Capability, settings: Settings) -> float:
         return 1.0
     deepest = able.forecast.likely_depth
     return _above(settings.max_sinkage - deepest.value, deepest.std)
+
+
+class Basis(NamedTuple):
+    """What a decision rests on: the instants (N,) [s] that were fitted, each so long [s], and the ground left behind.
+
+    unseen [m]: way driven since the last of them, until the window's end.
+    """
+
+    instants: NDArray[np.float64] = np.empty(0)
+    each: float = 0.0
+    unseen: float = 0.0
+
+    @property
+    def end(self) -> float:
+        """The last instant [s]; minus infinity without any."""
+        return float(self.instants[-1]) if len(self.instants) else -math.inf
+
+
+def at_present(way: Traversability, basis: Basis, loss: TractionLoss, now: float, config: Config) -> Traversability:
+    """What is left of a window's decision at a later time.
+
+    A decision has the time and the place of the data that it rests on, and none against what the wheels show:
+
+    - stuck: no_go, and nothing of what the estimate promises;
+    - with a wheel that spins: no better than caution;
+    - resting on data older than `max_age`, or on ground that lies further back than the vehicle is long: unknown;
+    - with less than `min_share` of a window measured since a wheel last spun: no better than caution.
+
+    Parameters
+    ----------
+    way
+        The decision when the window ended.
+    basis
+        What it rests on.
+    loss
+        Loss of traction as of now.
+    now
+        [s], the time of the data.
+    config
+        Of `max_age` and `min_share`; of the wheelbase, after which rear wheels stand where front wheels stood.
+    """
+    settings, length = config.traversability, 0.0 if config.vehicle is None else config.vehicle.wheelbase
+    if loss.stuck:
+        return Traversability(
+            State.NO_GO, 0.0, torque_available=way.torque_available, limit="slip", since_valid=way.since_valid
+        )
+    if loss.spinning and way.state is not State.NO_GO:
+        return replace(way, state=State.CAUTION, probability=None)
+    if way.state is State.UNKNOWN:
+        return way
+    if not (now - basis.end <= settings.max_age and basis.unseen <= length):  # nor nan
+        return replace(way, state=State.UNKNOWN, probability=None)
+    measured = np.count_nonzero(basis.instants > loss.last) * basis.each
+    if way.state is State.GO and measured < settings.min_share * config.estimator.window:
+        return replace(way, state=State.CAUTION, probability=None)
+    return way
 
 
 def _above(margin: float, std: float) -> float:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from feeding import feed_message
-from onlooker import good_tracked, of_soft_ground
+from onlooker import good_tracked, of_soft_ground, tracked_at
 from soilbus.can.dbc_files import load_databases
 from soilbus.daemon.estimator import WindowEstimator
 from soilbus.daemon.intake import WindowTask
@@ -41,8 +41,8 @@ def decided(tasks, told):
     estimator = WindowEstimator(CONFIG)
     found = []
     for task, tracked in zip(tasks, told, strict=False):
-        estimator.tracker.estimate = lambda window, end, tracked=tracked: replace(
-            tracked, since=end - CONFIG.estimator.window * tracked.since
+        estimator.tracker.estimate = lambda window, end, tracked=tracked: tracked_at(
+            tracked, window, since=end - CONFIG.estimator.window * tracked.since
         )
         found.append(estimator.solve_unwatched(task))
     return found

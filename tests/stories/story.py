@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -17,7 +18,7 @@ STEPS = (-3600.0, -5.0, -1.5, -0.6, 0.4, 2.0, 70.0, 3600.0)
 TO_SOME = ("deaf", "noisy", "spoilt", "repeated")
 """What happens to some of the messages: they do not come, or others in their place; are damaged; do not count on."""
 TO_ALL = ("lost", "off", "halted", "forged", "clock", "restart", "killed", "hangs", "late")
-TO_GROUND = ("blind", "soft", "raises", "weak")
+TO_GROUND = ("blind", "soft", "raises", "weak", "unsaid")
 """What only a tracker that is told the truth knows of."""
 
 
@@ -70,8 +71,10 @@ def begin(drive: Drive, faults: dict[str, Any]) -> None:
         match kind:
             case "noisy":
                 drive.wire.deaf, drive.wire.noisy = what, True
-            case "weak":
+            case "weak" | "unsaid":
                 drive.wire.power = WEAK
+                if kind == "unsaid":  # some samples of the limit come, then none any more
+                    drive.wire.mute_from = drive.clock.now + 4.0 * drive.wire.cycle
             case "hangs":
                 drive.worker.hangs = True
             case "late":
@@ -92,5 +95,5 @@ def end(drive: Drive, firm: bool = True) -> None:
     wire = drive.wire
     wire.deaf = wire.spoilt = wire.repeated = frozenset()
     wire.noisy = wire.lost = wire.off = wire.halted = wire.forged = wire.blind = wire.raises = False
-    wire.soft, wire.power = not firm, 1.0
+    wire.soft, wire.power, wire.mute_from = not firm, 1.0, math.inf
     drive.worker.wake()

@@ -10,9 +10,10 @@ from soilbus.daemon.intake import Intake
 from soilbus.daemon.service import Service
 from soilbus.daemon.states import ServiceState
 from soilbus.traversability import State as Way
+from soilbus.traversability import Traversability
 
 from .drives import cheap, real
-from .story import TO_ALL, TO_SOME, Event, drawn, told
+from .story import TO_ALL, TO_SOME, Event, begin, drawn, end, told
 
 AT_A_TIME, HEALED = 25, 10
 SEEDS = [range(first, first + AT_A_TIME) for first in range(0, 200, AT_A_TIME)]
@@ -63,7 +64,7 @@ def with_the_verdict_of_the_run_before(monkeypatch):
 
     def present_way(self, now):
         knows = self.result is None and self._keeper.recalled is not None
-        return Way.GO if knows and self._state[0] is ServiceState.ESTIMATING else usual(self, now)
+        return Traversability(Way.GO) if knows and self._state[0] is ServiceState.ESTIMATING else usual(self, now)
 
     monkeypatch.setattr(Service, "present_way", present_way)
 
@@ -131,4 +132,30 @@ def test_go_after_soft_ground_needs_two_windows():
     assert str(drive.last["State"]) != "go"
     drive.run(1.2)
     assert str(drive.last["State"]) == "go"
+    assert drive.faults == []
+
+
+@pytest.mark.parametrize("by", [0.0, -3600.0, 3600.0])
+def test_a_torque_limit_that_is_not_told_any_more_holds(by):
+    drive = told(cheap(), [])
+    begin(drive, {"unsaid": True, "clock": by})
+    drive.run(3.0)
+    before = drive.go
+    drive.run(4.0)
+    assert drive.go == before
+    assert str(drive.last["State"]) == "no_go"
+    end(drive)
+    drive.run(4.0)
+    assert str(drive.last["State"]) == "go"
+    assert drive.faults == []
+
+
+def test_one_wild_torque_limit_moves_nothing():
+    drive = told(cheap(), [Event({"unsaid": True}, 2.0)])
+    begin(drive, {"unsaid": True})
+    drive.run(3.0)
+    assert str(drive.last["State"]) == "no_go"
+    drive.wire.power, drive.wire.mute_from = 1.0, drive.clock.now + drive.wire.cycle  # once
+    drive.run(2.0)
+    assert str(drive.last["State"]) == "no_go"
     assert drive.faults == []

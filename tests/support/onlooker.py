@@ -35,6 +35,7 @@ from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.service import Service
 from soilbus.daemon.store import Owner
 from soilbus.estimation.tracked import Tracked
+from soilbus.estimation.window import Window
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -99,6 +100,13 @@ def of_soft_ground(tracked: Tracked) -> Tracked:
     return dataclasses.replace(tracked, fit=dataclasses.replace(fit, rival=None))
 
 
+def tracked_at(tracked: Tracked, window: Window, **changed: Any) -> Tracked:
+    """The same of a window's own instants."""
+    optimum = tracked.fit.optimum
+    optimum = dataclasses.replace(optimum, t=optimum.t - optimum.t[-1] + window.t[-1])
+    return dataclasses.replace(tracked, fit=dataclasses.replace(tracked.fit, optimum=optimum), **changed)
+
+
 class Known(NamedTuple):
     """The truth when a frame of this stamp was delivered; firm: neither ground nor motors forbid what is asked."""
 
@@ -142,12 +150,12 @@ class Wire:
     """No model fits the ground; it holds nothing; it makes the estimator fail."""
     power: float = 1.0
     """Share of their torque that the motors have."""
-    mute: bool = False
-    """The motors do not say how much torque they have."""
+    mute_from: float = math.inf
+    """When the motors begin not to say how much torque they have."""
     good: dict[str, float] = field(default_factory=dict)
     stamps: dict[str, float] = field(default_factory=dict)
-    powers: dict[str, float] = field(default_factory=dict)
-    """Share of its torque that each motor has told last."""
+    powers: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Shares of its torque that each motor has told last; one may be wild."""
     heard: list[Known] = field(default_factory=list)
     """What was so at each delivery since the clock was set back last."""
     forged_at: float = -math.inf
@@ -205,7 +213,7 @@ class Wire:
             self.good, self.stamps, self.heard = {}, {}, []
             self.known_anew()
         self.newest = max(self.newest, stamp)
-        weak = len(self.powers) == len(MOTORS) and max(self.powers.values()) <= WEAK
+        weak = len(self.powers) == len(MOTORS) and max(max(told) for told in self.powers.values()) <= WEAK
         firm = not (self.soft or weak)
         self.heard.append(Known(stamp, self.clock.now, self.soft, firm, self.blind, self.raises))
         return stamp
@@ -219,7 +227,9 @@ class Wire:
         good = name not in self.spoilt
         if name in MOTORS:
             limit = int.from_bytes(data[4:6], "little")
-            data[4:6] = b"\xff\xff" if self.mute else int(limit * self.power).to_bytes(2, "little")
+            data[4:6] = (
+                b"\xff\xff" if self.clock.now >= self.mute_from else int(limit * self.power).to_bytes(2, "little")
+            )
         if checked:
             counter = 5 if name in self.repeated else self.counter
             good = good and name not in self.repeated
@@ -230,8 +240,8 @@ class Wire:
         stamp = self.stamp()
         if good and stamp >= self.stamps.get(name, -math.inf):
             self.good[name], self.stamps[name] = self.clock.now, stamp
-            if name in MOTORS and not self.mute:
-                self.powers[name] = self.power
+            if name in MOTORS and self.clock.now < self.mute_from:
+                self.powers[name] = self.powers.get(name, (1.0, 1.0))[1], self.power
         return can.Message(
             timestamp=stamp, arbitration_id=message.arbitration_id, is_extended_id=message.is_extended_id, data=data
         )
@@ -345,7 +355,7 @@ class Drive:
             tracked = self.of_soft if known.soft else self.tracked
             assert tracked is not None
             estimator.tracker._newest = tracked.fit.whole
-            return dataclasses.replace(tracked, since=end - self.config.estimator.window, mismatch=known.blind)
+            return tracked_at(tracked, window, since=end - self.config.estimator.window, mismatch=known.blind)
 
         if self.tracked is not None:
             estimator.tracker.estimate = estimate

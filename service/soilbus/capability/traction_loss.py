@@ -1,0 +1,127 @@
+"""Wheels that spin and a vehicle that does not move, as the sensors show them, whatever soil was estimated.
+
+    slip velocity of a wheel   v_s = r omega - V
+    it spins where             v_s > max(v_min, s_max r omega)
+    the vehicle stalls where   V < v_min and r omega < v_min of every wheel, while the wheels' thrust sum(T / r) exceeds
+                               what draft, slope and inertia ask by more than any ground resists, or all motors give
+                               all they can
+
+Slip 1 - V/(r omega) is not defined at standstill, its velocity is: so one rule holds from standstill to full speed.
+What lasts for `spin_time` takes the word from any estimate that says go; a vehicle that spins or stalls without making
+way for `stuck_time` is stuck.  It stays stuck until it has moved, for the ground is the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.config import Traversability as Settings
+from soilbus.estimation.window import Rig, Window, pull_given
+from soilbus.terra.vehicle import GRAVITY
+
+LONGEST_GAP = 1.0
+"""Silence [s] after which nothing is known of what lasts."""
+
+
+class Motion(NamedTuple):
+    """One moment: time [s], ground speed [m/s], rim speeds [m/s] of the wheels, and whether thrust moves nothing.
+
+    nan is what is not known.  resistance: thrust beyond what draft, slope and inertia ask, as a share of the weight.
+    at_limit: every motor whose limit is known gives all it can, and at least one is known.
+    """
+
+    t: float
+    ground: float
+    rim: Sequence[float]
+    resistance: float
+    at_limit: bool
+
+
+@dataclass(frozen=True, slots=True)
+class TractionLoss:
+    """What is remembered from one moment to the next; `observed` makes the next one.  All times in s.
+
+    t: the last moment.  spins, sticks, moves: since when a wheel spins or the vehicle stalls, it makes no way under
+    thrust, it moves without spinning; inf where it does not.  stuck: it was, and has not moved since.  last: when any
+    of it was last seen to last; what was measured before then says nothing of the ground under the wheels.
+    """
+
+    t: float = -math.inf
+    spins: float = math.inf
+    sticks: float = math.inf
+    moves: float = math.inf
+    spinning: bool = False
+    stuck: bool = False
+    last: float = -math.inf
+
+    @property
+    def present(self) -> bool:
+        """Whether a wheel spins, or the vehicle is stuck."""
+        return self.spinning or self.stuck
+
+
+NO_LOSS = TractionLoss()
+
+
+def observed(before: TractionLoss, motion: Motion, min_speed: float, settings: Settings) -> TractionLoss:
+    """What is lost after one more moment; moments in their order, at any rate.
+
+    Parameters
+    ----------
+    before
+        What the moment before left; nothing of it counts after LONGEST_GAP, or when time goes back.
+    motion
+        The wheels and the vehicle now.
+    min_speed
+        Least speed [m/s] at which motion is told from rest.
+    settings
+        `max_slip`, `spin_time`, `stuck_time`, `stall_resistance`.
+
+    Returns
+    -------
+    TractionLoss
+        With `spinning` and `stuck` as of now.
+    """
+    if not 0.0 <= motion.t - before.t <= LONGEST_GAP:
+        before = replace(before, spins=math.inf, sticks=math.inf, moves=math.inf) if motion.t > before.t else NO_LOSS
+    known = [rim for rim in motion.rim if math.isfinite(rim)]
+    if not known or not math.isfinite(motion.ground):
+        return replace(before, t=motion.t)
+    spinning = sum(rim - motion.ground > max(min_speed, settings.max_slip * rim) for rim in known)
+    stands = motion.ground < min_speed
+    forced = motion.at_limit or motion.resistance > settings.stall_resistance  # nan: not known
+    stalls = stands and forced and max(known) < min_speed
+    no_way = stalls or (spinning > 0 and stands) or 2 * spinning >= len(known)
+    t = motion.t
+    spins = min(before.spins, t) if spinning or stalls else math.inf
+    sticks = min(before.sticks, t) if no_way else math.inf
+    moves = min(before.moves, t) if not stands and not spinning else math.inf
+    stuck = t - sticks >= settings.stuck_time or (before.stuck and t - moves < settings.spin_time)
+    lasting = t - spins >= settings.spin_time
+    return TractionLoss(t, spins, sticks, moves, lasting, stuck, t if lasting or stuck else before.last)
+
+
+def motion_of(window: Window, rig: Rig, torque_limit: NDArray[np.float64], settings: Settings) -> Motion | None:
+    """The mean motion over the few bins of a forward window; None without a bin, or for a rig without a chassis.
+
+    torque_limit (W,) [N m] is nan where a motor's is not known.
+    """
+    if not len(window.t) or rig.chassis is None:
+        return None
+    columns = np.column_stack(
+        [window.ground_speed, pull_given(window, rig.chassis), rig.radius * window.speed, window.torque]
+    )
+    known = np.isfinite(columns)
+    with np.errstate(invalid="ignore"):
+        ground, asked, *wheels = np.where(known, columns, 0.0).sum(axis=0) / known.sum(axis=0)
+    rim, torque = np.split(np.array(wheels), 2)
+    limited = np.isfinite(torque_limit)
+    at_limit = limited.any() and (torque[limited] >= settings.full_torque * torque_limit[limited]).all()
+    resistance = ((torque / rig.radius).sum() - asked) / (rig.chassis.mass * GRAVITY)
+    return Motion(float(window.t[-1]), float(ground), rim.tolist(), float(resistance), bool(at_limit))

@@ -1,0 +1,129 @@
+"""Drives that end stuck, frame by frame, whose end no model of a soil has written.
+
+While it drives, the simulator's quasi-static tractor; from then on kinematics and statics written down here: the ground
+speed, and the rim speed and torque of each wheel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import can
+import numpy as np
+
+from soilbus.assembly import chassis_of
+from soilbus.config import Config
+from soilbus.simulator.drive import Drive, drive
+from soilbus.simulator.frames import frames
+from soilbus.simulator.recording import Recording
+from soilbus.simulator.scenario import SAMPLE_RATE, Patch, Profile, Scenario
+from soilbus.simulator.sensors import measure
+from soilbus.terra.vehicle import axle_loads
+
+CRAWL = 0.02
+"""Ground speed [m/s] at which the simulated drive ends and the vehicle stands."""
+SPIN_UP = 0.3
+"""Time [s] in which torque and rim speed of a try rise."""
+
+
+class Try(NamedTuple):
+    """What the wheels do while the vehicle stands: rim speeds [m/s] and torques [N m] of FL, FR, RL, RR."""
+
+    rim: tuple[float, float, float, float]
+    torque: tuple[float, float, float, float]
+
+
+TRIES = {
+    "all wheels spin": Try((2.0,) * 4, (700.0, 700.0, 900.0, 900.0)),
+    "left wheels spin": Try((2.0, 0.0, 2.0, 0.0), (300.0, 300.0, 400.0, 400.0)),
+    "rear wheels spin": Try((0.0, 0.0, 2.0, 2.0), (150.0, 150.0, 700.0, 700.0)),
+    "one wheel spins": Try((0.0, 0.0, 0.0, 2.0), (100.0, 100.0, 120.0, 120.0)),
+    "diagonal wheels spin": Try((1.5, 0.0, 0.0, 1.5), (200.0, 200.0, 250.0, 250.0)),
+    "all wheels spin slowly": Try((0.45,) * 4, (700.0, 700.0, 900.0, 900.0)),
+    "motors at their limit": Try((0.0,) * 4, (2400.0,) * 4),
+    "half of the limit": Try((0.0,) * 4, (1200.0,) * 4),
+}
+STANDS = Try((0.0,) * 4, (0.0,) * 4)
+
+
+@dataclass(frozen=True)
+class Story:
+    """Frames of a drive, and when what it is about begins [s, the frames' time]."""
+
+    messages: list[can.Message]
+    begins: float
+
+
+def stop_and_try(config: Config, attempt: Try, seed: int, drives: float = 13.0, lasts: float = 8.0) -> Story:
+    """A drive on loam of so many seconds, a stop at 0.5 m/s^2, a wait of 1.5 s and a try in vain."""
+    waits = 1.5
+    done = driven(config, seed, drives, 0.5)
+
+    def standing(t: np.ndarray) -> dict[str, np.ndarray]:
+        on = np.clip((t - waits) / SPIN_UP, 0.0, 1.0)
+        return {"ground_speed": 0.0 * t} | _wheels(
+            config, [on * rim for rim in attempt.rim], [on * torque for torque in attempt.torque]
+        )
+
+    return told(continued(done, config, waits + lasts, standing), config, seed, float(done.columns["t"][-1]) + waits)
+
+
+def halted_by_a_patch(config: Config, seed: int, deceleration: float = 1.0, lasts: float = 8.0) -> Story:
+    """Left wheels meet a soft patch and spin through open differentials until the vehicle stands, and go on."""
+    done = driven(config, seed, 14.0, None)
+    speed = float(done.columns["ground_speed"][-1])
+
+    def halting(t: np.ndarray) -> dict[str, np.ndarray]:
+        ground = np.maximum(speed - deceleration * t, 0.0)
+        spin = speed + (2.0 - speed) * np.clip(t / 0.5, 0.0, 1.0)
+        rims = [spin if wheel.name.endswith("L") else ground for wheel in config.wheel]
+        torques = [np.full_like(t, 300.0 if wheel.axle == "front" else 400.0) for wheel in config.wheel]
+        rate = np.where(ground > 0.0, -deceleration, 0.0)
+        return {"ground_speed": ground, "acceleration": rate} | _wheels(config, rims, torques)
+
+    story = continued(done, config, lasts, halting)
+    return told(story, config, seed, float(done.columns["t"][-1]) + speed / deceleration)
+
+
+def driven(config: Config, seed: int, seconds: float, deceleration: float | None, soil: str = "loam") -> Drive:
+    """So many seconds on loam at 1.0 to 1.8 m/s under a draft that varies, then to a stop unless that is None."""
+    rng = np.random.default_rng([seed, 7])
+    t = np.arange(0.0, seconds + 0.1, seconds / 4.0)
+    v = rng.uniform(1.2, 1.6) + 0.2 * rng.uniform(-1.0, 1.0, len(t))
+    stop = 0.0 if deceleration is None else (float(v[-1]) - CRAWL) / deceleration
+    ends = [seconds + stop] if deceleration is not None else []
+    speed = Profile([*t.tolist(), *ends], [*v.tolist(), *[CRAWL for _ in ends]])
+    at = np.arange(0.0, seconds, 1.0)
+    mean, phase = rng.uniform(600.0, 1500.0), rng.uniform(0.0, 6.0)
+    draft = mean * (1.0 + 0.6 * np.sin(0.9 * at + phase))
+    load = Profile([*at.tolist(), *ends], [*draft.tolist(), *[0.0 for _ in ends]])
+    return drive(config, Scenario(seconds + stop, [Patch(0.0, soil)], speed, draft=load), seed)
+
+
+def continued(
+    done: Drive, config: Config, seconds: float, then: Callable[[np.ndarray], dict[str, np.ndarray]]
+) -> Drive:
+    """The drive with what `then` says of the time after it; without draft, loads at rest, the rest as it was."""
+    chassis = chassis_of(config)
+    assert chassis is not None
+    since = np.arange(1, round(seconds * SAMPLE_RATE) + 1) / SAMPLE_RATE
+    zero = np.zeros(len(since))
+    front, rear = axle_loads(chassis, 0.0, 0.0, 0.0)
+    new = {name: np.full(len(since), column[-1]) for name, column in done.columns.items()}
+    new |= {"t": done.columns["t"][-1] + since, "acceleration": zero, "draft": zero, "pitch": zero}
+    new |= {f"load.{w.name}": zero + (front if w.axle == "front" else rear) / 2.0 for w in config.wheel}
+    new |= then(since)
+    return replace(done, columns={name: np.concatenate([done.columns[name], new[name]]) for name in done.columns})
+
+
+def told(done: Drive, config: Config, seed: int, begins: float) -> Story:
+    """What the sensors send of it."""
+    messages = list(frames(Recording(done.columns, measure(done, config, seed), seed), config))
+    return Story(messages, messages[0].timestamp + begins)
+
+
+def _wheels(config: Config, rims: Sequence[np.ndarray], torques: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+    speeds = {f"speed.{w.name}": rim / w.radius for w, rim in zip(config.wheel, rims, strict=True)}
+    return speeds | {f"torque.{w.name}": torque for w, torque in zip(config.wheel, torques, strict=True)}
