@@ -11,7 +11,7 @@ import pytest
 
 from fakes import FakeClock, InlineExecutor, ScriptedBus
 from feeding import feed_message
-from in_vain import STANDS, TRIES, Story, driven, halted_by_a_patch, stop_and_try
+from in_vain import STANDS, TRIES, Story, driven, halted_by_a_patch, stop_and_try, turned_onto, with_a_dead_axle
 from soilbus.can.bus import LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
@@ -176,3 +176,27 @@ def test_a_torque_limit_holds_until_another_one_is_reported(limits_apart, lost, 
     assert len(held) >= 3
     assert {way.state for way in held} == {State.NO_GO}
     assert [way.torque_available for way in held] == pytest.approx([400.0] * len(held), rel=5e-3)
+
+
+@pytest.mark.parametrize("soil", ["heavy_clay_40", "wet_clay"])
+def test_a_turn_leaves_the_measured_ground_behind(soil):
+    # In a turn no instant is judged: once the vehicle is off the ground that was, nothing says that it may go on.
+    story = turned_onto(CONFIG, soil, seed=51)
+    wheelbase, speed, window_hop = 1.95, 1.2, 1.0
+    left_behind = wheelbase / speed + window_hop
+    found = [(at - story.begins, state) for at, state in states(live(story.messages))]
+    assert "go" in {state for at, state in found if -2.0 < at < 0.0}
+    assert not [at for at, state in found if left_behind + 0.2 < at < 8.0 and state == "go"]
+
+
+@pytest.mark.parametrize("dead", ["front", "rear"])
+def test_motors_that_give_nothing_are_not_counted_on(dead):
+    # Their limit says 2400 N m; the truth is by brute force, without the service's model of a vehicle.
+    story, most = with_a_dead_axle(CONFIG, dead, "loam", seed=61)
+    results = replayed(story.messages)
+    judged = [r.traversability for r in results if r.traversability.max_draft is not None]
+    assert len(judged) >= 10
+    for way in judged:
+        assert way.max_draft.value == pytest.approx(most, abs=max(4.0 * way.max_draft.std, 150.0))
+    asked = [w.torque_available for w in judged]
+    assert asked == pytest.approx([2.0 * 2400.0] * len(asked), rel=5e-3)

@@ -1,4 +1,4 @@
-"""Drives that end stuck, frame by frame, whose end no model of a soil has written.
+"""Drives that end stuck or lack a motor, frame by frame, by other formulas than the simulator's.
 
 While it drives, the simulator's quasi-static tractor; from then on kinematics and statics written down here: the ground
 speed, and the rim speed and torque of each wheel.
@@ -20,7 +20,9 @@ from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import SAMPLE_RATE, Patch, Profile, Scenario
 from soilbus.simulator.sensors import measure
+from soilbus.terra.soils import SOILS
 from soilbus.terra.vehicle import axle_loads
+from statics import brute_with_rolling
 
 CRAWL = 0.02
 """Ground speed [m/s] at which the simulated drive ends and the vehicle stands."""
@@ -127,3 +129,48 @@ def told(done: Drive, config: Config, seed: int, begins: float) -> Story:
 def _wheels(config: Config, rims: Sequence[np.ndarray], torques: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
     speeds = {f"speed.{w.name}": rim / w.radius for w, rim in zip(config.wheel, rims, strict=True)}
     return speeds | {f"torque.{w.name}": torque for w, torque in zip(config.wheel, torques, strict=True)}
+
+
+def turned_onto(config: Config, soil: str, seed: int, lasts: float = 8.0) -> Story:
+    """From loam onto another soil, whose edge the front wheels meet as a turn begins.
+
+    There rim speeds of left and right differ by 0.3 of their mean for so long.
+    """
+    begins = 14.0
+    speed = 1.2
+    scenario = Scenario(
+        begins + lasts + 6.0,
+        [Patch(0.0, "loam"), Patch(speed * begins + 1.2, soil)],
+        Profile([0.0, 60.0], [speed, speed]),
+        draft=Profile([0.0, 3.0, 6.0, 9.0, 12.0, 60.0], [600.0, 1400.0, 700.0, 1500.0, 800.0, 800.0]),
+    )
+    done = drive(config, scenario, seed)
+    t = done.columns["t"]
+    turns = np.where((t >= begins) & (t < begins + lasts), 0.15, 0.0)
+    side = {w.name: 1.0 if w.name.endswith("L") else -1.0 for w in config.wheel}
+    speeds = {f"speed.{w}": done.columns[f"speed.{w}"] * (1.0 - side[w] * turns) for w in side}
+    return told(replace(done, columns=done.columns | speeds), config, seed, begins)
+
+
+def with_a_dead_axle(config: Config, dead: str, soil: str, seed: int, seconds: float = 24.0) -> tuple[Story, float]:
+    """The motors of one axle give nothing though their limit says otherwise, and the most that is then pulled [N].
+
+    Balanced by brute force, over slips of the other axle that swing between 0.15 and 0.5.
+    """
+    slips = np.linspace(0.12, 0.6, 13)
+    found = [brute_with_rolling(SOILS[soil], slip, dead) for slip in slips]
+    pulls = np.array([pull for pull, _ in found])
+    rng = np.random.default_rng([seed, 3])
+    done = driven(config, seed, 3.0, None)
+    t = np.arange(0.0, seconds, 1.0 / SAMPLE_RATE)
+    phase = rng.uniform(0.0, 6.0, 2)
+    slip = 0.325 + 0.0875 * (np.sin(0.7 * t + phase[0]) + np.sin(1.1 * t + phase[1]))
+    columns = {"t": t, "ground_speed": 1.3 + 0.0 * t, "acceleration": 0.0 * t, "pitch": 0.0 * t}
+    columns["draft"] = np.interp(slip, slips, pulls)
+    for w in config.wheel:
+        load, _, torque, angle, s = np.array([axles[str(w.axle)] for _, axles in found]).T
+        of_wheel = {"load": load, "torque": torque, "sinkage": w.radius * (1.0 - np.cos(angle))}
+        columns |= {f"{quantity}.{w.name}": np.interp(slip, slips, column) for quantity, column in of_wheel.items()}
+        columns[f"speed.{w.name}"] = 1.3 / (w.radius * (1.0 - np.interp(slip, slips, s)))
+    rest = {name: np.resize(column[-1:], len(t)) for name, column in done.columns.items() if name not in columns}
+    return told(replace(done, columns=rest | columns), config, seed, 0.0), float(pulls.max())

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.config import Traversability as Settings
+from soilbus.estimation.plausibility import NO_TRACTION, TRACTION
 from soilbus.estimation.window import Rig, Window, pull_given
 from soilbus.terra.vehicle import GRAVITY
 
@@ -105,6 +106,23 @@ def observed(before: TractionLoss, motion: Motion, min_speed: float, settings: S
     stuck = t - sticks >= settings.stuck_time or (before.stuck and t - moves < settings.spin_time)
     lasting = t - spins >= settings.spin_time
     return TractionLoss(t, spins, sticks, moves, lasting, stuck, t if lasting or stuck else before.last)
+
+
+def idle(window: Window, rig: Rig, since: float, before: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which wheels (W,) do not drive: without torque while another one pulls, for most of the time after `since` [s].
+
+    Whatever limit is reported for its motor, such a wheel rolls.  Where no wheel pulls, or a torque is not known, it is
+    as `before` (W,).
+    """
+    recent = window.t > since
+    with np.errstate(invalid="ignore", divide="ignore"):
+        traction = window.torque[recent] / (rig.radius * window.load[recent])
+        pulls = (traction > TRACTION).any(axis=1)
+        still = np.abs(traction[pulls]) < NO_TRACTION
+    known = np.isfinite(traction[pulls])
+    if 2 * pulls.sum() <= len(traction):
+        return before
+    return np.where(2 * known.sum(axis=0) > len(known), 2 * still.sum(axis=0) > known.sum(axis=0), before)
 
 
 def motion_of(window: Window, rig: Rig, torque_limit: NDArray[np.float64], settings: Settings) -> Motion | None:

@@ -13,7 +13,7 @@ from soilbus.assembly import completion_of, model_of, prior_of, rig_of
 from soilbus.capability.assessment import Demand, OverSlip
 from soilbus.capability.demand import present_demand
 from soilbus.capability.immobilisation import SPAN, Watch, moments, watched, with_loss
-from soilbus.capability.traction_loss import NO_LOSS, motion_of, observed
+from soilbus.capability.traction_loss import NO_LOSS, idle, motion_of, observed
 from soilbus.capability.uncertain_model import UncertainModel
 from soilbus.capability.wheels import WheelTable
 from soilbus.config import Config
@@ -71,6 +71,7 @@ class WindowEstimator:
         self._watch = Watch()
         self._curve: OverSlip | None = None
         self._loss = NO_LOSS
+        self._idle = np.zeros(len(self.rig.wheels), bool)
         self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
         self._guess = guessed(self.prior, prior_of(Config()))
         settings = config.estimator
@@ -132,7 +133,11 @@ class WindowEstimator:
         window = _with_true_draft(task.window, effects, self.rig)
         demand = present_demand(window, self.rig.chassis, self._settings.hop, self._draft_gain(tracked))
         here = tracked.ground not in (Ground.CHANGING, Ground.SETTLING)
-        return Undecided(result, demand, task.torque_limit, window, task.fresh, model, here)
+        if task.fresh:
+            self._idle = np.zeros(len(self.rig.wheels), bool)
+        self._idle = idle(task.window, self.rig, task.end - self._settings.hop, self._idle)
+        limit = np.where(self._idle, 0.0, task.torque_limit)
+        return Undecided(result, demand, limit, window, task.fresh, model, here)
 
     def decide(self, window: Undecided) -> WindowResult:
         """The result with its traversability and watch; windows in their order, here or in another process."""
