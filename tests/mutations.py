@@ -23,7 +23,7 @@ FAILED = 1
 
 
 class Mutation(NamedTuple):
-    """One place of a file below service/soilbus with other text in it, and the tests (pytest arguments) that kill it."""
+    """Another text in one place of a file below service/soilbus, and the tests (pytest arguments) that kill it."""
 
     name: str
     file: str
@@ -58,12 +58,32 @@ MUTATIONS = (
     Mutation(
         "stale inputs do not interrupt", "daemon/service.py",
         '"input_missing", "input_stale", ', "",
-        (f"{STORIES}::test_go_is_said_where_the_truth_allows_it_and_nowhere_else[range(0, 25)]",),
+        ("tests/daemon/test_loop.py::test_losing_a_needed_stream_ends_go_within_its_timeout",),
     ),
     Mutation(
         "another sender does not interrupt", "daemon/service.py",
         ', "foreign_sender"))', "))",
-        (f"{STORIES}::test_go_is_said_where_the_truth_allows_it_and_nowhere_else",),
+        ("tests/daemon/test_loop.py::test_a_second_sender_ends_go",),
+    ),
+    Mutation(
+        "wheels that spin leave go as it was", "judgement.py",
+        "if loss.spinning and way.state is not State.NO_GO:", "if False:",
+        ("tests/daemon/test_facts.py::test_a_soft_patch_under_one_side_ends_go_on_the_bus",),
+    ),
+    Mutation(
+        "a vehicle that is stuck may go", "judgement.py",
+        "    if loss.stuck:\n        return Traversability(", "    if False:\n        return Traversability(",
+        ("tests/daemon/test_facts.py::test_a_start_in_vain_ends_go_on_the_bus",),
+    ),
+    Mutation(
+        "ground left behind counts as the present one", "judgement.py",
+        " and basis.unseen <= length):", "):",
+        (f"{DECISION}::test_ground_left_behind_is_unknown",),
+    ),
+    Mutation(
+        "a little measured since a wheel spun is enough", "judgement.py",
+        "measured < settings.min_share * config.estimator.window", "False",
+        (f"{DECISION}::test_a_little_measured_since_a_wheel_spun_is_no_go",),
     ),
     Mutation(
         "hysteresis without a past", "daemon/estimator.py",

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from feeding import feed_message
 from onlooker import good_tracked, of_soft_ground, tracked_at
 from soilbus.can.dbc_files import load_databases
+from soilbus.capability.traction_loss import TractionLoss
 from soilbus.daemon.estimator import WindowEstimator
 from soilbus.daemon.intake import WindowTask
 from soilbus.daemon.pipeline import Pipeline
 from soilbus.estimation.tracked import Tracked
+from soilbus.judgement import Basis, at_present
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
-from soilbus.traversability import State, Status
+from soilbus.traversability import State, Status, Traversability
 
 CONFIG = reference_configuration()
 
@@ -87,3 +90,22 @@ def test_a_little_of_a_new_soil_is_no_go(tasks, firm):
     assert (little.status, little.reason) == (Status.NOT_EXCITED, "not_excited new_soil")
     assert little.traversability.state is not State.GO
     assert (enough.status, enough.traversability.state) == (Status.VALID, State.GO)
+
+
+@pytest.mark.parametrize(("ago", "state"), [(1.0, State.GO), (2.5, State.UNKNOWN)])
+def test_ground_left_behind_is_unknown(ago, state, tasks, firm):
+    """At more than 1 m/s the instants before the last second lie within the vehicle's length, older ones do not."""
+    window = tasks[0].window
+    assert window.ground_speed.min() > 1.0
+    estimator = WindowEstimator(CONFIG)
+    tracked = tracked_at(firm, window, since=tasks[0].start)
+    optimum = replace(tracked.fit.optimum, t=tracked.fit.optimum.t - ago)
+    estimator.tracker.estimate = lambda *_: replace(tracked, fit=replace(tracked.fit, optimum=optimum))
+    assert estimator.solve(tasks[0]).traversability.state is state
+
+
+@pytest.mark.parametrize(("last", "state"), [(8.0, State.GO), (9.0, State.CAUTION)])
+def test_a_little_measured_since_a_wheel_spun_is_no_go(last, state):
+    basis = Basis(np.arange(0.0, 10.0, 0.1), 0.1)
+    way = at_present(Traversability(State.GO, 1.0), basis, TractionLoss(t=10.0, last=last), 10.0, CONFIG)
+    assert way.state is state

@@ -168,6 +168,7 @@ class Wire:
         self.counter = self.next = self.life = 0
         self.base, self.halted_at, self.newest = self.clock.now, math.nan, -math.inf
         self.told_off = False
+        self.counters: dict[str, int] = {}
 
     def recv(self, timeout=None):
         if self.lost:
@@ -200,7 +201,8 @@ class Wire:
             if self.noisy:
                 return can.Message(timestamp=self.stamp(), arbitration_id=0x123, is_extended_id=False, data=b"\x5a" * 3)
 
-    def stamp(self) -> float:
+    def stamp(self, listened: bool = False) -> float:
+        """Of the next frame; only one to which the service listens tells that the clock was set back."""
         step, self.step = self.step, 0.0
         self.offset += step
         if self.halted and math.isnan(self.halted_at):
@@ -208,6 +210,8 @@ class Wire:
         if not self.halted:
             self.halted_at = math.nan
         stamp = (self.halted_at if self.halted else self.clock.now) + self.offset
+        if not listened:
+            return stamp
         if stamp < self.newest - CLOCK_STEP:
             self.life, self.newest = self.life + 1, -math.inf
             self.good, self.stamps, self.heard = {}, {}, []
@@ -217,6 +221,14 @@ class Wire:
         firm = not (self.soft or weak)
         self.heard.append(Known(stamp, self.clock.now, self.soft, firm, self.blind, self.raises))
         return stamp
+
+    def unheard(self, name: str) -> float:
+        """Time [s] since a good frame of this name, less what the clock that stamps frames has lost since."""
+        if name not in self.good:
+            return math.inf
+        last = self.heard[-1]
+        lost = (self.stamps[name] - self.good[name]) - (last.stamp - last.at)
+        return self.clock.now - self.good[name] - max(lost, 0.0)
 
     def until(self, stamp: float) -> Known:
         """What was so when the last frame older than a stamp of the clock, as it is set now, was delivered."""
@@ -232,12 +244,13 @@ class Wire:
             )
         if checked:
             counter = 5 if name in self.repeated else self.counter
-            good = good and name not in self.repeated
+            good = good and counter != self.counters.get(name)
+            self.counters[name] = counter
             data[6] = data[6] & 0x0F | counter << 4
             data[7] = frame_checksum(message.arbitration_id, bytes(data), 7)
         if name in self.spoilt:
             data = bytearray(b ^ 0x5A for b in data) if checked else bytearray(b"\xff" * 8)
-        stamp = self.stamp()
+        stamp = self.stamp(listened=True)
         if good and stamp >= self.stamps.get(name, -math.inf):
             self.good[name], self.stamps[name] = self.clock.now, stamp
             if name in MOTORS and self.clock.now < self.mute_from:
@@ -294,7 +307,7 @@ class Worker(InlineExecutor):
 
 
 class Handed(NamedTuple):
-    """A window that the worker got: after how many steps back of the clock, its end, and the truth at its last frame."""
+    """A window that the worker got: after how many steps back of the clock, its end, and the truth at its end."""
 
     life: int
     ended: float
@@ -335,7 +348,7 @@ class Drive:
         self.lives: dict[int, int] = {}
         self.forget()
         self.worker = Worker(self.clock, self.note)
-        self.wire.good, self.wire.stamps, self.wire.powers = {}, {}, {}
+        self.wire.good, self.wire.stamps, self.wire.powers, self.wire.counters = {}, {}, {}, {}
         self.service = Service(
             self.config, pipeline, bus, Publisher(OUT), Notifier(), self.worker, self.clock, self.take,
             lambda: keeper, self.clock.wait_for,
@@ -408,7 +421,7 @@ class Drive:
         if self.wire.halted:
             self.halted_until = now + SLACK
         patience = self.max_age if now < self.halted_until else TIMEOUT  # stamps that stand cannot say what is late
-        stale = any(not now - self.wire.good.get(name, -math.inf) <= patience + SLACK for name in NEEDED)
+        stale = any(not self.wire.unheard(name) <= patience + SLACK for name in NEEDED)
         if stale or self.wire.lost or self.wire.off:
             self.interrupted = now
         self.interrupted = max(self.interrupted, self.wire.forged_at)
