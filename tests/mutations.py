@@ -68,7 +68,7 @@ MUTATIONS = (
     Mutation(
         "wheels that spin leave go as it was", "judgement.py",
         "if loss.spinning and way.state is not State.NO_GO:", "if False:",
-        ("tests/daemon/test_facts.py::test_a_soft_patch_under_one_side_ends_go_on_the_bus",),
+        (f"{DECISION}::test_a_wheel_that_spins_is_caution_at_best_and_at_least",),
     ),
     Mutation(
         "a vehicle that is stuck may go", "judgement.py",

@@ -109,3 +109,19 @@ def test_a_little_measured_since_a_wheel_spun_is_no_go(last, state):
     basis = Basis(np.arange(0.0, 10.0, 0.1), 0.1)
     way = at_present(Traversability(State.GO, 1.0), basis, TractionLoss(t=10.0, last=last), 10.0, CONFIG)
     assert way.state is state
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        (State.GO, State.CAUTION),
+        (State.CAUTION, State.CAUTION),
+        (State.NO_GO, State.NO_GO),
+        (State.UNKNOWN, State.CAUTION),
+    ],
+)
+def test_a_wheel_that_spins_is_caution_at_best_and_at_least(before, after):
+    basis = Basis(np.arange(0.0, 10.0, 0.1), 0.1)
+    loss = TractionLoss(t=10.0, spinning=True)
+    way = at_present(Traversability(before, None if before is State.UNKNOWN else 0.9), basis, loss, 10.0, CONFIG)
+    assert way.state is after
