@@ -391,7 +391,8 @@ class Drive:
         window = self.handed[result.t]
         if window.fresh or result.traversability.probability is None:
             self.in_a_row = math.inf  # nothing is held back by what is not known
-        self.in_a_row = self.in_a_row + 1 if window.known.firm and not window.known.blind else 0
+        if result.traversability.probability is not None:
+            self.in_a_row = self.in_a_row + 1 if window.known.firm and not window.known.blind else 0
         if window.life == self.wire.life:
             self.result, self.window = result, window
 
