@@ -342,6 +342,8 @@ class Traversability(_Section):
     stall_resistance: PositiveFloat = 0.15
     """Thrust of a standing vehicle beyond draft, slope and inertia, as a share of its weight, from which it stalls:
     more than the motion resistance of wheels that still roll (Wong, Theory of Ground Vehicles, ch. 2)."""
+    contradiction: PositiveFloat = 3.0
+    """Standard deviations by which the wheels must pull less at their present slip than predicted for it to count."""
     full_torque: Annotated[float, Field(gt=0.0, le=1.0)] = 0.95
     """Share of its torque limit from which a motor gives all it can: ripple and gain error of a torque sensor."""
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import can
 import numpy as np
+from scipy.optimize import brentq
 
 from soilbus.assembly import chassis_of
 from soilbus.config import Config
@@ -22,7 +23,8 @@ from soilbus.simulator.scenario import SAMPLE_RATE, Patch, Profile, Scenario
 from soilbus.simulator.sensors import measure
 from soilbus.terra.soils import SOILS
 from soilbus.terra.vehicle import axle_loads
-from statics import brute_with_rolling
+from soilbus.terra.wheel import Soil
+from statics import WEIGHT, brute_with_rolling, wheel
 
 CRAWL = 0.02
 """Ground speed [m/s] at which the simulated drive ends and the vehicle stands."""
@@ -152,12 +154,12 @@ def turned_onto(config: Config, soil: str, seed: int, lasts: float = 8.0) -> Sto
     return told(replace(done, columns=done.columns | speeds), config, seed, begins)
 
 
-def with_a_dead_axle(config: Config, dead: str, soil: str, seed: int, seconds: float = 24.0) -> tuple[Story, float]:
+def with_a_dead_axle(config: Config, dead: str, soil: str, seed: int, seconds: float = 15.0) -> tuple[Story, float]:
     """The motors of one axle give nothing though their limit says otherwise, and the most that is then pulled [N].
 
     Balanced by brute force, over slips of the other axle that swing between 0.15 and 0.5.
     """
-    slips = np.linspace(0.12, 0.6, 13)
+    slips = np.array([0.12, 0.18, 0.27, 0.4, 0.6])
     found = [brute_with_rolling(SOILS[soil], slip, dead) for slip in slips]
     pulls = np.array([pull for pull, _ in found])
     rng = np.random.default_rng([seed, 3])
@@ -174,3 +176,55 @@ def with_a_dead_axle(config: Config, dead: str, soil: str, seed: int, seconds: f
         columns[f"speed.{w.name}"] = 1.3 / (w.radius * (1.0 - np.interp(slip, slips, s)))
     rest = {name: np.resize(column[-1:], len(t)) for name, column in done.columns.items() if name not in columns}
     return told(replace(done, columns=rest | columns), config, seed, 0.0), float(pulls.max())
+
+
+def with_a_soft_side(config: Config, soft: str, seed: int, over: float = 3.0) -> tuple[Story, float, float]:
+    """From loam, with the left wheels onto a softer soil within so many seconds, under a draft that is held.
+
+    By brute force, all wheels at one slip.  Second and third the most that is pulled afterwards [N], and the draft [N].
+    """
+    firm, other = (np.log(np.array(SOILS[name])) for name in ("loam", soft))
+    shares, slips = np.linspace(0.0, 1.0, 4), np.array([0.03, 0.07, 0.13, 0.22, 0.36, 0.6])
+    table = [[_half_on(Soil(*np.exp(firm + share * (other - firm))), slip) for slip in slips] for share in shares]
+    pulls = np.array([[pull for pull, _ in row] for row in table])
+    begins, most = 14.0, float(pulls[-1].max())
+    rng = np.random.default_rng([seed, 5])
+    t = np.arange(0.0, begins + over + 3.0, 1.0 / SAMPLE_RATE)
+    held = most * rng.uniform(0.90, 0.97)
+    swing = held * (1.0 - 0.45 * (1.0 + np.sin(0.8 * t + rng.uniform(0.0, 6.0))) * np.clip(begins - t, 0.0, 1.0))
+    share = np.clip((t - begins) / over, 0.0, 1.0)
+    columns = {"t": t, "ground_speed": 1.3 + 0.0 * t, "acceleration": 0.0 * t, "pitch": 0.0 * t, "draft": swing}
+
+    def along(values: np.ndarray) -> np.ndarray:
+        """Values (share, slip) at each instant's share, over slip."""
+        return np.array([[np.interp(s, shares, column) for column in values.T] for s in share])
+
+    slip = np.array([np.interp(p, row, slips) for p, row in zip(swing, along(pulls), strict=True)])
+    for i, w in enumerate(config.wheel):
+        quantities = {q: np.array([[of[i][q] for _, of in row] for row in table]) for q in table[0][0][1][i]}
+        for q, values in quantities.items():
+            of_time = along(values)
+            columns[f"{q}.{w.name}"] = np.array(
+                [np.interp(s, slips, row) for s, row in zip(slip, of_time, strict=True)]
+            )
+        columns[f"speed.{w.name}"] = 1.3 / (w.radius * (1.0 - slip))
+    done = driven(config, seed, 3.0, None)
+    rest = {name: np.resize(column[-1:], len(t)) for name, column in done.columns.items() if name not in columns}
+    return told(replace(done, columns=rest | columns), config, seed, begins), most, held
+
+
+def _half_on(left: Soil, slip: float) -> tuple[float, list[dict[str, float]]]:
+    """Level pull [N] with left wheels on a soil and right ones on loam, and each wheel's load, torque, sinkage."""
+    sizes = ((0.50, 0.26), (0.50, 0.26), (0.62, 0.38), (0.62, 0.38))
+
+    def wheels(pull: float) -> list[np.ndarray]:
+        front = (WEIGHT * 0.95 - pull * 0.45) / 1.95
+        loads = (front / 2.0, front / 2.0, (WEIGHT - front) / 2.0, (WEIGHT - front) / 2.0)
+        soils = (left, SOILS["loam"], left, SOILS["loam"])
+        return [wheel(*each, slip, *size) for each, size in zip(zip(soils, loads, strict=True), sizes, strict=True)]
+
+    pull = float(brentq(lambda p: sum(w[1] for w in wheels(p)) - p, -0.75 * WEIGHT, 0.6 * WEIGHT, xtol=1.0))
+    return pull, [
+        {"load": w[0], "torque": w[2], "sinkage": size[0] * (1.0 - np.cos(w[3]))}
+        for w, size in zip(wheels(pull), sizes, strict=True)
+    ]

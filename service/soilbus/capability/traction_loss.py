@@ -16,15 +16,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.config import NoiseOfChannels
 from soilbus.config import Traversability as Settings
 from soilbus.estimation.plausibility import NO_TRACTION, TRACTION
 from soilbus.estimation.window import Rig, Window, pull_given
 from soilbus.terra.vehicle import GRAVITY
+
+if TYPE_CHECKING:
+    from soilbus.capability.assessment import OverSlip
 
 LONGEST_GAP = 1.0
 """Silence [s] after which nothing is known of what lasts."""
@@ -33,8 +37,9 @@ LONGEST_GAP = 1.0
 class Motion(NamedTuple):
     """One moment: time [s], ground speed [m/s], rim speeds [m/s] of the wheels, and whether thrust moves nothing.
 
-    nan is what is not known.  resistance: thrust beyond what draft, slope and inertia ask, as a share of the weight.
-    at_limit: every motor whose limit is known gives all it can, and at least one is known.
+    nan is what is not known.  slip: mean of the driving wheels, by their torques; pull [N]: of draft, slope and
+    inertia, nan where the acceleration is not measured.  resistance: thrust beyond what these three ask, as a share of
+    the weight.  at_limit: every motor whose limit is known gives all it can, and at least one is known.
     """
 
     t: float
@@ -42,6 +47,8 @@ class Motion(NamedTuple):
     rim: Sequence[float]
     resistance: float
     at_limit: bool
+    slip: float = math.nan
+    pull: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +58,7 @@ class TractionLoss:
     t: the last moment.  spins, sticks, moves: since when a wheel spins or the vehicle stalls, it makes no way under
     thrust, it moves without spinning; inf where it does not.  stuck: it was, and has not moved since.  last: when any
     of it was last seen to last; what was measured before then says nothing of the ground under the wheels.
+    slip, pull: of late, with `spin_time` as time constant; nan where not known.
     """
 
     t: float = -math.inf
@@ -60,6 +68,8 @@ class TractionLoss:
     spinning: bool = False
     stuck: bool = False
     last: float = -math.inf
+    slip: float = math.nan
+    pull: float = math.nan
 
     @property
     def present(self) -> bool:
@@ -93,7 +103,7 @@ def observed(before: TractionLoss, motion: Motion, min_speed: float, settings: S
         before = replace(before, spins=math.inf, sticks=math.inf, moves=math.inf) if motion.t > before.t else NO_LOSS
     known = [rim for rim in motion.rim if math.isfinite(rim)]
     if not known or not math.isfinite(motion.ground):
-        return replace(before, t=motion.t)
+        return replace(before, t=motion.t, slip=math.nan, pull=math.nan)
     spinning = sum(rim - motion.ground > max(min_speed, settings.max_slip * rim) for rim in known)
     stands = motion.ground < min_speed
     forced = motion.at_limit or motion.resistance > settings.stall_resistance  # nan: not known
@@ -105,7 +115,30 @@ def observed(before: TractionLoss, motion: Motion, min_speed: float, settings: S
     moves = min(before.moves, t) if not stands and not spinning else math.inf
     stuck = t - sticks >= settings.stuck_time or (before.stuck and t - moves < settings.spin_time)
     lasting = t - spins >= settings.spin_time
-    return TractionLoss(t, spins, sticks, moves, lasting, stuck, t if lasting or stuck else before.last)
+    kept = math.exp(-(t - before.t) / settings.spin_time) if math.isfinite(before.slip + before.pull) else 0.0
+    slip, pull = (
+        now + kept * (late - now) if kept else now
+        for now, late in ((motion.slip, before.slip), (motion.pull, before.pull))
+    )
+    last = t if lasting or stuck else before.last
+    return TractionLoss(t, spins, sticks, moves, lasting, stuck, last, slip, pull)
+
+
+def missing_pull(loss: TractionLoss, curve: OverSlip, noise: NoiseOfChannels, deviations: float) -> float:
+    """Pull [N] that the estimate predicts at the present slip and the wheels surely do not give; 0 where nothing is.
+
+    The innovation P(s) - P, less so many of its standard deviations: of the curve, of the slip by the gain errors of
+    both speeds, and of the draft's gain error.
+    """
+    known = np.isfinite(curve.pull)
+    if not known.any() or not math.isfinite(loss.slip + loss.pull) or loss.slip < curve.slip[0]:
+        return 0.0
+    slips, pulls, stds = curve.slip[known], curve.pull[known], curve.pull_std[known]
+    predicted, std = float(np.interp(loss.slip, slips, pulls)), float(np.interp(loss.slip, slips, stds))
+    slope = float(np.interp(loss.slip, slips, np.gradient(pulls, slips))) if len(slips) > 1 else 0.0
+    of_slip = slope * (1.0 - loss.slip) * math.hypot(noise.speed.gain, noise.ground_speed.gain)
+    sd = math.hypot(std, of_slip, noise.draft.gain * loss.pull)
+    return max(predicted - loss.pull - deviations * sd, 0.0)
 
 
 def idle(window: Window, rig: Rig, since: float, before: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -142,4 +175,10 @@ def motion_of(window: Window, rig: Rig, torque_limit: NDArray[np.float64], setti
     limited = np.isfinite(torque_limit)
     at_limit = limited.any() and (torque[limited] >= settings.full_torque * torque_limit[limited]).all()
     resistance = ((torque / rig.radius).sum() - asked) / (rig.chassis.mass * GRAVITY)
-    return Motion(float(window.t[-1]), float(ground), rim.tolist(), float(resistance), bool(at_limit))
+    weights = np.where((torque > 0.0) & (rim > 0.0), torque, 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slip = np.where(weights > 0.0, weights * (1.0 - ground / rim), 0.0).sum() / weights.sum()
+    pull = asked if np.isfinite(window.acceleration).any() else math.nan
+    return Motion(
+        float(window.t[-1]), float(ground), rim.tolist(), float(resistance), bool(at_limit), float(slip), float(pull)
+    )
