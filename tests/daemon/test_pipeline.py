@@ -179,6 +179,7 @@ DECISION = {
     "max_draft",
     "max_grade",
     "limit",
+    "age",
     "since_valid",
 }
 

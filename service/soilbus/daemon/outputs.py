@@ -93,6 +93,7 @@ def json_line(result: WindowResult, config: Config) -> str:
                 "max_draft": _value_std(way.max_draft),
                 "max_grade": _value_std(way.max_grade),
                 "limit": way.limit,
+                "age": _finite(result.t - result.basis.end),
                 "since_valid": way.since_valid,
             },
             "gaps": dict(result.gaps),

@@ -326,7 +326,7 @@ class Service:
                     "State": str(way.state),
                     "LimitingCause": way.limit if known else None,
                     "Probability": way.probability if known else None,
-                    "Age": None if self.result is None else max(self._age(now), 0.0),
+                    "Age": max(age, 0.0) if math.isfinite(age := self._age(now)) else None,
                     "SinceValid": self._since_valid(now),
                     "Window": window,
                 },
