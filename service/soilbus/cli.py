@@ -99,7 +99,7 @@ def _check(args: argparse.Namespace) -> None:
 def _replay(args: argparse.Namespace) -> None:
     from soilbus.can.dbc_files import load_databases
     from soilbus.daemon.pipeline import Pipeline
-    from soilbus.daemon.replay import LogError, check_heard, estimator_beside, replay
+    from soilbus.daemon.replay import LogError, estimator_beside, replay
     from soilbus.report.progress import progress
     from soilbus.report.soil_map import check_position_is_mapped, soil_map
     from soilbus.report.windows import summary
@@ -119,7 +119,6 @@ def _replay(args: argparse.Namespace) -> None:
         try:
             for result in replay(pipeline, args.logs, step, workers):
                 results.append(result)
-            check_heard(pipeline, args.logs)
         except LogError as error:
             if not (args.partial and results):
                 hint = "" if not results else f"; --partial keeps the {len(results)} windows before"

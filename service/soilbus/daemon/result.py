@@ -24,7 +24,8 @@ class WindowResult:
     the largest first.  position is in the middle of the data that count: of the window, or
     of its part on a new soil.  failure is the kind of a solve that failed, None where none did.
     watch warns of immobilisation; unknown where the loop watches ten times a second itself.  gaps: reduced
-    chi-square of the channels that have not fitted for minutes, the worst first.
+    chi-square of the channels that have not fitted for minutes, the worst first.  log names the
+    recording that the window is of; None for the live bus.
     """
 
     t: float
@@ -45,3 +46,4 @@ class WindowResult:
     failure: str | None = None
     gaps: Mapping[str, float] = field(default_factory=dict)
     watch: Watch = Watch()  # noqa: RUF009, immutable
+    log: str | None = None
