@@ -26,7 +26,7 @@ class BusTime:
 
     def set_ahead(self, stamp: float, now: float) -> bool:
         """Whether a frame's stamp says that the clock which stamps frames was set ahead since the last frame."""
-        return self.last_frame > 0.0 and CLOCK_STEP < stamp - self.at(now) and stamp <= LAST_TIME
+        return self.last_frame > 0.0 and stamp - self.at(now) > CLOCK_STEP and stamp <= LAST_TIME
 
     def took(self, stamp: float, now: float) -> None:
         """A frame was taken."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from soilbus.capability.immobilisation import Watch
+from soilbus.daemon.excitation import Excitation
 from soilbus.daemon.positions import Position
 from soilbus.traversability import Status, Traversability
 
@@ -25,7 +26,7 @@ class WindowResult:
     of its part on a new soil.  failure is the kind of a solve that failed, None where none did.
     watch warns of immobilisation; unknown where the loop watches ten times a second itself.  gaps: reduced
     chi-square of the channels that have not fitted for minutes, the worst first.  log names the
-    recording that the window is of; None for the live bus.
+    recording that the window is of; None for the live bus.  excitation: how much draft and slip varied.
     """
 
     t: float
@@ -47,3 +48,4 @@ class WindowResult:
     gaps: Mapping[str, float] = field(default_factory=dict)
     watch: Watch = Watch()  # noqa: RUF009, immutable
     log: str | None = None
+    excitation: Excitation = Excitation()  # noqa: RUF009, immutable
