@@ -132,7 +132,7 @@ logs_drawn = st.lists(
 )
 
 
-@settings(deadline=None, max_examples=12, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=25, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(drawn=logs_drawn)
 def test_any_sequence_of_logs_gives_the_windows_of_each_and_accounts_for_every_sample(drawn, drive, tmp_path):
     logs, sent = [], 0
@@ -303,3 +303,18 @@ def test_a_cut_frame_is_one_line_and_partial_keeps_the_windows_before(lines, tmp
     assert len(out.read_text().splitlines()) == 5
     with pytest.raises(LogError, match="cut off"):
         recordings_of(CONFIG, DATABASE, [log])
+
+
+def test_a_wild_sample_after_the_last_window_is_counted(lines, tmp_path):
+    some = [line for line in lines if float(line[1:18]) < START + SECONDS - 0.3]
+    place = [i for i, line in enumerate(some) if "18FE49" in line and float(line[1:18]) < START + SECONDS - 0.7][-1]
+    head, data = some[place].split("#")
+    faster = round(1.3 * int.from_bytes(bytes.fromhex(data[:4]), "little")).to_bytes(2, "little").hex()
+    some[place] = f"{head}#{faster}{data[4:]}"
+    (tmp_path / "a.log").write_text("".join(some))
+    pipeline = transcribing()
+    windows = windows_of([tmp_path / "a.log"], pipeline)
+    assert windows[-1]["t"] < float(some[place][1:18])
+    assert [w["rejected"] for w in windows] == [{}] * len(windows)
+    assert pipeline.intake.refusals.total == {"wild": 1}
+    assert pipeline.intake.refusals.used == samples_in(some) - 1

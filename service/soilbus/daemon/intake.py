@@ -169,7 +169,6 @@ class Intake:
         self._ready = ready
 
     def _restart(self) -> None:
-        self._screen_the_rest()
         self.epoch += 1  # nothing of the one before may be carried over
         self._bins = None
         self._fresh = True
@@ -219,6 +218,7 @@ class Intake:
         while self._bins is not None and self.next_end <= now:
             self.ingest(self.next_end)
             if self.next_end - self._newest > LONGEST_GAP:
+                self._screen_the_rest()
                 self._restart()
                 break
             tasks.append(self._task(self._bins, self.next_end))
