@@ -10,7 +10,7 @@ import cantools
 import pytest
 
 from soilbus.can.publish import Publisher, value_codes
-from soilbus.daemon.intake import LONGEST_GAP
+from soilbus.can.admission import LONGEST_GAP
 from soilbus.simulator.reference import reference_configuration
 
 DBC = Path(__file__).resolve().parents[2] / "dbc"
