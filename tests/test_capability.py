@@ -28,7 +28,7 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
-from statics import MODEL, WEIGHT, WHEELS, brute
+from statics import MODEL, WEIGHT, WHEELS, brute, brute_with_rolling
 
 CONFIG = reference_configuration()
 RIG = rig_of(CONFIG)
@@ -125,6 +125,28 @@ def test_unlimited_pull_is_the_best_over_slip(name):
     assert able.max_grade.value == pytest.approx(math.asin(steepest / WEIGHT), abs=3e-4)
 
 
+@pytest.mark.parametrize("name", ["loam", "wet_clay", "dry_sand"])
+@pytest.mark.parametrize("dead", ["front", "rear"])
+def test_a_wheel_that_cannot_drive_rolls(name, dead):
+    # Its limit is 0: it holds the vehicle back as a rolling wheel does, and no more.
+    soil, limit = SOILS[name], np.where(RIG.front == (dead == "front"), 0.0, np.nan)
+    able = assessed(soil, limit)
+    pulls = [brute_with_rolling(soil, slip, dead)[0] for slip in (0.1, 0.3, 0.45, 0.6)]
+    found = able.over_slip
+    assert np.interp([0.1, 0.3, 0.45, 0.6], found.slip, found.pull) == pytest.approx(pulls, abs=4e-3 * WEIGHT)
+    assert able.max_draft.value == pytest.approx(max(pulls), abs=6e-3 * WEIGHT)
+    assert able.set_points[dead] == assessment.SetPoint(None, None)
+    drives = able.set_points["rear" if dead == "front" else "front"].pull
+    assert (drives is None) == (max(pulls) < -3000.0)  # where no slip of these wheels pulls more than they resist
+
+
+def test_a_vehicle_whose_wheels_all_roll_must_be_pulled():
+    able = assessed(SOILS["loam"], np.zeros(4))
+    slip = brentq(lambda s: brute(SOILS["loam"], s)[1][2].sum(), -0.3, 0.02, xtol=1e-5)
+    assert able.max_draft.value == pytest.approx(brute(SOILS["loam"], slip)[0], abs=6e-3 * WEIGHT)
+    assert set(able.set_points.values()) == {assessment.SetPoint(None, None)}
+
+
 @pytest.mark.parametrize("name", ["loam", "wet_clay", "sandy_loam_22"])
 @pytest.mark.parametrize("duty", [LEVEL, Duty(0.0, None)], ids=["level", "grade"])
 def test_torque_limit_is_met_exactly(name, duty):
@@ -153,7 +175,7 @@ def test_more_torque_never_pulls_less():
     assert pulls[-1] == assessed(soil).max_draft.value
 
 
-@pytest.mark.parametrize(("name", "share"), [("loam", 0.0), ("wet_clay", 0.9), ("dry_sand", 0.5)])
+@pytest.mark.parametrize(("name", "share"), [("loam", 0.3), ("wet_clay", 0.9), ("dry_sand", 0.5)])
 def test_motors_too_weak_to_turn_the_wheels_without_a_push(name, share):
     # The motors give less than the least slip asks for: only wheels that skid need so little.
     soil = SOILS[name]

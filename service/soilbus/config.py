@@ -331,7 +331,21 @@ class Traversability(_Section):
     hold: PositiveInt = 2
     """Windows in a row that must speak for a better state."""
     max_age: PositiveFloat = 3.0
-    """Seconds after which a posterior no longer supports go."""
+    """Seconds after the last instant that it rests on from which a posterior no longer supports go."""
+    min_share: Annotated[float, Field(gt=0.0, le=1.0)] = 0.15
+    """Share of a window that must be measured on the present ground: since it changed, since a wheel last spun."""
+    spin_time: PositiveFloat = 0.4
+    """Seconds for which a wheel beyond max_slip, or thrust that moves nothing, ends go: with means over 0.3 s and a
+    look every 0.1 s, within one second."""
+    stuck_time: PositiveFloat = 1.2
+    """Seconds for which a vehicle makes no way under thrust from which it is stuck; no start takes as long to show."""
+    stall_resistance: PositiveFloat = 0.15
+    """Thrust of a standing vehicle beyond draft, slope and inertia, as a share of its weight, from which it stalls:
+    more than the motion resistance of wheels that still roll (Wong, Theory of Ground Vehicles, ch. 2)."""
+    contradiction: PositiveFloat = 3.0
+    """Standard deviations by which the wheels must pull less at their present slip than predicted for it to count."""
+    full_torque: Annotated[float, Field(gt=0.0, le=1.0)] = 0.95
+    """Share of its torque limit from which a motor gives all it can: ripple and gain error of a torque sensor."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Traversability:

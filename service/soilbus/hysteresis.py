@@ -38,6 +38,12 @@ def settled(last: Held, probability: float | None, status: Status, settings: Set
     return Held(max(last.state, risen, key=_rank), recent)
 
 
+def doubted(last: Held) -> Held:
+    """The state in force while the ground changes, and nothing is known of the new one: at most caution."""
+    state = min(last.state, State.CAUTION, key=_rank) if last.state is not State.UNKNOWN else State.CAUTION
+    return Held(state, (state,))
+
+
 def _rank(state: State) -> int:
     return ORDER.index(state)
 

@@ -37,7 +37,8 @@ class Traversability:
 
     Torques are sums over the wheels [N m]; max_draft [N] on the level; max_grade [rad]
     without draft; slip_needed gives the present demand; since_valid is the time [s] since the
-    end of the last valid window; capability has all the rest.
+    end of the last valid window; capability has all the rest; spare is the pull [N] on the present slope beyond
+    the demand and its margin.
     """
 
     state: State = State.UNKNOWN
@@ -50,6 +51,7 @@ class Traversability:
     limit: str | None = None
     since_valid: float | None = None
     capability: Capability | None = None
+    spare: Estimate | None = None
 
 
 def state_of(probability: float, status: Status, settings: Settings) -> State:

@@ -78,7 +78,7 @@ def by_draws(n: int = RandomSoils.n) -> Iterator[None]:
     """`assess` by plain Monte Carlo; the wheels' tables are kept within the context, so it is of one posterior."""
     tables: dict[tuple[float, ...], WheelTable] = {}
 
-    def table(soils, rig, model, slip, *_):
+    def table(soils, rig, model, slip, *_, **__):
         key = tuple(slip.tolist())
         if key not in tables:
             tables[key] = wheel_table(soils, rig, model, slip)

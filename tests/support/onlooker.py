@@ -182,7 +182,12 @@ class Drive:
     def content(self, estimator: WindowEstimator) -> None:
         def estimate(window, end):
             estimator.tracker._newest = self.tracked.fit.whole
-            return dataclasses.replace(self.tracked, since=end - CONFIG.estimator.window, mismatch=self.wire.blind)
+            old = self.tracked.fit.optimum
+            optimum = dataclasses.replace(old, t=old.t - old.t[-1] + window.t[-1])  # of the window's own instants
+            fit = dataclasses.replace(self.tracked.fit, optimum=optimum)
+            return dataclasses.replace(
+                self.tracked, fit=fit, since=end - CONFIG.estimator.window, mismatch=self.wire.blind
+            )
 
         estimator._tracker.estimate = estimate
 

@@ -40,3 +40,28 @@ def brute(soil: Soil, slip: float, draft: float | None = None, sine: float | Non
     least = (draft or 0.0) - 0.75 * WEIGHT
     pull = brentq(lambda p: 2.0 * axles(soil, slip, *split(p))[1].sum() - p, least, 0.6 * WEIGHT, xtol=1e-3)
     return pull, axles(soil, slip, *split(pull))
+
+
+def brute_with_rolling(soil: Soil, slip: float, rolling: str) -> tuple[float, dict[str, np.ndarray]]:
+    """Level pull [N] where the wheels of one axle ("front", "rear") take no torque and the others slip.
+
+    And by axle the (load, pull, torque, entry angle, slip) of one wheel.
+    """
+    sizes = {"front": (0.50, 0.26), "rear": (0.62, 0.38)}
+
+    def of_axle(name: str, load: float) -> np.ndarray:
+        def torque(s: float) -> float:
+            return float(wheel(soil, load, s, *sizes[name])[2])
+
+        s = brentq(torque, -0.6, 0.3, xtol=1e-8) if name == rolling else slip
+        return np.append(wheel(soil, load, s, *sizes[name]), s)
+
+    def axles_at(pull: float) -> dict[str, np.ndarray]:
+        front = (WEIGHT * 0.95 - pull * 0.45) / 1.95
+        return {"front": of_axle("front", front / 2.0), "rear": of_axle("rear", (WEIGHT - front) / 2.0)}
+
+    def left(pull: float) -> float:
+        return 2.0 * sum(float(of[1]) for of in axles_at(pull).values()) - pull
+
+    pull = float(brentq(left, -0.75 * WEIGHT, 0.6 * WEIGHT, xtol=1.0))
+    return pull, axles_at(pull)

@@ -132,16 +132,17 @@ def assess(
 ) -> tuple[Capability | None, WheelTable]:
     """Capability on one soil, and the wheels' table to start the next window's from.
 
-    torque_limit (W,) [N m] holds nan where a motor's limit is not known; max_sinkage [m].
-    None where no steady driving within slip and sinkage limits exists.  Raises ValueError
+    torque_limit (W,) [N m] holds nan where a motor's limit is not known; a wheel whose limit is 0 rolls freely.
+    max_sinkage [m].  None where no steady driving within slip and sinkage limits exists.  Raises ValueError
     for a rig without a chassis.
     """
     uncertain = UncertainModel.over(model)
     points = SigmaPoints.of(posterior, uncertain.shifts)
+    driven = ~(torque_limit <= 0.0)
     completed = uncertain.of_rows(len(points.soils))
-    table = wheel_table(points.soils, rig, uncertain, slip_grid(max_slip), last, TOLERANCE)
+    table = wheel_table(points.soils, rig, uncertain, slip_grid(max_slip), last, TOLERANCE, driven)
     skids = np.linspace(-MAX_SKID, table.slip[0], SKID_GRID)
-    skid = cache(lambda: wheel_table(points.soils, rig, uncertain, skids))
+    skid = cache(lambda: wheel_table(points.soils, rig, uncertain, skids, driven=driven))
     of_points = balance(table)
     level = of_points.drawn(points)
     limits = Limits.of(table.axles, torque_limit, max_sinkage, completed)
@@ -200,6 +201,8 @@ class _Vehicle:
         wheels that skid: below zero, as only a push or a slope moves the vehicle.
         """
         found = largest_pull(driving, self.limits)
+        if not self.table.axles.driven.any():
+            return found._replace(cause="torque")
         lost = ~np.isfinite(found.pull)
         if not lost.any():
             return found
@@ -233,16 +236,19 @@ class _Vehicle:
 
 
 def _set_points(axles: Axles, level: Balance, limits: Limits, draft: Largest) -> dict[str, SetPoint]:
-    """Efficiency is drawbar power over the wheels' power, DP V/(T omega)."""
-    names = {"front": axles.front[:, 0], "rear": ~axles.front[:, 0]}
-    names = {name: kinds for name, kinds in names.items() if kinds.any()}
+    """Efficiency is drawbar power over the wheels' power, DP V/(T omega); an axle that is not driven has none."""
+    of_axles = {"front": axles.front[:, 0], "rear": ~axles.front[:, 0]}
+    names = {name: driven for name, kinds in of_axles.items() if (driven := kinds & axles.driven[:, 0]).any()}
+    none = {name: SetPoint(None, None) for name, kinds in of_axles.items() if kinds.any()}
+    if not names:
+        return none
     values = np.empty((len(names), 2, *level.pull.shape))
     for (efficiency, pull), kinds in zip(values, names.values(), strict=True):
         force = axle_sum(level.torque, axles, kinds, 1.0 / axles.radius)
         pull[:] = axle_sum(level.drawbar, axles, kinds)
         np.divide(pull * (1.0 - level.slip), np.where(force > 0.0, force, -np.inf), out=efficiency)
     slips = estimates(*slips_of_most(values.reshape(-1, *level.pull.shape), level, limits, draft.slip))
-    return {name: SetPoint(*slips[2 * i : 2 * i + 2]) for i, name in enumerate(names)}
+    return none | {name: SetPoint(*slips[2 * i : 2 * i + 2]) for i, name in enumerate(names)}
 
 
 def _forecast(

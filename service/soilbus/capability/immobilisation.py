@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from soilbus.capability.traction_loss import TractionLoss
 from soilbus.capability.trend import LAG, SWING, Capacity, Demand, Line, Peaks, Trend
 from soilbus.estimation.window import Rig, Window, inertia_of, pull_given
 from soilbus.terra.vehicle import slip_ratio
@@ -188,6 +189,13 @@ def _ago(recent: Sequence[Look], t: float) -> Look | None:
 def _anew(before: Watch, t: float) -> Watch:
     """Nothing remembered but the peaks."""
     return Watch(peaks=before.peaks, asked=before.asked) if t >= before.peaks.since else Watch()
+
+
+def with_loss(watch: Watch, loss: TractionLoss) -> Watch:
+    """The same, as it is to be reported while traction is lost: that needs no trend, and no estimate."""
+    if not loss.present:
+        return watch
+    return replace(watch, warning=Alert.IMMOBILISATION, time_left=0.0 if loss.stuck else watch.time_left)
 
 
 class Moment(NamedTuple):

@@ -28,6 +28,7 @@ class Limits(NamedTuple):
         """From the wheels' torque limits (W,) [N m], nan where not known, and a sinkage [m] of wheels on the level."""
         torque = np.full(len(axles.count), np.inf)
         np.fmin.at(torque, axles.of_wheel, torque_limit)
+        torque[~axles.driven[:, 0]] = np.inf  # they roll
         deepest = model.angle_of_sinkage(max_sinkage, axles.wheel(axles.level[:, 0]))
         return cls(torque, np.minimum(deepest, MAX_ENTRY_ANGLE))
 

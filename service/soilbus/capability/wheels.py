@@ -1,7 +1,8 @@
 """The wheels over slip on many soils at once, on the level: forces, and how they change with load and slip.
 
-All wheels turn at the same slip.  Loads follow the pull (load transfer) and entry angles
-follow the loads; both are solved together by Newton.
+All driven wheels turn at the same slip; the others roll at the slip that takes no torque.
+Loads follow the pull (load transfer) and entry angles follow the loads; both are solved
+together by Newton.
 """
 
 from __future__ import annotations
@@ -34,21 +35,23 @@ RIDGE = 1e-6
 LEAST = 1e-12
 MAX_ITERATIONS = 12
 TEST_LOAD = 0.9
+ROLLING_SLIP, MAX_ROLLING_SLIP = -0.05, 0.5
+"""Slip from which that of a wheel without torque is looked for, and the skid that it never passes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Axles:
-    """Wheels alike in axle, radius and width count as one of A kinds.
+    """Wheels alike in axle, radius, width and whether they are driven count as one of A kinds.
 
-    radius, width [m], front and count have shape
-    (A, 1).  A wheel's load is level cos + tilt sin of the slope + lever times the draft, (A, 1)
-    each; of_wheel (W,) is each wheel's kind.
+    radius, width [m], front, driven and count have shape (A, 1).  A wheel's load is level cos + tilt sin of
+    the slope + lever times the draft, (A, 1) each; of_wheel (W,) is each wheel's kind.
     """
 
     chassis: Chassis
     radius: Array
     width: Array
     front: NDArray[np.bool_]
+    driven: NDArray[np.bool_]
     count: Array
     level: Array
     tilt: Array
@@ -56,13 +59,14 @@ class Axles:
     of_wheel: NDArray[np.intp]
 
     @classmethod
-    def of(cls, rig: Rig) -> Axles:
-        """The kinds of a rig's wheels; ValueError for a rig without a chassis."""
+    def of(cls, rig: Rig, driven: NDArray[np.bool_] | None = None) -> Axles:
+        """The kinds of a rig's wheels, all driven or those of `driven` (W,); ValueError for a rig without a chassis."""
         if rig.chassis is None:
             raise ValueError("a capability needs the vehicle's mass and geometry")
-        kinds = list(zip(rig.radius.tolist(), rig.width.tolist(), rig.front.tolist(), strict=True))
+        drives = [True] * len(rig.wheels) if driven is None else driven.tolist()
+        kinds = list(zip(rig.radius.tolist(), rig.width.tolist(), rig.front.tolist(), drives, strict=True))
         unlike = list(dict.fromkeys(kinds))
-        radius, width, front = (np.array(column)[:, None] for column in zip(*unlike, strict=True))
+        radius, width, front, drive = (np.array(column)[:, None] for column in zip(*unlike, strict=True))
         count = np.array([[float(kinds.count(kind))] for kind in unlike])
         share = 1.0 / np.where(front, rig.front.sum(), (~rig.front).sum())
         cases = ((0.0, 0.0), (0.0, math.pi / 2.0), (1.0, 0.0))
@@ -70,7 +74,7 @@ class Axles:
             share * np.where(front, *axle_loads(rig.chassis, draft, slope, 0.0)) for draft, slope in cases
         )
         of_wheel = np.array([unlike.index(kind) for kind in kinds])
-        return cls(rig.chassis, radius, width, front, count, level, tilt, drawn - level, of_wheel)
+        return cls(rig.chassis, radius, width, front, drive, count, level, tilt, drawn - level, of_wheel)
 
     def wheel(self, load: Array) -> Wheel:
         """One wheel of each kind under a load [N] (..., A)."""
@@ -129,8 +133,11 @@ def wheel_table(
     slip: Array,
     start: WheelTable | None = None,
     tolerance: float = TOLERANCE,
+    driven: NDArray[np.bool_] | None = None,
 ) -> WheelTable:
-    """Wheels on soils (D, 6) at slips (S,); `start` is the same rig's table of similar soils.
+    """Wheels on soils (D, 6) at slips (S,) of the driven ones (W,), all by default.
+
+    `start` is the same rig's table of similar soils.
 
     The last of the soils are those of the model's doubts, where it has any.  tolerance: the Newton
     step of pull and load, over the weight, that is the last.
@@ -139,9 +146,14 @@ def wheel_table(
     """
     n_soils, n_slips = len(soils), len(slip)
     completed = UncertainModel.over(model).of_rows(n_soils)
-    if start is not None and not (start.pull.shape == (n_soils, n_slips) and np.array_equal(start.slip, slip)):
+    axles = Axles.of(rig, driven)
+    if start is not None and not (
+        start.pull.shape == (n_soils, n_slips)
+        and np.array_equal(start.slip, slip)
+        and np.array_equal(start.axles.driven, axles.driven)
+    ):
         start = None
-    axles = Axles.of(rig) if start is None else start.axles
+    slips = np.where(axles.driven, np.broadcast_to(slip, (n_soils, len(axles.count), n_slips)), ROLLING_SLIP)
     if start is not None:
         pull, angle = _foreseen(start, soils)
         pull = np.where(start.balanced, pull, 0.0)
@@ -151,22 +163,30 @@ def wheel_table(
     load = np.broadcast_to(axles.loads(pull, 0.0), angle.shape).copy()
     unknown = np.isnan(angle).any(axis=(1, 2))
     if unknown.any():
-        guess = _state(soils[unknown], axles, slip, angle[unknown])
+        guess = _state(soils[unknown], axles, slips[unknown], angle[unknown])
         angle[unknown] = entry_angle_for_load(load[unknown], guess, completed.first.model, tolerance=1e-2)
     last_step = tolerance * axles.weight
     with np.errstate(all="ignore"):
-        now = _newton_step(soils, axles, completed, slip, pull, load, angle)
+        now = _newton_step(soils, axles, completed, slips, pull, load, angle)
         for _ in range(MAX_ITERATIONS - 1):
             rows = np.flatnonzero((now.miss > last_step).any(axis=1))
             if not len(rows):
                 break
             angle[rows] = np.clip(now.at[2, rows], 0.5 * angle[rows], 2.0 * angle[rows]).clip(max=MAX_ENTRY_ANGLE)
-            of_rows = soils[rows], axles, completed.of(rows), slip, now.pull[rows], now.load[rows], angle[rows]
+            of_rows = (
+                soils[rows],
+                axles,
+                completed.of(rows),
+                now.slip[rows],
+                now.pull[rows],
+                now.load[rows],
+                angle[rows],
+            )
             for whole, part in zip(now, _newton_step(*of_rows), strict=True):
                 whole[(slice(None),) * (part.ndim == 4) + (rows,)] = part
-    pull, load, at, by_load, by_slip, miss = now
+    pull, load, at, by_load, by_slip, slips, miss = now
     balanced = np.isfinite(at[2]).all(axis=1) & (load > 0.0).all(axis=1) & (miss <= last_step)
-    bend = _bend(soils[:1], axles, completed.first, slip, load[:1], at[:, :1], by_load[:, :1])
+    bend = _bend(soils[:1], axles, completed.first, slips[:1], load[:1], at[:, :1], by_load[:, :1])
     return WheelTable(axles, soils, slip, np.where(balanced, pull, np.nan), load, at, by_load, by_slip, bend, balanced)
 
 
@@ -185,36 +205,46 @@ def _foreseen(start: WheelTable, soils: Array) -> tuple[Array, Array]:
 
 
 class _Step(NamedTuple):
-    """Pull, load, at, by_load and by_slip as in WheelTable after a step, and how far it went [N] (D, S)."""
+    """As in WheelTable after a step, with the slips (D, A, S), and how far it went [N] (D, S)."""
 
     pull: Array
     load: Array
     at: Array
     by_load: Array
     by_slip: Array
+    slip: Array
     miss: Array
 
 
 def _newton_step(
     soils: Array, axles: Axles, model: ModelOfRows, slip: Array, pull: Array, load: Array, angle: Array
 ) -> _Step:
-    """One step towards wheels that carry their loads and a level pull that balances itself."""
+    """One step towards wheels that carry their loads and a level pull that balances itself.
+
+    A wheel that is not driven takes no torque: T = 0 is solved for its slip, which so follows its load.
+    """
     forces, d = model.forces_and_slopes(_state(soils, axles, slip, angle), ~axles.front, load)
     by_carried = np.stack([d.by_angle[1], d.by_angle[2], np.ones_like(d.by_angle[0])]) / d.by_angle[0]
     by_load = by_carried * (1.0 - d.by_load[0])
     by_load[:2] += d.by_load[1:]
-    off = load - forces[0]
-    gain = (axles.count * axles.lever * by_load[0]).sum(axis=1) - 1.0
-    change = -((axles.count * (forces[1] + by_carried[0] * off)).sum(axis=1) - pull) / gain
-    shift = axles.lever * change[:, None]
-    step = off + shift
     by_slip = -by_carried * d.by_slip[0]
     by_slip[:2] += d.by_slip[1:]
-    at = by_carried * off + by_load * shift
+    off = load - forces[0]
+    by_torque = np.where(axles.driven, 0.0, -by_slip / by_slip[1])  # of the slip that takes a torque away
+    rolled = forces[2] + by_carried[1] * off
+    rolled_by_load = by_load[1].copy()
+    by_load += by_torque * rolled_by_load
+    gain = (axles.count * axles.lever * by_load[0]).sum(axis=1) - 1.0
+    change = -((axles.count * (forces[1] + by_carried[0] * off + by_torque[0] * rolled)).sum(axis=1) - pull) / gain
+    shift = axles.lever * change[:, None]
+    step = off + shift
+    slower = np.where(axles.driven, 0.0, (rolled + rolled_by_load * shift) / by_slip[1])
+    at = by_carried * off + by_load * shift + by_torque * rolled
     at[:2] += forces[1:]
     at[2] += angle
     miss = np.maximum(np.abs(change), np.abs(step).max(axis=1))
-    return _Step(pull + change, load + shift, at, by_load, by_slip, miss)
+    slip = np.clip(slip - slower, -MAX_ROLLING_SLIP, None)
+    return _Step(pull + change, load + shift, at, by_load, by_slip * axles.driven, slip, miss)
 
 
 def _bend(
@@ -228,11 +258,11 @@ def _bend(
             _state(soil, axles, slip, np.clip(linear[2], 0.0, MAX_ENTRY_ANGLE)), ~axles.front, load + change
         )
         exact = np.stack([forces[1], forces[2], linear[2]]) + by_load * (load + change - forces[0])
-        return np.asarray((exact - linear) / change**2)
+        return np.asarray((exact - linear) / change**2 * axles.driven)
 
 
 def _state(soils: Array, axles: Axles, slip: Array, angle: Array) -> WheelState:
-    """Every soil under every kind of wheel at every slip, each field of the whole shape."""
+    """Every soil under every kind of wheel at its slips (D, A, S), each field of the whole shape."""
     k_c, k_phi, n, phi, c, K = soils.T[:, :, None, None]
     modulus = lumped_modulus(k_c, k_phi, axles.width)
     state = WheelState(angle, slip, axles.radius, axles.width, modulus, n, np.tan(phi), c, K)

@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 from soilbus.assembly import completion_of, model_of, prior_of, rig_of
 from soilbus.capability.assessment import Demand, OverSlip
 from soilbus.capability.demand import present_demand
-from soilbus.capability.immobilisation import Watch, moments, watched
+from soilbus.capability.immobilisation import SPAN, Watch, moments, watched, with_loss
+from soilbus.capability.traction_loss import NO_LOSS, idle, motion_of, observed
 from soilbus.capability.uncertain_model import UncertainModel
 from soilbus.capability.wheels import WheelTable
 from soilbus.config import Config
 from soilbus.daemon.excitation import excitation_of
 from soilbus.daemon.gap import GapWatch, squares
 from soilbus.daemon.intake import WindowTask
-from soilbus.daemon.result import WindowResult
+from soilbus.daemon.result import WindowResult, as_of
 from soilbus.estimation.effect_parameters import active_at
 from soilbus.estimation.gauss_newton import Fit
 from soilbus.estimation.posterior import Estimate, Posterior
@@ -28,17 +29,12 @@ from soilbus.estimation.soil_class import SoilClasses, guessed
 from soilbus.estimation.tracked import MIN_ROWS, Ground, Settings, Tracked
 from soilbus.estimation.tracker import Tracker
 from soilbus.estimation.window import Rig, Window
-from soilbus.hysteresis import Held, settled
-from soilbus.judgement import judge
+from soilbus.hysteresis import Held, doubted, settled
+from soilbus.judgement import Basis, judge
 from soilbus.terra.effects.effect import Active, Surroundings, true_draft
 from soilbus.terra.effects.steady import CompletedModel
-from soilbus.traversability import State as Way
 from soilbus.traversability import Status, Traversability
 
-MIN_NEW_SOIL = 0.15
-"""Share of a window that a new soil must fill before its estimate is valid."""
-STUCK_RIM_SPEED = 2.5
-"""Least rim speed of a vehicle that is stuck, in units of the least speed at which slip is judged."""
 AMBIGUOUS = 2.0
 """Standard deviations of bearing pressure or tan phi by which another optimum makes a window ambiguous."""
 
@@ -47,18 +43,18 @@ AMBIGUOUS = 2.0
 class Undecided:
     """A window's estimate with what the decision needs besides; its traversability is still unknown.
 
-    demand is None where the draft is not known; torque_limit (W,) [N m]; stuck: the wheels
-    turn on the spot; driven: the window's data with the true draft; fresh: nothing of the window before
-    may be carried over; model: with what the window leaves known of the effects' parameters.
+    demand is None where the draft is not known; torque_limit (W,) [N m]; driven: the window's data with the
+    true draft; fresh: nothing of the window before may be carried over; model: with what the window leaves known of
+    the effects' parameters; here: whether the estimate is of the present ground.
     """
 
     result: WindowResult
     demand: Demand | None
     torque_limit: NDArray[np.float64]
-    stuck: bool
     driven: Window
     fresh: bool
     model: UncertainModel
+    here: bool
 
 
 class WindowEstimator:
@@ -75,6 +71,8 @@ class WindowEstimator:
         self._valid_at: float | None = None
         self._watch = Watch()
         self._curve: OverSlip | None = None
+        self._loss = NO_LOSS
+        self._idle = np.zeros(len(self.rig.wheels), bool)
         self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
         self._guess = guessed(self.prior, prior_of(Config()))
         settings = config.estimator
@@ -108,9 +106,9 @@ class WindowEstimator:
         fit = tracked.fit
         status, reason = self._status(task, tracked)
         posterior = None if fit is None or status is Status.INVALID else self._honest(tracked, fit)
-        stuck = self._stuck(task.window)
-        if stuck and status is Status.VALID:
-            status, reason = Status.NOT_EXCITED, "standstill"
+        basis = self._basis(task.window, fit)
+        if status is Status.VALID and task.end - basis.end > self.config.traversability.max_age:
+            status, reason = Status.NOT_EXCITED, _gated(tracked)
         result = WindowResult(
             t=task.end,
             index=task.index,
@@ -130,12 +128,18 @@ class WindowEstimator:
             failure=self._failure(tracked),
             gaps=self._watched_gaps(task, fit),
             excitation=excitation_of(task.window, self.rig, self._settings.min_speed),
+            basis=basis,
         )
         effects = self._effects(fit)
         model = self._present_model(task.window, tracked, effects)
         window = _with_true_draft(task.window, effects, self.rig)
         demand = present_demand(window, self.rig.chassis, self._settings.hop, self._draft_gain(tracked))
-        return Undecided(result, demand, task.torque_limit, stuck, window, task.fresh, model)
+        here = tracked.ground not in (Ground.CHANGING, Ground.SETTLING)
+        if task.fresh:
+            self._idle = np.zeros(len(self.rig.wheels), bool)
+        self._idle = idle(task.window, self.rig, task.end - self._settings.hop, self._idle)
+        limit = np.where(self._idle, 0.0, task.torque_limit)
+        return Undecided(result, demand, limit, window, task.fresh, model, here)
 
     def decide(self, window: Undecided) -> WindowResult:
         """The result with its traversability and watch; windows in their order, here or in another process."""
@@ -144,7 +148,8 @@ class WindowEstimator:
         able = result.traversability.capability
         if able is not None and result.status is Status.VALID:
             self._curve = able.over_slip
-        return replace(result, watch=self._watch)
+        now = as_of(result, self._loss, result.t, self.config)
+        return replace(now, watch=with_loss(self._watch, self._loss))
 
     def _decided(self, window: Undecided) -> WindowResult:
         """The result with its traversability."""
@@ -152,8 +157,6 @@ class WindowEstimator:
             window.result.posterior, window.result.status, window.demand, self.rig, window.model, window.torque_limit,
             self.config.traversability, None if window.fresh else self._wheels,
         )  # fmt: skip
-        if window.stuck:
-            way = replace(way, state=Way.NO_GO, probability=0.0, limit="slip")
         return replace(window.result, traversability=self._settle(way, window))
 
     def _settle(self, way: Traversability, window: Undecided) -> Traversability:
@@ -163,7 +166,10 @@ class WindowEstimator:
         result = window.result
         if result.status is Status.VALID:
             self._valid_at = result.t
-        self._held = settled(self._held, way.probability, result.status, self.config.traversability)
+        if window.here:
+            self._held = settled(self._held, way.probability, result.status, self.config.traversability)
+        else:  # the estimate is of the ground before
+            self._held, way = doubted(self._held), Traversability(torque_available=way.torque_available)
         return replace(
             way, state=self._held.state, since_valid=None if self._valid_at is None else result.t - self._valid_at
         )
@@ -179,8 +185,13 @@ class WindowEstimator:
     def _look(self, window: Undecided) -> None:
         """Watch the last hop with what was known of the soil before it."""
         if window.fresh:
-            self._watch, self._curve = Watch(), None
+            self._watch, self._curve, self._loss = Watch(), None, NO_LOSS
         since = window.result.t - self._settings.hop
+        driven = window.driven
+        for i in np.flatnonzero(driven.t > since).tolist():
+            few = driven.rows(np.arange(max(i + 1 - SPAN, 0), i + 1))
+            if (motion := motion_of(few, self.rig, window.torque_limit, self.config.traversability)) is not None:
+                self._loss = observed(self._loss, motion, self._settings.min_speed, self.config.traversability)
         for moment in moments(window.driven, self.rig, since, self._settings.min_speed):
             self._watch = watched(self._watch, moment.t, moment.slip, moment.pull, self._curve, moment.inertia)
 
@@ -228,14 +239,14 @@ class WindowEstimator:
         moving = window.ground_speed[window.ground_speed > self._settings.min_speed]
         return float(moving.mean()) if len(moving) else self._settings.min_speed
 
-    def _stuck(self, window: Window) -> bool:
-        """Whether the wheels turned but the vehicle stood during most of the last hop."""
-        recent = window.t > window.t[-1] - self._settings.hop if len(window.t) else window.t > 0.0
-        ground = window.ground_speed[recent]
-        rim = (self.rig.radius * window.speed[recent]).min(axis=1, initial=np.inf)
-        known = np.isfinite(ground) & np.isfinite(rim)
-        standing = known & (ground < self._settings.min_speed) & (rim > STUCK_RIM_SPEED * self._settings.min_speed)
-        return bool(standing.sum() > 0.5 * max(int(known.sum()), 1))
+    def _basis(self, window: Window, fit: Fit | None) -> Basis:
+        """The instants that a fit rests on, and how far the vehicle has driven since the last of them."""
+        instants = np.empty(0) if fit is None else fit.optimum.t
+        end = instants[-1] + self._settings.bin / 2.0 if len(instants) else -math.inf
+        since = window.ground_speed[window.t > end]
+        known = since[np.isfinite(since)]
+        unseen = float(known.mean()) * len(since) * self._settings.bin if len(known) else 0.0
+        return Basis(instants, self._settings.bin, unseen)
 
     def _status(self, task: WindowTask, tracked: Tracked) -> tuple[Status, str]:
         """Status and its reason; a sensor that lies is the reason of all that may follow from it."""
@@ -249,7 +260,7 @@ class WindowEstimator:
             return Status.INVALID, "input_missing " + " ".join(task.missing)
         if fit is None and not tracked.mismatch:
             if tracked.standstill + tracked.turning > 0:
-                return Status.NOT_EXCITED, "standstill" if tracked.standstill >= tracked.turning else "turning"
+                return Status.NOT_EXCITED, _gated(tracked)
             return Status.INVALID, "input_stale " + " ".join(task.poor) if task.poor else "no_convergence"
         failure = self._failure(tracked)
         if fit is None or failure is not None:
@@ -277,7 +288,7 @@ class WindowEstimator:
         """Whether the window has too little of the soil that has just begun."""
         if tracked.ground in (Ground.CHANGING, Ground.SETTLING):
             return True
-        return tracked.since > end - MIN_NEW_SOIL * self._settings.window
+        return tracked.since > end - self.config.traversability.min_share * self._settings.window
 
     def _failure(self, tracked: Tracked) -> str | None:
         """In what way a solve failed: not_finite, model_mismatch or no_convergence; None where it did not."""
@@ -295,6 +306,11 @@ class WindowEstimator:
         one, other = fit.posterior, fit.rival.belief.posterior
         pairs = ((self._bearing(one), self._bearing(other)), (one.tan_phi(), other.tan_phi()))
         return any(abs(a.value - b.value) > AMBIGUOUS * a.std for a, b in pairs)
+
+
+def _gated(tracked: Tracked) -> str:
+    """Why most of the instants were left out that were."""
+    return "standstill" if tracked.standstill >= tracked.turning else "turning"
 
 
 def _widening(tracked: Tracked, fit: Fit) -> float:

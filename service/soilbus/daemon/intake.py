@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from soilbus.can.admission import LONGEST_GAP, Admission
 from soilbus.can.channels import Channel, Decoded
 from soilbus.can.dbc_files import checked_messages
 from soilbus.can.mapping import POSITION_ROLES, channels_of
+from soilbus.capability.traction_loss import Motion, motion_of
 from soilbus.config import Config
 from soilbus.daemon.plausibility import Plausibility
 from soilbus.daemon.positions import PositionTrack
@@ -39,6 +41,8 @@ from soilbus.terra.vehicle import slip_ratio
 Array = NDArray[np.float64]
 
 DEFAULT_TIMEOUT = 1.0
+LIMIT_SAMPLES = 3
+"""Reported torque limits of which the median is in force: one wild sample moves nothing."""
 COVERAGE_BLOCK = 0.5
 MIN_COVERAGE = 0.95
 SLIP_SPAN = 0.3
@@ -74,7 +78,7 @@ class WindowTask:
 
 
 class Latest(NamedTuple):
-    """Slip ratio by wheel, pull [N] (draft, slope, inertia) of the last moments and the inertia in it.
+    """Slip ratio by wheel, pull [N] (draft, slope, inertia) of the last moments, the inertia in it, and the motion.
 
     None where unknown.
     """
@@ -82,6 +86,7 @@ class Latest(NamedTuple):
     slip: dict[str, float | None]
     pull: float | None
     inertia: float = 0.0
+    motion: Motion | None = None
 
 
 @dataclass(slots=True)
@@ -120,6 +125,43 @@ class Refusals:
         return {r: n for r, n in sorted(counts.items()) if n}
 
 
+class ReportedLimits:
+    """Greatest torque [N m] that each motor has reported, else the configured one (W,), nan where neither is known.
+
+    What a motor has reported holds until it reports another limit, however long it is silent and whatever becomes of
+    the clock.  The median of the last few samples is not moved by a wild one.
+    """
+
+    def __init__(self, wheels: Sequence[str], configured: Sequence[float]) -> None:
+        self._configured = dict(zip(wheels, configured, strict=True))
+        self._reported: dict[str, tuple[Array, Array]] = {}
+
+    def add(self, wheel: str, t: Array, value: Array) -> None:
+        """Samples (N,) of one wheel at the times t [s]."""
+        if wheel in self._configured:
+            old_t, old = self._reported.get(wheel, (t[:0], value[:0]))
+            self._reported[wheel] = np.append(old_t, t), np.append(old, value)
+
+    def at(self, t: float) -> Array:
+        """The limits (W,) in force at the time t [s]."""
+        return np.array([self._of(wheel, t) for wheel in self._configured])
+
+    def _of(self, wheel: str, now: float) -> float:
+        t, value = self._reported.get(wheel, (np.empty(0), np.empty(0)))
+        last = value[t <= now][-LIMIT_SAMPLES:]
+        return float(np.median(last)) if len(last) else self._configured[wheel]
+
+    def drop_before(self, end: float) -> None:
+        """Forget what is no longer among the last samples at the time `end` [s]."""
+        for wheel, (t, value) in self._reported.items():
+            first = max(int(np.count_nonzero(t <= end)) - LIMIT_SAMPLES, 0)
+            self._reported[wheel] = t[first:], value[first:]
+
+    def forget_times(self) -> None:
+        """The clock was set: what was reported was reported before all that follows."""
+        self._reported = {wheel: (np.full(len(t), -math.inf), value) for wheel, (t, value) in self._reported.items()}
+
+
 class Intake:
     """Admission, bins and freshness of one vehicle's channels.
 
@@ -140,9 +182,8 @@ class Intake:
         self._settings = config.estimator
         self._binned = frozenset(self.rig.channels)
         limits = {w.name: w.max_torque for w in config.wheel}
-        self._max_torque = np.array([limits[name] or math.nan for name in self.rig.wheels])
-        self._limit = np.full(len(self.rig.wheels), math.nan)
-        self._limit_t = np.full(len(self.rig.wheels), -math.inf)
+        self._decision = config.traversability
+        self._limits = ReportedLimits(self.rig.wheels, [limits[name] or math.nan for name in self.rig.wheels])
         self._index = 0
         self.epoch = 0
         self._ready: list[WindowTask] = []
@@ -174,6 +215,7 @@ class Intake:
         self._fresh = True
         self._positions.forget()
         self._plausibility.forget()
+        self._limits.forget_times()
         self._lying: tuple[str, ...] = ()
         self.next_end = math.inf
         self.last_seen: dict[str, float] = {}
@@ -199,16 +241,11 @@ class Intake:
         self.last_seen |= {name: float(t[-1]) for name, (t, _) in heard.items()}
         for name, (t, value) in heard.items():
             if name.startswith("torque_limit."):
-                self._note_limit(name.removeprefix("torque_limit."), t, value)
+                self._limits.add(name.removeprefix("torque_limit."), t, value)
         self._positions.add(heard)
         self._plausibility.add(heard)
         if self._bins is not None:
             self._bins.add({name: samples for name, samples in heard.items() if name in self._binned})
-
-    def _note_limit(self, wheel: str, t: Array, value: Array) -> None:
-        if wheel in self.rig.wheels:
-            i = self.rig.wheels.index(wheel)
-            self._limit[i], self._limit_t[i] = value[-1], t[-1]
 
     def due(self, now: float) -> list[WindowTask]:
         """Every window that ended at or before `now` [s] and was not handed out yet."""
@@ -255,7 +292,6 @@ class Intake:
         covered = dict(zip(self.rig.channels, coverage(window).tolist(), strict=True))
         badly_covered = [c.name for c in self.needed if covered[c.name] < MIN_COVERAGE]
         poor = tuple(dict.fromkeys(self.stale(end) + badly_covered))
-        fresh_limit = end - self._limit_t < DEFAULT_TIMEOUT
         task = WindowTask(
             index=self._index,
             start=start,
@@ -264,7 +300,7 @@ class Intake:
             slip=self._slip(window),
             missing=missing if self.rig.wheels else (*missing, "wheels"),
             poor=poor,
-            torque_limit=np.where(fresh_limit, self._limit, self._max_torque),
+            torque_limit=self._limits.at(end),
             track=self._positions.copy(),
             rejected=self.refusals.within(start, end),
             fresh=self._fresh,
@@ -276,6 +312,7 @@ class Intake:
         bins.drop_before(start + self._settings.hop)
         self._positions.drop_before((start + end) / 2.0 + self._settings.hop)
         self._plausibility.drop_before(start + self._settings.hop)
+        self._limits.drop_before(end)
         return task
 
     def stale(self, now: float) -> list[str]:
@@ -296,7 +333,9 @@ class Intake:
             return Latest(self._slip(window), None)
         pull, inertia = pull_given(window, self.rig.chassis), inertia_of(window, self.rig.chassis)
         given = column_means(pull[:, None])[0]
-        return Latest(self._slip(window), given, 0.0 if given is None else float(inertia[np.isfinite(pull)].mean()))
+        motion = motion_of(forward(window), self.rig, self._limits.at(now), self._decision)
+        part = 0.0 if given is None else float(inertia[np.isfinite(pull)].mean())
+        return Latest(self._slip(window), given, part, motion)
 
     def _slip(self, window: Window) -> dict[str, float | None]:
         window = forward(window)

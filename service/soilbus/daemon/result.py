@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from soilbus.capability.immobilisation import Watch
+from soilbus.capability.traction_loss import TractionLoss
+from soilbus.config import Config
 from soilbus.daemon.excitation import Excitation
 from soilbus.daemon.positions import Position
+from soilbus.judgement import Basis, at_present
 from soilbus.traversability import Status, Traversability
 
 if TYPE_CHECKING:
@@ -27,6 +30,7 @@ class WindowResult:
     watch warns of immobilisation; unknown where the loop watches ten times a second itself.  gaps: reduced
     chi-square of the channels that have not fitted for minutes, the worst first.  log names the
     recording that the window is of; None for the live bus.  excitation: how much draft and slip varied.
+    basis: what the decision rests on.
     """
 
     t: float
@@ -49,3 +53,12 @@ class WindowResult:
     watch: Watch = Watch()  # noqa: RUF009, immutable
     log: str | None = None
     excitation: Excitation = Excitation()  # noqa: RUF009, immutable
+    basis: Basis = Basis()  # noqa: RUF009, immutable
+
+
+def as_of(result: WindowResult, loss: TractionLoss, now: float, config: Config) -> WindowResult:
+    """The result with what is left of its decision at the time `now` [s]; of a stuck vehicle none is valid."""
+    way = at_present(result.traversability, result.basis, loss, now, config)
+    if loss.stuck and result.status is Status.VALID:
+        return replace(result, traversability=way, status=Status.NOT_EXCITED, reason="standstill")
+    return replace(result, traversability=way)

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 from soilbus.can.bus import LiveBus
 from soilbus.can.bus_state import BusState
 from soilbus.can.publish import Publisher
-from soilbus.capability.immobilisation import Watch, watched
+from soilbus.capability.immobilisation import Watch, watched, with_loss
+from soilbus.capability.traction_loss import NO_LOSS, observed
 from soilbus.config import Config
 from soilbus.daemon.backlog import Backlog, wait_for
 from soilbus.daemon.beat import next_tick
@@ -25,12 +26,12 @@ from soilbus.daemon.intake import Latest
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.outputs import TICK, WINDOW_MODULUS, forecast_frame, hop_frames, slip_frames
 from soilbus.daemon.pipeline import Pipeline
-from soilbus.daemon.result import WindowResult
+from soilbus.daemon.result import WindowResult, as_of
 from soilbus.daemon.solver import INTERNAL, Solver
 from soilbus.daemon.states import ServiceState, state_after
 from soilbus.daemon.totals import totals
-from soilbus.traversability import State as Way
-from soilbus.traversability import Status
+from soilbus.judgement import Basis, at_present
+from soilbus.traversability import State, Status, Traversability
 
 if TYPE_CHECKING:
     from soilbus.capability.assessment import OverSlip
@@ -89,7 +90,7 @@ class Service:
         self.deadline_misses = 0
         self.failures: Counter[str] = Counter()
         """Failed solves by kind, since the start."""
-        self._watch = Watch()
+        self._watch, self._loss = Watch(), NO_LOSS
         self._curve: tuple[OverSlip | None, float] = None, -math.inf
         self._stopping = False
         self._started = clock()
@@ -193,7 +194,7 @@ class Service:
                 self.failures[result.failure] += 1
             if pending.epoch == self.intake.epoch:
                 self._take(result, pending.at)
-            for message, values in hop_frames(result):
+            for message, values in hop_frames(as_of(result, self._loss, result.t, self.config)):
                 self.bus.send(self.publisher.frame(message, values))
             if self.on_window is not None:
                 self.on_window(result)
@@ -217,6 +218,7 @@ class Service:
             self.intake.ingest()
         if self.intake.epoch != self._epoch:
             self._epoch, self.result, self._watch, self._curve = self.intake.epoch, None, Watch(), (None, -math.inf)
+            self._loss = NO_LOSS
         self._look_after_health(now)
         self._state = self._present_state(now)
         if _interrupts(self._state) or self.bus.counts.lost != self._lost:
@@ -270,16 +272,23 @@ class Service:
             reason = f"bus_error {self.bus.state}"
         return state_after(self.result), reason
 
-    def present_way(self, now: float) -> Way:
-        """go, caution or no_go only while all works, no needed input is stale and the posterior is young.
+    def present_way(self, now: float) -> Traversability:
+        """The decision as of now: only while all works, no needed input is stale and its data are young.
 
         After an interruption only a window that ended later counts.
         """
-        if self.result is None or _interrupts(self._present_state(now)) or self._fault or self._solver.in_fault:
-            return Way.UNKNOWN
-        if self._ended <= self._interrupted or not self._age(now) <= self.config.traversability.max_age:  # nor nan
-            return Way.UNKNOWN
-        return self.result.traversability.state
+        if _interrupts(self._present_state(now)) or self._fault or self._solver.in_fault:
+            return Traversability()
+        result = None if self._ended <= self._interrupted else self.result
+        way, basis = (Traversability(), Basis()) if result is None else (result.traversability, result.basis)
+        return at_present(way, basis, self._loss, self._present_time(now), self.config)
+
+    def _present_time(self, now: float) -> float:
+        """The bus's time, or that of the last window's end and ours since, whichever is later: the stamps' may halt."""
+        by_stamps = self._time.at(now)
+        if self.result is None or math.isnan(by_stamps):
+            return by_stamps
+        return max(by_stamps, self.result.t + now - self._ended)
 
     def _present_curve(self, now: float) -> OverSlip | None:
         """Pull over slip of the last valid window, while it is young enough to extrapolate from."""
@@ -287,37 +296,38 @@ class Service:
         return known if self._time.at(now) - t < LONGEST_CURVE else None
 
     def _age(self, now: float) -> float:
-        """Of the posterior [s], by the bus's time or ours, whichever says more: the stamps' clock may halt."""
-        if self.result is None:
-            return math.inf
-        by_stamps = self._time.at(now) - self.result.t
-        return by_stamps if math.isnan(by_stamps) else max(by_stamps, now - self._ended)
+        """Of the data that the decision rests on [s]."""
+        return math.inf if self.result is None else self._present_time(now) - self.result.basis.end
 
     def _since_valid(self, now: float) -> float | None:
         """Time [s] since the last valid posterior; None where there was none in this epoch."""
-        before = None if self.result is None else self.result.traversability.since_valid
-        return None if before is None else before + max(self._age(now), 0.0)
+        if self.result is None or self.result.traversability.since_valid is None:
+            return None
+        return self.result.traversability.since_valid + max(self._present_time(now) - self.result.t, 0.0)
 
     def _publish_ten_hertz(self, now: float) -> None:
-        way = self.present_way(now)
-        known = way is not Way.UNKNOWN and self.result is not None
-        decided = self.result.traversability if known and self.result is not None else None
-        window = self.result.index % WINDOW_MODULUS if self.result is not None else None
         latest = self.intake.latest(self._time.at(now)) if self.bus.is_open else Latest({}, None)
+        if latest.motion is not None:
+            settings = self.config.traversability
+            self._loss = observed(self._loss, latest.motion, self.config.estimator.min_speed, settings)
+        way = self.present_way(now)
+        known = way.state is not State.UNKNOWN
+        window = self.result.index % WINDOW_MODULUS if self.result is not None else None
         for message, values in slip_frames(latest.slip):
             self.bus.send(self.publisher.frame(message, values))
         self._watch = watched(
             self._watch, self._time.at(now), latest.slip.values(), latest.pull, self._present_curve(now), latest.inertia
         )  # fmt: skip
-        self.bus.send(self.publisher.frame(*forecast_frame(self.result if known else None, self._watch)))
-        limit = decided.limit if decided is not None else None
+        warning = with_loss(self._watch, self._loss)
+        foreseeable = self.result if known and not self._loss.stuck else None
+        self.bus.send(self.publisher.frame(*forecast_frame(foreseeable, warning)))
         self.bus.send(
             self.publisher.frame(
                 "Traversability",
                 {
-                    "State": str(way),
-                    "LimitingCause": limit,
-                    "Probability": None if decided is None else decided.probability,
+                    "State": str(way.state),
+                    "LimitingCause": way.limit if known else None,
+                    "Probability": way.probability if known else None,
                     "Age": None if self.result is None else max(self._age(now), 0.0),
                     "SinceValid": self._since_valid(now),
                     "Window": window,
@@ -328,8 +338,8 @@ class Service:
             self.publisher.frame(
                 "TorqueDemand",
                 {
-                    "TorqueRequired": None if decided is None else decided.torque_required,
-                    "TorqueAvailable": None if decided is None else decided.torque_available,
+                    "TorqueRequired": way.torque_required if known else None,
+                    "TorqueAvailable": way.torque_available if known else None,
                     "Window": window,
                 },
             )
@@ -365,7 +375,7 @@ class Service:
         if self.result is not None and self.result.bearing is not None:
             bearing = self.result.bearing
             text += f", bearing pressure {bearing.value / 1e3:.1f} +- {bearing.std / 1e3:.1f} kPa"
-            text += f", {self.present_way(now)}"
+            text += f", {self.present_way(now).state}"
         if self.deadline_misses:
             text += f", deadline misses {self.deadline_misses}"
         if self.failures:
