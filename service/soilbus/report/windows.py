@@ -123,8 +123,8 @@ def _plots(results: Sequence[WindowResult]) -> Any:
 
     figure = Figure(figsize=(10, 9), layout="constrained")
     axes: Any = figure.subplots(4, 1, sharex=True)
-    begin, several = 0.0, len({r.log for r in results}) > 1
-    for stretch in stretches(results):
+    begin, cut, several = 0.0, stretches(results), len({r.log for r in results}) > 1
+    for stretch in cut:
         shift = begin - stretch[0].t
         _stretch(axes, stretch, shift)
         if begin:
@@ -136,7 +136,7 @@ def _plots(results: Sequence[WindowResult]) -> Any:
     labels = ("bearing pressure, kPa", "friction angle, °", "max. draft, kN", "slip")
     for axis, label in zip(axes, labels, strict=True):
         axis.set_ylabel(label)
-    axes[3].set_xlabel("end of window, s" + ("; one recording after the other" if begin and several else ""))
+    axes[3].set_xlabel("end of window, s" + ("; one recording after the other" if len(cut) > 1 else ""))
     if results and results[0].slip:
         axes[3].legend(list(results[0].slip), ncols=4)
     return figure
