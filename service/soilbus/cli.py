@@ -99,7 +99,7 @@ def _check(args: argparse.Namespace) -> None:
 def _replay(args: argparse.Namespace) -> None:
     from soilbus.can.dbc_files import load_databases
     from soilbus.daemon.pipeline import Pipeline
-    from soilbus.daemon.replay import LogError, check_heard, estimator_beside, replay
+    from soilbus.daemon.replay import LogError, estimator_beside, replay
     from soilbus.report.progress import progress
     from soilbus.report.soil_map import check_position_is_mapped, soil_map
     from soilbus.report.windows import summary
@@ -114,28 +114,37 @@ def _replay(args: argparse.Namespace) -> None:
         return
     pipeline = Pipeline(config, load_databases(config))
     results: list[WindowResult] = []
-    cut_off: LogError | None = None
+    faults: list[LogError] = []
     with estimator_beside(config) as workers, progress("replay") as step:
         try:
-            for result in replay(pipeline, args.logs, step, workers):
-                results.append(result)
-            check_heard(pipeline, args.logs)
+            results.extend(replay(pipeline, args.logs, step, workers, faults.append if args.partial else None))
         except LogError as error:
-            if not (args.partial and results):
-                hint = "" if not results else f"; --partial keeps the {len(results)} windows before"
-                raise WorkError(f"{error}{hint}") from None
-            cut_off = error
-    if cut_off is not None:
-        print(f"soilbus: {cut_off}; {len(results)} windows before that are kept", file=sys.stderr)
-    _write_windows(args, config, results, summary(results, pipeline))
+            kept = [f"the {error.windows} windows before"] * (error.windows > 0) + ["the other logs"] * (
+                len(args.logs) > 1
+            )
+            hint = f"; --partial keeps {' and '.join(kept)}" if kept else ""
+            raise WorkError(f"{error}{hint}") from None
+    for fault in faults:
+        print(f"soilbus: {fault}; {fault.windows} windows before that are kept", file=sys.stderr)
+    text = summary(results, pipeline)
+    _write_windows(args, config, results, text)
     if args.map is not None:
-        text, left_out = soil_map(results)
+        map_text, left_out = soil_map(results)
         with whole_file(args.map) as out:
-            out.write(text)
+            out.write(map_text)
         if left_out:
             print(f"soilbus: {left_out} of {len(results)} windows have no position: not on the map", file=sys.stderr)
     if "-" not in (str(args.json), str(args.map)):
-        print(summary(results, pipeline), end="")
+        print(text, end="")
+    _need_a_use(results, config)
+
+
+def _need_a_use(results: Sequence[WindowResult], config: Config) -> None:
+    from soilbus.report.advice import of_use
+    from soilbus.report.windows import why_of_no_use
+
+    if not of_use(results):
+        raise WorkError(why_of_no_use(results, config.estimator.window))
 
 
 def _replay_tables(args: argparse.Namespace, config: Config) -> None:
@@ -150,10 +159,11 @@ def _replay_tables(args: argparse.Namespace, config: Config) -> None:
     except LogError as error:
         raise WorkError(str(error)) from None
     refused = sum((Counter(result.rejected) for result in results), Counter[str]())
-    text = summary_of(results, f"{len(args.logs)} tables", refused)
+    text = summary_of(results, f"{len(args.logs)} tables", None, refused)
     _write_windows(args, config, results, text)
     if str(args.json) != "-":
         print(text, end="")
+    _need_a_use(results, config)
 
 
 def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[WindowResult], text: str) -> None:
