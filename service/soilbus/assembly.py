@@ -33,12 +33,13 @@ def rig_of(config: Config) -> Rig:
         front=np.array([of_table or w.axle == "front" for w in wheels], dtype=bool),
         chassis=chassis_of(config),
         noise=noise,
+        track=None if config.vehicle is None else config.vehicle.track,
     )
 
 
 def chassis_of(config: Config) -> Chassis | None:
     """Mass and geometry, where the configuration has a vehicle."""
-    return None if config.vehicle is None else Chassis(**config.vehicle.model_dump())
+    return None if config.vehicle is None else Chassis(**config.vehicle.model_dump(exclude={"track"}))
 
 
 def prior_of(config: Config) -> SoilPrior:

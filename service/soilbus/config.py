@@ -67,6 +67,8 @@ class Vehicle(_Section):
     cg_ahead_of_rear_axle: PositiveFloat
     cg_height: PositiveFloat
     hitch_height: NonNegativeFloat = 0.5
+    track: PositiveFloat | None = None
+    """Distance between the middles of the left and the right wheels; turns a yaw rate into a difference of speeds."""
 
     @model_validator(mode="after")
     def _cg_between_axles(self) -> Vehicle:
@@ -134,6 +136,8 @@ class Signals(_Section):
     draft: Signal | None = None
     pitch: Signal | None = None
     acceleration: Signal | None = None
+    yaw_rate: Signal | None = None
+    """Positive to the left [rad/s]; tells turns from wheels that spin on one side."""
     latitude: Signal | None = None
     """WGS84, positive north; only for the map."""
     longitude: Signal | None = None
@@ -233,10 +237,11 @@ class NoiseOfChannels(_Section):
     sinkage: Noise = Noise(absolute=0.005)
     pitch: Noise = Noise(absolute=0.003)
     acceleration: Noise = Noise(absolute=0.02)
+    yaw_rate: Noise = Noise(absolute=0.01)
     slip: Noise = Noise(absolute=0.005)
     """Of a table that tells slip itself; its gain is the relative error of 1 - slip."""
 
-    @field_validator("sinkage", "pitch", "acceleration")
+    @field_validator("sinkage", "pitch", "acceleration", "yaw_rate")
     @classmethod
     def _without_gain(cls, noise: Noise) -> Noise:
         if noise.gain:
@@ -297,7 +302,7 @@ class Estimator(_Section):
     min_speed: PositiveFloat = 0.2
     """Below it slip is not judged (standstill gate)."""
     max_turn: PositiveFloat = 0.15
-    """Relative difference of rim speeds of both axles' wheels above which slip is not judged (turn gate)."""
+    """Relative difference of the speeds of left and right wheels in a turn above which slip is not judged (turn gate)."""
     z_ref: PositiveFloat = 0.02
     b_ref: PositiveFloat = 0.3
     max_bearing_std: PositiveFloat = 0.10

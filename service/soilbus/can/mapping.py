@@ -18,7 +18,9 @@ from soilbus.config import Signal as Mapped
 
 WHEEL_ROLES = ("torque", "speed", "load", "sinkage", "torque_limit", "motor_speed")
 POSITION_ROLES = ("latitude", "longitude")
-VEHICLE_ROLES = ("ground_speed", "draft", "pitch", "acceleration", *POSITION_ROLES)
+VEHICLE_ROLES = ("ground_speed", "draft", "pitch", "acceleration", "yaw_rate", *POSITION_ROLES)
+OPTIONAL_ROLES = ("yaw_rate", *POSITION_ROLES)
+"""Without them a window is as good as before."""
 
 MAX_SPEED = 25.0  # m/s, faster than any field tractor
 LEAST_GAP, GAP_CYCLES = 2.0, 1.5
@@ -36,6 +38,7 @@ _DIMENSIONS: dict[str, tuple[str, ...]] = {
     "draft": ("force",),
     "pitch": ("angle",),
     "acceleration": ("acceleration",),
+    "yaw_rate": ("rotation",),
     "latitude": ("angle",),
     "longitude": ("angle",),
 }
@@ -225,6 +228,8 @@ def plausible(config: Config, quantity: str, wheel: Wheel | None) -> tuple[float
             return -1.0, 1.0
         case "acceleration":
             return -20.0, 20.0
+        case "yaw_rate":
+            return -4.0, 4.0  # a skid-steered rover on the spot
         case "latitude":
             return -math.pi / 2.0, math.pi / 2.0
         case "longitude":

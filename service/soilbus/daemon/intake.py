@@ -19,7 +19,7 @@ from soilbus.assembly import rig_of
 from soilbus.can.admission import Admission
 from soilbus.can.channels import Channel, Column, Decoded
 from soilbus.can.dbc_files import checked_messages
-from soilbus.can.mapping import POSITION_ROLES, channels_of
+from soilbus.can.mapping import OPTIONAL_ROLES, POSITION_ROLES, channels_of
 from soilbus.config import Config
 from soilbus.daemon.plausibility import Plausibility
 from soilbus.daemon.positions import PositionTrack
@@ -141,7 +141,7 @@ class Intake:
     def _is_needed(self, channel: Channel) -> bool:
         if channel.wheel:
             return channel.wheel in self.rig.wheels and channel.quantity in ("torque", "speed", "load")
-        return channel.quantity not in POSITION_ROLES
+        return channel.quantity not in OPTIONAL_ROLES
 
     def _restart(self) -> None:
         self.epoch += 1  # nothing of the one before may be carried over
