@@ -36,7 +36,7 @@ def drive(rims, ground, yaw=None) -> Window:
 
 
 def on_a_curve(radius, speed, slips, steer=0.0) -> tuple[np.ndarray, float]:
-    """Rim speeds of a left turn of the rear axle's middle about a centre `radius` away (right if < 0), and the yaw rate.
+    """Rim speeds and yaw rate, the rear axle's middle `radius` from the centre of a turn (to the left if > 0).
 
     The wheels' paths from the geometry of a steered front axle (Ackermann), wheelbase tan(steer) = radius apart.
     """
