@@ -49,7 +49,7 @@ class Usual:
     """From the least to the greatest value that a real machine has; what lies outside is a slip of the pen.
 
     `slips` are units in which the quantity is often written by mistake, with their SI value:
-    the one that makes sense of a value outside is named.
+    the one that makes the most ordinary value of it is named.
     """
 
     low: float
@@ -66,10 +66,12 @@ class Usual:
     def _fault(self, value: float) -> str:
         unit = f" {self.unit}" if self.unit else ""
         text = f"{value:g}{unit} is not from {self.low:g} to {self.high:g}{unit}"
-        for name, size in self.slips:
-            if self.low <= value * size <= self.high:
-                return f"{text}; is it in {name}? {value:g} {name} are {value * size:.4g}{unit}"
-        return text
+        middle = math.sqrt(max(self.low, self.high / 50.0) * self.high)
+        sensible = [(n, value * size) for n, size in self.slips if self.low <= value * size <= self.high]
+        if not sensible:
+            return text
+        name, meant = min(sensible, key=lambda slip: abs(math.log(max(slip[1], 1e-9) / middle)))
+        return f"{text}; is it in {name}? {value:g} {name} are {meant:.4g}{unit}"
 
 
 _SHORT = (("mm", 1e-3), ("cm", 1e-2))

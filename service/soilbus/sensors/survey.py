@@ -575,14 +575,15 @@ def _slips(facts: Facts, limits: Limits) -> Iterator[Finding]:
 
 
 def _why_fast(factor: float) -> str:
+    """What makes rims this many times as fast as the ground, beside a slip of up to 0.4."""
     for known, why in (
-        (3.6, "is the ground speed in km/h less than the DBC says, "),
-        (1.0 / 3.6, "is the ground speed in km/h where the DBC says m/s, "),
-        (2.0, "a diameter in the place of a radius, "),
         (30.0 / math.pi, "are the wheel speeds in rpm where the DBC says rad/s, "),
+        (3.6, "is the ground speed in m/s where the DBC says km/h, "),
+        (2.0, "a diameter in the place of a radius, "),
+        (1.0 / 3.6, "is the ground speed in km/h where the DBC says m/s, "),
         (math.pi / 30.0, "are the wheel speeds in rad/s where the DBC says rpm, "),
     ):
-        if abs(math.log(max(factor, 1e-9) / known)) < 0.15:
+        if 0.95 < factor / known < 1.7:
             return why
     return ""
 
@@ -605,7 +606,8 @@ def _balance(facts: Facts, limits: Limits) -> Iterator[Finding]:
     if median(thrust) > limits.most_thrust * weight:
         yield Finding(
             f"the wheels thrust with {median(thrust) / 1e3:.0f} kN, more than soil can hold under"
-            f" {weight / 1e3:.0f} kN: gear ratios, `at`, or unit or byte order of the torques?",
+            f" {weight / 1e3:.0f} kN: gear_ratio too large, torques measured at the other side of the gear"
+            " (`at`), or their unit or byte order?",
             True,
             torques,
         )
