@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import can
+import numpy as np
 import pytest
 
 from soilbus.assembly import with_effects
@@ -18,12 +19,15 @@ from soilbus.can.dbc_files import load_databases, shipped_dbc
 from soilbus.cli import main
 from soilbus.config import Config
 from soilbus.config_file import load_config
+from soilbus.daemon.intake import Intake
 from soilbus.daemon.replay import read_frames
+from soilbus.estimation.window import turning
 from soilbus.sensors.survey import Survey, survey
 from soilbus.simulator.frames import frames
 from soilbus.simulator.play import scenario_over
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import TRACTOR, reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario, Swing
 
 FIELD = Path(__file__).resolve().parents[1] / "field/field.toml"
 WHEELS = ("FL", "FR", "RL", "RR")
@@ -164,6 +168,51 @@ def test_a_gear_ratio_is_told_by_forces_where_no_motor_speed_is_on_the_bus(field
         assert len(found.faults) == 1
         assert "gear_ratio too large" in found.faults[0]
         assert beside(load_config(config), field_frames(name)).findings == ()
+
+
+def test_a_draft_that_hardly_changes_still_tells_by_its_size():
+    drive = Scenario(30.0, (Patch(0.0, "loam"),), draft=Swing(3500.0, 3500.0))
+    recording = simulate(reference_configuration(), drive, 3)
+    heard = [frame_of(message) for message in frames(recording, reference_configuration())]
+    assert beside(reference_configuration(), heard).findings == ()
+    found = beside(set_for(TRACTOR, [f"wheel.{w}.torque.at=wheel" for w in WHEELS]), heard)
+    assert len(found.faults) == 1
+    assert all(word in found.faults[0] for word in ("the wheels thrust with 0.", "(`at`)"))
+
+
+def test_turns_tell_the_sign_of_the_yaw_rate(tmp_path):
+    imu = (
+        'BO_ 2566862537 Imu: 8 CHASSIS\n SG_ YawRate : 0|16@1+ (0.0005,-16) [-16|16] "rad/s" SOILBUS\n\n'
+        "BO_ 2566861770 DrawbarPin"
+    )
+    dbc = shipped_dbc("tractor.dbc").read_text().replace("BO_ 2566861770 DrawbarPin", imu, 1)
+    path = configured(TRACTOR, "tractor.dbc", dbc, tmp_path)
+    sets = ["signals.yaw_rate=Imu.YawRate", "vehicle.track=1.2"]
+    config = load_config(path, sets)
+    recording = simulate(config, scenario_over(["loam"], 60.0), 9)
+    columns = recording.channels
+    yaw = columns["yaw_rate"]
+    yaw.value += np.where((yaw.t > 20.0) & (yaw.t < 30.0), 0.4, 0.0)  # a left turn, the right wheels go faster
+    for wheel, side in (("FL", -1.0), ("FR", 1.0), ("RL", -1.0), ("RR", 1.0)):
+        radius = next(w.radius for w in config.wheel if w.name == wheel)
+        speed = columns[f"speed.{wheel}"]
+        speed.value += np.where((speed.t > 20.0) & (speed.t < 30.0), side * 0.4 * 1.2 / 2.0 / radius, 0.0)
+    heard = [frame_of(message) for message in frames(recording, config)]
+    assert beside(config, heard).findings == ()
+    wrong = beside(load_config(path, [*sets, "signals.yaw_rate.sign=-1"]), heard)
+    assert len(wrong.faults) == 1
+    assert wrong.faults[0].startswith("signals.yaw_rate: to the left while the left wheels go faster")
+    # in the service: the turn is left out, and a yaw rate that is lost costs nothing but itself
+    for kept in (True, False):
+        intake = Intake(config, load_databases(config))
+        for t, identifier, extended, data, remote, _ in heard:
+            if kept or identifier != 2566862537 & 0x1FFFFFFF:
+                intake.admission.feed(t, identifier, extended, data, remote)
+        tasks = intake.due(heard[-1][0])
+        assert all(task.poor == task.missing == task.implausible == () for task in tasks)
+        turns = {round(task.end - heard[0][0]): turning(task.window, intake.rig, 0.15).sum() for task in tasks}
+        assert turns[18] == turns[42] == 0
+        assert turns[30] == pytest.approx(98, abs=3)
 
 
 def test_a_whole_axle_in_a_mirror_is_the_same_vehicle(field_frames):

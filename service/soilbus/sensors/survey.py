@@ -11,7 +11,8 @@ check compares means over a whole recording with what the vehicle is said to be:
                 right, and with its slip: the signs of a regression tell loads, speeds or torques
                 that are swapped.  All three swapped at once are the same vehicle in a mirror.
 
-Where a recording does not vary enough to tell, the survey says so.
+Where a recording does not vary enough to tell, the survey says so.  Nothing tells the loads of a
+front and a rear wheel apart that carry alike.
 """
 
 from __future__ import annotations
@@ -82,6 +83,10 @@ class Limits:
     """Slope of the balance."""
     excited: float = 0.008
     """Sd of the draft's changes within 1 s, as share of the weight, from which the balance tells anything."""
+    pull: float = 0.02
+    """Median pull, as share of the weight, from which its size counts."""
+    less_thrust: float = 0.9
+    """Thrust over pull, at least: rolling resistance, never less than a hundredth of the weight, is in the thrust."""
     most_thrust: float = 0.9
     """Median thrust over weight: no soil bears more for long."""
     side_sd: float = 4.0
@@ -384,7 +389,8 @@ def _dimension(channel: Channel) -> str:
 def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config, limits: Limits) -> Iterator[Finding]:
     """Values that never change although the vehicle drives, and values that jump as no vehicle does."""
     ground = heard.get("ground_speed", (np.empty(0), np.empty(0)))
-    drives = np.ptp(ground[0][np.abs(ground[1]) > config.estimator.min_speed]) if len(ground[0]) else 0.0
+    moving = ground[0][np.abs(ground[1]) > config.estimator.min_speed]
+    drives = float(np.ptp(moving)) if len(moving) else 0.0
     for s in seen:
         quantity, name = s.channel.quantity, s.channel.name
         if quantity in ("torque_limit", *POSITION_ROLES) or s.count < 50:
@@ -429,7 +435,7 @@ def _compared(
         ]
     findings: list[Finding] = []
     questions: list[str] = []
-    for check in (_weight, _ways, _gears, _slips, _balance, _sides, _yaw):
+    for check in (_weight, _ways, _gears, _slips, _balance, _levels, _sides, _yaw):
         try:
             found = list(check(facts, limits))
         except NotToldError as reason:
@@ -511,7 +517,7 @@ def _ways(facts: Facts, limits: Limits) -> Iterator[Finding]:
             text = f"wheel.{wheel}.speed: turns backward while most wheels turn forward: sign = -1?"
             yield Finding(text, True, (f"speed.{wheel}", f"torque.{wheel}"))
     thrust = [median(facts.thrust[:, i]) for i in range(len(rig.wheels))]
-    share = np.array(thrust) / median(np.abs(np.array(thrust)))
+    share = np.array(thrust) / max(np.nanmax(np.abs(thrust), initial=0.0), 1.0)
     drives = np.nansum(np.sign(share) * (np.abs(share) > 0.2))
     for wheel, part in zip(rig.wheels, share.tolist(), strict=True):
         if drives > 0.0 and part < -0.2:
@@ -598,7 +604,7 @@ def _balance(facts: Facts, limits: Limits) -> Iterator[Finding]:
     if median(thrust) < -0.02 * weight:
         yield Finding(
             f"the wheels brake with {-median(thrust) / 1e3:.1f} kN all along while the vehicle drives on: sign of the"
-            " torques (sign = -1)?",
+            " torques, or of the wheel speeds (sign = -1)?",
             True,
             torques,
         )
@@ -656,6 +662,25 @@ def _balance(facts: Facts, limits: Limits) -> Iterator[Finding]:
             " sign = -1)?",
             True,
             (name,),
+        )
+
+
+def _levels(facts: Facts, limits: Limits) -> Iterator[Finding]:
+    """Thrust beside pull all along: the wheels give the pull and what the soil resists besides."""
+    window, rig, chassis = facts.window, facts.rig, facts.rig.chassis
+    if chassis is None:
+        return
+    weight = chassis.mass * GRAVITY
+    thrust = median(facts.thrust.sum(axis=1))
+    known = facts.straight & np.isfinite(window.pitch)
+    asked = median(pull_given(window, chassis)[known])
+    if asked > limits.pull * weight and thrust < limits.less_thrust * asked:
+        yield Finding(
+            f"the wheels thrust with {thrust / 1e3:.2f} kN, but draft, slope and inertia alone ask for"
+            f" {asked / 1e3:.2f} kN: gear_ratio too small, torques measured at the other side of the gear (`at`), or"
+            " unit of torque or draft?",
+            True,
+            (*(f"torque.{w}" for w in rig.wheels), "draft"),
         )
 
 
