@@ -52,7 +52,7 @@ slips = st.floats(0.0, 0.6)
 
 @given(
     to=st.sampled_from([-1.0, 1.0]),
-    radius=st.floats(1.6, 6.0),
+    radius=st.floats(1.6, 4.0),
     speed=st.floats(0.3, 3.0),
     slip=slips,
     steer=st.floats(0.0, 0.7),
