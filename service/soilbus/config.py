@@ -81,6 +81,7 @@ RADIUS = Usual(0.05, 1.5, "m", _SHORT)
 WIDTH = Usual(0.02, 2.0, "m", _SHORT)
 MASS = Usual(20.0, 6.0e4, "kg", (("t", 1e3),))
 WHEELBASE = Usual(0.2, 8.0, "m", _SHORT)
+CG_AHEAD = Usual(0.02, 8.0, "m", _SHORT)
 HEIGHT = Usual(0.02, 4.0, "m", _SHORT)
 HITCH_HEIGHT = Usual(0.0, 2.5, "m", _SHORT)
 TRACK = Usual(0.15, 5.0, "m", _SHORT)
@@ -130,7 +131,7 @@ class Vehicle(_Section):
 
     mass: Annotated[PositiveFloat, AfterValidator(MASS)]
     wheelbase: Annotated[PositiveFloat, AfterValidator(WHEELBASE)]
-    cg_ahead_of_rear_axle: Annotated[PositiveFloat, AfterValidator(WHEELBASE)]
+    cg_ahead_of_rear_axle: Annotated[PositiveFloat, AfterValidator(CG_AHEAD)]
     cg_height: Annotated[PositiveFloat, AfterValidator(HEIGHT)]
     hitch_height: Annotated[NonNegativeFloat, AfterValidator(HITCH_HEIGHT)] = 0.5
     track: Annotated[PositiveFloat, AfterValidator(TRACK)] | None = None
