@@ -98,7 +98,7 @@ MISTAKES = {
     "mass 5071, in lb": (["vehicle.mass=5071"], ["vehicle.mass = 5071 kg", "lb"]),
     "mass 8818": (["vehicle.mass=8818"], ["vehicle.mass = 8818 kg"]),
     "mass a sixth less": (["vehicle.mass=1900"], ["vehicle.mass = 1900 kg"]),
-    "gear ratio of all": (EACH_GEAR, ["wheel.RR.gear_ratio = 48", "the motor turns 24"]),
+    "gear ratio of all": (EACH_GEAR, ["wheel.RR.gear_ratio = 48", "RR.ShaftSpeed turns 24"]),
     "gear ratio of one": (["wheel.RL.gear_ratio=12"], ["wheel.RL.gear_ratio = 12", "turns 24 times as fast"]),
     "draft sign": (["signals.draft.sign=-1"], ["signals.draft", "sign of the draft"]),
     "acceleration sign": (["signals.acceleration.sign=-1"], ["signals.acceleration"]),
@@ -213,6 +213,16 @@ def test_turns_tell_the_sign_of_the_yaw_rate(tmp_path):
         turns = {round(task.end - heard[0][0]): turning(task.window, intake.rig, 0.15).sum() for task in tasks}
         assert turns[18] == turns[42] == 0
         assert turns[30] == pytest.approx(98, abs=3)
+
+
+def test_a_speed_beside_the_torque_that_is_the_wheels_own_is_no_wrong_gear(field_frames, tmp_path):
+    dbc = re.sub(
+        r"(ShaftSpeed .*)\(0.125,0\)(.*)", rf"\1({0.125 / 24.0!r},0)\2", FIELD.with_name("field.dbc").read_text()
+    )
+    config = configured(FIELD, "field.dbc", dbc, tmp_path)
+    assert beside(load_config(config), field_frames("loam")).findings == ()
+    mapped = load_config(config, ["wheel.FL.motor_speed=McuFL.ShaftSpeed"])
+    assert any("McuFL.ShaftSpeed turns 1 times" in line for line in beside(mapped, field_frames("loam")).faults)
 
 
 def test_a_whole_axle_in_a_mirror_is_the_same_vehicle(field_frames):

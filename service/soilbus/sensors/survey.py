@@ -33,7 +33,7 @@ from soilbus.can.channels import Channel, Reason
 from soilbus.can.dbc_files import checked_messages
 from soilbus.can.mapping import OPTIONAL_ROLES, POSITION_ROLES, channels_of
 from soilbus.can.units import SI, unit_of
-from soilbus.config import Config, Signal
+from soilbus.config import Config, ConfigError, Signal
 from soilbus.daemon.plausibility import resolution_of
 from soilbus.estimation.plausibility import implausible, without
 from soilbus.estimation.series import change, median
@@ -148,7 +148,9 @@ class NotToldError(Exception):
 
 
 class Facts(NamedTuple):
-    """A recording's bins: as measured (`raw`) and forward; where it drives straight on (N,); motor speeds (N, W)."""
+    """A recording's bins: as measured (`raw`) and forward; where it drives straight on (N,); motor speeds
+    (N, W); the names of the mapped channels.
+    """
 
     config: Config
     rig: Rig
@@ -156,6 +158,7 @@ class Facts(NamedTuple):
     window: Window
     straight: Mask
     motor: Array
+    mapped: frozenset[str]
 
     @property
     def slip(self) -> Array:
@@ -183,8 +186,11 @@ def survey(config: Config, database: Database, frames: Iterable[Frame], limits: 
     Raises ConfigError where configuration and database do not fit.
     """
     told = config.model_copy(update={"wheel": _with_motor_speeds(config, database)})
-    channels = channels_of(told, database)
     mapped = {c.name for c in channels_of(config, database)}
+    try:
+        channels = channels_of(told, database)
+    except ConfigError:  # of a speed that nobody mapped
+        told, channels = config, channels_of(config, database)
     admission = Admission(channels, database, checked_messages(config))
     parts, refused, n = _heard(admission, frames)
     longest = max(parts, key=lambda part: sum(len(t) for t, _ in part.values()))
@@ -194,7 +200,7 @@ def survey(config: Config, database: Database, frames: Iterable[Frame], limits: 
         return Survey(seen, (Finding(text, True),), ())
     findings = [*_absent(seen, database), *(f for s in seen for f in _of_one(s, database, limits))]
     findings += _stuck_and_jagged(seen, longest, config, limits)
-    facts = _facts(config, channels, longest)
+    facts = _facts(told, mapped, longest)
     open_questions = [f"{_key(s.channel)}: not in this recording" for s in seen if _is_absent(s) and _is_optional(s)]
     if facts is not None:
         found, questions = _compared(facts, findings, channels, database, limits)
@@ -279,7 +285,7 @@ def _seen(channel: Channel, heard: Columns, refused: Mapping[tuple[str, Reason],
     return Seen(channel, len(t), float(rate), low, high, why)
 
 
-def _facts(config: Config, channels: Iterable[Channel], heard: Columns) -> Facts | None:
+def _facts(config: Config, mapped: Iterable[str], heard: Columns) -> Facts | None:
     """The recording in bins; None where no wheel is measured or nothing was heard of the rig."""
     rig, bin_length = rig_of(config), config.estimator.bin
     known = {name: column for name, column in heard.items() if name in set(rig.channels)}
@@ -299,7 +305,7 @@ def _facts(config: Config, channels: Iterable[Channel], heard: Columns) -> Facts
             motor[:, i] = _binned(*heard[f"motor_speed.{wheel}"], start, bin_length, len(raw.t))
     moving = np.abs(window.ground_speed) > config.estimator.min_speed
     straight = moving & ~turning(window, rig, config.estimator.max_turn)
-    return Facts(config, rig, raw, window, straight, motor)
+    return Facts(config, rig, raw, window, straight, motor, frozenset(mapped))
 
 
 def _binned(t: Array, value: Array, start: float, bin_length: float, n: int) -> Array:
@@ -530,18 +536,22 @@ def _ways(facts: Facts, limits: Limits) -> Iterator[Finding]:
 
 
 def _gears(facts: Facts, limits: Limits) -> Iterator[Finding]:
-    """The motors' speeds beside the wheels'."""
+    """The motors' speeds beside the wheels'; one that nobody mapped may be at the wheel itself."""
     for i, wheel in enumerate(facts.rig.wheels):
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = median(np.abs(facts.motor[:, i] / facts.raw.speed[:, i])[facts.straight])
-        if math.isfinite(ratio) and abs(math.log(max(ratio, 1e-9))) > limits.gear:
-            gear = next(w.gear_ratio for w in facts.config.wheel if w.name == wheel)
-            yield Finding(
-                f"wheel.{wheel}.gear_ratio = {gear:g}, but the motor turns {gear * ratio:.4g} times as fast as the"
-                " wheel: gear ratio, or unit or byte order of one of the speeds?",
-                True,
-                (f"torque.{wheel}", f"motor_speed.{wheel}"),
-            )
+        own = next(w for w in facts.config.wheel if w.name == wheel)
+        if not math.isfinite(ratio) or abs(math.log(max(ratio, 1e-9))) < limits.gear or own.motor_speed is None:
+            continue
+        if f"motor_speed.{wheel}" not in facts.mapped and abs(own.gear_ratio * ratio - 1.0) < limits.gear:
+            continue
+        yield Finding(
+            f"wheel.{wheel}.gear_ratio = {own.gear_ratio:g}, but {own.motor_speed.signal} turns"
+            f" {own.gear_ratio * ratio:.4g} times as fast as the wheel: gear ratio, or unit or byte order of one of the"
+            " speeds?",
+            True,
+            (f"torque.{wheel}", f"motor_speed.{wheel}"),
+        )
 
 
 def _slips(facts: Facts, limits: Limits) -> Iterator[Finding]:
@@ -756,10 +766,11 @@ def _contradictions(facts: Facts, channels: Iterable[Channel], database: Databas
     resolution = {c.name: resolution_of(c, database) for c in channels}
     n = max(round(s.window / s.bin), 1)
     named: Counter[str] = Counter()
+    mapped = np.array([f"motor_speed.{w}" in facts.mapped for w in rig.wheels])
     begins = range(0, max(len(facts.window.t) - n, 0) + 1, n)
     for begin in begins:
         rows = np.arange(begin, min(begin + n, len(facts.window.t)))
-        motor = np.abs(facts.motor[rows])
+        motor = np.where(mapped, np.abs(facts.motor[rows]), np.nan)
         named.update(implausible(facts.window.rows(rows), rig, s.min_speed, s.max_turn, s.bin, resolution, motor))
     for name, count in named.items():
         if count > max(limits.windows * len(begins), 1.0):
