@@ -63,7 +63,12 @@ def command_line() -> argparse.ArgumentParser:
     sub = command("run", "the service on a live bus")
     sub.add_argument("--wait", action="store_true", help="wait for an interface that is not there yet")
 
-    command("check", "check configuration and DBCs, list every mapped signal")
+    sub = command("check", "check configuration and DBCs, list every mapped signal")
+    heard = sub.add_mutually_exclusive_group()
+    heard.add_argument("--log", type=Path, metavar="LOG", help="and compare them with a recording")
+    heard.add_argument(
+        "--live", type=between(1.0, 3600.0), metavar="SECONDS", help="and with so many seconds of the configured bus"
+    )
 
     sub = command("replay", "the service's own pipeline over recorded logs")
     sub.add_argument("logs", nargs="+", type=Path, metavar="LOG")

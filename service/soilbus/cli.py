@@ -10,7 +10,7 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,8 +20,10 @@ from soilbus.arguments import command_line
 from soilbus.report.whole_file import NotWritten, whole_file
 
 if TYPE_CHECKING:
+    from soilbus.can.candump import Frame
     from soilbus.config import Config
     from soilbus.daemon.result import WindowResult
+    from soilbus.sensors.survey import Survey
 
 DONE, FAILED, WRONG_USAGE = 0, 1, 2
 
@@ -91,15 +93,57 @@ def _run(args: argparse.Namespace) -> None:
 
 
 def _check(args: argparse.Namespace) -> None:
-    from soilbus.report.configuration import configuration_report
+    from soilbus.config import ConfigError
+    from soilbus.report.configuration import configuration_report, configuration_warnings, survey_report
 
-    print(configuration_report(_configured(args)), end="")
+    config = _configured(args)
+    print(configuration_report(config), end="")
+    warnings, faults = configuration_warnings(config), list[str]()
+    if args.log is not None or args.live is not None:
+        found, of_channel = _surveyed(args, config)
+        print(survey_report(found), end="")
+        warnings += [*of_channel, *found.warnings]
+        faults = found.faults
+    for line in warnings:
+        print(f"soilbus: warning: {line}", file=sys.stderr)
+    if faults:
+        raise ConfigError(faults)
+
+
+def _surveyed(args: argparse.Namespace, config: Config) -> tuple[Survey, list[str]]:
+    """What a recording, or the bus, says of the configuration, and whether it is of the configured channel."""
+    from soilbus.can.bus import BusError, heard_for
+    from soilbus.can.dbc_files import load_databases
+    from soilbus.config import ConfigError
+    from soilbus.daemon.replay import LogError, other_channel, read_frames
+    from soilbus.report.progress import progress
+    from soilbus.sensors.survey import survey
+
+    if config.table is not None:
+        raise ConfigError(["[table]: check compares no table; replay and diagnose read it"])
+    database = load_databases(config)
+    try:
+        if args.live is not None:
+            return survey(config, database, heard_for(config.bus.model_dump(), args.live)), []
+        with progress("check") as step:
+            return survey(config, database, _counted(read_frames(args.log), step)), other_channel(config, [args.log])
+    except (LogError, BusError) as error:
+        raise WorkError(str(error)) from None
+
+
+def _counted(frames: Iterable[Frame], step: Callable[[int, float], None] | None) -> Iterator[Frame]:
+    first = None
+    for n, frame in enumerate(frames):
+        if step is not None and n % 10_000 == 0:
+            first = frame[0] if first is None else first
+            step(n, frame[0] - first)
+        yield frame
 
 
 def _replay(args: argparse.Namespace) -> None:
     from soilbus.can.dbc_files import load_databases
     from soilbus.daemon.pipeline import Pipeline
-    from soilbus.daemon.replay import LogError, estimator_beside, replay
+    from soilbus.daemon.replay import LogError, estimator_beside, other_channel, replay
     from soilbus.report.progress import progress
     from soilbus.report.soil_map import check_position_is_mapped, soil_map
     from soilbus.report.windows import summary
@@ -112,6 +156,8 @@ def _replay(args: argparse.Namespace) -> None:
     if config.table is not None:
         _replay_tables(args, config)
         return
+    for line in other_channel(config, args.logs):
+        print(f"soilbus: {line}", file=sys.stderr)
     pipeline = Pipeline(config, load_databases(config))
     results: list[WindowResult] = []
     faults: list[LogError] = []

@@ -82,7 +82,7 @@ def test_other_formats_are_read_too(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("bin_length", [0.1, 0.25, 0.5])
 def test_coverage_counts_half_seconds_with_a_sample(bin_length: float) -> None:
-    quantities = ("torque", "load", "speed", "sinkage", "ground_speed", "draft", "pitch", "acceleration")
+    quantities = ("torque", "load", "speed", "sinkage", "ground_speed", "draft", "pitch", "acceleration", "yaw_rate")
     noise = dict.fromkeys(quantities, SensorNoise(absolute=1.0))
     rig = Rig(("A", "B"), np.ones(2), np.ones(2), np.array([True, False]), None, noise)
     store = BinStore(rig, bin_length, 0.0)

@@ -63,7 +63,7 @@ def test_configuration_of_a_rig_is_checked_with_a_line_for_each_fault():
     assert "factor of 0" in fault({"table": table | {"slip": {"column": "s", "factor": 0.0}}})
     assert "nothing to compare" in fault({"table": {"wheel_load": "load", "slip": "slip"}})
     assert "source must be a text or a number" in fault({"table": table | {"where": {"source": [1, 2]}}})
-    vehicle = {"mass": 1.0, "wheelbase": 2.0, "cg_ahead_of_rear_axle": 1.0, "cg_height": 1.0}
+    vehicle = {"mass": 1000.0, "wheelbase": 2.0, "cg_ahead_of_rear_axle": 1.0, "cg_height": 1.0}
     assert "no [vehicle]" in fault({"vehicle": vehicle})
     with pytest.raises(ConfigError, match="axle: missing"):
         parse_config({"wheel": [wheel]})

@@ -20,7 +20,7 @@ from soilbus.assembly import rig_of
 from soilbus.can.admission import LONGEST_GAP, Admission
 from soilbus.can.channels import Channel, Decoded
 from soilbus.can.dbc_files import checked_messages
-from soilbus.can.mapping import POSITION_ROLES, channels_of
+from soilbus.can.mapping import OPTIONAL_ROLES, POSITION_ROLES, channels_of
 from soilbus.capability.traction_loss import Motion, motion_of
 from soilbus.config import Config
 from soilbus.daemon.plausibility import Plausibility
@@ -201,7 +201,7 @@ class Intake:
     def _is_needed(self, channel: Channel) -> bool:
         if channel.wheel:
             return channel.wheel in self.rig.wheels and channel.quantity in ("torque", "speed", "load")
-        return channel.quantity not in POSITION_ROLES
+        return channel.quantity not in OPTIONAL_ROLES
 
     def begin_anew(self) -> None:
         """What comes next is a recording of its own: its clock was set, or the bus was silent for long."""

@@ -7,11 +7,11 @@ import math
 import os
 import sys
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import chain
+from itertools import chain, islice
 from multiprocessing import get_all_start_methods, get_context
 from pathlib import Path
 from typing import Any, TypeVar
@@ -29,6 +29,8 @@ from soilbus.daemon.result import WindowResult
 _T = TypeVar("_T")
 
 SWITCH_INTERVAL = 0.0002
+FIRST_LINES = 2000
+"""Lines of a log in which its channels are looked for: several seconds of a bus."""
 MAX_AHEAD = 30
 """Windows that may wait for the estimator."""
 
@@ -256,3 +258,26 @@ def _estimate(task: WindowTask) -> Undecided:
     if _estimator is None:
         raise RuntimeError("estimator_beside() was not entered")
     return _estimator.estimate(task)
+
+
+def other_channel(config: Config, logs: Iterable[Path]) -> list[str]:
+    """A line for each candump log whose first lines are of another channel than the configured one, or of several."""
+    lines = []
+    for path in logs:
+        names = _channels(path)
+        if names and names != {config.bus.channel}:
+            of = " and ".join(sorted(names))
+            lines.append(f"{path}: frames of {of}, where bus.channel = {config.bus.channel}; all of them count")
+    return lines
+
+
+def _channels(path: Path) -> set[str]:
+    """Channels in the first lines of a candump log; none for other formats and what cannot be read."""
+    if ".log" not in path.suffixes[-2:]:
+        return set()
+    try:
+        with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as text:
+            words = [line.split(maxsplit=2) for line in islice(text, FIRST_LINES)]
+    except (OSError, EOFError, ValueError):
+        return set()
+    return {word[1] for word in words if len(word) == 3 and word[0].startswith("(")}
