@@ -218,6 +218,24 @@ def test_usage_errors_exit_with_2(capsys):
         assert stop.value.code == 2
 
 
+def test_without_a_window_of_use_the_outputs_are_kept_and_one_line_says_why(log, tractor, tmp_path, capsys):
+    whole = log.read_text().splitlines(keepends=True)
+    (tmp_path / "deaf.log").write_text("".join(line for line in whole if "18FF32C8#" not in line))
+    (tmp_path / "short.log").write_text("".join(whole[:3000]))
+    capsys.readouterr()
+    for name, n, why in (
+        ("deaf.log", 4, "no window could be used: 4 of 4 are invalid: input_missing load.FL"),
+        ("short.log", 0, "no window could be made: no recording lasts the 10 s of a window"),
+    ):
+        out = tmp_path / "out.jsonl"
+        assert main(["replay", "--config", str(tractor), str(tmp_path / name), "--json", str(out)]) == 1
+        printed, err = lines(capsys)
+        assert len(out.read_text().splitlines()) == n
+        assert printed[1] == f"of use: 0 valid, 0 with a doubtful estimate; of no use: {n}"
+        assert len(err) == 1
+        assert why in err[0]
+
+
 def test_report_is_one_page_with_its_picture_inside(log, tractor, tmp_path, capsys):
     pytest.importorskip("matplotlib", reason="the extra `plots` is not installed")
     out = tmp_path / "report.html"
@@ -228,11 +246,14 @@ def test_report_is_one_page_with_its_picture_inside(log, tractor, tmp_path, caps
     assert page.count("<tr>") == 1 + 4
 
 
-def test_deere_logs_never_claim_to_know(field_recording, tmp_path):
+def test_deere_logs_never_claim_to_know(field_recording, tmp_path, capsys):
     out = tmp_path / "out.jsonl"
     for name in ("start", "in-gear"):
         log = field_recording(f"deere-5055e-{name}.log.gz")
-        assert main(["replay", "--config", str(FIELD.with_name("deere.toml")), str(log), "--json", str(out)]) == 0
+        assert main(["replay", "--config", str(FIELD.with_name("deere.toml")), str(log), "--json", str(out)]) == 1
+        (error,) = lines(capsys)[1]
+        assert "no window could be used" in error
+        assert "no usable value of ground_speed" in error
         windows = [json.loads(line) for line in out.read_text().splitlines()]
         assert len(windows) > 20
         assert {w["state"] for w in windows} <= {"listening", "degraded"}

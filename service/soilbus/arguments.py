@@ -63,14 +63,19 @@ def command_line() -> argparse.ArgumentParser:
     sub = command("run", "the service on a live bus")
     sub.add_argument("--wait", action="store_true", help="wait for an interface that is not there yet")
 
-    command("check", "check configuration and DBCs, list every mapped signal")
+    sub = command("check", "check configuration and DBCs, list every mapped signal")
+    heard = sub.add_mutually_exclusive_group()
+    heard.add_argument("--log", type=Path, metavar="LOG", help="and compare them with a recording")
+    heard.add_argument(
+        "--live", type=between(1.0, 3600.0), metavar="SECONDS", help="and with so many seconds of the configured bus"
+    )
 
     sub = command("replay", "the service's own pipeline over recorded logs")
     sub.add_argument("logs", nargs="+", type=Path, metavar="LOG")
     sub.add_argument("--json", type=Path, metavar="OUT", help="one JSON object a line per window; - for stdout")
     sub.add_argument("--report", type=Path, metavar="OUT.html", help="self-contained HTML with plots (extra: plots)")
     sub.add_argument("--map", type=Path, metavar="OUT.geojson", help="a point for each window; needs a mapped position")
-    sub.add_argument("--partial", action="store_true", help="keep the windows before the point where a log is cut off")
+    sub.add_argument("--partial", action="store_true", help="keep the windows before the point where a log is damaged")
 
     sub = command("simulate", "simulated tractor, to a bus in real time or to a log", "optional")
     sub.add_argument("--soil", action="append", default=[], metavar="NAME", help="soil; repeat it for a sequence")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,15 +13,23 @@ from soilbus.config import Effect as EffectSetting
 from soilbus.estimation.effect_parameters import Free
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.window import Rig, SensorNoise
+from soilbus.spelling import did_you_mean
 from soilbus.terra.effects.effect import Active, Effect, Parameter
 from soilbus.terra.vehicle import Chassis
 from soilbus.terra.wheel import FAST_NODES, WheelModel
 
 
 def rig_of(config: Config) -> Rig:
-    """The vehicle with the wheels that have all of torque, speed and load; the one wheel of a test rig."""
+    """The vehicle with all its wheels; the one wheel of a test rig; no wheel where none is measured.
+
+    ConfigError with a line for each wheel that is not measured while others are, and for an
+    axle without wheels: what it carries and its rolling resistance would be put down to the
+    soil under the others.
+    """
     of_table = config.table is not None
-    wheels = [w for w in config.wheel if of_table or (w.torque and w.speed and w.load)]
+    if faults := [] if of_table else list(_unmeasured(config)):
+        raise ConfigError(faults)
+    wheels = [w for w in config.wheel if of_table or not w.lacking]
     noise = {q: SensorNoise(**getattr(config.noise, q).model_dump()) for q in type(config.noise).model_fields}
     slip = noise.pop("slip")
     if of_table:  # its speeds are stand-ins for the slip, see tables.py
@@ -33,12 +41,30 @@ def rig_of(config: Config) -> Rig:
         front=np.array([of_table or w.axle == "front" for w in wheels], dtype=bool),
         chassis=chassis_of(config),
         noise=noise,
+        track=None if config.vehicle is None else config.vehicle.track,
     )
+
+
+def _unmeasured(config: Config) -> Iterator[str]:
+    """A line for each wheel that carries the vehicle unseen, where others are measured."""
+    if all(w.lacking for w in config.wheel):
+        return
+    for w in config.wheel:
+        if missing := w.lacking:
+            keys = " and ".join(f"wheel.{w.name}.{role}" for role in missing)
+            yield (
+                f"wheel {w.name} has no {' and no '.join(missing)}: map {keys}; without, its rolling resistance"
+                " would be put down to the soil under the other wheels"
+            )
+    if config.vehicle is not None:
+        for axle in ("front", "rear"):
+            if axle not in {w.axle for w in config.wheel}:
+                yield f"no [[wheel]] is on the {axle} axle, which carries its share of the weight: give all wheels"
 
 
 def chassis_of(config: Config) -> Chassis | None:
     """Mass and geometry, where the configuration has a vehicle."""
-    return None if config.vehicle is None else Chassis(**config.vehicle.model_dump())
+    return None if config.vehicle is None else Chassis(**config.vehicle.model_dump(exclude={"track"}))
 
 
 def prior_of(config: Config) -> SoilPrior:
@@ -146,7 +172,11 @@ def _set_effect(settings: dict[str, dict[str, Any]], text: str, wheels: Sequence
 def _active(setting: EffectSetting, shear_law: str, wheels: Sequence[str]) -> Active:
     effect, given = _effect(setting.name), setting.model_extra or {}
     names = [parameter.name for parameter in effect.parameters]
-    faults = [f"{effect.name} has no parameter {key}; known: {', '.join(names)}" for key in given if key not in names]
+    faults = [
+        f"{effect.name} has no parameter {key}{did_you_mean(key, names)}; known: {', '.join(names)}"
+        for key in given
+        if key not in names
+    ]
     if effect.base_law not in (None, shear_law):
         faults.append(f"{effect.name} can be added to shear_law = {effect.base_law} only")
     values: dict[str, Any] = {}
@@ -167,7 +197,7 @@ def _effect(name: str) -> Effect:
     from soilbus.terra.effects.catalogue import CATALOGUE
 
     if name not in CATALOGUE:
-        raise ConfigError([f"no effect is named {name}; known: {', '.join(CATALOGUE)}"])
+        raise ConfigError([f"no effect is named {name}{did_you_mean(name, CATALOGUE)}; known: {', '.join(CATALOGUE)}"])
     return CATALOGUE[name]
 
 
@@ -175,7 +205,7 @@ def _of_wheels(given: Any, parameter: Parameter, wheels: Sequence[str]) -> Any:
     if not _by_wheel(given):
         return np.full(len(wheels), _within(given, parameter))
     if unknown := [name for name in given if name not in wheels]:
-        raise ConfigError([f"no wheel is named {name}" for name in unknown])
+        raise ConfigError([f"no wheel is named {name}{did_you_mean(name, wheels)}" for name in unknown])
     return np.array([_within(given.get(name, parameter.neutral), parameter) for name in wheels])
 
 

@@ -10,7 +10,7 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,8 +20,10 @@ from soilbus.arguments import command_line
 from soilbus.report.whole_file import NotWritten, whole_file
 
 if TYPE_CHECKING:
+    from soilbus.can.candump import Frame
     from soilbus.config import Config
     from soilbus.daemon.result import WindowResult
+    from soilbus.sensors.survey import Survey
 
 DONE, FAILED, WRONG_USAGE = 0, 1, 2
 
@@ -91,15 +93,57 @@ def _run(args: argparse.Namespace) -> None:
 
 
 def _check(args: argparse.Namespace) -> None:
-    from soilbus.report.configuration import configuration_report
+    from soilbus.config import ConfigError
+    from soilbus.report.configuration import configuration_report, configuration_warnings, survey_report
 
-    print(configuration_report(_configured(args)), end="")
+    config = _configured(args)
+    print(configuration_report(config), end="")
+    warnings, faults = configuration_warnings(config), list[str]()
+    if args.log is not None or args.live is not None:
+        found, of_channel = _surveyed(args, config)
+        print(survey_report(found), end="")
+        warnings += [*of_channel, *found.warnings]
+        faults = found.faults
+    for line in warnings:
+        print(f"soilbus: warning: {line}", file=sys.stderr)
+    if faults:
+        raise ConfigError(faults)
+
+
+def _surveyed(args: argparse.Namespace, config: Config) -> tuple[Survey, list[str]]:
+    """What a recording, or the bus, says of the configuration, and whether it is of the configured channel."""
+    from soilbus.can.bus import BusError, heard_for
+    from soilbus.can.dbc_files import load_databases
+    from soilbus.config import ConfigError
+    from soilbus.daemon.replay import LogError, other_channel, read_frames
+    from soilbus.report.progress import progress
+    from soilbus.sensors.survey import survey
+
+    if config.table is not None:
+        raise ConfigError(["[table]: check compares no table; replay and diagnose read it"])
+    database = load_databases(config)
+    try:
+        if args.live is not None:
+            return survey(config, database, heard_for(config.bus.model_dump(), args.live)), []
+        with progress("check") as step:
+            return survey(config, database, _counted(read_frames(args.log), step)), other_channel(config, [args.log])
+    except (LogError, BusError) as error:
+        raise WorkError(str(error)) from None
+
+
+def _counted(frames: Iterable[Frame], step: Callable[[int, float], None] | None) -> Iterator[Frame]:
+    first = None
+    for n, frame in enumerate(frames):
+        if step is not None and n % 10_000 == 0:
+            first = frame[0] if first is None else first
+            step(n, frame[0] - first)
+        yield frame
 
 
 def _replay(args: argparse.Namespace) -> None:
     from soilbus.can.dbc_files import load_databases
     from soilbus.daemon.pipeline import Pipeline
-    from soilbus.daemon.replay import LogError, check_heard, estimator_beside, replay
+    from soilbus.daemon.replay import LogError, estimator_beside, other_channel, replay
     from soilbus.report.progress import progress
     from soilbus.report.soil_map import check_position_is_mapped, soil_map
     from soilbus.report.windows import summary
@@ -112,30 +156,41 @@ def _replay(args: argparse.Namespace) -> None:
     if config.table is not None:
         _replay_tables(args, config)
         return
+    for line in other_channel(config, args.logs):
+        print(f"soilbus: {line}", file=sys.stderr)
     pipeline = Pipeline(config, load_databases(config))
     results: list[WindowResult] = []
-    cut_off: LogError | None = None
+    faults: list[LogError] = []
     with estimator_beside(config) as workers, progress("replay") as step:
         try:
-            for result in replay(pipeline, args.logs, step, workers):
-                results.append(result)
-            check_heard(pipeline, args.logs)
+            results.extend(replay(pipeline, args.logs, step, workers, faults.append if args.partial else None))
         except LogError as error:
-            if not (args.partial and results):
-                hint = "" if not results else f"; --partial keeps the {len(results)} windows before"
-                raise WorkError(f"{error}{hint}") from None
-            cut_off = error
-    if cut_off is not None:
-        print(f"soilbus: {cut_off}; {len(results)} windows before that are kept", file=sys.stderr)
-    _write_windows(args, config, results, summary(results, pipeline))
+            kept = [f"the {error.windows} windows before"] * (error.windows > 0) + ["the other logs"] * (
+                len(args.logs) > 1
+            )
+            hint = f"; --partial keeps {' and '.join(kept)}" if kept else ""
+            raise WorkError(f"{error}{hint}") from None
+    for fault in faults:
+        print(f"soilbus: {fault}; {fault.windows} windows before that are kept", file=sys.stderr)
+    text = summary(results, pipeline)
+    _write_windows(args, config, results, text)
     if args.map is not None:
-        text, left_out = soil_map(results)
+        map_text, left_out = soil_map(results)
         with whole_file(args.map) as out:
-            out.write(text)
+            out.write(map_text)
         if left_out:
             print(f"soilbus: {left_out} of {len(results)} windows have no position: not on the map", file=sys.stderr)
     if "-" not in (str(args.json), str(args.map)):
-        print(summary(results, pipeline), end="")
+        print(text, end="")
+    _need_a_use(results, config)
+
+
+def _need_a_use(results: Sequence[WindowResult], config: Config) -> None:
+    from soilbus.report.advice import of_use
+    from soilbus.report.windows import why_of_no_use
+
+    if not of_use(results):
+        raise WorkError(why_of_no_use(results, config.estimator.window))
 
 
 def _replay_tables(args: argparse.Namespace, config: Config) -> None:
@@ -150,10 +205,11 @@ def _replay_tables(args: argparse.Namespace, config: Config) -> None:
     except LogError as error:
         raise WorkError(str(error)) from None
     refused = sum((Counter(result.rejected) for result in results), Counter[str]())
-    text = summary_of(results, f"{len(args.logs)} tables", refused)
+    text = summary_of(results, f"{len(args.logs)} tables", None, refused)
     _write_windows(args, config, results, text)
     if str(args.json) != "-":
         print(text, end="")
+    _need_a_use(results, config)
 
 
 def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[WindowResult], text: str) -> None:

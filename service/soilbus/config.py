@@ -6,11 +6,14 @@ error.  Values are SI; a quantity in another unit says so in its name.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -20,6 +23,8 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+
+from soilbus.spelling import did_you_mean
 
 CONTROL_FREE_NAME = r"^[A-Za-z0-9_-]{1,16}$"
 Name = Annotated[str, Field(pattern=CONTROL_FREE_NAME)]
@@ -39,6 +44,61 @@ def _printable(text: str) -> str:
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
+@dataclass(frozen=True)
+class Usual:
+    """From the least to the greatest value that a real machine has; what lies outside is a slip of the pen.
+
+    `slips` are units in which the quantity is often written by mistake, with their SI value:
+    the one that makes the most ordinary value of it is named.
+    """
+
+    low: float
+    high: float
+    unit: str
+    slips: tuple[tuple[str, float], ...] = ()
+
+    def __call__(self, value: float) -> float:
+        """The same value; ValueError for one that no machine has."""
+        if not self.low <= value <= self.high:
+            raise ValueError(self._fault(value))
+        return value
+
+    def _fault(self, value: float) -> str:
+        unit = f" {self.unit}" if self.unit else ""
+        text = f"{value:g}{unit} is not from {self.low:g} to {self.high:g}{unit}"
+        middle = math.sqrt(max(self.low, self.high / 50.0) * self.high)
+        sensible = [(n, value * size) for n, size in self.slips if self.low <= value * size <= self.high]
+        if not sensible:
+            return text
+        name, meant = min(sensible, key=lambda slip: abs(math.log(max(slip[1], 1e-9) / middle)))
+        return f"{text}; is it in {name}? {value:g} {name} are {meant:.4g}{unit}"
+
+
+_SHORT = (("mm", 1e-3), ("cm", 1e-2))
+# From the smallest rovers and single-wheel test beds of the literature (radius 85 mm) to the largest
+# articulated tractors and harvesters (30 t, tyres of 2.2 m diameter), with a margin.
+RADIUS = Usual(0.05, 1.5, "m", _SHORT)
+WIDTH = Usual(0.02, 2.0, "m", _SHORT)
+MASS = Usual(20.0, 6.0e4, "kg", (("t", 1e3),))
+WHEELBASE = Usual(0.2, 8.0, "m", _SHORT)
+CG_AHEAD = Usual(0.02, 8.0, "m", _SHORT)
+HEIGHT = Usual(0.02, 4.0, "m", _SHORT)
+HITCH_HEIGHT = Usual(0.0, 2.5, "m", _SHORT)
+TRACK = Usual(0.15, 5.0, "m", _SHORT)
+GEAR_RATIO = Usual(0.1, 1000.0, "")
+WHEEL_TORQUE = Usual(5.0, 2.0e5, "N m", (("kN m", 1e3),))
+WINDOW = Usual(0.5, 600.0, "s", (("ms", 1e-3),))
+SHARE = Usual(0.0, 1.0, "", (("%", 1e-2),))
+# Soils: Wong, Theory of Ground Vehicles (2008), table 2.3, has phi of 6 to 38 degrees, n of 0.11 to 1.6, k_phi of
+# 43 to 5880 kN/m^(n+2), k_c up to 102 kN/m^(n+1), c up to 69 kPa, K of a few mm to cm; simulants reach n of 1.3.
+ANGLE = Usual(0.0, 1.05, "rad", (("degrees", math.pi / 180.0),))
+EXPONENT = Usual(0.0, 3.0, "")
+MODULUS_C = Usual(0.0, 1.0e7, "N/m^(n+1)")
+MODULUS_PHI = Usual(6.0e3, 1.0e9, "N/m^(n+2)", (("kN/m^(n+2)", 1e3),))
+COHESION = Usual(0.0, 1.0e6, "Pa")
+SHEAR_LENGTH = Usual(0.0, 0.5, "m", _SHORT)
+
+
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=False)
 
@@ -49,6 +109,13 @@ class Bus(BaseModel):
     model_config = ConfigDict(extra="allow", frozen=True)
     interface: str = "socketcan"
     channel: str = "can0"
+
+    @model_validator(mode="after")
+    def _no_typing_error(self) -> Bus:
+        for key in self.model_extra or {}:
+            if meant := did_you_mean(key, type(self).model_fields):
+                raise ValueError(f"{key}: unknown key{meant}")
+        return self
 
 
 class Dbc(_Section):
@@ -62,11 +129,13 @@ class Dbc(_Section):
 class Vehicle(_Section):
     """Longitudinal vehicle; lengths m, mass kg, heights above the ground."""
 
-    mass: PositiveFloat
-    wheelbase: PositiveFloat
-    cg_ahead_of_rear_axle: PositiveFloat
-    cg_height: PositiveFloat
-    hitch_height: NonNegativeFloat = 0.5
+    mass: Annotated[PositiveFloat, AfterValidator(MASS)]
+    wheelbase: Annotated[PositiveFloat, AfterValidator(WHEELBASE)]
+    cg_ahead_of_rear_axle: Annotated[PositiveFloat, AfterValidator(CG_AHEAD)]
+    cg_height: Annotated[PositiveFloat, AfterValidator(HEIGHT)]
+    hitch_height: Annotated[NonNegativeFloat, AfterValidator(HITCH_HEIGHT)] = 0.5
+    track: Annotated[PositiveFloat, AfterValidator(TRACK)] | None = None
+    """Distance between the middles of the left and the right wheels; turns a yaw rate into a difference of speeds."""
 
     @model_validator(mode="after")
     def _cg_between_axles(self) -> Vehicle:
@@ -106,10 +175,10 @@ class Wheel(_Section):
 
     name: Name
     axle: Literal["front", "rear"] | None = None
-    radius: PositiveFloat
-    width: PositiveFloat
-    gear_ratio: PositiveFloat = 1.0
-    max_torque: PositiveFloat | None = None
+    radius: Annotated[PositiveFloat, AfterValidator(RADIUS)]
+    width: Annotated[PositiveFloat, AfterValidator(WIDTH)]
+    gear_ratio: Annotated[PositiveFloat, AfterValidator(GEAR_RATIO)] = 1.0
+    max_torque: Annotated[PositiveFloat, AfterValidator(WHEEL_TORQUE)] | None = None
     torque: Signal | None = None
     speed: Signal | None = None
     load: Signal | None = None
@@ -126,6 +195,11 @@ class Wheel(_Section):
             raise ValueError(f"wheel {self.name} has a torque but no speed: map `speed`, else it has no slip")
         return self
 
+    @property
+    def lacking(self) -> list[str]:
+        """The roles that are not mapped of those without which the wheel counts for nothing."""
+        return [role for role in ("torque", "speed", "load") if getattr(self, role) is None]
+
 
 class Signals(_Section):
     """Signals of the whole vehicle."""
@@ -134,6 +208,8 @@ class Signals(_Section):
     draft: Signal | None = None
     pitch: Signal | None = None
     acceleration: Signal | None = None
+    yaw_rate: Signal | None = None
+    """Positive to the left [rad/s]; tells turns from wheels that spin on one side."""
     latitude: Signal | None = None
     """WGS84, positive north; only for the map."""
     longitude: Signal | None = None
@@ -211,9 +287,9 @@ class Noise(_Section):
     """
 
     absolute: NonNegativeFloat = 0.0
-    relative: NonNegativeFloat = 0.0
-    of_mean: NonNegativeFloat = 0.0
-    gain: NonNegativeFloat = 0.0
+    relative: Annotated[NonNegativeFloat, AfterValidator(SHARE)] = 0.0
+    of_mean: Annotated[NonNegativeFloat, AfterValidator(SHARE)] = 0.0
+    gain: Annotated[NonNegativeFloat, AfterValidator(SHARE)] = 0.0
 
     @model_validator(mode="after")
     def _not_perfect(self) -> Noise:
@@ -233,10 +309,11 @@ class NoiseOfChannels(_Section):
     sinkage: Noise = Noise(absolute=0.005)
     pitch: Noise = Noise(absolute=0.003)
     acceleration: Noise = Noise(absolute=0.02)
+    yaw_rate: Noise = Noise(absolute=0.01)
     slip: Noise = Noise(absolute=0.005)
     """Of a table that tells slip itself; its gain is the relative error of 1 - slip."""
 
-    @field_validator("sinkage", "pitch", "acceleration")
+    @field_validator("sinkage", "pitch", "acceleration", "yaw_rate")
     @classmethod
     def _without_gain(cls, noise: Noise) -> Noise:
         if noise.gain:
@@ -257,6 +334,21 @@ class Prior(_Section):
         return self
 
 
+def _prior(usual: Usual) -> AfterValidator:
+    """Check of a prior: its value, if it has one, and its std must be ones that soils have."""
+
+    def checked(prior: Prior) -> Prior:
+        for key, value in (("value", prior.value), ("std", prior.std)):
+            try:
+                if value > 0.0 and (key == "value" or value > usual.high):
+                    usual(value)
+            except ValueError as error:
+                raise ValueError(f"{key}: {error}") from None
+        return prior
+
+    return AfterValidator(checked)
+
+
 class SoilPrior(_Section):
     """Prior of each soil parameter (SI, phi in rad), for tilled soils of all textures.
 
@@ -265,12 +357,12 @@ class SoilPrior(_Section):
     coefficient of variation.
     """
 
-    k_c: Prior = Prior(value=6.0e3, std=1.2e4)
-    k_phi: Prior = Prior(value=8.0e5, std=1.4e6)
-    n: Prior = Prior(value=0.6, std=0.4)
-    phi: Prior = Prior(value=0.40, std=0.20)
-    c: Prior = Prior(value=3.0e3, std=2.0e3)
-    K: Prior = Prior(value=0.02, std=0.01)
+    k_c: Annotated[Prior, _prior(MODULUS_C)] = Prior(value=6.0e3, std=1.2e4)
+    k_phi: Annotated[Prior, _prior(MODULUS_PHI)] = Prior(value=8.0e5, std=1.4e6)
+    n: Annotated[Prior, _prior(EXPONENT)] = Prior(value=0.6, std=0.4)
+    phi: Annotated[Prior, _prior(ANGLE)] = Prior(value=0.40, std=0.20)
+    c: Annotated[Prior, _prior(COHESION)] = Prior(value=3.0e3, std=2.0e3)
+    K: Annotated[Prior, _prior(SHEAR_LENGTH)] = Prior(value=0.02, std=0.01)
 
     @model_validator(mode="before")
     @classmethod
@@ -288,7 +380,7 @@ class SoilPrior(_Section):
 class Estimator(_Section):
     """Window estimation; times s, speeds m/s, lengths m."""
 
-    window: PositiveFloat = 10.0
+    window: Annotated[PositiveFloat, AfterValidator(WINDOW)] = 10.0
     hop: PositiveFloat = 1.0
     soil_drift: NonNegativeFloat = 0.015
     """How far the soil may wander in the time of one window, as sd of a relative change."""
@@ -297,7 +389,7 @@ class Estimator(_Section):
     min_speed: PositiveFloat = 0.2
     """Below it slip is not judged (standstill gate)."""
     max_turn: PositiveFloat = 0.15
-    """Relative difference of rim speeds of both axles' wheels above which slip is not judged (turn gate)."""
+    """Relative difference of speeds left and right in a turn above which slip is not judged (turn gate)."""
     z_ref: PositiveFloat = 0.02
     b_ref: PositiveFloat = 0.3
     max_bearing_std: PositiveFloat = 0.10

@@ -10,6 +10,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from soilbus.config import Config, ConfigError
+from soilbus.config_faults import fault_lines
 
 
 def load_config(path: Path | str, overrides: Iterable[str] = ()) -> Config:
@@ -34,7 +35,7 @@ def parse_config(raw: Mapping[str, Any], folder: Path = Path("."), source: str =
     try:
         return Config.model_validate({**raw, "folder": folder})
     except ValidationError as error:
-        raise ConfigError(f"{source}: {_fault(raw, e)}" for e in error.errors()) from None
+        raise ConfigError(f"{source}: {line}" for line in fault_lines(raw, error)) from None
 
 
 def overridden(raw: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
@@ -67,7 +68,8 @@ def _child(here: Any, part: str, path: str, text: str) -> Any:
         for i, item in enumerate(here):
             if part in (str(i), item.get("name") if isinstance(item, dict) else None):
                 return item
-        raise ConfigError([f"--set {text}: no {path}"])
+        names = [item["name"] for item in here if isinstance(item, dict) and isinstance(item.get("name"), str)]
+        raise ConfigError([f"--set {text}: no {path}; there are {', '.join(names)}"])
     child = here.setdefault(part, {})
     if isinstance(child, str):  # "Message.Signal", or the name of a column, grows into its table form
         here[part] = {"column" if path.startswith("table.") else "signal": child}
@@ -75,13 +77,3 @@ def _child(here: Any, part: str, path: str, text: str) -> Any:
     if not isinstance(child, (dict, list)):
         raise ConfigError([f"--set {text}: {path} is a value, not a table"])
     return child
-
-
-def _fault(raw: Mapping[str, Any], error: Any) -> str:
-    where = ".".join(str(part) for part in error["loc"] if part not in ("str",))
-    if error["type"] == "extra_forbidden":
-        return f"{where}: unknown key"
-    if error["type"] == "missing":
-        return f"{where}: missing"
-    message = str(error["msg"]).removeprefix("Value error, ")
-    return f"{where}: {message}" if where else message

@@ -84,7 +84,7 @@ def _compressed(config: Config) -> list[str]:
         "estimator.bin": config.estimator.bin,
     }
     if config.vehicle is not None:
-        lengths = config.vehicle.model_dump(exclude={"mass"})
+        lengths = config.vehicle.model_dump(exclude={"mass"}, exclude_none=True)
         sizes |= {f"vehicle.{name}": length for name, length in lengths.items()}
     return [f"{key}={size / SPEED_UP}" for key, size in sizes.items()]
 

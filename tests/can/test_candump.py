@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from soilbus.can.candump import BATCH, Frame, candump_frames, frame_of
+from soilbus.can.candump import BATCH, Frame, candump_frames, frame_of, whole
 
 PLAIN = "(1700000000.000266) can0 18FF2211#025415B303000000\n"
 
@@ -43,7 +43,8 @@ def outcome(frames: Iterator[Frame]) -> tuple[list[Frame], type[Exception] | Non
 
 
 def peer(text: str) -> tuple[list[Frame], type[Exception] | None, str]:
-    return outcome(map(frame_of, can.CanutilsLogReader(io.StringIO(text))))
+    """What python-can reads of it, as far as its frames are whole."""
+    return outcome(frame_of(whole(message)) for message in can.CanutilsLogReader(io.StringIO(text)))
 
 
 @settings(max_examples=300, deadline=None)

@@ -22,7 +22,7 @@ from soilbus.simulator.scenario import excited
 FIELD_TOML = Path(__file__).resolve().parents[1] / "field/field.toml"
 START = 1_700_000_000.0
 SPEEDS = 0x510
-QUANTITIES = ("torque", "load", "speed", "sinkage", "ground_speed", "draft", "pitch", "acceleration")
+QUANTITIES = ("torque", "load", "speed", "sinkage", "ground_speed", "draft", "pitch", "acceleration", "yaw_rate")
 
 
 @pytest.fixture(scope="module")

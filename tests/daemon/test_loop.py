@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import errno
 import itertools
 import math
@@ -397,3 +398,40 @@ def test_a_window_that_ended_before_the_bus_came_back_says_nothing_of_the_presen
     since = [str(f["State"]) for f in bench.sent("Traversability", since=gone + 0.01)]
     assert len(since) >= 4
     assert set(since) == {"unknown"}
+
+
+class Stamped(ScriptedBus):
+    """Hands out messages in the time of the drive, whatever their stamps say."""
+
+    def __init__(self, clock: FakeClock, messages, by: float, since: float) -> None:
+        start = messages[0].timestamp
+        super().__init__(clock, [copy.copy(m) for m in messages], start)
+        self.at = [m.timestamp - self.offset for m in messages]
+        for message in self.messages:
+            message.timestamp += by if message.timestamp >= start + since else 0.0
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        due = self.at[self.next] if self.next < len(self.at) else math.inf
+        if due > self.clock.now + (timeout or 0.0):
+            self.clock.sleep(max(timeout or 0.0, 1e-4))
+            return None
+        self.clock.now = max(self.clock.now, due)
+        self.next += 1
+        return self.messages[self.next - 1]
+
+
+@pytest.mark.parametrize("by", [-3600.0, -1.5, 1.5, 20.0, 3600.0])
+def test_a_clock_that_is_set_begins_windows_anew_at_once(recording, by):
+    """With it set ahead the service handed out a window of nothing for each second that never was."""
+    since, window = 7.0, 4.0
+    bench = Bench(recording, reference_configuration([f"estimator.window={window}"]))
+    bench.wire = Stamped(bench.clock, recording, by, since)
+    bench.run(DURATION)
+    start = recording[0].timestamp
+    ends = [r.t - start for r in bench.results]
+    before, after = ends[:-5], ends[-5:]
+    assert before == pytest.approx([4.0, 5.0, 6.0, 7.0][: len(before)], abs=0.01)
+    assert len(before) >= 3  # the last one ends with the old time
+    assert after == pytest.approx([since + by + window + i for i in range(5)], abs=0.02)
+    assert {str(r.status) for r in bench.results} == {"valid"}
+    assert [r.index for r in bench.results] == list(range(len(ends)))

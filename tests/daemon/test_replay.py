@@ -82,7 +82,7 @@ def test_other_formats_are_read_too(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("bin_length", [0.1, 0.25, 0.5])
 def test_coverage_counts_half_seconds_with_a_sample(bin_length: float) -> None:
-    quantities = ("torque", "load", "speed", "sinkage", "ground_speed", "draft", "pitch", "acceleration")
+    quantities = ("torque", "load", "speed", "sinkage", "ground_speed", "draft", "pitch", "acceleration", "yaw_rate")
     noise = dict.fromkeys(quantities, SensorNoise(absolute=1.0))
     rig = Rig(("A", "B"), np.ones(2), np.ones(2), np.array([True, False]), None, noise)
     store = BinStore(rig, bin_length, 0.0)
@@ -125,3 +125,18 @@ def test_windows_before_a_cut_come_before_its_error_with_an_estimator_beside(tmp
         take_all(workers)
     assert seen == [0, 1, 2, 3][: len(seen)]
     assert len(seen) >= 3
+
+
+@pytest.mark.parametrize("gone", [3, 6, 12])
+def test_a_frame_without_its_last_bytes_is_refused_in_other_formats_too(tmp_path, gone):
+    path = tmp_path / "a.asc"
+    with can.Logger(path) as log:
+        for i in range(5):
+            log(can.Message(timestamp=1.0 + i, arbitration_id=0x210, is_extended_id=False, data=bytes([i] * 8)))
+    head, _, last = path.read_text().rpartition(" 04 04 04 04 04 04 04 04")
+    assert last
+    path.write_text(head + " 04 04 04 04 04 04 04 04"[:-gone])
+    for read in (read_frames, read_log):
+        found, error = outcome(read, path)
+        assert len(found) == 4
+        assert "cut off or damaged after 4 frames (a frame of 8 bytes has" in error

@@ -23,6 +23,7 @@ from soilbus.diagnosis.completion import complete
 from soilbus.diagnosis.records import TooLittle, record_of_rows
 from soilbus.diagnosis.verdict import Verdict, gap_limit
 from soilbus.estimation.gauss_newton import fit_window
+from soilbus.estimation.posterior import Posterior
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.report.configuration import configuration_report
 from soilbus.terra.effects.catalogue import CATALOGUE
@@ -62,7 +63,7 @@ def test_configuration_of_a_rig_is_checked_with_a_line_for_each_fault():
     assert "factor of 0" in fault({"table": table | {"slip": {"column": "s", "factor": 0.0}}})
     assert "nothing to compare" in fault({"table": {"wheel_load": "load", "slip": "slip"}})
     assert "source must be a text or a number" in fault({"table": table | {"where": {"source": [1, 2]}}})
-    vehicle = {"mass": 1.0, "wheelbase": 2.0, "cg_ahead_of_rear_axle": 1.0, "cg_height": 1.0}
+    vehicle = {"mass": 1000.0, "wheelbase": 2.0, "cg_ahead_of_rear_axle": 1.0, "cg_height": 1.0}
     assert "no [vehicle]" in fault({"vehicle": vehicle})
     with pytest.raises(ConfigError, match="axle: missing"):
         parse_config({"wheel": [wheel]})
@@ -355,3 +356,28 @@ def test_replay_of_tables_writes_the_daemons_json_and_summary(tmp_path, measured
     assert "1 windows from 1 tables" in capsys.readouterr().out
     assert main(["replay", "--config", str(config), str(tmp_path / "none.csv")]) == 1
     assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("quieter", [5.0, 20.0, 40.0])
+def test_nothing_is_known_less_than_beforehand_however_badly_the_model_fits(quieter, tmp_path):
+    """With noise set too low the widened k_c was 7e3 +- 7e21, then no number at all: a traceback of replay --json."""
+    raw = tomllib.loads(RIG)
+    raw["noise"] = {
+        channel: {kind: sd if kind == "gain" else sd / quieter for kind, sd in noise.items()}
+        for channel, noise in raw["noise"].items()
+    }
+    config, degraded = parse_config(raw), 0
+    prior = prior_of(config)
+    beforehand = Posterior(Soil(*prior.median.tolist()), np.diag(prior.log_std**2)).parameters()
+    for seed, truth in enumerate((TRUTH, Soil(5e3, 6e5, 0.5, 0.4, 4e3, 0.03), Soil(1e3, 3e6, 1.1, 0.6, 500.0, 0.01))):
+        path = write_csv(tmp_path / "t.csv", noisy(sweep(truth, LOADS, SLIPS), np.random.default_rng(seed)))
+        (result,) = replay_tables(config, [path])
+        window = json.loads(json_line(result, config), parse_constant=pytest.fail)
+        if window["soil"] is None:
+            continue
+        degraded += window["status"] == "degraded"
+        assert window["chi2"] > 3.0
+        for name, known in window["soil"].items():
+            least = beforehand[name].std / beforehand[name].value
+            assert 0.0 <= known["std"] / known["value"] <= least * (1.0 + 1e-9), (name, known)
+    assert degraded

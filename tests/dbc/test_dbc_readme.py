@@ -9,8 +9,8 @@ from pathlib import Path
 import cantools
 import pytest
 
+from soilbus.can.admission import LONGEST_GAP
 from soilbus.can.publish import Publisher, value_codes
-from soilbus.daemon.intake import LONGEST_GAP
 from soilbus.simulator.reference import reference_configuration
 
 DBC = Path(__file__).resolve().parents[2] / "dbc"

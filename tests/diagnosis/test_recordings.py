@@ -55,7 +55,7 @@ def test_a_record_holds_the_bins_of_the_windows_of_replay(log):
     (whole,) = parts(listener(), log)
     assert whole.t[-1] - whole.t[0] == pytest.approx(SECONDS, abs=0.3)
     intake = listener()
-    windows = [task.window for now in fed(intake, [log]) for task in intake.due(now)]
+    windows = [task.window for now in fed(intake, log) for task in intake.due(now)]
     assert len(windows) == 6
     inner = slice(1, -1)  # the first and the last bin have no neighbour on one side
     for window in windows:
@@ -67,7 +67,7 @@ def test_a_record_holds_the_bins_of_the_windows_of_replay(log):
 
 def test_a_log_whose_windows_nobody_takes_is_read_a_second_at_a_time(log):
     """And not frame by frame from the end of the first window on."""
-    times = list(fed(listener(), [log]))
+    times = list(fed(listener(), log))
     assert len(times) <= SECONDS + 3
     assert times == sorted(times)
 

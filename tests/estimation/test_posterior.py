@@ -102,3 +102,20 @@ def test_derived_quantities_jointly_against_monte_carlo(seed):
     assert derived["tan_phi"] == posterior.tan_phi()
     with pytest.raises(KeyError):
         derived["K_L(0.3)"]
+
+
+@pytest.mark.parametrize("factor", [1.0, 4.0, 1e3, 1e12])
+def test_widening_divides_what_the_data_told_and_not_the_prior(factor):
+    rng = np.random.default_rng(3)
+    prior = SoilPrior(np.array([6e3, 8e5, 0.6, 0.4, 3e3, 0.02]), np.array([1.27, 1.19, 0.6, 0.47, 0.0, 0.47]))
+    free = prior.log_std > 0.0
+    beforehand = np.diag(prior.log_std[free] ** -2.0)
+    rows = rng.normal(size=(3, 5)) * 20.0  # of some directions the data say nothing
+    covariance = np.zeros((6, 6))
+    covariance[np.ix_(free, free)] = np.linalg.inv(beforehand + rows.T @ rows)
+    posterior = Posterior(Soil(*prior.median.tolist()), covariance)
+    widened = posterior.widened(factor, prior)
+    expected = np.linalg.inv(beforehand + rows.T @ rows / factor)
+    np.testing.assert_allclose(widened.log_covariance[np.ix_(free, free)], expected, rtol=1e-6, atol=1e-9)
+    assert widened.log_covariance[4].tolist() == [0.0] * 6
+    assert widened.soil == posterior.soil

@@ -242,7 +242,8 @@ def test_channels_do_not_mix():
 # --- the store: windows do not depend on how the samples came ---
 
 NOISE = dict.fromkeys(
-    ("torque", "load", "speed", "sinkage", "ground_speed", "draft", "pitch", "acceleration"), SensorNoise(absolute=1.0)
+    ("torque", "load", "speed", "sinkage", "ground_speed", "draft", "pitch", "acceleration", "yaw_rate"),
+    SensorNoise(absolute=1.0),
 )
 RIG = Rig(("A",), np.array([0.5]), np.array([0.3]), np.array([True]), None, NOISE)
 RATES = {"torque.A": 50.0, "load.A": 100.0, "ground_speed": 25.0, "draft": 10.0, "pitch": 1.0}

@@ -20,6 +20,7 @@ NOISE = {
     "draft": SensorNoise(absolute=40.0, of_mean=0.1),
     "pitch": SensorNoise(absolute=0.002),
     "acceleration": SensorNoise(absolute=0.02),
+    "yaw_rate": SensorNoise(absolute=0.01),
 }
 RIG = Rig(("L", "R"), np.array([0.5, 0.6]), np.array([0.3, 0.4]), np.array([True, False]), None, NOISE)
 EPOCH = 1_700_000_000.0

@@ -38,11 +38,14 @@ OUT_OF_ORDER = 0.1
 """Seconds by which a frame may be stamped earlier than one that came before it: drivers hand frames over in bunches."""
 CLOCK_STEP = 1.0
 """The same, above which the clock was set and the new time is believed."""
+LONGEST_GAP = 60.0
+"""Seconds without a mapped frame after which a new recording begins: the bus slept, or the clock was set ahead."""
 LAST_TIME = 1e10
 """Stamps [s] beyond it, either way, are no times: a clock that ticks in seconds would not move any more."""
 MAX_LISTED_UNKNOWN = 1024
 
 _EXTENDED = 1 << 31
+_FOLLOWS = LONGEST_GAP + OUT_OF_ORDER
 _NONE: NDArray[np.float64] = np.empty(0)
 
 
@@ -73,6 +76,10 @@ class Admission:
     A message of a standard parameter group (`j1939.STANDARD_PGNS`) is heard from any source and
     priority, one source at a time, unless the database has several messages of that group.
 
+    `at_break` is called when a frame comes that does not follow the ones before it (its clock was
+    set back, or there was none for LONGEST_GAP), before it is filed: what is not taken then is
+    refused where the clock was set back.
+
     Raises ValueError when two messages share an identifier, when a checked message has no
     Counter or no byte-aligned 8-bit Checksum, or as `ColumnDecoder` does; KeyError for a message
     or signal that the database does not have.
@@ -83,7 +90,9 @@ class Admission:
         self._inboxes: list[Inbox] = []
         self._by_key: dict[int, Inbox] = {}
         self._groups: dict[int, Inbox] = {}
+        self.at_break: Callable[[], None] = lambda: None
         self._earliest = math.inf  # an earlier stamp is out of order; inf: there is none yet
+        self._untimed: Counter[Reason] = Counter()
         by_message: dict[str, list[Channel]] = {}
         for channel in channels:
             by_message.setdefault(channel.message, []).append(channel)
@@ -106,7 +115,7 @@ class Admission:
             inbox = self._inbox_of_group(arbitration_id, extended)
             if inbox is None:
                 return
-        if not self._earliest <= t <= LAST_TIME and not self._is_time(inbox, t):
+        if not 0.0 <= t - self._earliest <= _FOLLOWS and not self._is_time(inbox, t):
             return
         if t - OUT_OF_ORDER > self._earliest:
             self._earliest = t - OUT_OF_ORDER
@@ -119,13 +128,26 @@ class Admission:
         """Samples of all frames filed so far with t < until [s]; later frames stay.
 
         Every channel has a column, perhaps empty; times do not decrease within it.  A refused
-        frame counts as a refused sample of each of its channels, except frames of a source that
-        is not listened to, remote frames and those without a time, which are in `counts` only.
+        frame counts as a refused sample of each of its channels; those of a source that is not
+        listened to, of remote frames and of frames without a time are in `untimed`.
         """
-        out = Decoded()
+        out = Decoded(untimed=self._untimed)
+        self._untimed = Counter()
         for inbox in self._inboxes:
             self._open(inbox, popped(inbox, until), out)
         return out
+
+    @property
+    def newest(self) -> float:
+        """The latest stamp [s] that is believed; minus infinity before the first."""
+        return self._earliest + OUT_OF_ORDER if math.isfinite(self._earliest) else -math.inf
+
+    def cut_short(self, arbitration_id: int, extended: bool, data: Data) -> Message | None:
+        """The mapped message of a frame with less data than the DBC says, where others of it were whole."""
+        inbox = self._by_key.get(_key(arbitration_id, extended))
+        if inbox is None or len(data) >= inbox.message.length or not self.counts.admitted[inbox.message.name]:
+            return None
+        return inbox.message
 
     def can_filters(self) -> list[dict[str, Any]]:
         """Filters for python-can that pass exactly the frames of the mapped messages."""
@@ -159,21 +181,22 @@ class Admission:
         if self._earliest == math.inf:
             self._earliest = -math.inf
         elif t < self._earliest + OUT_OF_ORDER - CLOCK_STEP:
+            self.at_break()
             self._step_clock()
-            self._earliest = -math.inf
         elif t < self._earliest:
             inbox.late.append(t)
             return False
+        elif t - self._earliest > _FOLLOWS:
+            self.at_break()
         return True
 
     def _step_clock(self) -> None:
-        """Believe the new time; what was filed under the old one has no place in it."""
+        """Believe the new time; what nobody took of the old one has no place in it."""
         self.counts.clock_steps += 1
+        self._earliest = -math.inf
         for inbox in self._inboxes:
-            gone = len(inbox.frames) + len(inbox.late)
-            self.counts.received[inbox.message.name] += gone
-            if gone:
-                self.counts.refused[inbox.message.name, Reason.TIME_BACKWARDS] += gone
+            for _ in range(len(inbox.frames) + len(inbox.late)):
+                self._refuse_unheard(inbox, Reason.TIME_BACKWARDS)
             inbox.forget()
 
     def _open(self, inbox: Inbox, frames: list[Frame], out: Decoded) -> None:
@@ -210,7 +233,7 @@ class Admission:
             self._refuse(inbox, bad, Reason.WRONG_LENGTH, out)
         if inbox.lock is not None:
             heard = _of_locked_source(inbox.lock, good)
-            self._count_wrong_source(inbox, len(good) - len(heard))
+            self._refuse_untimed(inbox, len(good) - len(heard), Reason.WRONG_SOURCE)
             good = heard
         if not good:
             return None
@@ -250,11 +273,12 @@ class Admission:
     def _refuse_unheard(self, inbox: Inbox, reason: Reason) -> None:
         """One frame that is not even filed."""
         self.counts.received[inbox.message.name] += 1
-        self.counts.refused[inbox.message.name, reason] += 1
+        self._refuse_untimed(inbox, 1, reason)
 
-    def _count_wrong_source(self, inbox: Inbox, n: int) -> None:
+    def _refuse_untimed(self, inbox: Inbox, n: int, reason: Reason) -> None:
         if n:
-            self.counts.refused[inbox.message.name, Reason.WRONG_SOURCE] += n
+            self.counts.refused[inbox.message.name, reason] += n
+            self._untimed[reason] += n * len(inbox.channels)
 
 
 def _key(arbitration_id: int, extended: bool) -> int:

@@ -7,7 +7,8 @@ import logging
 import math
 import os
 import socket
-from collections.abc import Callable, Collection, Mapping, Sequence
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -65,6 +66,29 @@ def open_bus(settings: Mapping[str, Any], filters: Sequence[dict[str, Any]] | No
         raise BusError(f"bus {name}: {_one_line(error)}", may_come=True) from None
     except (ValueError, TypeError, AttributeError) as error:
         raise BusError(f"bus {name}: {_one_line(error)}", may_come=False) from None
+
+
+def heard_for(settings: Mapping[str, Any], seconds: float) -> Iterator[tuple[float, int, bool, bytes, bool, bool]]:
+    """Frames that the bus carries from now on, as `candump.Frame`; nothing is sent.
+
+    Raises BusError for a bus that cannot be opened or goes away.
+    """
+    bus = open_bus(settings)
+    try:
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0.0:
+            try:
+                message = bus.recv(left)
+            except (OSError, can.CanError) as error:
+                name = f"{settings.get('interface')}:{settings.get('channel')}"
+                raise BusError(f"bus {name}: {_one_line(error)}", may_come=True) from None
+            if message is not None:
+                yield (
+                    message.timestamp, message.arbitration_id, message.is_extended_id, bytes(message.data),
+                    message.is_remote_frame, message.is_error_frame,
+                )  # fmt: skip
+    finally:
+        bus.shutdown()
 
 
 def _prepare(bus: can.BusABC) -> None:

@@ -43,11 +43,19 @@ def frame_of(message: can.Message) -> Frame:
     )
 
 
+def whole(message: can.Message) -> can.Message:
+    """The message; ValueError where it has other than the bytes that it says: its line was cut off."""
+    told = message.dlc if message.is_fd else min(message.dlc, 8)
+    if not (message.is_remote_frame or message.is_error_frame or len(message.data) == told):
+        raise ValueError(f"a frame of {told} bytes has {len(message.data)}")
+    return message
+
+
 def candump_frames(lines: Iterable[str]) -> Iterator[Frame]:
     """Frames of a log's lines, the same that `can.CanutilsLogReader` reads.
 
-    Raises what the reader (ValueError, IndexError) or `lines` raises, after the frames before
-    that place.
+    Raises what the reader (ValueError, IndexError) or `lines` raises, or ValueError for half a byte,
+    after the frames before that place.
     """
     return chain.from_iterable(candump_batches(lines))
 
@@ -59,7 +67,7 @@ def candump_batches(lines: Iterable[str]) -> Iterator[list[Frame]]:
         if _PLAIN_LINES(text):
             yield list(_plain(text))
         else:
-            yield from ([frame_of(message)] for message in can.CanutilsLogReader(StringIO(text)))
+            yield from ([frame_of(whole(message))] for message in can.CanutilsLogReader(StringIO(text)))
 
 
 def _batches(lines: Iterator[str]) -> Iterator[list[str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -68,7 +69,8 @@ class Column:
 
 @dataclass(slots=True)
 class Decoded:
-    """Columns by channel name; times of refused samples by channel name and reason."""
+    """Columns by channel name; times of refused samples by channel name and reason; refused ones without a time."""
 
     columns: dict[str, Column] = field(default_factory=dict)
     refused: dict[tuple[str, Reason], NDArray[np.float64]] = field(default_factory=dict)
+    untimed: Counter[Reason] = field(default_factory=Counter)

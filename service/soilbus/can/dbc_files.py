@@ -12,6 +12,7 @@ from cantools.database.can import Database, Message
 from soilbus.can.checksum import CHECKSUM, COUNTER
 from soilbus.can.inbox import checksum_byte_of
 from soilbus.config import Config, ConfigError
+from soilbus.spelling import did_you_mean
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -55,6 +56,10 @@ def load_databases(config: Config) -> Database:
                 first, known = messages.setdefault(message.name, (name, message))
                 if not _same(known, message):
                     faults.append(f"dbc.input: {first} and {name} define message {message.name} differently")
+        except FileNotFoundError as error:
+            faults.append(
+                f"dbc.input: {name}: {error.strerror or error}{did_you_mean(name, _dbc_names(config.folder))}"
+            )
         except OSError as error:
             faults.append(f"dbc.input: {name}: {error.strerror or error}")
         except Exception as error:  # the parser raises all kinds on a text that is no DBC
@@ -76,7 +81,11 @@ def checked_messages(config: Config) -> frozenset[str]:
     if not config.dbc.checked:
         return frozenset(found)
     known = {m.name: m for m in load_databases(config).messages}
-    faults = [f"dbc.checked: no message {name} in the DBC" for name in config.dbc.checked if name not in known]
+    faults = [
+        f"dbc.checked: no message {name} in the DBC{did_you_mean(name, known)}"
+        for name in config.dbc.checked
+        if name not in known
+    ]
     faults += [
         f"dbc.checked: {name} has no {COUNTER} and byte-aligned 8-bit {CHECKSUM}"
         for name in config.dbc.checked
@@ -109,6 +118,12 @@ def output_database(config: Config) -> Database:
 def filters_of(database: Database) -> list[dict[str, Any]]:
     """Filters for python-can that pass the messages of a database only."""
     return [{"can_id": m.frame_id, "can_mask": 0x1FFFFFFF, "extended": m.is_extended_frame} for m in database.messages]
+
+
+def _dbc_names(folder: Path) -> set[str]:
+    """Names of the DBC files beside a configuration, and of ours."""
+    folders = (folder, _PACKAGE / "dbc", _PACKAGE.parents[1] / "dbc")
+    return {path.name for place in folders for path in place.glob("*.dbc")}
 
 
 def _is_shipped(path: Path) -> bool:

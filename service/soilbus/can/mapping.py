@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
@@ -15,10 +14,13 @@ from soilbus.can.decode import check_decodable, code_limits
 from soilbus.can.units import SI, STANDARD_GRAVITY, unit_of
 from soilbus.config import Config, ConfigError, Wheel
 from soilbus.config import Signal as Mapped
+from soilbus.spelling import did_you_mean
 
 WHEEL_ROLES = ("torque", "speed", "load", "sinkage", "torque_limit", "motor_speed")
 POSITION_ROLES = ("latitude", "longitude")
-VEHICLE_ROLES = ("ground_speed", "draft", "pitch", "acceleration", *POSITION_ROLES)
+VEHICLE_ROLES = ("ground_speed", "draft", "pitch", "acceleration", "yaw_rate", *POSITION_ROLES)
+OPTIONAL_ROLES = ("yaw_rate", *POSITION_ROLES)
+"""Without them a window is as good as before."""
 
 MAX_SPEED = 25.0  # m/s, faster than any field tractor
 LEAST_GAP, GAP_CYCLES = 2.0, 1.5
@@ -36,6 +38,7 @@ _DIMENSIONS: dict[str, tuple[str, ...]] = {
     "draft": ("force",),
     "pitch": ("angle",),
     "acceleration": ("acceleration",),
+    "yaw_rate": ("rotation",),
     "latitude": ("angle",),
     "longitude": ("angle",),
 }
@@ -129,7 +132,7 @@ def _find(database: Database, path: str) -> tuple[Message, Signal]:
     messages = {m.name: m for m in database.messages}
     message = messages.get(message_name)
     if message is None:
-        raise _Fault(f"no message {message_name} in the DBC{_nearest(message_name, messages)}")
+        raise _Fault(f"no message {message_name} in the DBC{did_you_mean(message_name, messages)}")
     return message, _find_signal(message, signal_name)
 
 
@@ -138,15 +141,9 @@ def _find_signal(message: Message, name: str) -> Signal:
         return check_decodable(message, name)
     except KeyError:
         names = [s.name for s in message.signals]
-        raise _Fault(f"no signal {name} in message {message.name}{_nearest(name, names)}") from None
+        raise _Fault(f"no signal {name} in message {message.name}{did_you_mean(name, names)}") from None
     except ValueError as error:
         raise _Fault(str(error)) from None
-
-
-def _nearest(name: str, names: Iterable[str]) -> str:
-    folded = {n.casefold(): n for n in names}
-    close = difflib.get_close_matches(name.casefold(), folded, n=1)
-    return f"; did you mean {folded[close[0]]}?" if close else ""
 
 
 def _valid_signal(message: Message, mapped: Mapped) -> str | None:
@@ -225,6 +222,8 @@ def plausible(config: Config, quantity: str, wheel: Wheel | None) -> tuple[float
             return -1.0, 1.0
         case "acceleration":
             return -20.0, 20.0
+        case "yaw_rate":
+            return -4.0, 4.0  # a skid-steered rover on the spot
         case "latitude":
             return -math.pi / 2.0, math.pi / 2.0
         case "longitude":

@@ -58,7 +58,7 @@ class UncertainModel:
         """With what a window has left of the effects' parameters, at a ground speed [m/s].
 
         Their places are the last of the belief's gains, in prior standard deviations.  Only
-        effects that count in steady driving do so here.  widening multiplies the covariance.
+        effects that count in steady driving do so here.  widening is that of `Posterior.widened`.
         """
 
         def at(pulls: Array) -> CompletedModel:
@@ -81,7 +81,7 @@ class UncertainModel:
             step[places] = axis * np.sqrt(size)
             shift = belief.covariance[:_SOIL, of_effects] @ axis / np.sqrt(size)
             way = _way_inside(free, pulls, step)
-            scale = way * np.sqrt(widening)
+            scale = way * np.sqrt(widening / (1.0 + (widening - 1.0) * min(size, 1.0)))
             doubts.append(Doubt(at(pulls + scale * step), scale * shift))
         return cls(mean, tuple(doubts))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from soilbus.can.admission import CLOCK_STEP, LAST_TIME
 from soilbus.can.bus import LiveBus
 from soilbus.can.wire import STAMPED
 
@@ -22,6 +23,10 @@ class BusTime:
         self._nothing_left = now
         self.last_frame = -1e9
         """Monotonic time at which a frame was taken last."""
+
+    def set_ahead(self, stamp: float, now: float) -> bool:
+        """Whether a frame's stamp says that the clock which stamps frames was set ahead since the last frame."""
+        return self.last_frame > 0.0 and stamp - self.at(now) > CLOCK_STEP and stamp <= LAST_TIME
 
     def took(self, stamp: float, now: float) -> None:
         """A frame was taken."""

@@ -17,6 +17,7 @@ from soilbus.capability.traction_loss import NO_LOSS, idle, motion_of, observed
 from soilbus.capability.uncertain_model import UncertainModel
 from soilbus.capability.wheels import WheelTable
 from soilbus.config import Config
+from soilbus.daemon.excitation import excitation_of
 from soilbus.daemon.gap import GapWatch, squares
 from soilbus.daemon.intake import WindowTask
 from soilbus.daemon.result import WindowResult, as_of
@@ -126,6 +127,7 @@ class WindowEstimator:
             position=task.track.at((tracked.since + task.end) / 2.0),
             failure=self._failure(tracked),
             gaps=self._watched_gaps(task, fit),
+            excitation=excitation_of(task.window, self.rig, self._settings.min_speed),
             basis=basis,
         )
         effects = self._effects(fit)
@@ -209,8 +211,7 @@ class WindowEstimator:
 
     def _honest(self, tracked: Tracked, fit: Fit) -> Posterior:
         """Posterior, of both optima where there are two, widened where the residuals are larger than the noise."""
-        posterior = fit.whole.posterior
-        return Posterior(posterior.soil, posterior.log_covariance * _widening(tracked, fit))
+        return fit.whole.posterior.widened(_widening(tracked, fit), self.prior)
 
     def _draft_gain(self, tracked: Tracked) -> Estimate:
         """Gain error of the load cell at the hitch: as fitted, else what is known of it beforehand."""

@@ -17,10 +17,10 @@ from cantools.database.can import Database
 from numpy.typing import NDArray
 
 from soilbus.assembly import rig_of
-from soilbus.can.admission import Admission
-from soilbus.can.channels import Channel, Column, Decoded
+from soilbus.can.admission import LONGEST_GAP, Admission
+from soilbus.can.channels import Channel, Decoded
 from soilbus.can.dbc_files import checked_messages
-from soilbus.can.mapping import POSITION_ROLES, channels_of
+from soilbus.can.mapping import OPTIONAL_ROLES, POSITION_ROLES, channels_of
 from soilbus.capability.traction_loss import Motion, motion_of
 from soilbus.config import Config
 from soilbus.daemon.plausibility import Plausibility
@@ -45,8 +45,6 @@ LIMIT_SAMPLES = 3
 """Reported torque limits of which the median is in force: one wild sample moves nothing."""
 COVERAGE_BLOCK = 0.5
 MIN_COVERAGE = 0.95
-LONGEST_GAP = 60.0
-"""Silence [s] after which windows are counted anew instead of being reported one by one."""
 SLIP_SPAN = 0.3
 EDGE_LEAD = 0.005
 """Bins begin this long before the first sample [s]: else each frame of its message would fall on
@@ -57,8 +55,8 @@ an edge, and a microsecond would decide on which side."""
 class WindowTask:
     """One window's data and what is known of its inputs; everything an estimate needs.
 
-    index counts windows since the start; start and end [s]; missing are needed channels
-    never seen, poor those that are stale at the end or covered the window badly;
+    index counts windows since the start; epoch counts how often time began anew; start and end [s];
+    missing are needed channels never seen, poor those that are stale at the end or covered the window badly;
     implausible are channels that lie, and are not in the window;
     torque_limit (W,) [N m], nan where unknown; track knows the positions from the window's
     middle on; fresh: nothing of the window before may be carried over.
@@ -76,6 +74,7 @@ class WindowTask:
     rejected: dict[str, int]
     fresh: bool
     implausible: tuple[str, ...] = ()
+    epoch: int = 0
 
 
 class Latest(NamedTuple):
@@ -92,15 +91,24 @@ class Latest(NamedTuple):
 
 @dataclass(slots=True)
 class Refusals:
-    """Refused samples by reason, kept as long as a window may ask for them."""
+    """Refused samples by reason, kept as long as a window may ask for them; `used` counts the samples not refused."""
 
     entries: list[tuple[str, Array]] = field(default_factory=list)
     total: Counter[str] = field(default_factory=Counter)
+    used: int = 0
 
     def add(self, decoded: Decoded) -> None:
-        """Take note of what one batch of frames refused."""
+        """Take note of what one batch of frames used and refused."""
+        self.used += sum(len(column.t) for column in decoded.columns.values())
         for (_, reason), times in decoded.refused.items():
             self.note(str(reason), times)
+        for reason, n in decoded.untimed.items():
+            self.total[str(reason)] += n
+
+    def note_wild(self, times: Array) -> None:
+        """Take note of samples that were used until they were found wild."""
+        self.note(WILD, times)
+        self.used -= len(times)
 
     def note(self, reason: str, times: Array) -> None:
         """Take note of samples refused for one reason at these times [s], ascending."""
@@ -161,6 +169,7 @@ class Intake:
     """
 
     def __init__(self, config: Config, database: Database) -> None:
+        self._config, self._database = config, database
         self.channels = channels_of(config, database)
         self.admission = Admission(self.channels, database, checked_messages(config))
         self.rig = rig_of(config)
@@ -177,16 +186,32 @@ class Intake:
         self._limits = ReportedLimits(self.rig.wheels, [limits[name] or math.nan for name in self.rig.wheels])
         self._index = 0
         self.epoch = 0
+        self._ready: list[WindowTask] = []
+        self._bins: BinStore | None = None
         self._restart()
+        self.admission.at_break = self.begin_anew
+
+    def of_another_recording(self) -> Intake:
+        """An intake that knows nothing of what this one heard; both count windows, frames and refusals together."""
+        other = Intake(self._config, self._database)
+        other.admission.counts, other._index = self.admission.counts, self._index
+        other.refusals.total, other.refusals.used = self.refusals.total, self.refusals.used
+        return other
 
     def _is_needed(self, channel: Channel) -> bool:
         if channel.wheel:
             return channel.wheel in self.rig.wheels and channel.quantity in ("torque", "speed", "load")
-        return channel.quantity not in POSITION_ROLES
+        return channel.quantity not in OPTIONAL_ROLES
+
+    def begin_anew(self) -> None:
+        """What comes next is a recording of its own: its clock was set, or the bus was silent for long."""
+        ready = self.finish(self.admission.newest)
+        self._restart()
+        self._ready = ready
 
     def _restart(self) -> None:
         self.epoch += 1  # nothing of the one before may be carried over
-        self._bins: BinStore | None = None
+        self._bins = None
         self._fresh = True
         self._positions.forget()
         self._plausibility.forget()
@@ -195,20 +220,19 @@ class Intake:
         self.next_end = math.inf
         self.last_seen: dict[str, float] = {}
         self._newest = -math.inf  # stamp of the latest sample, admitted or refused
-        self._clock_steps = self.admission.counts.clock_steps
+
+    def _screen_the_rest(self) -> None:
+        """Count the wild samples that came after the last window too."""
+        if self._bins is not None:
+            self._bins.window(self._newest, self._newest + self._bins.bin_length)
+            self.refusals.note_wild(self._bins.new_wild())
 
     def ingest(self, until: float = math.inf) -> None:
         """Decode the frames filed so far that are older than `until` [s] and put them into bins."""
         decoded = self.admission.take(until)
-        if self.admission.counts.clock_steps != self._clock_steps:
-            self._restart()
         self.refusals.add(decoded)
         if (times := _times(decoded)) is not None:
             first, last = times
-            if last - (self._newest if self._bins is not None else first) > LONGEST_GAP:
-                decoded, first = _after_silence(decoded, self._newest)
-                if first > self._newest + LONGEST_GAP:
-                    self._restart()
             self._newest = max(self._newest, last)
             if self._bins is None:
                 self._bins = BinStore(self.rig, self._settings.bin, first - EDGE_LEAD)
@@ -225,14 +249,13 @@ class Intake:
 
     def due(self, now: float) -> list[WindowTask]:
         """Every window that ended at or before `now` [s] and was not handed out yet."""
+        tasks, self._ready = self._ready, []
         if self._bins is None:
             self.ingest(now)
-        tasks: list[WindowTask] = []
-        while self.next_end <= now:
+        while self._bins is not None and self.next_end <= now:
             self.ingest(self.next_end)
-            if self.next_end > now or self._bins is None:  # the clock was set meanwhile
-                break
             if self.next_end - self._newest > LONGEST_GAP:
+                self._screen_the_rest()
                 self._restart()
                 break
             tasks.append(self._task(self._bins, self.next_end))
@@ -243,7 +266,9 @@ class Intake:
         """Windows still open at the end of a recording that lasts until `now` [s]."""
         tasks = self.due(now)
         self.ingest(math.inf)
-        return tasks + self.due(now)
+        tasks += self.due(now)
+        self._screen_the_rest()
+        return tasks
 
     def taken_whole(self) -> Window | None:
         """All that was ingested since the clock was last set, as one window; what comes later begins anew.
@@ -255,14 +280,14 @@ class Intake:
         if bins is not None and end - bins.origin >= bins.bin_length:
             end = bins.origin + math.floor((end - bins.origin) / bins.bin_length) * bins.bin_length
             window = forward(bins.window(bins.origin, end))
-            self.refusals.note(WILD, bins.new_wild())
+            self.refusals.note_wild(bins.new_wild())
         self._restart()
         return window
 
     def _task(self, bins: BinStore, end: float) -> WindowTask:
         start = end - self._settings.window
         window, self._lying = self._plausibility.screened(forward(bins.window(start, end)))
-        self.refusals.note(WILD, bins.new_wild())
+        self.refusals.note_wild(bins.new_wild())
         missing = tuple(c.name for c in self.needed if c.name not in self.last_seen)
         covered = dict(zip(self.rig.channels, coverage(window).tolist(), strict=True))
         badly_covered = [c.name for c in self.needed if covered[c.name] < MIN_COVERAGE]
@@ -280,6 +305,7 @@ class Intake:
             rejected=self.refusals.within(start, end),
             fresh=self._fresh,
             implausible=self._lying,
+            epoch=self.epoch,
         )
         self._fresh = False
         self._index += 1
@@ -324,19 +350,6 @@ def _times(decoded: Decoded) -> tuple[float, float] | None:
     ends = [(c.t[0], c.t[-1]) for c in decoded.columns.values() if len(c.t)]
     ends += [(known.min(), known.max()) for t in decoded.refused.values() if len(known := t[np.isfinite(t)])]
     return (float(min(first for first, _ in ends)), float(max(last for _, last in ends))) if ends else None
-
-
-def _after_silence(decoded: Decoded, newest: float) -> tuple[Decoded, float]:
-    """What came after the last LONGEST_GAP without a sample, counted from `newest` [s] on, and when it begins [s].
-
-    A clock that is set ahead makes such a gap between two frames of one batch.
-    """
-    times = [c.t for c in decoded.columns.values()] + [t[np.isfinite(t)] for t in decoded.refused.values()]
-    t = np.sort(np.concatenate(times))
-    gaps = np.flatnonzero(np.diff(t, prepend=newest) > LONGEST_GAP)
-    begin = float(t[gaps[-1]] if len(gaps) else t[0])
-    columns = {n: Column(c.t[c.t >= begin], c.value[c.t >= begin]) for n, c in decoded.columns.items()}
-    return Decoded(columns, decoded.refused), begin
 
 
 def column_means(rows: Array) -> list[float | None]:

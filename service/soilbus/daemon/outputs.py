@@ -73,37 +73,37 @@ def json_line(result: WindowResult, config: Config) -> str:
     way = result.traversability
     bearing = {"z_ref": config.estimator.z_ref, "b_ref": config.estimator.b_ref, **_value_std(result.bearing)}
     posterior = result.posterior
-    return json.dumps(
-        {
-            "t": round(result.t, 6),
-            "window": result.index,
-            "status": str(result.status),
-            "state": str(state_after(result)),
-            "reason": result.reason,
-            "soil": None if posterior is None else {k: _value_std(e) for k, e in posterior.parameters().items()},
-            "bearing_pressure": bearing,
-            "soil_class": None if result.soil_class is None else likeliest(result.soil_class),
-            "slip": result.slip,
-            "sinkage": result.sinkage,
-            "traversability": {
-                "state": str(way.state),
-                "probability": way.probability,
-                "torque_required": way.torque_required,
-                "torque_available": way.torque_available,
-                "max_draft": _value_std(way.max_draft),
-                "max_grade": _value_std(way.max_grade),
-                "limit": way.limit,
-                "since_valid": way.since_valid,
-            },
-            "gaps": dict(result.gaps),
-            "warning": {"state": str(result.watch.warning), "time_left": _finite(result.watch.time_left)},
-            "capability": None if way.capability is None else _capability(way.capability),
-            "chi2": result.chi2,
-            "samples": result.samples,
-            "rejected": result.rejected,
+    line = {
+        "t": round(result.t, 6),
+        "log": result.log,
+        "window": result.index,
+        "status": str(result.status),
+        "state": str(state_after(result)),
+        "reason": result.reason,
+        "soil": None if posterior is None else {k: _value_std(e) for k, e in posterior.parameters().items()},
+        "bearing_pressure": bearing,
+        "soil_class": None if result.soil_class is None else likeliest(result.soil_class),
+        "slip": result.slip,
+        "sinkage": result.sinkage,
+        "traversability": {
+            "state": str(way.state),
+            "probability": way.probability,
+            "torque_required": way.torque_required,
+            "torque_available": way.torque_available,
+            "max_draft": _value_std(way.max_draft),
+            "max_grade": _value_std(way.max_grade),
+            "limit": way.limit,
+            "age": result.t - result.basis.end,
+            "since_valid": way.since_valid,
         },
-        allow_nan=False,
-    )
+        "gaps": dict(result.gaps),
+        "warning": {"state": str(result.watch.warning), "time_left": result.watch.time_left},
+        "capability": None if way.capability is None else _capability(way.capability),
+        "chi2": result.chi2,
+        "samples": result.samples,
+        "rejected": result.rejected,
+    }
+    return json.dumps(known(line), allow_nan=False)
 
 
 def _capability(able: Capability) -> dict[str, Any]:
@@ -124,7 +124,7 @@ def _capability(able: Capability) -> dict[str, Any]:
             "sinkage": {wheel: _value_std(depth) for wheel, depth in forecast.sinkage.items()},
         },
         "over_slip": {
-            column: [_finite(x) for x in getattr(able.over_slip, column).tolist()]
+            column: getattr(able.over_slip, column).tolist()
             for column in ("slip", "pull", "pull_std", "torque", "torque_std")
         },
     }
@@ -203,8 +203,13 @@ def forecast_frame(result: WindowResult | None, watch: Watch) -> tuple[str, dict
     }
 
 
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
+def known(value: Any) -> Any:
+    """What JSON can say of nested dicts, lists and numbers: null for every number that is not finite."""
+    if isinstance(value, Mapping):
+        return {key: known(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [known(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _value(estimate: Estimate | None) -> float | None:

@@ -30,10 +30,15 @@ class Pipeline:
 
     def __init__(self, config: Config, database: Database) -> None:
         self.config, self.database = config, database
-        self.intake = Intake(config, database)
-        self.admission = self.intake.admission
-        self.feed = self.intake.admission.feed
+        self._hear_with(Intake(config, database))
         completion_of(config)  # its faults are told now, and not when the estimator is made
+
+    def _hear_with(self, intake: Intake) -> None:
+        self.intake, self.admission, self.feed = intake, intake.admission, intake.admission.feed
+
+    def begin_recording(self) -> None:
+        """What is fed from now on is of another recording: nothing is carried over to it but the counts."""
+        self._hear_with(self.intake.of_another_recording())
 
     @cached_property
     def estimator(self) -> WindowEstimator:

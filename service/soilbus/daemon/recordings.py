@@ -11,8 +11,8 @@ from cantools.database.can import Database
 
 from soilbus.assembly import completion_of, model_of, rig_of
 from soilbus.config import Config
-from soilbus.daemon.intake import LONGEST_GAP, Intake
-from soilbus.daemon.replay import check_heard, fed
+from soilbus.daemon.intake import Intake
+from soilbus.daemon.replay import fed, log_names
 from soilbus.diagnosis.records import Record, TooLittle, record_of
 from soilbus.estimation.window import Window
 
@@ -44,13 +44,13 @@ def recordings_of(
     effects, free = completion_of(config)
     records: list[Record] = []
     first, too_short, rejected, samples = [], [], Counter[str](), 0
-    for path in logs:
+    for path, log in zip(logs, log_names(logs), strict=True):
         intake = Intake(config, database)
         first.append(len(records))
         fault: TooLittle | None = None
         for i, window in enumerate(parts(intake, path, progress)):
             samples += window.samples
-            name = path.name if i == 0 else f"{path.name}, part {i + 1}"
+            name = log if i == 0 else f"{log}, part {i + 1}"
             try:
                 record = record_of(name, window, rig, model, settings.min_speed, settings.max_turn)
             except TooLittle as error:
@@ -58,10 +58,9 @@ def recordings_of(
                 too_short.append(name)
                 continue
             records.append(record.completed(effects, free))
-        check_heard(intake, [path])
         rejected += intake.refusals.total
         if len(records) == first[-1]:
-            raise TooLittle(_why(path, intake, fault))
+            raise TooLittle(_why(log, intake, fault))
     return Recordings(tuple(records), tuple(first), samples, dict(rejected.most_common()), tuple(too_short))
 
 
@@ -70,30 +69,26 @@ def parts(intake: Intake, log: Path, progress: Callable[[int, float], None] | No
 
     Raises LogError for a log that cannot be read to its end.
     """
-    last: float | None = None
-    counts, steps = intake.admission.counts, 0
-    for now in fed(intake, [log], progress):
-        if last is not None and not last <= now <= last + LONGEST_GAP:
-            intake.ingest()
-            yield from _whole(intake)
-        elif counts.clock_steps != steps:  # set by so little that nothing else showed it
-            yield from _whole(intake)
-        steps = counts.clock_steps
+    whole: list[Window] = []
+
+    def end() -> None:
+        intake.ingest()
+        window = intake.taken_whole()
+        if window is not None:
+            whole.append(window)
+
+    intake.admission.at_break = end
+    for now in fed(intake, log, progress):
+        yield from whole
+        whole.clear()
         intake.ingest(now)
-        last = now
-    intake.ingest()
-    yield from _whole(intake)
+    end()
+    yield from whole
 
 
-def _whole(intake: Intake) -> Iterator[Window]:
-    window = intake.taken_whole()
-    if window is not None:
-        yield window
-
-
-def _why(path: Path, intake: Intake, fault: TooLittle | None) -> str:
+def _why(log: str, intake: Intake, fault: TooLittle | None) -> str:
     """What is wrong with a log without a usable part."""
     admitted = intake.admission.counts.admitted
     unheard = [channel.name for channel in intake.needed if not admitted[channel.message]]
-    what = f"{path.name}: no usable instant in it" if fault is None else str(fault)
+    what = f"{log}: no usable instant in it" if fault is None else str(fault)
     return what + (f"; never heard: {', '.join(unheard)}" if unheard else "")

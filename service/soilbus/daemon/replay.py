@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import gzip
+import math
 import os
 import sys
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
-from itertools import chain
+from dataclasses import replace
+from itertools import chain, islice
 from multiprocessing import get_all_start_methods, get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
 import can
 
-from soilbus.can.candump import Frame, candump_batches, frame_of
+from soilbus.can.admission import LONGEST_GAP, Admission
+from soilbus.can.candump import Frame, candump_batches, frame_of, whole
 from soilbus.config import Config
 from soilbus.daemon.estimator import Undecided, WindowEstimator
 from soilbus.daemon.intake import Intake, WindowTask
@@ -26,12 +29,16 @@ from soilbus.daemon.result import WindowResult
 _T = TypeVar("_T")
 
 SWITCH_INTERVAL = 0.0002
+FIRST_LINES = 2000
+"""Lines of a log in which its channels are looked for: several seconds of a bus."""
 MAX_AHEAD = 30
 """Windows that may wait for the estimator."""
 
 
 class LogError(Exception):
-    """A log cannot be read, or not to its end; the text says where and why."""
+    """A log cannot be read, or not to its end; the text says where and why; `windows` ended before that place."""
+
+    windows = 0
 
 
 def read_log(path: Path) -> Iterator[can.Message]:
@@ -39,7 +46,7 @@ def read_log(path: Path) -> Iterator[can.Message]:
 
     Raises LogError for a file that is missing, of an unknown format, or damaged.
     """
-    return chain.from_iterable(_read(path, lambda reader: ([message] for message in reader)))
+    return chain.from_iterable(_read(path, lambda reader: ([whole(message)] for message in reader)))
 
 
 def read_frames(path: Path) -> Iterator[Frame]:
@@ -50,7 +57,7 @@ def read_frames(path: Path) -> Iterator[Frame]:
 def _frames(reader: Any) -> Iterator[list[Frame]]:
     if isinstance(reader, can.CanutilsLogReader):
         return candump_batches(reader.file)
-    return ([frame_of(message)] for message in reader)
+    return ([frame_of(whole(message))] for message in reader)
 
 
 def _read(path: Path, batches: Callable[[Any], Iterator[list[_T]]]) -> Iterator[list[_T]]:
@@ -83,69 +90,140 @@ def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())[:100] or type(error).__name__
 
 
+def log_names(logs: Sequence[Path]) -> list[str]:
+    """What to call each of the logs: as much of the end of its path as tells it from the others.
+
+    A log that is given twice has its number besides.
+    """
+    paths = [path.absolute().parts for path in logs]
+    ends = Counter(parts[-n:] for parts in set(paths) for n in range(1, len(parts) + 1))
+    seen: Counter[tuple[str, ...]] = Counter()
+    names = []
+    for parts in paths:
+        n = next(n for n in range(1, len(parts) + 1) if ends[parts[-n:]] == 1)
+        seen[parts] += 1
+        names.append(str(Path(*parts[-n:])) + (f" ({seen[parts]})" if seen[parts] > 1 else ""))
+    return names
+
+
 def replay(
     pipeline: Pipeline,
     logs: Sequence[Path],
     progress: Callable[[int, float], None] | None = None,
     workers: Executor | None = None,
+    on_fault: Callable[[LogError], None] | None = None,
 ) -> Iterator[WindowResult]:
-    """Results of every window of the logs, one after the other; LogError as read_log().
+    """Results of every window of the logs, one log after the other, each named by the `log` of its results.
+
+    Each log is a recording of its own: its windows are those that it has alone, with their
+    numbers counted on.  The pipeline counts frames and refusals of all of them.
 
     `progress` is called now and then with the number of frames read and the time in the
     recording [s].  With `workers` (of `estimator_beside`) reading and estimating go on at
     the same time; the results are the same.
+
+    A log that is damaged, or of another bus, raises LogError after the windows before that
+    place; with `on_fault` that is called instead, and the next log follows.
     """
-    tasks = _tasks(pipeline.intake, logs, progress)
+    tasks = _tasks(pipeline, logs, progress, on_fault)
     if workers is None:
-        yield from map(pipeline.estimator.solve, tasks)
+        for name, task in tasks:
+            yield replace(pipeline.estimator.solve(task), log=name)
         return
     decide = pipeline.estimator.decide
-    pending: deque[Future[Undecided]] = deque()
-    cut_off: LogError | None = None
+    pending: deque[tuple[str, Future[Undecided]]] = deque()
+    fault: LogError | None = None
+
+    def decided() -> WindowResult:
+        name, future = pending.popleft()
+        return replace(decide(future.result()), log=name)
+
     try:
-        for task in tasks:
-            pending.append(workers.submit(_estimate, task))
-            while pending and (pending[0].done() or len(pending) > MAX_AHEAD):
-                yield decide(pending.popleft().result())
+        for name, task in tasks:
+            pending.append((name, workers.submit(_estimate, task)))
+            while pending and (pending[0][1].done() or len(pending) > MAX_AHEAD):
+                yield decided()
     except LogError as error:
-        cut_off = error
-    for future in pending:
-        yield decide(future.result())
-    if cut_off is not None:
-        raise cut_off
+        fault = error
+    while pending:
+        yield decided()
+    if fault is not None:
+        raise fault
 
 
-def _tasks(intake: Intake, logs: Sequence[Path], progress: Callable[[int, float], None] | None) -> Iterator[WindowTask]:
-    last = 0.0
-    for last in fed(intake, logs, progress):
-        yield from intake.due(last)
-    yield from intake.finish(last)
+def _tasks(
+    pipeline: Pipeline,
+    logs: Sequence[Path],
+    progress: Callable[[int, float], None] | None,
+    on_fault: Callable[[LogError], None] | None,
+) -> Iterator[tuple[str, WindowTask]]:
+    """The windows of every log with its name."""
+    for path, name in zip(logs, log_names(logs), strict=True):
+        pipeline.begin_recording()
+        n = 0
+        try:
+            for task in _windows(pipeline.intake, path, progress):
+                n += 1
+                yield name, task
+        except LogError as error:
+            error.windows = n
+            if on_fault is None:
+                raise
+            on_fault(error)
 
 
-def fed(intake: Intake, logs: Sequence[Path], progress: Callable[[int, float], None] | None = None) -> Iterator[float]:
-    """Feeds the frames of the logs to an intake; LogError as read_log().
+def _windows(intake: Intake, log: Path, progress: Callable[[int, float], None] | None) -> Iterator[WindowTask]:
+    """The windows of one log; LogError after those before the place where it is damaged."""
+    fault: LogError | None = None
+    try:
+        for now in fed(intake, log, progress):
+            yield from intake.due(now)
+    except LogError as error:
+        fault = error
+    yield from intake.finish(intake.admission.newest)
+    if fault is not None:
+        raise fault
+
+
+def fed(intake: Intake, log: Path, progress: Callable[[int, float], None] | None = None) -> Iterator[float]:
+    """Feeds the frames of a log to an intake.
 
     Yields the time [s] when a window has ended (once, whether it is taken or not), every second of the recording, and
     at its end.
+
+    Raises LogError as read_log(), where the last frame is not whole, and where no frame is of a mapped message.
     """
-    feed = intake.admission.feed
-    last = 0.0
+    admission, counts = intake.admission, intake.admission.counts
+    feed = admission.feed
+    unheard = counts.unknown + counts.error_frames
+    first = due = math.nan
     n = 0
-    for path in logs:
-        due = -1.0
-        for t, identifier, extended, data, remote, error in read_frames(path):
-            n += 1
-            if error:
-                intake.admission.counts.error_frames += 1
-                continue
-            last = t
-            if last >= due or last < due - 2.0:
-                yield last
-                due = min(intake.next_end, last + 1.0) if intake.next_end > last else last + 1.0
-                if progress is not None:
-                    progress(n, last)
-            feed(t, identifier, extended, data, remote)
-    yield last
+    frame: Frame = (math.nan, 0, False, b"", False, True)
+    for n, frame in enumerate(read_frames(log), 1):
+        t, identifier, extended, data, remote, error = frame
+        if error:
+            counts.error_frames += 1
+            continue
+        feed(t, identifier, extended, data, remote)
+        if not due - 2.0 <= t < due:
+            yield _believed(admission, t)
+            due = min(intake.next_end, t + 1.0) if intake.next_end > t else t + 1.0
+            if progress is not None:
+                first = t if math.isnan(first) else first
+                progress(n, t - first)
+    t, identifier, extended, data, remote, error = frame
+    yield _believed(admission, t)
+    if counts.unknown + counts.error_frames == unheard + n:
+        raise LogError(f"{log}: none of its {n} frames is in the DBC: a log of another bus?")
+    message = None if remote or error else admission.cut_short(identifier, extended, data)
+    if message is not None:
+        raise LogError(f"{log}: cut off in its last frame ({len(data)} of {message.length} bytes of {message.name})")
+
+
+def _believed(admission: Admission, t: float) -> float:
+    """A frame's stamp [s]; that of the latest mapped frame where it is far from it, for then it is no time."""
+    newest = admission.newest
+    return t if newest <= t <= newest + LONGEST_GAP else newest
 
 
 @contextmanager
@@ -182,9 +260,24 @@ def _estimate(task: WindowTask) -> Undecided:
     return _estimator.estimate(task)
 
 
-def check_heard(listener: Pipeline | Intake, logs: Iterable[Path]) -> None:
-    """Raises LogError where not one frame of a mapped message was in the logs."""
-    counts = listener.admission.counts
-    if not sum(counts.received.values()):
-        names = ", ".join(str(p) for p in logs)
-        raise LogError(f"{names}: none of its {counts.unknown} frames is in the DBC: a log of another bus?")
+def other_channel(config: Config, logs: Iterable[Path]) -> list[str]:
+    """A line for each candump log whose first lines are of another channel than the configured one, or of several."""
+    lines = []
+    for path in logs:
+        names = _channels(path)
+        if names and names != {config.bus.channel}:
+            of = " and ".join(sorted(names))
+            lines.append(f"{path}: frames of {of}, where bus.channel = {config.bus.channel}; all of them count")
+    return lines
+
+
+def _channels(path: Path) -> set[str]:
+    """Channels in the first lines of a candump log; none for other formats and what cannot be read."""
+    if ".log" not in path.suffixes[-2:]:
+        return set()
+    try:
+        with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as text:
+            words = [line.split(maxsplit=2) for line in islice(text, FIRST_LINES)]
+    except (OSError, EOFError, ValueError):
+        return set()
+    return {word[1] for word in words if len(word) == 3 and word[0].startswith("(")}

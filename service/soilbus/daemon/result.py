@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from soilbus.capability.immobilisation import Watch
 from soilbus.capability.traction_loss import TractionLoss
 from soilbus.config import Config
+from soilbus.daemon.excitation import Excitation
 from soilbus.daemon.positions import Position
 from soilbus.judgement import Basis, at_present
 from soilbus.traversability import Status, Traversability
@@ -27,7 +28,9 @@ class WindowResult:
     the largest first.  position is in the middle of the data that count: of the window, or
     of its part on a new soil.  failure is the kind of a solve that failed, None where none did.
     watch warns of immobilisation; unknown where the loop watches ten times a second itself.  gaps: reduced
-    chi-square of the channels that have not fitted for minutes, the worst first.  basis: what the decision rests on.
+    chi-square of the channels that have not fitted for minutes, the worst first.  log names the
+    recording that the window is of; None for the live bus.  excitation: how much draft and slip varied.
+    basis: what the decision rests on.
     """
 
     t: float
@@ -48,6 +51,8 @@ class WindowResult:
     failure: str | None = None
     gaps: Mapping[str, float] = field(default_factory=dict)
     watch: Watch = Watch()  # noqa: RUF009, immutable
+    log: str | None = None
+    excitation: Excitation = Excitation()  # noqa: RUF009, immutable
     basis: Basis = Basis()  # noqa: RUF009, immutable
 
 

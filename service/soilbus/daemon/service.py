@@ -166,6 +166,9 @@ class Service:
             if message is None:
                 self._time.took_nothing(self.clock())
                 return
+            now = self.clock()
+            if self._time.set_ahead(message.timestamp, now):
+                self.intake.begin_anew()
             feed(
                 message.timestamp,
                 message.arbitration_id,
@@ -173,7 +176,6 @@ class Service:
                 message.data,
                 message.is_remote_frame,
             )
-            now = self.clock()
             self._time.took(message.timestamp, now)
             if message.timestamp >= self.intake.next_end or now >= self._next_tick:
                 return
@@ -182,7 +184,7 @@ class Service:
         """Give the windows that have ended to the worker; what it cannot keep up with is dropped."""
         for task in self.intake.due(self._time.heard(self.intake.next_end, now)):
             ended = now - max(0.0, self._time.at(now) - task.end)
-            self.deadline_misses += self._backlog.add(task, ended, self.intake.epoch, now)
+            self.deadline_misses += self._backlog.add(task, ended, task.epoch, now)
             self._handed_out = now
 
     def _collect(self, now: float) -> None:
@@ -326,7 +328,7 @@ class Service:
                     "State": str(way.state),
                     "LimitingCause": way.limit if known else None,
                     "Probability": way.probability if known else None,
-                    "Age": None if self.result is None else max(self._age(now), 0.0),
+                    "Age": max(age, 0.0) if math.isfinite(age := self._age(now)) else None,
                     "SinceValid": self._since_valid(now),
                     "Window": window,
                 },

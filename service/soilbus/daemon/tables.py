@@ -25,7 +25,7 @@ from soilbus.daemon.estimator import WindowEstimator
 from soilbus.daemon.intake import WindowTask, column_means
 from soilbus.daemon.positions import PositionTrack
 from soilbus.daemon.recordings import Recordings
-from soilbus.daemon.replay import LogError
+from soilbus.daemon.replay import LogError, log_names
 from soilbus.daemon.result import WindowResult
 from soilbus.diagnosis.records import Record, TooLittle, record_of_rows
 from soilbus.estimation.readings import MAX_SLIP, MIN_SLIP
@@ -93,9 +93,10 @@ def runs_of(config: Config, path: Path) -> list[Run]:
 def replay_tables(config: Config, paths: Sequence[Path]) -> Iterator[WindowResult]:
     """Each run as one window of the daemon's own estimator; t is its last row's. TableError as runs_of()."""
     estimator = WindowEstimator(config)
-    runs = (run for path in paths for run in runs_of(config, path))
-    for index, run in enumerate(run for run in runs if len(run.window.t)):
-        yield estimator.solve(_task(index, run, estimator.rig))
+    named = zip(paths, log_names(paths), strict=True)
+    runs = ((name, run) for path, name in named for run in runs_of(config, path) if len(run.window.t))
+    for index, (name, run) in enumerate(runs):
+        yield replace(estimator.solve(_task(index, run, estimator.rig)), log=name)
 
 
 def _task(index: int, run: Run, rig: Rig) -> WindowTask:

@@ -129,7 +129,7 @@ def _rig(trial: Trial, noise: Noise) -> Rig:
         "load": SensorNoise(relative=noise.W), "draft": SensorNoise(relative=noise.DP),
         "torque": SensorNoise(relative=noise.T), "sinkage": SensorNoise(absolute=noise.sinkage),
         "ground_speed": SensorNoise(absolute=noise.slip * RIM_SPEED), "speed": SensorNoise(absolute=1e-9),
-        "pitch": SensorNoise(), "acceleration": SensorNoise(),
+        "pitch": SensorNoise(), "acceleration": SensorNoise(), "yaw_rate": SensorNoise(),
     }  # fmt: skip
     return Rig(("wheel",), np.array([trial.radius]), np.array([trial.width]), np.array([False]), None, sensors)
 

@@ -101,6 +101,24 @@ class Posterior:
         """Tangent of the internal friction angle."""
         return self._estimate(tan_phi(self.soil))
 
+    def widened(self, factor: float, prior: SoilPrior) -> Posterior:
+        """The same where the data's noise variance is `factor` (>= 1) times what was assumed.
+
+        The information that the data gave beyond the prior, not the prior's own, is divided by the
+        factor: in units of the prior's standard deviations each principal variance s becomes
+        1 / (1 + (1/s - 1) / factor).  So nothing is ever known less than beforehand.
+        """
+        free = prior.free
+        if factor <= 1.0 or not len(free):
+            return self
+        unit = prior.log_std[free]
+        variance, axes = np.linalg.eigh(self.log_covariance[np.ix_(free, free)] / np.outer(unit, unit))
+        variance = np.clip(variance, 0.0, 1.0)
+        wide = factor * variance / (1.0 + (factor - 1.0) * variance)
+        covariance = np.zeros_like(self.log_covariance)
+        covariance[np.ix_(free, free)] = (axes * wide) @ axes.T * np.outer(unit, unit)
+        return Posterior(self.soil, covariance)
+
     def distance(self, soil: Soil) -> float:
         """How many standard deviations a soil is away, all free parameters together (Mahalanobis)."""
         free = np.flatnonzero(np.diag(self.log_covariance) > 0.0)

@@ -8,7 +8,7 @@ bin without an admitted sample holds nan: missing is never zero.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import NamedTuple
 
@@ -21,10 +21,10 @@ from soilbus.terra.vehicle import Chassis, pull_required
 Array = NDArray[np.float64]
 
 WHEEL_QUANTITIES = ("torque", "load", "speed", "sinkage")
-VEHICLE_QUANTITIES = ("ground_speed", "draft", "pitch", "acceleration")
+VEHICLE_QUANTITIES = ("ground_speed", "draft", "pitch", "acceleration", "yaw_rate")
 LEAST_LEVEL = {
     "torque": 50.0, "load": 500.0, "speed": 0.4, "sinkage": 0.01,
-    "ground_speed": 0.2, "draft": 500.0, "pitch": 0.01, "acceleration": 0.1,
+    "ground_speed": 0.2, "draft": 500.0, "pitch": 0.01, "acceleration": 0.1, "yaw_rate": 0.02,
 }  # fmt: skip
 """Magnitudes (SI) below which a relative noise shrinks no further when samples are screened: a
 sensor at rest still has its resolution and its zero."""
@@ -55,6 +55,8 @@ class Rig:
     front: NDArray[np.bool_]
     chassis: Chassis | None
     noise: Mapping[str, SensorNoise]
+    track: float | None = None
+    """Distance [m] between the left and the right wheels, where known."""
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -68,8 +70,9 @@ class Window:
     """Bin means of one window and the variances of those means; nan where missing.
 
     torque [N m], load [N], speed [rad/s], sinkage [m] have shape (N, W); ground_speed
-    [m/s], draft [N], pitch [rad], acceleration [m/s^2] have shape (N,).  `variance` holds
-    an array of the same shape for each.  `has` names the quantities with any sample.
+    [m/s], draft [N], pitch [rad], acceleration [m/s^2], yaw_rate [rad/s] (positive to the
+    left; unknown where it is not given) have shape (N,).  `variance` holds an array of the
+    same shape for each.
     """
 
     t: Array
@@ -83,6 +86,11 @@ class Window:
     acceleration: Array
     variance: Mapping[str, Array]
     samples: int
+    yaw_rate: Array = field(default_factory=lambda: np.empty(0))
+
+    def __post_init__(self) -> None:
+        if len(self.yaw_rate) != len(self.t):
+            object.__setattr__(self, "yaw_rate", np.full(len(self.t), np.nan))
 
     def rows(self, keep: NDArray[np.intp]) -> Window:
         """The window with only these bins."""
@@ -95,8 +103,8 @@ def forward(window: Window) -> Window:
     """The window with every instant of reversing turned into the same drive forward.
 
     A smooth wheel is its own mirror image: backwards, all that points along the ground
-    changes its sign and nothing else does.  So wheel speed, torque, draft, pitch and
-    acceleration are negated and the ground speed becomes its magnitude (a radar's has no
+    changes its sign and nothing else does.  So wheel speed, torque, draft, pitch,
+    acceleration and yaw rate are negated and the ground speed becomes its magnitude (a radar's has no
     sign anyway), while loads and sinkages stay.  The load transfer is in the measured
     loads, which stay with their wheels.  Not mirrored is what tells front from rear: which
     axle runs in the other's ruts, and lugs with a direction.
@@ -121,28 +129,67 @@ def forward(window: Window) -> Window:
         draft=way * window.draft,
         pitch=way * window.pitch,
         acceleration=way * window.acceleration,
+        yaw_rate=way * window.yaw_rate,
     )
 
 
 def turning(window: Window, rig: Rig, max_turn: float) -> NDArray[np.bool_]:
     """At which instants (N,) of a forward window the vehicle turns too sharply for one ground speed.
 
-    There the rim speeds of the two wheels of every axle differ by more than max_turn of
-    their mean.  On a turn of radius R with track B they differ by B/R, and each wheel's
-    slip, told from the speed of the vehicle's middle, is wrong by B/(2 R) (1 - slip).  One
-    axle alone may differ as much by slip: with different loads on a side slope.  An axle
-    with an unknown speed, or not with two wheels, does not count; without any no instant
-    is in a turn.
+    On a turn of radius R with track B and yaw rate r = V/R, the ground speeds of the two
+    wheels of an axle differ by B r, that is by B/R of their mean V, and each wheel's slip,
+    taken from the speed of the vehicle's middle, is wrong by B/(2 R) (1 - slip).  An instant
+    is in a turn where that relative difference exceeds `max_turn`.
+
+    Where the yaw rate is known it decides: rim speeds that differ without it are wheel spin.
+    With a track the difference is B r.  Without one the rim speeds must show a turn (below)
+    to the side of the yaw rate, by a difference that a track could make of it.
+
+    Without a yaw rate the rim speeds alone tell.  A turn makes the wheels of the same side the
+    faster ones on every axle, by the same relative difference but for what steering angle and
+    tracks make of it, and by no more than a turn about a centre one track away.  All else is
+    slip: of one wheel, of one on each axle crosswise (open differentials), of all on one side
+    while the others stand, or of one axle on a side slope.  An axle with an unknown speed, or
+    not with two wheels, does not count; without any no instant is in a turn.
     """
+    apart, faster = _rim_differences(window, rig)
+    size = np.abs(apart)
+    least, most = np.fmin.reduce(size, axis=1, initial=np.inf), np.fmax.reduce(size, axis=1, initial=0.0)
+    one_way = np.abs(np.nansum(np.sign(apart), axis=1)) == np.isfinite(apart).sum(axis=1)
+    by_rims = np.isfinite(least) & (least > max_turn) & (most < SHARPEST_TURN) & (most < UNLIKE_AXLES * least)
+    by_rims &= one_way
+    yaw = window.yaw_rate
+    if not np.isfinite(yaw).any():
+        return np.asarray(by_rims)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        if rig.track is not None:
+            by_yaw = rig.track * np.abs(yaw) > max_turn * np.abs(window.ground_speed)
+        else:
+            track = faster / yaw[:, None]  # of the axle, were nothing but the turn in it
+            low, high = TRACKS
+            by_yaw = by_rims & (np.isnan(track) | ((track > low) & (track < high))).all(axis=1)
+    return np.asarray(np.where(np.isfinite(yaw), by_yaw, by_rims))
+
+
+SHARPEST_TURN = 1.0
+"""Relative difference of rim speeds of a turn about a centre one track from the vehicle's middle: B/R = 1.
+Steered tractors turn about centres at least 1.5 tracks away; one side that spins while the other stands is at 2."""
+UNLIKE_AXLES = 2.0
+"""Ratio of the axles' relative differences in one turn.  The front axle's is less by the square of the cosine of the
+steering angle (1/2 at 45 degrees), the slower inner wheels of both slip about alike."""
+TRACKS = (0.3, 8.0)
+"""Tracks [m] of wheeled vehicles, from small rovers to 3.2 m, the latter over 1 - slip for slips up to 0.6."""
+
+
+def _rim_differences(window: Window, rig: Rig) -> tuple[Array, Array]:
+    """Right less left rim speed (N, P) of each pair: over their mean, and in m/s; nan where unknown."""
     left, right = (rig.radius[side] * window.speed[:, side] for side in pairs(rig))
     with np.errstate(invalid="ignore", divide="ignore"):
-        apart = 2.0 * np.abs(left - right) / (left + right)
-    least = np.fmin.reduce(apart, axis=1, initial=np.inf)
-    return np.asarray(np.isfinite(least) & (least > max_turn))
+        return 2.0 * (right - left) / (left + right), right - left
 
 
 def pairs(rig: Rig) -> NDArray[np.intp]:
-    """Left and right wheels (2, P) of the axles that have two."""
+    """Left and right wheels (2, P) of the axles that have two; the left one is configured first."""
     return _pairs(tuple(rig.front.tolist()))
 
 

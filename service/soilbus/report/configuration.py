@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from cantools.database.can import Database
@@ -15,6 +16,7 @@ from soilbus.config import Config, Table
 from soilbus.daemon.outputs import check_cycle_times
 from soilbus.report.soil_prior import prior_text
 from soilbus.report.table import table
+from soilbus.sensors.survey import Seen, Survey
 
 
 def configuration_report(config: Config) -> str:
@@ -31,6 +33,66 @@ def configuration_report(config: Config) -> str:
     rows = [_row(channel, database, channel.name in assumed, channel.message in checked) for channel in channels]
     head = ("role", "signal", "unit", "factor to SI", "plausible", "every", "status")
     return _report(config, [table(head, rows)])
+
+
+def configuration_warnings(config: Config) -> list[str]:
+    """Lines on what is assumed, or cannot be estimated, for want of a word in the configuration."""
+    lines = []
+    quantities = [q for q in _measured(config) if q not in config.noise.model_fields_set]
+    if "noise" not in config.model_fields_set:
+        lines.append(
+            "no [noise]: each sensor's noise is assumed to be that of a well-instrumented tractor, and the error bars"
+            " with it; give it from data sheets or a drive on the road"
+        )
+    elif quantities:
+        lines.append(f"[noise] does not give {', '.join(quantities)}: the defaults below are assumed")
+    if config.table is None and all(w.lacking for w in config.wheel):
+        lines.append("no wheel has torque, speed and load mapped: nothing can be estimated")
+    elif config.table is None and config.signals.ground_speed is None:
+        lines.append("signals.ground_speed is not mapped: without slip nothing can be estimated")
+    c = config.soil.c
+    if 0.0 < c.value < LEAST_COHESION and c.std > 0.0:
+        lines.append(f"soil.c.value = {c.value:g} Pa is next to nothing; is it in kPa?")
+    return lines
+
+
+LEAST_COHESION = 70.0
+"""Pa: the stiffest clay of Wong's table has 69 kPa, the loosest sand 1 kPa."""
+
+
+def _measured(config: Config) -> Iterator[str]:
+    """The quantities that are mapped and whose noise counts."""
+    names = {"wheel_load": "load", "drawbar_pull": "draft"}
+    if config.table is not None:
+        yield from (names.get(role, role) for role in config.table.columns if role != "t")
+        return
+    for quantity in type(config.noise).model_fields:
+        wheels = any(getattr(wheel, quantity, None) is not None for wheel in config.wheel)
+        if wheels or getattr(config.signals, quantity, None) is not None:
+            yield quantity
+
+
+def survey_report(found: Survey) -> str:
+    """What was heard of every mapped signal, and what the recording cannot show."""
+    rows = [_heard_row(seen, found) for seen in found.seen]
+    text = "\n" + table(("role", "values", "every", "from", "to", "refused", "beside the configuration"), rows)
+    return text + "".join(f"cannot be told: {line}\n" for line in found.open)
+
+
+def _heard_row(seen: Seen, found: Survey) -> tuple[str, ...]:
+    of_it = [f for f in found.findings if seen.channel.name in f.channels]
+    status = "fault, see below" if any(f.fatal for f in of_it) else "warning, see below" if of_it else "plausible"
+    if not seen.count:
+        status = status if of_it else "not heard"
+    return (
+        seen.channel.name,
+        str(seen.count),
+        f"{1e3 / seen.rate:.0f} ms" if math.isfinite(seen.rate) else "-",
+        f"{seen.low:.4g}" if seen.count else "-",
+        f"{seen.high:.4g}" if seen.count else "-",
+        str(sum(seen.refused.values())),
+        status,
+    )
 
 
 def _report(config: Config, parts: list[str]) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 
 from soilbus.config import Config
 from soilbus.daemon.diagnose import Findings
+from soilbus.daemon.outputs import known
 from soilbus.diagnosis.completion import Completion
 from soilbus.diagnosis.learned import WARNING, Correction
 from soilbus.diagnosis.naming import Addition
@@ -58,7 +59,7 @@ def findings_json(findings: Findings) -> str:
         "too_short": list(recordings.too_short),
         "seconds": round(findings.seconds, 3),
     }
-    return json.dumps(_finite(told), indent=1, allow_nan=False) + "\n"
+    return json.dumps(known(told), indent=1, allow_nan=False) + "\n"
 
 
 def _place(place: Disagreement) -> dict[str, Any]:
@@ -112,15 +113,6 @@ def _soil(posterior: Posterior, findings: Findings) -> dict[str, Any]:
 
 def _estimates(estimates: dict[str, Estimate]) -> dict[str, dict[str, float]]:
     return {name: {"value": e.value, "std": e.std} for name, e in estimates.items()}
-
-
-def _finite(value: Any) -> Any:
-    """The same with None for every number that is not finite."""
-    if isinstance(value, dict):
-        return {key: _finite(v) for key, v in value.items()}
-    if isinstance(value, list):
-        return [_finite(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def findings_text(findings: Findings) -> str:

@@ -9,19 +9,12 @@ from contextlib import contextmanager
 
 @contextmanager
 def progress(title: str) -> Iterator[Callable[[int, float], None] | None]:
-    """Yields a function to call with frames read and time in the recording [s]; None in a pipe."""
+    """Yields a function to call with frames read and time since the recording's begin [s]; None in a pipe."""
     with phases(title) as say:
         if say is None:
             yield None
             return
-        start: list[float] = []
-
-        def step(frames: int, t: float) -> None:
-            if not start:
-                start.append(t)
-            say(f"{frames} frames, {t - start[0]:.0f} s of recording")
-
-        yield step
+        yield lambda frames, t: say(f"{frames} frames, {t:.0f} s of recording")
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from soilbus.config import Config, ConfigError
+from soilbus.daemon.outputs import known
 from soilbus.daemon.result import WindowResult
 from soilbus.estimation.posterior import Estimate
 
@@ -34,7 +35,7 @@ def soil_map(results: Iterable[WindowResult]) -> tuple[str, int]:
         if result.position is None:
             left_out += 1
         else:
-            features.append(json.dumps(_feature(result), allow_nan=False))
+            features.append(json.dumps(known(_feature(result)), allow_nan=False))
     body = ",\n".join(features)
     return f'{{"type": "FeatureCollection", "features": [\n{body}\n]}}\n', left_out
 
@@ -54,6 +55,7 @@ def _properties(result: WindowResult) -> dict[str, Any]:
     way, parameters = result.traversability, {} if result.posterior is None else result.posterior.parameters()
     likeliest = max(result.soil_class.items(), key=lambda item: item[1]) if result.soil_class else (None, None)
     return {
+        "log": result.log,
         "window": result.index,
         "t": round(result.t, 6),
         "time": _time(result.t),
@@ -62,9 +64,9 @@ def _properties(result: WindowResult) -> dict[str, Any]:
         **_value_std("bearing_pressure", "kpa", result.bearing, 1e3),
         **_value_std("phi", "deg", parameters.get("phi"), math.pi / 180.0),
         "soil_class": likeliest[0],
-        "soil_class_probability": _finite(likeliest[1]),
+        "soil_class_probability": likeliest[1],
         "state": str(way.state),
-        "probability": _finite(way.probability),
+        "probability": way.probability,
         **_value_std("max_draft", "n", way.max_draft, 1.0),
         "limit": way.limit,
     }
@@ -80,8 +82,4 @@ def _time(t: float) -> str | None:
 
 def _value_std(name: str, unit: str, estimate: Estimate | None, factor: float) -> dict[str, float | None]:
     value, std = (None, None) if estimate is None else (estimate.value / factor, estimate.std / factor)
-    return {f"{name}_{unit}": _finite(value), f"{name}_std_{unit}": _finite(std)}
-
-
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
+    return {f"{name}_{unit}": value, f"{name}_std_{unit}": std}

@@ -14,12 +14,20 @@ from soilbus.simulator.course import NORTHWARD, Course
 from soilbus.simulator.frames import frames, write_log
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.spelling import did_you_mean
+from soilbus.terra.soils import SOILS
 
 _MEAN_SPEED = 1.4
 
 
 def scenario_over(soils: Sequence[str], duration: float, course: Course = NORTHWARD) -> Scenario:
-    """The soils one after the other in equal parts of the time, with all the excitation they bear."""
+    """The soils one after the other in equal parts of the time, with all the excitation they bear.
+
+    KeyError for a name that is not known.
+    """
+    for name in soils:
+        if name not in SOILS:
+            raise KeyError(f"no soil is named {name}{did_you_mean(name, SOILS)}; known: {', '.join(SOILS)}")
     length = duration * _MEAN_SPEED / len(soils)
     patches = tuple(Patch(i * length, name) for i, name in enumerate(soils))
     return Scenario(duration, patches, slip=Swing(0.05, 0.40), course=course)

@@ -36,7 +36,7 @@ def fitted(config: Config) -> Iterator[tuple[str, str]]:
         for quantity in ("torque", "speed", "load", "sinkage", "torque_limit", "motor_speed"):
             if getattr(wheel, quantity) is not None:
                 yield quantity, wheel.name
-    for quantity in ("ground_speed", "draft", "pitch", "acceleration", "latitude", "longitude"):
+    for quantity in ("ground_speed", "draft", "pitch", "acceleration", "yaw_rate", "latitude", "longitude"):
         if getattr(config.signals, quantity) is not None:
             yield quantity, ""
 
@@ -49,6 +49,7 @@ def measure(drive: Drive, config: Config, seed: int) -> dict[str, Column]:
     """
     columns: dict[str, Column] = {}
     t, told = drive.columns["t"], drive.columns | _changed(drive, [wheel.name for wheel in config.wheel])
+    told = told | {"yaw_rate": np.zeros(len(t))}  # the drives are straight
     for quantity, wheel in fitted(config):
         name = f"{quantity}.{wheel}" if wheel else quantity
         every = slice(None, None, _DIVIDERS.get(quantity, 1))

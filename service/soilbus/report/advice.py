@@ -1,0 +1,89 @@
+"""Why windows did not give a valid estimate, and what to do about it, in words computed from the data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from soilbus.daemon.result import WindowResult
+from soilbus.traversability import Status
+
+DIAGNOSE = "record it and run soilbus diagnose"
+
+
+def advice(windows: Sequence[WindowResult], valid: Sequence[WindowResult]) -> str | None:
+    """One line for windows of one status and reason, beside the valid ones; None where there is nothing to say."""
+    kind, *names = windows[0].reason.split()
+    what = ", ".join(names)
+    match kind:
+        case "not_excited" if names == ["new_soil"]:
+            return "the ground had just changed: nothing to do but drive on"
+        case "not_excited" | "ambiguous":
+            return _vary(windows, valid)
+        case "standstill":
+            return "the vehicle stood or crept, so slip is not defined: drive"
+        case "turning":
+            return "the vehicle turned, so its wheels have no common ground speed: drive straight"
+        case "input_missing":
+            return f"no usable value of {what} ever came: check the mapping, and that this bus carries it"
+        case "input_stale":
+            return f"{what} had pauses: check the sender and the wiring, or set a timeout that fits its rate"
+        case "implausible":
+            return f"{what} contradicts the other sensors: check mounting, sign, scale and wiring"
+        case "model_mismatch":
+            chi2 = [w.chi2 for w in windows if w.chi2 is not None and np.isfinite(w.chi2)]
+            off = f"the model is {np.sqrt(np.median(chi2)):.2g} times the noise off: " if chi2 else ""
+            return f"{off}check mass, radii, gear ratios and signs; else {DIAGNOSE}"
+        case "no_convergence":
+            return f"no soil explains these data ({_moved(windows)}): check signs and scales; else {DIAGNOSE}"
+    return None
+
+
+def _vary(windows: Sequence[WindowResult], valid: Sequence[WindowResult]) -> str:
+    """What moved too little in these windows, beside the valid ones."""
+    here, there = _draft(windows), _draft(valid)
+    if here is None or there is None:
+        return f"vary the load more: {_moved(windows)}"
+    if here.sd < there.sd:
+        return f"vary the load: {_moved(windows, ' only')}; in the valid windows {_moved(valid)}"
+    return f"vary the load for longer on one ground: {_moved(windows)}, as much as in the valid windows"
+
+
+class _Spread(NamedTuple):
+    mean: float
+    sd: float
+
+
+def _moved(windows: Sequence[WindowResult], only: str = "") -> str:
+    """How much draft and slip vary within a window (standard deviations), as medians of the windows."""
+    draft, slip = _draft(windows), _slip(windows)
+    said = []
+    if draft is not None:
+        newtons = f"{draft.mean:.0f} ± {draft.sd:.0f} N"
+        share = 100.0 * draft.sd / abs(draft.mean) if abs(draft.mean) > draft.sd else None
+        said.append(
+            f"the draft was {newtons}" if share is None else f"the draft moved by {share:.2g} %{only} ({newtons})"
+        )
+    if slip is not None:
+        said.append(f"slip was {100.0 * slip.mean:.1f} ± {100.0 * slip.sd:.1f} %")
+    return ", ".join(said) or "draft and slip are not known"
+
+
+def _draft(windows: Sequence[WindowResult]) -> _Spread | None:
+    return _typical([(w.excitation.draft, w.excitation.draft_sd) for w in windows])
+
+
+def _slip(windows: Sequence[WindowResult]) -> _Spread | None:
+    return _typical([(w.excitation.slip, w.excitation.slip_sd) for w in windows])
+
+
+def _typical(of: Sequence[tuple[float | None, float | None]]) -> _Spread | None:
+    known = [(mean, sd) for mean, sd in of if mean is not None and sd is not None]
+    return _Spread(*np.median(known, axis=0).tolist()) if known else None
+
+
+def of_use(windows: Sequence[WindowResult]) -> list[WindowResult]:
+    """Those with an estimate of the soil, whatever its status."""
+    return [window for window in windows if window.status is not Status.INVALID and window.posterior is not None]

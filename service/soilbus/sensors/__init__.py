@@ -1,0 +1,1 @@
+"""Is this reading to be believed: what recordings say of their own sensors."""

@@ -1,0 +1,779 @@
+"""A recording beside the configuration: what is heard of each mapped signal, and what contradicts the vehicle.
+
+Mistakes of mapping are gross and last: a wrong sign, unit, gear ratio, byte order, wheel.  So each
+check compares means over a whole recording with what the vehicle is said to be:
+
+    weight      sum of the wheel loads = m g cos(pitch), and its share on each axle by moments
+    gear        motor speed = gear ratio * wheel speed
+    slip        1 - v / (r omega) within what driven wheels do
+    balance     changes of sum(torque / r) = 0.7 to 1.0 * changes of draft, and so of slope + inertia
+    sides       torque of the left less the right wheel grows with the load of the left less the
+                right, and with its slip: the signs of a regression tell loads, speeds or torques
+                that are swapped.  All three swapped at once are the same vehicle in a mirror.
+
+Where a recording does not vary enough to tell, the survey says so.  Nothing tells the loads of a
+front and a rear wheel apart that carry alike.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from cantools.database.can import Database
+from numpy.typing import NDArray
+
+from soilbus.assembly import rig_of
+from soilbus.can.admission import Admission
+from soilbus.can.channels import Channel, Reason
+from soilbus.can.dbc_files import checked_messages
+from soilbus.can.mapping import OPTIONAL_ROLES, POSITION_ROLES, channels_of
+from soilbus.can.units import SI, unit_of
+from soilbus.config import Config, ConfigError, Signal
+from soilbus.daemon.plausibility import resolution_of
+from soilbus.estimation.plausibility import implausible, without
+from soilbus.estimation.series import change, median
+from soilbus.estimation.window import BinStore, Rig, Window, forward, pairs, pull_given, turning
+from soilbus.terra.vehicle import GRAVITY, axle_loads, slip_ratio
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Frame = tuple[float, int, bool, bytes | bytearray, bool, bool]
+
+BATCH = 5000
+"""Frames that are decoded at a time."""
+SILENCE = 60.0
+"""Seconds without a frame, or set back, after which a recording begins anew; the longest part is compared."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """From where a recording contradicts its configuration.
+
+    Evidence, where not said: three recordings of the field vehicle and simulated drives on loam, wet clay, heavy clay
+    and sand gave loads of 0.997 to 1.002 of the weight, axles within 0.004 of it, slopes of the balance of 0.72 to
+    1.01, slips of 5 % of the time of 0.06 to 0.14, and slips of wheels within 0.04 of each other.
+    """
+
+    least_seconds: float = 10.0
+    """Of driving straight on, to compare anything [s]."""
+    refused: float = 0.05
+    """Share of refused values that is a warning; four times as many are a fault."""
+    rate: float = 0.8
+    """Share of the rate that the DBC gives, below which a signal is slow."""
+    least_rate: float = 5.0
+    """Values a second that windows of 0.1 s bins live on."""
+    weight: float = 0.15
+    """Share of the weight by which loads may be off: fuel, driver, what is carried; half of it is a warning."""
+    axle: float = 0.12
+    """The same of one axle: centre of gravity and height of the hitch are known that well."""
+    gear: float = 0.03
+    """Relative difference of motor and wheel speed: resolution and phase; any other gear step is larger."""
+    pushed: float = -0.2
+    """Slip of a wheel that drives, below which no wheel is."""
+    never_less: float = 0.45
+    """Slip that 95 % of a drive exceeds: a vehicle that only digs."""
+    wheel_apart: float = 0.15
+    """Difference of one wheel's median slip from the median of all."""
+    scale: tuple[float, float] = (0.6, 1.3)
+    """Slope of the balance."""
+    excited: float = 0.008
+    """Sd of the draft's changes within 1 s, as share of the weight, from which the balance tells anything."""
+    pull: float = 0.02
+    """Median pull, as share of the weight, from which its size counts."""
+    less_thrust: float = 0.9
+    """Thrust over pull, at least: rolling resistance, never less than a hundredth of the weight, is in the thrust."""
+    most_thrust: float = 0.9
+    """Median thrust over weight: no soil bears more for long."""
+    side_sd: float = 4.0
+    """Standard deviations by which a regression's factor must have the wrong sign, or be beyond the scale."""
+    side_offset: float = 0.3
+    """Constant difference of the torques of an axle, as share of their mean."""
+    jump: float = 0.3
+    """Median change from value to value, as share of the median value: bodies of tonnes have inertia."""
+    jump_sd: float = 10.0
+    """The same in standard deviations of the configured noise."""
+    windows: float = 0.2
+    """Share of windows in which a sensor contradicts the others."""
+
+
+LIMITS = Limits()
+
+
+class Finding(NamedTuple):
+    """What is wrong, in one line; `fatal` where estimates would be wrong; the channels (by name) in question."""
+
+    text: str
+    fatal: bool
+    channels: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What was heard of one mapped signal: values, rate [1/s] or nan, range (SI) or nan, refused by reason."""
+
+    channel: Channel
+    count: int
+    rate: float
+    low: float
+    high: float
+    refused: Mapping[Reason, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """Every mapped signal, what is wrong, and what this recording cannot show."""
+
+    seen: tuple[Seen, ...]
+    findings: tuple[Finding, ...]
+    open: tuple[str, ...]
+
+    @property
+    def faults(self) -> list[str]:
+        """Lines on what makes estimates wrong."""
+        return [f.text for f in self.findings if f.fatal]
+
+    @property
+    def warnings(self) -> list[str]:
+        """Lines on what is odd."""
+        return [f.text for f in self.findings if not f.fatal]
+
+
+class NotToldError(Exception):
+    """The recording cannot show this; the text says what and why."""
+
+
+class Facts(NamedTuple):
+    """A recording's bins: as measured (`raw`) and forward; where it drives straight on (N,); motor speeds
+    (N, W); the names of the mapped channels.
+    """
+
+    config: Config
+    rig: Rig
+    raw: Window
+    window: Window
+    straight: Mask
+    motor: Array
+    mapped: frozenset[str]
+
+    @property
+    def slip(self) -> Array:
+        """Slip (N, W), nan where the vehicle does not drive straight on."""
+        ground = np.where(self.straight, self.window.ground_speed, np.nan)[:, None]
+        return np.asarray(slip_ratio(self.rig.radius, self.window.speed, ground))
+
+    @property
+    def thrust(self) -> Array:
+        """Torque over radius [N] (N, W), nan where the vehicle does not drive straight on."""
+        return np.where(self.straight[:, None], self.window.torque / self.rig.radius, np.nan)
+
+    def less(self, channels: Iterable[str]) -> Facts:
+        """Without these channels."""
+        gone = set(channels)
+        motor = np.where([f"motor_speed.{w}" in gone for w in self.rig.wheels], np.nan, self.motor)
+        return self._replace(
+            raw=without(self.raw, self.rig, gone), window=without(self.window, self.rig, gone), motor=motor
+        )
+
+
+def survey(config: Config, database: Database, frames: Iterable[Frame], limits: Limits = LIMITS) -> Survey:
+    """Compares the frames of one recording (time [s], identifier, extended, data, remote, error) with a configuration.
+
+    Raises ConfigError where configuration and database do not fit.
+    """
+    told = config.model_copy(update={"wheel": _with_motor_speeds(config, database)})
+    mapped = {c.name for c in channels_of(config, database)}
+    try:
+        channels = channels_of(told, database)
+    except ConfigError:  # of a speed that nobody mapped
+        told, channels = config, channels_of(config, database)
+    admission = Admission(channels, database, checked_messages(config))
+    parts, refused, n = _heard(admission, frames)
+    longest = max(parts, key=lambda part: sum(len(t) for t, _ in part.values()))
+    seen = tuple(_seen(c, longest, refused) for c in channels if c.name in mapped)
+    if not sum(admission.counts.received.values()):
+        text = f"none of the {n} frames heard is of a mapped message: another bus or channel, or the wrong DBC?"
+        return Survey(seen, (Finding(text, True),), ())
+    findings = [*_absent(seen, database), *(f for s in seen for f in _of_one(s, database, limits))]
+    findings += _stuck_and_jagged(seen, longest, config, limits)
+    facts = _facts(told, mapped, longest)
+    open_questions = [f"{_key(s.channel)}: not in this recording" for s in seen if _is_absent(s) and _is_optional(s)]
+    if facts is not None:
+        found, questions = _compared(facts, findings, channels, database, limits)
+        findings += found
+        open_questions += questions
+    return Survey(seen, tuple(findings), tuple(open_questions))
+
+
+# --- hearing ---
+
+
+def _with_motor_speeds(config: Config, database: Database) -> list[object]:
+    """The wheels, with a motor's speed where the message of its torque has one and none is mapped."""
+    wheels: list[object] = []
+    for wheel in config.wheel:
+        if wheel.torque is not None and wheel.motor_speed is None and wheel.torque.at != "wheel":
+            name = wheel.torque.signal.partition(".")[0]
+            message = next((m for m in database.messages if m.name == name), None)
+            taken = {getattr(wheel, role).signal for role in ("torque", "speed") if getattr(wheel, role) is not None}
+            turns = [s for s in message.signals if _rotation(s.unit)] if message is not None else []
+            if len(turns) == 1 and f"{name}.{turns[0].name}" not in taken:
+                signal = Signal(signal=f"{name}.{turns[0].name}", sign=wheel.torque.sign)
+                wheel = wheel.model_copy(update={"motor_speed": signal})
+        wheels.append(wheel)
+    return wheels
+
+
+def _rotation(text: str | None) -> bool:
+    try:
+        unit = unit_of(text)
+    except ValueError:
+        return False
+    return unit is not None and unit.dimension == "rotation"
+
+
+Columns = dict[str, tuple[Array, Array]]
+
+
+def _heard(admission: Admission, frames: Iterable[Frame]) -> tuple[list[Columns], Counter[tuple[str, Reason]], int]:
+    """Samples by channel of each part of the recording that has one clock, refusals, and the number of frames."""
+    pieces: list[list[Columns]] = [[]]
+    refused: Counter[tuple[str, Reason]] = Counter()
+    last, n, steps = math.nan, 0, 0
+
+    def take() -> None:
+        decoded = admission.take()
+        refused.update({key: len(t) for key, t in decoded.refused.items()})
+        pieces[-1].append({name: (c.t, c.value) for name, c in decoded.columns.items() if len(c.t)})
+
+    for t, identifier, extended, data, remote, error in frames:
+        n += 1
+        if error:
+            continue
+        if abs(t - last) > SILENCE:
+            take()
+            pieces.append([])
+        last = t
+        admission.feed(t, identifier, extended, data, remote)
+        if n % BATCH == 0:
+            if admission.counts.clock_steps != steps:
+                steps = admission.counts.clock_steps
+                pieces.append([])
+            take()
+    take()
+    return [_joined(piece) for piece in pieces], refused, n
+
+
+def _joined(pieces: list[Columns]) -> Columns:
+    names = {name for piece in pieces for name in piece}
+    joined: Columns = {}
+    for name in names:
+        parts = [piece[name] for piece in pieces if name in piece]
+        joined[name] = (np.concatenate([t for t, _ in parts]), np.concatenate([v for _, v in parts]))
+    return joined
+
+
+def _seen(channel: Channel, heard: Columns, refused: Mapping[tuple[str, Reason], int]) -> Seen:
+    t, value = heard.get(channel.name, (np.empty(0), np.empty(0)))
+    rate = (len(t) - 1) / (t[-1] - t[0]) if len(t) > 1 and t[-1] > t[0] else math.nan
+    low, high = (float(value.min()), float(value.max())) if len(value) else (math.nan, math.nan)
+    why = {reason: n for (name, reason), n in refused.items() if name == channel.name}
+    return Seen(channel, len(t), float(rate), low, high, why)
+
+
+def _facts(config: Config, mapped: Iterable[str], heard: Columns) -> Facts | None:
+    """The recording in bins; None where no wheel is measured or nothing was heard of the rig."""
+    rig, bin_length = rig_of(config), config.estimator.bin
+    known = {name: column for name, column in heard.items() if name in set(rig.channels)}
+    if not rig.wheels or not known:
+        return None
+    start = min(float(t[0]) for t, _ in known.values())
+    end = max(float(t[-1]) for t, _ in known.values())
+    store = BinStore(rig, bin_length, start)
+    store.add(known)
+    raw = store.window(start, end)
+    if not len(raw.t):
+        return None
+    window = forward(raw)
+    motor = np.full(raw.speed.shape, np.nan)
+    for i, wheel in enumerate(rig.wheels):
+        if f"motor_speed.{wheel}" in heard:
+            motor[:, i] = _binned(*heard[f"motor_speed.{wheel}"], start, bin_length, len(raw.t))
+    moving = np.abs(window.ground_speed) > config.estimator.min_speed
+    straight = moving & ~turning(window, rig, config.estimator.max_turn)
+    return Facts(config, rig, raw, window, straight, motor, frozenset(mapped))
+
+
+def _binned(t: Array, value: Array, start: float, bin_length: float, n: int) -> Array:
+    place = np.floor((t - start) / bin_length + 1e-9).astype(np.intp)
+    inside = (place >= 0) & (place < n)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        count = np.bincount(place[inside], minlength=n)
+        return np.asarray(np.bincount(place[inside], value[inside], minlength=n) / count)
+
+
+# --- one signal by itself ---
+
+
+def _key(channel: Channel) -> str:
+    """The key of the configuration that maps this channel."""
+    return f"wheel.{channel.wheel}.{channel.quantity}" if channel.wheel else f"signals.{channel.quantity}"
+
+
+def _is_absent(seen: Seen) -> bool:
+    return seen.count == 0 and not seen.refused
+
+
+def _is_optional(seen: Seen) -> bool:
+    return seen.channel.quantity in {*OPTIONAL_ROLES, "sinkage", "torque_limit", "motor_speed"}
+
+
+_WHY: Mapping[Reason, str] = {
+    Reason.NOT_AVAILABLE: "the sender says that it is not available",
+    Reason.ERROR: "the sender reports an error",
+    Reason.RESERVED: "codes that the DBC reserves",
+    Reason.OUT_OF_RANGE: "beyond the DBC's range: start bit, length or byte order?",
+    Reason.IMPLAUSIBLE: "beyond what this vehicle can do ({low:.4g} to {high:.4g} {unit}): unit, factor, byte order?",
+    Reason.SATURATED: "at the end of the range",
+    Reason.NOT_VALID: "its `valid` signal does not vouch for it: right `valid_values`?",
+    Reason.BAD_CHECKSUM: "wrong Checksum: is it another maker's? (dbc.checked, dbc/README.md)",
+    Reason.BAD_COUNTER: "its Counter does not count as in dbc/README.md (dbc.checked)",
+    Reason.WRONG_LENGTH: "frames of another length than the DBC says",
+    Reason.TIME_BACKWARDS: "stamps that run backwards",
+    Reason.BAD_TIME: "stamps that are no times",
+}
+
+
+def _absent(seen: Iterable[Seen], database: Database) -> Iterator[Finding]:
+    """Messages without which nothing can be estimated, and that never came."""
+    missing: dict[str, list[Channel]] = {}
+    for s in seen:
+        if _is_absent(s) and not _is_optional(s):
+            missing.setdefault(s.channel.message, []).append(s.channel)
+    for name, channels in missing.items():
+        message = database.get_message_by_name(name)
+        where = f"{'29' if message.is_extended_frame else '11'}-bit identifier {message.frame_id:#x}"
+        keys = ", ".join(_key(channel) for channel in channels)
+        yield Finding(f"{keys}: no frame of {name} ({where}) was heard", True, tuple(c.name for c in channels))
+
+
+def _of_one(seen: Seen, database: Database, limits: Limits) -> Iterator[Finding]:
+    """Whether a signal comes often enough and with values that count."""
+    channel, key = seen.channel, _key(seen.channel)
+    message = database.get_message_by_name(channel.message)
+    refused = sum(seen.refused.values())
+    if _is_absent(seen):
+        return
+    share = refused / (refused + seen.count)
+    if share > limits.refused:
+        reason, n = max(seen.refused.items(), key=lambda item: item[1])
+        unit = SI.get(_dimension(channel), "")
+        why = _WHY.get(reason, str(reason).replace("_", " ")).format(low=channel.low, high=channel.high, unit=unit)
+        text = f"{key}: {n} of {refused + seen.count} values of {channel.message}.{channel.signal} do not count: {why}"
+        yield Finding(text, share > 4.0 * limits.refused, (channel.name,) if share > 4.0 * limits.refused else ())
+    if math.isfinite(seen.rate) and channel.quantity not in POSITION_ROLES:
+        due = 1e3 / message.cycle_time * (1.0 - share) if message.cycle_time else 0.0
+        if seen.rate < limits.rate * due:
+            yield Finding(f"{key}: {seen.rate:.3g} values a second, where the DBC says {due:.3g}", False)
+        elif seen.rate < limits.least_rate and not _is_optional(seen):
+            yield Finding(f"{key}: only {seen.rate:.3g} values a second; windows need {limits.least_rate:g}", False)
+
+
+def _dimension(channel: Channel) -> str:
+    of_quantity = {
+        "torque": "torque", "torque_limit": "torque", "speed": "rotation", "motor_speed": "rotation", "load": "force",
+        "draft": "force", "sinkage": "length", "ground_speed": "speed", "acceleration": "acceleration",
+        "yaw_rate": "rotation",
+    }  # fmt: skip
+    return of_quantity.get(channel.quantity, "angle")
+
+
+def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config, limits: Limits) -> Iterator[Finding]:
+    """Values that never change although the vehicle drives, and values that jump as no vehicle does."""
+    ground = heard.get("ground_speed", (np.empty(0), np.empty(0)))
+    moving = ground[0][np.abs(ground[1]) > config.estimator.min_speed]
+    drives = float(np.ptp(moving)) if len(moving) else 0.0
+    for s in seen:
+        quantity, name = s.channel.quantity, s.channel.name
+        if quantity in ("torque_limit", *POSITION_ROLES) or s.count < 50:
+            continue
+        _, value = heard[name]
+        unit = SI.get(_dimension(s.channel), "")
+        if s.low == s.high:
+            if drives > limits.least_seconds or quantity == "ground_speed":
+                text = f"{_key(s.channel)}: reads {s.low:.4g} {unit} in all {s.count} values: is the sensor connected?"
+                yield Finding(text, False, (name,) if s.low != 0.0 else ())
+            continue
+        noise = getattr(config.noise, "speed" if quantity == "motor_speed" else quantity)
+        size = float(np.median(np.abs(value)))
+        sd = math.sqrt(noise.absolute**2 + (noise.relative**2 + noise.of_mean**2) * size**2)
+        jumps = np.abs(np.diff(value))
+        typical = float(np.median(jumps))
+        alike = float((np.diff(value) ** 2).mean() / (2.0 * value.var()))  # 1 for values without any memory
+        if typical > max(limits.jump_sd * sd, limits.jump * size) and alike > 0.5:
+            yield Finding(
+                f"{_key(s.channel)}: jumps by {typical:.3g} {unit} from one value to the next, {typical / sd:.0f} times"
+                f" its noise: is the byte order (Intel, Motorola) or the start bit of {s.channel.message}."
+                f"{s.channel.signal} right in the DBC?",
+                True,
+                (name,),
+            )
+
+
+# --- signals beside each other ---
+
+Check = Callable[[Facts, Limits], Iterator[Finding]]
+
+
+def _compared(
+    facts: Facts, before: Iterable[Finding], channels: Iterable[Channel], database: Database, limits: Limits
+) -> tuple[list[Finding], list[str]]:
+    """Findings of all checks, each without the channels that an earlier one has named; and what cannot be told."""
+    facts = facts.less(name for f in before for name in f.channels)
+    if facts.straight.sum() * facts.config.estimator.bin < limits.least_seconds:
+        return [], [
+            f"the vehicle drives straight on for less than {limits.least_seconds:g} s: signs, gear ratio and sides"
+            " cannot be compared"
+        ]
+    findings: list[Finding] = []
+    questions: list[str] = []
+    for check in (_weight, _ways, _gears, _slips, _balance, _levels, _sides, _yaw):
+        try:
+            found = list(check(facts, limits))
+        except NotToldError as reason:
+            if not any(f.fatal for f in (*before, *findings)):  # else for want of what is at fault
+                questions.append(str(reason))
+            continue
+        findings += found
+        facts = facts.less(name for f in found for name in f.channels)
+    if not any(f.fatal for f in (*before, *findings)):
+        findings += _contradictions(facts, channels, database, limits)
+    return findings, questions
+
+
+def _weight(facts: Facts, limits: Limits) -> Iterator[Finding]:
+    """The loads' sum beside the mass, and each axle's beside the geometry."""
+    window, rig, chassis = facts.window, facts.rig, facts.rig.chassis
+    if chassis is None:
+        return
+    names = tuple(f"load.{w}" for w in rig.wheels)
+    pitch = np.where(np.isfinite(window.pitch), window.pitch, 0.0)
+    measured = median(window.load.sum(axis=1) / np.cos(pitch))
+    if not math.isfinite(measured):
+        raise NotToldError("not every wheel load is known: the loads cannot be compared with the mass")
+    weight = chassis.mass * GRAVITY
+    off = measured / weight - 1.0
+    if abs(off) > limits.weight / 2.0:
+        yield Finding(
+            f"the wheel loads sum to {measured / 1e3:.1f} kN, the weight of {measured / GRAVITY:.0f} kg, but"
+            f" vehicle.mass = {chassis.mass:g} kg: {_why_weight(measured / weight)}",
+            abs(off) > limits.weight,
+            names if abs(off) > limits.weight else (),
+        )
+        return
+    if set(rig.front.tolist()) != {True, False}:
+        return
+    draft, acceleration = (np.where(np.isfinite(a), a, 0.0) for a in (window.draft, window.acceleration))
+    due = [median(np.broadcast_to(a, window.t.shape)) for a in axle_loads(chassis, draft, pitch, acceleration)]
+    has = [median(window.load[:, rig.front].sum(axis=1)), median(window.load[:, ~rig.front].sum(axis=1))]
+    if abs(has[0] - due[0]) > limits.axle * weight:
+        swapped = abs(has[0] - due[1]) < limits.axle * weight
+        yield Finding(
+            f"the front wheels carry {has[0] / 1e3:.1f} kN and the rear wheels {has[1] / 1e3:.1f} kN, where mass,"
+            f" centre of gravity and draft give {due[0] / 1e3:.1f} and {due[1] / 1e3:.1f} kN: "
+            + (
+                "are the loads of front and rear wheels swapped?"
+                if swapped
+                else "cg_ahead_of_rear_axle, loads of swapped wheels, or a draft of the wrong sign or size?"
+            ),
+            swapped,
+            names if swapped else (),
+        )
+
+
+def _why_weight(ratio: float) -> str:
+    """What makes the loads this multiple of the weight."""
+    for factor, why in (
+        (0.45359237, "is the mass in lb?"),
+        (GRAVITY, "is the mass a weight, or are the loads taken for kg?"),
+        (1.0 / GRAVITY, "are the loads in kg, not in N?"),
+        (1e3, "are the loads in N where the DBC says kN?"),
+        (1e-3, "are the loads in kN where the DBC says N?"),
+        (2.0, "does each load cell read a whole axle?"),
+        (0.5, "does a load cell read only half of its wheel's load?"),
+    ):
+        if abs(math.log(ratio / factor)) < 0.04:
+            return why
+    return "which of them is wrong? (ballast, unit or scale of the loads)"
+
+
+def _ways(facts: Facts, limits: Limits) -> Iterator[Finding]:
+    """Wheels that turn, or drive, against all others."""
+    rig, raw = facts.rig, facts.raw
+    moving = facts.straight
+    with np.errstate(invalid="ignore"):
+        turns = [median(np.sign(raw.speed[moving, i])) for i in range(len(rig.wheels))]
+    way = np.sign(np.nansum(turns))
+    for wheel, turn in zip(rig.wheels, turns, strict=True):
+        if turn * way < 0.0:
+            text = f"wheel.{wheel}.speed: turns backward while most wheels turn forward: sign = -1?"
+            yield Finding(text, True, (f"speed.{wheel}", f"torque.{wheel}"))
+    thrust = [median(facts.thrust[:, i]) for i in range(len(rig.wheels))]
+    share = np.array(thrust) / max(np.nanmax(np.abs(thrust), initial=0.0), 1.0)
+    drives = np.nansum(np.sign(share) * (np.abs(share) > 0.2))
+    for wheel, part in zip(rig.wheels, share.tolist(), strict=True):
+        if drives > 0.0 and part < -0.2:
+            yield Finding(
+                f"wheel.{wheel}.torque: brakes while most wheels drive: sign = -1?", True, (f"torque.{wheel}",)
+            )
+    ground = median(np.sign(raw.ground_speed[moving]))
+    if ground < 0.0 and way > 0.0:
+        yield Finding("signals.ground_speed: backward while the wheels turn forward: sign = -1?", True)
+
+
+def _gears(facts: Facts, limits: Limits) -> Iterator[Finding]:
+    """The motors' speeds beside the wheels'; one that nobody mapped may be at the wheel itself."""
+    for i, wheel in enumerate(facts.rig.wheels):
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = median(np.abs(facts.motor[:, i] / facts.raw.speed[:, i])[facts.straight])
+        own = next(w for w in facts.config.wheel if w.name == wheel)
+        if not math.isfinite(ratio) or abs(math.log(max(ratio, 1e-9))) < limits.gear or own.motor_speed is None:
+            continue
+        if f"motor_speed.{wheel}" not in facts.mapped and abs(own.gear_ratio * ratio - 1.0) < limits.gear:
+            continue
+        yield Finding(
+            f"wheel.{wheel}.gear_ratio = {own.gear_ratio:g}, but {own.motor_speed.signal} turns"
+            f" {own.gear_ratio * ratio:.4g} times as fast as the wheel: gear ratio, or unit or byte order of one of the"
+            " speeds?",
+            True,
+            (f"torque.{wheel}", f"motor_speed.{wheel}"),
+        )
+
+
+def _slips(facts: Facts, limits: Limits) -> Iterator[Finding]:
+    """Rim speeds beside the ground speed, and beside each other."""
+    slip, rig = facts.slip, facts.rig
+    drives = np.where(facts.thrust > 0.0, slip, np.nan)
+    usual = np.array([median(drives[:, i]) for i in range(len(rig.wheels))])
+    if not np.isfinite(usual).any():
+        raise NotToldError("no slip is known: wheel and ground speeds cannot be compared")
+    least = float(np.nanquantile(slip, 0.05)) if np.isfinite(slip).any() else math.nan
+    middle = float(np.nanmedian(usual))
+    at_shaft = any(w.speed is not None and w.speed.at == "shaft" for w in facts.config.wheel)
+    if middle < limits.pushed or least > limits.never_less:
+        seems = middle if middle < limits.pushed else least
+        factor = 1.0 / (1.0 - seems)
+        text = (
+            f"the wheels seem to slip by {middle:.2f}, never by less than {least:.2f}"
+            if least > limits.never_less
+            else f"driving wheels seem to slip by {middle:.2f}"
+        )
+        gear = "gear ratio, " if at_shaft else ""
+        yield Finding(
+            f"{text}: their rims go {factor:.2f} times as fast as the ground: {_why_fast(factor)}"
+            f"{gear}radius, or unit, sign or byte order of ground and wheel speeds?",
+            True,
+            ("ground_speed", *(f"speed.{w}" for w in rig.wheels)),
+        )
+        return
+    for wheel, own in zip(rig.wheels, usual.tolist(), strict=True):
+        if abs(own - middle) > limits.wheel_apart:
+            yield Finding(
+                f"wheel.{wheel}: seems to slip by {own:.2f}, most wheels by {middle:.2f}: its radius,"
+                f" {'gear ratio, ' if at_shaft else ''}speed signal or its unit?",
+                True,
+                (f"speed.{wheel}",),
+            )
+
+
+def _why_fast(factor: float) -> str:
+    """What makes rims this many times as fast as the ground, beside a slip of up to 0.4."""
+    for known, why in (
+        (30.0 / math.pi, "are the wheel speeds in rpm where the DBC says rad/s, "),
+        (3.6, "is the ground speed in m/s where the DBC says km/h, "),
+        (2.0, "a diameter in the place of a radius, "),
+        (1.0 / 3.6, "is the ground speed in km/h where the DBC says m/s, "),
+        (math.pi / 30.0, "are the wheel speeds in rad/s where the DBC says rpm, "),
+    ):
+        if 0.95 < factor / known < 1.7:
+            return why
+    return ""
+
+
+def _balance(facts: Facts, limits: Limits) -> Iterator[Finding]:
+    """Changes of the wheels' thrust beside those of the pull that draft, slope and inertia ask for."""
+    window, rig, chassis = facts.window, facts.rig, facts.rig.chassis
+    if chassis is None:
+        return
+    weight, torques = chassis.mass * GRAVITY, tuple(f"torque.{w}" for w in rig.wheels)
+    thrust = facts.thrust.sum(axis=1)
+    if median(thrust) < -0.02 * weight:
+        yield Finding(
+            f"the wheels brake with {-median(thrust) / 1e3:.1f} kN all along while the vehicle drives on: sign of the"
+            " torques, or of the wheel speeds (sign = -1)?",
+            True,
+            torques,
+        )
+        return
+    if median(thrust) > limits.most_thrust * weight:
+        yield Finding(
+            f"the wheels thrust with {median(thrust) / 1e3:.0f} kN, more than soil can hold under"
+            f" {weight / 1e3:.0f} kN: gear_ratio too large, torques measured at the other side of the gear"
+            " (`at`), or their unit or byte order?",
+            True,
+            torques,
+        )
+        return
+    bin_length = facts.config.estimator.bin
+    lag, block = max(round(1.0 / bin_length), 1), max(round(0.5 / bin_length), 1)
+    inertia = pull_given(window, chassis) - window.draft
+    changes = np.stack([change(a, lag) for a in (thrust, window.draft, inertia)], axis=1)
+    changes = changes[np.isfinite(changes).all(axis=1)]
+    if len(changes) * bin_length < limits.least_seconds:
+        raise NotToldError(
+            "torques and draft are not known together: their signs and the gear ratio cannot be compared"
+        )
+    given, *asked = _blocks(changes, block).T
+    if asked[0].std() < limits.excited * weight:
+        raise NotToldError("the draft hardly changes: the signs of draft and torque and the gear ratio cannot be told")
+    (of_draft, of_inertia), (draft_sd, inertia_sd) = _regression(given, np.stack(asked, axis=1))
+    if of_draft < -limits.side_sd * draft_sd:
+        yield Finding(
+            "signals.draft: falls whenever the wheels thrust more: sign of the draft (positive holds the vehicle back;"
+            " sign = -1)?",
+            True,
+            ("draft",),
+        )
+        return
+    if of_draft > limits.scale[1] or of_draft + limits.side_sd * draft_sd < limits.scale[0]:
+        of_torque = of_inertia > 2.0 * limits.side_sd * inertia_sd and 0.7 < of_draft / of_inertia < 1.4
+        size = "large" if of_draft > 1.0 else "small"
+        why = (
+            f"gear_ratio too {size}, torques measured at the other side of the gear (`at`), or their unit?"
+            if of_torque
+            else f"unit or scale of the draft, or gear_ratio too {size} (or torques at the other side of the gear)?"
+        )
+        yield Finding(
+            f"the wheels' thrust changes {of_draft:.2f} times as much as the draft does: {why}",
+            True,
+            (*torques, "draft"),
+        )
+        return
+    if of_inertia < -limits.side_sd * inertia_sd:
+        slope = np.nanstd(change(window.pitch, lag)) * GRAVITY
+        name = "pitch" if slope > np.nanstd(change(window.acceleration, lag)) else "acceleration"
+        positive = "nose up" if name == "pitch" else "where the vehicle speeds up"
+        yield Finding(
+            f"signals.{name}: asks for less thrust whenever the wheels give more: its sign (positive {positive};"
+            " sign = -1)?",
+            True,
+            (name,),
+        )
+
+
+def _levels(facts: Facts, limits: Limits) -> Iterator[Finding]:
+    """Thrust beside pull all along: the wheels give the pull and what the soil resists besides."""
+    window, rig, chassis = facts.window, facts.rig, facts.rig.chassis
+    if chassis is None:
+        return
+    weight = chassis.mass * GRAVITY
+    thrust = median(facts.thrust.sum(axis=1))
+    known = facts.straight & np.isfinite(window.pitch)
+    asked = median(pull_given(window, chassis)[known])
+    if asked > limits.pull * weight and thrust < limits.less_thrust * asked:
+        yield Finding(
+            f"the wheels thrust with {thrust / 1e3:.2f} kN, but draft, slope and inertia alone ask for"
+            f" {asked / 1e3:.2f} kN: gear_ratio too small, torques measured at the other side of the gear (`at`), or"
+            " unit of torque or draft?",
+            True,
+            (*(f"torque.{w}" for w in rig.wheels), "draft"),
+        )
+
+
+def _regression(y: Array, x: Array) -> tuple[Array, Array]:
+    """Factors (K,) of the columns of x (N, K) in y (N,) by least squares, and their standard deviations."""
+    inverse = np.linalg.pinv(x.T @ x)
+    factors = inverse @ x.T @ y
+    left = float(((y - x @ factors) ** 2).sum()) / max(len(y) - x.shape[1], 1)
+    return factors, np.sqrt(left * np.diag(inverse))
+
+
+def _sides(facts: Facts, limits: Limits) -> Iterator[Finding]:
+    """Left and right wheel of each axle: the one with more load, or more slip, must have more torque."""
+    rig, thrust, slip = facts.rig, facts.thrust, facts.slip
+    for left, right in pairs(rig).T.tolist():
+        names = rig.wheels[left], rig.wheels[right]
+        y = thrust[:, left] - thrust[:, right]
+        load = facts.window.load[:, left] - facts.window.load[:, right]
+        x = np.stack([load, slip[:, left] - slip[:, right]], axis=1)
+        known = np.isfinite(y) & np.isfinite(x).all(axis=1)
+        per_block = max(round(0.5 / facts.config.estimator.bin), 1)
+        if known.sum() < 40 * per_block:
+            continue
+        y, x = _blocks(y[known][:, None], per_block)[:, 0], _blocks(x[known], per_block)
+        factors, sd = _regression(y, np.column_stack([x, np.ones(len(x))]))
+        of_load, of_slip = (factors < -limits.side_sd * sd)[:2]
+        swapped = f"{names[0]} and {names[1]} are swapped: the wheel with more"
+        wheels = tuple(f"{q}.{w}" for q in ("load", "speed", "torque") for w in names)
+        if of_load and of_slip:
+            yield Finding(f"the torques of {swapped} load and slip has less torque", True, wheels)
+        elif of_load:
+            yield Finding(f"the loads of {swapped} load has less torque", True, wheels)
+        elif of_slip:
+            yield Finding(f"the speeds of {swapped} slip has less torque", True, wheels)
+        mean = median(np.abs(thrust[:, [left, right]]).mean(axis=1))
+        if abs(factors[2]) > limits.side_offset * mean:
+            yield Finding(
+                f"the torques of {names[0]} and {names[1]} differ by {abs(factors[2]) / mean:.0%} of their mean all"
+                " along: gear ratio, sign or scale of one of them?",
+                False,
+            )
+
+
+def _blocks(values: Array, n: int) -> Array:
+    """Means of each n rows."""
+    whole = len(values) // n * n
+    return np.asarray(values[:whole].reshape(-1, n, values.shape[1]).mean(axis=1))
+
+
+def _yaw(facts: Facts, limits: Limits) -> Iterator[Finding]:
+    """The yaw rate beside the wheels' speeds in turns: positive to the left, where the right wheels go faster."""
+    window, rig = facts.window, facts.rig
+    if not np.isfinite(window.yaw_rate).any() or not pairs(rig).size:
+        return
+    rims = rig.radius * window.speed
+    apart = np.stack([rims[:, right] - rims[:, left] for left, right in pairs(rig).T.tolist()])
+    with np.errstate(invalid="ignore"):
+        turns = (np.abs(window.yaw_rate) > 0.1) & (np.abs(np.sign(apart).sum(axis=0)) == len(apart))
+    if turns.sum() * facts.config.estimator.bin < 2.0:
+        raise NotToldError("no turns: the sign of the yaw rate, and which wheels are left, cannot be told")
+    if median(np.sign(apart[0] * window.yaw_rate)[turns]) < 0.0:
+        yield Finding(
+            "signals.yaw_rate: to the left while the left wheels go faster: its sign (positive to the left), or left"
+            " and right wheels swapped (the left wheel of an axle comes first)?",
+            True,
+            ("yaw_rate",),
+        )
+
+
+def _contradictions(facts: Facts, channels: Iterable[Channel], database: Database, limits: Limits) -> Iterator[Finding]:
+    """Sensors that contradict the others in many windows, by the service's own checks."""
+    s, rig = facts.config.estimator, facts.rig
+    resolution = {c.name: resolution_of(c, database) for c in channels}
+    n = max(round(s.window / s.bin), 1)
+    named: Counter[str] = Counter()
+    mapped = np.array([f"motor_speed.{w}" in facts.mapped for w in rig.wheels])
+    begins = range(0, max(len(facts.window.t) - n, 0) + 1, n)
+    for begin in begins:
+        rows = np.arange(begin, min(begin + n, len(facts.window.t)))
+        motor = np.where(mapped, np.abs(facts.motor[rows]), np.nan)
+        named.update(implausible(facts.window.rows(rows), rig, s.min_speed, s.max_turn, s.bin, resolution, motor))
+    for name, count in named.items():
+        if count > max(limits.windows * len(begins), 1.0):
+            quantity, _, wheel = name.partition(".")
+            key = f"wheel.{wheel}.{quantity}" if wheel else f"signals.{quantity}"
+            yield Finding(f"{key}: contradicts the other sensors in {count} of {len(begins)} windows", False, (name,))

@@ -1,0 +1,97 @@
+"""Why windows are of no use and what to do: said in words, with the numbers of the drive."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from soilbus.can.dbc_files import load_databases
+from soilbus.daemon.excitation import Excitation
+from soilbus.daemon.pipeline import Pipeline
+from soilbus.daemon.replay import replay
+from soilbus.daemon.result import WindowResult
+from soilbus.report.windows import summary_of, why_of_no_use
+from soilbus.simulator.frames import START, frames, write_log
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
+from soilbus.traversability import Status, Traversability
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory):
+    """A steady pull through wet clay and a lively drive on loam, and what replay says of both."""
+    config = reference_configuration(["estimator.max_bearing_std=0.012"])
+    steady = Scenario(16.0, (Patch(0.0, "wet_clay"),), Swing(1.4, 1.45), draft=Swing(2500.0, 2650.0))
+    recordings = [simulate(config, scenario, seed=2) for scenario in (steady, excited("loam", 16.0))]
+    logs = [tmp_path_factory.mktemp("log") / f"{name}.log" for name in ("steady", "lively")]
+    for log, recording in zip(logs, recordings, strict=True):
+        write_log(frames(recording, config), log)
+    return recordings, list(replay(Pipeline(config, load_databases(config)), logs))
+
+
+def truth_of(recording, windows) -> tuple[float, float, float]:
+    """Medians over the windows of draft [N], its standard deviation [N], and that over the mean."""
+    t, draft = recording.truth["t"] + START, recording.truth["draft"]
+    of = [draft[(t >= w.t - 10.0) & (t < w.t)] for w in windows]
+    mean, sd = np.median([(x.mean(), x.std()) for x in of], axis=0)
+    return float(mean), float(sd), float(sd / mean)
+
+
+def test_the_summary_says_what_did_not_move_and_by_how_much(drives):
+    recordings, windows = drives
+    text = summary_of(windows, "two drives", None, Counter())
+    assert {(w.log, w.reason) for w in windows} == {("steady.log", "not_excited load_range"), ("lively.log", "none")}
+    line = next(line for line in text.splitlines() if "vary the load" in line)
+    number = r"([\d.e+]+)"
+    found = re.search(f"moved by {number} % only .{number} ± {number} N.*valid windows .*moved by {number} %", line)
+    share, mean, sd, lively = map(float, found.groups())
+    true_mean, true_sd, true_share = truth_of(recordings[0], [w for w in windows if w.log == "steady.log"])
+    assert mean == pytest.approx(true_mean, abs=0.01 * true_mean + 5.0)
+    assert sd == pytest.approx(true_sd, rel=0.15, abs=2.0)  # without the load cell's 40 N
+    assert share == pytest.approx(100.0 * true_share, rel=0.15, abs=0.3)
+    *_, true_lively = truth_of(recordings[1], [w for w in windows if w.log == "lively.log"])
+    assert lively == pytest.approx(100.0 * true_lively, rel=0.1)
+    assert f"of use: {len(windows) // 2} valid, {len(windows) // 2} with a doubtful estimate; of no use: 0" in text
+
+
+def window(reason: str, status: Status = Status.INVALID, **more) -> WindowResult:
+    return WindowResult(
+        1.0, 0, status, reason, None, None, {}, {}, Traversability(), more.pop("chi2", None), 0, {}, **more
+    )
+
+
+@pytest.mark.parametrize(
+    ("reason", "says"),
+    [
+        ("input_missing load.FL draft", "no usable value of load.FL, draft ever came"),
+        ("input_stale torque.RR", "torque.RR had pauses"),
+        ("implausible ground_speed", "ground_speed contradicts the other sensors"),
+        ("standstill", "drive"),
+        ("turning", "drive straight"),
+        ("no_convergence", "check signs and scales"),
+        ("model_mismatch", "5 times the noise off"),
+        ("internal_error", None),
+    ],
+)
+def test_each_reason_has_its_advice(reason, says):
+    unknown = [window(reason, chi2=25.0)] * 3
+    text = summary_of(unknown, "a log", 0, Counter())
+    assert f"    3 invalid: {reason}\n" in text
+    assert says is None or says in text
+    line = why_of_no_use(unknown, 10.0)
+    assert line.startswith(f"no window could be used: 3 of 3 are invalid: {reason}")
+    assert says is None or says in line
+    assert "\n" not in line
+    for text_ in (text, line):
+        assert "nan" not in text_
+        assert "None" not in text_
+
+
+def test_a_draft_about_zero_has_no_share():
+    windows = [window("ambiguous", Status.NOT_EXCITED, excitation=Excitation(3.0, 160.0, 0.02, 0.01))]
+    text = summary_of(windows, "a log", None, Counter())
+    assert "vary the load more: the draft was 3 ± 160 N, slip was 2.0 ± 1.0 %" in text

@@ -1,0 +1,391 @@
+"""`soilbus check` beside data: every mistake of mapping is named, and nothing where there is none."""
+
+from __future__ import annotations
+
+import math
+import re
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from soilbus.assembly import with_effects
+from soilbus.can.bus import heard_for
+from soilbus.can.candump import Frame, frame_of
+from soilbus.can.dbc_files import load_databases, shipped_dbc
+from soilbus.cli import main
+from soilbus.config import Config
+from soilbus.config_file import load_config
+from soilbus.daemon.intake import Intake
+from soilbus.daemon.replay import read_frames
+from soilbus.estimation.window import turning
+from soilbus.sensors.survey import Survey, survey
+from soilbus.simulator.frames import frames
+from soilbus.simulator.play import scenario_over
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import TRACTOR, reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario, Swing
+
+FIELD = Path(__file__).resolve().parents[1] / "field/field.toml"
+WHEELS = ("FL", "FR", "RL", "RR")
+
+
+@pytest.fixture(scope="module")
+def field_frames(field_recording) -> Callable[[str], list[Frame]]:
+    read: dict[str, list[Frame]] = {}
+
+    def of(name: str) -> list[Frame]:
+        if name not in read:
+            read[name] = list(read_frames(field_recording(f"{name}.log.gz")))
+        return read[name]
+
+    return of
+
+
+def driven(soils: Sequence[str], seed: int, duration: float = 40.0, effects: Sequence[str] = ()) -> list[Frame]:
+    config = with_effects(reference_configuration(), effects)
+    recording = simulate(config, scenario_over(soils, duration), seed)
+    return [frame_of(message) for message in frames(recording, config)]
+
+
+@pytest.fixture(scope="module")
+def clay_drive() -> list[Frame]:
+    return driven(["wet_clay"], 7)
+
+
+def beside(config: Config, heard: list[Frame]) -> Survey:
+    return survey(config, load_databases(config), heard)
+
+
+# --- nothing where there is nothing ---
+
+
+@pytest.mark.parametrize("name", ["loam", "clay", "stubble"])
+def test_the_field_vehicle_is_configured_without_fault(name, field_frames):
+    found = beside(load_config(FIELD), field_frames(name))
+    assert found.findings == ()
+    assert all("sinkage: not in this recording" in line for line in found.open)  # fitted in one of them only
+    assert all(s.count > 2900 and math.isfinite(s.rate) for s in found.seen if s.channel.quantity != "sinkage")
+
+
+@pytest.mark.parametrize(
+    ("soils", "seed", "effects"),
+    [
+        (["loam"], 11, []),
+        (["dry_sand"], 12, []),
+        (["heavy_clay_40"], 13, []),
+        (["loam", "wet_clay"], 14, []),
+        (["sandy_loam_11_michigan"], 15, ["slip_sinkage=1", "multipass=0.3"]),
+        (["lean_clay_32"], 16, ["grade=0.05", "draft_gain=0.15"]),
+        (["loam"], 17, ["rolling_radius=0.03", "wheel_load_offset=300", "draft_offset=400"]),
+        (["clayey_soil_38"], 18, ["drivetrain_loss=0.1", "torque_lag=0.2"]),
+    ],
+)
+def test_drives_and_what_models_miss_are_no_mistakes_of_mapping(soils, seed, effects):
+    found = beside(reference_configuration(), driven(soils, seed, 30.0, effects))
+    assert found.findings == ()
+    assert all("the draft hardly changes" in line for line in found.open)
+
+
+# --- mistakes in the configuration ---
+
+EACH_GEAR = [f"wheel.{w}.gear_ratio=48" for w in WHEELS]
+MISTAKES = {
+    "mass 3000": (["vehicle.mass=3000"], ["sum to 22.6 kN", "weight of 2300 kg", "vehicle.mass = 3000 kg"]),
+    "mass 5071, in lb": (["vehicle.mass=5071"], ["vehicle.mass = 5071 kg", "lb"]),
+    "mass 8818": (["vehicle.mass=8818"], ["vehicle.mass = 8818 kg"]),
+    "mass a sixth less": (["vehicle.mass=1900"], ["vehicle.mass = 1900 kg"]),
+    "gear ratio of all": (EACH_GEAR, ["wheel.RR.gear_ratio = 48", "RR.ShaftSpeed turns 24"]),
+    "gear ratio of one": (["wheel.RL.gear_ratio=12"], ["wheel.RL.gear_ratio = 12", "turns 24 times as fast"]),
+    "draft sign": (["signals.draft.sign=-1"], ["signals.draft", "sign of the draft"]),
+    "acceleration sign": (["signals.acceleration.sign=-1"], ["signals.acceleration"]),
+    "torque sign of one": (["wheel.FR.torque.sign=-1"], ["wheel.FR.torque", "brakes while most wheels drive"]),
+    "torque signs of all": ([f"wheel.{w}.torque.sign=-1" for w in WHEELS], ["brake", "sign of the torques"]),
+    "speed sign of one": (["wheel.RL.speed.sign=-1"], ["wheel.RL.speed", "turns backward"]),
+    "loads swapped": (
+        ["wheel.FL.load={load}.FR", "wheel.FR.load={load}.FL"], ["the loads of FL and FR are swapped"],
+    ),
+    "loads swapped at the rear": (
+        ["wheel.RL.load={load}.RR", "wheel.RR.load={load}.RL"], ["the loads of RL and RR are swapped"],
+    ),
+    "loads swapped front to rear": (
+        ["wheel.FL.load={load}.RL", "wheel.RL.load={load}.FL", "wheel.FR.load={load}.RR", "wheel.RR.load={load}.FR"],
+        [],  # these axles carry much the same: what shows is that left and right, or torques, do not fit
+    ),
+    "speeds swapped": (
+        ["wheel.FL.speed=WheelSpeeds.FR", "wheel.FR.speed=WheelSpeeds.FL"], ["speeds of FL and FR are swapped"],
+    ),
+    "torques swapped": (
+        ["wheel.RL.torque.signal={motor}RR.ShaftTorque", "wheel.RR.torque.signal={motor}RL.ShaftTorque"],
+        ["torques of RL and RR are swapped"],
+    ),
+    "diameter for radius": (["wheel.FL.radius=1.0"], ["wheel.FL: seems to slip by 0.6", "radius"]),
+    "diameters for radii": (
+        ["wheel.FL.radius=1.0", "wheel.FR.radius=1.0", "wheel.RL.radius=1.24", "wheel.RR.radius=1.24"],
+        ["the wheels seem to slip", "a diameter in the place of a radius"],
+    ),
+    "torque at the wheel": (
+        [f"wheel.{w}.torque.at=wheel" for w in WHEELS], ["thrust changes 0.0", "at the other side of the gear"],
+    ),
+}  # fmt: skip
+
+
+def set_for(config: Path, sets: Sequence[str]) -> Config:
+    names = {"load": "AxleLoads", "motor": "Mcu"} if config == FIELD else {"load": "WheelLoads", "motor": "Motor"}
+    return load_config(config, [text.format(**names) for text in sets])
+
+
+@pytest.mark.parametrize("mistake", [m for m in MISTAKES if m != "loads swapped front to rear"])
+def test_a_mistake_is_named_beside_a_recording_of_the_field_vehicle(mistake, field_frames):
+    sets, words = MISTAKES[mistake]
+    found = beside(set_for(FIELD, sets), field_frames("loam"))
+    lines = found.faults + found.warnings
+    assert any(all(word in line for word in words) for line in lines), lines
+    if mistake != "mass a sixth less":
+        assert found.faults
+
+
+@pytest.mark.parametrize(
+    "mistake",
+    ["mass 3000", "gear ratio of all", "draft sign", "loads swapped", "speeds swapped", "torques swapped",
+     "torque sign of one", "speed sign of one", "diameters for radii"],
+)  # fmt: skip
+def test_a_mistake_is_named_beside_a_simulated_drive(mistake, clay_drive):
+    sets, words = MISTAKES[mistake]
+    found = beside(set_for(TRACTOR, sets), clay_drive)
+    words = [word for word in words if "22.6 kN" not in word and "2300 kg" not in word]
+    assert any(all(word in line for word in words) for line in found.faults), found.faults
+
+
+def test_a_gear_ratio_is_told_by_forces_where_no_motor_speed_is_on_the_bus(field_frames, tmp_path):
+    dbc = re.sub(r"^ SG_ ShaftSpeed.*\n", "", FIELD.with_name("field.dbc").read_text(), flags=re.M)
+    config = configured(FIELD, "field.dbc", dbc, tmp_path)
+    for name in ("loam", "stubble"):
+        found = beside(load_config(config, EACH_GEAR), field_frames(name))
+        assert len(found.faults) == 1
+        assert "gear_ratio too large" in found.faults[0]
+        assert beside(load_config(config), field_frames(name)).findings == ()
+
+
+def test_a_draft_that_hardly_changes_still_tells_by_its_size():
+    drive = Scenario(30.0, (Patch(0.0, "loam"),), draft=Swing(3500.0, 3500.0))
+    recording = simulate(reference_configuration(), drive, 3)
+    heard = [frame_of(message) for message in frames(recording, reference_configuration())]
+    assert beside(reference_configuration(), heard).findings == ()
+    found = beside(set_for(TRACTOR, [f"wheel.{w}.torque.at=wheel" for w in WHEELS]), heard)
+    assert len(found.faults) == 1
+    assert all(word in found.faults[0] for word in ("the wheels thrust with 0.", "(`at`)"))
+
+
+def test_turns_tell_the_sign_of_the_yaw_rate(tmp_path):
+    imu = (
+        'BO_ 2566862537 Imu: 8 CHASSIS\n SG_ YawRate : 0|16@1+ (0.0005,-16) [-16|16] "rad/s" SOILBUS\n\n'
+        "BO_ 2566861770 DrawbarPin"
+    )
+    dbc = shipped_dbc("tractor.dbc").read_text().replace("BO_ 2566861770 DrawbarPin", imu, 1)
+    path = configured(TRACTOR, "tractor.dbc", dbc, tmp_path)
+    sets = ["signals.yaw_rate=Imu.YawRate", "vehicle.track=1.2"]
+    config = load_config(path, sets)
+    recording = simulate(config, scenario_over(["loam"], 60.0), 9)
+    columns = recording.channels
+    yaw = columns["yaw_rate"]
+    yaw.value += np.where((yaw.t > 20.0) & (yaw.t < 30.0), 0.4, 0.0)  # a left turn, the right wheels go faster
+    for wheel, side in (("FL", -1.0), ("FR", 1.0), ("RL", -1.0), ("RR", 1.0)):
+        radius = next(w.radius for w in config.wheel if w.name == wheel)
+        speed = columns[f"speed.{wheel}"]
+        speed.value += np.where((speed.t > 20.0) & (speed.t < 30.0), side * 0.4 * 1.2 / 2.0 / radius, 0.0)
+    heard = [frame_of(message) for message in frames(recording, config)]
+    assert beside(config, heard).findings == ()
+    wrong = beside(load_config(path, [*sets, "signals.yaw_rate.sign=-1"]), heard)
+    assert len(wrong.faults) == 1
+    assert wrong.faults[0].startswith("signals.yaw_rate: to the left while the left wheels go faster")
+    # in the service: the turn is left out, and a yaw rate that is lost costs nothing but itself
+    for kept in (True, False):
+        intake = Intake(config, load_databases(config))
+        for t, identifier, extended, data, remote, _ in heard:
+            if kept or identifier != 2566862537 & 0x1FFFFFFF:
+                intake.admission.feed(t, identifier, extended, data, remote)
+        tasks = intake.due(heard[-1][0])
+        assert all(task.poor == task.missing == task.implausible == () for task in tasks)
+        turns = {round(task.end - heard[0][0]): turning(task.window, intake.rig, 0.15).sum() for task in tasks}
+        assert turns[18] == turns[42] == 0
+        assert turns[30] == pytest.approx(98, abs=3)
+
+
+def test_a_speed_beside_the_torque_that_is_the_wheels_own_is_no_wrong_gear(field_frames, tmp_path):
+    dbc = re.sub(
+        r"(ShaftSpeed .*)\(0.125,0\)(.*)", rf"\1({0.125 / 24.0!r},0)\2", FIELD.with_name("field.dbc").read_text()
+    )
+    config = configured(FIELD, "field.dbc", dbc, tmp_path)
+    assert beside(load_config(config), field_frames("loam")).findings == ()
+    mapped = load_config(config, ["wheel.FL.motor_speed=McuFL.ShaftSpeed"])
+    assert any("McuFL.ShaftSpeed turns 1 times" in line for line in beside(mapped, field_frames("loam")).faults)
+
+
+def test_a_whole_axle_in_a_mirror_is_the_same_vehicle(field_frames):
+    sets = []
+    for one, other in (("FL", "FR"), ("FR", "FL")):
+        sets += [f"wheel.{one}.load=AxleLoads.{other}", f"wheel.{one}.speed=WheelSpeeds.{other}"]
+        sets += [f"wheel.{one}.sinkage=RideHeight.Sink{other}", f"wheel.{one}.torque.signal=Mcu{other}.ShaftTorque"]
+    assert beside(load_config(FIELD, sets), field_frames("loam")).findings == ()
+
+
+# --- mistakes in the DBC ---
+
+
+def configured(base: Path, dbc_name: str, dbc: str, folder: Path) -> Path:
+    (folder / "x.dbc").write_text(dbc)
+    (folder / "x.toml").write_text(base.read_text().replace(dbc_name, "x.dbc"))
+    return folder / "x.toml"
+
+
+def other_byte_order(dbc: str, message: str, signals: Sequence[str]) -> str:
+    """The DBC with 16-bit signals of messages of that name (a part of it) read the other way round."""
+
+    def turned(match: re.Match[str]) -> str:
+        name, start, order = match[1], int(match[2]), match[3]
+        if name not in signals:
+            return match[0]
+        return f" SG_ {name} : {start + 7 if order == '1' else start - 7}|16@{'0' if order == '1' else '1'}"
+
+    blocks = re.split(r"(?=^BO_ )", dbc, flags=re.M)
+    return "".join(
+        re.sub(r" SG_ (\w+) : (\d+)\|16@([01])", turned, block) if message in block.split(":")[0] else block
+        for block in blocks
+    )
+
+
+BYTE_ORDERS = {
+    "loads": ("Loads", WHEELS, "wheel.FL.load"),
+    "speeds": ("WheelSpeeds", WHEELS, "wheel.FL"),
+    "torques": ("M", ("ShaftTorque",), "wheel.FL.torque"),
+    "draft": ("DrawbarPin", ("Draft",), "signals.draft"),
+    "ground speed": ("GroundBased", ("GroundBasedMachineSpeed",), "signals.ground_speed"),
+}
+
+
+@pytest.mark.parametrize("what", list(BYTE_ORDERS))
+@pytest.mark.parametrize("vehicle", ["field", "simulated"])
+def test_a_wrong_byte_order_is_named(vehicle, what, field_frames, clay_drive, tmp_path):
+    base, name = (FIELD, "field.dbc") if vehicle == "field" else (TRACTOR, "tractor.dbc")
+    text = (base.with_name(name) if vehicle == "field" else shipped_dbc(name)).read_text()
+    message, signals, key = BYTE_ORDERS[what]
+    wrong = other_byte_order(text, message, signals)
+    assert wrong != text
+    found = beside(
+        load_config(configured(base, name, wrong, tmp_path)), field_frames("loam") if vehicle == "field" else clay_drive
+    )
+    assert any(line.startswith(key) and "byte order" in line for line in found.faults), found.faults
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        (r'(GroundBasedMachineSpeed .*)"m/s"', r'\1"km/h"', ["is the ground speed in m/s where the DBC says km/h"]),
+        (r'(ShaftTorque .*)"N.m"', r'\1"kNm"', ["wheel.FL.torque", "beyond what this vehicle can do", "unit"]),
+        (r'( (?:FL|FR|RL|RR) : .*)"N"', r'\1"kg"', ["the wheel loads sum to", "are the loads taken for kg"]),
+        (r'( (?:FL|FR|RL|RR) : .*)"rad/s"', r'\1"rpm"', ["are the wheel speeds in rad/s where the DBC says rpm"]),
+        (r'(Draft .*)\(1,0\)', r'\1(0.3,0)', ["times as much as the draft", "scale of the draft"]),
+    ],
+)  # fmt: skip
+def test_a_wrong_unit_is_named(old, new, words, field_frames, tmp_path):
+    text = FIELD.with_name("field.dbc").read_text()
+    wrong = re.sub(old, new, text)
+    assert wrong != text
+    # without the motors' speeds, which would give the wheels' away
+    wrong = re.sub(r"^ SG_ ShaftSpeed.*\n", "", wrong, flags=re.M)
+    found = beside(load_config(configured(FIELD, "field.dbc", wrong, tmp_path)), field_frames("loam"))
+    assert any(all(word in line for word in words) for line in found.faults), found.faults
+
+
+# --- what is on the bus ---
+
+
+def test_messages_that_never_come_are_named_once_each_with_their_keys(clay_drive):
+    config = reference_configuration()
+    frame_id = load_databases(config).get_message_by_name("WheelLoads").frame_id
+    found = beside(config, [f for f in clay_drive if f[1] != frame_id])
+    assert len(found.faults) == 1
+    assert all(f"wheel.{w}.load" in found.faults[0] for w in WHEELS)
+    assert f"{frame_id:#x}" in found.faults[0]
+
+
+def test_a_log_of_another_bus_is_one_line(clay_drive):
+    found = beside(load_config(FIELD), [f for f in clay_drive if f[1] & 0xFFFF00 != 0xFE4900])
+    assert len(found.faults) == 1
+    assert "another bus" in found.faults[0]
+
+
+def test_stuck_and_slow_signals_are_warned_of(clay_drive):
+    config = reference_configuration()
+    database = load_databases(config)
+    radar = database.get_message_by_name("GroundBasedSpeedAndDistance")
+    slow = [f for i, f in enumerate(clay_drive) if f[1] & 0xFFFF00 != radar.frame_id & 0xFFFF00 or i % 3 == 0]
+    found = beside(config, slow)
+    assert any(line.startswith("signals.ground_speed") and "25" in line for line in found.warnings), found.warnings
+    assert found.faults == []
+    loads = database.get_message_by_name("WheelLoads").frame_id
+    first = next(f for f in clay_drive if f[1] == loads)
+    stuck = [(f[0], f[1], f[2], first[3], f[4], f[5]) if f[1] == loads else f for f in clay_drive]
+    lines = beside(config, stuck).warnings
+    assert all(any(line.startswith(f"wheel.{w}.load: reads") for line in lines) for w in WHEELS), lines
+
+
+def test_a_recording_at_rest_says_what_it_cannot_show(clay_drive):
+    found = beside(reference_configuration(), clay_drive[:2000])
+    assert found.faults == []
+    assert any("straight on for less than 10 s" in line for line in found.open)
+
+
+def test_a_clock_that_jumps_makes_no_endless_table(clay_drive):
+    late = [(f[0] + 1e6 if i > len(clay_drive) // 4 else f[0], *f[1:]) for i, f in enumerate(clay_drive)]
+    found = beside(reference_configuration(), late)
+    assert found.faults == []
+    assert all(math.isfinite(s.rate) for s in found.seen)
+
+
+def test_the_command_prints_the_table_and_exits_with_2_on_faults(field_recording, capsys):
+    log = str(field_recording("loam.log.gz"))
+    assert main(["check", "--config", str(FIELD), "--log", log]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert re.search(r"^ground_speed +3000 +40 ms +0\.", out, re.M)
+    assert main(["check", "--config", str(FIELD), "--log", log, "--set", "vehicle.mass=3000"]) == 2
+    out, err = capsys.readouterr()
+    assert re.search(r"^load.FL .*fault, see below$", out, re.M)
+    assert err.startswith("soilbus: the wheel loads sum to")
+    assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("command", ["check", "replay"])
+def test_a_log_of_another_channel_is_told(command, field_recording, tmp_path, capsys):
+    log = str(field_recording("deere-5055e-start.log.gz"))
+    arguments = ["--log", log] if command == "check" else [log]
+    main([command, "--config", str(FIELD.with_name("deere.toml")), "--set", "bus.channel=can1", *arguments])
+    err = capsys.readouterr().err
+    assert "frames of can0, where bus.channel = can1" in err
+    main([command, "--config", str(FIELD.with_name("deere.toml")), *arguments])
+    assert "bus.channel" not in capsys.readouterr().err
+
+
+def test_the_configured_bus_is_heard_for_some_time(clay_drive):
+    settings = {"interface": "virtual", "channel": "survey"}
+    sender = can.Bus(**settings)
+    sent = [can.Message(arbitration_id=f[1], is_extended_id=f[2], data=f[3]) for f in clay_drive[:200]]
+
+    def send() -> None:
+        for message in sent:
+            sender.send(message)
+
+    heard = heard_for(settings, 1.0)
+    try:
+        later = threading.Timer(0.2, send)
+        later.start()
+        frames_heard = list(heard)
+        later.join()
+    finally:
+        sender.shutdown()
+    assert [(f[1], bytes(f[3])) for f in frames_heard] == [(m.arbitration_id, bytes(m.data)) for m in sent]

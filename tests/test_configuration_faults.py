@@ -1,0 +1,239 @@
+"""Mistakes in a configuration are told in the words of its file, to someone who knows vehicles and not programs."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import tomllib
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import BaseModel
+
+from soilbus.cli import main
+from soilbus.config import Config, ConfigError
+from soilbus.config_file import load_config, overridden, parse_config
+
+FIELD = Path(__file__).resolve().parent / "field/field.toml"
+JARGON = re.compile(
+    r"Input should|instance of|valid (?:dict|number|string|list|integer|boolean)|validat|pydantic|Extra inputs|"
+    r"unable to parse|NoneType|type=|List should|<class|Traceback|wheel\.\d"
+)
+
+
+def faults(*sets: str) -> list[str]:
+    with pytest.raises(ConfigError) as error:
+        load_config(FIELD, sets)
+    return [fault.removeprefix(f"{FIELD}: ") for fault in error.value.faults]
+
+
+@pytest.mark.parametrize(
+    ("override", "line"),
+    [
+        ("wheel.FL.radius=500", "wheel.FL.radius: 500 m is not from 0.05 to 1.5 m; is it in mm? 500 mm are 0.5 m"),
+        ("wheel.RR.radius=62", "wheel.RR.radius: 62 m is not from 0.05 to 1.5 m; is it in cm? 62 cm are 0.62 m"),
+        ("wheel.FL.width=260", "wheel.FL.width: 260 m is not from 0.02 to 2 m; is it in mm? 260 mm are 0.26 m"),
+        ("vehicle.mass=2.3", "vehicle.mass: 2.3 kg is not from 20 to 60000 kg; is it in t? 2.3 t are 2300 kg"),
+        ("vehicle.wheelbase=1950", "vehicle.wheelbase: 1950 m is not from 0.2 to 8 m; is it in mm? 1950 mm are 1.95 m"),
+        ("vehicle.hitch_height=45", "vehicle.hitch_height: 45 m is not from 0 to 2.5 m; is it in cm? 45 cm are 0.45 m"),
+        ("vehicle.track=1140", "vehicle.track: 1140 m is not from 0.15 to 5 m; is it in mm? 1140 mm are 1.14 m"),
+        (
+            "soil.phi.value=23",
+            "soil.phi: value: 23 rad is not from 0 to 1.05 rad; is it in degrees? 23 degrees are 0.4014 rad",
+        ),
+        (
+            "soil.phi.std=5",
+            "soil.phi: std: 5 rad is not from 0 to 1.05 rad; is it in degrees? 5 degrees are 0.08727 rad",
+        ),
+        ("soil.K.value=25", "soil.K: value: 25 m is not from 0 to 0.5 m; is it in mm? 25 mm are 0.025 m"),
+        (
+            "soil.k_phi.value=1515",
+            "soil.k_phi: value: 1515 N/m^(n+2) is not from 6000 to 1e+09 N/m^(n+2); is it in kN/m^(n+2)?"
+            " 1515 kN/m^(n+2) are 1.515e+06 N/m^(n+2)",
+        ),
+        ("noise.load.relative=2", "noise.load.relative: 2 is not from 0 to 1; is it in %? 2 % are 0.02"),
+        ("wheel.FL.max_torque=2.4", "wheel.FL.max_torque: 2.4 N m is not from 5 to 200000 N m; is it in kN m?"),
+        (
+            "estimator.window=10000",
+            "estimator.window: 10000 s is not from 0.5 to 600 s; is it in ms? 10000 ms are 10 s",
+        ),
+        ("noise.load=0.01", "noise.load: 0.01 is a single value; write it as a table with any of absolute, relative,"),
+        ("wheel.FL.radus=0.5", "wheel.FL.radus: unknown key; did you mean radius?"),
+        ("signals.ground_sped=A.B", "signals.ground_sped: unknown key; did you mean ground_speed?"),
+        ("estimatr.hop=1", "estimatr: unknown key; did you mean estimator?"),
+        ("bus.chanel=can1", "bus: chanel: unknown key; did you mean channel?"),
+        ("model.shear_law=rationl", 'model.shear_law: "rationl" is not one of exponential, rational; did you mean'),
+        ("wheel.FL.axle=fornt", 'wheel.FL.axle: "fornt" is not one of front, rear; did you mean front?'),
+        ("wheel.FL.gear_ratio=24:1", 'wheel.FL.gear_ratio: "24:1" is not a number'),
+        ("wheel.FL.torque=7", 'wheel.FL.torque: 7 is not "Message.Signal", nor a table with signal, sign, at,'),
+        ("wheel.FL.speed=Speed", 'wheel.FL.speed.signal: "Speed" is not "Message.Signal", the names of a message and'),
+        ('dbc.input="field.dbc"', 'dbc.input: "field.dbc" is not a list, such as input = ["field.dbc"]'),
+        ('wheel={name="FL"}', "wheel: write [[wheel]], in two brackets, once for each wheel"),
+        ("traversability.hold=1.5", "traversability.hold: 1.5 is not a whole number"),
+        ("wheel.FX.radius=0.5", "--set wheel.FX.radius=0.5: no wheel.FX; there are FL, FR, RL, RR"),
+    ],
+)
+def test_a_mistake_is_told_in_words_of_the_file(override, line):
+    lines = faults(override)
+    assert len(lines) == 1
+    assert lines[0].startswith(line)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ('model.effects=[{name="slip_sinkge"}]', ["slip_sinkge; did you mean slip_sinkage?"]),
+        ('model.effects=[{name="grade", slop_0=0.1}]', ["no parameter slop_0; did you mean slope_0?"]),
+        ('dbc.input=["feld.dbc"]', ["feld.dbc", "did you mean field.dbc?"]),
+        ('dbc.input=["tracktor.dbc"]', ["did you mean tractor.dbc?"]),
+        ('dbc.checked=["WheelSpeds"]', ["no message WheelSpeds", "did you mean WheelSpeeds?"]),
+        ("signals.draft.signal=DrawbarPin.Draught", ["did you mean Draft?"]),
+    ],
+)
+def test_a_name_that_is_nearly_right_is_asked_for(override, words, capsys):
+    assert main(["check", "--config", str(FIELD), "--set", override]) == 2
+    err = capsys.readouterr().err
+    assert all(word in err for word in words), err
+
+
+def test_a_soil_that_is_nearly_right_is_asked_for(tmp_path, capsys):
+    assert main(["simulate", "--soil", "lome", "--log", str(tmp_path / "x.log")]) == 1
+    assert "no soil is named lome; did you mean loam?" in capsys.readouterr().err
+
+
+# --- wheels that are not measured ---
+
+
+def without(lines: str, tmp_path: Path) -> Path:
+    """The field vehicle's configuration without the lines of this pattern in the first wheel."""
+    shutil.copy(FIELD.with_name("field.dbc"), tmp_path)
+    first, rest = FIELD.read_text().split('name = "FR"', 1)
+    (tmp_path / "c.toml").write_text(re.sub(rf"^(?:{lines}) = .*\n", "", first, flags=re.M) + 'name = "FR"' + rest)
+    return tmp_path / "c.toml"
+
+
+@pytest.mark.parametrize(
+    ("lines", "says"),
+    [
+        ("torque", "wheel FL has no torque: map wheel.FL.torque"),
+        ("torque|load", "wheel FL has no torque and no load: map wheel.FL.torque and wheel.FL.load"),
+        ("torque|load|speed", "map wheel.FL.torque and wheel.FL.speed and wheel.FL.load"),
+    ],
+)
+@pytest.mark.parametrize("command", ["check", "replay"])
+def test_a_wheel_that_is_not_measured_is_refused(command, lines, says, tmp_path, field_recording, capsys):
+    log = [str(field_recording("clay.log.gz"))] if command == "replay" else []
+    assert main([command, "--config", str(without(lines, tmp_path)), *log]) == 2
+    out, err = capsys.readouterr()
+    assert says in err
+    assert "rolling resistance" in err
+    assert out == ""
+
+
+def test_an_axle_without_wheels_is_refused(capsys):
+    wheels = tomllib.loads(FIELD.read_text())["wheel"][2:]
+    text = "[" + ", ".join(_inline(wheel) for wheel in wheels) + "]"
+    assert main(["check", "--config", str(FIELD), "--set", f"wheel={text}"]) == 2
+    assert "no [[wheel]] is on the front axle" in capsys.readouterr().err
+
+
+def _inline(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{k} = {_inline(v)}" for k, v in value.items()) + "}"
+    return json.dumps(value)
+
+
+# --- what is taken for granted is said ---
+
+
+def warnings(path: Path, capsys, *sets: str) -> list[str]:
+    assert main(["check", "--config", str(path), *(word for text in sets for word in ("--set", text))]) == 0
+    return capsys.readouterr().err.splitlines()
+
+
+def test_a_right_configuration_gives_no_warning(capsys):
+    assert warnings(FIELD, capsys) == []
+
+
+def test_noise_that_is_not_given_is_told(tmp_path, capsys):
+    shutil.copy(FIELD.with_name("field.dbc"), tmp_path)
+    text = FIELD.read_text()
+    path = tmp_path / "c.toml"
+    path.write_text(re.sub(r"\[noise\]\n(?:.+\n)+", "", text))
+    lines = warnings(path, capsys)
+    assert len(lines) == 1
+    assert "warning: no [noise]" in lines[0]
+    path.write_text(re.sub(r"^(?:load = \{ relative|draft = \{ absolute).*\n", "", text, flags=re.M))
+    lines = warnings(path, capsys)
+    assert len(lines) == 1
+    assert "[noise] does not give load, draft" in lines[0]
+
+
+def test_a_cohesion_in_kilopascals_is_warned_of(capsys):
+    lines = warnings(FIELD, capsys, "soil.c.value=2.0", "soil.c.std=0.5")
+    assert len(lines) == 1
+    assert "is it in kPa?" in lines[0]
+
+
+def test_a_configuration_that_cannot_estimate_says_so(capsys):
+    assert any("nothing can be estimated" in line for line in warnings(FIELD.with_name("deere.toml"), capsys))
+
+
+# --- no words of the library that checks ---
+
+
+def places(model: type[BaseModel], prefix: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    """Dotted paths of every key; of lists, the first item's."""
+    found: list[tuple[str, ...]] = []
+    for name, field in model.model_fields.items():
+        if name == "folder":
+            continue
+        path = (*prefix, name)
+        found.append(path)
+        for kind in _kinds(field.annotation):
+            if isinstance(kind, type) and issubclass(kind, BaseModel):
+                found += places(kind, (*path, "0") if "list" in str(field.annotation) else path)
+    return found
+
+
+def _kinds(kind: Any) -> list[Any]:
+    if get_origin(kind) in (Union, UnionType, list, dict):
+        return [part for argument in get_args(kind) for part in _kinds(argument)]
+    return [] if get_origin(kind) is Literal else [kind]
+
+
+WRONG = st.one_of(
+    st.none(), st.booleans(), st.integers(-(10**6), 10**6), st.floats(), st.text(max_size=8), st.just(10**30),
+    st.lists(st.integers(), max_size=2),
+    st.dictionaries(st.sampled_from(["value", "signal", "name", "x"]), st.integers(), max_size=2),
+)  # fmt: skip
+
+
+@given(place=st.sampled_from(places(Config)), value=WRONG)
+def test_no_wrong_value_is_told_in_the_words_of_a_library(place, value):
+    raw: Any = overridden(tomllib.loads(FIELD.read_text()), [])
+    here = raw
+    for step in place[:-1]:
+        here = here[int(step)] if isinstance(here, list) and step == "0" and here else _grown(here, step)
+        if here is None:
+            return
+    here[place[-1]] = value
+    lines: list[str] = []
+    try:
+        parse_config(raw)
+    except ConfigError as error:
+        lines = error.faults
+    assert [line for line in lines if JARGON.search(line)] == []
+
+
+def _grown(here: Any, step: str) -> Any:
+    if isinstance(here, list):
+        return None
+    if isinstance(here.get(step), str):
+        here[step] = {"signal": here[step]}
+    return here.setdefault(step, {})
