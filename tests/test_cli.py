@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gzip
 import json
 import shutil
@@ -10,6 +11,7 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
+from can.interfaces.virtual import VirtualBus
 
 from soilbus.cli import main
 from soilbus.config import ConfigError
@@ -239,3 +241,21 @@ def test_deere_logs_never_claim_to_know(field_recording, tmp_path):
         assert {w["traversability"]["state"] for w in windows} == {"unknown"}
         assert windows[0]["rejected"]["not_available"] > 0
         assert all(value is None for w in windows for value in w["slip"].values())
+
+
+def test_a_bus_that_goes_away_ends_simulate_with_one_line(tractor, capsys, monkeypatch):
+    sent = []
+
+    def send(self, message, timeout=None):
+        if len(sent) == 20:
+            raise can.CanOperationError("Failed to transmit: Network is down", errno.ENETDOWN)
+        sent.append(message)
+
+    monkeypatch.setattr(VirtualBus, "send", send)
+    settings = ["--set", "bus.interface=virtual", "--set", "bus.channel=gone"]
+    assert main(["simulate", "--config", str(tractor), *settings, "--duration", "3", "--bus"]) == 1
+    out, err = lines(capsys)
+    assert out == []
+    assert len(err) == 1
+    assert "virtual:gone" in err[0]
+    assert "Network is down" in err[0]
