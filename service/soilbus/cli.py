@@ -1,6 +1,6 @@
 """The command line: parse, call one function of a room, print.
 
-Exit codes: 0 done; 1 the work could not be done; 2 wrong usage or configuration.
+Exit codes: 0 done; 1 the work could not be done; 2 wrong usage or configuration; 130 interrupted.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ from typing import TYPE_CHECKING
 
 from soilbus.allocator import keep_freed_memory, loading
 from soilbus.arguments import command_line
+from soilbus.process import output_fault, say
 from soilbus.report.whole_file import NotWritten, whole_file
 
 if TYPE_CHECKING:
     from soilbus.config import Config
     from soilbus.daemon.result import WindowResult
 
-DONE, FAILED, WRONG_USAGE = 0, 1, 2
+DONE, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
 
 
 class WorkError(Exception):
@@ -33,7 +34,7 @@ class WorkError(Exception):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
     args = command_line().parse_args(arguments)
-    logging.basicConfig(level=logging.INFO, format="soilbus: %(message)s", stream=sys.stderr)
+    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[_Told()])
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # what it does for itself is no news
     logging.getLogger("can").setLevel(logging.CRITICAL)  # a bus that is away is ours to tell of, once
     keep_freed_memory()
@@ -44,16 +45,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
     except ConfigError as error:
         for fault in error.faults:
-            print(f"soilbus: {fault}", file=sys.stderr)
+            say(fault)
         return WRONG_USAGE
     except (WorkError, NotWritten) as error:
-        print(f"soilbus: {error}", file=sys.stderr)
+        say(str(error))
         return FAILED
-    except BrokenPipeError:  # the reader of our output has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except KeyboardInterrupt:
+        return INTERRUPTED
+    except OSError as error:
+        of_output = output_fault()
+        if isinstance(of_output or error, BrokenPipeError):  # the reader of our output has seen enough
+            return DONE
+        where = "standard output: " if of_output else f"{error.filename}: " if error.filename else ""
+        say(f"{where}{error.strerror or error}")
+        return FAILED
+    except MemoryError:
+        say("not enough memory")
         return FAILED
     return DONE
+
+
+class _Told(logging.Handler):
+    """The journal, or the terminal: whatever standard error is at the time."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """One line."""
+        say(self.format(record))
 
 
 def _configured(args: argparse.Namespace) -> Config:
@@ -126,14 +143,14 @@ def _replay(args: argparse.Namespace) -> None:
                 raise WorkError(f"{error}{hint}") from None
             cut_off = error
     if cut_off is not None:
-        print(f"soilbus: {cut_off}; {len(results)} windows before that are kept", file=sys.stderr)
+        say(f"{cut_off}; {len(results)} windows before that are kept")
     _write_windows(args, config, results, summary(results, pipeline))
     if args.map is not None:
         text, left_out = soil_map(results)
         with whole_file(args.map) as out:
             out.write(text)
         if left_out:
-            print(f"soilbus: {left_out} of {len(results)} windows have no position: not on the map", file=sys.stderr)
+            say(f"{left_out} of {len(results)} windows have no position: not on the map")
     if "-" not in (str(args.json), str(args.map)):
         print(summary(results, pipeline), end="")
 
@@ -188,7 +205,7 @@ def _simulate(args: argparse.Namespace) -> None:
     except OSError as error:
         raise WorkError(f"{args.log or 'bus'}: {error.strerror or error}") from None
     if recording.bogged_at is not None:
-        print(f"soilbus: the tractor is stuck after {recording.bogged_at:.1f} s", file=sys.stderr)
+        say(f"the tractor is stuck after {recording.bogged_at:.1f} s")
 
 
 def _diagnose(args: argparse.Namespace) -> None:
@@ -341,4 +358,6 @@ _WORK: dict[str, Callable[[argparse.Namespace], None]] = {
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from soilbus.__main__ import program
+
+    program()
