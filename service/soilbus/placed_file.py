@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-_NO_UNNAMED_FILES = {errno.EOPNOTSUPP, errno.EISDIR, errno.EINVAL, errno.ENOENT}
+_NO_UNNAMED_FILES = {errno.EOPNOTSUPP, errno.EISDIR, errno.EINVAL}
 
 
 @contextmanager
@@ -22,7 +22,7 @@ def placed(path: Path) -> Iterator[int]:
     """
     path = Path(os.path.realpath(path))
     if path.exists() and not stat.S_ISREG(path.stat().st_mode):
-        descriptor, spare = os.open(path, os.O_WRONLY | os.O_CLOEXEC), None
+        descriptor = os.open(path, os.O_WRONLY | os.O_CLOEXEC)
         with _closing(descriptor):
             yield descriptor
         return
@@ -55,7 +55,7 @@ def _new(folder: Path, spare: Path) -> tuple[int, bool]:
     try:
         return os.open(folder, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o666), False
     except OSError as error:
-        if error.errno not in _NO_UNNAMED_FILES or not folder.is_dir():
+        if error.errno not in _NO_UNNAMED_FILES:
             raise
     return os.open(spare, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666), True
 

@@ -28,6 +28,7 @@ class Ended(KeyboardInterrupt):
 def run_and_leave(main: Callable[[], int]) -> NoReturn:
     """Leave the process with the exit code of `main`, or by the signal that ended it."""
     received: list[int] = []
+    _hush_threads_of(received)
 
     def end(number: int, _: FrameType | None) -> None:
         signal.signal(number, signal.SIG_DFL)  # the next one ends it at once
@@ -52,9 +53,25 @@ def run_and_leave(main: Callable[[], int]) -> NoReturn:
     if fault is not None and code == 0 and not isinstance(fault, BrokenPipeError):
         say(f"standard output: {fault.strerror}")
         code = 1
+    _give_up_messages()
     if any(not thread.daemon for thread in threading.enumerate() if thread is not threading.main_thread()):
         os._exit(code)
     sys.exit(code)
+
+
+def _hush_threads_of(received: list[int]) -> None:
+    """What threads and destructors make of a signal is no news once there is one."""
+    of_thread, unraisable = threading.excepthook, sys.unraisablehook
+    threading.excepthook = lambda args: None if received else of_thread(args)
+    sys.unraisablehook = lambda args: None if received else unraisable(args)
+
+
+def _give_up_messages() -> None:
+    """What standard error has not taken by now is lost, and no reason for another exit code."""
+    try:
+        sys.stderr.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
 
 
 def hold_standard_streams() -> None:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import active_children
+from multiprocessing import resource_tracker
 from multiprocessing.context import ForkContext, ForkProcess, SpawnContext, SpawnProcess
 from multiprocessing.process import BaseProcess
 from typing import Any, Literal
@@ -49,19 +50,29 @@ def workers(
 ) -> Iterator[ProcessPoolExecutor]:
     """A pool of `count` processes, each of which calls `begin` first.
 
-    They are killed when this process dies, when the thread that starts them ends, and when the context is left by an
-    exception.
+    They are killed when this process dies, and when the thread that starts them ends.  Left by an exception, the
+    context waits for none of them.
     """
     context = _ForkContext() if method == "fork" else _SpawnContext()
-    others = active_children()
-    with ProcessPoolExecutor(count, context, _begin, (os.getpid(), begin, *arguments)) as pool:
-        try:
-            yield pool
-        except BaseException:
-            for child in active_children():
-                if child not in others:
-                    child.kill()
-            raise
+    if method == "spawn":
+        _start_quiet_tracker()
+    pool = ProcessPoolExecutor(count, context, _begin, (os.getpid(), begin, *arguments))
+    try:
+        yield pool
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        raise
+    pool.shutdown()
+
+
+def _start_quiet_tracker() -> None:
+    """multiprocessing's tracker tidies up after a process that was killed, which is no news."""
+    quiet = "ignore:resource_tracker"
+    sys.warnoptions.append(quiet)  # handed on to it
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        sys.warnoptions.remove(quiet)
 
 
 def _begin(parent: int, begin: Callable[..., None], *arguments: Any) -> None:
