@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager
+from io import TextIOBase
 from itertools import chain
 from multiprocessing import get_all_start_methods
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import Any, TypeVar
 import can
 
 from soilbus.can.candump import Frame, candump_batches, frame_of
+from soilbus.can.log_lines import LogLines
 from soilbus.config import Config
 from soilbus.daemon.estimator import Undecided, WindowEstimator
 from soilbus.daemon.intake import Intake, WindowTask
@@ -59,6 +61,8 @@ def _read(path: Path, batches: Callable[[Any], Iterator[list[_T]]]) -> Iterator[
     n = 0
     try:
         with _reader(path) as reader:
+            if isinstance(getattr(reader, "file", None), TextIOBase):
+                reader.file = LogLines(reader.file)
             for batch in batches(reader):
                 n += len(batch)
                 yield batch
