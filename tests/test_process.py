@@ -237,4 +237,4 @@ def test_a_disk_that_hangs_does_not_keep_the_service_from_ending(tmp_path):
     service.terminate()
     service.communicate(timeout=LONGEST)
     assert service.returncode == 0
-    assert time.monotonic() - begin < 8.0  # systemd waits ten
+    assert time.monotonic() - begin < 10.0  # as long as systemd waits

@@ -468,3 +468,20 @@ def test_nothing_is_vouched_for_while_another_node_sends_under_our_identifiers(r
         assert {s for t, s in status if t < 12.5} == {"valid"}
         assert {s for t, s in status if t > 12.5} == {"degraded"}
         assert len(status) == len(bench.results)
+
+
+def test_a_frame_that_is_not_for_us_says_nothing_of_those_behind_it(recording):
+    """The machine stands still as a window ends; a frame under our identifier is the first that waits."""
+    samples = []
+    for theirs in (False, True):
+        bench = Bench(recording)
+        bench.run(9.895)
+        following = bench.wire.next
+        if theirs:
+            at = recording[following].timestamp
+            bench.wire.messages.insert(following, can.Message(timestamp=at, arbitration_id=0x18FF649A, data=bytes(8)))
+        bench.clock.now += 0.5
+        bench.run(1.0)
+        samples.append([result.samples for result in bench.results])
+    assert samples[0] == samples[1]
+    assert samples[0][0] > 1000
