@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.assembly import completion_of, model_of, rig_of
+from soilbus.can.log_lines import LogLines
 from soilbus.config import Column, Config, Table
 from soilbus.daemon.estimator import WindowEstimator
 from soilbus.daemon.intake import WindowTask, column_means
@@ -216,8 +217,8 @@ def _columns(path: Path, needed: Sequence[str]) -> Columns:
 def _csv(path: Path, needed: Sequence[str]) -> Columns:
     try:
         with path.open(newline="", encoding="utf-8-sig") as lines:
-            rows = [row for row in csv.reader(lines, strict=True) if row]
-    except (UnicodeDecodeError, csv.Error) as error:
+            rows = [row for row in csv.reader(LogLines(lines), strict=True) if row]
+    except (ValueError, csv.Error) as error:
         raise TableError(f"{path}: not CSV text ({_one_line(error)})") from None
     header = [name.strip() for name in rows[0]] if rows else []
     _check_columns(path, header, needed)
