@@ -19,6 +19,7 @@ from soilbus.diagnosis.verdict import SURE, Verdict, is_real
 from soilbus.diagnosis.where import Disagreement, disagreements
 from soilbus.estimation.posterior import Posterior, SoilPrior
 from soilbus.terra.effects.effect import Effect
+from soilbus.terra.effects.vehicle import GRADE, GRADE_BESIDE_PITCH
 
 MAX_EFFECTS = 3
 
@@ -73,7 +74,7 @@ def diagnose(
     if base is None:
         raise NotFitted("the present model does not converge on these recordings")
     law = records[0].learned.model.shear_law
-    candidates = [effect for effect in catalogue if effect.base_law in (None, law)]
+    candidates = [of_vehicle(effect, records) for effect in catalogue if effect.base_law in (None, law)]
     where = disagreements(base)
     present = base
     additions: list[Addition] = []
@@ -95,6 +96,12 @@ def diagnose(
     verdict = _verdict(before, after, additions)
     learned = corrections(list(records), present) if verdict is Verdict.UNKNOWN else []
     return Diagnosis(verdict, tuple(where), tuple(additions), base, present, tuple(learned), before, after)
+
+
+def of_vehicle(effect: Effect, records: Sequence[Record]) -> Effect:
+    """The effect as it can be on the vehicle of these recordings: beside a pitch sensor a slope is measured."""
+    with_pitch = all(record.learned.with_pitch for record in records)
+    return GRADE_BESIDE_PITCH if with_pitch and effect is GRADE else effect
 
 
 def _verdict(before: Gap, after: Gap, additions: Sequence[Addition]) -> Verdict:

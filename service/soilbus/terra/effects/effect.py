@@ -67,6 +67,7 @@ class Parameter:
     `starts`: further values that a search does well to begin at, where the sensitivity at
     `neutral` alone may be blind (the depth of a pan below all sinkages of a record).
     `of_record`: it describes one record and means nothing in another.
+    `of_vehicle`: it is the same in all records, though its effect is of the record.
     `knot`: it is the height of a curve there.
     """
 
@@ -79,6 +80,7 @@ class Parameter:
     starts: tuple[float, ...] = ()
     of_record: bool = False
     knot: Knot | None = None
+    of_vehicle: bool = False
 
 
 WheelHook = Callable[[WheelState, WheelModel, Surroundings, Values], tuple[WheelState, WheelModel]]
@@ -131,6 +133,10 @@ class Effect:
     def neutral(self) -> dict[str, float]:
         """Values at which the effect is absent."""
         return {p.name: p.neutral for p in self.parameters}
+
+    def own_in_each_record(self, parameter: Parameter) -> bool:
+        """Whether every record has its own value of one of the parameters."""
+        return (self.of_record and not parameter.of_vehicle) or parameter.of_record
 
 
 class Active(NamedTuple):
