@@ -9,13 +9,14 @@ import numpy as np
 
 from soilbus.diagnosis.candidates import THINNED, Standing
 from soilbus.diagnosis.completion import Completion
+from soilbus.diagnosis.detectable import Detectable, detectable
 from soilbus.diagnosis.fits import Fits
 from soilbus.diagnosis.gap import Gap, gap_of
 from soilbus.diagnosis.learned import Correction, corrections
 from soilbus.diagnosis.naming import ASTRAY, Addition, converged, named
 from soilbus.diagnosis.reconsidered import reconsidered
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.verdict import SURE, Verdict, is_real
+from soilbus.diagnosis.verdict import Verdict, verdict_of
 from soilbus.diagnosis.where import Disagreement, disagreements
 from soilbus.estimation.posterior import Posterior, SoilPrior
 from soilbus.terra.effects.effect import Effect
@@ -34,7 +35,8 @@ class Diagnosis:
 
     additions are in the order of what they explain beside each other, the most first.
     learned describes what is left where the verdict is unknown.  The gaps are those of
-    gap_of().
+    gap_of().  imitation: the effects explain what they do only together (see only_together()).
+    detectable tells of a verdict `none` what these recordings could have shown.
     """
 
     verdict: Verdict
@@ -45,6 +47,8 @@ class Diagnosis:
     learned: tuple[Correction, ...]
     gap_before: Gap
     gap_after: Gap
+    imitation: bool = False
+    detectable: tuple[Detectable, ...] = ()
 
     def soil_before(self, record: int) -> Posterior:
         """The soil of a recording as the present model tells it."""
@@ -93,20 +97,34 @@ def diagnose(
     progress("holding out every block in turn")
     before = gap_of(records, prior, base)
     after = gap_of(records, prior, present) if additions else before
-    verdict = _verdict(before, after, additions)
+    imitation = only_together(whole, base, present, additions)
+    chances = [addition.probability for addition in additions]
+    verdict = verdict_of(before.value, after.value, min(before.rows, after.rows), chances, imitation)
     learned = corrections(list(records), present) if verdict is Verdict.UNKNOWN else []
-    return Diagnosis(verdict, tuple(where), tuple(additions), base, present, tuple(learned), before, after)
+    shown: tuple[Detectable, ...] = ()
+    if verdict is Verdict.NONE:
+        progress("asking what these recordings could have shown")
+        shown = detectable(records, prior, base, [effect for effect in candidates if effect.name not in base.names])
+    return Diagnosis(
+        verdict, tuple(where), tuple(additions), base, present, tuple(learned), before, after, imitation, shown
+    )
+
+
+def only_together(whole: Fits, base: Completion, present: Completion, additions: Sequence[Addition]) -> bool:
+    """Whether as many effects as are ever added explain more together than the sum of what each explains alone.
+
+    Faults that are there at once take from each other what both explain.  Where the sum is more than its parts, parts
+    of one effect's signature cancel another's, and what is left over fits: as likely the imitation of something that
+    the catalogue lacks.
+    """
+    if len(additions) < MAX_EFFECTS:
+        return False
+    alone = [whole.of((*base.effects, addition.effect)) for addition in additions]
+    falls = [0.0 if one is None else max(base.evidence - one.evidence, 0.0) for one in alone]
+    return sum(falls) < base.evidence - present.evidence
 
 
 def of_vehicle(effect: Effect, records: Sequence[Record]) -> Effect:
     """The effect as it can be on the vehicle of these recordings: beside a pitch sensor a slope is measured."""
     with_pitch = all(record.learned.with_pitch for record in records)
     return GRADE_BESIDE_PITCH if with_pitch and effect is GRADE else effect
-
-
-def _verdict(before: Gap, after: Gap, additions: Sequence[Addition]) -> Verdict:
-    if is_real(before.value, after.value, min(before.rows, after.rows)):
-        return Verdict.UNKNOWN
-    if not additions:
-        return Verdict.NONE
-    return Verdict.NAMED if all(a.probability >= SURE for a in additions) else Verdict.AMBIGUOUS

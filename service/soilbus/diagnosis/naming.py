@@ -9,7 +9,14 @@ from dataclasses import dataclass, replace
 from soilbus.diagnosis.candidates import STEPS, Promising, Standing, promising
 from soilbus.diagnosis.completion import Completion
 from soilbus.diagnosis.fits import Fits
-from soilbus.diagnosis.verdict import PLAUSIBLE, hopeless_from, price, probabilities
+from soilbus.diagnosis.verdict import (
+    PLAUSIBLE,
+    TEMPERATURE,
+    hopeless_from,
+    price,
+    probabilities,
+    temperatures,
+)
 from soilbus.estimation.gauss_newton import Effort
 from soilbus.terra.effects.effect import Effect
 
@@ -24,7 +31,8 @@ class Addition:
     """One round: the effect added, its probability, and the other names with theirs; falls of -2 log evidence.
 
     beside are the names of the effects beside which it was named; form_left is that of all these effects, by their
-    probabilities (root mean square).
+    probabilities (root mean square).  divided_by is what the falls are divided by before they become probabilities,
+    usually and at times (see `verdict`).
     """
 
     effect: Effect
@@ -33,6 +41,7 @@ class Addition:
     falls: dict[str, float]
     beside: frozenset[str] = frozenset()
     form_left: float = Effect.form_left
+    divided_by: tuple[float, float] = (TEMPERATURE, TEMPERATURE)
 
     def beside_another(self, effect: Effect, other: Effect) -> Addition:
         """The same with one effect beside it in place of another."""
@@ -75,7 +84,8 @@ def named(
     others = {n: p for n, p in chances.items() if n != best and p >= PLAUSIBLE}
     effect, completion = fitted[best]
     form_left = _form_left({n: p for n, p in chances.items() if n == best or n in others}, candidates)
-    return Addition(effect, chances[best], others, falls, present.names, form_left), completion
+    heat = temperatures(explained + most)
+    return Addition(effect, chances[best], others, falls, present.names, form_left, heat), completion
 
 
 def _compared(

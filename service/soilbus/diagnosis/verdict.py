@@ -135,6 +135,18 @@ def least_that_pays(explained: float) -> float:
     return max(PAYS_BESIDE if explained > 0.0 else PAYS, ADDS * explained)
 
 
+def verdict_of(before: float, after: float, rows: int, chances: Sequence[float], imitation: bool = False) -> Verdict:
+    """The verdict from the gaps before and after on so many residuals, and the probability of each effect added.
+
+    imitation: whether the effects explain what they do only together, see `diagnose`.
+    """
+    if is_real(before, after, rows):
+        return Verdict.UNKNOWN
+    if not chances:
+        return Verdict.NONE
+    return Verdict.NAMED if min(chances) >= SURE and not imitation else Verdict.AMBIGUOUS
+
+
 def is_real(before: float, after: float, checked_rows: int) -> bool:
     """Whether a gap is left that the effects added do not explain."""
     share = UNEXPLAINED_FAR if after > FAR_GAP else UNEXPLAINED

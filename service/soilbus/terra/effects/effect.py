@@ -108,6 +108,8 @@ class Effect:
     mixes_instants: `torque` needs other instants than its own, adds them up, alike in each of however many columns,
     and is given plain arrays.
     of_record: its parameters describe the ground of one record and mean nothing in another.
+    of_tyre: it is there only where a wheel has a tyre.
+    ruled_out: what on the vehicle makes it impossible, where anything does.
     form_left: share of what it changes of the soil's parameters by which these are off (standard deviation), as no
     effect's formula is the field's: of the blind tune halves of seeds 109 to 113.
     """
@@ -127,6 +129,8 @@ class Effect:
     base_law: str | None = None
     of_record: bool = False
     mixes_instants: bool = False
+    of_tyre: bool = False
+    ruled_out: str = ""
     form_left: float = 0.125
 
     @property

@@ -41,6 +41,7 @@ DRIVETRAIN_LOSS = Effect(
         Parameter("fading", "1", 0.0, 0.3, 0.0, 1.5, starts=(0.6,)),
     ),
     torque=_drive_line,
+    ruled_out="a torque cell between gear and wheel reads what reaches the wheel",
 )
 
 SLOPE_KNOTS = 16
@@ -110,6 +111,8 @@ ROLLING_RADIUS = Effect(
         Parameter("rear", "1", 0.0, 0.03, -0.15, 0.15),
     ),
     wheel=_true_radius,
+    of_tyre=True,
+    ruled_out="a rigid wheel is not worn or inflated: its radius is what a ruler says",
 )
 
 
