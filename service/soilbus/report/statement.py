@@ -103,7 +103,7 @@ def pressure_error(found: Detectable, before: Sequence[Posterior], config: Confi
     for posterior, soil_error in zip(before, found.soil_error, strict=True):
         pressure = bearing_pressure(posterior.soil, config.estimator.z_ref, config.estimator.b_ref)
         by_logs = pressure.gradient * np.array(posterior.soil) / pressure.value
-        errors.append((float(by_logs @ soil_error), posterior.propagate(pressure.gradient) / pressure.value))
+        errors.append((float(np.expm1(by_logs @ soil_error)), posterior.propagate(pressure.gradient) / pressure.value))
     return max(errors, key=lambda error: abs(error[0]) / max(error[1], 1e-12))
 
 
