@@ -108,7 +108,7 @@ def test_what_is_not_finite_is_null(findings):
 
 def test_page_text_and_json_say_the_same_of_what_could_be_seen(findings):
     """And a page does not say 12 where 30 was asked."""
-    soil_error = np.array([[-0.2, -0.2, 0.0, 0.0, 0.0, 0.0]])
+    soil_error = np.log(0.8) * np.array([[1.0, 1.0, 0.0, 0.0, 0.0, 0.0]])
     seen = (
         Detectable(CATALOGUE["torque_lag"], 0.04, 0.04, 0.0 * soil_error),
         Detectable(CATALOGUE["slip_sinkage"], None, 1.2, soil_error),

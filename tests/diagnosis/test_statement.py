@@ -67,7 +67,7 @@ def said(found: Diagnosis) -> str:
     return "\n".join([statement(found), doubt(found) or "", *place_lines(findings), *shown_lines(found, CONFIG)])
 
 
-@settings(max_examples=600, deadline=None)
+@settings(max_examples=400, deadline=None)
 @given(diagnoses())
 def test_no_sentence_contradicts_another(found):
     text = said(found)
@@ -140,5 +140,6 @@ def test_what_could_not_be_shown_is_told_with_what_it_does_to_the_soil():
     assert "could have shown, from about these sizes on: torque_lag 0.04 s, multipass 0.03" in text
     assert "could not have shown, at any usual size: slip_sinkage" in text
     std = SOIL.bearing_pressure(0.02, 0.3)
-    assert f"its +- {100.0 * std.std / std.value:.1f} %: slip_sinkage 1 by -22.3 %" in text  # log 0.8
-    assert text.count(" by ") == 1
+    assert f"its +- {100.0 * std.std / std.value:.1f} %: slip_sinkage 1 by -20.0 %" in text
+    assert "torque_lag" not in text.splitlines()[-1]
+    assert "multipass" not in text.splitlines()[-1]
