@@ -12,7 +12,7 @@ import pytest
 
 from availability import unavailable
 from single_wheel import NOISE, RIG, WIDTH, noisy, sweep, write_csv
-from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.assembly import model_of, prior_of, rig_of, with_effects
 from soilbus.cli import main
 from soilbus.config import Config, ConfigError
 from soilbus.config_file import parse_config
@@ -355,3 +355,20 @@ def test_replay_of_tables_writes_the_daemons_json_and_summary(tmp_path, measured
     assert "1 windows from 1 tables" in capsys.readouterr().out
     assert main(["replay", "--config", str(config), str(tmp_path / "none.csv")]) == 1
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_rigid_wheel_has_no_effect_of_a_tyre(tmp_path, measured):
+    path = write_csv(tmp_path / "t.csv", measured)
+    raw = tomllib.loads(RIG)
+    rigid = parse_config(raw | {"wheel": [raw["wheel"][0] | {"tyre": "rigid"}]})
+    names = [{e.name for e in candidates(c, recordings_of_tables(c, [path]).records)} for c in (rig(), rigid)]
+    assert names[0] - names[1] == {"tyre_deflection", "rolling_radius"}
+    assert names[1] < names[0]
+
+
+def test_a_rigid_wheel_is_not_given_an_effect_of_a_tyre():
+    raw = tomllib.loads(RIG)
+    rigid = parse_config(raw | {"wheel": [raw["wheel"][0] | {"tyre": "rigid"}]})
+    with pytest.raises(ConfigError, match=r"tyre_deflection is of a tyre, and every wheel is said to be rigid"):
+        with_effects(rigid, ["tyre_deflection=1e-6"])
+    assert "wheel.0.tyre" in fault({"wheel": [raw["wheel"][0] | {"tyre": "wooden"}]})

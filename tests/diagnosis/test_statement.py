@@ -46,8 +46,8 @@ def diagnoses(draw) -> Diagnosis:
     chances = [draw(st.floats(0.05, 1.0)) for _ in names]
     before = Gap(draw(st.floats(0.95, 9.0)), draw(st.integers(20, 20000)))
     after = Gap(draw(st.floats(0.9, 1.0)) + draw(st.floats(0.0, 1.0)) ** 3 * (before.value - 0.9), before.rows)
-    imitation = len(names) == 3 and draw(st.booleans())
-    verdict = verdict_of(before.value, after.value if names else before.value, before.rows, chances, imitation)
+    imitation = (0.9, 0.6, 0.1) if len(names) == 3 and draw(st.booleans()) else ()
+    verdict = verdict_of(before.value, after.value if names else before.value, before.rows, chances, bool(imitation))
     where = draw(st.sampled_from([(), (PLACE,), (PLACE, PLACE)]))
     seen = tuple(shown(n, draw(st.sampled_from([None, 0.1]))) for n in NAMES) if verdict is Verdict.NONE else ()
     added = tuple(map(addition, names, chances))
@@ -103,15 +103,17 @@ def test_effects_that_are_more_together_than_apart_are_doubted_with_what_rules_t
     names = ("tyre_deflection", "rolling_radius", "stress_peak_shift")
     added = tuple(addition(name, 0.9) for name in names)
     found = Diagnosis(
-        Verdict.AMBIGUOUS, (PLACE,), added, NOTHING, NOTHING, (), Gap(9.0, 900), Gap(1.0, 900), imitation=True
+        Verdict.AMBIGUOUS, (PLACE,), added, NOTHING, NOTHING, (), Gap(9.0, 900), Gap(1.0, 900), (0.9, 0.6, 0.1)
     )
     told = doubt(found) or ""
-    assert "imitate something which the catalogue lacks" in told
+    assert "tyre_deflection 90 %, rolling_radius 60 %, stress_peak_shift 10 %" in told
+    assert "imitation of something that the catalogue lacks" in told
+    assert 'say tyre = "rigid"' in told
     assert "tyre_deflection: a rigid wheel has no tyre" in told
     assert "rolling_radius: a rigid wheel" in told
     assert verdict_of(9.0, 1.0, 900, [0.9] * 3) is Verdict.NAMED
     assert verdict_of(9.0, 1.0, 900, [0.9] * 3, imitation=True) is Verdict.AMBIGUOUS
-    assert doubt(dataclasses.replace(found, imitation=False)) is None
+    assert doubt(dataclasses.replace(found, imitation=())) is None
 
 
 def test_probabilities_beside_falls_that_differ_little_are_explained():
@@ -135,7 +137,7 @@ def test_probabilities_beside_falls_that_differ_little_are_explained():
 
 def test_what_could_not_be_shown_is_told_with_what_it_does_to_the_soil():
     seen = (shown("torque_lag", 0.04), shown("slip_sinkage", None, -0.2), shown("multipass", 0.03, 0.001))
-    found = Diagnosis(Verdict.NONE, (), (), NOTHING, NOTHING, (), Gap(1.0, 900), Gap(1.0, 900), False, seen)
+    found = Diagnosis(Verdict.NONE, (), (), NOTHING, NOTHING, (), Gap(1.0, 900), Gap(1.0, 900), (), seen)
     text = "\n".join(shown_lines(found, CONFIG))
     assert "could have shown, from about these sizes on: torque_lag 0.04 s, multipass 0.03" in text
     assert "could not have shown, at any usual size: slip_sinkage" in text

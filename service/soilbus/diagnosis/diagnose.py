@@ -23,6 +23,9 @@ from soilbus.terra.effects.effect import Effect
 from soilbus.terra.effects.vehicle import GRADE, GRADE_BESIDE_PITCH
 
 MAX_EFFECTS = 3
+OVERLAP = 0.25
+"""Share by which the sum of what effects explain alone may differ from what they explain together: of 9 blind pairs
+(seed 132) with nothing in common it was 0.96 to 1.08, of 5 that look alike 1.1 to 1.6."""
 
 
 class NotFitted(Exception):
@@ -35,7 +38,7 @@ class Diagnosis:
 
     additions are in the order of what they explain beside each other, the most first.
     learned describes what is left where the verdict is unknown.  The gaps are those of
-    gap_of().  imitation: the effects explain what they do only together (see only_together()).
+    gap_of().  imitation: what each effect explains alone, where all may be an imitation (see shares_alone()).
     detectable tells of a verdict `none` what these recordings could have shown.
     """
 
@@ -47,7 +50,7 @@ class Diagnosis:
     learned: tuple[Correction, ...]
     gap_before: Gap
     gap_after: Gap
-    imitation: bool = False
+    imitation: tuple[float, ...] = ()
     detectable: tuple[Detectable, ...] = ()
 
     def soil_before(self, record: int) -> Posterior:
@@ -97,9 +100,9 @@ def diagnose(
     progress("holding out every block in turn")
     before = gap_of(records, prior, base)
     after = gap_of(records, prior, present) if additions else before
-    imitation = only_together(whole, base, present, additions)
+    imitation = shares_alone(whole, base, present, additions)
     chances = [addition.probability for addition in additions]
-    verdict = verdict_of(before.value, after.value, min(before.rows, after.rows), chances, imitation)
+    verdict = verdict_of(before.value, after.value, min(before.rows, after.rows), chances, bool(imitation))
     learned = corrections(list(records), present) if verdict is Verdict.UNKNOWN else []
     shown: tuple[Detectable, ...] = ()
     if verdict is Verdict.NONE:
@@ -110,18 +113,21 @@ def diagnose(
     )
 
 
-def only_together(whole: Fits, base: Completion, present: Completion, additions: Sequence[Addition]) -> bool:
-    """Whether as many effects as are ever added explain more together than the sum of what each explains alone.
+def shares_alone(
+    whole: Fits, base: Completion, present: Completion, additions: Sequence[Addition]
+) -> tuple[float, ...]:
+    """What each effect explains alone, as a share of what all explain together; empty where nothing is to be doubted.
 
-    Faults that are there at once take from each other what both explain.  Where the sum is more than its parts, parts
-    of one effect's signature cancel another's, and what is left over fits: as likely the imitation of something that
-    the catalogue lacks.
+    Faults that have nothing in common explain together the sum of what each explains alone.  Where as many effects as
+    are ever added do not, the signature of one lies over that of another, which hides it or cancels part of it: as
+    likely an imitation of something that the catalogue lacks as so many faults at once.
     """
     if len(additions) < MAX_EFFECTS:
-        return False
+        return ()
     alone = [whole.of((*base.effects, addition.effect)) for addition in additions]
-    falls = [0.0 if one is None else max(base.evidence - one.evidence, 0.0) for one in alone]
-    return sum(falls) < base.evidence - present.evidence
+    together = base.evidence - present.evidence
+    shares = tuple(0.0 if one is None else max(base.evidence - one.evidence, 0.0) / together for one in alone)
+    return () if abs(sum(shares) - 1.0) < OVERLAP else shares
 
 
 def of_vehicle(effect: Effect, records: Sequence[Record]) -> Effect:

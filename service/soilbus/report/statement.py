@@ -67,13 +67,18 @@ def doubt(diagnosis: Diagnosis) -> str | None:
     """Why effects that explain the data only together are to be doubted; None where they are not such."""
     if not diagnosis.imitation:
         return None
-    names = [addition.effect.name for addition in diagnosis.additions]
+    shares = zip(diagnosis.additions, diagnosis.imitation, strict=True)
+    alone = ", ".join(f"{addition.effect.name} {100.0 * share:.0f} %" for addition, share in shares)
     against = [f"{a.effect.name}: {a.effect.ruled_out}" for a in diagnosis.additions if a.effect.ruled_out]
     told = (
-        f"to be doubted: {', '.join(names[:-1])} and {names[-1]} explain more together than the sum of what each "
-        "explains alone, as parts that imitate something which the catalogue lacks do; so many faults at once are rare"
+        f"to be doubted: of what they explain together each alone explains {alone}; separate faults would add up to "
+        "100 %, so these may be an imitation of something that the catalogue lacks"
     )
-    return told + (f"; not possible where {'; '.join(against)}" if against else "")
+    if against:
+        told += f". What rules them out: {'; '.join(against)}"
+    if any(addition.effect.of_tyre for addition in diagnosis.additions):
+        told += ' (say tyre = "rigid" of such wheels)'
+    return told
 
 
 def why_probabilities(addition: Addition) -> str | None:
