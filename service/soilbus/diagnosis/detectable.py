@@ -5,7 +5,10 @@ without it by u H u, on average over the noise.  H (P, P) is the Fisher informat
 after soil, gains and effects of the model have taken up what they can (Schur complement).  From
 that follows the expected fall of -2 log evidence, and the size at which it is what an effect must
 explain.  An effect of that size is overlooked every other time, one of twice the size hardly ever.
-Till then the fit has moved the soil instead: by as much as that, nobody can say that it is not.
+Till then the fit has moved the soil instead: nobody can say that it has not been moved so far.
+
+All this is linear in the effect.  A size is too small where the effect bends far before it is seen,
+and for delays where nothing but noise changes quickly: noise of torques counts as change there.
 """
 
 from __future__ import annotations
