@@ -144,3 +144,21 @@ def test_json_says_whether_a_gap_is_left_and_why_names_are_near_each_other(findi
     left = json.loads(findings_json(with_verdict(findings, Verdict.AMBIGUOUS, gap_after=Gap(1.5, 900))))
     assert left["gap"]["open"] is True
     assert "something is left besides" in left["sentence"]
+
+
+def test_a_small_offset_of_the_hitch_may_as_well_be_one_of_the_pitch_sensor(findings):
+    """As m g sin(slope) is the same push; a great one is beyond what a pitch sensor is ever off by."""
+    told = json.loads(findings_json(findings))["effects"][0]
+    offset = told["parameters"]["offset"]["value"]
+    slope = np.degrees(offset / (CONFIG.vehicle.mass * 9.80665))
+    assert told["same_as"] == (
+        f"a pitch sensor that reads {abs(slope):.2f} deg too {'high' if slope > 0.0 else 'low'} would do the same"
+    )
+    assert told["same_as"] in findings_text(findings)
+    completed = findings.diagnosis.completed
+    place = completed.checks[-1].problem.n_sensors
+    gains = completed.fits[-1].mode.gains.copy()
+    gains[place] = 500.0 / completed.free[0].std
+    fit = dataclasses.replace(completed.fits[-1], mode=dataclasses.replace(completed.fits[-1].mode, gains=gains))
+    great = with_verdict(findings, Verdict.AMBIGUOUS, completed=dataclasses.replace(completed, fits=(fit,)))
+    assert json.loads(findings_json(great))["effects"][0]["same_as"] is None

@@ -20,6 +20,7 @@ from soilbus.report.statement import (
     is_open,
     no_places,
     pressure_error,
+    same_push,
     shown_lines,
     statement,
     why_probabilities,
@@ -103,6 +104,7 @@ def _effect(addition: Addition, completed: Completion) -> dict[str, Any]:
         "why_ambiguous": why_ambiguous(addition),
         "why_probabilities": why_probabilities(addition),
         "ruled_out": effect.ruled_out or None,
+        "same_as": same_push(addition, completed),
         "tells": {name: CATALOGUE[name].tells for name in (effect.name, *addition.alternatives)},
         "evidence": dict(sorted(addition.falls.items(), key=lambda item: -item[1])),
     }
@@ -212,6 +214,7 @@ def effect_lines(number: int, addition: Addition, completed: Completion) -> list
         unit = units.get(name) or units[name.rpartition("_")[0]]
         std = f"+- {estimate.std:.2g}" if estimate.std > 0.0 else "(held)"
         lines.append(f"   {name} = {estimate.value:.4g} {std}" + ("" if unit == "1" else f" {unit}"))
+    lines += [f"   {line}" for line in filter(None, [same_push(addition, completed)])]
     if addition.alternatives:
         others = ", ".join(f"{name} {p:.2f}" for name, p in addition.alternatives.items())
         lines += [f"   or: {others}", f"   {why_ambiguous(addition)}", f"   {why_probabilities(addition)}"]

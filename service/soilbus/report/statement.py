@@ -5,16 +5,20 @@ What is said depends on all there is to say at once: verdict, effects added, gap
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from soilbus.config import Config
+from soilbus.diagnosis.completion import Completion
 from soilbus.diagnosis.detectable import Detectable
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.naming import Addition
 from soilbus.diagnosis.verdict import AT_TIMES, Verdict, gap_limit
 from soilbus.estimation.posterior import Posterior, bearing_pressure
+from soilbus.terra.effects.vehicle import GRADE_BESIDE_PITCH
+from soilbus.terra.vehicle import GRAVITY
 
 MOST_FEARED = 3
 """Effects that may be there unseen which the text lists."""
@@ -79,6 +83,19 @@ def doubt(diagnosis: Diagnosis) -> str | None:
     if any(addition.effect.of_tyre for addition in diagnosis.additions):
         told += ' (say tyre = "rigid" of such wheels)'
     return told
+
+
+def same_push(addition: Addition, completed: Completion) -> str | None:
+    """The error of the pitch sensor that would do the same as an offset of the hitch; None where none may."""
+    problem = completed.checks[-1].problem
+    chassis = problem.rig.chassis
+    if addition.effect.name != "draft_offset" or chassis is None or not problem.with_pitch:
+        return None
+    slope = completed.parameters()["draft_offset"]["offset"].value / (chassis.mass * GRAVITY)
+    if abs(slope) > GRADE_BESIDE_PITCH.parameters[0].high:
+        return None
+    way = "high" if slope > 0.0 else "low"
+    return f"a pitch sensor that reads {abs(math.degrees(slope)):.2f} deg too {way} would do the same"
 
 
 def why_probabilities(addition: Addition) -> str | None:
