@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import errno
 import gzip
+import itertools
 import json
+import os
 import shutil
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import can
 import numpy as np
 import pytest
+from can.interfaces.virtual import VirtualBus
 
 from soilbus.cli import main
 from soilbus.config import ConfigError
@@ -157,6 +163,55 @@ def test_a_wheel_without_load_or_speed_is_a_fault(key, tmp_path, capsys):
     assert f"wheel FL has a torque but no {key}" in err[0]
 
 
+@pytest.mark.parametrize("value", ["[" * 2000 + "]" * 2000, "{a=" * 2000 + "1" + "}" * 2000, "9" * 5000])
+def test_a_value_that_no_parser_bears_is_one_line_and_exit_code_2(value, tmp_path, capsys):
+    (tmp_path / "c.toml").write_text(f"x = {value}\n")
+    for words in (["--config", str(tmp_path / "c.toml")], ["--config", str(FIELD), "--set", f"vehicle.mass={value}"]):
+        assert main(["check", *words]) == 2
+        printed, err = lines(capsys)
+        assert printed == []
+        assert len(err) == 1
+        assert len(err[0]) < 250
+        assert "too deeply" in err[0] or "too many digits" in err[0]
+
+
+@pytest.mark.parametrize("kind", ["pipe", "endless", "folder", "large"])
+def test_a_dbc_that_is_no_regular_file_is_one_line_and_exit_code_2(kind, tmp_path, capsys):
+    name = {"endless": "/dev/zero"}.get(kind, str(tmp_path / kind))
+    if kind == "pipe":
+        os.mkfifo(name)
+    elif kind == "folder":
+        os.mkdir(name)
+    elif kind == "large":
+        with open(name, "wb") as file:
+            file.truncate(2**31)
+    for key in ("dbc.input", "output.dbc"):
+        value = f'["{name}"]' if key == "dbc.input" else f'"{name}"'
+        assert main(["check", "--config", str(FIELD), "--set", f"{key}={value}"]) == 2
+        printed, err = lines(capsys)
+        assert printed == []
+        assert len(err) == 1
+        assert key in err[0]
+        assert any(why in err[0] for why in ("not a regular file", "larger than", "directory"))
+
+
+@pytest.mark.parametrize(
+    ("column", "value"), [("ts", None), ("ts", "noon"), ("arbitration_id", None), ("arbitration_id", 1.5)]
+)
+def test_a_damaged_sqlite_log_is_cut_off_where_it_is_damaged(column, value, log, tractor, tmp_path, capsys):
+    path = tmp_path / "drive.db"
+    with can.Logger(path) as writer, can.LogReader(log) as reader:
+        for message in itertools.islice(reader, 400):
+            writer(message)
+    with closing(sqlite3.connect(path)) as base, base:
+        base.execute(f"UPDATE messages SET {column} = ? WHERE rowid = 300", [value])
+    assert main(["replay", "--config", str(tractor), str(path)]) == 1
+    printed, err = lines(capsys)
+    assert printed == []
+    assert len(err) == 1
+    assert f"{path}: cut off or damaged after 299 frames" in err[0]
+
+
 @pytest.mark.parametrize(
     "text", ["[vehicle\n", "\xff\xfe", "[vehicle]\nmass = 1\n[vehicle]\nmass = 2\n", 'wheel = "x"\n', "soil = 3\n"]
 )
@@ -260,3 +315,21 @@ def test_deere_logs_never_claim_to_know(field_recording, tmp_path, capsys):
         assert {w["traversability"]["state"] for w in windows} == {"unknown"}
         assert windows[0]["rejected"]["not_available"] > 0
         assert all(value is None for w in windows for value in w["slip"].values())
+
+
+def test_a_bus_that_goes_away_ends_simulate_with_one_line(tractor, capsys, monkeypatch):
+    sent = []
+
+    def send(self, message, timeout=None):
+        if len(sent) == 20:
+            raise can.CanOperationError("Failed to transmit: Network is down", errno.ENETDOWN)
+        sent.append(message)
+
+    monkeypatch.setattr(VirtualBus, "send", send)
+    settings = ["--set", "bus.interface=virtual", "--set", "bus.channel=gone"]
+    assert main(["simulate", "--config", str(tractor), *settings, "--duration", "3", "--bus"]) == 1
+    out, err = lines(capsys)
+    assert out == []
+    assert len(err) == 1
+    assert "virtual:gone" in err[0]
+    assert "Network is down" in err[0]

@@ -9,7 +9,7 @@ import time
 
 def test_demo_ends_by_itself_in_time_and_turns_from_go_to_no_go():
     begin = time.monotonic()
-    done = subprocess.run([sys.executable, "-m", "soilbus.cli", "demo"], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-m", "soilbus", "demo"], capture_output=True, text=True, timeout=60)
     taken = time.monotonic() - begin
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""

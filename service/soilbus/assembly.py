@@ -100,6 +100,8 @@ def effects_of(config: Config, wheels: Sequence[str] | None = None) -> tuple[Act
             if setting.name in found:
                 raise ConfigError([f"two effects are named {setting.name}"])
             found[setting.name] = _active(setting, config.model.shear_law, of_all)
+            if CATALOGUE[setting.name].of_tyre and not _has_tyres(config):
+                raise ConfigError([f"{setting.name} is of a tyre, and every wheel is said to be rigid"])
         except ConfigError as error:
             faults += error.faults
     if faults:
@@ -109,6 +111,17 @@ def effects_of(config: Config, wheels: Sequence[str] | None = None) -> tuple[Act
         Active(effect, {name: value[place] if np.ndim(value) else value for name, value in values.items()})
         for effect, values in (found[name] for name in CATALOGUE if name in found)
     )
+
+
+def possible_effects(config: Config) -> list[Effect]:
+    """The effects of the catalogue that can be there on the configured machine: without tyres none of a tyre."""
+    from soilbus.terra.effects.catalogue import CATALOGUE
+
+    return [effect for effect in CATALOGUE.values() if _has_tyres(config) or not effect.of_tyre]
+
+
+def _has_tyres(config: Config) -> bool:
+    return not config.wheel or any(wheel.tyre == "flexible" for wheel in config.wheel)
 
 
 def completion_of(config: Config) -> tuple[tuple[Effect, ...], tuple[Free, ...]]:

@@ -1,6 +1,6 @@
 """The command line: parse, call one function of a room, print.
 
-Exit codes: 0 done; 1 the work could not be done; 2 wrong usage or configuration.
+Exit codes: 0 done; 1 the work could not be done; 2 wrong usage or configuration; 130 interrupted.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from soilbus.allocator import keep_freed_memory, loading
 from soilbus.arguments import command_line
+from soilbus.process import output_fault, say
 from soilbus.report.whole_file import NotWritten, whole_file
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from soilbus.daemon.result import WindowResult
     from soilbus.sensors.survey import Survey
 
-DONE, FAILED, WRONG_USAGE = 0, 1, 2
+DONE, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
 
 
 class WorkError(Exception):
@@ -35,7 +36,7 @@ class WorkError(Exception):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
     args = command_line().parse_args(arguments)
-    logging.basicConfig(level=logging.INFO, format="soilbus: %(message)s", stream=sys.stderr)
+    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[_Told()])
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # what it does for itself is no news
     logging.getLogger("can").setLevel(logging.CRITICAL)  # a bus that is away is ours to tell of, once
     keep_freed_memory()
@@ -46,16 +47,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
     except ConfigError as error:
         for fault in error.faults:
-            print(f"soilbus: {fault}", file=sys.stderr)
+            say(fault)
         return WRONG_USAGE
     except (WorkError, NotWritten) as error:
-        print(f"soilbus: {error}", file=sys.stderr)
+        say(str(error))
         return FAILED
-    except BrokenPipeError:  # the reader of our output has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except KeyboardInterrupt:
+        return INTERRUPTED
+    except OSError as error:
+        of_output = output_fault()
+        if isinstance(of_output or error, BrokenPipeError):  # the reader of our output has seen enough
+            return DONE
+        where = "standard output: " if of_output else f"{error.filename}: " if error.filename else ""
+        say(f"{where}{error.strerror or error}")
+        return FAILED
+    except MemoryError:
+        say("not enough memory")
         return FAILED
     return DONE
+
+
+class _Told(logging.Handler):
+    """The journal, or the terminal: whatever standard error is at the time."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """One line."""
+        say(self.format(record))
 
 
 def _configured(args: argparse.Namespace) -> Config:
@@ -105,7 +122,7 @@ def _check(args: argparse.Namespace) -> None:
         warnings += [*of_channel, *found.warnings]
         faults = found.faults
     for line in warnings:
-        print(f"soilbus: warning: {line}", file=sys.stderr)
+        say(f"warning: {line}")
     if faults:
         raise ConfigError(faults)
 
@@ -157,7 +174,7 @@ def _replay(args: argparse.Namespace) -> None:
         _replay_tables(args, config)
         return
     for line in other_channel(config, args.logs):
-        print(f"soilbus: {line}", file=sys.stderr)
+        say(line)
     pipeline = Pipeline(config, load_databases(config))
     results: list[WindowResult] = []
     faults: list[LogError] = []
@@ -171,7 +188,7 @@ def _replay(args: argparse.Namespace) -> None:
             hint = f"; --partial keeps {' and '.join(kept)}" if kept else ""
             raise WorkError(f"{error}{hint}") from None
     for fault in faults:
-        print(f"soilbus: {fault}; {fault.windows} windows before that are kept", file=sys.stderr)
+        say(f"{fault}; {fault.windows} windows before that are kept")
     text = summary(results, pipeline)
     _write_windows(args, config, results, text)
     if args.map is not None:
@@ -179,7 +196,7 @@ def _replay(args: argparse.Namespace) -> None:
         with whole_file(args.map) as out:
             out.write(map_text)
         if left_out:
-            print(f"soilbus: {left_out} of {len(results)} windows have no position: not on the map", file=sys.stderr)
+            say(f"{left_out} of {len(results)} windows have no position: not on the map")
     if "-" not in (str(args.json), str(args.map)):
         print(text, end="")
     _need_a_use(results, config)
@@ -244,7 +261,7 @@ def _simulate(args: argparse.Namespace) -> None:
     except OSError as error:
         raise WorkError(f"{args.log or 'bus'}: {error.strerror or error}") from None
     if recording.bogged_at is not None:
-        print(f"soilbus: the tractor is stuck after {recording.bogged_at:.1f} s", file=sys.stderr)
+        say(f"the tractor is stuck after {recording.bogged_at:.1f} s")
 
 
 def _diagnose(args: argparse.Namespace) -> None:
@@ -397,4 +414,6 @@ _WORK: dict[str, Callable[[argparse.Namespace], None]] = {
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from soilbus.__main__ import program
+
+    program()

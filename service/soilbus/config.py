@@ -170,13 +170,14 @@ class Wheel(_Section):
     """One wheel and its sensors; radius is the rolling radius [m], width the tyre's [m].
 
     `max_torque` [N m] is the motor's limit at the wheel where no signal tells it.  Only the
-    wheel of a test rig has no axle.
+    wheel of a test rig has no axle.  A rigid wheel has no tyre that could flatten or wear.
     """
 
     name: Name
     axle: Literal["front", "rear"] | None = None
     radius: Annotated[PositiveFloat, AfterValidator(RADIUS)]
     width: Annotated[PositiveFloat, AfterValidator(WIDTH)]
+    tyre: Literal["flexible", "rigid"] = "flexible"
     gear_ratio: Annotated[PositiveFloat, AfterValidator(GEAR_RATIO)] = 1.0
     max_torque: Annotated[PositiveFloat, AfterValidator(WHEEL_TORQUE)] | None = None
     torque: Signal | None = None

@@ -9,8 +9,14 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from soilbus.bounded_file import read_bounded
 from soilbus.config import Config, ConfigError
 from soilbus.config_faults import fault_lines
+
+LARGEST = 2**20
+"""Bytes of a configuration: a thousand times those of a tractor's."""
+_SHOWN = 60
+"""Characters of an override that a fault repeats."""
 
 
 def load_config(path: Path | str, overrides: Iterable[str] = ()) -> Config:
@@ -20,11 +26,11 @@ def load_config(path: Path | str, overrides: Iterable[str] = ()) -> Config:
     """
     path = Path(path)
     try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+        raw = tomllib.loads(read_bounded(path, LARGEST, regular=False).decode())
     except OSError as error:
         raise ConfigError([f"{path}: {error.strerror or error}"]) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError([f"{path}: not TOML: {error}"]) from None
+    except (ValueError, RecursionError) as error:
+        raise ConfigError([f"{path}: not TOML: {_why(error)}"]) from None
     return parse_config(overridden(raw, overrides), folder=path.parent, source=str(path))
 
 
@@ -54,12 +60,23 @@ def _override(raw: dict[str, Any], text: str) -> None:
         parsed = tomllib.loads(f"x = {value}")["x"]
     except tomllib.TOMLDecodeError:
         parsed = value.strip()
+    except (ValueError, RecursionError) as error:
+        raise ConfigError([f"--set {text[:_SHOWN]}...: {_why(error)}"]) from None
     here: Any = raw
     for i, part in enumerate(parts[:-1]):
         here = _child(here, part, ".".join(parts[: i + 1]), text)
     if isinstance(here, list):
         raise ConfigError([f"--set {text}: {'.'.join(parts[:-1])} is a list"])
     here[parts[-1]] = parsed
+
+
+def _why(error: ValueError | RecursionError) -> str:
+    """What the parser of TOML has against a text; an integer's digits and the depth it only minds by the way."""
+    if isinstance(error, RecursionError):
+        return "tables or lists nested too deeply"
+    if isinstance(error, (tomllib.TOMLDecodeError, UnicodeDecodeError)):
+        return str(error)
+    return "a number with too many digits"
 
 
 def _child(here: Any, part: str, path: str, text: str) -> Any:

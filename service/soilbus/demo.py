@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import subprocess
 import threading
+import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 
 import can
 from rich.console import Console
 
-from soilbus.can.bus import BusError, open_bus
+from soilbus.can.bus import BusError, LiveBus, open_bus
 from soilbus.can.dbc_files import filters_of, output_database
 from soilbus.config import Config
 from soilbus.daemon.result import WindowResult
@@ -49,7 +50,9 @@ def run_demo(duration: float) -> None:
         config = reference_configuration(overrides + _compressed(real))
         ours = output_database(config)
         bus = config.bus.model_dump()
-        with open_bus(bus, []) as tractor, open_bus(bus, filters_of(ours)) as ear:
+        ear = LiveBus(lambda: open_bus(bus, filters_of(ours)), time.monotonic, time.sleep)
+        with open_bus(bus, []) as tractor, closing(ear):
+            ear.open()
             service = start_service(config, wait=False, on_window=results.append, rehearse=False)
             sender = threading.Thread(target=send_in_time, args=(messages, tractor.send, SPEED_UP), daemon=True)
             worker = threading.Thread(target=service.run, daemon=True)

@@ -23,6 +23,7 @@ from soilbus.can.bus import (
     open_bus,
 )
 from soilbus.can.publish import Frame
+from soilbus.daemon.bus_health import health_text
 
 FRAME = Frame(0x18FF609A, True, bytes(8))
 
@@ -226,3 +227,49 @@ def test_faults_that_last_are_said_once_in_a_while(caplog):
     texts = [r.getMessage() for r in caplog.records]
     assert sum("another node" in t for t in texts) == sum("queue full" in t for t in texts) == 2
     assert len(texts) == 4
+
+
+@pytest.mark.parametrize("error", [ValueError("invalid literal for int()"), IndexError("string index out of range")])
+def test_a_frame_that_the_driver_cannot_read_is_counted_and_the_next_one_comes(error):
+    clock = FakeClock()
+    wire = ScriptedBus(clock, [can.Message(timestamp=1.7e9)])
+    wire.fail_receive.append(error)
+    bus = live(lambda: wire, clock)
+    bus.open()
+    assert bus.receive(1.0) is None
+    assert not bus.found_nothing  # other frames may wait behind it
+    assert bus.receive(1.0) is not None
+    assert (bus.counts.garbled, bus.counts.received, bus.counts.lost) == (1, 1, 0)
+    assert "1 frames that the driver could not read" in health_text(bus.state, bus.counts)
+
+
+def test_a_driver_that_only_garbles_is_opened_anew():
+    clock = FakeClock()
+    opened = []
+
+    class Garbling(ScriptedBus):
+        def recv(self, timeout=None):
+            clock.now += 0.01
+            raise UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte")
+
+    bus = live(lambda: opened.append(clock.now) or Garbling(clock), clock)
+    bus.open()
+    begin = clock.now
+    while clock.now < begin + 20.0:
+        bus.receive(0.02)
+    assert 8 <= len(opened) <= 20
+    assert bus.counts.garbled > 500
+
+
+def test_only_silence_counts_as_nothing_to_take():
+    clock = FakeClock()
+    theirs = can.Message(timestamp=1.7e9, arbitration_id=OWN[0], data=bytes(8))
+    wire = ScriptedBus(clock, [theirs, can.Message(timestamp=1.7e9, is_error_frame=True)])
+    bus = LiveBus(lambda: wire, clock, clock.sleep, [OWN])
+    bus.open()
+    found_nothing = []
+    for _ in range(3):
+        assert bus.receive(0.1) is None
+        found_nothing.append(bus.found_nothing)
+    assert found_nothing == [False, False, True]
+    assert (bus.counts.foreign, bus.counts.error_frames) == (1, 1)

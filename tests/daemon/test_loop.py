@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 import errno
 import itertools
 import math
+from concurrent.futures import Executor, Future
+from copy import copy
 from dataclasses import replace
 
 import can
@@ -38,7 +39,7 @@ def recording() -> list[can.Message]:
 class Bench:
     """A service on a scripted bus."""
 
-    def __init__(self, messages=(), config=None) -> None:
+    def __init__(self, messages=(), config=None, workers: Executor | None = None) -> None:
         self.config = config or reference_configuration()
         self.clock = FakeClock()
         self.wire = ScriptedBus(self.clock, messages)
@@ -50,8 +51,8 @@ class Bench:
         pipeline = Pipeline(self.config, load_databases(self.config))
         self.results = []
         self.service = Service(
-            self.config, pipeline, self.bus, Publisher(database), Notifier(), InlineExecutor(), self.clock,
-            self.results.append,
+            self.config, pipeline, self.bus, Publisher(database), Notifier(), workers or InlineExecutor(),
+            self.clock, self.results.append,
         )  # fmt: skip
 
     def _open(self):
@@ -405,7 +406,7 @@ class Stamped(ScriptedBus):
 
     def __init__(self, clock: FakeClock, messages, by: float, since: float) -> None:
         start = messages[0].timestamp
-        super().__init__(clock, [copy.copy(m) for m in messages], start)
+        super().__init__(clock, [copy(m) for m in messages], start)
         self.at = [m.timestamp - self.offset for m in messages]
         for message in self.messages:
             message.timestamp += by if message.timestamp >= start + since else 0.0
@@ -435,3 +436,89 @@ def test_a_clock_that_is_set_begins_windows_anew_at_once(recording, by):
     assert after == pytest.approx([since + by + window + i for i in range(5)], abs=0.02)
     assert {str(r.status) for r in bench.results} == {"valid"}
     assert [r.index for r in bench.results] == list(range(len(ends)))
+
+
+def test_garbled_frames_change_nothing_but_a_count(recording):
+    clean, garbled = Bench(recording), Bench(recording)
+    for bench in (clean, garbled):
+        while bench.clock.now < 1000.0 + DURATION - 1.0:
+            if bench is garbled and len(garbled.wire.fail_receive) == 0:
+                garbled.wire.fail_receive.append(ValueError("invalid literal for int() with base 16: 'x3'"))
+            bench.run(0.5)
+    assert garbled.bus.counts.garbled > 20
+    assert garbled.bus.counts.lost == 0
+    assert [(r.t, r.samples, r.status) for r in garbled.results] == [(r.t, r.samples, r.status) for r in clean.results]
+    assert len(clean.results) >= 5
+
+
+class Slow(InlineExecutor):
+    """Does what it is given when it is told to."""
+
+    def __init__(self) -> None:
+        self.holds = False
+        self.held: list[tuple] = []
+
+    def submit(self, fn, /, *args, **kwargs):
+        if not self.holds:
+            return super().submit(fn, *args, **kwargs)
+        future = Future()
+        self.held.append((future, fn, args))
+        return future
+
+
+def test_what_was_estimated_before_the_clock_was_set_is_not_sent(recording):
+    """The worker is slow: it has a window while the clock is set back by an hour, 12.5 s after the start."""
+    workers = Slow()
+    bench = Bench(recording, workers=workers)
+    usual, begin = bench.wire.recv, recording[0].timestamp
+
+    def recv(timeout=None):
+        message = usual(timeout)
+        if message is None or message.timestamp - begin < 12.5:
+            return message
+        message = copy(message)
+        message.timestamp -= 3600.0
+        return message
+
+    bench.wire.recv = recv
+    bench.run(11.5)
+    assert len(bench.sent("SoilStrength")) == 2
+    workers.holds = True
+    bench.run(1.2)
+    ((future, fn, args),) = workers.held
+    workers.holds = False
+    future.set_result(fn(*args))
+    bench.run(0.5)
+    assert [str(r.status) for r in bench.results] == ["valid"] * 3
+    assert len(bench.sent("SoilStrength")) == 2
+
+
+def test_nothing_is_vouched_for_while_another_node_sends_under_our_identifiers(recording):
+    begin = recording[0].timestamp
+    forged = can.Message(timestamp=begin + 12.5, arbitration_id=0x18FF649A, data=bytes(8))
+    bench = Bench(sorted([*recording, forged], key=lambda m: m.timestamp))
+    start = bench.clock.now
+    bench.run(DURATION - 0.5)
+    assert {str(r.status) for r in bench.results} == {"valid"}
+    for name in ("SoilStrength", "DraftCapability", "TractionLimits", "SoilClass"):
+        status = [(f["at"] - start, str(f["Status"])) for f in bench.sent(name)]
+        assert {s for t, s in status if t < 12.5} == {"valid"}
+        assert {s for t, s in status if t > 12.5} == {"degraded"}
+        assert len(status) == len(bench.results)
+
+
+def test_a_frame_that_is_not_for_us_says_nothing_of_those_behind_it(recording):
+    """The machine stands still as a window ends; a frame under our identifier is the first that waits."""
+    samples = []
+    for theirs in (False, True):
+        bench = Bench(recording)
+        bench.run(9.895)
+        following = bench.wire.next
+        if theirs:
+            at = recording[following].timestamp
+            bench.wire.messages.insert(following, can.Message(timestamp=at, arbitration_id=0x18FF649A, data=bytes(8)))
+        bench.clock.now += 0.5
+        bench.run(1.0)
+        samples.append([result.samples for result in bench.results])
+    assert samples[0] == samples[1]
+    assert samples[0][0] > 1000

@@ -359,3 +359,12 @@ def test_two_hundred_kills_lose_nothing_that_was_stored(tmp_path: Path):
     assert told["kills"] == 200
     assert told["broken"] == told["lost"] == 0
     assert told["written"] > 200
+
+
+def test_a_pipe_in_the_place_of_the_new_file_halts_nobody(tmp_path: Path):
+    path = tmp_path / "state.json"
+    os.mkfifo(tmp_path / "state.json.new")
+    with pytest.raises(OSError, match="No such device"):
+        write_whole(path, CONTENT)
+    write_whole(path, CONTENT)
+    assert path.read_bytes() == CONTENT

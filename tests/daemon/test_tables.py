@@ -12,7 +12,7 @@ import pytest
 
 from availability import unavailable
 from single_wheel import NOISE, RIG, WIDTH, noisy, sweep, write_csv
-from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.assembly import model_of, prior_of, rig_of, with_effects
 from soilbus.cli import main
 from soilbus.config import Config, ConfigError
 from soilbus.config_file import parse_config
@@ -381,3 +381,20 @@ def test_nothing_is_known_less_than_beforehand_however_badly_the_model_fits(quie
             least = beforehand[name].std / beforehand[name].value
             assert 0.0 <= known["std"] / known["value"] <= least * (1.0 + 1e-9), (name, known)
     assert degraded
+
+
+def test_a_rigid_wheel_has_no_effect_of_a_tyre(tmp_path, measured):
+    path = write_csv(tmp_path / "t.csv", measured)
+    raw = tomllib.loads(RIG)
+    rigid = parse_config(raw | {"wheel": [raw["wheel"][0] | {"tyre": "rigid"}]})
+    names = [{e.name for e in candidates(c, recordings_of_tables(c, [path]).records)} for c in (rig(), rigid)]
+    assert names[0] - names[1] == {"tyre_deflection", "rolling_radius"}
+    assert names[1] < names[0]
+
+
+def test_a_rigid_wheel_is_not_given_an_effect_of_a_tyre():
+    raw = tomllib.loads(RIG)
+    rigid = parse_config(raw | {"wheel": [raw["wheel"][0] | {"tyre": "rigid"}]})
+    with pytest.raises(ConfigError, match=r"tyre_deflection is of a tyre, and every wheel is said to be rigid"):
+        with_effects(rigid, ["tyre_deflection=1e-6"])
+    assert "tyre" in fault({"wheel": [raw["wheel"][0] | {"tyre": "wooden"}]})

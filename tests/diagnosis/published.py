@@ -33,9 +33,6 @@ POINTS = Path(__file__).resolve().parents[3] / "shared/field/single-wheel-publis
 LUG = 0.01
 """Height of the lugs [m] of the two rigs that had both wheels."""
 
-
-ABSENT = frozenset({"tyre_deflection"})
-"""What these wheels, of metal, cannot have."""
 ERRORS = (1.0, 2.0)
 """Assumed errors in units of those in rigs/*.toml: a finding should outlive twice the error."""
 
@@ -82,8 +79,7 @@ def diagnosed(rig: str, wheel: str, errors: float, points: Path, told: Completio
     """The diagnosis of one wheel's points; `told` is what another wheel told of the same soil."""
     config = configuration(rig, wheel, errors)
     records = records_of(config, points, told)
-    catalogue = [effect for effect in candidates(config, records) if effect.name not in ABSENT]
-    return diagnose(records, prior_of(config), catalogue)
+    return diagnose(records, prior_of(config), candidates(config, records))
 
 
 def records_of(config: Config, points: Path, told: Completion | None = None) -> tuple[Record, ...]:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 import json
 
+import numpy as np
 import pytest
 
 from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.daemon.diagnose import Findings
 from soilbus.daemon.recordings import Recordings
 from soilbus.diagnosis.completion import complete
+from soilbus.diagnosis.detectable import Detectable
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.gap import Gap
 from soilbus.diagnosis.learned import WARNING, Correction, Term
@@ -102,3 +104,61 @@ def test_what_is_not_finite_is_null(findings):
     place = Disagreement("draft", "", "everywhere", float("inf"), 0.0)
     told = findings_json(with_verdict(findings, Verdict.AMBIGUOUS, base=base, where=(place,)))
     assert json.loads(told, parse_constant=pytest.fail)["where"][0]["size"] is None
+
+
+def test_page_text_and_json_say_the_same_of_what_could_be_seen(findings):
+    """And a page does not say 12 where 30 was asked."""
+    soil_error = np.log(0.8) * np.array([[1.0, 1.0, 0.0, 0.0, 0.0, 0.0]])
+    seen = (
+        Detectable(CATALOGUE["torque_lag"], 0.04, 0.04, 0.0 * soil_error),
+        Detectable(CATALOGUE["slip_sinkage"], None, 1.2, soil_error),
+    )
+    base = findings.diagnosis.base
+    none = with_verdict(findings, Verdict.NONE, additions=(), where=(), completed=base, detectable=seen)
+    told, text, page = json.loads(findings_json(none)), findings_text(none), diagnosis_report(none)
+    assert told["could_show"] == [{"name": "torque_lag", "parameter": "delay", "unit": "s", "size": 0.04}]
+    assert told["could_not_show"] == ["slip_sinkage"]
+    (feared,) = told["unseen"]
+    assert (feared["name"], feared["size"]) == ("slip_sinkage", 1.2)
+    assert feared["bearing_pressure_error"] == pytest.approx(-0.2)
+    assert feared["bearing_pressure_std"] < 0.2
+    for line in (
+        told["sentence"],
+        "slip_sinkage 1.2 by -20.0 %",
+        "could not have shown, at any usual size: slip_sinkage",
+    ):
+        assert line in text
+        assert line in page
+    asked = json.loads(findings_json(findings))
+    assert asked["could_show"] is asked["could_not_show"] is asked["unseen"] is None
+    assert "from a fall of 12 on" in diagnosis_report(findings)
+    beside = dataclasses.replace(OFFSET, beside=frozenset({"lugs"}))
+    assert "from a fall of 30 on" in diagnosis_report(with_verdict(findings, Verdict.AMBIGUOUS, additions=(beside,)))
+
+
+def test_json_says_whether_a_gap_is_left_and_why_names_are_near_each_other(findings):
+    told = json.loads(findings_json(findings))
+    assert told["gap"]["open"] is False
+    assert "divided by" in told["effects"][0]["why_probabilities"]
+    assert told["effects"][0]["why_probabilities"] in findings_text(findings)
+    left = json.loads(findings_json(with_verdict(findings, Verdict.AMBIGUOUS, gap_after=Gap(1.5, 900))))
+    assert left["gap"]["open"] is True
+    assert "something is left besides" in left["sentence"]
+
+
+def test_a_small_offset_of_the_hitch_may_as_well_be_one_of_the_pitch_sensor(findings):
+    """As m g sin(slope) is the same push; a great one is beyond what a pitch sensor is ever off by."""
+    told = json.loads(findings_json(findings))["effects"][0]
+    offset = told["parameters"]["offset"]["value"]
+    slope = np.degrees(offset / (CONFIG.vehicle.mass * 9.80665))
+    assert told["same_as"] == (
+        f"a pitch sensor that reads {abs(slope):.2f} deg too {'high' if slope > 0.0 else 'low'} would do the same"
+    )
+    assert told["same_as"] in findings_text(findings)
+    completed = findings.diagnosis.completed
+    place = completed.checks[-1].problem.n_sensors
+    gains = completed.fits[-1].mode.gains.copy()
+    gains[place] = 500.0 / completed.free[0].std
+    fit = dataclasses.replace(completed.fits[-1], mode=dataclasses.replace(completed.fits[-1].mode, gains=gains))
+    great = with_verdict(findings, Verdict.AMBIGUOUS, completed=dataclasses.replace(completed, fits=(fit,)))
+    assert json.loads(findings_json(great))["effects"][0]["same_as"] is None

@@ -84,7 +84,7 @@ def test_few_instants_foretell_a_model_of_all():
 def test_the_model_at_hand_is_not_fitted_again():
     beside = SimpleNamespace(names=frozenset({"hardpan"}), effects=(PAN,), evidence=100.0, cost=90.0)
     at_hand = SimpleNamespace(names=("lugs", "hardpan"), evidence=50.0, cost=40.0)
-    counted = Promising([(LUGS, ())], {}, {})
+    counted = Promising([(LUGS, ())], {}, {}, {})
     no_fits = None
     fitted, _ = _fitted(no_fits, beside, counted, explained=0.0, asked=30.0, at_hand=at_hand)
     assert fitted == {"lugs": (LUGS, at_hand)}

@@ -36,3 +36,17 @@ def test_each_recording_has_a_wander_of_its_own():
     assert -10.0 < second[drift] * std < -4.0
     offset = found.parameters()["draft_offset"]["offset"]
     assert abs(offset.value - 300.0) < 3.0 * offset.std
+
+
+def test_what_each_recording_has_of_its_own_is_as_unknown_in_the_next_one_as_in_the_first():
+    """What is the vehicle's is better known then, and stays so."""
+    records = [wandering(8.0, 3), wandering(3.0, 4)]
+    found = complete(records, prior_of(reference_configuration()), [CATALOGUE["draft_offset"]])
+    n = found.checks[0].problem.n_sensors
+    place = {f.parameter.name: 6 + n + i for i, f in enumerate(found.free)}
+    before = found.before[1]
+    row = before.covariance[place["drift"]]
+    assert row[place["drift"]] == abs(row).sum() == 1.0
+    assert before.gains[place["drift"] - 6] == 0.0
+    assert before.covariance[place["offset"], place["offset"]] < 0.5
+    assert before.gains[place["offset"] - 6] != 0.0

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import re
 
 import can
+import numpy as np
 import pytest
 from rich.console import Console
 
-from fakes import FakeClock
+from fakes import FakeClock, ScriptedBus
+from soilbus.can.bus import BusError, LiveBus
+from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import output_database
 from soilbus.can.publish import Publisher
-from soilbus.report.dashboard import WIDTH, panel
+from soilbus.report.dashboard import WIDTH, panel, show
 from soilbus.report.readings import Readings
 from soilbus.simulator.reference import reference_configuration
 
@@ -183,3 +187,67 @@ def test_what_is_not_vouched_for_is_grey(setup):
     assert not dashboard.is_valid("TractionAdvice")
     dashboard.receive(message(publisher.frame("WheelSlip", WHOLE["WheelSlip"])))
     assert dashboard.is_valid("WheelSlip")  # has no status of its own
+
+
+def with_code(frame, byte: int, code: int) -> can.Message:
+    """The frame with other low four bits in a byte, and the checksum that belongs to it."""
+    data = bytearray(frame.data)
+    data[byte] = data[byte] & 0xF0 | code
+    data[7] = frame_checksum(frame.arbitration_id, bytes(data), 7)
+    return can.Message(arbitration_id=frame.arbitration_id, is_extended_id=True, data=data)
+
+
+@pytest.mark.parametrize("code", range(4, 14))
+def test_a_state_that_has_no_name_yet_is_unknown(setup, code):
+    publisher, dashboard, _ = setup
+    dashboard.receive(with_code(publisher.frame("Traversability", {"State": "go", "Probability": 0.9}), 0, code))
+    assert dashboard.bad_frames == 0
+    assert dashboard.value("Traversability", "State") is None
+    assert dashboard.number("Traversability", "Probability") == pytest.approx(0.9, abs=3e-4)
+    text = shown(dashboard)
+    assert " UNKNOWN " in text
+    assert "p = 0.90" in text
+
+
+def test_no_payload_whatever_breaks_the_dashboard():
+    database = output_database(reference_configuration())
+    dashboard = Readings(database, FakeClock())
+    rng = np.random.default_rng(11)
+    for _ in range(30):
+        for layout in database.messages:
+            data = bytearray(rng.bytes(layout.length))
+            data[7] = frame_checksum(layout.frame_id, bytes(data), 7)
+            dashboard.receive(can.Message(arbitration_id=layout.frame_id, is_extended_id=True, data=data))
+        assert "soilbus" in shown(dashboard)
+    assert dashboard.value("SoilbusIdentity", "Uptime") is not None
+
+
+def test_a_bus_that_goes_is_said_and_waited_for(setup):
+    publisher, dashboard, clock = setup
+    wire = ScriptedBus(clock, [message(publisher.frame("Traversability", {"State": "go"}))], start=-5.0)
+    wire.fail_receive.append(can.CanOperationError("Network is down", errno.ENETDOWN))
+    tries, screens = [], []
+
+    def opened():
+        tries.append(clock.now)
+        if 1 < len(tries) < 4:
+            raise BusError("bus socketcan:can0: Network is down", may_come=True)
+        return wire
+
+    bus = LiveBus(opened, clock, clock.sleep)
+    bus.open()
+
+    def is_back() -> bool:
+        screens.append(shown_with(dashboard, bus.fault))
+        return dashboard.value("Traversability", "State") == "go"
+
+    show(dashboard, bus, Console(file=io.StringIO()), done=is_back)
+    assert len(tries) == 4
+    assert any("bus: away (bus socketcan:can0: Network is down)" in screen for screen in screens)
+    assert "away" not in screens[-1]
+
+
+def shown_with(dashboard, fault: str) -> str:
+    console = Console(width=WIDTH, record=True, file=io.StringIO())
+    console.print(panel(dashboard, fault))
+    return console.export_text()

@@ -24,10 +24,7 @@ def prepare(folder: Path, recording: Path, seconds: int, *, hooks: str = "", dro
         (folder / "played.log").write_text("".join(itertools.islice(lines, PER_SECOND * seconds)))
     shutil.copytree(REPO / "tests/field", folder / "config", ignore=shutil.ignore_patterns("*.py", "__pycache__"))
     path = os.pathsep.join(filter(None, (hooks, _python_path())))
-    (folder / "soilbus").write_text(
-        f"#!/bin/sh\nexec env PYTHONPATH={path} {sys.executable} -c "
-        f"'import sys; from soilbus.cli import main; sys.exit(main())' \"$@\"\n"
-    )
+    (folder / "soilbus").write_text(f'#!/bin/sh\nexec env PYTHONPATH={path} {sys.executable} -m soilbus "$@"\n')
     (folder / "soilbus").chmod(0o755)
     (folder / "dropin.conf").write_text("\n".join([_dropin(), *dropin, ""]))
 

@@ -52,7 +52,7 @@ OF_SERVICE = COMMON | {
     "User": "soilbus",
     "CapabilityBoundingSet": "",  # a raw CAN socket needs none
     "AmbientCapabilities": "",
-    "RestrictAddressFamilies": "AF_CAN AF_NETLINK AF_UNIX",
+    "RestrictAddressFamilies": "AF_CAN AF_UNIX",
     "LimitCORE": "0",  # what the watchdog aborts must not fill the flash
     "MemoryMax": "512M",  # frames from anyone cannot take the ECU's memory
     "TasksMax": "32",

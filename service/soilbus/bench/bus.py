@@ -151,7 +151,7 @@ def _daemon(channel: str, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
         notify.bind(str(folder / "notify"))
         run = ["run", "--config", str(TRACTOR), "--set", "bus.interface=socketcan", "--set", f"bus.channel={channel}"]
         process = subprocess.Popen(
-            [sys.executable, "-m", "soilbus.cli", *run], env={**os.environ, "NOTIFY_SOCKET": str(folder / "notify")}
+            [sys.executable, "-m", "soilbus", *run], env={**os.environ, "NOTIFY_SOCKET": str(folder / "notify")}
         )
         reader = threading.Thread(target=_swallow, args=(notify, process), daemon=True)
         try:

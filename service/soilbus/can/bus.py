@@ -31,6 +31,8 @@ RECEIVE_BUFFER = 4 * 2**20
 SO_RCVBUFFORCE = 33  # which Python does not name
 RETRY = 0.005
 """Longest wait for a frame [s] while frames of ours wait for room."""
+GARBLED_FOR = 1.0
+"""A driver that for so long [s] hands out nothing but what it cannot read is opened anew: it may never come right."""
 SAY_AGAIN = 60.0
 """A fault that lasts is said in the journal this often [s]."""
 
@@ -52,20 +54,22 @@ def open_bus(settings: Mapping[str, Any], filters: Sequence[dict[str, Any]] | No
 
     Raises BusError with one line.
     """
-    name = f"{settings.get('interface')}:{settings.get('channel')}"
     try:
         bus = can.Bus(**dict(settings), can_filters=list(filters) if filters is not None else None)
         _prepare(bus)
         return bus
-    except can.CanInterfaceNotImplementedError as error:
-        raise BusError(f"bus {name}: {_one_line(error)}", may_come=False) from None
-    except (OSError, can.CanError) as error:
-        number = getattr(error, "errno", None) or getattr(error, "error_code", None)
-        if number in _KERNEL_WITHOUT_CAN:
-            raise BusError(f"bus {name}: this kernel has no SocketCAN", may_come=False) from None
-        raise BusError(f"bus {name}: {_one_line(error)}", may_come=True) from None
-    except (ValueError, TypeError, AttributeError) as error:
-        raise BusError(f"bus {name}: {_one_line(error)}", may_come=False) from None
+    except Exception as error:  # drivers raise all kinds
+        raise bus_fault(settings, error) from None
+
+
+def bus_fault(settings: Mapping[str, Any], error: Exception) -> BusError:
+    """One line on the bus that the section [bus] describes, of what its driver raised."""
+    name = f"{settings.get('interface')}:{settings.get('channel')}"
+    number = getattr(error, "errno", None) or getattr(error, "error_code", None)
+    if number in _KERNEL_WITHOUT_CAN:
+        return BusError(f"bus {name}: this kernel has no SocketCAN", may_come=False)
+    is_there = isinstance(error, (OSError, can.CanError)) and not isinstance(error, can.CanInterfaceNotImplementedError)
+    return BusError(f"bus {name}: {_one_line(error)}", may_come=is_there)
 
 
 def heard_for(settings: Mapping[str, Any], seconds: float) -> Iterator[tuple[float, int, bool, bytes, bool, bool]]:
@@ -125,6 +129,8 @@ class BusCounts:
     dropped: int = 0
     overruns: int = 0
     error_frames: int = 0
+    garbled: int = 0
+    """Frames that the driver could not read: of a serial adapter, say, that lost a character."""
     foreign: int = 0
     """Frames of others under our identifiers."""
     lost: int = 0
@@ -151,6 +157,8 @@ class LiveBus:
         self.state = BusState.UNKNOWN
         self.last_foreign = -math.inf
         """When the last foreign frame came, by `clock` [s]."""
+        self.found_nothing = True
+        """Whether the last `receive` returned None because no frame of any kind waited."""
         self._opener, self._clock, self._sleep, self._own = opener, clock, sleep, frozenset(own)
         self._counts = BusCounts()
         self._wire: Wire | None = None
@@ -159,6 +167,7 @@ class LiveBus:
         self._refused_while_away = 0
         self._next_try = -1.0
         self._back_off = FIRST_BACK_OFF
+        self._garbled_since: float | None = None
         self._said: dict[str, float] = {}
 
     @property
@@ -218,7 +227,11 @@ class LiveBus:
         self._back_off = min(2.0 * self._back_off, LONGEST_BACK_OFF)
 
     def receive(self, timeout: float) -> Received | can.Message | None:
-        """The next frame for us; None after `timeout` [s], when the bus is away, or for a frame that is not ours."""
+        """The next frame for us; None after `timeout` [s], when the bus is away, or for a frame that is not for us.
+
+        Whatever a driver raises that tells of no failure of the bus is one frame that it could not read.
+        """
+        self.found_nothing = True
         if self._wire is None and not self._reopen():
             self._sleep(min(timeout, max(self._next_try - self._clock(), 0.0)))
             return None
@@ -232,8 +245,13 @@ class LiveBus:
         except (can.CanError, OSError) as error:
             self._lost(error)
             return None
+        except Exception as error:
+            self._note_garbled(error)
+            return None
+        self._garbled_since = None
         if message is None:
             return None
+        self.found_nothing = False
         if message.is_error_frame:
             self._note_error(message)
             return None
@@ -262,6 +280,18 @@ class LiveBus:
         if self.state is not before:
             log.warning("controller: %s", self.state)
 
+    def _note_garbled(self, error: Exception) -> None:
+        self._counts.garbled += 1
+        self.found_nothing = False
+        now = self._clock()
+        if self._garbled_since is None:
+            self._garbled_since = now
+        if now - self._garbled_since > GARBLED_FOR:
+            self._garbled_since = None
+            self._lost(error)
+        else:
+            self._say(f"the driver could not read a frame: {type(error).__name__}")
+
     def _note_foreign(self, message: Received | can.Message) -> None:
         self._counts.foreign += 1
         self.last_foreign = self._clock()
@@ -285,7 +315,7 @@ class LiveBus:
         while self._wire is not None and (frame := self._outbox.first(now)) is not None:
             try:
                 self._wire.send(frame)
-            except (can.CanError, OSError) as error:
+            except Exception as error:  # drivers raise all kinds
                 if error_number(error) not in _NO_ROOM:
                     self._lost(error)
                 else:
@@ -310,5 +340,5 @@ class LiveBus:
             self._overruns_before += wire.overruns
             try:
                 wire.shutdown()
-            except (can.CanError, OSError) as error:
+            except Exception as error:  # drivers raise all kinds
                 log.debug("closing: %s", error)

@@ -14,6 +14,7 @@ import re
 from collections.abc import Iterable, Iterator
 from io import StringIO
 from itertools import chain, islice, repeat
+from operator import index
 
 import can
 
@@ -32,10 +33,13 @@ _CUTS = str.maketrans("()#", "   ")
 
 
 def frame_of(message: can.Message) -> Frame:
-    """The frame that a message of python-can stands for."""
+    """The frame that a message of python-can stands for.
+
+    Raises TypeError or ValueError where its time or identifier is no number, as from a damaged SQLite log.
+    """
     return (
-        message.timestamp,
-        message.arbitration_id,
+        float(message.timestamp),
+        index(message.arbitration_id),
         message.is_extended_id,
         message.data,
         message.is_remote_frame,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
@@ -9,12 +10,20 @@ from typing import Any
 
 from cantools.database.can import Database, Message
 
+from soilbus.bounded_file import read_bounded
 from soilbus.can.checksum import CHECKSUM, COUNTER
+from soilbus.can.dbc_text import message_names, of_messages
 from soilbus.can.inbox import checksum_byte_of
+from soilbus.can.j1939 import STANDARD_PGNS, pgn_of
 from soilbus.config import Config, ConfigError
 from soilbus.spelling import did_you_mean
 
+LARGEST = 32 * 2**20
+"""Bytes of a DBC file: five times those of one with 10 000 messages."""
 _PACKAGE = Path(__file__).resolve().parents[1]
+
+
+_SIGNAL = re.compile(r"(\w+)\.\w+")
 
 
 def shipped_dbc(name: str) -> Path:
@@ -40,8 +49,10 @@ def located(folder: Path, name: str) -> Path:
         return beside
 
 
-def load_databases(config: Config) -> Database:
+def load_databases(config: Config, mapped_only: bool = False) -> Database:
     """All DBC files of the configuration as one database.
+
+    With `mapped_only` messages are left out that can have no say in what is mapped, unless a mapped one is missing.
 
     Raises ConfigError with a line for each file that is missing or not a DBC, and for each
     message that two files define differently.
@@ -50,9 +61,10 @@ def load_databases(config: Config) -> Database:
     if not config.dbc.input:
         faults.append("dbc.input: no DBC file given")
     messages: dict[str, tuple[str, Message]] = {}
+    names = _mapped(config) if mapped_only else None
     for name in config.dbc.input:
         try:
-            for message in _read(located(config.folder, name)).messages:
+            for message in _read(located(config.folder, name), names).messages:
                 first, known = messages.setdefault(message.name, (name, message))
                 if not _same(known, message):
                     faults.append(f"dbc.input: {first} and {name} define message {message.name} differently")
@@ -66,7 +78,21 @@ def load_databases(config: Config) -> Database:
             faults.append(f"dbc.input: {name}: not a DBC file: {_one_line(error)}")
     if faults:
         raise ConfigError(faults)
+    if names is not None and not names <= messages.keys():
+        return load_databases(config)  # whoever says what is missing may name what is there
     return _database(message for _, message in messages.values())
+
+
+def _mapped(config: Config) -> set[str]:
+    """Names of the messages that the configuration names: in Message.Signal anywhere, or as to be checked."""
+    found, left = set(config.dbc.checked), [config.model_dump(mode="json", exclude={"dbc", "output", "bus", "folder"})]
+    while left:
+        item = left.pop()
+        if isinstance(item, (dict, list)):
+            left.extend(item.values() if isinstance(item, dict) else item)
+        elif isinstance(item, str) and (signal := _SIGNAL.fullmatch(item)):
+            found.add(signal[1])
+    return found
 
 
 def checked_messages(config: Config) -> frozenset[str]:
@@ -80,7 +106,7 @@ def checked_messages(config: Config) -> frozenset[str]:
     found = {m.name for path in ours for m in _read(path).messages if checksum_byte_of(m) is not None}
     if not config.dbc.checked:
         return frozenset(found)
-    known = {m.name: m for m in load_databases(config).messages}
+    known = {m.name: m for m in load_databases(config, mapped_only=True).messages}
     faults = [
         f"dbc.checked: no message {name} in the DBC{did_you_mean(name, known)}"
         for name in config.dbc.checked
@@ -133,13 +159,21 @@ def _is_shipped(path: Path) -> bool:
         return False
 
 
-def _read(path: Path) -> Database:
-    raw = path.read_bytes()
+def _read(path: Path, names: set[str] | None = None) -> Database:
+    """The DBC of a file; of its messages only these and those that may be mistaken for one of them."""
+    raw = read_bounded(path, LARGEST)
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = raw.decode("cp1252", errors="replace")
-    return _parsed(text)
+    has_some = False
+    if names is not None:
+        has_some = bool(message_names(text))
+        text = of_messages(text, names, lambda identifier: pgn_of(identifier) in STANDARD_PGNS)
+    database = _parsed(text)
+    if not database.messages and not has_some:
+        raise ValueError("no message in it")
+    return database
 
 
 @lru_cache(maxsize=4)
@@ -148,8 +182,6 @@ def _parsed(text: str) -> Database:
     # not strict: an overlap in a message that nobody maps is none of our business
     database = Database(strict=False)
     database.add_dbc_string(text)
-    if not database.messages:
-        raise ValueError("no message in it")
     return database
 
 

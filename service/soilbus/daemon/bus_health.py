@@ -14,6 +14,7 @@ _WORDS = {
     "overruns": "received frames lost for want of room",
     "dropped": "frames of ours not sent",
     "error_frames": "error frames",
+    "garbled": "frames that the driver could not read",
     "foreign": "frames of another sender under our identifiers",
     "reopened": "times reopened",
 }

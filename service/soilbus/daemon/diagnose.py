@@ -9,14 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from soilbus.assembly import prior_of
+from soilbus.assembly import possible_effects, prior_of
 from soilbus.can.dbc_files import load_databases
 from soilbus.config import Config
 from soilbus.daemon.recordings import Recordings, recordings_of
 from soilbus.daemon.tables import candidates, recordings_of_tables
 from soilbus.diagnosis.diagnose import Diagnosis, NotFitted, diagnose
 from soilbus.estimation.posterior import Posterior
-from soilbus.terra.effects.catalogue import CATALOGUE
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +44,7 @@ def diagnose_logs(config: Config, logs: Sequence[Path], say: Callable[[str], Non
         recordings = recordings_of(
             config, load_databases(config), logs, lambda frames, _: tell(f"reading, {frames} frames") if say else None
         )
-        catalogue = list(CATALOGUE.values())
+        catalogue = possible_effects(config)
     else:
         recordings = recordings_of_tables(config, logs)
         catalogue = candidates(config, recordings.records)

@@ -8,11 +8,12 @@ import os
 import sys
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from dataclasses import replace
+from io import TextIOBase
 from itertools import chain, islice
-from multiprocessing import get_all_start_methods, get_context
+from multiprocessing import get_all_start_methods
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,11 +21,13 @@ import can
 
 from soilbus.can.admission import LONGEST_GAP, Admission
 from soilbus.can.candump import Frame, candump_batches, frame_of, whole
+from soilbus.can.log_lines import LogLines
 from soilbus.config import Config
 from soilbus.daemon.estimator import Undecided, WindowEstimator
 from soilbus.daemon.intake import Intake, WindowTask
 from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.result import WindowResult
+from soilbus.workers import workers
 
 _T = TypeVar("_T")
 
@@ -65,6 +68,8 @@ def _read(path: Path, batches: Callable[[Any], Iterator[list[_T]]]) -> Iterator[
     n = 0
     try:
         with _reader(path) as reader:
+            if isinstance(getattr(reader, "file", None), TextIOBase):
+                reader.file = LogLines(reader.file)
             for batch in batches(reader):
                 n += len(batch)
                 yield batch
@@ -232,12 +237,12 @@ def estimator_beside(config: Config) -> Iterator[Executor | None]:
     if (os.cpu_count() or 1) < 2 or "fork" not in get_all_start_methods():
         yield None
         return
-    with ProcessPoolExecutor(1, get_context("fork"), initializer=_begin, initargs=(config,)) as workers:
-        workers.submit(_begun).result()  # forked now, before there are threads
+    with workers(1, "fork", _begin, config) as beside:
+        beside.submit(_begun).result()  # forked now, before there are threads
         usual = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_INTERVAL)  # the pool's thread must get its turn to hand on tasks
         try:
-            yield workers
+            yield beside
         finally:
             sys.setswitchinterval(usual)
 

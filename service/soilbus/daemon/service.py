@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
@@ -164,7 +165,8 @@ class Service:
             wait = min(self._next_tick - now, self._time.wait(self.intake.next_end, now, longest))
             message = self.bus.receive(max(0.0, wait))
             if message is None:
-                self._time.took_nothing(self.clock())
+                if self.bus.found_nothing:
+                    self._time.took_nothing(self.clock())
                 return
             now = self.clock()
             if self._time.set_ahead(message.timestamp, now):
@@ -192,12 +194,19 @@ class Service:
         for result, pending in self._backlog.results(now):
             if result.failure is not None:
                 self.failures[result.failure] += 1
-            if pending.epoch == self.intake.epoch:
+            if pending.epoch == self.intake.epoch:  # else it is of a time that is none any more
                 self._take(result, pending.at)
-            for message, values in hop_frames(as_of(result, self._loss, result.t, self.config)):
-                self.bus.send(self.publisher.frame(message, values))
+                present = as_of(self._vouched(result, pending.at, now), self._loss, result.t, self.config)
+                for message, values in hop_frames(present):
+                    self.bus.send(self.publisher.frame(message, values))
             if self.on_window is not None:
                 self.on_window(result)
+
+    def _vouched(self, result: WindowResult, ended: float, now: float) -> WindowResult:
+        """The result as it may go out: valid only where nothing has interrupted the inputs since its window's end."""
+        if result.status is Status.VALID and (ended <= self._interrupted or _interrupts(self._present_state(now))):
+            return replace(result, status=Status.DEGRADED)
+        return result
 
     def _take(self, result: WindowResult, ended: float) -> None:
         if result.gaps and not (self.result is not None and self.result.gaps):

@@ -43,7 +43,7 @@ def start_service(
     Raises ConfigError for a configuration that cannot work, BusError for a bus that
     cannot be opened.
     """
-    pipeline, ours = Pipeline(config, load_databases(config)), output_database(config)
+    pipeline, ours = Pipeline(config, load_databases(config, mapped_only=True)), output_database(config)
     check_cycle_times(config, ours)
     publisher = Publisher(ours)
     settings = config.bus.model_dump()

@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.assembly import completion_of, model_of, rig_of
+from soilbus.assembly import completion_of, model_of, possible_effects, rig_of
+from soilbus.can.log_lines import LogLines
 from soilbus.config import Column, Config, Table
 from soilbus.daemon.estimator import WindowEstimator
 from soilbus.daemon.intake import WindowTask, column_means
@@ -30,7 +31,6 @@ from soilbus.daemon.result import WindowResult
 from soilbus.diagnosis.records import Record, TooLittle, record_of_rows
 from soilbus.estimation.readings import MAX_SLIP, MIN_SLIP
 from soilbus.estimation.window import Rig, Window, window_of_samples
-from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.effects.size import for_wheel
 from soilbus.terra.vehicle import slip_ratio
@@ -141,7 +141,7 @@ def recordings_of_tables(config: Config, paths: Sequence[Path]) -> Recordings:
 
 
 def candidates(config: Config, records: Sequence[Record]) -> list[Effect]:
-    """The effects that a table can tell, with priors for a wheel of this size and load.
+    """The effects that a table can tell, and the wheel can have, with priors for one of this size and load.
 
     Not those of the true speed, of other wheels, nor, without a column of times, those
     that run along with time: the order of rows is that of slip or load as often as not.
@@ -151,7 +151,7 @@ def candidates(config: Config, records: Sequence[Record]) -> list[Effect]:
         unknown |= OF_TIME
     load = float(np.mean(np.concatenate([record.learned.load[:, 0] for record in records])))
     radius = config.wheel[0].radius
-    return [for_wheel(effect, load, radius) for effect in CATALOGUE.values() if effect.name not in unknown]
+    return [for_wheel(effect, load, radius) for effect in possible_effects(config) if effect.name not in unknown]
 
 
 def _run(name: str, values: Mapping[str, Array], rig: Rig, config: Config) -> Run:
@@ -216,8 +216,8 @@ def _columns(path: Path, needed: Sequence[str]) -> Columns:
 def _csv(path: Path, needed: Sequence[str]) -> Columns:
     try:
         with path.open(newline="", encoding="utf-8-sig") as lines:
-            rows = [row for row in csv.reader(lines, strict=True) if row]
-    except (UnicodeDecodeError, csv.Error) as error:
+            rows = [row for row in csv.reader(LogLines(lines), strict=True) if row]
+    except (ValueError, csv.Error) as error:
         raise TableError(f"{path}: not CSV text ({_one_line(error)})") from None
     header = [name.strip() for name in rows[0]] if rows else []
     _check_columns(path, header, needed)

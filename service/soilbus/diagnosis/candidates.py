@@ -9,6 +9,7 @@ from typing import NamedTuple
 from soilbus.diagnosis.completion import Completion
 from soilbus.diagnosis.fits import Fits
 from soilbus.diagnosis.score import Score
+from soilbus.diagnosis.sizes import OwnParameters
 from soilbus.diagnosis.verdict import hopeless, least_that_pays
 from soilbus.estimation.gauss_newton import Effort, Start
 from soilbus.terra.effects.effect import Effect
@@ -86,12 +87,14 @@ class Standing(NamedTuple):
 class Promising(NamedTuple):
     """Candidates worth a fit of all data, with where it starts.
 
-    Falls of -2 log evidence that scores foretell of others, and how far behind the best one a few instants put each.
+    Falls of -2 log evidence that scores foretell of others, and how far behind the best one a few instants put each,
+    with what these foretell of the parameters that further recordings have for themselves.
     """
 
     fits: Sequence[tuple[Effect, Sequence[Start]]]
     foreseen: dict[str, float]
     behind: dict[str, float]
+    further: dict[str, tuple[OwnParameters, ...]]
 
 
 def promising(
@@ -109,7 +112,7 @@ def promising(
         most = max(times * -score.evidence for times, found in of_all for score in found)
         if most >= CLEAR or present.known is before:
             trials = _trials(few, before, worth_trying(foreseen, further, again), present.rows)
-            return _of_trials(trials, explained)
+            return _of_trials(trials, explained, present.rows)
     return _of_scores([*foreseen, *present.fits.further_scores(present.known, candidates)], least_that_pays(explained))
 
 
@@ -133,14 +136,20 @@ def _trials(few: Fits, before: Completion, found: Mapping[str, Sequence[Score]],
     return sorted(trials, key=lambda trial: -trial.fall)
 
 
-def _of_trials(trials: Sequence[_Trial], explained: float) -> Promising:
+def _of_trials(trials: Sequence[_Trial], explained: float, rows: int) -> Promising:
     """Those that count, the best first; to be fitted to all are the first ones that are not behind for good."""
     best = trials[0].fall if trials else 0.0
     settled = bool(trials) and trials[0].completion.converged
     kept = [t for t in trials if t.fall > 0.0 and not hopeless(best - t.fall, explained + best)][:COUNTED]
     open_still = [t for t in kept if not (settled and t.completion.converged and best - t.fall > BEHIND)]
     fits = [(t.effect, t.completion.as_starts()) for t in open_still[:FITTED]]
-    return Promising(fits, {}, {t.effect.name: best - t.fall for t in kept})
+    behind = {t.effect.name: best - t.fall for t in kept}
+    return Promising(
+        fits,
+        {},
+        behind,
+        {t.effect.name: t.completion.further_parameters(t.effect, rows / t.completion.rows) for t in kept},
+    )
 
 
 def _of_scores(found: Iterable[Score], least: float) -> Promising:
@@ -152,7 +161,7 @@ def _of_scores(found: Iterable[Score], least: float) -> Promising:
     chosen = list(best.values())[:COUNTED]
     enough = WORTH_FITTING * max([least, *(-s.evidence for s in chosen)])
     fitted = [(s.effect, s.starts) for s in chosen if -s.evidence > enough]
-    return Promising(fitted, {s.effect.name: -s.evidence for s in chosen[len(fitted) :]}, {})
+    return Promising(fitted, {s.effect.name: -s.evidence for s in chosen[len(fitted) :]}, {}, {})
 
 
 def fall_foretold(before: Completion, after: Completion, rows: int) -> float:

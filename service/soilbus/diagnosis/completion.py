@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.sizes import correction
+from soilbus.diagnosis.sizes import OwnParameters, correction, own_parameters
 from soilbus.diagnosis.slow_descent import descended
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.completed import CompletedProblem
@@ -140,6 +140,18 @@ class Completion:
         ]
         return np.concatenate([gains[:n_sensors], pulls])
 
+    def further_parameters(self, effect: Effect, times: float = 1.0) -> tuple[OwnParameters, ...]:
+        """What each recording after the first tells of its own values of an effect of the record.
+
+        As of so many times the data.  A zero that wanders in each recording is not meant: without a wander it is
+        the same effect.
+        """
+        own = [i for i in _members(effect, self.free) if effect.own_in_each_record(self.free[i].parameter)]
+        if not own or not effect.of_record:
+            return ()
+        n_sensors, free = self.checks[0].problem.n_sensors, [self.free[i] for i in own]
+        return tuple(own_parameters(*_of_parameters(fit, n_sensors, own), free, times) for fit in self.fits[1:])
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the effects."""
@@ -239,16 +251,27 @@ def _start(fit: Fit, checked: Latents | None = None) -> Start:
 
 
 def _sizes(effect: Effect, free: Sequence[Free], fits: Sequence[Fit], checks: Sequence[Checked]) -> float:
-    """Correction of the evidence for one effect of unknown size: once, or for each recording where it is its own."""
-    members = [i for i, f in enumerate(free) if f.effect == effect.name and f.std > 0.0]
-    if not members:
-        return 0.0
-    gains = checks[0].problem.n_sensors + np.array(members)
-    told = [fit.mode for fit in (fits if effect.of_record else fits[-1:])]
-    return sum(
-        correction(mode.gains[gains], mode.covariance[np.ix_(_SOIL + gains, _SOIL + gains)], [free[i] for i in members])
-        for mode in told
-    )
+    """Correction of the evidence for one effect of unknown size: once, or for each recording where it is its own.
+
+    What all recordings share of it counts with the last one, which knows what all of them told.
+    """
+    n_sensors, told = checks[0].problem.n_sensors, 0.0
+    for fit in fits if effect.of_record else fits[-1:]:
+        members = [f for f in _members(effect, free) if fit is fits[-1] or effect.own_in_each_record(free[f].parameter)]
+        if members:
+            told += correction(*_of_parameters(fit, n_sensors, members), [free[i] for i in members])
+    return told
+
+
+def _members(effect: Effect, free: Sequence[Free]) -> list[int]:
+    """Places of an effect's parameters that are not held."""
+    return [i for i, f in enumerate(free) if f.effect == effect.name and f.std > 0.0]
+
+
+def _of_parameters(fit: Fit, n_sensors: int, members: Sequence[int]) -> tuple[Array, Array]:
+    """Pulls (P,) and covariance (P, P) of some of the effects' parameters."""
+    gains = n_sensors + np.array(members)
+    return fit.mode.gains[gains], fit.mode.covariance[np.ix_(_SOIL + gains, _SOIL + gains)]
 
 
 def _of_first(record: Record, prior: SoilPrior, problem: CompletedProblem) -> Belief:
@@ -281,9 +304,11 @@ def _fitted(
 def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects: Sequence[Effect]) -> Belief:
     """What one recording tells of the next: all but the soil and what belongs to one recording only."""
     after = known.of_another_soil(prior)
-    own = {effect.name for effect in effects if effect.of_record}
+    by_name = {effect.name: effect for effect in effects}
     gone = [
-        problem.n_sensors + i for i, free in enumerate(problem.free) if free.effect in own or free.parameter.of_record
+        problem.n_sensors + i
+        for i, free in enumerate(problem.free)
+        if by_name[free.effect].own_in_each_record(free.parameter)
     ]
     gains, covariance = after.gains.copy(), after.covariance.copy()
     for i in gone:

@@ -9,7 +9,14 @@ from dataclasses import dataclass, replace
 from soilbus.diagnosis.candidates import STEPS, Promising, Standing, promising
 from soilbus.diagnosis.completion import Completion
 from soilbus.diagnosis.fits import Fits
-from soilbus.diagnosis.verdict import PLAUSIBLE, hopeless_from, price, probabilities
+from soilbus.diagnosis.verdict import (
+    PLAUSIBLE,
+    TEMPERATURE,
+    hopeless_from,
+    price,
+    probabilities,
+    temperatures,
+)
 from soilbus.estimation.gauss_newton import Effort
 from soilbus.terra.effects.effect import Effect
 
@@ -24,7 +31,8 @@ class Addition:
     """One round: the effect added, its probability, and the other names with theirs; falls of -2 log evidence.
 
     beside are the names of the effects beside which it was named; form_left is that of all these effects, by their
-    probabilities (root mean square).
+    probabilities (root mean square).  divided_by is what the falls are divided by before they become probabilities,
+    usually and at times (see `verdict`).
     """
 
     effect: Effect
@@ -33,6 +41,7 @@ class Addition:
     falls: dict[str, float]
     beside: frozenset[str] = frozenset()
     form_left: float = Effect.form_left
+    divided_by: tuple[float, float] = (TEMPERATURE, TEMPERATURE)
 
     def beside_another(self, effect: Effect, other: Effect) -> Addition:
         """The same with one effect beside it in place of another."""
@@ -61,21 +70,34 @@ def named(
     fitted, at_most = _fitted(whole, present, counted, explained, asked, at_hand)
     if not fitted:
         return None
-    best = min(fitted, key=lambda name: fitted[name][1].evidence)
-    if present.evidence - fitted[best][1].evidence < asked:
-        fitted[best] = fitted[best][0], converged(whole, present.evidence, fitted[best][1])
+    fitted = _compared(whole, present, fitted, explained)
     falls = {name: present.evidence - completion.evidence for name, (_, completion) in fitted.items()}
-    best = max(falls, key=lambda name: falls[name])
-    if falls[best] < asked:
+    most = max(falls.values())
+    if most < asked:
         return None
-    falls |= {name: min(fall, falls[best]) for name, fall in counted.foreseen.items()}
-    foretold = {name: falls[best] - behind for name, behind in counted.behind.items() if name not in fitted}
+    falls |= {name: min(fall, most) for name, fall in counted.foreseen.items()}
+    foretold = {name: most - behind for name, behind in counted.behind.items() if name not in fitted}
     falls |= {name: min(fall, at_most.get(name, fall)) for name, fall in foretold.items()}
-    chances = probabilities(falls, explained)
+    further = counted.further | {name: fit.further_parameters(effect) for name, (effect, fit) in fitted.items()}
+    chances = probabilities(falls, explained, further)
+    best = next(name for name in chances if name in fitted and falls[name] >= asked)
     others = {n: p for n, p in chances.items() if n != best and p >= PLAUSIBLE}
     effect, completion = fitted[best]
     form_left = _form_left({n: p for n, p in chances.items() if n == best or n in others}, candidates)
-    return Addition(effect, chances[best], others, falls, present.names, form_left), completion
+    heat = temperatures(explained + most)
+    return Addition(effect, chances[best], others, falls, present.names, form_left, heat), completion
+
+
+def _compared(
+    whole: Fits, present: Standing, fitted: dict[str, tuple[Effect, Completion]], explained: float
+) -> dict[str, tuple[Effect, Completion]]:
+    """The candidates with fits that can be compared: those among which the best one may be have converged."""
+    least = min(fit.evidence for _, fit in fitted.values())
+    within = hopeless_from(explained + present.evidence - least)
+    return {
+        name: (effect, converged(whole, present.evidence, fit) if fit.evidence - least < within else fit)
+        for name, (effect, fit) in fitted.items()
+    }
 
 
 def _form_left(chances: Mapping[str, float], candidates: Iterable[Effect]) -> float:

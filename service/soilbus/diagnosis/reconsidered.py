@@ -17,7 +17,7 @@ from soilbus.diagnosis.candidates import (
 from soilbus.diagnosis.completion import Completion
 from soilbus.diagnosis.fits import Fits
 from soilbus.diagnosis.naming import Addition, named
-from soilbus.diagnosis.verdict import PAYS, hopeless, probabilities
+from soilbus.diagnosis.verdict import PAYS, hopeless, probabilities, temperatures
 from soilbus.estimation.gauss_newton import Effort
 from soilbus.terra.effects.effect import Effect
 
@@ -80,7 +80,8 @@ def _without_it(
     if _rivals(few, without, addition, candidates, here, explained, rows):
         return Standing.foretold(without, few, rows)
     (chance,) = probabilities({effect.name: fall}, explained - fall).values()
-    return Addition(effect, chance, {}, {effect.name: fall}, _others(addition, present), effect.form_left)
+    others = _others(addition, present)
+    return Addition(effect, chance, {}, {effect.name: fall}, others, effect.form_left, temperatures(explained))
 
 
 def _rivals(

@@ -44,7 +44,7 @@ class Score:
 
 
 @dataclass(frozen=True, slots=True)
-class _Normal:
+class Normal:
     """Normal equations of one recording: those of the present model solved for, the effects' left over.
 
     by_effects (P,) is the gradient, left (P, P) the information without the prior's,
@@ -67,7 +67,7 @@ def scores(
     """The candidates in the order of what they are foreseen to explain, the best first."""
     n_wheels = len(records[0].learned.rig.wheels)
     free = [f for effect in candidates for f in parameters_of(effect, n_wheels)]
-    normals = [_normal(r, prior, present, i, candidates, free) for i, r in enumerate(records)]
+    normals = normals_of(records, prior, present, candidates, free)
     found = []
     for effect in candidates:
         columns = np.array([i for i, f in enumerate(free) if f.effect == effect.name])
@@ -85,8 +85,8 @@ def further_scores(
     Biometrika 64:247).
     """
     found: dict[str, Score] = {}
-    for moves in zip_longest(*(_moves(effect) for effect in candidates)):
-        by_name = {move.effect.name: move for move in moves if move is not None}
+    for group in moves(candidates):
+        by_name = {move.effect.name: move for move in group}
         for score in scores(records, prior, present, [move.moved for move in by_name.values()]):
             move, best = by_name[score.effect.name], found.get(score.effect.name)
             if best is None or score.evidence < best.evidence:
@@ -95,7 +95,7 @@ def further_scores(
     return list(found.values())
 
 
-class _Move(NamedTuple):
+class Move(NamedTuple):
     """An effect, the same with one parameter's neutral value moved, and by how many std of each parameter (P,)."""
 
     effect: Effect
@@ -103,7 +103,13 @@ class _Move(NamedTuple):
     offsets: list[float]
 
 
-def _moves(effect: Effect) -> Iterator[_Move]:
+def moves(candidates: Sequence[Effect]) -> Iterator[list[Move]]:
+    """All further starts of the candidates, of each one at a time."""
+    for group in zip_longest(*(_moves(effect) for effect in candidates)):
+        yield [move for move in group if move is not None]
+
+
+def _moves(effect: Effect) -> Iterator[Move]:
     """One for each value at which a parameter may start besides."""
     for parameter in effect.parameters:
         for value in parameter.starts:
@@ -111,7 +117,7 @@ def _moves(effect: Effect) -> Iterator[_Move]:
             offsets = [
                 (value - parameter.neutral) / parameter.std if p is parameter else 0.0 for p in effect.parameters
             ]
-            yield _Move(effect, replace(effect, parameters=moved), offsets)
+            yield Move(effect, replace(effect, parameters=moved), offsets)
 
 
 def _offset(start: Start, offsets: Sequence[float]) -> Start:
@@ -121,6 +127,13 @@ def _offset(start: Start, offsets: Sequence[float]) -> Start:
     return Start(start.soil, gains)
 
 
+def normals_of(
+    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect], free: Sequence[Free]
+) -> list[Normal]:
+    """The normal equations of each recording for candidates with these parameters."""
+    return [_normal(r, prior, present, i, candidates, free) for i, r in enumerate(records)]
+
+
 def _normal(
     record: Record,
     prior: SoilPrior,
@@ -128,7 +141,7 @@ def _normal(
     i: int,
     candidates: Sequence[Effect],
     free: Sequence[Free],
-) -> _Normal:
+) -> Normal:
     problem = record.learned.completed((*present.effects, *candidates), (*present.free, *free))
     fit, before, P = present.fits[i], present.before[i], len(free)
     covariance = np.zeros((len(before.covariance) + P,) * 2)
@@ -149,10 +162,10 @@ def _normal(
     answer = inverse[1] @ information[base, new]
     left = information[new, new] - np.eye(P) - information[new, base] @ answer
     by_effects = point.gradient[new] - answer.T @ point.gradient[base]
-    return _Normal(fitting, place, point.at, by_effects, left, answer, present.checks[i].latents, present)
+    return Normal(fitting, place, point.at, by_effects, left, answer, present.checks[i].latents, present)
 
 
-def _score(effect: Effect, columns: NDArray[np.intp], free: Sequence[Free], normals: Sequence[_Normal]) -> Score:
+def _score(effect: Effect, columns: NDArray[np.intp], free: Sequence[Free], normals: Sequence[Normal]) -> Score:
     """One effect's score over all recordings; with parameters of its own in each where it is of the recording."""
     block = np.ix_(columns, columns)
     own = [free[i] for i in columns.tolist()]
@@ -201,7 +214,7 @@ def _within(information: Array, gradient: Array, free: Sequence[Free]) -> _Solut
     return _Solution(step, fall, there + float(step[inside] @ pull) - fall)
 
 
-def _start(normal: _Normal, columns: NDArray[np.intp], step: Array) -> Start:
+def _start(normal: Normal, columns: NDArray[np.intp], step: Array) -> Start:
     share = min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-12))
     step = share * step
     follow = -normal.answer[:, columns] @ step

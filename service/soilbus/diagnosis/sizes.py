@@ -14,6 +14,7 @@ Sci. 14:382).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,10 +40,39 @@ def evidence_of_any_size(information: Array, pull: Array, free: Sequence[Free]) 
     return float(-2.0 * np.logaddexp.reduce(-0.5 * each) + 2.0 * np.log(len(found)))
 
 
+class OwnParameters(NamedTuple):
+    """What one recording tells of the parameters (P,) that are its own, as evidence_of_any_size() wants it."""
+
+    information: Array
+    pull: Array
+    free: tuple[Free, ...]
+
+    def surcharge(self, temperature: float) -> float:
+        """By how much more they cost than their share of a -2 log evidence that is divided by a temperature.
+
+        That division is for formulas that are not the field's: as if there were so many times less data.  What
+        parameters cost for being there does not shrink in proportion, but as their information does (coarsened
+        posterior: Miller & Dunson 2019, J. Am. Stat. Assoc. 114:1113).
+        """
+        coarse = evidence_of_any_size(self.information / temperature, self.pull / temperature, self.free)
+        return coarse - evidence_of_any_size(self.information, self.pull, self.free) / temperature
+
+
+def own_parameters(pulls: Array, covariance: Array, free: Sequence[Free], times: float = 1.0) -> OwnParameters:
+    """The same from what a fit came to, with so many times the data."""
+    information, pull = _likelihood(pulls, covariance)
+    return OwnParameters(times * information, times * pull, tuple(free))
+
+
+def _likelihood(pulls: Array, covariance: Array) -> tuple[Array, Array]:
+    """Information (P, P) and pull (P,) of the data alone."""
+    precision = np.linalg.inv(covariance)
+    return precision - np.eye(len(pulls)), precision @ pulls
+
+
 def correction(pulls: Array, covariance: Array, free: Sequence[Free]) -> float:
     """What that changes of a -2 log evidence found with the prior std themselves, from what the fit came to."""
-    precision = np.linalg.inv(covariance)
-    information, pull = precision - np.eye(len(pulls)), precision @ pulls
+    information, pull = _likelihood(pulls, covariance)
     fixed = np.zeros(len(pulls), bool)
     return evidence_of_any_size(information, pull, free) - float(_evidences(information, pull, fixed)[0])
 

@@ -8,8 +8,11 @@ reported are `report` halves of seeds from 3 on.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
+from types import MappingProxyType
+
+from soilbus.diagnosis.sizes import OwnParameters
 
 
 class Verdict(StrEnum):
@@ -55,13 +58,19 @@ LEAST_GAP = 1.04
 """Reduced chi-square up to which no gap is told, however many residuals: noise is not known better."""
 
 
-def probabilities(falls: Mapping[str, float], explained: float) -> dict[str, float]:
+def probabilities(
+    falls: Mapping[str, float],
+    explained: float,
+    further: Mapping[str, Sequence[OwnParameters]] = MappingProxyType({}),
+) -> dict[str, float]:
     """Probability of each name from its fall of -2 log evidence, the largest first, where others explain so much.
 
-    What is left to one is the probability that nothing more is missing.
+    further are the parameters that recordings after the first have for themselves under a name: that they come out
+    alike is a chance, which no error of a formula makes more likely.  What is left to one is the probability that
+    nothing more is missing.
     """
     most = max(falls.values())
-    usual, great = (_shares(falls, heat(explained + most)) for heat in (_temperature, _great_temperature))
+    usual, great = (_shares(falls, t, further) for t in temperatures(explained + most))
     something = 1.0 / (1.0 + math.exp(-most / (2.0 * _temperature(explained, FORM_LEFT))))
     chances = {n: something * ((1.0 - AT_TIMES) * usual[n] + AT_TIMES * great[n]) for n in falls}
     return dict(sorted(chances.items(), key=lambda item: -item[1]))
@@ -77,6 +86,14 @@ def hopeless_from(explained: float) -> float:
     return HOPELESS * _great_temperature(explained)
 
 
+def temperatures(explained: float) -> tuple[float, float]:
+    """What differences of -2 log evidence between names are divided by, where so much is explained: usually, at times.
+
+    At times is AT_TIMES.
+    """
+    return _temperature(explained), _great_temperature(explained)
+
+
 def _temperature(explained: float, form_error: float = FORM_ERROR) -> float:
     """What differences of -2 log evidence are divided by, where so much of it is explained in all."""
     return TEMPERATURE + form_error * max(explained, 0.0)
@@ -86,9 +103,15 @@ def _great_temperature(explained: float) -> float:
     return _temperature(min(explained, GROWN), GREAT_FORM_ERROR)
 
 
-def _shares(falls: Mapping[str, float], temperature: float) -> dict[str, float]:
-    most = max(falls.values())
-    weights = {name: math.exp((fall - most) / (2.0 * temperature)) for name, fall in falls.items()}
+def _shares(
+    falls: Mapping[str, float], temperature: float, further: Mapping[str, Sequence[OwnParameters]]
+) -> dict[str, float]:
+    tempered = {
+        name: fall / temperature - sum(own.surcharge(temperature) for own in further.get(name, ()))
+        for name, fall in falls.items()
+    }
+    most = max(tempered.values())
+    weights = {name: math.exp((fall - most) / 2.0) for name, fall in tempered.items()}
     total = sum(weights.values())
     return {name: weight / total for name, weight in weights.items()}
 
@@ -110,6 +133,18 @@ def price(explained: float, gap: float, checked_rows: int, rows: int) -> float:
 def least_that_pays(explained: float) -> float:
     """The least that it ever is."""
     return max(PAYS_BESIDE if explained > 0.0 else PAYS, ADDS * explained)
+
+
+def verdict_of(before: float, after: float, rows: int, chances: Sequence[float], imitation: bool = False) -> Verdict:
+    """The verdict from the gaps before and after on so many residuals, and the probability of each effect added.
+
+    imitation: whether the effects explain what they do only together, see `diagnose`.
+    """
+    if is_real(before, after, rows):
+        return Verdict.UNKNOWN
+    if not chances:
+        return Verdict.NONE
+    return Verdict.NAMED if min(chances) >= SURE and not imitation else Verdict.AMBIGUOUS
 
 
 def is_real(before: float, after: float, checked_rows: int) -> bool:

@@ -100,7 +100,10 @@ def _looks(check: Checked, completion: Completion, record: int) -> Iterator[_Loo
         n = int(known.sum())
         if n >= FEWEST:
             square = float((z[known, i] ** 2).mean())
-            yield _Look(channel, wheel, "scatter", math.sqrt(square), (square - 1.0) * math.sqrt(n / 2.0))
+            left_open = belief.covariance @ (by[known, i].T @ by[known, i])  # of I + M: M's trace, and that of M^2
+            expected, of_squares = float(left_open.trace()), float((left_open @ left_open).trace())
+            sd = math.sqrt(2.0 * (n + 2.0 * expected + of_squares)) / n
+            yield _Look(channel, wheel, "scatter", math.sqrt(square), (square - 1.0 - expected / n) / sd)
 
 
 def _regions(regressors: dict[str, Array], known: NDArray[np.bool_]) -> Iterator[tuple[str, NDArray[np.intp]]]:

@@ -109,12 +109,14 @@ class Readings:
     def _balance(self, take: Callable[[str], Reading], usable: NDArray[np.bool_]) -> None:
         """The pull that draft, slope and inertia ask of the wheels, and its variance."""
         self.draft, draft_var, known = take("draft")
+        self.with_pitch = False
         demand, variance = self.draft.copy(), draft_var.copy()
         acceleration, acceleration_var = np.zeros_like(demand), np.zeros_like(demand)
         if self.rig.chassis is not None:
             mass = self.rig.chassis.mass
             pitch, pitch_var, has_pitch = take("pitch")
-            if has_pitch.any():
+            self.with_pitch = bool(has_pitch.any())
+            if self.with_pitch:
                 known = known & has_pitch
             acceleration, acceleration_var, has_acceleration = take("acceleration")
             if has_acceleration.any():

@@ -7,15 +7,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 
-import can
 from rich.console import Console, Group
 from rich.live import Live
 from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from soilbus.can.bus import open_bus
+from soilbus.can.bus import LiveBus, open_bus
 from soilbus.can.dbc_files import filters_of, output_database
 from soilbus.config import Config
 from soilbus.report.readings import Readings
@@ -45,9 +45,10 @@ FAULTS_OF_BUS = {
 WIDTH = 78
 
 
-def panel(known: Readings) -> Panel:
-    """What a driver sees."""
-    way = str(known.value("Traversability", "State") or "unknown")
+def panel(known: Readings, fault: str = "") -> Panel:
+    """What a driver sees; `fault` is what keeps the bus away."""
+    way = str(known.value("Traversability", "State"))
+    way = way if way in COLOURS else "unknown"
     head = Text(f" {way.upper().replace('_', '-')} ", style=f"bold black on {COLOURS[way]}")
     ground, task = (Table.grid(padding=(0, 4)) for _ in range(2))
     ground.add_row(_soil(known), _wheels(known))
@@ -55,22 +56,22 @@ def panel(known: Readings) -> Panel:
     told = (Text("  ".join(words)) for words in (_detail(known), _demand(known)))
     parts = (head, _warning(known), *told, Text(" ".join(_kind(known))), Text(""))
     service, bus = (Text("  ".join(words)) for words in (_service(known), _bus(known)))
-    last = (Text(""), task, Text(""), service, bus)
+    last = (Text(""), task, Text(""), service, Text(f"bus: away ({fault})") if fault else bus)
     return Panel(Group(*parts, ground, *last), title="soilbus", width=WIDTH)
 
 
 def _detail(known: Readings) -> Iterator[str]:
     """Of the verdict."""
-    yield from _said(known, "Traversability", "Probability", "p = {:.2f}")
+    yield from _measured(known, "Traversability", "Probability", "p = {:.2f}")
     yield from _said(known, "Traversability", "LimitingCause", "limit: {}")
-    yield from _said(known, "Traversability", "Age", "{:.1f} s old")
-    yield from _said(known, "Traversability", "SinceValid", "valid {:.1f} s ago")
+    yield from _measured(known, "Traversability", "Age", "{:.1f} s old")
+    yield from _measured(known, "Traversability", "SinceValid", "valid {:.1f} s ago")
 
 
 def _kind(known: Readings) -> Iterator[str]:
     yield from _said(known, "SoilClass", "Kind", "soil: {}")
-    yield from _said(known, "SoilClass", "Probability", "({:.2f})")
-    yield from _said(known, "SoilClass", "UnknownProbability", "none of the known {:.2f}")
+    yield from _measured(known, "SoilClass", "Probability", "({:.2f})")
+    yield from _measured(known, "SoilClass", "UnknownProbability", "none of the known {:.2f}")
 
 
 def _demand(known: Readings) -> Iterator[str]:
@@ -78,8 +79,8 @@ def _demand(known: Readings) -> Iterator[str]:
     needed, there = (known.number("TorqueDemand", f"Torque{what}") for what in ("Required", "Available"))
     if needed is not None or there is not None:
         yield "torque {} of {} N m".format(*("-" if x is None else f"{x:.0f}" for x in (needed, there)))
-    yield from _said(known, "DemandForecast", "Slip", "slip to come {:.2f}")
-    yield from _said(known, "DemandForecast", "Sinkage", "sinkage {:.0f} mm")
+    yield from _measured(known, "DemandForecast", "Slip", "slip to come {:.2f}")
+    yield from _measured(known, "DemandForecast", "Sinkage", "sinkage {:.0f} mm")
 
 
 def _service(known: Readings) -> Iterator[str]:
@@ -88,7 +89,7 @@ def _service(known: Readings) -> Iterator[str]:
         yield "soilbus " + ".".join(f"{part:.0f}" for part in version)
     yield from _said(known, "SoilbusStatus", "State", "service: {}")
     yield from _said(known, "SoilbusStatus", "Reason", "({})")
-    yield from _said(known, "SoilbusStatus", "RejectedShare", "refused {:.1f} %")
+    yield from _measured(known, "SoilbusStatus", "RejectedShare", "refused {:.1f} %")
     if known.bad_frames:
         yield f"bad frames {known.bad_frames}"
 
@@ -140,7 +141,7 @@ def _wheels(known: Readings) -> Table:
 def _warning(known: Readings) -> Text:
     if known.value("DemandForecast", "Warning") != "immobilisation":
         return Text("")
-    left = "".join(_said(known, "DemandForecast", "TimeLeft", " in {:.0f} s"))
+    left = "".join(_measured(known, "DemandForecast", "TimeLeft", " in {:.0f} s"))
     return Text(f" GETTING STUCK{left} ", style="bold white on red")
 
 
@@ -152,9 +153,16 @@ def _table(*titles: str) -> Table:
 
 
 def _said(known: Readings, message: str, signal: str, form: str) -> Iterator[str]:
-    """A signal in words, nothing where it is not known."""
+    """A named value in words, nothing where it is not known."""
     value = known.value(message, signal)
     if value is not None and value != "none":
+        yield form.format(value)
+
+
+def _measured(known: Readings, message: str, signal: str, form: str) -> Iterator[str]:
+    """A number in words, nothing where it is not known."""
+    value = known.number(message, signal)
+    if value is not None:
         yield form.format(value)
 
 
@@ -176,15 +184,20 @@ def _figures(value: float, spread: float) -> str:
 
 
 def watch(config: Config, seconds: float | None = None) -> None:
-    """Show the dashboard of the configured bus until interrupted, or for some seconds; raises BusError."""
+    """Show the dashboard of the configured bus until interrupted, or for some seconds.
+
+    A bus that goes away is waited for.  Raises BusError where it cannot be opened to begin with.
+    """
     database = output_database(config)
-    with open_bus(config.bus.model_dump(), filters_of(database)) as bus:
+    settings, filters = config.bus.model_dump(), filters_of(database)
+    with closing(LiveBus(lambda: open_bus(settings, filters), time.monotonic, time.sleep)) as bus:
+        bus.open()
         show(Readings(database), bus, Console(), until=None if seconds is None else time.monotonic() + seconds)
 
 
 def show(
     known: Readings,
-    bus: can.BusABC,
+    bus: LiveBus,
     console: Console,
     until: float | None = None,
     done: Callable[[], bool] = lambda: False,
@@ -193,9 +206,9 @@ def show(
     with Live(panel(known), console=console, auto_refresh=False, screen=False) as live:
         redraw = time.monotonic()
         while not done() and (until is None or time.monotonic() < until):
-            message = bus.recv(max(0.0, redraw - time.monotonic()))
-            if message is not None and not message.is_error_frame:
+            message = bus.receive(max(0.0, redraw - time.monotonic()))
+            if message is not None:
                 known.receive(message)
             if time.monotonic() >= redraw:
                 redraw = time.monotonic() + 0.2
-                live.update(panel(known), refresh=True)
+                live.update(panel(known, bus.fault), refresh=True)

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from soilbus.daemon.diagnose import Findings
 from soilbus.diagnosis.completion import Completion
-from soilbus.diagnosis.verdict import PAYS
+from soilbus.diagnosis.verdict import PAYS, PAYS_BESIDE
 from soilbus.diagnosis.where import channels
 from soilbus.report.findings import (
-    SENTENCES,
     admission_line,
     chance_text,
     effect_lines,
@@ -25,6 +24,7 @@ from soilbus.report.findings import (
     soil_rows,
 )
 from soilbus.report.page import html_table, page, picture
+from soilbus.report.statement import doubt, shown_lines, statement, why_probabilities
 
 Array = NDArray[np.float64]
 
@@ -42,8 +42,10 @@ def diagnosis_report(findings: Findings) -> str:
     return page(
         "soilbus diagnose",
         ", ".join(record.name for record in findings.recordings.records),
-        f"<p><b>{diagnosis.verdict}</b>: {html.escape(SENTENCES[diagnosis.verdict])}</p>",
+        f"<p><b>{diagnosis.verdict}</b>: {html.escape(statement(diagnosis))}</p>",
+        *(f"<p>{html.escape(line)}</p>" for line in filter(None, [doubt(diagnosis)])),
         f"<p>{html.escape(gap_line(findings))}</p>",
+        *(f"<p>{html.escape(line)}</p>" for line in shown_lines(diagnosis, findings.config)),
         *_effects(findings),
         *_candidates(findings),
         "<h2>Where model and data disagreed</h2>",
@@ -76,7 +78,9 @@ def _candidates(findings: Findings) -> Iterator[str]:
         ]
         yield f"<h2>Candidates for effect {number}</h2>"
         yield html_table(("effect", "fall of -2 log evidence", "probability"), rows)
-        yield f"<p>An effect is added from a fall of {PAYS:g} on.</p>"
+        why = why_probabilities(addition)
+        least = PAYS_BESIDE if addition.beside else PAYS
+        yield f"<p>An effect is added from a fall of {least:g} on." + (f" {html.escape(why)}.</p>" if why else "</p>")
 
 
 def _places(findings: Findings) -> str:

@@ -13,20 +13,24 @@ from soilbus.daemon.outputs import known
 from soilbus.diagnosis.completion import Completion
 from soilbus.diagnosis.learned import WARNING, Correction
 from soilbus.diagnosis.naming import Addition
-from soilbus.diagnosis.verdict import Verdict, gap_limit
+from soilbus.diagnosis.verdict import gap_limit
 from soilbus.diagnosis.where import Disagreement
 from soilbus.estimation.posterior import Estimate, Posterior
+from soilbus.report.statement import (
+    doubt,
+    is_open,
+    no_places,
+    pressure_error,
+    same_push,
+    shown_lines,
+    statement,
+    why_probabilities,
+)
 from soilbus.report.table import table
 from soilbus.terra.effects.catalogue import CATALOGUE
 
 MOST_PLACES = 8
 """Places of disagreement that the text lists."""
-SENTENCES = {
-    Verdict.NONE: "model and data agree: nothing is missing",
-    Verdict.NAMED: "an effect is missing, and the data tell which",
-    Verdict.AMBIGUOUS: "an effect is missing, and the data do not tell for sure which",
-    Verdict.UNKNOWN: "something is missing that no effect of the catalogue explains",
-}
 UNITS = {"torque": "N m", "draft": "N", "sinkage": "m"}
 
 
@@ -38,7 +42,8 @@ def findings_json(findings: Findings) -> str:
     ]
     told = {
         "verdict": str(diagnosis.verdict),
-        "sentence": SENTENCES[diagnosis.verdict],
+        "sentence": statement(diagnosis),
+        "doubt": doubt(diagnosis),
         "where": [_place(place) for place in diagnosis.where],
         "effects": [_effect(addition, findings.diagnosis.completed) for addition in diagnosis.additions],
         "gap": {
@@ -47,7 +52,9 @@ def findings_json(findings: Findings) -> str:
             "noise_floor": 1.0,
             "limit": gap_limit(diagnosis.gap_after.rows),
             "residuals": diagnosis.gap_after.rows,
+            "open": is_open(diagnosis),
         },
+        **_shown(findings),
         "soil_before": soils[0]["before"],
         "soil_after": soils[0]["after"],
         "soils": soils,
@@ -60,6 +67,25 @@ def findings_json(findings: Findings) -> str:
         "seconds": round(findings.seconds, 3),
     }
     return json.dumps(known(told), indent=1, allow_nan=False) + "\n"
+
+
+def _shown(findings: Findings) -> dict[str, Any]:
+    """What the recordings could have shown, from which size on, and what not; null where nobody asked."""
+    diagnosis = findings.diagnosis
+    if not diagnosis.detectable:
+        return {"could_show": None, "could_not_show": None, "unseen": None}
+    before = [diagnosis.soil_before(i) for i in range(len(diagnosis.base.fits))]
+    shown: list[dict[str, Any]] = []
+    unseen: list[dict[str, Any]] = []
+    for found in diagnosis.detectable:
+        of = {"name": found.effect.name, "parameter": found.parameter.name, "unit": found.parameter.unit}
+        if found.size is not None:
+            shown.append(of | {"size": found.size})
+        error, std = pressure_error(found, before, findings.config)
+        if abs(error) > std:
+            unseen.append(of | {"size": found.unseen, "bearing_pressure_error": error, "bearing_pressure_std": std})
+    hidden = [found.effect.name for found in diagnosis.detectable if found.size is None]
+    return {"could_show": shown, "could_not_show": hidden, "unseen": unseen}
 
 
 def _place(place: Disagreement) -> dict[str, Any]:
@@ -77,6 +103,9 @@ def _effect(addition: Addition, completed: Completion) -> dict[str, Any]:
         "sentence": effect.physics,
         "source": effect.source,
         "why_ambiguous": why_ambiguous(addition),
+        "why_probabilities": why_probabilities(addition),
+        "ruled_out": effect.ruled_out or None,
+        "same_as": same_push(addition, completed),
         "tells": {name: CATALOGUE[name].tells for name in (effect.name, *addition.alternatives)},
         "evidence": dict(sorted(addition.falls.items(), key=lambda item: -item[1])),
     }
@@ -118,8 +147,9 @@ def _estimates(estimates: dict[str, Estimate]) -> dict[str, dict[str, float]]:
 def findings_text(findings: Findings) -> str:
     """The whole for a reader at a terminal."""
     diagnosis = findings.diagnosis
-    lines = [f"{diagnosis.verdict}: {SENTENCES[diagnosis.verdict]}", "", gap_line(findings)]
+    lines = [f"{diagnosis.verdict}: {statement(diagnosis)}", *filter(None, [doubt(diagnosis)]), "", gap_line(findings)]
     lines += [f"  {line}" for line in place_lines(findings)]
+    lines += shown_lines(diagnosis, findings.config)
     for number, addition in enumerate(diagnosis.additions, 1):
         lines += ["", *effect_lines(number, addition, findings.diagnosis.completed)]
     if diagnosis.learned:
@@ -139,11 +169,9 @@ def gap_line(findings: Findings) -> str:
 
 def place_lines(findings: Findings) -> list[str]:
     """The places of disagreement, the clearest first."""
-    before, where = findings.diagnosis.gap_before, findings.diagnosis.where
-    if not where and before.value > gap_limit(before.rows):
-        return ["too few held-out residuals in any region to tell where model and data disagree"]
+    where = findings.diagnosis.where
     if not where:
-        return ["no channel disagrees with the model anywhere by more than noise"]
+        return [no_places(findings.diagnosis)]
     shown = [
         f"{_channel(p)}, {p.region}: {size_text(p)} (chance {chance_text(p.significance)})" for p in where[:MOST_PLACES]
     ]
@@ -178,9 +206,11 @@ def effect_lines(number: int, addition: Addition, completed: Completion) -> list
         unit = units.get(name) or units[name.rpartition("_")[0]]
         std = f"+- {estimate.std:.2g}" if estimate.std > 0.0 else "(held)"
         lines.append(f"   {name} = {estimate.value:.4g} {std}" + ("" if unit == "1" else f" {unit}"))
+    lines += [f"   {line}" for line in filter(None, [same_push(addition, completed)])]
     if addition.alternatives:
         others = ", ".join(f"{name} {p:.2f}" for name, p in addition.alternatives.items())
-        lines += [f"   or: {others}", f"   {why_ambiguous(addition)}", "   what would tell them apart:"]
+        lines += [f"   or: {others}", f"   {why_ambiguous(addition)}", f"   {why_probabilities(addition)}"]
+        lines += ["   what would tell them apart:"]
         lines += [f"   - {name}: {CATALOGUE[name].tells}" for name in (effect.name, *addition.alternatives)]
     return lines
 

@@ -7,10 +7,14 @@ from collections.abc import Callable
 from typing import Any
 
 import can
+from cantools.database import DecodeError
 from cantools.database.can import Database
+from cantools.database.can.signal import Signal
+from cantools.database.namedsignalvalue import NamedSignalValue
 
 from soilbus.can.checksum import COUNTER, frame_checksum
 from soilbus.can.inbox import checksum_byte_of
+from soilbus.can.wire import Received
 
 CYCLES_UNTIL_STALE = 3
 GRACE = 0.2
@@ -22,14 +26,15 @@ class Readings:
 
     def __init__(self, database: Database, clock: Callable[[], float] = time.monotonic) -> None:
         self._messages = {m.frame_id: m for m in database.messages}
+        self._signals = {m.name: {s.name: s for s in m.signals} for m in database.messages}
         self._cycle = {m.name: (m.cycle_time or 1000) / 1000.0 for m in database.messages}
         self._clock = clock
         self._values: dict[str, dict[str, Any]] = {}
         self._seen: dict[str, float] = {}
         self.bad_frames = 0
 
-    def receive(self, message: can.Message) -> None:
-        """Take one frame; one with a wrong checksum or the counter of the one before counts as not received."""
+    def receive(self, message: Received | can.Message) -> None:
+        """Take one frame; a bad one (checksum, counter of the one before, not decodable) counts as not received."""
         layout = self._messages.get(message.arbitration_id) if message.is_extended_id else None
         if layout is None or message.is_remote_frame or len(message.data) != layout.length:
             return
@@ -38,7 +43,11 @@ class Readings:
         if place is not None and data[place] != frame_checksum(message.arbitration_id, data, place):
             self.bad_frames += 1
             return
-        values: dict[str, Any] = layout.decode(data)  # type: ignore[assignment]
+        try:
+            values: dict[str, Any] = layout.decode(data)  # type: ignore[assignment]
+        except (DecodeError, ValueError):  # an output.dbc of the user's may have multiplexers
+            self.bad_frames += 1
+            return
         if COUNTER in values and values[COUNTER] == self._values.get(layout.name, {}).get(COUNTER):
             self.bad_frames += 1
             return
@@ -46,15 +55,17 @@ class Readings:
         self._seen[layout.name] = self._clock()
 
     def value(self, message: str, signal: str) -> float | str | None:
-        """A signal's value or name; None where the frame is stale or the value not available."""
+        """A signal's value or name; None where the frame is stale, or the value not available or reserved."""
         age = self._clock() - self._seen.get(message, -1e9)
         if age > CYCLES_UNTIL_STALE * self._cycle[message] + GRACE:
             return None
         value = self._values[message].get(signal)
-        if isinstance(value, (int, float)):
-            return float(value)
-        name = str(value)
-        return None if name in ("not_available", "error") else name
+        if isinstance(value, NamedSignalValue):
+            name = str(value)
+            return None if name in ("not_available", "error") else name
+        if value is None or _is_reserved(self._signals[message][signal], value):
+            return None
+        return float(value)
 
     def number(self, message: str, signal: str) -> float | None:
         """A signal's value where it is a number."""
@@ -65,3 +76,13 @@ class Readings:
         """Whether a message may be acted on: it is fresh and its Status, where it has one, is valid."""
         status = self.value(message, "Status")
         return status == "valid" or "Status" not in self._values.get(message, {"Status": None})
+
+
+def _is_reserved(signal: Signal, value: float) -> bool:
+    """Whether a value without a name means nothing yet: beyond the signal's range, or among named states."""
+    low, high = signal.minimum, signal.maximum
+    if low is None or high is None:
+        return False
+    half = abs(signal.scale) / 2.0
+    named = [code * signal.scale + signal.offset for code in (signal.choices or ())]
+    return not low - half < value < high + half or any(low - half < x < high + half for x in named)

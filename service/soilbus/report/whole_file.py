@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import sys
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
+
+from soilbus.placed_file import placed
 
 
 class NotWritten(Exception):
@@ -25,19 +25,11 @@ def whole_file(path: Path) -> Iterator[IO[str]]:
         yield sys.stdout
         return
     try:
-        with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=f".{path.name}.", delete=False) as out:
-            try:
-                yield out
-            except BaseException:
-                os.unlink(out.name)
-                raise
-        os.chmod(out.name, 0o666 & ~_umask())
-        os.replace(out.name, path)
+        # a file's name need not be UTF-8: it is shown by its codes then
+        with (
+            placed(path) as descriptor,
+            open(descriptor, "w", encoding="utf-8", errors="backslashreplace", closefd=False) as out,
+        ):
+            yield out
     except OSError as error:
         raise NotWritten(f"{path}: {error.strerror or error}") from None
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

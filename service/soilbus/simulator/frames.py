@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import gzip
+import io
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import can
 import numpy as np
@@ -18,6 +21,7 @@ from soilbus.can.checksum import COUNTER, column_checksums
 from soilbus.can.mapping import channels_of, load_databases
 from soilbus.can.publish import checksum_byte, value_codes
 from soilbus.config import Config, Wheel
+from soilbus.placed_file import placed
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.sensors import channel_rng
 from soilbus.terra.stress import Array
@@ -27,6 +31,14 @@ START = 1_700_000_000.0
 _JITTER = 1e-3
 _PHASE = 0.9e-3
 _PHASES = 12
+
+_WRITERS: dict[str, Callable[[Any], Any]] = {
+    ".log": can.CanutilsLogWriter,
+    ".asc": can.ASCWriter,
+    ".csv": can.CSVWriter,
+    ".blf": can.BLFWriter,
+}
+"""Those that write into a file that is open."""
 
 Payload = NDArray[np.uint8]
 
@@ -64,8 +76,23 @@ def write_log(messages: Iterable[can.Message], path: Path) -> None:
     The file appears only when it is complete.  Raises ValueError for an unknown suffix,
     OSError where it cannot be written.
     """
-    suffixes = "".join(path.suffixes[-2:] if path.suffix.lower() == ".gz" else path.suffixes[-1:])
-    part = path.with_name(f".soilbus-{os.getpid()}{suffixes}")
+    *_, kind, last = ("", "", *(suffix.lower() for suffix in path.suffixes))
+    is_packed = last == ".gz"
+    kind = kind if is_packed else last
+    if kind not in _WRITERS or (is_packed and kind == ".blf"):
+        _write_by_name(messages, path, kind + last if is_packed else kind)
+        return
+    with placed(path) as descriptor, open(descriptor, "wb+", closefd=False) as raw:
+        packed = gzip.GzipFile(fileobj=raw, mode="wb") if is_packed else raw
+        file = packed if kind == ".blf" else io.TextIOWrapper(packed, encoding="utf-8")
+        with _WRITERS[kind](file) as log:
+            for message in messages:
+                log(message)
+
+
+def _write_by_name(messages: Iterable[can.Message], path: Path, suffix: str) -> None:
+    """Write a log of a format that its writer opens itself, under a hidden name first."""
+    part = path.with_name(f".soilbus-{os.getpid()}{suffix}")
     try:
         with can.Logger(part) as log:
             for message in messages:

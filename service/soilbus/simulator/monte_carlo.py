@@ -19,12 +19,10 @@ import math
 import time
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from multiprocessing import get_context
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -48,6 +46,7 @@ from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import Soil
+from soilbus.workers import workers
 
 Array = NDArray[np.float64]
 
@@ -190,7 +189,7 @@ def processes(count: int) -> Iterator[Each]:
     if count < 2:
         yield map
         return
-    with ProcessPoolExecutor(count, get_context("spawn"), initializer=keep_freed_memory) as pool:
+    with workers(count, "spawn", keep_freed_memory) as pool:
         yield partial(pool.map, chunksize=4)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import can
 
-from soilbus.can.bus import open_bus
+from soilbus.can.bus import bus_fault, open_bus
 from soilbus.config import Config
 from soilbus.simulator.course import NORTHWARD, Course
 from soilbus.simulator.frames import frames, write_log
@@ -36,14 +36,19 @@ def scenario_over(soils: Sequence[str], duration: float, course: Course = NORTHW
 def play(recording: Recording, config: Config, log: Path | None) -> None:
     """Write the recording's frames to a log, or send them to the configured bus in real time.
 
-    Raises BusError, OSError, and ValueError for a log format that is not known.
+    Raises BusError where the bus cannot be opened or goes away, OSError for a log that cannot be written, and
+    ValueError for a log format that is not known.
     """
     messages = frames(recording, config)
     if log is not None:
         write_log(messages, log)
         return
-    with open_bus(config.bus.model_dump()) as bus:
-        send_in_time(messages, bus.send)
+    settings = config.bus.model_dump()
+    with open_bus(settings) as bus:
+        try:
+            send_in_time(messages, bus.send)
+        except (can.CanError, OSError) as error:
+            raise bus_fault(settings, error) from None
 
 
 def send_in_time(

@@ -6,13 +6,12 @@ import argparse
 import json
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
-from multiprocessing import get_context
 from typing import TextIO
 
 from soilbus.allocator import keep_freed_memory
 from soilbus.simulator.drive import SimulationError
+from soilbus.workers import workers
 
 from .cases import KINDS, Case, cases
 from .table import report
@@ -67,7 +66,7 @@ def _trials(wanted: Sequence[Case], count: int) -> Iterator[tuple[Case, Trial | 
         for case in wanted:
             yield case, _trial((case.kind, case.id))
         return
-    with ProcessPoolExecutor(count, get_context("spawn"), initializer=keep_freed_memory) as pool:
+    with workers(count, "spawn", keep_freed_memory) as pool:
         yield from zip(wanted, pool.map(_trial, [(case.kind, case.id) for case in wanted]), strict=True)
 
 

@@ -34,6 +34,20 @@ def through_knots(share: Any, heights: Sequence[Any]) -> Any:
     return weighed_sum(splines(share, len(heights)), heights)
 
 
+def mean_height(heights: Sequence[Any]) -> Any:
+    """The mean over the whole way of the curve through_knots(); linear in the heights."""
+    return weighed_sum(_mean_splines(len(heights)), heights)
+
+
+@cache
+def _mean_splines(knots: int) -> Array:
+    """The mean over the way (knots,) of each of splines(): trapezoids, less what the curvature takes off."""
+    interval = 1.0 / (knots - 1)
+    ends = np.full(knots, interval)
+    ends[[0, -1]] /= 2.0
+    return np.asarray(ends - 0.5 * (ends @ _bending(knots)))
+
+
 def curve_of(name: str, unit: str, knots: range, intervals: int, std: float, most: float) -> tuple[Parameter, ...]:
     """The heights of a curve at these of its knots 0..intervals, each with this prior std, as parameters name_1 ..."""
     return tuple(Parameter(f"{name}_{i}", unit, 0.0, std, -most, most, knot=Knot(name, i, intervals)) for i in knots)

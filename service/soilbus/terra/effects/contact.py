@@ -129,6 +129,7 @@ LUGS = Effect(
     ),
     wheel=_lugged_soil,
     forces=_lugged_arm,
+    ruled_out="a smooth rim has no lugs",
 )
 
 _EVENLY = 0.04
@@ -200,5 +201,7 @@ TYRE_DEFLECTION = Effect(
     ),
     wheel=_substitute_circle,
     forces=_flattened_forces,
+    of_tyre=True,
+    ruled_out="a rigid wheel has no tyre that could flatten",
     form_left=1.0,
 )

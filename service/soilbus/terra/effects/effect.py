@@ -67,6 +67,7 @@ class Parameter:
     `starts`: further values that a search does well to begin at, where the sensitivity at
     `neutral` alone may be blind (the depth of a pan below all sinkages of a record).
     `of_record`: it describes one record and means nothing in another.
+    `of_vehicle`: it is the same in all records, though its effect is of the record.
     `knot`: it is the height of a curve there.
     """
 
@@ -79,6 +80,7 @@ class Parameter:
     starts: tuple[float, ...] = ()
     of_record: bool = False
     knot: Knot | None = None
+    of_vehicle: bool = False
 
 
 WheelHook = Callable[[WheelState, WheelModel, Surroundings, Values], tuple[WheelState, WheelModel]]
@@ -106,6 +108,8 @@ class Effect:
     mixes_instants: `torque` needs other instants than its own, adds them up, alike in each of however many columns,
     and is given plain arrays.
     of_record: its parameters describe the ground of one record and mean nothing in another.
+    of_tyre: it is there only where a wheel has a tyre.
+    ruled_out: what on the vehicle makes it impossible, where anything does.
     form_left: share of what it changes of the soil's parameters by which these are off (standard deviation), as no
     effect's formula is the field's: of the blind tune halves of seeds 109 to 113.
     """
@@ -125,12 +129,18 @@ class Effect:
     base_law: str | None = None
     of_record: bool = False
     mixes_instants: bool = False
+    of_tyre: bool = False
+    ruled_out: str = ""
     form_left: float = 0.125
 
     @property
     def neutral(self) -> dict[str, float]:
         """Values at which the effect is absent."""
         return {p.name: p.neutral for p in self.parameters}
+
+    def own_in_each_record(self, parameter: Parameter) -> bool:
+        """Whether every record has its own value of one of the parameters."""
+        return (self.of_record and not parameter.of_vehicle) or parameter.of_record
 
 
 class Active(NamedTuple):

@@ -102,6 +102,7 @@ MULTIPASS = Effect(
         Parameter("reloading", "1", 0.0, 0.2, -0.7, 2.0),
     ),
     wheel=_multipass,
+    ruled_out="a wheel with none ahead of it runs in no rut",
 )
 
 

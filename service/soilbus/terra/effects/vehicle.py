@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from soilbus.terra.dual import value_of
-from soilbus.terra.effects.along import curve_of, instants, share_of_way, stretches, through_knots
+from soilbus.terra.effects.along import curve_of, instants, mean_height, share_of_way, stretches, through_knots
 from soilbus.terra.effects.effect import Effect, Parameter, Surroundings, Values
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import WheelModel, WheelState
@@ -40,6 +41,7 @@ DRIVETRAIN_LOSS = Effect(
         Parameter("fading", "1", 0.0, 0.3, 0.0, 1.5, starts=(0.6,)),
     ),
     torque=_drive_line,
+    ruled_out="a torque cell between gear and wheel reads what reaches the wheel",
 )
 
 SLOPE_KNOTS = 16
@@ -57,7 +59,8 @@ GRADE = Effect(
     name="grade",
     physics="The field is not level, and gravity holds back or pushes what no sensor has told of.",
     source="weight along the slope, m g sin(slope): Wong 2008, ch. 3; natural cubic spline between knots",
-    tells="driving both ways on the slope, or a pitch sensor; a slope that never changes is a draft offset",
+    tells="driving both ways on the slope, or a pitch sensor with its zero set on level ground; a slope that never"
+    " changes, and is the same on every field, is a draft offset",
     parameters=(
         Parameter("slope_0", "rad", 0.0, 0.03, -0.3, 0.3),
         *curve_of("slope", "rad", range(1, SLOPE_KNOTS), SLOPE_KNOTS - 1, 0.03, 0.3),
@@ -65,6 +68,28 @@ GRADE = Effect(
     resistance=_unmeasured_slope,
     of_record=True,
 )
+
+
+def _pitch_error(around: Surroundings, values: Values) -> Any:
+    """m g sin of what a pitch sensor leaves out: its zero, and a curve along the way that is zero on the mean."""
+    heights = [values[f"slope_{i}"] for i in range(SLOPE_KNOTS)]
+    slope = values["pitch_offset"] + through_knots(instants(share_of_way(around)), heights) - mean_height(heights)
+    return around.mass * GRAVITY * np.sin(slope)
+
+
+GRADE_BESIDE_PITCH = replace(
+    GRADE,
+    physics="The pitch sensor is not at zero on level ground, or leaves out how the field rises and falls: gravity"
+    " holds back or pushes what it has not told of.",
+    source="weight along the slope, m g sin(slope): Wong 2008, ch. 3; an inclinometer's zero and its mounting are"
+    " taken to be right to 0.3 deg, and never off by more than three times that",
+    parameters=(
+        Parameter("pitch_offset", "rad", 0.0, 0.005, -0.015, 0.015, of_vehicle=True),
+        *curve_of("slope", "rad", range(SLOPE_KNOTS), SLOPE_KNOTS - 1, 0.03, 0.3),
+    ),
+    resistance=_pitch_error,
+)
+"""The same where the pitch is measured: a slope that never changes is then an offset of that sensor, and no more."""
 
 
 def _true_radius(
@@ -86,6 +111,8 @@ ROLLING_RADIUS = Effect(
         Parameter("rear", "1", 0.0, 0.03, -0.15, 0.15),
     ),
     wheel=_true_radius,
+    of_tyre=True,
+    ruled_out="a rigid wheel is not worn or inflated: its radius is what a ruler says",
 )
 
 

@@ -1,0 +1,151 @@
+"""What a diagnosis comes to, in sentences that do not contradict each other: text, page and JSON print these.
+
+What is said depends on all there is to say at once: verdict, effects added, gap left, places of disagreement.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from soilbus.config import Config
+from soilbus.diagnosis.completion import Completion
+from soilbus.diagnosis.detectable import Detectable
+from soilbus.diagnosis.diagnose import Diagnosis
+from soilbus.diagnosis.naming import Addition
+from soilbus.diagnosis.verdict import AT_TIMES, Verdict, gap_limit
+from soilbus.estimation.posterior import Posterior, bearing_pressure
+from soilbus.terra.effects.vehicle import GRADE_BESIDE_PITCH
+from soilbus.terra.vehicle import GRAVITY
+
+MOST_FEARED = 3
+"""Effects that may be there unseen which the text lists."""
+
+
+def is_open(diagnosis: Diagnosis) -> bool:
+    """Whether the gap that is left is above what noise alone does."""
+    return diagnosis.gap_after.value > gap_limit(diagnosis.gap_after.rows)
+
+
+def statement(diagnosis: Diagnosis) -> str:
+    """One line: what was found, and whether something is left besides."""
+    names = [addition.effect.name for addition in diagnosis.additions]
+    told = _found(diagnosis.verdict, names, bool(diagnosis.where))
+    if names and diagnosis.verdict is not Verdict.UNKNOWN and is_open(diagnosis):
+        limit = gap_limit(diagnosis.gap_after.rows)
+        told += f"; something is left besides: the gap of {diagnosis.gap_after.value:.2f} is above {limit:.2f}"
+    return told
+
+
+def _found(verdict: Verdict, names: Sequence[str], disagree: bool) -> str:
+    several = len(names) > 1
+    if verdict is Verdict.NONE:
+        if disagree:
+            return "no effect explains enough to be added, though single places disagree by more than noise"
+        return "model and data agree: nothing is missing that these recordings could have shown"
+    if verdict is Verdict.NAMED:
+        return (
+            "effects are missing, and the data tell which"
+            if several
+            else "an effect is missing, and the data tell which"
+        )
+    if verdict is Verdict.AMBIGUOUS:
+        who = "effects are missing" if several else "an effect is missing"
+        return f"{who}, and the data do not tell for sure which"
+    if not names:
+        return "something is missing that no effect of the catalogue explains"
+    there = f"{', '.join(names[:-1])} and {names[-1]} are" if several else f"{names[0]} is"
+    return f"{there} there, as far as the data tell, and more is missing that no effect of the catalogue explains"
+
+
+def no_places(diagnosis: Diagnosis) -> str:
+    """What is said where no single place of disagreement stands out."""
+    if diagnosis.additions or diagnosis.verdict is not Verdict.NONE:
+        return "no single place stands out from noise: what is missing shows in all of them together"
+    return "no channel disagrees with the model anywhere by more than noise"
+
+
+def doubt(diagnosis: Diagnosis) -> str | None:
+    """Why effects that explain the data only together are to be doubted; None where they are not such."""
+    if not diagnosis.imitation:
+        return None
+    shares = zip(diagnosis.additions, diagnosis.imitation, strict=True)
+    alone = ", ".join(f"{addition.effect.name} {100.0 * share:.0f} %" for addition, share in shares)
+    against = [f"{a.effect.name}: {a.effect.ruled_out}" for a in diagnosis.additions if a.effect.ruled_out]
+    told = (
+        f"to be doubted: of what they explain together each alone explains {alone}; separate faults would add up to "
+        "100 %, so these may be an imitation of something that the catalogue lacks"
+    )
+    if against:
+        told += f". What rules them out: {'; '.join(against)}"
+    if any(addition.effect.of_tyre for addition in diagnosis.additions):
+        told += ' (say tyre = "rigid" of such wheels)'
+    return told
+
+
+def same_push(addition: Addition, completed: Completion) -> str | None:
+    """The error of the pitch sensor that would do the same as an offset of the hitch; None where none may."""
+    problem = completed.checks[-1].problem
+    chassis = problem.rig.chassis
+    if addition.effect.name != "draft_offset" or chassis is None or not problem.with_pitch:
+        return None
+    slope = completed.parameters()["draft_offset"]["offset"].value / (chassis.mass * GRAVITY)
+    if abs(slope) > GRADE_BESIDE_PITCH.parameters[0].high:
+        return None
+    way = "high" if slope > 0.0 else "low"
+    return f"a pitch sensor that reads {abs(math.degrees(slope)):.2f} deg too {way} would do the same"
+
+
+def why_probabilities(addition: Addition) -> str | None:
+    """Why probabilities are so near each other beside falls that are not; None where there is one name only."""
+    if len(addition.falls) < 2:
+        return None
+    usual, great = addition.divided_by
+    return (
+        "probabilities: no formula of an effect is the field's, and of falls this great such an error may tip the "
+        f"balance; so their differences are divided by {usual:.0f} (with a chance of {100 * AT_TIMES:.0f} % by "
+        f"{great:.0f}) before half of each is taken as a logarithm of odds"
+    )
+
+
+def size_of(found: Detectable, size: float) -> str:
+    """A size of an effect with its unit."""
+    unit = found.parameter.unit
+    return f"{found.effect.name} {size:.2g}" + ("" if unit == "1" else f" {unit}")
+
+
+def pressure_error(found: Detectable, before: Sequence[Posterior], config: Config) -> tuple[float, float]:
+    """Relative error of the bearing pressure under an effect that is there unseen, and the relative std that is told.
+
+    Of the recording in which it is greatest beside that std.
+    """
+    errors = []
+    for posterior, soil_error in zip(before, found.soil_error, strict=True):
+        pressure = bearing_pressure(posterior.soil, config.estimator.z_ref, config.estimator.b_ref)
+        by_logs = pressure.gradient * np.array(posterior.soil) / pressure.value
+        errors.append((float(np.expm1(by_logs @ soil_error)), posterior.propagate(pressure.gradient) / pressure.value))
+    return max(errors, key=lambda error: abs(error[0]) / max(error[1], 1e-12))
+
+
+def shown_lines(diagnosis: Diagnosis, config: Config) -> Iterator[str]:
+    """What these recordings could have shown, what not, and what may hide behind the soil's std."""
+    shown = [found for found in diagnosis.detectable if found.size is not None]
+    if shown:
+        sizes = ", ".join(size_of(found, found.size) for found in shown if found.size is not None)
+        yield f"these recordings could have shown, from about these sizes on: {sizes}"
+    if hidden := [found.effect.name for found in diagnosis.detectable if found.size is None]:
+        yield f"they could not have shown, at any usual size: {', '.join(hidden)}"
+    before = [diagnosis.soil_before(i) for i in range(len(diagnosis.base.fits))]
+    errors = [(found, *pressure_error(found, before, config)) for found in diagnosis.detectable]
+    feared = sorted((e for e in errors if abs(e[1]) > e[2]), key=lambda e: -abs(e[1]))
+    if feared:
+        parts = [
+            f"{size_of(found, found.unseen)} by {100.0 * error:+.1f} %" for found, error, _ in feared[:MOST_FEARED]
+        ]
+        more = f" (and {len(feared) - MOST_FEARED} more by less)" if len(feared) > MOST_FEARED else ""
+        yield (
+            "what they could not have shown may move the bearing pressure by more than its "
+            f"+- {100.0 * feared[0][2]:.1f} %: {', '.join(parts)}{more}"
+        )

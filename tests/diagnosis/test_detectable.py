@@ -1,0 +1,128 @@
+"""What a recording could have shown: sizes from the Fisher information, held against effects that are truly there."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from soilbus.assembly import model_of, prior_of, rig_of, with_effects
+from soilbus.diagnosis.completion import complete
+from soilbus.diagnosis.detectable import Detectable, detectable
+from soilbus.diagnosis.diagnose import Diagnosis, diagnose
+from soilbus.diagnosis.records import Record, record_of
+from soilbus.diagnosis.score import scores
+from soilbus.diagnosis.verdict import Verdict, price
+from soilbus.estimation.window import BinStore
+from soilbus.report.statement import pressure_error
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.soils import soil_named
+
+CONFIG = reference_configuration()
+PRIOR = prior_of(CONFIG)
+TRUE = soil_named("loam").bearing_pressure(0.02, 0.3)
+SECONDS = 40.0
+RICH = excited("loam", SECONDS)
+STEADY = Scenario(
+    80.0, (Patch(0.0, "loam"),), Swing(1.3, 1.3), Swing(3000.0, 3000.0), slip_spread=0.0, side_shift=Swing(0.0, 0.0)
+)
+"""Even ground, one speed, one draft."""
+VALIDATED = ("slip_sinkage", "torque_lag", "multipass", "rolling_radius")
+
+
+def driven(scenario: Scenario, seed: int, *effects: str, without: str = "") -> Record:
+    rig = rig_of(CONFIG)
+    store = BinStore(rig, 0.1, 0.0)
+    channels = simulate(with_effects(CONFIG, effects), scenario, seed=seed).channels
+    store.add({n: (c.t, c.value) for n, c in channels.items() if n in rig.channels and n != without})
+    return record_of("drive", store.window(0.0, scenario.duration), rig, model_of(CONFIG), 0.2, 0.15)
+
+
+class Found(NamedTuple):
+    diagnosis: Diagnosis
+    shown: dict[str, Detectable]
+
+
+def found(record: Record) -> Found:
+    diagnosis = diagnose([record], PRIOR, list(CATALOGUE.values()))
+    return Found(diagnosis, {one.effect.name: one for one in diagnosis.detectable})
+
+
+@pytest.fixture(scope="module")
+def rich() -> Found:
+    return found(driven(RICH, 1))
+
+
+@pytest.mark.parametrize("seed", [5, 6])
+def test_an_even_drive_says_that_it_could_not_have_shown_what_it_hides(seed):
+    """Wheels that dig, at one slip only, are a softer soil: the pressure is a sixth off, told to 0.5 %."""
+    told, shown = found(driven(STEADY, seed, "slip_sinkage=1.0"))
+    assert told.verdict is Verdict.NONE
+    assert shown["slip_sinkage"].size is None or shown["slip_sinkage"].size > 1.0
+    pressure = told.soil_after(0).bearing_pressure(0.02, 0.3)
+    off = pressure.value / TRUE - 1.0
+    assert abs(off) > 10.0 * pressure.std / pressure.value
+    error, std = pressure_error(shown["slip_sinkage"], [told.soil_before(0)], CONFIG)
+    assert std == pytest.approx(pressure.std / pressure.value)
+    assert 0.5 < error / off < 2.0
+
+
+def test_a_rich_drive_says_that_it_could_have_shown_it_and_does(rich):
+    assert rich.diagnosis.verdict is Verdict.NONE
+    assert rich.shown["slip_sinkage"].size < 0.3
+    assert {name for name, one in rich.shown.items() if one.size is None} <= {"rate_stiffening", "hardpan", "lugs"}
+    told = found(driven(RICH, 11, "slip_sinkage=1.0"))
+    assert told.diagnosis.additions[0].effect.name == "slip_sinkage"
+    assert told.shown == {}
+
+
+@pytest.mark.parametrize(("times", "seen"), [(2.0, True), (0.5, False)])
+@pytest.mark.parametrize("name", VALIDATED)
+def test_twice_the_size_is_seen_and_half_of_it_is_not(rich, name, times, seen):
+    told = found(driven(RICH, 21, f"{name}={times * rich.shown[name].size}")).diagnosis
+    assert (told.verdict is not Verdict.NONE) == seen
+
+
+def test_more_of_the_same_drive_shows_less_and_a_sensor_less_shows_more():
+    """The size goes with the root of the information: four times the data, less than half the size."""
+    short, long = (
+        {d.effect.name: d for d in shown_by(driven(dataclasses.replace(RICH, duration=t), 1))} for t in (20.0, 80.0)
+    )
+    blind = {d.effect.name: d for d in shown_by(driven(RICH, 1, without="draft"))}
+    for name in ("torque_lag", "multipass", "slip_sinkage"):
+        assert 1.5 < short[name].size / long[name].size < 4.0
+    assert blind["draft_offset"].size is blind["draft_gain"].size is None
+    assert np.abs(blind["draft_offset"].soil_error).max() < 1e-9
+
+
+def shown_by(record: Record) -> tuple[Detectable, ...]:
+    base = complete([record], PRIOR, ())
+    assert base is not None
+    candidates = [CATALOGUE[n] for n in ("torque_lag", "multipass", "slip_sinkage", "draft_offset", "draft_gain")]
+    return detectable([record], PRIOR, base, candidates)
+
+
+def test_an_effect_that_no_datum_tells_of_has_no_evidence_either_way():
+    """Without a draft its load cell has neither an offset nor a gain: the evidence stays exactly as it is."""
+    record = driven(dataclasses.replace(RICH, duration=20.0), 3, without="draft")
+    base = complete([record], PRIOR, ())
+    for score in scores([record], PRIOR, base, [CATALOGUE["draft_offset"], CATALOGUE["draft_gain"]]):
+        assert (score.fall, score.evidence) == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+def test_of_a_great_gap_an_effect_must_explain_a_good_part():
+    """An excess of 5000 on 10 000 residuals, of which one effect explains a hundredth: that is no answer."""
+    assert 500.0 < price(0.0, 1.5, 3000, 10000) < 2500.0
+    assert price(0.0, 1.5, 3000, 10000) == pytest.approx(2.0 * price(0.0, 1.25, 3000, 10000))
+
+
+def test_three_faults_that_have_nothing_in_common_are_not_doubted():
+    record = driven(RICH, 31, "torque_lag=0.15", "draft_gain=0.15", "rate_stiffening=0.2")
+    told = diagnose([record], PRIOR, list(CATALOGUE.values()))
+    assert {a.effect.name for a in told.additions} == {"torque_lag", "draft_gain", "rate_stiffening"}
+    assert told.imitation == ()

@@ -1,0 +1,116 @@
+"""Several fields, one vehicle: what is the same on every field is the vehicle's, what differs is the fields'."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from soilbus.assembly import model_of, prior_of, rig_of, with_effects
+from soilbus.config import Config
+from soilbus.diagnosis.diagnose import Diagnosis, diagnose
+from soilbus.diagnosis.records import Record, record_of
+from soilbus.estimation.window import BinStore
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import excited
+from soilbus.terra.effects.along import mean_height, through_knots
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.vehicle import GRAVITY
+
+SECONDS = 40.0
+SOILS = ("loam", "wet_clay", "dry_sand", "clayey_soil_38")
+WITHOUT_GAINS = [f"noise.{quantity}.gain=0.0" for quantity in ("torque", "load", "speed", "ground_speed", "draft")]
+CONFIG = reference_configuration(WITHOUT_GAINS)
+BLIND = CONFIG.model_copy(update={"signals": CONFIG.signals.model_copy(update={"pitch": None})})
+"""The same tractor without a pitch sensor."""
+PITCH_OF_OFFSET = 400.0 / (CONFIG.vehicle.mass * GRAVITY)
+"""Slope [rad] that holds back as much as an offset of 400 N."""
+
+
+def field(config: Config, truth: Config, soil: str, slope: float, seed: int) -> Record:
+    store = BinStore(rig_of(config), 0.1, 0.0)
+    scenario = dataclasses.replace(excited(soil, SECONDS), slope=((0.0, slope),))
+    channels = simulate(truth, scenario, seed=seed).channels
+    known = rig_of(config).channels if config.signals.pitch else [c for c in rig_of(config).channels if c != "pitch"]
+    store.add({name: (c.t, c.value) for name, c in channels.items() if name in known})
+    return record_of(soil, store.window(0.0, SECONDS), rig_of(config), model_of(config), 0.2, 0.15)
+
+
+def diagnosed(config: Config, seed: int, slopes: tuple[float, ...], *effects: str) -> Diagnosis:
+    truth = with_effects(config, effects)
+    records = [field(config, truth, *each, 10 * seed + i) for i, each in enumerate(zip(SOILS, slopes, strict=True))]
+    return diagnose(records, prior_of(config), list(CATALOGUE.values()))
+
+
+def chances(found: Diagnosis) -> dict[str, float]:
+    first = found.additions[0]
+    return {first.effect.name: first.probability} | first.alternatives
+
+
+@pytest.mark.parametrize("seed", range(1, 7))
+def test_a_draft_offset_is_no_slope_of_four_fields(seed):
+    """The pitch is measured: that sensor would have to be off by a whole degree."""
+    found = diagnosed(CONFIG, seed, (0.0,) * 4, "draft_offset=400")
+    assert found.additions[0].effect.name == "draft_offset"
+    assert chances(found).get("grade", 0.0) < 0.02
+    assert len(found.additions) == 1
+    offset = found.completed.parameters()["draft_offset"]["offset"]
+    assert abs(offset.value - 400.0) < max(4.0 * offset.std, 8.0)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_push_that_is_the_same_on_four_fields_is_an_offset(seed):
+    """Nothing measures the pitch, and four fields might each have that slope: by chance, which is told."""
+    found = diagnosed(BLIND, seed, (0.0,) * 4, "draft_offset=400")
+    assert found.additions[0].effect.name == "draft_offset"
+    assert chances(found)["draft_offset"] > 0.8
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_slopes_that_differ_from_field_to_field_are_no_offset(seed):
+    slopes = tuple(PITCH_OF_OFFSET * share for share in (1.3, -0.8, 1.0, 0.2))
+    found = diagnosed(BLIND, seed, slopes)
+    assert [addition.effect.name for addition in found.additions] == ["grade"]
+    assert chances(found)["grade"] > 0.98
+    n_sensors = found.completed.checks[0].problem.n_sensors
+    place = [f.parameter.name for f in found.completed.free].index("slope_0")
+    std = found.completed.free[place].std
+    told = [fit.mode.gains[n_sensors + place] * std for fit in found.completed.fits]
+    assert told == pytest.approx(slopes, abs=0.006)
+
+
+def test_one_field_cannot_tell_a_slope_from_an_offset():
+    records = [field(BLIND, with_effects(BLIND, ["draft_offset=400"]), "loam", 0.0, 5)]
+    found = diagnose(records, prior_of(BLIND), list(CATALOGUE.values()))
+    assert min(chances(found)[name] for name in ("draft_offset", "grade")) > 0.1
+
+
+def test_a_pitch_offset_is_one_of_the_vehicle():
+    """A pitch sensor that is off by 0.5 deg leaves the same push in every recording, and is never given more than 1."""
+    found = diagnosed(CONFIG, 7, (0.0,) * 4)
+    assert found.additions == ()
+    for seed, degrees in ((7, 0.5), (8, 2.0)):
+        records = [
+            with_pitch_error(field(CONFIG, CONFIG, soil, 0.0, 10 * seed + i), np.radians(degrees))
+            for i, soil in enumerate(SOILS)
+        ]
+        told = diagnose(records, prior_of(CONFIG), [CATALOGUE["grade"]]).completed.parameters()["grade"]
+        assert abs(told["pitch_offset"].value) <= 0.015
+        if degrees == 0.5:
+            assert abs(told["pitch_offset"].value - np.radians(0.5)) < 4.0 * told["pitch_offset"].std < 0.005
+
+
+def with_pitch_error(record: Record, error: float) -> Record:
+    """The recording as if the pitch sensor had read less by so much [rad]: by the balance alone."""
+    push = record.learned.rig.chassis.mass * GRAVITY * error
+    for part in (record.learned, record.checked, record.whole):
+        part.demand = part.demand - push
+    return record
+
+
+def test_a_curve_has_the_mean_of_its_heights_along_the_way():
+    heights = np.random.default_rng(3).normal(size=16).tolist()
+    share = np.linspace(0.0, 1.0, 20001)
+    assert mean_height(heights) == pytest.approx(np.trapezoid(through_knots(share, heights), share), abs=1e-7)

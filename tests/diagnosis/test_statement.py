@@ -1,0 +1,147 @@
+"""No diagnosis contradicts itself: whatever was found, verdict, gap, places and what could be seen say the same."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from soilbus.diagnosis.detectable import Detectable
+from soilbus.diagnosis.diagnose import Diagnosis
+from soilbus.diagnosis.gap import Gap
+from soilbus.diagnosis.naming import Addition
+from soilbus.diagnosis.verdict import Verdict, gap_limit, probabilities, temperatures, verdict_of
+from soilbus.diagnosis.where import Disagreement
+from soilbus.estimation.posterior import Posterior
+from soilbus.report.findings import place_lines
+from soilbus.report.statement import doubt, shown_lines, statement, why_probabilities
+from soilbus.simulator.reference import reference_configuration
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.soils import soil_named
+
+CONFIG = reference_configuration()
+PLACE = Disagreement("draft", "", "slip 0.20..0.35", 312.0, 1e-5)
+SOIL = Posterior(soil_named("loam"), np.diag([0.3, 0.02, 0.01, 0.005, 0.1, 0.02]) ** 2)
+NOTHING = SimpleNamespace(fits=[SimpleNamespace(posterior=SOIL)])
+NAMES = sorted(CATALOGUE)
+
+
+def addition(name: str, chance: float) -> Addition:
+    return Addition(CATALOGUE[name], chance, {}, {name: 50.0})
+
+
+def shown(name: str, size: float | None, error: float = 0.0) -> Detectable:
+    """An effect whose unseen size moves the soil's moduli, and so the pressure, by a relative error."""
+    return Detectable(CATALOGUE[name], size, size or 1.0, np.log1p(error) * np.array([[1.0, 1.0, 0, 0, 0, 0]]))
+
+
+@st.composite
+def diagnoses(draw) -> Diagnosis:
+    names = draw(st.lists(st.sampled_from(NAMES), unique=True, max_size=3))
+    chances = [draw(st.floats(0.05, 1.0)) for _ in names]
+    before = Gap(draw(st.floats(0.95, 9.0)), draw(st.integers(20, 20000)))
+    after = Gap(draw(st.floats(0.9, 1.0)) + draw(st.floats(0.0, 1.0)) ** 3 * (before.value - 0.9), before.rows)
+    imitation = (0.9, 0.6, 0.1) if len(names) == 3 and draw(st.booleans()) else ()
+    verdict = verdict_of(before.value, after.value if names else before.value, before.rows, chances, bool(imitation))
+    where = draw(st.sampled_from([(), (PLACE,), (PLACE, PLACE)]))
+    seen = tuple(shown(n, draw(st.sampled_from([None, 0.1]))) for n in NAMES) if verdict is Verdict.NONE else ()
+    added = tuple(map(addition, names, chances))
+    after = after if names else before
+    return Diagnosis(verdict, where, added, NOTHING, NOTHING, (), before, after, imitation, seen)
+
+
+AGREES = re.compile(r"\bagree\b|nothing is missing|no channel disagrees")
+MISSING = re.compile(
+    r"(?:effects?|something|more) (?:is|are) missing|is left besides|disagree by more|reading less model"
+)
+
+
+def said(found: Diagnosis) -> str:
+    """All sentences about model and data."""
+    findings = SimpleNamespace(diagnosis=found, config=CONFIG)
+    return "\n".join([statement(found), doubt(found) or "", *place_lines(findings), *shown_lines(found, CONFIG)])
+
+
+@settings(max_examples=400, deadline=None)
+@given(diagnoses())
+def test_no_sentence_contradicts_another(found):
+    text = said(found)
+    assert not (AGREES.search(text) and MISSING.search(text)), text
+    assert bool(AGREES.search(text)) == (found.verdict is Verdict.NONE and not found.where), text
+
+
+@settings(max_examples=300, deadline=None)
+@given(diagnoses())
+def test_a_gap_that_is_left_is_said_in_the_first_line(found):
+    is_open = found.gap_after.value > gap_limit(found.gap_after.rows)
+    assert is_open == bool(re.search(r"is left besides|no effect of the catalogue explains", statement(found)))
+    assert len(statement(found).splitlines()) == 1
+
+
+@settings(max_examples=300, deadline=None)
+@given(diagnoses())
+def test_unknown_beside_names_says_that_these_are_there_and_more(found):
+    if found.verdict is Verdict.UNKNOWN and found.additions:
+        assert re.search(r"there, .* and more is missing", statement(found))
+        assert all(a.effect.name in statement(found) for a in found.additions)
+
+
+def test_a_named_effect_with_a_gap_left_and_no_place_of_its_own():
+    found = Diagnosis(
+        Verdict.NAMED, (), (addition("slip_sinkage", 0.97),), NOTHING, NOTHING, (), Gap(2.4, 900), Gap(1.3, 900)
+    )
+    assert "something is left besides: the gap of 1.30 is above 1.19" in statement(found)
+    assert "no single place stands out" in said(found)
+
+
+def test_effects_that_are_more_together_than_apart_are_doubted_with_what_rules_them_out():
+    names = ("tyre_deflection", "rolling_radius", "stress_peak_shift")
+    added = tuple(addition(name, 0.9) for name in names)
+    found = Diagnosis(
+        Verdict.AMBIGUOUS, (PLACE,), added, NOTHING, NOTHING, (), Gap(9.0, 900), Gap(1.0, 900), (0.9, 0.6, 0.1)
+    )
+    told = doubt(found) or ""
+    assert "tyre_deflection 90 %, rolling_radius 60 %, stress_peak_shift 10 %" in told
+    assert "imitation of something that the catalogue lacks" in told
+    assert 'say tyre = "rigid"' in told
+    assert "tyre_deflection: a rigid wheel has no tyre" in told
+    assert "rolling_radius: a rigid wheel" in told
+    assert verdict_of(9.0, 1.0, 900, [0.9] * 3) is Verdict.NAMED
+    assert verdict_of(9.0, 1.0, 900, [0.9] * 3, imitation=True) is Verdict.AMBIGUOUS
+    assert doubt(dataclasses.replace(found, imitation=())) is None
+
+
+def test_probabilities_beside_falls_that_differ_little_are_explained():
+    """Falls of 885, 882 and 870 would be 0.82, 0.18 and 0.0005 if formulas were right."""
+    falls = {"a": 885.0, "b": 882.0, "c": 870.0}
+    chances = probabilities(falls, 0.0)
+    one = Addition(CATALOGUE["lugs"], chances["a"], {"b": chances["b"]}, falls, divided_by=temperatures(885.0))
+    usual, great = temperatures(885.0)
+    told = why_probabilities(one) or ""
+    assert f"divided by {usual:.0f} (with a chance of 15 % by {great:.0f})" in told
+    expected = {
+        n: sum(
+            share * np.exp(falls[n] / (2.0 * t)) / sum(np.exp(f / (2.0 * t)) for f in falls.values())
+            for share, t in ((0.85, usual), (0.15, great))
+        )
+        for n in falls
+    }
+    assert chances == pytest.approx(expected, rel=1e-6)
+    assert why_probabilities(addition("lugs", 1.0)) is None
+
+
+def test_what_could_not_be_shown_is_told_with_what_it_does_to_the_soil():
+    seen = (shown("torque_lag", 0.04), shown("slip_sinkage", None, -0.2), shown("multipass", 0.03, 0.001))
+    found = Diagnosis(Verdict.NONE, (), (), NOTHING, NOTHING, (), Gap(1.0, 900), Gap(1.0, 900), (), seen)
+    text = "\n".join(shown_lines(found, CONFIG))
+    assert "could have shown, from about these sizes on: torque_lag 0.04 s, multipass 0.03" in text
+    assert "could not have shown, at any usual size: slip_sinkage" in text
+    std = SOIL.bearing_pressure(0.02, 0.3)
+    assert f"its +- {100.0 * std.std / std.value:.1f} %: slip_sinkage 1 by -20.0 %" in text
+    assert "torque_lag" not in text.splitlines()[-1]
+    assert "multipass" not in text.splitlines()[-1]

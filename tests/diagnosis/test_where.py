@@ -1,0 +1,86 @@
+"""Where model and data disagree: nowhere where nothing is missing, and there where something was hidden."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.diagnosis.completion import complete
+from soilbus.diagnosis.records import Record, record_of
+from soilbus.diagnosis.where import Disagreement, disagreements
+from soilbus.estimation.window import BinStore
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import excited
+
+CONFIG = reference_configuration()
+RIG = rig_of(CONFIG)
+SOILS = ("loam", "wet_clay", "dry_sand")
+
+
+def recorded(soil: str, seconds: float, seed: int, channel: str = "", error=None) -> Record:
+    """A drive; `error` gives what a channel reads too much from times, slips and speeds of the truth."""
+    recording = simulate(CONFIG, excited(soil, seconds), seed=seed)
+    columns = {n: (c.t, c.value) for n, c in recording.channels.items() if n in RIG.channels}
+    if error is not None:
+        t, value = columns[channel]
+        truth = {n: np.interp(t, recording.truth["t"], recording.truth[n]) for n in ("slip.RL", "ground_speed")}
+        columns[channel] = t, value + error(t, truth["slip.RL"], truth["ground_speed"])
+    store = BinStore(RIG, 0.1, 0.0)
+    store.add(columns)
+    return record_of("drive", store.window(0.0, seconds), RIG, model_of(CONFIG), 0.2, 0.15)
+
+
+def places(record: Record) -> list[Disagreement]:
+    base = complete([record], prior_of(CONFIG), ())
+    assert base is not None
+    return disagreements(base)
+
+
+def test_where_nothing_is_missing_no_place_is_told():
+    """Of a hundred looks a drive one is beyond 1 % by chance: all of them together must not be."""
+    told = {seed: places(recorded(SOILS[seed % 3], 40.0, seed)) for seed in range(8)}
+    assert {seed: found for seed, found in told.items() if found} == {}
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_a_fit_leaves_open_is_no_disagreement(seed):
+    """Learned from small slips alone, the model is off at great ones by far more than noise: as it says itself."""
+    record = recorded(SOILS[seed % 3], 40.0, seed)
+    great = record.whole.slip.mean(axis=1) > 0.2
+    learned, checked = (record.whole.part(np.flatnonzero(part)) for part in (~great, great))
+    assert min(learned.n, checked.n) > 60
+    assert places(dataclasses.replace(record, learned=learned, checked=checked)) == []
+
+
+@pytest.mark.parametrize(
+    ("channel", "size", "region", "error"),
+    [
+        ("torque.RL", 250.0, "time", lambda t, slip, speed: np.where(t > 40.0, 250.0, 0.0)),
+        ("sinkage.FR", -0.006, "slip", lambda t, slip, speed: np.where(slip > 0.28, -0.006, 0.0)),
+        ("draft", 250.0, "speed", lambda t, slip, speed: np.where(speed > 1.5, 250.0, 0.0)),
+    ],
+)
+def test_a_hidden_error_is_found_at_its_channel_wheel_and_region(channel, size, region, error):
+    found = places(recorded("loam", 60.0, 3, channel, error))
+    assert found
+    quantity, _, wheel = channel.partition(".")
+    assert (found[0].channel, found[0].wheel) == (quantity, wheel)
+    thirds = {
+        float(place.region.removeprefix(f"{region} ").split("..")[0]): place.size
+        for place in found
+        if (place.channel, place.wheel) == (quantity, wheel) and place.region.startswith(f"{region} ")
+    }
+    assert len(thirds) >= 2
+    step = thirds[max(thirds)] - thirds[min(thirds)]  # the fit has spread it over all of the region
+    assert 0.5 < step / size < 1.2
+
+
+def test_significances_are_of_all_looks_together_and_the_clearest_comes_first():
+    error = lambda t, slip, speed: 250.0 * (t > 40.0)  # noqa: E731
+    told = [place.significance for place in places(recorded("loam", 60.0, 3, "torque.RL", error))]
+    assert told == sorted(told)
+    assert max(told) <= 0.01

@@ -1,0 +1,91 @@
+"""Files that are there whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+import threading
+from pathlib import Path
+
+import pytest
+
+from soilbus.placed_file import placed
+from soilbus.report.whole_file import NotWritten, whole_file
+
+
+@pytest.fixture(params=[True, False], ids=["unnamed", "hidden"])
+def folder(request, tmp_path: Path, monkeypatch) -> Path:
+    """On a file system that has files without names, and on one that has not."""
+    if not request.param:
+        usual = os.open
+
+        def refusing(path, flags, *args, **kwargs):
+            if flags & os.O_TMPFILE == os.O_TMPFILE:
+                raise OSError(errno.EOPNOTSUPP, "Operation not supported")
+            return usual(path, flags, *args, **kwargs)
+
+        monkeypatch.setattr(os, "open", refusing)
+    return tmp_path
+
+
+def put(path: Path, content: bytes) -> None:
+    with placed(path) as descriptor:
+        os.write(descriptor, content)
+
+
+def test_a_file_takes_the_place_of_the_one_before(folder: Path):
+    path = folder / "out"
+    for content in (b"first and longer", b"second"):
+        put(path, content)
+        assert path.read_bytes() == content
+        assert list(folder.iterdir()) == [path]
+
+
+def test_the_users_mask_holds(folder: Path):
+    before = os.umask(0o027)
+    try:
+        put(folder / "out", b"x")
+    finally:
+        os.umask(before)
+    assert (folder / "out").stat().st_mode & 0o777 == 0o640
+
+
+def test_what_fails_leaves_the_one_before(folder: Path):
+    path = folder / "out"
+    put(path, b"first")
+    with pytest.raises(TypeError), placed(path) as descriptor:
+        os.write(descriptor, "no bytes")
+    assert path.read_bytes() == b"first"
+    assert list(folder.iterdir()) == [path]
+
+
+def test_a_link_stays_one(folder: Path):
+    (folder / "real").write_bytes(b"first")
+    (folder / "link").symlink_to("real")
+    put(folder / "link", b"second")
+    assert (folder / "link").is_symlink()
+    assert (folder / "real").read_bytes() == b"second"
+
+
+def test_a_pipe_and_a_device_are_written_to_and_stay(folder: Path):
+    os.mkfifo(folder / "pipe")
+    heard: list[bytes] = []
+    reader = threading.Thread(target=lambda: heard.append((folder / "pipe").read_bytes()))
+    reader.start()
+    put(folder / "pipe", b"said")
+    reader.join(10.0)
+    assert heard == [b"said"]
+    assert (folder / "pipe").is_fifo()
+    put(Path("/dev/null"), b"lost")
+    assert Path("/dev/null").is_char_device()
+
+
+def test_what_a_killed_process_left_under_a_hidden_name_is_in_nobodys_way(folder: Path):
+    (folder / f".soilbus-{os.getpid()}").write_text("left")
+    put(folder / "out", b"x")
+    assert list(folder.iterdir()) == [folder / "out"]
+
+
+def test_a_folder_that_is_not_there_is_one_line(folder: Path):
+    with pytest.raises(NotWritten, match=r"no/out: No such file or directory"), whole_file(folder / "no/out") as out:
+        out.write("x")
