@@ -87,7 +87,9 @@ def moves(output: str, old: Sequence[Any], new: Sequence[Any], tolerances: Toler
         elif part not in before:
             found.append(Move(*place, "", Kind.CHANGED, None, _short(after[part]), float("inf"), "more than before"))
         else:
-            found += (Move(place[0], place[1], *rest) for rest in _walk(before[part], after[part], (), None, tolerances))
+            found += (
+                Move(place[0], place[1], *rest) for rest in _walk(before[part], after[part], (), None, tolerances)
+            )
     return found
 
 
