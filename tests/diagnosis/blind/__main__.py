@@ -26,6 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--kind", choices=KINDS, action="append", help="repeatable; all by default")
     parser.add_argument("--half", choices=HALVES, help="all by default")
     parser.add_argument("--only", default="", help="only cases with this in their id")
+    parser.add_argument("--every", type=int, default=1, help="only one of so many of them (1)")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--list", action="store_true", help="name the cases without driving them")
     parser.add_argument("--json", help="write one object a line for each case")
@@ -35,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for kind in chosen.kind or KINDS
         for case in cases(kind, chosen.seed)
         if chosen.half in (None, case.half) and chosen.only in case.id
-    ]
+    ][:: max(chosen.every, 1)]
     if chosen.list:
         print("\n".join(f"{case.half:7}{case.id}" for case in wanted))
         return 0
