@@ -11,10 +11,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from soilbus.capability.assessment import OverSlip
-from soilbus.capability.immobilisation import AHEAD, CALM, LONGEST_GAP, SETTLED, Alert, Watch, watched
+from soilbus.capability.immobilisation import AHEAD, CALM, LONGEST_GAP, SETTLED, Alert, Moment, Watch, watched
 from soilbus.capability.trend import Capacity, Demand
 from soilbus.simulator import boggings, firm_drives
-from soilbus.simulator.bogging_trials import REACTION, Task, WarningTrial, figures, trial
+from soilbus.simulator.bogging_trials import (
+    REACTION,
+    Observation,
+    Task,
+    WarningTrial,
+    figures,
+    half_of,
+    judged,
+    observed,
+    trial,
+    warning_trials,
+    watch,
+)
 from soilbus.simulator.drive import drive as driven
 from soilbus.simulator.reference import reference_configuration
 
@@ -293,10 +305,74 @@ def test_whatever_comes_there_is_an_answer_and_silence_is_never_all_clear(moment
         assert state.time_left is None or state.time_left >= 0.0
 
 
+# --- trials: what is made of a watched drive ---
+
+
+def observation(moments_of, curves, end):
+    """A drive that passes its limit at the end, at 1 m/s, with these (from, until, slip) and (time, curve)."""
+    t = np.arange(0.0, end, 0.1)
+    slip = np.full(len(t), 0.2)
+    for since, until, value in moments_of:
+        slip[(t >= since) & (t < until)] = value
+    looks = [Moment(now, [s], float(pull_at(min(s, 0.6)))) for now, s in zip(t.tolist(), slip.tolist(), strict=True)]
+    return Observation(looks, curves, 0.0, end, True, t, t, 0.0)
+
+
+def test_the_lead_is_that_of_the_last_warning_that_holds_until_the_end():
+    seen = observation([(10.0, 12.0, 0.65), (40.0, 50.0, 0.65)], [(0.0, CURVE)], 50.0)
+    t, warned = watch(seen)
+    begins = t[1:][warned[1:] & ~warned[:-1]]
+    assert begins == pytest.approx([10.0, 40.0], abs=0.11)
+    found = judged("draft", seen)
+    assert (found.warnings, found.lead) == (2, pytest.approx(10.0, abs=0.11))
+    assert found.way == pytest.approx(found.lead, abs=0.11)
+    over = observation([(10.0, 12.0, 0.65)], [(0.0, CURVE)], 50.0)
+    assert (judged("draft", over).warnings, judged("draft", over).lead) == (1, 0.0)  # it had gone again
+
+
+def test_a_curve_counts_from_the_end_of_its_window_on():
+    for known in (10.0, 13.0):
+        t, warned = watch(observation([(0.0, 30.0, 0.65)], [(known, CURVE)], 30.0))
+        assert t[np.argmax(warned)] == pytest.approx(known + SETTLED, abs=0.051)
+
+
+def test_only_what_the_service_calls_valid_gives_a_curve(monkeypatch):
+    """Where no window may be so uncertain and still be valid, there is no curve, and so no warning by the ground."""
+    monkeypatch.setattr(boggings, "BOGGING", 16.0)
+    settings = CONFIG.estimator.model_copy(update={"max_bearing_std": 1e-6})
+    strict = CONFIG.model_copy(update={"estimator": settings})
+    assert [len(observed(Task(config, "draft", 11)).curves) for config in (CONFIG, strict)] == [6, 0]
+
+
+def test_thresholds_are_tuned_on_other_drives_than_are_reported(monkeypatch):
+    def asked(half):
+        tasks = []
+        each = lambda work, of: tasks.extend(of) or [WarningTrial(t.kind, 1.0, 0, math.nan, math.nan) for t in of]  # noqa: E731
+        warning_trials(CONFIG, 7, 0.05, 1, each, half)
+        return {task.seed for task in tasks}
+
+    tune, report = asked("tune"), asked("report")
+    assert {half_of(seed) for seed in tune} == {"tune"}
+    assert {half_of(seed) for seed in report} == {"report"}
+    assert not tune & report
+    with pytest.raises(ValueError, match="no half of the drives is called both; known: report, tune"):
+        asked("both")
+
+
 # --- simulated drives ---
 
 
-@pytest.mark.parametrize(("kind", "seed"), [("draft", 11), ("softening", 6), ("grade", 2), ("digging", 3)])
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [
+        ("draft", 11),
+        ("softening", 6),
+        ("grade", 2),
+        ("digging", 3),
+        ("uneven_softening", 2),
+        ("uneven_draft", 4),
+    ],
+)
 def test_a_simulated_bogging_is_foreseen(kind, seed):
     found = trial(Task(CONFIG, kind, seed))
     assert found.lead >= 3.0

@@ -9,7 +9,9 @@ from contextlib import redirect_stdout
 import pytest
 
 from soilbus.cli import main
-from soilbus.estimation.paper_tables import RUNS
+from soilbus.estimation.paper import EXACT, SIMPSON, WheelEquations
+from soilbus.estimation.paper_tables import RUNS, SANDY_LOAM, WET_CLAY
+from soilbus.report import paper
 
 
 @pytest.fixture(scope="module")
@@ -87,3 +89,27 @@ def test_wrong_usage_is_one_line(wrong, capsys):
         main(["paper", *wrong])
     assert stop.value.code == 2
     assert capsys.readouterr().err.splitlines()[-1].startswith(f"soilbus paper: error: argument {wrong[0]}: {wrong[1]}")
+
+
+def test_the_verdicts_follow_from_the_figures(output, monkeypatch):
+    """Where the figures are others, so are the verdicts."""
+    said = re.sub(r"\s+", " ", " ".join(section(output, "What holds")))
+    for verdict in (
+        "Convergence holds", "are not the method's", "The accuracy does not hold", "(conclusion 3) does not hold",
+        "fit neither one load nor one sinkage", "Real time holds",
+    ):  # fmt: skip
+        assert verdict in said
+    clay = WheelEquations(WET_CLAY.at(0.05), EXACT).forces(WET_CLAY.truth).T
+    loam = WheelEquations(SANDY_LOAM.at(0.05), EXACT).forces(SANDY_LOAM.truth).T
+    slow = [run._replace(seconds=1e-9) for run in RUNS]
+    for name, value in (
+        ("K_L_bound", lambda *_: 1e-4), ("TORQUE_ON_CLAY", clay), ("TORQUE_ON_LOAM", loam), ("RUNS", slow),
+        ("SOLVED", 0.0), ("EXACT", SIMPSON),
+    ):  # fmt: skip
+        monkeypatch.setattr(paper, name, value)
+    said = " ".join(paper.what_holds(0.05))
+    for verdict in (
+        "Convergence does not hold", "The accuracy holds", "(conclusion 3) holds", "fit one sinkage",
+        "Real time does not hold",
+    ):  # fmt: skip
+        assert verdict in said

@@ -119,7 +119,7 @@ def command_line() -> argparse.ArgumentParser:
     figures(sub, "drives, noise and priors")
 
     sub = command("decisions", "what soilbus foretells, beside what simulated drives then do", "optional")
-    sub.add_argument("--drives", type=counted, default=150, metavar="N", help="on each held soil (default 150)")
+    sub.add_argument("--drives", type=counted, default=150, metavar="N", help="on each soil (default 150)")
     sub.add_argument("--calls", type=counted, default=600, metavar="N", help="of go, caution, no-go (default 600)")
     sub.add_argument("--boggings", type=counted, default=40, metavar="N", help="drives into trouble (default 40)")
     sub.add_argument("--hours", type=between(0.0, 100.0), default=1.0, metavar="H", help="on firm ground (default 1)")

@@ -19,3 +19,10 @@ def test_the_readme_names_every_key_of_a_line():
     table = re.search(r"^\| key \| meaning \|\n.*\n((?:\|.*\n)+)", README.read_text(encoding="utf-8"), re.M)[1]
     named = [key for row in table.splitlines() for key in re.findall(r"`(\w+)`", row.split("|")[1])]
     assert sorted(named) == sorted(json.loads(json_line(NOTHING, reference_configuration())))
+
+
+def test_the_readme_gives_the_drift_of_the_soil_that_is_in_force():
+    (said,) = re.findall(
+        r"`estimator\.soil_drift`, ([\d.]+) in the time of one window", README.read_text(encoding="utf-8")
+    )
+    assert float(said) == reference_configuration().estimator.soil_drift

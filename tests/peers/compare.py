@@ -109,6 +109,13 @@ def verdict(scores: Scores) -> str:
     )
 
 
+def ours_is_ahead(scores: Scores) -> bool:
+    """Whether ours has a value for every window, and is the better one as often as peers that are told the same."""
+    better = Counter(d.better for _, _, _, d in duels(scores))
+    failed = any(score.failure_rate > 0.0 for found in scores.values() for e, score in found.items() if e.name == OURS)
+    return not failed and better["ours"] >= better["peer"]
+
+
 def _times(scores: Scores) -> str:
     """Median time of each method over ours."""
     seconds: dict[str, list[float]] = {}

@@ -14,7 +14,7 @@ from soilbus.terra.soils import SOILS
 
 from . import finite_differences, kalman, learned, linear, multiple_models, newton_raphson, ours
 from .__main__ import main
-from .compare import compared, tables, verdict
+from .compare import compared, ours_is_ahead, tables, verdict
 from .roster import OURS, Entry, roster
 from .scores import Duel, Score, duel, truth
 from .windows import configured_prior, simulated_case, told_about
@@ -206,6 +206,9 @@ def test_a_peer_that_is_better_is_said_to_be():
     assert "a peer in 1 (" in said
     assert "Faster: a peer 1 ms" in said
     assert "nowhere" in verdict({"loam": {mine: good, peer: bad}})
+    failing = Score(LOAM, [*answers_of(*(1.0 + off_by[1:] / 2.0)), None], [0.001] * 12)
+    ahead = [ours_is_ahead({"loam": {mine: m, peer: p}}) for m, p in ((bad, good), (good, bad), (failing, bad))]
+    assert ahead == [False, True, False]
     assert "7.7 / 7.5" in "".join(tables({"loam": {mine: bad}}))
 
 

@@ -35,3 +35,9 @@ def test_easy_and_hard_drives_are_told_apart_with_an_interval():
 def test_interval_of_a_count(count):
     exact = (chi2.ppf(0.025, 2 * count) / 2.0 if count else 0.0, chi2.ppf(0.975, 2 * count + 2) / 2.0)  # Garwood 1936
     assert poisson_interval(count) == pytest.approx(exact, rel=0.02, abs=0.02)
+
+
+def test_the_figures_say_what_they_share_with_the_estimator():
+    said = " ".join(decisions_report([], NO_CALLS, []).split())
+    assert "simulated with the estimator's own wheel-soil model, noise and priors" in said
+    assert "nothing was tuned on" not in said

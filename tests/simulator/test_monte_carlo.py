@@ -125,6 +125,7 @@ def test_a_cell_without_one_good_window_is_said_not_raised():
     cell = summary("loam", 2.0, False, [lost(), lost()])
     assert cell.failed == 2
     text = monte_carlo_report([cell, summary("loam", 2.0, True, made_up(9))])
+    assert "simulated with the estimator's own wheel-soil model, noise and priors" in text
     assert "nan" in text
     assert json.loads(json.dumps(as_json(cell), allow_nan=False))["chi2"] is None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from unittest import mock
 
 import numpy as np
@@ -78,7 +78,7 @@ def by_draws(n: int = RandomSoils.n) -> Iterator[None]:
     """`assess` by plain Monte Carlo; the wheels' tables are kept within the context, so it is of one posterior."""
     tables: dict[tuple[float, ...], WheelTable] = {}
 
-    def table(soils, rig, model, slip, *_, **__):
+    def table(soils: Any, rig: Any, model: Any, slip: np.ndarray, *_: Any, **__: Any) -> WheelTable:
         key = tuple(slip.tolist())
         if key not in tables:
             tables[key] = wheel_table(soils, rig, model, slip)
@@ -100,7 +100,7 @@ def assessed(posterior: Posterior, torque_limit: float, demand: Demand | None) -
     return able
 
 
-def figures(able: Capability) -> dict[str, Moments]:
+def figures(able: Capability) -> dict[str, Any]:
     """Every scalar of a capability by name, an Estimate or Moments."""
     found = {
         "max_draft": able.max_draft,

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 from cantools.database import Database
-from cantools.database.can import Message
+from cantools.database.can import Message, Signal
 from numpy.typing import NDArray
 
 from soilbus.can.checksum import column_checksums
@@ -67,11 +67,11 @@ class Stream:
         return self.with_payload(payload)
 
 
-def places(signal) -> NDArray[np.intp]:
+def places(signal: Signal) -> NDArray[np.intp]:
     """Columns of a signal's bits in unpackbits' order, least significant first."""
     if signal.byte_order == "big_endian":
         last = 8 * (signal.start // 8) + 7 - signal.start % 8 + signal.length - 1
-        return last - np.arange(signal.length)
+        return np.asarray(last - np.arange(signal.length))
     position = signal.start + np.arange(signal.length)
     return np.asarray(8 * (position // 8) + 7 - position % 8)
 
@@ -128,13 +128,17 @@ def cut(message: str) -> Edit:
     return lambda log, t: log.changed(message, lambda s: s.before(t) if (s.t < t).any() else None)
 
 
+def _edited(edit: Callable[[Stream, str], Stream], signal: str) -> Callable[[Stream], Stream]:
+    return lambda stream: edit(stream, signal)
+
+
 def mapped(*paths: str, by: Callable[[Array], Array]) -> Edit:
     """Values (N,) of signals replaced by a function of them."""
 
     def edit(log: Log, t: float) -> Log:
         for path in paths:
             message, signal = split(path)
-            log = log.changed(message, lambda s, n=signal: s.with_values(n, by(s.signal(n)), s.t >= t))
+            log = log.changed(message, _edited(lambda s, n: s.with_values(n, by(s.signal(n)), s.t >= t), signal))
         return log
 
     return edit
@@ -206,7 +210,7 @@ def codes(code: int, *paths: str) -> Edit:
     def edit(log: Log, t: float) -> Log:
         for path in paths:
             message, signal = split(path)
-            log = log.changed(message, lambda s, n=signal: s.with_codes(n, np.full(len(s.t), code), s.t >= t))
+            log = log.changed(message, _edited(lambda s, n: s.with_codes(n, np.full(len(s.t), code), s.t >= t), signal))
         return log
 
     return edit
@@ -232,7 +236,11 @@ class Restamped(Log):
 
     def frames(self) -> list[Frame]:
         """As they come."""
-        return [(t - self.by if i in self.ids and t >= self.since else t, i, *rest) for t, i, *rest in super().frames()]
+
+        def stamped(t: float, i: int, extended: bool, data: bytes) -> Frame:
+            return t - self.by if i in self.ids and t >= self.since else t, i, extended, data
+
+        return [stamped(*frame) for frame in super().frames()]
 
 
 def stamped_early(by: float, *messages: str) -> Edit:

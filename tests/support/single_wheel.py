@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from soilbus.terra.effects.effect import Active, Surroundings, forces_with, wheel_with
-from soilbus.terra.wheel import Soil, WheelModel, sinkage, state_on
+from soilbus.terra.wheel import Soil, WheelModel, WheelState, sinkage, state_on
 
 RADIUS, WIDTH = 0.30, 0.20
 NOISE = {"load": 0.01, "slip": 0.004, "pull": 8.0, "torque": 3.0, "sink": 0.001}
@@ -46,7 +46,7 @@ def sweep(
     for W, s in zip(load, slip, strict=True):
         around = Surroundings(0.0, 0.0, W, 1.0 - s, 1.0 / RADIUS, False, 0.0, 0.0, 0.0, 1.0)
 
-        def state(angle, s=s):
+        def state(angle: float, s: float = s) -> WheelState:
             return state_on(soil, np.array([angle]), np.array([s]), RADIUS, WIDTH)
 
         angle = brentq(

@@ -17,7 +17,7 @@ def wheel(soil: Soil, load: float, slip: float, radius: float, width: float) -> 
     """(load, pull, torque, entry angle) of one wheel that carries a load."""
 
     def excess(angle: float) -> float:
-        return wheel_forces(state_on(soil, angle, slip, radius, width), MODEL)[0] - load
+        return float(wheel_forces(state_on(soil, angle, slip, radius, width), MODEL)[0] - load)
 
     angle = brentq(excess, 1e-4, 1.39, xtol=1e-10)
     return np.append(wheel_forces(state_on(soil, angle, slip, radius, width), MODEL), angle)
@@ -35,7 +35,10 @@ def brute(soil: Soil, slip: float, draft: float | None = None, sine: float | Non
     """Pull at which draft, slope and wheels balance, and forces of the axles; the duty that is None takes the rest."""
 
     def split(pull: float) -> tuple[float, float]:
-        return (pull - WEIGHT * sine, sine) if draft is None else (draft, (pull - draft) / WEIGHT)
+        if draft is not None:
+            return draft, (pull - draft) / WEIGHT
+        assert sine is not None
+        return pull - WEIGHT * sine, sine
 
     least = (draft or 0.0) - 0.75 * WEIGHT
     pull = brentq(lambda p: 2.0 * axles(soil, slip, *split(p))[1].sum() - p, least, 0.6 * WEIGHT, xtol=1e-3)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from soilbus.terra.effects.effect import Surroundings
@@ -37,7 +39,7 @@ def wheels_around(
     return state, around
 
 
-def one_wheel(around: Surroundings, **changes: object) -> Surroundings:
+def one_wheel(around: Surroundings, **changes: Any) -> Surroundings:
     """The surroundings of a single wheel at one instant."""
     alone = around._replace(
         t=0.0, distance=0.0, load=5e3, ground_speed=1.0, wheel_speed=2.0, rear=False, draft=2e3, acceleration=0.0

@@ -17,6 +17,8 @@ soils that the windows and what was known allow, by the information that a windo
 the estimate that has the least on average over them attains here; and ours over that.  Where the first is
 above {most}, none can be within the target on all of them.  samples: median number of effective ones.
 """
+SHARED = """Windows are simulated with the estimator's own wheel-soil model, noise and priors: the figures show how much
+of what such a window holds the estimate gets out, and that its intervals are right if the model is."""
 _TOLD = "{:.2f}+-{:.2f} {:.2f} {:.2f}+-{:.2f}"
 
 
@@ -36,7 +38,7 @@ def monte_carlo_report(cells: Sequence[Cell]) -> str:
     """One line a cell: RMS error over the bound and coverage of each quantity, with marks where targets are missed."""
     names = list(dict.fromkeys(name for cell in cells for name in cell.quantities))
     head = ("soil", "window", "sinkage", *names, "chi2", "failed", "open", "fit")
-    text = table(head, [_row(cell, names) for cell in cells]) + "\n" + "\n".join(_notes(cells)) + "\n"
+    text = "\n".join([table(head, [_row(cell, names) for cell in cells]), *_notes(cells), SHARED]) + "\n"
     exact = [(cell, cell.exact) for cell in cells if cell.exact is not None]
     if not exact:
         return text

@@ -11,22 +11,24 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.capability.assessment import OverSlip, assess
+from soilbus.assembly import rig_of
+from soilbus.capability.assessment import OverSlip
 from soilbus.capability.immobilisation import Alert, Moment, Watch, moments, watched
 from soilbus.config import Config
-from soilbus.estimation.tracked import Ground, Settings
-from soilbus.estimation.tracker import Tracker
-from soilbus.estimation.window import BinStore, Rig
+from soilbus.daemon.estimator import WindowEstimator
+from soilbus.estimation.window import BinStore
 from soilbus.simulator.boggings import KINDS, Trouble, bogging
 from soilbus.simulator.drive import drive
 from soilbus.simulator.firm_drives import EASY, FIRM_DRIVE, FIRM_KINDS, HARD, firm_ground
 from soilbus.simulator.monte_carlo import Each
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Swing
+from soilbus.simulator.windows import task_of
+from soilbus.traversability import Status
 
 Array = NDArray[np.float64]
 
+HALVES = ("report", "tune")
 LOOK = 0.1
 """Time [s] between two looks, as in the service."""
 ENOUGH_TIME, ENOUGH_WAY = 3.0, 3.0
@@ -185,47 +187,42 @@ def watch(seen: Observation) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def _looks(recording: Recording, config: Config, end: float) -> tuple[list[Moment], list[tuple[float, OverSlip]]]:
-    """The moments until the end [s], and the curves from their times on."""
+    """The moments until the end [s], and from their times on the curves of windows that the service calls valid."""
     rig, settings = rig_of(config), config.estimator
-    tracker = Tracker(
-        rig, prior_of(config), model_of(config),
-        Settings(settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift),
-    )  # fmt: skip
+    estimator, no_limit = WindowEstimator(config), np.full(len(rig.radius), np.nan)
     store = BinStore(rig, LOOK, 0.0)
     store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
     curves = []
     for due in np.arange(settings.window, end, settings.hop).tolist():
-        curve = _curve(tracker, store, due, config, rig)
-        if curve is not None:
-            curves.append((due, curve))
+        window = store.window(due - settings.window, due)
+        result = estimator.solve_unwatched(task_of(window, due, config, no_limit, fresh=due == settings.window))
+        able = result.traversability.capability
+        if able is not None and result.status is Status.VALID:
+            curves.append((due, able.over_slip))
     return list(moments(store.window(0.0, end), rig, 0.0, settings.min_speed)), curves
 
 
-def _curve(tracker: Tracker, store: BinStore, end: float, config: Config, rig: Rig) -> OverSlip | None:
-    """Pull over slip of one window, None where the service would not call it valid."""
-    tracked = tracker.estimate(store.window(end - config.estimator.window, end), end)
-    fit = tracked.fit
-    if fit is None or tracked.mismatch or not fit.converged or tracked.ground is Ground.CHANGING:
-        return None
-    way = config.traversability
-    limit = np.full(len(rig.radius), np.nan)
-    able, _ = assess(fit.posterior, rig, model_of(config), None, limit, way.max_slip, way.max_sinkage)
-    return None if able is None else able.over_slip
+def half_of(seed: int) -> str:
+    """The half of all drives that one with this seed is in: thresholds may be set by "tune" drives alone."""
+    return "tune" if seed % 2 else "report"
 
 
 def warning_trials(
-    config: Config, boggings: int, hours: float, seed: int, each: Each = map
+    config: Config, boggings: int, hours: float, seed: int, each: Each = map, half: str = "report"
 ) -> tuple[WarningFigures, ...]:
     """Figures of so many boggings, evenly of all kinds, and of so many hours without one, half of them hard.
 
-    The same seed gives the same drives.  Raises SimulationError where the vehicle cannot be driven.
+    All drives are of one half (half_of).  The same seed gives the same drives.  Raises SimulationError where the
+    vehicle cannot be driven, ValueError for another half.
     """
+    if half not in HALVES:
+        raise ValueError(f"no half of the drives is called {half}; known: {', '.join(HALVES)}")
     firm = math.ceil(3600.0 * hours / (FIRM_DRIVE - config.estimator.window))
     kinds = [KINDS[i % len(KINDS)] for i in range(boggings)] + [
         HARD[i // 2 % len(HARD)] if i % 2 else EASY for i in range(firm)
     ]
     key = np.random.SeedSequence([seed, zlib.crc32(b"warnings")])
-    seeds = key.generate_state(len(kinds)).tolist()
+    seeds = [int(s) // 2 * 2 + HALVES.index(half) for s in key.generate_state(len(kinds))]
     trials = list(each(trial, [Task(config, kind, s) for kind, s in zip(kinds, seeds, strict=True)]))
     return tuple(
         figures(kind, found)

@@ -1,8 +1,8 @@
 """Simulated drives: the largest draft foretold from one window, beside the one that the soil truly holds.
 
-Each drive has a soil of its own about one that nothing was tuned on, works at moderate
-slips, and is estimated from one window alone, cold.  The truth is solved by the
-simulator's own equilibrium, slip by slip.
+Each drive has a soil of its own about one of a few, works at moderate slips, and is
+estimated from one window alone, cold.  The truth is solved by the simulator's own
+equilibrium, slip by slip.
 """
 
 from __future__ import annotations

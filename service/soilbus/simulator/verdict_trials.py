@@ -2,12 +2,13 @@
 
 Each drive has a soil of its own about one of the table's, harder and softer, works at
 slips and a draft of its own, and ends in one call: a probability and a state from one
-window, cold.  The truth is solved by the simulator's own equilibrium for the demand that
-the sensors saw with noise.  Torque and sinkage limits are drawn too, so that every cause
-comes to its turn.  Most demands are far from the limit, where any call is easy; so three
-drives in four ask for a margin that is drawn from the estimate to make all probabilities
-alike frequent.  It depends on the measurements alone: whoever knows them and no more must
-still find calls of p come true with frequency p.
+window, cold, by the service's own estimator: what it does not call valid is never called
+go.  The truth is solved by the simulator's own equilibrium for the demand that the sensors
+saw with noise.  Torque and sinkage limits are drawn too, so that every cause comes to its
+turn.  Most demands are far from the limit, where any call is easy; so three drives in four
+ask for a margin that is drawn from the estimate to make all probabilities alike frequent.
+It depends on the measurements alone: whoever knows them and no more must still find calls
+of p come true with frequency p.
 """
 
 from __future__ import annotations
@@ -22,14 +23,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.assembly import prior_of, rig_of
 from soilbus.capability.assessment import Demand
 from soilbus.capability.demand import present_demand
-from soilbus.config import Config
+from soilbus.config import Config, Prior
 from soilbus.config import Traversability as Settings
-from soilbus.estimation.marginal import cold_fit
-from soilbus.estimation.readings import gain_names
-from soilbus.estimation.residuals import WindowProblem
+from soilbus.daemon.estimator import WindowEstimator
+from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.window import BinStore, Rig, Window
 from soilbus.judgement import judge
 from soilbus.simulator.draft_trials import true_largest_draft
@@ -37,9 +37,10 @@ from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.monte_carlo import MAX_PHI, NORMAL_95, Each, missed
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.simulator.windows import task_of
 from soilbus.terra.soils import KINDS, soil_named
 from soilbus.terra.wheel import Soil, WheelModel
-from soilbus.traversability import State, Status, Traversability
+from soilbus.traversability import State, Traversability
 
 Array = NDArray[np.float64]
 
@@ -135,18 +136,16 @@ def trial(task: Task) -> Call:
     ground, recording = _driven(config, seed, rng)
     settings = config.traversability.model_copy(update={"max_sinkage": ground.max_sinkage})
     measured, exact = (_window(recording, config, rig, of_truth) for of_truth in (False, True))
-    prior = missed(prior_of(config), ground.soil, np.random.default_rng([seed, 1]))
-    fit = cold_fit(WindowProblem(measured, rig, model_of(config), config.estimator.min_speed), prior)
+    told = _told(config, missed(prior_of(config), ground.soil, np.random.default_rng([seed, 1])))
+    task_of_window = task_of(measured, config.estimator.window, told, ground.torque_limit, fresh=True)
+    estimate = WindowEstimator(told).estimate(task_of_window)
+    posterior, status, demand = estimate.result.posterior, estimate.result.status, estimate.demand
     asked = present_demand(exact, rig.chassis, config.estimator.hop)
-    if fit is None or not fit.converged or asked is None:
-        return Call(ground.name, math.nan, State.UNKNOWN, None, False)
-    gain = fit.whole.gain(gain_names(rig).index("draft"))
-    demand = present_demand(measured, rig.chassis, config.estimator.hop, gain)
-    if demand is None:
+    if posterior is None or asked is None or demand is None:
         return Call(ground.name, math.nan, State.UNKNOWN, None, False)
 
     def judged(by: Settings) -> Traversability:
-        return judge(fit.whole.posterior, Status.VALID, demand, rig, model_of(config), ground.torque_limit, by)[0]
+        return judge(posterior, status, demand, rig, estimate.model, ground.torque_limit, by)[0]
 
     way = judged(settings)
     if rng.random() < NEAR and (margin := _margin(way, demand, rng)) is not None:
@@ -154,6 +153,14 @@ def trial(task: Task) -> Call:
         way = judged(settings)
     probability = math.nan if way.probability is None else way.probability
     return Call(ground.name, probability, way.state, way.limit, _can(config, ground, settings, asked.pull))
+
+
+def _told(config: Config, prior: SoilPrior) -> Config:
+    """The configuration with another prior of the soil."""
+    std = prior.median * np.sqrt(np.expm1(prior.log_std**2))
+    pairs = zip(PARAMETERS, prior.median.tolist(), std.tolist(), strict=True)
+    soil = config.soil.model_copy(update={name: Prior(value=value, std=s) for name, value, s in pairs})
+    return config.model_copy(update={"soil": soil})
 
 
 def _margin(way: Traversability, demand: Demand, rng: np.random.Generator) -> float | None:

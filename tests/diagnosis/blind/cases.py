@@ -18,7 +18,7 @@ from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import Soil, WheelModel, sinkage, state_on
 
-from . import contact_forms, further_forms, outside, soil_forms, vehicle_forms
+from . import contact_forms, far_forms, further_forms, outside, soil_forms, vehicle_forms
 from .form import SIZES, Form, Hidden, Setting, together
 
 KINDS = ("single", "pair", "outside", "plain", "hard")
@@ -29,7 +29,8 @@ SOILS = (
 )  # fmt: skip
 DURATION = 120.0
 EARLIER = (*soil_forms.FORMS, *contact_forms.FORMS, *vehicle_forms.FORMS)
-FORMS = (*EARLIER, *further_forms.FORMS)
+PAIRED = (*EARLIER, *further_forms.FORMS)
+FORMS = (*PAIRED, *far_forms.FORMS)
 PAIRS, FURTHER_PAIRS, NULLS = 24, 8, 24
 """Cases of these kinds for each seed: pairs of earlier forms, pairs with a further one, nulls."""
 _ALIKE = ({"grade", "draft_offset"}, {"draft_offset", "draft_gain"})
@@ -42,7 +43,7 @@ class Case:
     """One recording to be diagnosed.
 
     hidden: names of the catalogue's effects in it, none for nulls and for what the catalogue
-    lacks; forms: titles of the formulas used; imitable: only for the latter.  `config` is all
+    lacks; forms: titles of the formulas used; imitable: only for the latter; far: all formulas are.  `config` is all
     that the diagnosis is given beside `recording.channels`; `soil` is the truth, at the
     middle of the way where it changes.
     """
@@ -53,24 +54,45 @@ class Case:
     forms: tuple[str, ...]
     size: str
     imitable: bool
+    far: bool
     soil_name: str
     soil: Soil
     with_sinkage: bool
     config: Config
     scenario: Scenario
     seed: int
-    how: Hidden
+    parts: tuple[Hidden, ...]
+
+    @property
+    def how(self) -> Hidden:
+        """All that is hidden, at once."""
+        return together(self.parts)
 
     @property
     def half(self) -> str:
-        """ "tune" or "report": a case stays on its side for ever."""
-        return "tune" if zlib.crc32(self.id.encode()) % 2 else "report"
+        """ "tune" or "report", which share no formula; "mixed" for pairs of both.  A null goes by its id."""
+        if not self.forms:
+            return "tune" if zlib.crc32(self.id.encode()) % 2 else "report"
+        halves = {half_of(title) for title in self.forms}
+        return halves.pop() if len(halves) == 1 else "mixed"
 
     @cached_property
     def recording(self) -> Recording:
         """The drive, simulated when first asked for; SimulationError if it cannot be driven."""
         driven = simulate(self.how.tractor(self.config), self.how.way(self.scenario), self.seed, self.how.effects)
         return self.how.after(driven)
+
+
+@cache
+def _order(title: str) -> int:
+    alike = [form.title for form in (*FORMS, *outside.FORMS) if form.title.startswith(title.partition(":")[0] + ":")]
+    return alike.index(title)
+
+
+def half_of(title: str) -> str:
+    """ "tune" or "report" by turns among the formulas of an effect: one stays on its side for ever."""
+    first = zlib.crc32(title.partition(":")[0].encode())
+    return "tune" if (first + _order(title)) % 2 else "report"
 
 
 def cases(kind: str, seed: int) -> Iterator[Case]:
@@ -90,7 +112,7 @@ def cases(kind: str, seed: int) -> Iterator[Case]:
 
 def _pairs(seed: int) -> Iterator[tuple[tuple[Form, ...], str]]:
     rng = np.random.default_rng([seed, 2])
-    for count, forms, further in ((PAIRS, EARLIER, False), (FURTHER_PAIRS, FORMS, True)):
+    for count, forms, further in ((PAIRS, EARLIER, False), (FURTHER_PAIRS, PAIRED, True)):
         found = 0
         while found < count:
             one, other = (forms[i] for i in rng.choice(len(forms), 2, replace=False))
@@ -108,7 +130,7 @@ def _case(kind: str, seed: int, number: int, forms: tuple[Form, ...], size: str)
     soil, with_sinkage = soil_named(name), bool(rng.integers(2)) or any(form.by_sinkage for form in forms)
     config = _told(kind, soil, with_sinkage, rng)
     setting = Setting(soil, _plain_sinkage(soil), rng)
-    how = together([form.hide(form.size(size, with_sinkage), setting) for form in forms])
+    parts = tuple(form.hide(form.size(size, with_sinkage), setting) for form in forms)
     sensors = "sinkage" if with_sinkage else "bare"
     return Case(
         id="/".join(part for part in (kind, "+".join(titles), size, name, sensors, f"{seed}.{number}") if part),
@@ -117,13 +139,14 @@ def _case(kind: str, seed: int, number: int, forms: tuple[Form, ...], size: str)
         forms=titles,
         size=size,
         imitable=any(form.imitable for form in forms),
+        far=bool(forms) and all(form.far for form in forms),
         soil_name=name,
         soil=soil,
         with_sinkage=with_sinkage,
-        config=how.told(config),
+        config=together(parts).told(config),
         scenario=_scenario(kind, name, rng),
         seed=int(rng.integers(2**31)),
-        how=how,
+        parts=parts,
     )
 
 

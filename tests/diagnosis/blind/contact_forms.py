@@ -177,6 +177,7 @@ FORMS = (
         (0.06, 0.06),
         0.12,
         by_hooks(forces=_flanks),
+        far=True,
     ),
     Form(
         "lugs", "tips", "shear radius at the tip: Ding et al. 2011", "m", (0.014, 0.015), 0.06, by_hooks(forces=_tips)
@@ -247,6 +248,7 @@ FORMS = (
         (0.001, 0.02),
         0.05,
         _round_tyre(lambda load, k: k * (load / 6000.0) ** 0.65),
+        far=True,
     ),
     Form("exponential_shear", "range", "Janosi & Hanamoto 1961; slips to", "1", (0.15, 0.18), 0.4, _shear, other=False),
 )

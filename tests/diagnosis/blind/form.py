@@ -66,6 +66,7 @@ class Form:
     effect: its name in the catalogue, "" where it is not in there.  small: the size, in
     `unit`, that is barely visible with a sinkage sensor and without; large: as great as it
     gets.  other: no parameters make the catalogue's formula this one.
+    far: no parameters make the catalogue's formula nine tenths of this one.
     by_sinkage: nothing but a sinkage sensor shows it.  imitable: an effect outside the
     catalogue, more than a fifth of which one inside does to the same readings.
     """
@@ -80,6 +81,7 @@ class Form:
     other: bool = True
     by_sinkage: bool = False
     imitable: bool = False
+    far: bool = False
 
     def size(self, name: str, with_sinkage: bool) -> float:
         """One of SIZES in `unit`; the medium one lies as many times above the small as below the large one."""

@@ -200,6 +200,7 @@ FORMS = (
         (0.012, 0.02),
         0.25,
         by_hooks(wheel=_penetration),
+        far=True,
     ),
     Form("hardpan", "sharp", "bed of springs", "1", (0.8, 0.9), 8.0, by_hooks(forces=_sharp)),
     Form("hardpan", "graded", "denser with depth", "1", (0.3, 0.33), 2.0, by_hooks(forces=_graded)),

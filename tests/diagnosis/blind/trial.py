@@ -10,16 +10,15 @@ from typing import Any
 import numpy as np
 
 from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.diagnosis.completion import Completion, complete
-from soilbus.diagnosis.diagnose import Diagnosis, diagnose
+from soilbus.diagnosis.diagnose import NotFitted, diagnose
 from soilbus.diagnosis.records import Record, record_of
-from soilbus.diagnosis.score import further_scores, scores
-from soilbus.estimation.posterior import Estimate, Posterior, SoilPrior
+from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.window import BinStore
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Effect
 
 from .cases import Case
+from .visible import Shown, shown
 
 
 @dataclass(frozen=True)
@@ -27,8 +26,9 @@ class Trial:
     """A case's truth beside the diagnosis.
 
     named: names added, the one that explains most first; sets: for each of them all names
-    with probabilities.  visible: by how much the true effect lowers the penalised cost, of
-    two effects the less visible one beside the other (nan for what the catalogue lacks).
+    with probabilities.  visible: what the recording shows of the effect, of two effects of
+    the less visible one beside the other, and true_gap what it leaves unexplained, by the generator
+    alone (visible.py; 0 and 1 where nothing is hidden).  A diagnosis that fails has the verdict FAILED and no names.
     bearing_*: relative errors of the bearing pressure; bearing_sd the told relative deviation in the end.
     """
 
@@ -42,7 +42,9 @@ class Trial:
     named: tuple[str, ...]
     sets: tuple[dict[str, float], ...]
     falls: tuple[dict[str, float], ...]
+    far: bool
     visible: float
+    true_gap: float
     gap_before: float
     gap_after: float
     rows: int
@@ -67,13 +69,29 @@ def record_of_case(case: Case) -> Record:
     return record_of(case.id, store.window(0.0, end), rig, model_of(config), settings.min_speed, settings.max_turn)
 
 
-def tried(case: Case) -> Trial:
+def tried(case: Case, candidates: Sequence[Effect] = tuple(CATALOGUE.values())) -> Trial:
     """The case diagnosed; SimulationError if it cannot be driven."""
-    record, prior = record_of_case(case), prior_of(case.config)
+    record, prior, truth = record_of_case(case), prior_of(case.config), shown(case) if case.parts else NOTHING
     begin = time.process_time()
-    found = diagnose([record], prior, list(CATALOGUE.values()))
-    seconds = time.process_time() - begin
-    before, after = (_bearing(case, soil) for soil in (found.soil_before(0), found.soil_after(0)))
+    told: dict[str, Any] = FAILED
+    try:
+        found = diagnose([record], prior, list(candidates))
+    except (NotFitted, np.linalg.LinAlgError):
+        pass
+    else:
+        before, after = (_bearing(case, soil) for soil in (found.soil_before(0), found.soil_after(0)))
+        told = {
+            "verdict": str(found.verdict),
+            "named": tuple(a.effect.name for a in found.additions),
+            "sets": tuple({a.effect.name: a.probability} | a.alternatives for a in found.additions),
+            "falls": tuple(a.falls for a in found.additions),
+            "gap_before": found.gap_before.value,
+            "gap_after": found.gap_after.value,
+            "rows": found.gap_after.rows,
+            "bearing_before": _bearing_error(case, before),
+            "bearing_after": _bearing_error(case, after),
+            "bearing_sd": after.std / after.value,
+        }
     return Trial(
         id=case.id,
         kind=case.kind,
@@ -81,54 +99,19 @@ def tried(case: Case) -> Trial:
         hidden=case.hidden,
         size=case.size,
         imitable=case.imitable,
-        verdict=str(found.verdict),
-        named=tuple(a.effect.name for a in found.additions),
-        sets=tuple({a.effect.name: a.probability} | a.alternatives for a in found.additions),
-        falls=tuple(a.falls for a in found.additions),
-        visible=_visible(case, record, found),
-        gap_before=found.gap_before.value,
-        gap_after=found.gap_after.value,
-        rows=found.gap_after.rows,
-        bearing_before=_bearing_error(case, before),
-        bearing_after=_bearing_error(case, after),
-        bearing_sd=after.std / after.value,
-        seconds=seconds,
+        far=case.far,
+        visible=truth.energy,
+        true_gap=truth.gap,
+        seconds=time.process_time() - begin,
+        **told,
     )
 
 
-def _visible(case: Case, record: Record, found: Diagnosis) -> float:
-    """Fall of -2 log posterior, learned and held-out blocks, when the true effect is added to the present model.
-
-    Of two effects the smaller fall: that of each one beside the other.
-    """
-    if not case.hidden:
-        return float("nan")
-    prior = prior_of(case.config)
-    without = {name: _with([*case.hidden], name, record, prior, found) for name in case.hidden}
-    whole = min((_added(CATALOGUE[name], record, prior, without[name]) for name in case.hidden), key=_cost)
-    if set(found.completed.names) == set(case.hidden):
-        whole = min(whole, found.completed, key=_cost)
-    return min(map(_cost, without.values())) - _cost(whole)
-
-
-def _with(hidden: Sequence[str], left_out: str, record: Record, prior: SoilPrior, found: Diagnosis) -> Completion:
-    """The present model with all the true effects but one."""
-    present = found.base
-    for name in hidden:
-        if name != left_out:
-            present = _added(CATALOGUE[name], record, prior, present)
-    return present
-
-
-def _added(effect: Effect, record: Record, prior: SoilPrior, present: Completion) -> Completion:
-    """The model with one effect more, from every start; itself where that fits worse."""
-    scored = [*scores([record], prior, present, [effect]), *further_scores([record], prior, present, [effect])]
-    tries = [complete([record], prior, (*present.effects, effect), score.starts) for score in scored]
-    return min((more for more in (present, *tries) if more is not None), key=_cost)
-
-
-def _cost(completion: Completion) -> float:
-    return completion.cost + sum(check.at.chi2 for check in completion.checks)
+NOTHING = Shown(0.0, 1.0)
+FAILED = {
+    "verdict": "failed", "named": (), "sets": (), "falls": (), "gap_before": np.inf, "gap_after": np.inf, "rows": 1,
+    "bearing_before": np.inf, "bearing_after": np.inf, "bearing_sd": np.inf,
+}  # fmt: skip
 
 
 def _bearing(case: Case, soil: Posterior) -> Estimate:
