@@ -142,7 +142,7 @@ def _said(command: str, config: Path, log: Path, folder: Path) -> Output:
     out = folder / "said.json"
     with redirect_stdout(StringIO()):
         code = main([command, "--config", str(config), str(log), "--json", str(out)])
-    if code:
+    if not out.exists():  # a replay without a window of use ends with 1, and writes all the same
         raise RuntimeError(f"soilbus {command} {log} ended with {code}")
     text = out.read_text()
     found = [json.loads(line) for line in text.splitlines()] if command == "replay" else [json.loads(text)]
