@@ -56,8 +56,9 @@ PERIODS = {
     "DrawbarPin": 0.02, "GroundBasedSpeedAndDistance": 0.04, "Attitude": 0.02, "RideHeight": 0.02,
 }  # fmt: skip
 """Seconds between two frames of a message."""
-_CARRIES = {"torque": "Mcu", "speed": "WheelSpeeds", "load": "AxleLoads", "draft": "DrawbarPin", "pitch": "Attitude"} | {
-    "ground_speed": "GroundBasedSpeedAndDistance", "acceleration": "Attitude", "sinkage": "RideHeight"
+_CARRIES = {
+    "torque": "Mcu", "speed": "WheelSpeeds", "load": "AxleLoads", "draft": "DrawbarPin", "pitch": "Attitude",
+    "ground_speed": "GroundBasedSpeedAndDistance", "acceleration": "Attitude", "sinkage": "RideHeight",
 }  # fmt: skip
 _NOISE = {  # absolute, relative, of the mean; sd of the fixed gain error
     "torque": (0.0, 0.0, 0.01, 0.005), "load": (0.0, 0.01, 0.0, 0.005), "speed": (0.0, 0.002, 0.0, 0.0015),
@@ -123,7 +124,8 @@ def drive(
     periods: Mapping[str, float] | None = None,
     with_sinkage: bool = False,
 ) -> Recording:
-    """Drive with a draft that wanders and jerks, over a rough field (`shake` 0: a smooth one).
+    """Drive with a draft that wanders and jerks, over a rough field (`shake` 0: a smooth one; 1: loads shake by
+    3 % (sd), 4: by 13 %).
 
     delays and lags [s] by quantity ("torque", "load", ...): a sample with the stamp t reads what was at t - delay,
     behind a first-order lag.  periods [s] by message in place of PERIODS.
@@ -191,7 +193,7 @@ def _truth(rng: np.random.Generator, ground: Ground, duration: float, shake: flo
     rim = 1.6 + 0.35 * _wander(rng, t, 0.02, 0.12)
     spread = 1.0 + 0.012 * np.stack([_wander(rng, t, 0.05, 0.4) for _ in WHEELS])
     omega = np.clip(rim, 0.8, 2.6) * spread / RADIUS[:, None]
-    rough = shake * 0.04 * weight * np.stack([rng.standard_normal(len(t)) for _ in _MODES])
+    rough = shake * 0.01 * weight * np.stack([rng.standard_normal(len(t)) for _ in _MODES])
     load, speed, acceleration = _integrated(ground, draft, slope, omega, rough)
     slip = 1.0 - speed / (RADIUS[:, None] * omega)
     columns = {"t": t, "ground_speed": speed, "acceleration": acceleration, "draft": draft, "pitch": slope}
@@ -271,7 +273,10 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
 
 
 def _contact(ground: Ground, r: float, b: float, entry: Array, slip: Array) -> tuple[Array, Array, Array]:
-    """Load [N], drawbar pull [N], torque [N m] of wheels (N,) at entry angles [rad] and slips; greatest stress half way."""
+    """Load [N], drawbar pull [N], torque [N m] of wheels (N,) at entry angles [rad] and slips.
+
+    The greatest stress is half way; behind it the front's stresses come back mirrored.
+    """
     stiffness = (ground.k_c / b + ground.k_phi) * r**ground.n
     load, pull, torque = (np.zeros(len(entry)) for _ in range(3))
     for node, weight in zip(_NODES.tolist(), _WEIGHTS.tolist(), strict=True):
