@@ -24,6 +24,7 @@ from soilbus.config import Config
 from soilbus.daemon.plausibility import Plausibility
 from soilbus.daemon.positions import PositionTrack
 from soilbus.estimation.plausibility import without
+from soilbus.estimation.resolution import resolved_window
 from soilbus.estimation.screening import WILD
 from soilbus.estimation.window import (
     VEHICLE_QUANTITIES,
@@ -211,13 +212,14 @@ class Intake:
     def taken_whole(self) -> Window | None:
         """All that was ingested since the clock was last set, as one window; what comes later begins anew.
 
-        None where there is no sample; the bin that has just begun is left out.
+        Its bins are as short as the recording's spectrum asks for (see `resolution`); the one
+        that has just begun is left out.  None where there is no sample.
         """
         bins, end = self._bins, max(self.last_seen.values(), default=-math.inf)
         window = None
         if bins is not None and end - bins.origin >= bins.bin_length:
             end = bins.origin + math.floor((end - bins.origin) / bins.bin_length) * bins.bin_length
-            window = forward(bins.window(bins.origin, end))
+            window = forward(resolved_window(bins, end))
             self.refusals.note(WILD, bins.new_wild())
         self._restart()
         return window

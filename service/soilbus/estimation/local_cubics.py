@@ -1,0 +1,118 @@
+"""A series of samples as a smooth curve, as smooth as its own spectrum and noise allow.
+
+    y_j = x(t_j) + e_j,  var e_j known;  x(t) by local cubics through 2 m + 1 samples
+
+Savitzky & Golay (Anal. Chem. 36:1627, 1964); m is the one of least estimated risk, Mallows' C_p
+(Technometrics 15:661, 1973): mean of (y - x)^2 / var + 2 w0, where w0 is the weight that a sample has in its own
+smoothed value.  A channel that wanders slowly is averaged over many samples, one that shakes over few.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+HALF_WIDTHS = (2, 3, 4, 6, 9, 13, 19, 28)
+"""Samples on each side that are tried; two are the fewest that leave a cubic anything to average."""
+GAP = 1.5
+"""Median steps from which two samples belong to different stretches."""
+
+
+class Curve(NamedTuple):
+    """Values and slopes [1/s] at times t [s] ascending (K,), cubics between them.
+
+    step [s] is the median one and half_width the samples on each side through which each cubic was laid (0: none).
+    """
+
+    t: Array
+    value: Array
+    slope: Array
+    step: float
+    half_width: int
+
+    def at(self, t: Array) -> tuple[Array, Array, Array]:
+        """Value, slope and second derivative at times (N,) [s]; straight on beyond the ends, nan of no curve."""
+        if len(self.t) < 2:
+            nothing = np.zeros(len(t))
+            return np.full(len(t), self.value[0] if len(self.t) else np.nan), nothing, nothing
+        inside = np.clip(t, self.t[0], self.t[-1])
+        i = np.clip(np.searchsorted(self.t, inside, side="right") - 1, 0, len(self.t) - 2)
+        h = self.t[i + 1] - self.t[i]
+        u = (inside - self.t[i]) / h
+        rise = (self.value[i + 1] - self.value[i]) / h
+        left, right = self.slope[i], self.slope[i + 1]
+        square, cube = 3.0 * rise - 2.0 * left - right, left + right - 2.0 * rise
+        slope = left + u * (2.0 * square + 3.0 * u * cube)
+        value = self.value[i] + h * u * (left + u * (square + u * cube)) + slope * (t - inside)
+        second = np.where(t == inside, (2.0 * square + 6.0 * u * cube) / h, 0.0)
+        return value, slope, second
+
+    def spread(self, powers: Array) -> Array:
+        """x' C x (N,) of powers x = 1, s, s^2, s^3 (N, 4), s in steps from a sample; C: covariance of a cubic there.
+
+        In variances of a sample, of a curve that has a half_width.
+        """
+        return np.asarray(np.einsum("ni,ij,nj->n", powers, _cubics(self.half_width).covariance, powers))
+
+
+def curve_of(t: Array, value: Array, variance: Array) -> Curve:
+    """The curve of samples at times t [s], ascending, with these variances, all (K,)."""
+    steps = np.diff(t)
+    step = float(np.median(steps)) if len(steps) else 0.0
+    runs = np.split(np.arange(len(t)), np.flatnonzero(steps > GAP * step) + 1)
+    plain = np.gradient(value, t) if len(t) > 1 and bool((steps > 0.0).all()) else np.zeros(len(t))
+    best, least = Curve(t, value, plain, step, 0), 2.0  # of no smoothing w0 = 1
+    for half in HALF_WIDTHS:
+        long_enough = [run for run in runs if len(run) > 2 * half]
+        if 2 * sum(map(len, long_enough)) < len(t):
+            break
+        smooth, slope = value.copy(), plain.copy()
+        for run in long_enough:
+            smooth[run], of_step = _through(value[run], half)
+            slope[run] = of_step / step
+        weighed = (value - smooth) ** 2 / np.where(variance > 0.0, variance, np.inf)
+        risk = float(weighed.mean()) + 2.0 * float(_cubics(half).covariance[0, 0])
+        if risk < least:
+            best, least = Curve(t, smooth, slope, step, half), risk
+    return best
+
+
+def powers(steps: Array) -> Array:
+    """1, s, s^2, s^3 (N, 4) of s (N,)."""
+    return np.asarray(steps[:, None] ** np.arange(4.0))
+
+
+class _Cubics(NamedTuple):
+    """Weights of values and slopes at each of M places of equal steps (M, M), covariance (4, 4) at the middle one."""
+
+    value: Array
+    slope: Array
+    covariance: Array
+
+
+@cache
+def _cubics(half: int) -> _Cubics:
+    places = np.arange(-half, half + 1.0)
+    basis = powers(places)
+    fit = np.linalg.pinv(basis)
+    by_step = np.zeros((len(places), 4))
+    by_step[:, 1:] = basis[:, :3] * np.arange(1.0, 4.0)
+    return _Cubics(basis @ fit, by_step @ fit, fit @ fit.T)
+
+
+def _through(values: Array, half: int) -> tuple[Array, Array]:
+    """Smoothed values and their slopes by step (K,), K > 2 half."""
+    weights = _cubics(half)
+    out = []
+    for of_place in (weights.value, weights.slope):
+        smooth = np.empty(len(values))
+        smooth[half : len(values) - half] = np.convolve(values, of_place[half][::-1], "valid")
+        smooth[:half] = of_place[:half] @ values[: 2 * half + 1]
+        smooth[len(values) - half :] = of_place[half + 1 :] @ values[-2 * half - 1 :]
+        out.append(smooth)
+    return out[0], out[1]
