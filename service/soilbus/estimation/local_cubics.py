@@ -24,7 +24,7 @@ GAP = 1.5
 
 
 class Curve(NamedTuple):
-    """Values and slopes [1/s] at times t [s] ascending (K,), cubics between them.
+    """Values, slopes [1/s] and second derivatives [1/s^2] at times t [s] ascending (K,), cubics between them.
 
     step [s] is the median one and half_width the samples on each side through which each cubic was laid (0: none).
     """
@@ -32,11 +32,16 @@ class Curve(NamedTuple):
     t: Array
     value: Array
     slope: Array
+    second: Array
     step: float
     half_width: int
 
     def at(self, t: Array) -> tuple[Array, Array, Array]:
-        """Value, slope and second derivative at times (N,) [s]; straight on beyond the ends, nan of no curve."""
+        """Value, slope and second derivative at times (N,) [s]; straight on beyond the ends, nan of no curve.
+
+        Each is interpolated by itself: the second derivative of cubics through smoothed values
+        would be mostly what the smoothing left of the noise.
+        """
         if len(self.t) < 2:
             nothing = np.zeros(len(t))
             return np.full(len(t), self.value[0] if len(self.t) else np.nan), nothing, nothing
@@ -44,12 +49,9 @@ class Curve(NamedTuple):
         i = np.clip(np.searchsorted(self.t, inside, side="right") - 1, 0, len(self.t) - 2)
         h = self.t[i + 1] - self.t[i]
         u = (inside - self.t[i]) / h
-        rise = (self.value[i + 1] - self.value[i]) / h
-        left, right = self.slope[i], self.slope[i + 1]
-        square, cube = 3.0 * rise - 2.0 * left - right, left + right - 2.0 * rise
-        slope = left + u * (2.0 * square + 3.0 * u * cube)
-        value = self.value[i] + h * u * (left + u * (square + u * cube)) + slope * (t - inside)
-        second = np.where(t == inside, (2.0 * square + 6.0 * u * cube) / h, 0.0)
+        slope = _hermite(u, h, self.slope, self.second, i)
+        value = _hermite(u, h, self.value, self.slope, i) + slope * (t - inside)
+        second = np.where(t == inside, (1.0 - u) * self.second[i] + u * self.second[i + 1], 0.0)
         return value, slope, second
 
     def spread(self, powers: Array) -> Array:
@@ -66,19 +68,20 @@ def curve_of(t: Array, value: Array, variance: Array) -> Curve:
     step = float(np.median(steps)) if len(steps) else 0.0
     runs = np.split(np.arange(len(t)), np.flatnonzero(steps > GAP * step) + 1)
     plain = np.gradient(value, t) if len(t) > 1 and bool((steps > 0.0).all()) else np.zeros(len(t))
-    best, least = Curve(t, value, plain, step, 0), 2.0  # of no smoothing w0 = 1
+    flat = np.zeros(len(t))
+    best, least = Curve(t, value, plain, flat, step, 0), 2.0  # of no smoothing w0 = 1
     for half in HALF_WIDTHS:
         long_enough = [run for run in runs if len(run) > 2 * half]
         if 2 * sum(map(len, long_enough)) < len(t):
             break
-        smooth, slope = value.copy(), plain.copy()
+        smooth, slope, second = value.copy(), plain.copy(), flat.copy()
         for run in long_enough:
-            smooth[run], of_step = _through(value[run], half)
-            slope[run] = of_step / step
+            smooth[run], by_step, twice = _through(value[run], half)
+            slope[run], second[run] = by_step / step, twice / step**2
         weighed = (value - smooth) ** 2 / np.where(variance > 0.0, variance, np.inf)
         risk = float(weighed.mean()) + 2.0 * float(_cubics(half).covariance[0, 0])
         if risk < least:
-            best, least = Curve(t, smooth, slope, step, half), risk
+            best, least = Curve(t, smooth, slope, second, step, half), risk
     return best
 
 
@@ -87,11 +90,17 @@ def powers(steps: Array) -> Array:
     return np.asarray(steps[:, None] ** np.arange(4.0))
 
 
-class _Cubics(NamedTuple):
-    """Weights of values and slopes at each of M places of equal steps (M, M), covariance (4, 4) at the middle one."""
+def _hermite(u: Array, h: Array, value: Array, slope: Array, i: NDArray[np.intp]) -> Array:
+    """Cubics from place i to the next one, h away, at shares u of the way, all (N,)."""
+    left, right, rise = slope[i], slope[i + 1], (value[i + 1] - value[i]) / h
+    square, cube = 3.0 * rise - 2.0 * left - right, left + right - 2.0 * rise
+    return np.asarray(value[i] + h * u * (left + u * (square + u * cube)))
 
-    value: Array
-    slope: Array
+
+class _Cubics(NamedTuple):
+    """Weights of values and two derivatives at each of M places (3, M, M), covariance (4, 4) amid them."""
+
+    weights: Array
     covariance: Array
 
 
@@ -100,19 +109,17 @@ def _cubics(half: int) -> _Cubics:
     places = np.arange(-half, half + 1.0)
     basis = powers(places)
     fit = np.linalg.pinv(basis)
-    by_step = np.zeros((len(places), 4))
+    by_step, twice = np.zeros(basis.shape), np.zeros(basis.shape)
     by_step[:, 1:] = basis[:, :3] * np.arange(1.0, 4.0)
-    return _Cubics(basis @ fit, by_step @ fit, fit @ fit.T)
+    twice[:, 2:] = basis[:, :2] * np.array([2.0, 6.0])
+    return _Cubics(np.stack([basis, by_step, twice]) @ fit, fit @ fit.T)
 
 
-def _through(values: Array, half: int) -> tuple[Array, Array]:
-    """Smoothed values and their slopes by step (K,), K > 2 half."""
-    weights = _cubics(half)
-    out = []
-    for of_place in (weights.value, weights.slope):
-        smooth = np.empty(len(values))
+def _through(values: Array, half: int) -> Array:
+    """Smoothed values and their first two derivatives by step (3, K), K > 2 half."""
+    out = np.empty((3, len(values)))
+    for smooth, of_place in zip(out, _cubics(half).weights, strict=True):
         smooth[half : len(values) - half] = np.convolve(values, of_place[half][::-1], "valid")
         smooth[:half] = of_place[:half] @ values[: 2 * half + 1]
         smooth[len(values) - half :] = of_place[half + 1 :] @ values[-2 * half - 1 :]
-        out.append(smooth)
-    return out[0], out[1]
+    return out

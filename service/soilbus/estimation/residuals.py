@@ -67,6 +67,23 @@ class Response(NamedTuple):
     pull_by_effects: Array
 
 
+class Lateness(NamedTuple):
+    """What readings of channels that are not late would tell besides these, and its derivatives by the effects.
+
+    torque (N, W) [N m], measured (N, 2 W + 1) of the latents, demand (N,) [N]; by_torque (P, N, W) and so on.
+    predicted (N, W) [N m] is what a low pass makes of the torques of the model, less these.
+    """
+
+    torque: Array
+    measured: Array
+    demand: Array
+    predicted: Array
+    by_torque: Array
+    by_measured: Array
+    by_demand: Array
+    by_predicted: Array
+
+
 class WindowProblem(Readings):
     """One window's data and the model that is to explain it, ready to be linearised at any soil."""
 
@@ -83,6 +100,10 @@ class WindowProblem(Readings):
     def gain_bounds(self) -> tuple[Array, Array]:
         """Least and greatest gains (G,), infinite where any will do."""
         return np.full(len(self.gain_std), -np.inf), np.full(len(self.gain_std), np.inf)
+
+    def lateness(self, gains: Array, latents: Latents, torque: Array) -> Lateness | None:
+        """Of gains (G,) and latents, with these torques (N, W) of the model; None where nothing is late."""
+        return None
 
     def thinned(self, most: int) -> WindowProblem:
         """The same window with at most so many of its usable instants, evenly spread."""
@@ -170,12 +191,14 @@ class WindowProblem(Readings):
         A = self._by_latents(at)
 
         of_torque, of_latents, of_draft, corrected, variance, row_var = self._corrected(gains)
+        late = self.lateness(gains, latents, at.value[1])
+        torque = self.torque if late is None else self.torque + late.torque
         draft, draft_var = self.draft * of_draft, self.draft_var * of_draft**2
 
         first_effect = 7 + (self.n_sensors if by_sensors else 0)
         rows = np.zeros((*A.shape[:2], first_effect + len(gains) - self.n_sensors))
         residual, by_soil, by_effects = rows[:, :, 0], rows[:, :, 1:7], rows[:, :, first_effect:]
-        residual[:, :W] = self.torque * of_torque - at.value[1]
+        residual[:, :W] = torque * of_torque - at.value[1]
         residual[:, W] = self.demand - self.draft + draft + at.pull - at.value[0].sum(1)
         by_soil[:, :W] = -at.by_soil[1].transpose(1, 2, 0)
         by_soil[:, W] = -at.by_soil[0].sum(2).T
@@ -192,6 +215,15 @@ class WindowProblem(Readings):
             diagonals(by_gain[:, :W, :W])[:] = -of_torque * at.value[1]
             np.multiply(A, -latent_by_gain[:, None, :], out=by_gain[:, :, W:-1])
             by_gain[:, W, -1] = -of_draft * (draft - residual[:, W] * draft_var / row_var[:, W])
+        by_late = np.zeros((0, *now.shape))
+        if late is not None:
+            corrected = corrected + late.measured * of_latents
+            by_late = late.by_measured * of_latents
+            residual[:, :W] -= late.predicted
+            residual[:, W] += late.demand
+            by_effects[:, :W] += (of_torque * late.by_torque - late.by_predicted).transpose(1, 2, 0)
+            by_effects[:, W] += late.by_demand.T
+            by_effects += np.einsum("nml,pnl->nmp", A, by_late)
         residual += (A @ (corrected - now)[:, :, None])[:, :, 0]
         if self._missing is not None:
             A[self._missing] = 0.0
@@ -206,6 +238,7 @@ class WindowProblem(Readings):
             corrected=corrected,
             variance=variance,
             by_gain=latent_by_gain,
+            by_late=by_late,
             off=at.off,
             load_slope=at.load_slope,
             load_by_slip=at.load_by_slip,
@@ -300,6 +333,8 @@ class WindowProblem(Readings):
         N, W = self.n, self.n_wheels
         left = (at.weighed @ np.concatenate([[1.0], soil_step, gain_step])).reshape(N, 1, at.by_latents.shape[1])
         new = at.corrected - at.variance * (left @ at.by_latents)[:, 0] - at.by_gain * gain_step[W : self.n_sensors - 1]
+        if len(at.by_late):
+            new += np.tensordot(gain_step[self.n_sensors :], at.by_late, 1)
         load, speed, ground = new[:, :W], new[:, W : 2 * W], new[:, 2 * W]
         slip_change = (latents.ground_speed[:, None] / latents.speed - ground[:, None] / speed) / self.rig.radius
         more = load - latents.load - at.load_by_slip * slip_change

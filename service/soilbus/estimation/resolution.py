@@ -19,6 +19,7 @@ delays need it, errs by less than noise: by at most 3/128 of the fourth differen
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -46,10 +47,10 @@ class _Channel(NamedTuple):
 
 
 class _Binned(NamedTuple):
-    """Of each bin (B,) with samples: its number, mean sample time, their number, value at the centre, worth of it."""
+    """Each bin (B,) with samples: its number, how many, the value at the centre, how many samples that is worth."""
 
     bins: NDArray[np.intp]
-    count: Array
+    samples: Array
     value: Array
     worth: Array
 
@@ -61,17 +62,20 @@ def resolved_window(store: BinStore, end: float) -> Window:
     noise = NoiseTable.of(store.rig)
     channels = list(_channels(samples, store, noise))
     span = end - store.origin
+    names = store.rig.channels
+    curves = {names[c.column]: c.curve._replace(t=c.curve.t + store.origin) for c in channels}
     length = _bin_length(channels, store.bin_length, span)
     if length >= store.bin_length:
-        return whole
+        return replace(whole, curves=curves)
     n = int(np.floor(span / length + 1e-9))
-    mean = np.full((n, len(store.rig.channels)), np.nan)
+    mean: Array = np.full((n, len(names)), np.nan)
     worth, count = np.zeros(mean.shape), np.zeros(mean.shape)
+    centre: Array = store.origin + (np.arange(n, dtype=np.float64) + 0.5) * length
     for channel in channels:
         found = _binned(channel, length, n)
         at = found.bins, channel.column
-        mean[at], worth[at], count[at] = found.value, found.worth, found.count
-    return made_window(noise, store.origin + (np.arange(n) + 0.5) * length, mean, worth, count)
+        mean[at], worth[at], count[at] = found.value, found.worth, found.samples
+    return replace(made_window(noise, centre, mean, worth, count), curves=curves)
 
 
 def _channels(samples: Samples, store: BinStore, noise: NoiseTable) -> Iterator[_Channel]:
@@ -99,7 +103,7 @@ def _bin_length(channels: Iterable[_Channel], longest: float, span: float) -> fl
 def _lost(channel: _Channel, length: float, n: int) -> float:
     """Share of the samples that values at the centres cost."""
     found = _binned(channel, length, n)
-    return 1.0 - float(found.worth.sum() / found.count.sum()) if len(found.bins) else 0.0
+    return 1.0 - float(found.worth.sum() / found.samples.sum()) if len(found.bins) else 0.0
 
 
 def _binned(channel: _Channel, length: float, n: int) -> _Binned:
@@ -108,8 +112,8 @@ def _binned(channel: _Channel, length: float, n: int) -> _Binned:
     kept = (number >= 0) & (number < n)
     t, number = channel.t[kept], number[kept]
     bins, which = np.unique(number, return_inverse=True)
-    count = np.bincount(which, minlength=len(bins)).astype(float)
-    centre = (bins + 0.5) * length
+    count: Array = np.bincount(which, minlength=len(bins)).astype(float)
+    centre: Array = (bins + 0.5) * length
 
     def mean(values: Array) -> Array:
         return np.asarray(np.bincount(which, values, len(bins)) / count)
@@ -120,7 +124,7 @@ def _binned(channel: _Channel, length: float, n: int) -> _Binned:
     there = powers((centre - middle) / step)
     of_samples = powers((t - middle[which]) / step)
     used = np.stack([mean(of_samples[:, i]) for i in range(4)], axis=1)
-    more = 1.0 - 1.0 / count  # of straight lines from sample to sample
+    more = np.subtract(1.0, 1.0 / count)  # of straight lines from sample to sample
     if channel.curve.half_width:
         more = channel.curve.spread(there) - channel.curve.spread(used)
     worth = np.minimum(1.0 / np.maximum(1.0 / count + more, 0.5 / count), count)

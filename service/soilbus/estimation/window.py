@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.estimation.local_cubics import Curve
 from soilbus.estimation.screening import SIDE, Samples, joined, judge
 from soilbus.terra.vehicle import Chassis, pull_required
 
@@ -69,7 +70,7 @@ class Window:
 
     torque [N m], load [N], speed [rad/s], sinkage [m] have shape (N, W); ground_speed
     [m/s], draft [N], pitch [rad], acceleration [m/s^2] have shape (N,).  `variance` holds
-    an array of the same shape for each.  `has` names the quantities with any sample.
+    an array of the same shape for each.  `curves` are the samples' own curves by channel, where they were made.
     """
 
     t: Array
@@ -83,12 +84,12 @@ class Window:
     acceleration: Array
     variance: Mapping[str, Array]
     samples: int
+    curves: Mapping[str, Curve]
 
     def rows(self, keep: NDArray[np.intp]) -> Window:
         """The window with only these bins."""
-        values = {q: getattr(self, q)[keep] for q in (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)}
-        variance = {q: v[keep] for q, v in self.variance.items()}
-        return Window(t=self.t[keep], variance=variance, samples=self.samples, **values)
+        values: dict[str, Any] = {q: getattr(self, q)[keep] for q in (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)}
+        return replace(self, t=self.t[keep], variance={q: v[keep] for q, v in self.variance.items()}, **values)
 
 
 def forward(window: Window) -> Window:
@@ -121,6 +122,7 @@ def forward(window: Window) -> Window:
         draft=way * window.draft,
         pitch=way * window.pitch,
         acceleration=way * window.acceleration,
+        curves={},
     )
 
 
@@ -334,7 +336,7 @@ def made_window(noise: NoiseTable, t: Array, mean: Array, worth: Array, count: A
     """A window from bin means, the samples they are worth and those in them, (N, channels) as rig.channels."""
     variance = _variance_of_means(mean, np.where(count > 0.0, worth, 0.0), noise)
     values, variances = _by_quantity(mean, noise.n_wheels), _by_quantity(variance, noise.n_wheels)
-    return Window(t=t, variance=variances, samples=int(count.sum()), **values)
+    return Window(t=t, variance=variances, samples=int(count.sum()), curves={}, **values)
 
 
 def _by_quantity(table: Array, n_wheels: int) -> dict[str, Array]:

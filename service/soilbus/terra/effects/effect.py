@@ -13,6 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from dataclasses import field as dataclass_field
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -88,6 +90,13 @@ DraftHook = Callable[[Any, Surroundings, Values], Any]
 ErrorHook = Callable[[Surroundings, Values], Any]
 
 
+class Late(NamedTuple):
+    """Names of the parameters [s] by which a channel is late: a dead time, and the time constant of a low pass."""
+
+    delay: str
+    time_constant: str
+
+
 @dataclass(frozen=True)
 class Effect:
     """One physical or sensor effect.
@@ -103,8 +112,7 @@ class Effect:
     hitch, reading less truth, of true drafts (N,).  load: errors [N] (N, W) of the wheel
     load cells.  resistance: force [N] (N,) that holds the vehicle back and is in no reading.
     base_law: the shear law of models to which the effect can be added, None for any.
-    mixes_instants: `torque` needs other instants than its own, adds them up, alike in each of however many columns,
-    and is given plain arrays.
+    late: quantities of which the effect's samples are late, each by the parameters named.
     of_record: its parameters describe the ground of one record and mean nothing in another.
     form_left: share of what it changes of the soil's parameters by which these are off (standard deviation), as no
     effect's formula is the field's: of the blind tune halves of seeds 109 to 113.
@@ -124,7 +132,7 @@ class Effect:
     resistance: ErrorHook | None = None
     base_law: str | None = None
     of_record: bool = False
-    mixes_instants: bool = False
+    late: Mapping[str, Late] = dataclass_field(default_factory=lambda: MappingProxyType({}))
     form_left: float = 0.125
 
     @property
