@@ -61,8 +61,8 @@ def probabilities(falls: Mapping[str, float], explained: float) -> dict[str, flo
     What is left to one is the probability that nothing more is missing.
     """
     most = max(falls.values())
-    usual, great = (_shares(falls, heat(explained + most)) for heat in (_temperature, _great_temperature))
-    something = 1.0 / (1.0 + math.exp(-most / (2.0 * _temperature(explained, FORM_LEFT))))
+    usual, great = (_shares(falls, heat(explained + most)) for heat in (temperature, _great_temperature))
+    something = 1.0 / (1.0 + math.exp(-most / (2.0 * temperature(explained, FORM_LEFT))))
     chances = {n: something * ((1.0 - AT_TIMES) * usual[n] + AT_TIMES * great[n]) for n in falls}
     return dict(sorted(chances.items(), key=lambda item: -item[1]))
 
@@ -77,13 +77,13 @@ def hopeless_from(explained: float) -> float:
     return HOPELESS * _great_temperature(explained)
 
 
-def _temperature(explained: float, form_error: float = FORM_ERROR) -> float:
+def temperature(explained: float, form_error: float = FORM_ERROR) -> float:
     """What differences of -2 log evidence are divided by, where so much of it is explained in all."""
     return TEMPERATURE + form_error * max(explained, 0.0)
 
 
 def _great_temperature(explained: float) -> float:
-    return _temperature(min(explained, GROWN), GREAT_FORM_ERROR)
+    return temperature(min(explained, GROWN), GREAT_FORM_ERROR)
 
 
 def _shares(falls: Mapping[str, float], temperature: float) -> dict[str, float]:

@@ -289,7 +289,8 @@ class CompletedProblem(WindowProblem):
                     predicted, rate, by_tau = self._behind(tau, latents, torque)
                     by_predicted[at[0]], by_predicted[at[1]] = -std * rate, of_tau * by_tau
                     tau, std, of_tau = 0.0, 0.0, 0.0
-                for column, curve in enumerate(self._curves.of(quantity)):
+                for column, series in enumerate(self._curves.of(quantity)):
+                    curve = series.faithful if quantity == "torque" else series.smooth
                     value, slope, second = curve.at(self.t + d)
                     added[:, column] += np.nan_to_num(value - curve.at(self.t)[0] + tau * slope)
                     by[at[0], :, column] += std * np.nan_to_num(slope + tau * second)
@@ -321,8 +322,9 @@ class CompletedProblem(WindowProblem):
         polynomial through the model's own torques over load and slip.
         """
         off, slope, by_tau = (np.zeros(torque.shape) for _ in range(3))
-        (ground,) = self._curves.of("ground_speed")
-        loads, speeds = self._curves.of("load"), self._curves.of("speed")
+        loads, speeds, (ground,) = (
+            [series.smooth for series in self._curves.of(q)] for q in ("load", "speed", "ground_speed")
+        )
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
         for w, (load, speed) in enumerate(zip(loads, speeds, strict=True)):
             used = self.usable[:, w]

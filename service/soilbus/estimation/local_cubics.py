@@ -62,27 +62,60 @@ class Curve(NamedTuple):
         return np.asarray(np.einsum("ni,ij,nj->n", powers, _cubics(self.half_width).covariance, powers))
 
 
+class Series(NamedTuple):
+    """A channel's curve of least risk, for slopes and low passes, and the faithful one, for delays."""
+
+    smooth: Curve
+    faithful: Curve
+
+    @classmethod
+    def of(cls, t: Array, value: Array, variance: Array) -> Series:
+        """As curve_of()."""
+        smooth = curve_of(t, value, variance)
+        return cls(smooth, faithful(smooth, value))
+
+    def later(self, by: float) -> Series:
+        """The same with times that are greater [s]."""
+        return Series(*(curve._replace(t=curve.t + by) for curve in self))
+
+
 def curve_of(t: Array, value: Array, variance: Array) -> Curve:
-    """The curve of samples at times t [s], ascending, with these variances, all (K,)."""
-    steps = np.diff(t)
-    step = float(np.median(steps)) if len(steps) else 0.0
-    runs = np.split(np.arange(len(t)), np.flatnonzero(steps > GAP * step) + 1)
-    plain = np.gradient(value, t) if len(t) > 1 and bool((steps > 0.0).all()) else np.zeros(len(t))
-    flat = np.zeros(len(t))
-    best, least = Curve(t, value, plain, flat, step, 0), 2.0  # of no smoothing w0 = 1
+    """The curve of least risk of samples at times t [s], ascending, with these variances, all (K,)."""
+    best, least = _curve(t, value, 0), 2.0  # of no smoothing w0 = 1
     for half in HALF_WIDTHS:
-        long_enough = [run for run in runs if len(run) > 2 * half]
-        if 2 * sum(map(len, long_enough)) < len(t):
+        curve = _curve(t, value, half)
+        if not curve.half_width:
             break
-        smooth, slope, second = value.copy(), plain.copy(), flat.copy()
-        for run in long_enough:
-            smooth[run], by_step, twice = _through(value[run], half)
-            slope[run], second[run] = by_step / step, twice / step**2
-        weighed = (value - smooth) ** 2 / np.where(variance > 0.0, variance, np.inf)
+        weighed = (value - curve.value) ** 2 / np.where(variance > 0.0, variance, np.inf)
         risk = float(weighed.mean()) + 2.0 * float(_cubics(half).covariance[0, 0])
         if risk < least:
-            best, least = Curve(t, smooth, slope, second, step, half), risk
+            best, least = curve, risk
     return best
+
+
+def faithful(curve: Curve, value: Array) -> Curve:
+    """The curve through half as many of the samples (K,): its bias is a sixteenth, below noise, its noise sqrt(2).
+
+    What is late is told by how the curve moves; least risk leaves as much bias as noise, which would be a delay.
+    """
+    return _curve(curve.t, value, max(curve.half_width // 2, HALF_WIDTHS[0])) if curve.half_width else curve
+
+
+def _curve(t: Array, value: Array, half: int) -> Curve:
+    """Cubics through so many samples on each side; through the samples themselves where stretches are too short."""
+    steps = np.diff(t)
+    step = float(np.median(steps)) if len(steps) else 0.0
+    slope = np.gradient(value, t) if len(t) > 1 and bool((steps > 0.0).all()) else np.zeros(len(t))
+    plain = Curve(t, value, slope, np.zeros(len(t)), step, 0)
+    runs = np.split(np.arange(len(t)), np.flatnonzero(steps > GAP * step) + 1)
+    runs = [run for run in runs if len(run) > 2 * half]
+    if not half or 2 * sum(map(len, runs)) < len(t):
+        return plain
+    smooth, slope, second = value.copy(), slope.copy(), plain.second.copy()
+    for run in runs:
+        smooth[run], by_step, twice = _through(value[run], half)
+        slope[run], second[run] = by_step / step, twice / step**2
+    return Curve(t, smooth, slope, second, step, half)
 
 
 def powers(steps: Array) -> Array:

@@ -10,7 +10,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.local_cubics import Curve, curve_of
+from soilbus.estimation.local_cubics import Series
 from soilbus.estimation.window import Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
 
@@ -157,9 +157,9 @@ class Curves:
     def __init__(self, window: Window, wheels: tuple[str, ...]) -> None:
         self.window = window
         self._wheels = wheels
-        self._made: dict[str, list[Curve]] = {}
+        self._made: dict[str, list[Series]] = {}
 
-    def of(self, quantity: str) -> list[Curve]:
+    def of(self, quantity: str) -> list[Series]:
         """One curve for each wheel, or one for the vehicle."""
         if quantity not in self._made:
             values, variances = getattr(self.window, quantity), self.window.variance[quantity]
@@ -170,9 +170,9 @@ class Curves:
             self._made[quantity] = [self._curve(v, var) for v, var in zip(*(c.T for c in columns), strict=True)]
         return self._made[quantity]
 
-    def _curve(self, values: Array, variance: Array) -> Curve:
+    def _curve(self, values: Array, variance: Array) -> Series:
         known = np.isfinite(values) & np.isfinite(variance)
-        return curve_of(self.window.t[known], values[known], variance[known])
+        return Series.of(self.window.t[known], values[known], variance[known])
 
 
 def travelled(t: Array, ground_speed: Array, window: Array) -> tuple[Array, Array]:

@@ -192,13 +192,12 @@ class WindowProblem(Readings):
 
         of_torque, of_latents, of_draft, corrected, variance, row_var = self._corrected(gains)
         late = self.lateness(gains, latents, at.value[1])
-        torque = self.torque if late is None else self.torque + late.torque
         draft, draft_var = self.draft * of_draft, self.draft_var * of_draft**2
 
         first_effect = 7 + (self.n_sensors if by_sensors else 0)
         rows = np.zeros((*A.shape[:2], first_effect + len(gains) - self.n_sensors))
         residual, by_soil, by_effects = rows[:, :, 0], rows[:, :, 1:7], rows[:, :, first_effect:]
-        residual[:, :W] = torque * of_torque - at.value[1]
+        residual[:, :W] = self.torque * of_torque - at.value[1]
         residual[:, W] = self.demand - self.draft + draft + at.pull - at.value[0].sum(1)
         by_soil[:, :W] = -at.by_soil[1].transpose(1, 2, 0)
         by_soil[:, W] = -at.by_soil[0].sum(2).T
@@ -217,14 +216,14 @@ class WindowProblem(Readings):
             by_gain[:, W, -1] = -of_draft * (draft - residual[:, W] * draft_var / row_var[:, W])
         by_late = np.zeros((0, *now.shape))
         if late is not None:
-            corrected = corrected + late.measured * of_latents
+            residual += self.late_residuals(late, A, gains)
             by_late = late.by_measured * of_latents
-            residual[:, :W] -= late.predicted
-            residual[:, W] += late.demand
             by_effects[:, :W] += (of_torque * late.by_torque - late.by_predicted).transpose(1, 2, 0)
             by_effects[:, W] += late.by_demand.T
             by_effects += np.einsum("nml,pnl->nmp", A, by_late)
         residual += (A @ (corrected - now)[:, :, None])[:, :, 0]
+        if late is not None:
+            corrected = corrected + late.measured * of_latents
         if self._missing is not None:
             A[self._missing] = 0.0
             rows[self._missing] = 0.0
@@ -246,6 +245,25 @@ class WindowProblem(Readings):
             load_by_effects=at.load_by_effects,
         )
 
+    def late_residuals(self, late: Lateness | None, A: Array, gains: Array) -> Array:
+        """What late readings are off (N, m) at gains (G,), A (N, m, 2 W + 1) the residuals' derivatives by latents."""
+        residual, W = np.zeros(A.shape[:2]), self.n_wheels
+        if late is not None:
+            of_sensors = 1.0 / (1.0 + gains[: self.n_sensors])
+            residual[:, :W] = late.torque * of_sensors[:W] - late.predicted
+            residual[:, W] = late.demand
+            residual += (A @ (late.measured * of_sensors[W:-1])[:, :, None])[:, :, 0]
+            residual[~self._known] = 0.0
+        return residual
+
+    def variances(self, gains: Array) -> tuple[Array, Array]:
+        """Variances of latents (N, 2 W + 1) and rows (N, m) at gains (G,)."""
+        return self._corrected(gains)[4:]
+
+    def torques(self, soil: Array, gains: Array, latents: Latents) -> Array:
+        """Torques (N, W) [N m] of the model."""
+        return np.asarray(self._response(Soil(*soil.tolist()), gains, latents).value[1])
+
     def _corrected(self, gains: Array) -> tuple[Array, Array, float, Array, Array, Array]:
         """Readings less their gain errors (G,): factors of torques, latents and draft; latents with variance; rows'.
 
@@ -266,7 +284,7 @@ class WindowProblem(Readings):
         where there are sensors; standard normal where model and noise are right, nan where
         there is no reading.
         """
-        variance, row_var = self._corrected(gains)[4:]
+        variance, row_var = self.variances(gains)
         inverse = inverse_covariance(at.by_latents, variance, row_var, self.n_wheels)
         root = np.sqrt(diagonals(inverse))
         weighed = at.weighed.reshape(*root.shape, -1) / root[:, :, None]

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.local_cubics import Curve, curve_of, powers
+from soilbus.estimation.local_cubics import Curve, Series, curve_of, faithful, powers
 from soilbus.estimation.screening import Samples
 from soilbus.estimation.window import BinStore, NoiseTable, Window, made_window
 
@@ -45,6 +45,10 @@ class _Channel(NamedTuple):
     curve: Curve
     needed: bool
 
+    def series(self) -> Series:
+        """The curve, and a faithful one."""
+        return Series(self.curve, faithful(self.curve, self.value))
+
 
 class _Binned(NamedTuple):
     """Each bin (B,) with samples: its number, how many, the value at the centre, how many samples that is worth."""
@@ -63,7 +67,7 @@ def resolved_window(store: BinStore, end: float) -> Window:
     channels = list(_channels(samples, store, noise))
     span = end - store.origin
     names = store.rig.channels
-    curves = {names[c.column]: c.curve._replace(t=c.curve.t + store.origin) for c in channels}
+    curves = {names[c.column]: c.series().later(store.origin) for c in channels}
     length = _bin_length(channels, store.bin_length, span)
     if length >= store.bin_length:
         return replace(whole, curves=curves)
@@ -112,7 +116,7 @@ def _binned(channel: _Channel, length: float, n: int) -> _Binned:
     kept = (number >= 0) & (number < n)
     t, number = channel.t[kept], number[kept]
     bins, which = np.unique(number, return_inverse=True)
-    count: Array = np.bincount(which, minlength=len(bins)).astype(float)
+    count = np.asarray(np.bincount(which, minlength=len(bins)), np.float64)
     centre: Array = (bins + 0.5) * length
 
     def mean(values: Array) -> Array:
@@ -124,7 +128,7 @@ def _binned(channel: _Channel, length: float, n: int) -> _Binned:
     there = powers((centre - middle) / step)
     of_samples = powers((t - middle[which]) / step)
     used = np.stack([mean(of_samples[:, i]) for i in range(4)], axis=1)
-    more = np.subtract(1.0, 1.0 / count)  # of straight lines from sample to sample
+    more = 1.0 - 1.0 / count  # of straight lines from sample to sample
     if channel.curve.half_width:
         more = channel.curve.spread(there) - channel.curve.spread(used)
     worth = np.minimum(1.0 / np.maximum(1.0 / count + more, 0.5 / count), count)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.local_cubics import Curve
+from soilbus.estimation.local_cubics import Series
 from soilbus.estimation.screening import SIDE, Samples, joined, judge
 from soilbus.terra.vehicle import Chassis, pull_required
 
@@ -84,7 +84,7 @@ class Window:
     acceleration: Array
     variance: Mapping[str, Array]
     samples: int
-    curves: Mapping[str, Curve]
+    curves: Mapping[str, Series]
 
     def rows(self, keep: NDArray[np.intp]) -> Window:
         """The window with only these bins."""

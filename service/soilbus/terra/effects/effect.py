@@ -96,6 +96,11 @@ class Late(NamedTuple):
     delay: str
     time_constant: str
 
+    @property
+    def total(self) -> str:
+        """Name of their sum, which data tell best: a low pass delays by its time constant, to the first order."""
+        return self.delay.removesuffix("delay") + "total"
+
 
 @dataclass(frozen=True)
 class Effect:
