@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ import numpy as np
 from cantools.database.can import Database
 from numpy.typing import NDArray
 
-from soilbus.assembly import rig_of
+from soilbus.assembly import delays_of, rig_of
 from soilbus.can.admission import Admission
 from soilbus.can.channels import Channel, Column, Decoded
 from soilbus.can.dbc_files import checked_messages
@@ -116,10 +117,14 @@ class Refusals:
 class Intake:
     """Admission, bins and freshness of one vehicle's channels.
 
-    Raises ConfigError where configuration and database do not fit.
+    Channels that are late by their `delay` and by `delays` [s] by quantity (those of the
+    configuration's effects where none are given) are put beside what was true with them: all
+    others wait for the latest one.  So each window is whole, and tells of as long before its
+    end; whether a channel is fresh goes by the stamps of its frames.  Raises ConfigError where
+    configuration and database do not fit.
     """
 
-    def __init__(self, config: Config, database: Database) -> None:
+    def __init__(self, config: Config, database: Database, delays: Mapping[str, float] | None = None) -> None:
         self.channels = channels_of(config, database)
         self.admission = Admission(self.channels, database, checked_messages(config))
         self.rig = rig_of(config)
@@ -129,6 +134,10 @@ class Intake:
             {c.name: c.timeout or DEFAULT_TIMEOUT for c in self.channels if c.quantity in POSITION_ROLES}
         )
         self._plausibility = Plausibility(self.rig, self.channels, database, config.estimator)
+        of_effects = delays_of(config) if delays is None else delays
+        late = {c.name: c.delay + of_effects.get(c.quantity, 0.0) for c in self.channels}
+        latest = max(0.0, *late.values()) if late else 0.0
+        self._waits = {name: latest - delay for name, delay in late.items() if latest != delay}
         self._settings = config.estimator
         self._binned = frozenset(self.rig.channels)
         limits = {w.name: w.max_torque for w in config.wheel}
@@ -178,6 +187,9 @@ class Intake:
             if name.startswith("torque_limit."):
                 self._note_limit(name.removeprefix("torque_limit."), t, value)
         self._positions.add(heard)
+        for name in heard.keys() & self._waits.keys():
+            t, value = heard[name]
+            heard[name] = t + self._waits[name], value
         self._plausibility.add(heard)
         if self._bins is not None:
             self._bins.add({name: samples for name, samples in heard.items() if name in self._binned})

@@ -128,8 +128,7 @@ def _binned(channel: _Channel, length: float, n: int) -> _Binned:
     there = powers((centre - middle) / step)
     of_samples = powers((t - middle[which]) / step)
     used = np.stack([mean(of_samples[:, i]) for i in range(4)], axis=1)
-    more = 1.0 - 1.0 / count  # of straight lines from sample to sample
-    if channel.curve.half_width:
-        more = channel.curve.spread(there) - channel.curve.spread(used)
+    smooth = channel.curve.half_width > 0  # else straight lines from sample to sample, worth one of them
+    more = channel.curve.spread(there) - channel.curve.spread(used) if smooth else 1.0 - 1.0 / count
     worth = np.minimum(1.0 / np.maximum(1.0 / count + more, 0.5 / count), count)
     return _Binned(bins, count, left + channel.curve.at(centre)[0], worth)

@@ -46,15 +46,19 @@ def measure(drive: Drive, config: Config, seed: int) -> dict[str, Column]:
     """Noisy samples of every mapped channel, SI, by channel name (can.channels).
 
     Each value is what effects leave of the truth, times a gain fixed for the drive, plus
-    white noise (config [noise]); positions are off by POSITION_NOISE.
+    white noise (config [noise]); positions are off by POSITION_NOISE.  A signal with a delay tells
+    what was true so long before.
     """
     columns: dict[str, Column] = {}
+    wheels = {wheel.name: wheel for wheel in config.wheel}
     t, told = drive.columns["t"], drive.columns | _changed(drive, [wheel.name for wheel in config.wheel])
     for quantity, wheel in fitted(config):
         name = f"{quantity}.{wheel}" if wheel else quantity
         every = slice(None, None, _DIVIDERS.get(quantity, 1))
         measured = _SAME_TRUTH.get(quantity, quantity)
         truth, rng = told[f"{measured}.{wheel}" if wheel else measured], channel_rng(seed, name)
+        if (delay := getattr(wheels[wheel] if wheel else config.signals, quantity).delay) != 0.0:
+            truth = np.interp(t - delay, t, truth)
         if quantity in ("latitude", "longitude"):
             parallel = 1.0 if quantity == "latitude" else np.cos(drive.columns["latitude"])
             truth = wrapped(truth + POSITION_NOISE / (SEMI_MAJOR_AXIS * parallel) * rng.standard_normal(len(t)))
