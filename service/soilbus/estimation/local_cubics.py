@@ -21,6 +21,8 @@ HALF_WIDTHS = (2, 3, 4, 6, 9, 13, 19, 28)
 """Samples on each side that are tried; two are the fewest that leave a cubic anything to average."""
 GAP = 1.5
 """Median steps from which two samples belong to different stretches."""
+PARTS = 16
+"""Parts of a step to which phases are rounded for the variance."""
 
 
 class Curve(NamedTuple):
@@ -54,13 +56,6 @@ class Curve(NamedTuple):
         second = np.where(t == inside, (1.0 - u) * self.second[i] + u * self.second[i + 1], 0.0)
         return value, slope, second
 
-    def spread(self, powers: Array) -> Array:
-        """x' C x (N,) of powers x = 1, s, s^2, s^3 (N, 4), s in steps from a sample; C: covariance of a cubic there.
-
-        In variances of a sample, of a curve that has a half_width.
-        """
-        return np.asarray(np.einsum("ni,ij,nj->n", powers, _cubics(self.half_width).covariance, powers))
-
 
 class Series(NamedTuple):
     """A channel's curve of least risk, for slopes and low passes, and the faithful one, for delays."""
@@ -87,7 +82,7 @@ def curve_of(t: Array, value: Array, variance: Array) -> Curve:
         if not curve.half_width:
             break
         weighed = (value - curve.value) ** 2 / np.where(variance > 0.0, variance, np.inf)
-        risk = float(weighed.mean()) + 2.0 * float(_cubics(half).covariance[0, 0])
+        risk = float(weighed.mean()) + 2.0 * _cubics(half).own
         if risk < least:
             best, least = curve, risk
     return best
@@ -118,6 +113,32 @@ def _curve(t: Array, value: Array, half: int) -> Curve:
     return Curve(t, smooth, slope, second, step, half)
 
 
+@cache
+def variance_of_one(half: int, n: int, parts: int) -> float:
+    """Variance of a value at one instant by n samples: their mean less the curve's there, plus the curve's there.
+
+    In variances of a sample; the instant is so many PARTS of a step behind their middle.
+    """
+    weights, reach = _cubics(half).weights[:, half], half + n + 2
+    nothing = np.zeros((3, 2 * reach + n))
+
+    def around(place: int) -> Array:
+        """Weights of the samples in the curve's value, slope and second derivative at one of them."""
+        of_place = np.zeros_like(nothing)
+        of_place[:, reach + place - half : reach + place + half + 1] = weights
+        return of_place
+
+    own = np.zeros(nothing.shape[1])
+    own[reach : reach + n] = 1.0 / n
+    middle = (n - 1) / 2.0 + parts / PARTS
+    place = int(np.floor(middle))
+    share = np.full(len(own), middle - place)
+    both = np.stack([around(place), around(place + 1)])
+    there = _hermite(share, np.ones(len(own)), both[:, 0], both[:, 1], np.zeros(1, np.intp))[0]
+    left = own - np.mean([around(i)[0] for i in range(n)], axis=0)
+    return float(((left + there) ** 2).sum())
+
+
 def powers(steps: Array) -> Array:
     """1, s, s^2, s^3 (N, 4) of s (N,)."""
     return np.asarray(steps[:, None] ** np.arange(4.0))
@@ -131,10 +152,10 @@ def _hermite(u: Array, h: Array, value: Array, slope: Array, i: NDArray[np.intp]
 
 
 class _Cubics(NamedTuple):
-    """Weights of values and two derivatives at each of M places (3, M, M), covariance (4, 4) amid them."""
+    """Weights of values and two derivatives at each of M places (3, M, M), and a sample's own at the middle one."""
 
     weights: Array
-    covariance: Array
+    own: float
 
 
 @cache
@@ -145,7 +166,7 @@ def _cubics(half: int) -> _Cubics:
     by_step, twice = np.zeros(basis.shape), np.zeros(basis.shape)
     by_step[:, 1:] = basis[:, :3] * np.arange(1.0, 4.0)
     twice[:, 2:] = basis[:, :2] * np.array([2.0, 6.0])
-    return _Cubics(np.stack([basis, by_step, twice]) @ fit, fit @ fit.T)
+    return _Cubics(np.stack([basis, by_step, twice]) @ fit, float((basis @ fit)[half, half]))
 
 
 def _through(values: Array, half: int) -> Array:

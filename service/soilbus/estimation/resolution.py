@@ -4,11 +4,7 @@
 
 is the value at the centre c of a bin by the samples y_j in it, with s the channel's curve (see `local_cubics`): not
 a mean over the bin but the value of one instant, whatever the phases of the messages.  So a nonlinear model needs no
-second-order term.  It is worth fewer samples than it has,
-
-    var x(c) = var y (1/n + e' C e - u' C u),
-
-with e and u the powers of a local cubic at c and their mean over the samples, C the covariance of that cubic.
+second-order term.  It is a weighted sum of samples, and its variance that of the sum: it is worth fewer than n.
 
 The bin is the longest at which this loses at most MOST_LOST of what the n samples are worth, in each channel that
 the model needs; none shorter than the slowest of these channels' periods, at which every bin still has a sample.
@@ -25,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.local_cubics import Curve, Series, curve_of, faithful, powers
+from soilbus.estimation.local_cubics import PARTS, Curve, Series, curve_of, faithful, variance_of_one
 from soilbus.estimation.screening import Samples
 from soilbus.estimation.window import BinStore, NoiseTable, Window, made_window
 
@@ -117,18 +113,17 @@ def _binned(channel: _Channel, length: float, n: int) -> _Binned:
     t, number = channel.t[kept], number[kept]
     bins, which = np.unique(number, return_inverse=True)
     count = np.asarray(np.bincount(which, minlength=len(bins)), np.float64)
-    centre: Array = (bins + 0.5) * length
+    centre = np.asarray((bins + 0.5) * length, np.float64)
 
     def mean(values: Array) -> Array:
         return np.asarray(np.bincount(which, values, len(bins)) / count)
 
     left = mean(channel.value[kept] - channel.curve.at(t)[0])
     step = channel.curve.step or length
-    middle = channel.t[np.clip(np.searchsorted(channel.t, centre), 0, len(channel.t) - 1)]  # a sample nearby
-    there = powers((centre - middle) / step)
-    of_samples = powers((t - middle[which]) / step)
-    used = np.stack([mean(of_samples[:, i]) for i in range(4)], axis=1)
-    smooth = channel.curve.half_width > 0  # else straight lines from sample to sample, worth one of them
-    more = channel.curve.spread(there) - channel.curve.spread(used) if smooth else 1.0 - 1.0 / count
-    worth = np.minimum(1.0 / np.maximum(1.0 / count + more, 0.5 / count), count)
+    phase = np.rint((centre - mean(t)) / step * PARTS).astype(int)
+    worth = np.ones(len(bins))  # of straight lines from sample to sample
+    if channel.curve.half_width:
+        kinds, which = np.unique(np.stack([count.astype(int), phase]), axis=1, return_inverse=True)
+        of_kind = [1.0 / variance_of_one(channel.curve.half_width, *kind) for kind in kinds.T.tolist()]
+        worth = np.minimum(np.array(of_kind)[which.ravel()], count)
     return _Binned(bins, count, left + channel.curve.at(centre)[0], worth)
