@@ -61,7 +61,7 @@ def test_a_torque_40_ms_late_is_named_and_told():
 
 @pytest.mark.parametrize(("quantity", "delay"), [("ground_speed", 0.2), ("load", 0.06)])
 def test_a_channel_that_is_late_is_named_and_the_others_are_not_late(quantity, delay):
-    found = diagnosed(504, quantity, delay)
+    found = diagnosed(504, quantity, delay, 0.0)
     assert [a.effect.name for a in found.additions] == ["channel_lag"]
     assert str(found.verdict) == "named"
     told = found.completed.parameters()["channel_lag"]

@@ -12,9 +12,7 @@ integrals, then every `forces`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from dataclasses import field as dataclass_field
-from types import MappingProxyType
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -137,7 +135,7 @@ class Effect:
     resistance: ErrorHook | None = None
     base_law: str | None = None
     of_record: bool = False
-    late: Mapping[str, Late] = dataclass_field(default_factory=lambda: MappingProxyType({}))
+    late: Mapping[str, Late] = field(default_factory=dict, hash=False)
     form_left: float = 0.125
 
     @property
