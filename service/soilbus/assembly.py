@@ -124,8 +124,19 @@ def _has_tyres(config: Config) -> bool:
     return not config.wheel or any(wheel.tyre == "flexible" for wheel in config.wheel)
 
 
-def completion_of(config: Config) -> tuple[tuple[Effect, ...], tuple[Free, ...]]:
+def delays_of(config: Config) -> dict[str, float]:
+    """How late each quantity is [s] by the effect channel_lag of model.effects; ConfigError as `effects_of`."""
+    if not config.model.effects:
+        return {}
+    from soilbus.terra.effects.sensors import CHANNEL_LAG, lateness
+
+    return lateness([active for active in effects_of(config) if active.effect is CHANNEL_LAG])
+
+
+def completion_of(config: Config, in_time: bool = True) -> tuple[tuple[Effect, ...], tuple[Free, ...]]:
     """The effects that complete the estimator's model, and what is known of their parameters.
+
+    in_time: samples come as the service takes them in, so that no channel is late any more (see `delays_of`).
 
     Those of model.effects but for what describes one recording: effects of_record are left
     out, such parameters stay neutral.  Another parameter's value is the prior's mean and its
@@ -133,7 +144,11 @@ def completion_of(config: Config) -> tuple[tuple[Effect, ...], tuple[Free, ...]]
     """
     wheels = rig_of(config).wheels
     settings = {setting.name: setting.model_extra or {} for setting in config.model.effects}
-    active = [a for a in effects_of(config, wheels) if not a.effect.of_record]
+    active = [
+        a
+        for a in effects_of(config, wheels)
+        if not (a.effect.of_record or (in_time and a.effect.name == "channel_lag"))
+    ]
     free: list[Free] = []
     for effect, values in active:
         for parameter in effect.parameters:

@@ -150,7 +150,8 @@ class Signal(_Section):
     `sign` flips a sensor mounted the other way round.  `valid` names a signal (or a
     signal of the same message) that must hold one of `valid_values` for the value to
     count.  `at` tells on which side of the gear a torque or speed is measured.
-    `timeout` [s] is the age from which the channel counts as stale.
+    `timeout` [s] is the age from which the channel counts as stale.  `delay` [s] is how much
+    earlier what a sample tells was true: a radar's filter, a receiver's solution, a queue.
     """
 
     signal: SignalName
@@ -159,6 +160,7 @@ class Signal(_Section):
     valid: str | None = None
     valid_values: list[int] = Field(default_factory=lambda: [1])
     timeout: PositiveFloat | None = None
+    delay: Annotated[float, Field(ge=-1.0, le=2.0)] = 0.0
 
     @model_validator(mode="before")
     @classmethod

@@ -88,17 +88,19 @@ def probability_of_depth(able: Capability, settings: Settings) -> float:
 class Basis(NamedTuple):
     """What a decision rests on: the instants (N,) [s] that were fitted, each so long [s], and the ground left behind.
 
-    unseen [m]: way driven since the last of them, until the window's end.
+    unseen [m]: way driven since the last of them, until the window's end; late [s]: by so much what they tell is older
+    than its stamps, where channels wait for one that is late.
     """
 
     instants: NDArray[np.float64] = np.empty(0)
     each: float = 0.0
     unseen: float = 0.0
+    late: float = 0.0
 
     @property
     def end(self) -> float:
-        """The last instant [s]; minus infinity without any."""
-        return float(self.instants[-1]) if len(self.instants) else -math.inf
+        """The last instant that is told of [s]; minus infinity without any."""
+        return float(self.instants[-1]) - self.late if len(self.instants) else -math.inf
 
 
 def at_present(way: Traversability, basis: Basis, loss: TractionLoss, now: float, config: Config) -> Traversability:

@@ -283,7 +283,7 @@ def test_effects_that_a_table_cannot_tell_are_no_candidates(tmp_path, measured):
     records = recordings_of_tables(rig(), [path]).records
     names = {effect.name for effect in candidates(rig(), records)}
     assert set(CATALOGUE) - names == {
-        "rate_stiffening", "inertia", "torque_lag", "soil_drift", "grade", "multipass",
+        "rate_stiffening", "inertia", "torque_lag", "channel_lag", "soil_drift", "grade", "multipass",
     }  # fmt: skip
     names = {effect.name for effect in candidates(rig(t="s"), records)}
     assert set(CATALOGUE) - names == {"rate_stiffening", "inertia", "multipass"}

@@ -67,8 +67,6 @@ def moved(problem, gains, latents):
     for i in range(len(problem.free)):
         nudge = 1e-4 * (np.arange(len(gains)) == problem.n_sensors + i)
         yield ("by_effects", i), 1e-4, lambda way, d=nudge: (SOIL, gains + way * d, latents)
-    if problem.effects[0].mixes_instants:
-        return  # what other instants add is not followed through their latents
     for field, name in (("by_load", "load"), ("by_speed", "speed"), ("by_ground", "ground_speed")):
         value = getattr(latents, name)
         step = 1e-5 * float(value.mean())
@@ -104,5 +102,5 @@ def test_what_is_told_is_what_the_hooks_make_of_the_forces(at):
     assert response.value[0] == pytest.approx(forces[1], rel=1e-9)
     if active.effect.torque is None:
         assert response.value[1] == pytest.approx(forces[2], rel=1e-9)
-    elif not active.effect.mixes_instants:
+    else:
         assert response.value[1] == pytest.approx(active.effect.torque(forces[2], around, active.values), rel=1e-9)

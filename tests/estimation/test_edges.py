@@ -17,7 +17,6 @@ from soilbus.estimation.effect_parameters import parameters_of
 from soilbus.estimation.gauss_newton import THOROUGH, Start, continued, descend, fit_window
 from soilbus.estimation.normal_equations import Fitting, Point
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-from soilbus.estimation.smoothing import SMOOTHED, smoothed
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.soils import SOILS
 
@@ -110,18 +109,3 @@ def test_angles_solved_anew_carry_the_loads_with_the_effects_as_they_are(simulat
     place.latents.entry_angle *= 1.1
     point = fitting.point(fitting.carried(place))
     assert np.abs(point.at.off).max() < 1e-3 * problem.load.mean()
-
-
-def test_smoothing_is_the_parabola_through_the_neighbours():
-    rng = np.random.default_rng(2)
-    t = np.concatenate([0.1 * np.arange(20), 5.0 + 0.1 * np.arange(12), 9.0 + 0.1 * np.arange(3)])
-    values = rng.normal(size=(len(t), 2))
-    told, half = smoothed(t, values), SMOOTHED // 2
-    for run in (range(20), range(20, 32)):
-        for i in run:
-            first = min(max(i - half, run[0]), run[-1] + 1 - SMOOTHED)
-            near = slice(first, first + SMOOTHED)
-            for wheel in range(2):
-                parabola = np.polynomial.Polynomial.fit(t[near] - t[i], values[near, wheel], 2)
-                assert told[i, wheel] == pytest.approx(parabola(0.0))
-    assert np.array_equal(told[32:], values[32:])

@@ -38,7 +38,7 @@ class Channel:
     `value in SI = factor * physical value of the DBC + offset`; values outside
     low..high (SI) are implausible.  `valid_signal` (same message) must hold one of
     `valid_values` (raw codes).  `quantity` is the role, e.g. "torque"; `wheel` the
-    wheel's name or "" for the vehicle.
+    wheel's name or "" for the vehicle.  What a sample tells was true `delay` [s] before its stamp.
     """
 
     quantity: str
@@ -52,6 +52,7 @@ class Channel:
     valid_signal: str | None = None
     valid_values: tuple[int, ...] = ()
     timeout: float | None = None
+    delay: float = 0.0
 
     @property
     def name(self) -> str:

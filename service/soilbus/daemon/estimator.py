@@ -106,7 +106,7 @@ class WindowEstimator:
         fit = tracked.fit
         status, reason = self._status(task, tracked)
         posterior = None if fit is None or status is Status.INVALID else self._honest(tracked, fit)
-        basis = self._basis(task.window, fit)
+        basis = self._basis(task, fit)
         if status is Status.VALID and task.end - basis.end > self.config.traversability.max_age:
             status, reason = Status.NOT_EXCITED, _gated(tracked)
         result = WindowResult(
@@ -239,14 +239,14 @@ class WindowEstimator:
         moving = window.ground_speed[window.ground_speed > self._settings.min_speed]
         return float(moving.mean()) if len(moving) else self._settings.min_speed
 
-    def _basis(self, window: Window, fit: Fit | None) -> Basis:
+    def _basis(self, task: WindowTask, fit: Fit | None) -> Basis:
         """The instants that a fit rests on, and how far the vehicle has driven since the last of them."""
         instants = np.empty(0) if fit is None else fit.optimum.t
         end = instants[-1] + self._settings.bin / 2.0 if len(instants) else -math.inf
-        since = window.ground_speed[window.t > end]
+        since = task.window.ground_speed[task.window.t > end]
         known = since[np.isfinite(since)]
         unseen = float(known.mean()) * len(since) * self._settings.bin if len(known) else 0.0
-        return Basis(instants, self._settings.bin, unseen)
+        return Basis(instants, self._settings.bin, unseen, task.late)
 
     def _status(self, task: WindowTask, tracked: Tracked) -> tuple[Status, str]:
         """Status and its reason; a sensor that lies is the reason of all that may follow from it."""

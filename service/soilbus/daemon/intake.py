@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ import numpy as np
 from cantools.database.can import Database
 from numpy.typing import NDArray
 
-from soilbus.assembly import rig_of
+from soilbus.assembly import delays_of, rig_of
 from soilbus.can.admission import LONGEST_GAP, Admission
 from soilbus.can.channels import Channel, Decoded
 from soilbus.can.dbc_files import checked_messages
@@ -26,6 +26,7 @@ from soilbus.config import Config
 from soilbus.daemon.plausibility import Plausibility
 from soilbus.daemon.positions import PositionTrack
 from soilbus.estimation.plausibility import without
+from soilbus.estimation.resolution import resolved_window
 from soilbus.estimation.screening import WILD
 from soilbus.estimation.window import (
     VEHICLE_QUANTITIES,
@@ -59,7 +60,8 @@ class WindowTask:
     missing are needed channels never seen, poor those that are stale at the end or covered the window badly;
     implausible are channels that lie, and are not in the window;
     torque_limit (W,) [N m], nan where unknown; track knows the positions from the window's
-    middle on; fresh: nothing of the window before may be carried over.
+    middle on; fresh: nothing of the window before may be carried over; late: by so much [s] the latest channel is late,
+    and all wait for it.
     """
 
     index: int
@@ -74,6 +76,7 @@ class WindowTask:
     rejected: dict[str, int]
     fresh: bool
     implausible: tuple[str, ...] = ()
+    late: float = 0.0
     epoch: int = 0
 
 
@@ -165,11 +168,15 @@ class ReportedLimits:
 class Intake:
     """Admission, bins and freshness of one vehicle's channels.
 
-    Raises ConfigError where configuration and database do not fit.
+    Channels that are late by their `delay` and by `delays` [s] by quantity (those of the
+    configuration's effects where none are given) are put beside what was true with them: all
+    others wait for the latest one.  So each window is whole, and tells of as long before its
+    end; whether a channel is fresh goes by the stamps of its frames.  Raises ConfigError where
+    configuration and database do not fit.
     """
 
-    def __init__(self, config: Config, database: Database) -> None:
-        self._config, self._database = config, database
+    def __init__(self, config: Config, database: Database, delays: Mapping[str, float] | None = None) -> None:
+        self._config, self._database, self._delays = config, database, delays
         self.channels = channels_of(config, database)
         self.admission = Admission(self.channels, database, checked_messages(config))
         self.rig = rig_of(config)
@@ -179,6 +186,10 @@ class Intake:
             {c.name: c.timeout or DEFAULT_TIMEOUT for c in self.channels if c.quantity in POSITION_ROLES}
         )
         self._plausibility = Plausibility(self.rig, self.channels, database, config.estimator)
+        of_effects = delays_of(config) if delays is None else delays
+        late = {c.name: c.delay + of_effects.get(c.quantity, 0.0) for c in self.channels}
+        self._latest = max([0.0, *late.values()])
+        self._waits = {name: self._latest - delay for name, delay in late.items() if self._latest != delay}
         self._settings = config.estimator
         self._binned = frozenset(self.rig.channels)
         limits = {w.name: w.max_torque for w in config.wheel}
@@ -193,7 +204,7 @@ class Intake:
 
     def of_another_recording(self) -> Intake:
         """An intake that knows nothing of what this one heard; both count windows, frames and refusals together."""
-        other = Intake(self._config, self._database)
+        other = Intake(self._config, self._database, self._delays)
         other.admission.counts, other._index = self.admission.counts, self._index
         other.refusals.total, other.refusals.used = self.refusals.total, self.refusals.used
         return other
@@ -243,6 +254,9 @@ class Intake:
             if name.startswith("torque_limit."):
                 self._limits.add(name.removeprefix("torque_limit."), t, value)
         self._positions.add(heard)
+        for name in heard.keys() & self._waits.keys():
+            t, value = heard[name]
+            heard[name] = t + self._waits[name], value
         self._plausibility.add(heard)
         if self._bins is not None:
             self._bins.add({name: samples for name, samples in heard.items() if name in self._binned})
@@ -273,13 +287,14 @@ class Intake:
     def taken_whole(self) -> Window | None:
         """All that was ingested since the clock was last set, as one window; what comes later begins anew.
 
-        None where there is no sample; the bin that has just begun is left out.
+        Its bins are as short as the recording's spectrum asks for (see `resolution`); the one
+        that has just begun is left out.  None where there is no sample.
         """
         bins, end = self._bins, max(self.last_seen.values(), default=-math.inf)
         window = None
         if bins is not None and end - bins.origin >= bins.bin_length:
             end = bins.origin + math.floor((end - bins.origin) / bins.bin_length) * bins.bin_length
-            window = forward(bins.window(bins.origin, end))
+            window = forward(resolved_window(bins, end))
             self.refusals.note_wild(bins.new_wild())
         self._restart()
         return window
@@ -304,6 +319,7 @@ class Intake:
             track=self._positions.copy(),
             rejected=self.refusals.within(start, end),
             fresh=self._fresh,
+            late=self._latest,
             implausible=self._lying,
             epoch=self.epoch,
         )

@@ -41,11 +41,11 @@ def recordings_of(
     for one without a usable part, ConfigError where configuration and database do not fit.
     """
     rig, model, settings = rig_of(config), model_of(config), config.estimator
-    effects, free = completion_of(config)
+    effects, free = completion_of(config, in_time=False)
     records: list[Record] = []
     first, too_short, rejected, samples = [], [], Counter[str](), 0
     for path, log in zip(logs, log_names(logs), strict=True):
-        intake = Intake(config, database)
+        intake = Intake(config, database, {})
         first.append(len(records))
         fault: TooLittle | None = None
         for i, window in enumerate(parts(intake, path, progress)):

@@ -45,7 +45,7 @@ RIM_SPEED = 100.0
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
 """Texts, in small letters, of a cell without a value."""
 OF_TRUE_SPEED = frozenset({"rate_stiffening", "inertia"})
-OF_TIME = frozenset({"torque_lag", "soil_drift", "grade"})
+OF_TIME = frozenset({"torque_lag", "channel_lag", "soil_drift", "grade"})
 OF_SEVERAL_WHEELS = frozenset({"multipass"})
 
 

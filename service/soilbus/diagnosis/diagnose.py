@@ -12,6 +12,7 @@ from soilbus.diagnosis.completion import Completion
 from soilbus.diagnosis.detectable import Detectable, detectable
 from soilbus.diagnosis.fits import Fits
 from soilbus.diagnosis.gap import Gap, gap_of
+from soilbus.diagnosis.late_posterior import with_lateness
 from soilbus.diagnosis.learned import Correction, corrections
 from soilbus.diagnosis.naming import ASTRAY, Addition, converged, named
 from soilbus.diagnosis.reconsidered import reconsidered
@@ -96,6 +97,9 @@ def diagnose(
         if len(additions) > 1 and present.gap < ASTRAY:
             additions, present = reconsidered(whole, few, base, present, additions, candidates)
     present = converged(whole, base.evidence, present)
+    if any(effect.late for effect in present.effects):
+        progress("telling delays from low passes")
+        present = with_lateness(records, prior, present, base.evidence - present.evidence)
     additions.sort(key=lambda addition: -addition.falls[addition.effect.name])
     progress("holding out every block in turn")
     before = gap_of(records, prior, base)

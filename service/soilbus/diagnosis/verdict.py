@@ -71,7 +71,7 @@ def probabilities(
     """
     most = max(falls.values())
     usual, great = (_shares(falls, t, further) for t in temperatures(explained + most))
-    something = 1.0 / (1.0 + math.exp(-most / (2.0 * _temperature(explained, FORM_LEFT))))
+    something = 1.0 / (1.0 + math.exp(-most / (2.0 * temperature(explained, FORM_LEFT))))
     chances = {n: something * ((1.0 - AT_TIMES) * usual[n] + AT_TIMES * great[n]) for n in falls}
     return dict(sorted(chances.items(), key=lambda item: -item[1]))
 
@@ -91,16 +91,16 @@ def temperatures(explained: float) -> tuple[float, float]:
 
     At times is AT_TIMES.
     """
-    return _temperature(explained), _great_temperature(explained)
+    return temperature(explained), _great_temperature(explained)
 
 
-def _temperature(explained: float, form_error: float = FORM_ERROR) -> float:
+def temperature(explained: float, form_error: float = FORM_ERROR) -> float:
     """What differences of -2 log evidence are divided by, where so much of it is explained in all."""
     return TEMPERATURE + form_error * max(explained, 0.0)
 
 
 def _great_temperature(explained: float) -> float:
-    return _temperature(min(explained, GROWN), GREAT_FORM_ERROR)
+    return temperature(min(explained, GROWN), GREAT_FORM_ERROR)
 
 
 def _shares(

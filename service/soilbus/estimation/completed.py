@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from functools import partial
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -18,22 +17,22 @@ from numpy.typing import NDArray
 
 from soilbus.estimation.effect_parameters import Free, active_at, varied_at
 from soilbus.estimation.linearised import Latents
-from soilbus.estimation.residuals import MAX_TURN, Response, WindowProblem
-from soilbus.estimation.smoothing import smoothed
+from soilbus.estimation.residuals import MAX_TURN, Lateness, Response, WindowProblem
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.dual import UNIT, Dual, slope_of, value_of
+from soilbus.terra.effects.along import through_low_pass
 from soilbus.terra.effects.effect import (
     Active,
     Effect,
     Forces,
     Surroundings,
-    Values,
     reactions_with,
     true_draft,
     wheel_with,
 )
 from soilbus.terra.stress import lumped_modulus
 from soilbus.terra.tangent import forces_along
+from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import (
     MAX_ENTRY_ANGLE,
     MIN_ENTRY_ANGLE,
@@ -46,12 +45,14 @@ from soilbus.terra.wheel import (
 
 Array = NDArray[np.float64]
 
-STEP = 1e-6
-"""Step of differences by parameters of effects that mix instants, in prior std."""
 LOAD_ROUNDS, LITTLE_TURN = 6, 0.01
 """Steps to the entry angles that carry the loads, and the relative one that is the last."""
 _LATENTS = ("entry_angle", "load", "speed", "ground_speed")
 _SOIL = Soil._fields
+
+
+_POWERS = tuple((i, j) for i in range(3) for j in range(5))
+"""Powers of load and of slip through which torques go: within 0.1 % of the model's over a recording."""
 
 
 class _Contact(NamedTuple):
@@ -163,7 +164,6 @@ class CompletedProblem(WindowProblem):
         contact = self._contact(wheels, active, forces_along(wheels.state, wheels.model))
         load, drawbar, torque, depth = self._told(contact, active, varied)
         around = self._surroundings(latents)
-        torque = torque + self._late(active, pulls, contact.forces[2], around)
         pull = self._pull(contact.forces[1].only(int), active, around)
         at, by_latents, by_soil, by_effects = _gathered(
             (load, drawbar, torque, depth), len(self.free), (self.n, self.n_wheels)
@@ -220,13 +220,10 @@ class CompletedProblem(WindowProblem):
         return excess
 
     def _told(self, contact: _Contact, active: Sequence[Active], latents: Latents) -> tuple[Any, Any, Any, Any]:
-        """Load that the soil carries beyond what it must, drawbar pull, torque reading and sinkage (N, W).
-
-        Without what other instants add to the torque readings.
-        """
+        """Load that the soil carries beyond what it must, drawbar pull, torque reading and sinkage (N, W)."""
         _, pull, torque = contact.forces
         for effect, values in active:
-            if effect.torque is not None and not effect.mixes_instants:
+            if effect.torque is not None:
                 torque = effect.torque(torque, contact.around, values)
         return self._excess(contact, active, latents), pull, torque, contact.depth
 
@@ -268,32 +265,90 @@ class CompletedProblem(WindowProblem):
         )
         return by_draft, by_acceleration
 
-    def _late(self, active: Sequence[Active], pulls: Array, torque: Any, around: Surroundings) -> Any:
-        """What other instants add to the readings of torques (N, W), by the soil and the effects' parameters.
+    def lateness(self, gains: Array, latents: Latents, torque: Array) -> Lateness | None:
+        """Of readings y that are late by d and a low pass of tau: x(t) = (1 + tau d/dt) y(t + d).
 
-        It is taken from smoothed torques, and not followed through their latents: each instant
-        is solved for by itself.
+        y(t + d) is y(t) + s(t + d) - s(t) with the curve s of the readings (see local_cubics): the noise of an instant
+        stays with it, else every delay would pair other noises and some would seem to fit better.  For torques, which
+        the model predicts, the low pass goes over the prediction instead, and so do derivatives: slopes of readings
+        have noise that would count as information.
         """
-        mixing = [a for a in active if a.effect.torque is not None and a.effect.mixes_instants]
-        if not mixing:
-            return 0.0
-        shape = torque.value.shape
-        by = {q: np.broadcast_to(d, shape) for q, d in torque.by.items() if q not in _LATENTS}
-        smooth = smoothed(self.t, np.concatenate([torque.value, *by.values()], axis=1))  # value, then derivatives
-        late, changes = np.zeros_like(smooth), dict[Any, Array]()
-        for effect, values in mixing:
-            plain = {name: value_of(value) for name, value in values.items()}
-            added = partial(_added, effect, around)
-            here = added(smooth, plain)
-            late += here
-            for name, value in values.items():
-                for i, std in value.by.items() if isinstance(value, Dual) else ():
-                    step = STEP if self.free[i].within(pulls[i] + STEP) else -STEP
-                    there = added(smooth[:, : shape[1]], {**plain, name: value.value + step * std})
-                    changes[i] = changes.get(i, 0.0) + (there - here[:, : shape[1]]) / step
-        told, *slopes = np.split(late, 1 + len(by), axis=1)
-        changes |= {q: changes.get(q, 0.0) + d for q, d in zip(by, slopes, strict=True)}
-        return Dual(told, changes)
+        places = {(f.effect, f.parameter.name): i for i, f in enumerate(self.free)}
+        pulls, W, P = gains[self.n_sensors :], self.n_wheels, len(self.free)
+        found: dict[str, tuple[Array, Array]] = {}
+        predicted, by_predicted = self._nothing_late("torque", P)
+        for effect in self.effects:
+            for quantity, (delay, time_constant) in effect.late.items():
+                at = places[effect.name, delay], places[effect.name, time_constant]
+                if all(self.free[i].std == 0.0 and self.free[i].value == 0.0 for i in at):
+                    continue
+                added, by = found.setdefault(quantity, self._nothing_late(quantity, P))
+                d, tau = (self.free[i].at(float(pulls[i])) for i in at)
+                std, of_tau = (self.free[i].std for i in at)
+                if quantity == "torque":
+                    predicted, rate, by_tau = self._behind(tau, latents, torque)
+                    by_predicted[at[0]], by_predicted[at[1]] = -std * rate, of_tau * by_tau
+                    tau, std, of_tau = 0.0, 0.0, 0.0
+                for column, series in enumerate(self._curves.of(quantity)):
+                    curve = series.faithful if quantity == "torque" else series.smooth
+                    value, slope, second = curve.at(self.t + d)
+                    added[:, column] += np.nan_to_num(value - curve.at(self.t)[0] + tau * slope)
+                    by[at[0], :, column] += std * np.nan_to_num(slope + tau * second)
+                    by[at[1], :, column] += of_tau * np.nan_to_num(slope)
+        if not found:
+            return None
+        read, load, ground, draft, pitch = (
+            found.get(q) or self._nothing_late(q, P) for q in ("torque", "load", "ground_speed", "draft", "pitch")
+        )
+        measured, by_measured = np.zeros((self.n, 2 * W + 1)), np.zeros((P, self.n, 2 * W + 1))
+        measured[:, :W], measured[:, 2 * W] = load[0] * self.usable, ground[0][:, 0]
+        by_measured[:, :, :W], by_measured[:, :, 2 * W] = load[1] * self.usable, ground[1][:, :, 0]
+        weight = 0.0 if self.rig.chassis is None else self.rig.chassis.mass * GRAVITY * np.cos(self.pitch)
+        return Lateness(
+            torque=read[0],
+            measured=measured,
+            demand=draft[0][:, 0] + weight * pitch[0][:, 0],
+            predicted=predicted,
+            by_torque=read[1],
+            by_measured=by_measured,
+            by_demand=draft[1][:, :, 0] + weight * pitch[1][:, :, 0],
+            by_predicted=by_predicted,
+        )
+
+    def _behind(self, tau: float, latents: Latents, torque: Array) -> tuple[Array, Array, Array]:
+        """What a low pass of tau [s] adds to the torques (N, W) of the model; the slope behind it; derivative by tau.
+
+        Between the instants, and where some are left out, torques follow from the curves of loads and speeds: by a
+        polynomial through the model's own torques over load and slip.
+        """
+        off, slope, by_tau = (np.zeros(torque.shape) for _ in range(3))
+        loads, speeds, (ground,) = (
+            [series.smooth for series in self._curves.of(q)] for q in ("load", "speed", "ground_speed")
+        )
+        slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
+        for w, (load, speed) in enumerate(zip(loads, speeds, strict=True)):
+            used = self.usable[:, w]
+            if len(load.t) < 2 or np.count_nonzero(used) < 2 * len(_POWERS):
+                continue
+            states = np.stack([latents.load[used, w], slip[used, w]])
+            rim = np.maximum(self.rig.radius[w] * speed.at(load.t)[0], 1e-3)
+            way = np.clip(np.stack([load.value, 1.0 - ground.at(load.t)[0] / rim]).T, *np.sort(states)[:, [0, -1]].T)
+            middle, size = states.mean(1)[:, None], np.maximum(states.std(1), 1e-9)[:, None]
+            basis = _monomials((states - middle) / size)
+            by_power = np.linalg.lstsq(basis, torque[used, w], rcond=None)[0]
+            along = _monomials((way.T - middle) / size) @ by_power
+            late = through_low_pass(load.t, along[:, None], tau)
+            rate = (along[:, None] - late) / tau if tau > 0.0 else np.gradient(along, load.t)[:, None]
+            behind = through_low_pass(load.t, rate, tau)
+            off[:, w] = np.interp(self.t, load.t, late[:, 0] - along) * used
+            slope[:, w] = np.interp(self.t, load.t, rate[:, 0]) * used
+            by_tau[:, w] = -np.interp(self.t, load.t, behind[:, 0]) * used
+        return off, slope, by_tau
+
+    def _nothing_late(self, quantity: str, n_effects: int) -> tuple[Array, Array]:
+        """Nothing (N, columns), with no derivatives (P, N, columns)."""
+        columns = len(self._curves.of(quantity))
+        return np.zeros((self.n, columns)), np.zeros((n_effects, self.n, columns))
 
     def _surroundings(self, latents: Latents) -> Surroundings:
         chassis = self.rig.chassis
@@ -328,9 +383,9 @@ def _gathered(told: Sequence[Any], n_effects: int, shape: tuple[int, int]) -> tu
     return at, by_latents, by_soil, by_effects
 
 
-def _added(effect: Effect, around: Surroundings, torque: Array, values: Values) -> Array:
-    """What an effect that mixes instants adds to torques (N, W)."""
-    return np.asarray(effect.torque(torque, around, values) - torque) if effect.torque else np.zeros_like(torque)
+def _monomials(states: Array) -> Array:
+    """Products (N, len(_POWERS)) of powers of load and slip (2, N)."""
+    return np.stack([states[0] ** i * states[1] ** j for i, j in _POWERS], axis=1)
 
 
 def _varied(soil: Soil) -> Soil:

@@ -68,6 +68,8 @@ class DenoisedProblem(WindowProblem):
         rows[:, :, 0] += (change @ (at.corrected - self._expected)[:, :, None])[:, :, 0]
         if by_sensors:
             rows[:, :, 7 + W : 6 + self.n_sensors] -= change * at.by_gain[:, None, :]
+        if len(at.by_late):
+            rows[:, :, -len(at.by_late) :] += np.einsum("nml,pnl->nmp", change, at.by_late)
         weighed = (self._inverse @ rows).reshape(at.rows.shape)
         nothing = np.zeros_like(at.variance)
         return replace(
@@ -78,6 +80,7 @@ class DenoisedProblem(WindowProblem):
             corrected=self._expected,
             variance=nothing,
             by_gain=nothing,
+            by_late=at.by_late[:0],
         )
 
 

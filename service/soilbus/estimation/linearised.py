@@ -54,6 +54,7 @@ class Linearised:
     corrected: Array  # (N, 2 W + 1) measured latents less their gain errors
     variance: Array  # of these
     by_gain: Array  # and minus their derivatives by the gain errors
+    by_late: Array  # (P, N, 2 W + 1) and their derivatives by the effects' parameters; (0, N, 2 W + 1) of none
     off: Array  # (N, W) latent load less the model's
     load_slope: Array  # (N, W) dW/d entry angle
     load_by_slip: Array
@@ -78,6 +79,7 @@ class Linearised:
             corrected=np.concatenate([self.corrected[first:], new.corrected]),
             variance=np.concatenate([self.variance[first:], new.variance]),
             by_gain=np.concatenate([self.by_gain[first:], new.by_gain]),
+            by_late=np.concatenate([self.by_late[:, first:], new.by_late], axis=1),
             off=np.concatenate([self.off[first:], new.off]),
             load_slope=np.concatenate([self.load_slope[first:], new.load_slope]),
             load_by_slip=np.concatenate([self.load_by_slip[first:], new.load_by_slip]),

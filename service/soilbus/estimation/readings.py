@@ -10,6 +10,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.estimation.local_cubics import Series
 from soilbus.estimation.window import Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
 
@@ -26,7 +27,7 @@ GAIN_QUANTITIES = ("torque", "load", "speed", "ground_speed", "draft")
 _BY_INSTANT = (
     "t", "usable", "torque", "torque_var", "has_torque", "sinkage", "sinkage_var", "has_sinkage", "load", "load_var",
     "speed", "speed_var", "ground_speed", "ground_speed_var", "slip", "draft", "draft_var", "demand", "demand_var",
-    "has_balance", "since", "distance", "wheel_angle", "acceleration", "acceleration_var",
+    "has_balance", "pitch", "since", "distance", "wheel_angle", "acceleration", "acceleration_var",
     "_measured", "_measured_var", "_row_var", "_known",
 )  # fmt: skip
 """Attributes of a window's problem with a row for each instant."""
@@ -47,7 +48,8 @@ class Readings:
 
     def __init__(self, window: Window, rig: Rig, min_speed: float, max_turn: float) -> None:
         self.rig = rig
-        window = forward(window)
+        self._curves = Curves(forward(window), rig.wheels)
+        window = self._curves.window
         n_wheels = len(rig.wheels)
         moving, in_turn = window.ground_speed > min_speed, turning(window, rig, max_turn)
         straight = moving & ~in_turn
@@ -112,6 +114,7 @@ class Readings:
         self.with_pitch = False
         demand, variance = self.draft.copy(), draft_var.copy()
         acceleration, acceleration_var = np.zeros_like(demand), np.zeros_like(demand)
+        self.pitch = np.zeros_like(demand)
         if self.rig.chassis is not None:
             mass = self.rig.chassis.mass
             pitch, pitch_var, has_pitch = take("pitch")
@@ -125,6 +128,7 @@ class Readings:
                 acceleration, acceleration_var = differentiated_speed(self.t, self.ground_speed, self.ground_speed_var)
             demand += mass * (GRAVITY * np.sin(pitch) + acceleration)
             variance += mass**2 * ((GRAVITY * np.cos(pitch)) ** 2 * pitch_var + acceleration_var)
+            self.pitch = pitch
         self.acceleration, self.acceleration_var = acceleration, acceleration_var
         self.demand, self.demand_var = demand, variance
         self.draft_var = np.where(known & usable.all(axis=1), draft_var, 0.0)
@@ -147,6 +151,30 @@ class Readings:
             setattr(part, name, getattr(self, name)[instants])
         part._count()
         return part
+
+
+class Curves:
+    """A window's measured series as smooth curves, made when they are asked for."""
+
+    def __init__(self, window: Window, wheels: tuple[str, ...]) -> None:
+        self.window = window
+        self._wheels = wheels
+        self._made: dict[str, list[Series]] = {}
+
+    def of(self, quantity: str) -> list[Series]:
+        """One curve for each wheel, or one for the vehicle."""
+        if quantity not in self._made:
+            values, variances = getattr(self.window, quantity), self.window.variance[quantity]
+            names = [quantity] if values.ndim == 1 else [f"{quantity}.{wheel}" for wheel in self._wheels]
+            if all(name in self.window.curves for name in names):
+                return self._made.setdefault(quantity, [self.window.curves[name] for name in names])
+            columns = values.reshape(len(self.window.t), -1), variances.reshape(len(self.window.t), -1)
+            self._made[quantity] = [self._curve(v, var) for v, var in zip(*(c.T for c in columns), strict=True)]
+        return self._made[quantity]
+
+    def _curve(self, values: Array, variance: Array) -> Series:
+        known = np.isfinite(values) & np.isfinite(variance)
+        return Series.of(self.window.t[known], values[known], variance[known])
 
 
 def travelled(t: Array, ground_speed: Array, window: Array) -> tuple[Array, Array]:

@@ -67,6 +67,23 @@ class Response(NamedTuple):
     pull_by_effects: Array
 
 
+class Lateness(NamedTuple):
+    """What readings of channels that are not late would tell besides these, and its derivatives by the effects.
+
+    torque (N, W) [N m], measured (N, 2 W + 1) of the latents, demand (N,) [N]; by_torque (P, N, W) and so on.
+    predicted (N, W) [N m] is what a low pass makes of the torques of the model, less these.
+    """
+
+    torque: Array
+    measured: Array
+    demand: Array
+    predicted: Array
+    by_torque: Array
+    by_measured: Array
+    by_demand: Array
+    by_predicted: Array
+
+
 class WindowProblem(Readings):
     """One window's data and the model that is to explain it, ready to be linearised at any soil."""
 
@@ -83,6 +100,10 @@ class WindowProblem(Readings):
     def gain_bounds(self) -> tuple[Array, Array]:
         """Least and greatest gains (G,), infinite where any will do."""
         return np.full(len(self.gain_std), -np.inf), np.full(len(self.gain_std), np.inf)
+
+    def lateness(self, gains: Array, latents: Latents, torque: Array) -> Lateness | None:
+        """Of gains (G,) and latents, with these torques (N, W) of the model; None where nothing is late."""
+        return None
 
     def thinned(self, most: int) -> WindowProblem:
         """The same window with at most so many of its usable instants, evenly spread."""
@@ -170,6 +191,7 @@ class WindowProblem(Readings):
         A = self._by_latents(at)
 
         of_torque, of_latents, of_draft, corrected, variance, row_var = self._corrected(gains)
+        late = self.lateness(gains, latents, at.value[1])
         draft, draft_var = self.draft * of_draft, self.draft_var * of_draft**2
 
         first_effect = 7 + (self.n_sensors if by_sensors else 0)
@@ -192,7 +214,16 @@ class WindowProblem(Readings):
             diagonals(by_gain[:, :W, :W])[:] = -of_torque * at.value[1]
             np.multiply(A, -latent_by_gain[:, None, :], out=by_gain[:, :, W:-1])
             by_gain[:, W, -1] = -of_draft * (draft - residual[:, W] * draft_var / row_var[:, W])
+        by_late = np.zeros((0, *now.shape))
+        if late is not None:
+            residual += self.late_residuals(late, A, gains)
+            by_late = late.by_measured * of_latents
+            by_effects[:, :W] += (of_torque * late.by_torque - late.by_predicted).transpose(1, 2, 0)
+            by_effects[:, W] += late.by_demand.T
+            by_effects += np.einsum("nml,pnl->nmp", A, by_late)
         residual += (A @ (corrected - now)[:, :, None])[:, :, 0]
+        if late is not None:
+            corrected = corrected + late.measured * of_latents
         if self._missing is not None:
             A[self._missing] = 0.0
             rows[self._missing] = 0.0
@@ -206,12 +237,32 @@ class WindowProblem(Readings):
             corrected=corrected,
             variance=variance,
             by_gain=latent_by_gain,
+            by_late=by_late,
             off=at.off,
             load_slope=at.load_slope,
             load_by_slip=at.load_by_slip,
             load_by_soil=at.load_by_soil,
             load_by_effects=at.load_by_effects,
         )
+
+    def late_residuals(self, late: Lateness | None, A: Array, gains: Array) -> Array:
+        """What late readings are off (N, m) at gains (G,), A (N, m, 2 W + 1) the residuals' derivatives by latents."""
+        residual, W = np.zeros(A.shape[:2]), self.n_wheels
+        if late is not None:
+            of_sensors = 1.0 / (1.0 + gains[: self.n_sensors])
+            residual[:, :W] = late.torque * of_sensors[:W] - late.predicted
+            residual[:, W] = late.demand
+            residual += (A @ (late.measured * of_sensors[W:-1])[:, :, None])[:, :, 0]
+            residual[~self._known] = 0.0
+        return residual
+
+    def variances(self, gains: Array) -> tuple[Array, Array]:
+        """Variances of latents (N, 2 W + 1) and rows (N, m) at gains (G,)."""
+        return self._corrected(gains)[4:]
+
+    def torques(self, soil: Array, gains: Array, latents: Latents) -> Array:
+        """Torques (N, W) [N m] of the model."""
+        return np.asarray(self._response(Soil(*soil.tolist()), gains, latents).value[1])
 
     def _corrected(self, gains: Array) -> tuple[Array, Array, float, Array, Array, Array]:
         """Readings less their gain errors (G,): factors of torques, latents and draft; latents with variance; rows'.
@@ -233,7 +284,7 @@ class WindowProblem(Readings):
         where there are sensors; standard normal where model and noise are right, nan where
         there is no reading.
         """
-        variance, row_var = self._corrected(gains)[4:]
+        variance, row_var = self.variances(gains)
         inverse = inverse_covariance(at.by_latents, variance, row_var, self.n_wheels)
         root = np.sqrt(diagonals(inverse))
         weighed = at.weighed.reshape(*root.shape, -1) / root[:, :, None]
@@ -300,6 +351,8 @@ class WindowProblem(Readings):
         N, W = self.n, self.n_wheels
         left = (at.weighed @ np.concatenate([[1.0], soil_step, gain_step])).reshape(N, 1, at.by_latents.shape[1])
         new = at.corrected - at.variance * (left @ at.by_latents)[:, 0] - at.by_gain * gain_step[W : self.n_sensors - 1]
+        if len(at.by_late):
+            new += np.tensordot(gain_step[self.n_sensors :], at.by_late, 1)
         load, speed, ground = new[:, :W], new[:, W : 2 * W], new[:, 2 * W]
         slip_change = (latents.ground_speed[:, None] / latents.speed - ground[:, None] / speed) / self.rig.radius
         more = load - latents.load - at.load_by_slip * slip_change

@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.estimation.local_cubics import Series
 from soilbus.estimation.screening import SIDE, Samples, joined, judge
 from soilbus.terra.vehicle import Chassis, pull_required
 
@@ -72,7 +73,7 @@ class Window:
     torque [N m], load [N], speed [rad/s], sinkage [m] have shape (N, W); ground_speed
     [m/s], draft [N], pitch [rad], acceleration [m/s^2], yaw_rate [rad/s] (positive to the
     left; unknown where it is not given) have shape (N,).  `variance` holds an array of the
-    same shape for each.
+    same shape for each.  `curves` are the samples' own curves by channel, where they were made.
     """
 
     t: Array
@@ -87,6 +88,7 @@ class Window:
     variance: Mapping[str, Array]
     samples: int
     yaw_rate: Array = field(default_factory=lambda: np.empty(0))
+    curves: Mapping[str, Series] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if len(self.yaw_rate) != len(self.t):
@@ -94,9 +96,8 @@ class Window:
 
     def rows(self, keep: NDArray[np.intp]) -> Window:
         """The window with only these bins."""
-        values = {q: getattr(self, q)[keep] for q in (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)}
-        variance = {q: v[keep] for q, v in self.variance.items()}
-        return Window(t=self.t[keep], variance=variance, samples=self.samples, **values)
+        values: dict[str, Any] = {q: getattr(self, q)[keep] for q in (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)}
+        return replace(self, t=self.t[keep], variance={q: v[keep] for q, v in self.variance.items()}, **values)
 
 
 def forward(window: Window) -> Window:
@@ -130,6 +131,7 @@ def forward(window: Window) -> Window:
         pitch=way * window.pitch,
         acceleration=way * window.acceleration,
         yaw_rate=way * window.yaw_rate,
+        curves={},
     )
 
 
@@ -212,7 +214,7 @@ class BinStore:
         self.bin_length = bin_length
         self.origin = origin
         self._index = {name: i for i, name in enumerate(rig.channels)}
-        self._noise = _NoiseTable.of(rig)
+        self._noise = NoiseTable.of(rig)
         self._first = 0
         self._totals = np.zeros((3, 0, len(self._index)))  # count, sum of values, sum of times
         self._recent: list[Samples] = []
@@ -251,6 +253,13 @@ class BinStore:
         samples, wild, _ = judge(samples.pick(near), self._noise.sd)
         totals = self._with(self._totals.copy(), samples.pick(~(samples.settled | wild)), high)
         return self._made(totals, low, high)
+
+    def screened(self, end: float) -> Samples:
+        """The samples before `end` [s] that are not wild, their times [s] counted from `origin`; nothing is decided."""
+        recent = list(self._recent)
+        samples, wild, _ = judge(self._taken(round((end - self.origin) / self.bin_length)), self._noise.sd)
+        self._recent = recent
+        return samples.pick(~wild)
 
     def new_wild(self) -> Array:
         """Times [s] of the samples found wild for good since the last call, ascending."""
@@ -304,7 +313,7 @@ class BinStore:
             mean, since = total / count, time / count
         centre: Array = (self._first + low + np.arange(len(mean), dtype=np.float64) + 0.5) * self.bin_length
         mean, worth = _at_centres(mean, since, centre)
-        return _make_window(self._noise, self.origin + centre, mean, count * worth, count)
+        return made_window(self._noise, self.origin + centre, mean, count * worth, count)
 
 
 def _at_centres(mean: Array, since: Array, centre: Array) -> tuple[Array, Array]:
@@ -331,7 +340,7 @@ def _at_centres(mean: Array, since: Array, centre: Array) -> tuple[Array, Array]
     )
 
 
-class _NoiseTable(NamedTuple):
+class NoiseTable(NamedTuple):
     """A rig's noise, column by column of its channels: variance, relative, of_mean, least level (channels,)."""
 
     n_wheels: int
@@ -341,7 +350,7 @@ class _NoiseTable(NamedTuple):
     least: Array
 
     @classmethod
-    def of(cls, rig: Rig) -> _NoiseTable:
+    def of(cls, rig: Rig) -> NoiseTable:
         noise = [rig.noise[name.partition(".")[0]] for name in rig.channels]
         return cls(
             len(rig.wheels),
@@ -350,6 +359,11 @@ class _NoiseTable(NamedTuple):
             np.array([n.of_mean for n in noise]),
             np.array([LEAST_LEVEL[name.partition(".")[0]] for name in rig.channels]),
         )
+
+    def of_samples(self, values: Array, column: int) -> Array:
+        """Variances (N,) of samples (N,) of the channel with this number."""
+        fixed = self.variance[column] + (self.of_mean[column] * np.abs(values).mean()) ** 2
+        return np.asarray(fixed + (self.relative[column] * values) ** 2)
 
     def sd(self, count: NDArray[np.intp], size: Array, level: Array) -> Array:
         """Sd (N,) of samples of magnitudes `size` (N,), channel after channel.
@@ -365,11 +379,11 @@ class _NoiseTable(NamedTuple):
         return np.sqrt(sd, out=sd)
 
 
-def _make_window(noise: _NoiseTable, t: Array, mean: Array, worth: Array, count: Array) -> Window:
+def made_window(noise: NoiseTable, t: Array, mean: Array, worth: Array, count: Array) -> Window:
     """A window from bin means, the samples they are worth and those in them, (N, channels) as rig.channels."""
     variance = _variance_of_means(mean, np.where(count > 0.0, worth, 0.0), noise)
     values, variances = _by_quantity(mean, noise.n_wheels), _by_quantity(variance, noise.n_wheels)
-    return Window(t=t, variance=variances, samples=int(count.sum()), **values)
+    return Window(t=t, variance=variances, samples=int(count.sum()), curves={}, **values)
 
 
 def _by_quantity(table: Array, n_wheels: int) -> dict[str, Array]:
@@ -379,7 +393,7 @@ def _by_quantity(table: Array, n_wheels: int) -> dict[str, Array]:
     return wheels | {q: table[:, first + i] for i, q in enumerate(VEHICLE_QUANTITIES)}
 
 
-def _variance_of_means(mean: Array, count: Array, noise: _NoiseTable) -> Array:
+def _variance_of_means(mean: Array, count: Array, noise: NoiseTable) -> Array:
     """Variances (N, channels) of bin means; not finite where a bin is empty."""
     of_sample = noise.variance + np.where(noise.relative != 0.0, (noise.relative * mean) ** 2, 0.0)
     if noise.of_mean.any():
@@ -399,7 +413,7 @@ def window_of_samples(rig: Rig, t: Array, samples: Mapping[str, Array], names: S
         if name in samples and (not names or name in names):
             mean[:, i] = samples[name]
     one = np.isfinite(mean).astype(float)
-    return _make_window(_NoiseTable.of(rig), np.asarray(t, float), mean, one, one)
+    return made_window(NoiseTable.of(rig), np.asarray(t, float), mean, one, one)
 
 
 def zero_if_unknown(values: Array) -> Array:

@@ -8,7 +8,7 @@ from typing import Any
 
 from cantools.database.can import Database
 
-from soilbus.assembly import completion_of, effects_of, rig_of
+from soilbus.assembly import completion_of, delays_of, effects_of, rig_of
 from soilbus.can.channels import Channel
 from soilbus.can.dbc_files import checked_messages, load_databases, output_database
 from soilbus.can.mapping import channels_of, without_unit
@@ -125,6 +125,10 @@ def effect_lines(config: Config) -> list[str]:
     effects, free = completion_of(config)
     lines = []
     for effect, _ in effects_of(config):
+        if effect.name == "channel_lag":
+            late = ", ".join(f"{quantity} {delay:.3g} s" for quantity, delay in delays_of(config).items())
+            lines.append(f"{effect.name}: taken out of the samples' stamps: {late}")
+            continue
         if effect not in effects:
             lines.append(f"{effect.name}: for simulate only; it describes the ground of one recording, no other's")
             continue
@@ -143,6 +147,8 @@ def _row(channel: Channel, database: Database, unit_assumed: bool, checked: bool
     status = "SI assumed: the DBC tells no unit" if unit_assumed else "ok"
     if channel.valid_signal:
         status += f", valid while {channel.valid_signal} is {'/'.join(map(str, channel.valid_values))}"
+    if channel.delay:
+        status += f", late by {channel.delay:g} s"
     if checked:
         status += ", counter and CRC required"
     every = f"{message.cycle_time} ms" if message.cycle_time else "not told"

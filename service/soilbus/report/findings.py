@@ -202,6 +202,7 @@ def effect_lines(number: int, addition: Addition, completed: Completion) -> list
     effect = addition.effect
     lines = [f"{number}. {effect.name}, probability {addition.probability:.2f}", f"   {effect.physics}"]
     units = {parameter.name: parameter.unit for parameter in effect.parameters}
+    units |= {late.total: "s" for late in effect.late.values()}
     for name, estimate in completed.parameters()[effect.name].items():
         unit = units.get(name) or units[name.rpartition("_")[0]]
         std = f"+- {estimate.std:.2g}" if estimate.std > 0.0 else "(held)"

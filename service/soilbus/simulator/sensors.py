@@ -14,6 +14,7 @@ from soilbus.config import Config, Noise
 from soilbus.simulator.drive import Drive
 from soilbus.simulator.scenario import SAMPLE_RATE
 from soilbus.terra.earth import SEMI_MAJOR_AXIS, wrapped
+from soilbus.terra.effects.sensors import read_late
 from soilbus.terra.stress import Array
 
 _DIVIDERS = {"ground_speed": 2, "latitude": 5, "longitude": 5}
@@ -45,9 +46,11 @@ def measure(drive: Drive, config: Config, seed: int) -> dict[str, Column]:
     """Noisy samples of every mapped channel, SI, by channel name (can.channels).
 
     Each value is what effects leave of the truth, times a gain fixed for the drive, plus
-    white noise (config [noise]); positions are off by POSITION_NOISE.
+    white noise (config [noise]); positions are off by POSITION_NOISE.  A signal with a delay tells
+    what was true so long before.
     """
     columns: dict[str, Column] = {}
+    wheels = {wheel.name: wheel for wheel in config.wheel}
     t, told = drive.columns["t"], drive.columns | _changed(drive, [wheel.name for wheel in config.wheel])
     told = told | {"yaw_rate": np.zeros(len(t))}  # the drives are straight
     for quantity, wheel in fitted(config):
@@ -55,6 +58,8 @@ def measure(drive: Drive, config: Config, seed: int) -> dict[str, Column]:
         every = slice(None, None, _DIVIDERS.get(quantity, 1))
         measured = _SAME_TRUTH.get(quantity, quantity)
         truth, rng = told[f"{measured}.{wheel}" if wheel else measured], channel_rng(seed, name)
+        if (delay := getattr(wheels[wheel] if wheel else config.signals, quantity).delay) != 0.0:
+            truth = np.interp(t - delay, t, truth)
         if quantity in ("latitude", "longitude"):
             parallel = 1.0 if quantity == "latitude" else np.cos(drive.columns["latitude"])
             truth = wrapped(truth + POSITION_NOISE / (SEMI_MAJOR_AXIS * parallel) * rng.standard_normal(len(t)))
@@ -65,7 +70,7 @@ def measure(drive: Drive, config: Config, seed: int) -> dict[str, Column]:
 
 
 def _changed(drive: Drive, wheels: list[str]) -> dict[str, NDArray[Any]]:
-    """Columns (N,) of draft, torques and loads as sensors without noise tell them."""
+    """Columns (N,) as sensors without noise tell them, of what effects change."""
     around = drive.surroundings
     torque, load = (np.stack([drive.columns[f"{q}.{wheel}"] for wheel in wheels], axis=1) for q in ("torque", "load"))
     draft = drive.columns["draft"]
@@ -79,6 +84,17 @@ def _changed(drive: Drive, wheels: list[str]) -> dict[str, NDArray[Any]]:
     changed = {"draft": draft}
     for i, wheel in enumerate(wheels):
         changed |= {f"torque.{wheel}": torque[:, i], f"load.{wheel}": load[:, i]}
+    return changed | _late(drive, drive.columns | changed, wheels)
+
+
+def _late(drive: Drive, told: dict[str, NDArray[Any]], wheels: list[str]) -> dict[str, NDArray[Any]]:
+    """Columns (N,) of channels that are late, of those that would be told in time."""
+    changed: dict[str, NDArray[Any]] = {}
+    for effect, values in drive.effects:
+        for quantity, late in effect.late.items():
+            names = [f"{quantity}.{wheel}" for wheel in wheels] if f"{quantity}.{wheels[0]}" in told else [quantity]
+            columns = np.stack([changed.get(name, told[name]) for name in names], axis=1)
+            changed |= dict(zip(names, read_late(columns, told["t"], values, late).T, strict=True))
     return changed
 
 

@@ -9,13 +9,14 @@ from hypothesis import strategies as st
 
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active, Effect, Surroundings, forces_with, wheel_with
+from soilbus.terra.effects.sensors import read_late
 from soilbus.terra.wheel import FORCES, WheelModel, WheelState, wheel_forces
 from wheels_around import REAR, wheels_around
 
 NAMES = [
     "slip_sinkage", "stress_peak_shift", "rut_recovery", "exponential_shear", "bulldozing", "lugs",
     "rate_stiffening", "multipass", "hardpan", "tyre_deflection", "drivetrain_loss", "grade", "draft_offset",
-    "draft_gain", "rolling_radius", "torque_lag", "inertia", "wheel_load_offset", "soil_drift",
+    "draft_gain", "rolling_radius", "torque_lag", "channel_lag", "inertia", "wheel_load_offset", "soil_drift",
 ]  # fmt: skip
 MODELS = {law: WheelModel(law) for law in ("exponential", "rational")}
 EFFECTS = pytest.mark.parametrize("effect", CATALOGUE.values(), ids=CATALOGUE)
@@ -30,6 +31,8 @@ def everything(effect: Effect, values: dict, state: WheelState, model: WheelMode
     out["reading"] = effect.torque(torque, around, values) if effect.torque else torque
     out["draft"] = draft + (effect.draft(draft, around, values) if effect.draft else nothing)
     out["load cell"] = around.load + (effect.load(around, values) if effect.load else 0.0)
+    for quantity, late in effect.late.items():
+        out[f"late {quantity}"] = read_late(np.sin(around.t), np.ravel(around.t), values, late)
     out["resistance"] = effect.resistance(around, values) if effect.resistance else nothing
     return out
 

@@ -13,6 +13,7 @@ from scipy.signal import lsim, lti
 from soilbus.terra.effects.along import stretches, through_low_pass
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active, wheel_with
+from soilbus.terra.effects.sensors import read_late
 from soilbus.terra.effects.vehicle import REFERENCE_RATE
 from soilbus.terra.vehicle import slip_ratio
 from soilbus.terra.wheel import WheelModel
@@ -24,7 +25,10 @@ T = np.linspace(0.0, 30.0, 301)
 
 def torque_of(name: str, torque: np.ndarray, around=AROUND, **values: float) -> np.ndarray:
     effect = CATALOGUE[name]
-    return effect.torque(torque, around, effect.neutral | values)
+    told = effect.neutral | values
+    if "torque" in effect.late:
+        return read_late(torque, around.t[:, 0], told, effect.late["torque"])
+    return effect.torque(torque, around, told)
 
 
 def test_a_drive_line_takes_torque_driving_and_braking():

@@ -12,7 +12,7 @@ integrals, then every `forces`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -90,6 +90,18 @@ DraftHook = Callable[[Any, Surroundings, Values], Any]
 ErrorHook = Callable[[Surroundings, Values], Any]
 
 
+class Late(NamedTuple):
+    """Names of the parameters [s] by which a channel is late: a dead time, and the time constant of a low pass."""
+
+    delay: str
+    time_constant: str
+
+    @property
+    def total(self) -> str:
+        """Name of their sum, which data tell best: a low pass delays by its time constant, to the first order."""
+        return self.delay.removesuffix("delay") + "total"
+
+
 @dataclass(frozen=True)
 class Effect:
     """One physical or sensor effect.
@@ -105,8 +117,7 @@ class Effect:
     hitch, reading less truth, of true drafts (N,).  load: errors [N] (N, W) of the wheel
     load cells.  resistance: force [N] (N,) that holds the vehicle back and is in no reading.
     base_law: the shear law of models to which the effect can be added, None for any.
-    mixes_instants: `torque` needs other instants than its own, adds them up, alike in each of however many columns,
-    and is given plain arrays.
+    late: quantities of which the effect's samples are late, each by the parameters named.
     of_record: its parameters describe the ground of one record and mean nothing in another.
     of_tyre: it is there only where a wheel has a tyre.
     ruled_out: what on the vehicle makes it impossible, where anything does.
@@ -128,9 +139,9 @@ class Effect:
     resistance: ErrorHook | None = None
     base_law: str | None = None
     of_record: bool = False
-    mixes_instants: bool = False
     of_tyre: bool = False
     ruled_out: str = ""
+    late: Mapping[str, Late] = field(default_factory=dict, hash=False)
     form_left: float = 0.125
 
     @property

@@ -1,13 +1,14 @@
-"""What sensors tell wrongly: the load cells of hitch and wheels, a torque that comes late."""
+"""What sensors tell wrongly: the load cells of hitch and wheels, channels that come late."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from soilbus.terra.effects.along import earlier, instants, through_low_pass
-from soilbus.terra.effects.effect import Effect, Parameter, Surroundings, Values
+from soilbus.terra.effects.effect import Active, Effect, Late, Parameter, Surroundings, Values
 from soilbus.terra.stress import Array
 
 _LOAD_CELLS = (
@@ -58,26 +59,59 @@ DRAFT_GAIN = Effect(
 )
 
 
-def _late(torque: Array, around: Surroundings, values: Values) -> Array:
-    """T(t - delay), on straight lines between instants and on beyond the first one of a run, through a low pass."""
-    t = instants(around.t)
-    first, second, part = earlier(t, values["delay"])
-    part = part[:, None]
-    queued = (1.0 - part) * torque[first] + part * torque[second]
-    return through_low_pass(t, queued, values["time_constant"])
+def late_by(values: Values, late: Late) -> float:
+    """How late a channel is in all [s]: a first-order lag is, to the first order, a delay of its time constant."""
+    return float(values[late.delay]) + float(values[late.time_constant])
 
+
+def lateness(active: Sequence[Active]) -> dict[str, float]:
+    """How late each quantity is in all by these effects [s]."""
+    found: dict[str, float] = {}
+    for effect, values in active:
+        for quantity, late in effect.late.items():
+            found[quantity] = found.get(quantity, 0.0) + late_by(values, late)
+    return found
+
+
+def read_late(truth: Array, t: Array, values: Values, late: Late) -> Array:
+    """x(t - delay) through a low pass, of (N, W) at times t [s] (N,).
+
+    On straight lines between instants, and on beyond the first one of a run.
+    """
+    first, second, part = earlier(t, values[late.delay])
+    part = part[:, None]
+    queued = (1.0 - part) * truth[first] + part * truth[second]
+    return through_low_pass(t, queued, values[late.time_constant])
+
+
+_DELAY_AND_LAG = "delay and first-order lag of a channel: Ljung, System Identification (2nd ed. 1999)"
+_TORQUE = Late("delay", "time_constant")
 
 TORQUE_LAG = Effect(
     name="torque_lag",
     physics="The torque comes late: filtered or queued on its way, it belongs to a moment that has passed.",
-    source="delay and first-order lag of a channel: Ljung, System Identification (2nd ed. 1999)",
+    source=_DELAY_AND_LAG,
     tells="quick changes of draft or speed; driving evenly hides it",
     parameters=(
-        Parameter("delay", "s", 0.0, 0.2, 0.0, 0.6),
-        Parameter("time_constant", "s", 0.0, 0.2, 0.0, 2.0),
+        Parameter(_TORQUE.delay, "s", 0.0, 0.2, 0.0, 0.6),
+        Parameter(_TORQUE.time_constant, "s", 0.0, 0.2, 0.0, 2.0),
     ),
-    torque=_late,
-    mixes_instants=True,
+    late={"torque": _TORQUE},
+)
+
+_OTHERS = {q: Late(f"{q}_delay", f"{q}_time_constant") for q in ("ground_speed", "draft", "load", "pitch")}
+
+CHANNEL_LAG = Effect(
+    name="channel_lag",
+    physics="A channel comes late: ground speed, draft, loads or pitch belong to a moment that has passed.",
+    source=_DELAY_AND_LAG + "; receivers of positions tell speeds 0.1 to 0.3 s late",
+    tells="quick changes of draft or speed; driving evenly hides it",
+    parameters=tuple(
+        Parameter(name, "s", 0.0, 0.2, low, 1.0)
+        for late in _OTHERS.values()
+        for name, low in ((late.delay, -0.2), (late.time_constant, 0.0))
+    ),
+    late=_OTHERS,
 )
 
 

@@ -51,7 +51,7 @@ class CompletedModel:
     @classmethod
     def of(cls, model: WheelModel, effects: Sequence[Active], ground_speed: float) -> CompletedModel:
         """With those of the effects that count."""
-        kept = [a for a in effects if not (a.effect.of_record or a.effect.each_wheel or a.effect.mixes_instants)]
+        kept = [a for a in effects if not (a.effect.of_record or a.effect.each_wheel or a.effect.late)]
         acting = [a for a in kept if a.effect.wheel or a.effect.forces or a.effect.torque]
         return cls(model, tuple(acting), ground_speed)
 

@@ -1,0 +1,132 @@
+"""Delays and low passes of channels, on recordings whose loads shake: the second generator, seeds of their own."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import shaking
+from soilbus.assembly import model_of, prior_of, rig_of
+from soilbus.can.dbc_files import load_databases
+from soilbus.cli import main
+from soilbus.config_file import load_config
+from soilbus.daemon.intake import Intake
+from soilbus.diagnosis.diagnose import Diagnosis, diagnose
+from soilbus.diagnosis.records import Record, record_of
+from soilbus.estimation.resolution import resolved_window
+from soilbus.estimation.window import BinStore
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.effects.effect import Late
+
+FIELD = Path(__file__).resolve().parents[1] / "field/field.toml"
+CONFIG = load_config(FIELD)
+
+
+def record_of_drive(drive: shaking.Recording) -> Record:
+    rig, settings = rig_of(CONFIG), CONFIG.estimator
+    store = BinStore(rig, settings.bin, 0.0)
+    store.add({name: samples for name, samples in drive.channels.items() if name in rig.channels})
+    window = resolved_window(store, math.floor(drive.truth["t"][-1]))
+    return record_of("drive", window, rig, model_of(CONFIG), settings.min_speed, settings.max_turn)
+
+
+@cache
+def diagnosed(seed: int, quantity: str = "", delay: float = 0.0, lag: float = 0.0) -> Diagnosis:
+    drive = shaking.drive(seed, delays={quantity: delay}, lags={quantity: lag}, duration=50.0)
+    return diagnose([record_of_drive(drive)], prior_of(CONFIG), list(CATALOGUE.values()))
+
+
+def test_nothing_is_missing_where_loads_shake():
+    """The gap of data with nothing missing is that of noise: 1 with a scatter of 0.03 for 2000 held-out residuals."""
+    found = [diagnosed(seed) for seed in (501, 502)]
+    assert [str(f.verdict) for f in found] == ["none", "none"]
+    assert np.mean([f.gap_before.value for f in found]) == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_torque_40_ms_late_is_named_and_told():
+    found = diagnosed(503, "torque", 0.04)
+    assert [a.effect.name for a in found.additions] == ["torque_lag"]
+    assert str(found.verdict) == "named"
+    assert found.gap_before.value > 5.0
+    assert found.gap_after.value == pytest.approx(1.0, abs=0.04)
+    told = found.completed.parameters()["torque_lag"]
+    assert abs(told["delay"].value - 0.04) < 2.0 * told["delay"].std < 0.05
+    assert abs(told["total"].value - 0.04) < 2.0 * told["total"].std < 0.02
+
+
+@pytest.mark.parametrize(("quantity", "delay"), [("ground_speed", 0.2), ("load", 0.06)])
+def test_a_channel_that_is_late_is_named_and_the_others_are_not_late(quantity, delay):
+    found = diagnosed(504, quantity, delay, 0.0)
+    assert [a.effect.name for a in found.additions] == ["channel_lag"]
+    assert str(found.verdict) == "named"
+    told = found.completed.parameters()["channel_lag"]
+    for other in ("ground_speed", "load", "draft"):
+        total, true = told[f"{other}_total"], delay if other == quantity else 0.0
+        assert abs(total.value - true) < 3.0 * total.std < 0.1, other
+
+
+@pytest.mark.parametrize(
+    ("seed", "quantity", "delay", "lag"),
+    [(504, "ground_speed", 0.2, 0.0), (505, "ground_speed", 0.0, 0.2), (505, "torque", 0.0, 0.2)],
+)
+def test_delay_and_time_constant_are_told_jointly(seed, quantity, delay, lag):
+    """Each within three standard deviations of the truth, their sum much more surely than either."""
+    found = diagnosed(seed, quantity, delay, lag)
+    name = "torque_lag" if quantity == "torque" else "channel_lag"
+    late: Late = CATALOGUE[name].late[quantity]
+    told = found.completed.parameters()[name]
+    for parameter, true in ((late.delay, delay), (late.time_constant, lag), (late.total, delay + lag)):
+        assert abs(told[parameter].value - true) < 3.0 * told[parameter].std, parameter
+    assert told[late.total].std < 0.03
+
+
+SPEED = "GroundBasedSpeedAndDistance.GroundBasedMachineSpeed"
+
+
+def test_a_configured_delay_is_taken_out_by_the_service(tmp_path):
+    """At the signal, or as `diagnose --model-out` writes it: windows are as if nothing had been late."""
+
+    def windows(*more: str, delay: float = 0.2) -> list[dict]:
+        log, out = tmp_path / f"late-{delay}.log", tmp_path / "out.json"
+        if not log.exists():
+            drive = shaking.drive(506, delays={"ground_speed": delay}, shake=0.0, duration=20.0)
+            drive.write(log, FIELD.with_name("field.dbc"))
+        assert main(["replay", "--config", str(FIELD), str(log), "--json", str(out), *more]) == 0
+        return [json.loads(line) for line in out.read_text().splitlines()]
+
+    of_effect = "ground_speed_delay={value=0.15,std=0.01},ground_speed_time_constant={value=0.05,std=0.01}"
+    at_signal = windows("--set", f'signals.ground_speed={{signal="{SPEED}",delay=0.2}}')
+    by_effect = windows("--set", f'model.effects=[{{name="channel_lag",{of_effect}}}]')
+    in_time = np.median([w["chi2"] for w in windows(delay=0.0)])
+    assert np.median([w["chi2"] for w in windows()]) > 2.0 * in_time
+    for told in (at_signal, by_effect):
+        assert np.median([w["chi2"] for w in told]) == pytest.approx(in_time, abs=0.05)
+        assert {w["status"] for w in told} == {"valid"}
+        pressures = [w["bearing_pressure"] for w in told]
+        true = shaking.LOAM.bearing_pressure()
+        assert np.mean([abs(p["value"] - true) < 2.5 * p["std"] for p in pressures]) > 0.9
+
+
+def test_all_channels_wait_for_the_latest():
+    """A step at one moment stands in the same bin of a channel that tells it in time and of one 0.3 s late."""
+    late = CONFIG.signals.ground_speed.model_copy(update={"delay": 0.3})
+    config = CONFIG.model_copy(update={"signals": CONFIG.signals.model_copy(update={"ground_speed": late})})
+    database = load_databases(config)
+    intake = Intake(config, database)
+    radar, hitch = (database.get_message_by_name(n) for n in ("GroundBasedSpeedAndDistance", "DrawbarPin"))
+    for i in range(500):
+        t = 0.02 * i
+        speed = {"GroundBasedMachineSpeed": 1.0 + (t - 0.3 > 5.0), "GroundBasedMachineDistance": 0.0}
+        intake.admission.feed(t, radar.frame_id, True, radar.encode(speed))
+        intake.admission.feed(t, hitch.frame_id, False, hitch.encode({"Draft": 1000.0 * (1.0 + (t > 5.0)), "Valid": 1}))
+    intake.ingest()
+    window = intake.taken_whole()
+    known = np.isfinite(window.ground_speed) & np.isfinite(window.draft)
+    apart = np.abs(window.draft[known] / 1000.0 - window.ground_speed[known]) > 0.5
+    assert known.mean() > 0.9
+    assert apart.sum() * np.diff(window.t)[0] <= 0.1

@@ -1,0 +1,99 @@
+"""Curves of samples: which they follow, what they are worth, how they move."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from soilbus.estimation.local_cubics import PARTS, Series, curve_of, variance_of_one
+from soilbus.estimation.resolution import resolved_window
+from soilbus.estimation.window import BinStore, Rig, SensorNoise
+from soilbus.terra.vehicle import Chassis
+
+T = np.cumsum(np.random.default_rng(1).uniform(0.019, 0.021, 2000))
+
+
+def wave(t, frequency):
+    return np.sin(2.0 * np.pi * frequency * t)
+
+
+@pytest.mark.parametrize("frequency", [0.2, 1.0, 4.0])
+def test_a_curve_follows_its_spectrum_and_leaves_noise_behind(frequency):
+    rng, noise = np.random.default_rng(2), 0.05
+    curve = curve_of(T, wave(T, frequency) + noise * rng.standard_normal(len(T)), np.full(len(T), noise**2))
+    off = curve.value - wave(T, frequency)
+    assert off.std() < 0.8 * noise
+    between = 0.5 * (T[20:-20][1:] + T[20:-20][:-1])
+    slope = 2.0 * np.pi * frequency * np.cos(2.0 * np.pi * frequency * between)
+    assert np.abs(curve.at(between)[1] - slope).mean() < 0.15 * np.abs(slope).max()
+
+
+def test_slow_channels_are_averaged_over_more_than_shaking_ones():
+    rng = np.random.default_rng(3)
+    widths = [
+        curve_of(T, wave(T, f) + 0.05 * rng.standard_normal(len(T)), np.full(len(T), 0.0025)).half_width
+        for f in (0.2, 1.0, 4.0)
+    ]
+    assert widths[0] > widths[1] > widths[2] >= 2
+
+
+def test_a_cubic_is_its_own_curve():
+    cubic = np.polynomial.Polynomial([1.0, -2.0, 0.5, 0.1])
+    t = 0.02 * np.arange(100)
+    for curve in Series.of(t, cubic(t), np.full(len(t), 1e-6)):
+        now = np.linspace(0.1, 1.8, 40)
+        for told, true in zip(curve.at(now), (cubic, cubic.deriv(), cubic.deriv(2)), strict=True):
+            assert told == pytest.approx(true(now), abs=1e-5)
+
+
+@pytest.mark.parametrize("half", [2, 4, 9])
+@pytest.mark.parametrize(("n", "phase"), [(1, 0.25), (2, 0.0), (5, 0.5), (3, -0.75)])
+def test_the_variance_of_a_value_at_one_instant_is_what_noise_makes_of_it(half, n, phase):
+    """The same sums over white noise, 20 000 times."""
+    rng = np.random.default_rng(4)
+    reach = half + n + 2
+    noise = rng.standard_normal((20_000, 2 * reach + n))
+    places = np.arange(-half, half + 1.0)
+    basis = places[:, None] ** np.arange(4)
+    value, slope = np.linalg.pinv(basis)[:2]
+    smooth, slopes = (
+        np.apply_along_axis(lambda row, w=w: np.convolve(row, w[::-1], "same"), 1, noise) for w in (value, slope)
+    )
+    middle = reach + (n - 1) / 2.0 + phase
+    i, u = int(middle), middle - int(middle)
+    left, right, rise = slopes[:, i], slopes[:, i + 1], smooth[:, i + 1] - smooth[:, i]
+    there = smooth[:, i] + u * (left + u * (3 * rise - 2 * left - right + u * (left + right - 2 * rise)))
+    own = slice(reach, reach + n)
+    told = noise[:, own].mean(1) - smooth[:, own].mean(1) + there
+    assert variance_of_one(half, n, round(phase * PARTS)) == pytest.approx(told.var(), rel=0.04)
+
+
+def store_of(shake: float, step: float = 0.02) -> BinStore:
+    """A vehicle of one wheel whose load shakes at 4 Hz, its messages at phases of their own."""
+    names = ("torque", "load", "speed", "ground_speed", "draft")
+    noise = {q: SensorNoise(absolute=0.01) for q in (*names, "sinkage", "pitch", "acceleration")}
+    chassis = Chassis(1000.0, 2.0, 1.0, 0.5, 0.5)
+    rig = Rig(("W",), np.array([0.5]), np.array([0.3]), np.array([True]), chassis, noise)
+    rng, store = np.random.default_rng(5), BinStore(rig, 0.1, 0.0)
+    samples = {}
+    for name in names:
+        t = rng.uniform(0.0, step) + step * np.arange(int(20.0 / step))
+        truth = 3.0 + wave(t, 0.1) + (shake * wave(t, 4.0) if name == "load" else 0.0)
+        channel = f"{name}.W" if name in ("torque", "load", "speed") else name
+        samples[channel] = t, truth + 0.01 * rng.standard_normal(len(t))
+    store.add(samples)
+    return store
+
+
+def test_bins_are_short_where_a_channel_shakes_and_no_shorter_than_its_samples_are_apart():
+    steps = [float(np.diff(resolved_window(store_of(*case), 20.0).t)[0]) for case in ((0.0,), (0.3,), (0.3, 0.05))]
+    assert steps[0] == pytest.approx(0.1)
+    assert steps[1] < 0.05
+    assert steps[2] == pytest.approx(0.05, rel=0.02)
+
+
+def test_a_value_is_that_of_the_bins_centre_and_its_variance_true():
+    window = resolved_window(store_of(0.3), 20.0)
+    inner = slice(20, -20)
+    off = (window.load[:, 0] - 3.0 - wave(window.t, 0.1) - 0.3 * wave(window.t, 4.0))[inner]
+    assert np.mean(off**2 / window.variance["load"][inner, 0]) == pytest.approx(1.0, abs=0.2)
