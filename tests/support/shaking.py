@@ -89,9 +89,6 @@ class Recording:
             factors = {s: f for s, (_, f) in signals.items()}
             unmapped: dict[str, Any] = {s.name: 0 for s in message.signals if s.name not in known}
             rest = unmapped | {"State": 3, "Valid": 1}
-                "State": 3,
-                "Valid": 1,
-            }
             rest = {name: value for name, value in rest.items() if name in {s.name for s in message.signals}}
             times = next(iter(known.values()))[0]
             width = "08X" if message.is_extended_frame else "03X"
