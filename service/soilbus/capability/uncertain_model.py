@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
 from soilbus.estimation.effect_parameters import Free, active_at
+from soilbus.estimation.form import FormLeft, formed
 from soilbus.estimation.posterior import PARAMETERS
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.effects.steady import CompletedModel, Slopes, Wheel
@@ -53,7 +54,7 @@ class UncertainModel:
     @classmethod
     def of(
         cls, model: WheelModel, effects: Sequence[Effect], free: Sequence[Free], belief: Belief, n_wheels: int,
-        ground_speed: float, widening: float = 1.0,
+        ground_speed: float, widening: float = 1.0, form: FormLeft | None = None,
     ) -> UncertainModel:  # fmt: skip
         """With what a window has left of the effects' parameters, at a ground speed [m/s].
 
@@ -61,7 +62,7 @@ class UncertainModel:
         effects that count in steady driving do so here.  widening multiplies the covariance.
         """
 
-        def at(pulls: Array) -> CompletedModel:
+        def at(pulls: Array, model: WheelModel = model) -> CompletedModel:
             return CompletedModel.of(model, active_at(effects, free, pulls, n_wheels), ground_speed)
 
         first = len(belief.gains) - len(free)
@@ -69,8 +70,9 @@ class UncertainModel:
         mean = at(pulls)
         names = {active.effect.name for active in mean.effects}
         places = np.flatnonzero([f.effect in names and f.std > 0.0 for f in free])
+        of_form = [] if form is None else _of_form(form, lambda step: at(pulls, formed(model, step)))
         if not len(places):
-            return cls(mean)
+            return cls(mean, tuple(of_form))
         of_effects = _SOIL + first + places
         variance, axes = np.linalg.eigh(belief.covariance[np.ix_(of_effects, of_effects)])
         doubts = []
@@ -83,7 +85,7 @@ class UncertainModel:
             way = _way_inside(free, pulls, step)
             scale = way * np.sqrt(widening)
             doubts.append(Doubt(at(pulls + scale * step), scale * shift))
-        return cls(mean, tuple(doubts))
+        return cls(mean, tuple(doubts + of_form))
 
     @property
     def shifts(self) -> Array:
@@ -95,6 +97,13 @@ class UncertainModel:
         known = n - len(self.doubts)
         row = np.concatenate([np.zeros(known, int), 1 + np.arange(len(self.doubts))])
         return ModelOfRows((self.mean, *(doubt.model for doubt in self.doubts)), row)
+
+
+def _of_form(form: FormLeft, at: Callable[[Array], CompletedModel]) -> list[Doubt]:
+    """A doubt for each principal direction of what the form leaves open."""
+    variance, axes = np.linalg.eigh(form.moment)
+    steps = (axes * np.sqrt(np.maximum(variance, 0.0))).T[variance > _LEAST]
+    return [Doubt(at(step), form.by_form[:_SOIL] @ step) for step in steps]
 
 
 def _way_inside(free: Sequence[Free], pulls: Array, step: Array) -> float:

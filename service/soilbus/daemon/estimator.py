@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.assembly import completion_of, model_of, prior_of, rig_of
+from soilbus.assembly import completion_of, form_of, model_of, prior_of, rig_of
 from soilbus.capability.assessment import Demand, OverSlip
 from soilbus.capability.demand import present_demand
 from soilbus.capability.immobilisation import Watch, moments, watched
@@ -81,7 +81,8 @@ class WindowEstimator:
         self._tracker = Tracker(
             self.rig, self.prior, self.model,
             Settings(
-                settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift, least
+                settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift, least,
+                form_of(config),
             ),
             *self._completion,
         )  # fmt: skip
@@ -194,12 +195,12 @@ class WindowEstimator:
         if fit is None:
             return UncertainModel.over(CompletedModel.of(self.model, effects, speed))
         widening = _widening(tracked, fit)
-        return UncertainModel.of(self.model, *self._completion, fit.whole, len(self.rig.wheels), speed, widening)
+        return UncertainModel.of(self.model, *self._completion, fit.whole, len(self.rig.wheels), speed, widening, fit.form)
 
     def _honest(self, tracked: Tracked, fit: Fit) -> Posterior:
         """Posterior, of both optima where there are two, widened where the residuals are larger than the noise."""
         posterior = fit.whole.posterior
-        return Posterior(posterior.soil, posterior.log_covariance * _widening(tracked, fit))
+        return Posterior(posterior.soil, _with_form(posterior.log_covariance * _widening(tracked, fit), fit))
 
     def _draft_gain(self, tracked: Tracked) -> Estimate:
         """Gain error of the load cell at the hitch: as fitted, else what is known of it beforehand."""
@@ -299,6 +300,11 @@ class WindowEstimator:
 def _widening(tracked: Tracked, fit: Fit) -> float:
     """Factor of the covariance of a fit that leaves more than noise."""
     return max(fit.chi2, 1.0) if tracked.mismatch else 1.0
+
+
+def _with_form(log_covariance: NDArray[np.float64], fit: Fit) -> NDArray[np.float64]:
+    """The covariance (6, 6) of the soil's logarithms with what the form of the model leaves open."""
+    return log_covariance if fit.form is None else log_covariance + fit.form.log_covariance
 
 
 def _with_true_draft(window: Window, effects: Sequence[Active], rig: Rig) -> Window:

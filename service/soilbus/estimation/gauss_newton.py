@@ -21,6 +21,7 @@ from soilbus.estimation.descent import (
     approach,
     settle,
 )
+from soilbus.estimation.form import FormLeft
 from soilbus.estimation.linearised import Bend, Latents, Linearised, Optimum
 from soilbus.estimation.normal_equations import Fitting, Place
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
@@ -125,7 +126,7 @@ class Fit:
     rival is another optimum that the data leave about as likely, where one was looked for
     and found; averaged is the mean of the whole posterior, where that was worked out (see
     `marginal`); bend: cost and evidence are those on a way that bends (see `bends`);
-    off_scale: sinkages and all else agree on no soil (see `scale`).
+    off_scale: sinkages and all else agree on no soil (see `scale`); form: what the model's form leaves open.
     All are of a constant soil until `present` moves them to the window's end.
     """
 
@@ -142,6 +143,7 @@ class Fit:
     averaged: Belief | None = None
     bend: Bend | None = None
     off_scale: bool = False
+    form: FormLeft | None = None
 
     @property
     def posterior(self) -> Posterior:

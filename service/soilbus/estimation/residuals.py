@@ -10,6 +10,7 @@ sect. 4.8).  The entry angle of each wheel follows from its load.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -239,6 +240,45 @@ class WindowProblem(Readings):
         weighed = at.weighed.reshape(*root.shape, -1) / root[:, :, None]
         weighed[~self._known] = np.nan
         return weighed[:, :, 0], weighed[:, :, 1:]
+
+    def by_form(self, optimum: Optimum) -> tuple[Array, Array]:
+        """Derivatives (R, 4) of the residuals by form.FORM at an optimum, and these weighed as `Linearised`."""
+        soil, gains, latents, at = Soil(*optimum.soil.tolist()), optimum.gains, optimum.latents, optimum.at
+        by_form = self._contact_by_form(soil, gains, latents)  # (3, 3, N, W)
+        slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
+        W, (n, m) = self.n_wheels, at.by_latents.shape[:2]
+        pull, torque, depth = np.concatenate([by_form[:, :1], by_form[:, :1] * slip, by_form[:, 1:]], axis=1)
+        rows = np.zeros((n, m, len(pull)))
+        rows[:, :W] = -torque.transpose(1, 2, 0)
+        rows[:, W] = -pull.sum(2).T
+        if self.with_sinkage:
+            rows[:, W + 1 :] = -depth.transpose(1, 2, 0)
+        rows[~self._known] = 0.0
+        variance, row_var = self._corrected(gains)[4:]
+        weighed = inverse_covariance(at.by_latents, variance, row_var, W) @ rows
+        return rows.reshape(n * m, -1), weighed.reshape(n * m, -1)
+
+    def _contact_by_form(self, soil: Soil, gains: Array, latents: Latents) -> Array:
+        """Derivatives (3, 3, N, W) of drawbar pull, torque and sinkage of wheels that carry the latent loads.
+
+        By the ratios of peak and exit angle, the latter behind the axle, and by the share of the other shear law.
+        """
+        shape, other = (self.n, self.n_wheels), 1.0
+        slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
+        model = self.model
+        if model.shear_law == "exponential":  # the same, with a share that can be taken away
+            model, other = replace(model, shear_law="rational", exponential_share=1.0), -1.0
+        _, d = wheel_forces_and_derivatives(
+            self._state(soil, latents.entry_angle, slip), model, ("peak", "leave", "exponential_share")
+        )
+        by_angle, by_form = d[:, 0].reshape(3, *shape), d[:, 7:].reshape(3, 3, *shape)
+        by_form[:, 1] *= -1.0
+        by_form[:, 2] *= other
+        turned = -by_form[0] / by_angle[0]
+        out = np.empty((3, 3, *shape))
+        out[:2] = by_form[1:] + by_angle[1:, None] * turned
+        out[2] = self.rig.radius * np.sin(latents.entry_angle) * turned
+        return out
 
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         """The wheels with the entry angle eliminated: it follows the load."""

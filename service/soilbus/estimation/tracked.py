@@ -29,6 +29,7 @@ class Settings:
 
     drift: sd of the logarithm of each soil coordinate after one window; it grows with the
     square root of time.  min_rows: residuals below which a window is not fitted.
+    form: root mean squares by which form.FORM may differ from the configured model's; () leaves none of it open.
     """
 
     window: float
@@ -37,6 +38,7 @@ class Settings:
     max_chi2: float
     drift: float
     min_rows: int = MIN_ROWS
+    form: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

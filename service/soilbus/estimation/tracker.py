@@ -24,6 +24,7 @@ from soilbus.estimation.completed import CompletedProblem
 from soilbus.estimation.coordinates import Coordinates
 from soilbus.estimation.curve import curve_of, with_curve, without_curve
 from soilbus.estimation.effect_parameters import Free
+from soilbus.estimation.form import FormLeft, form_left
 from soilbus.estimation.gauss_newton import Fit, Foreseen, fit_window, foreseen, resume
 from soilbus.estimation.marginal import with_whole
 from soilbus.estimation.normal_equations import Fitting
@@ -223,7 +224,16 @@ class Tracker:
             off_scale = sinkages_off_scale(fitting, fit)
             fit = with_whole(fitting.problem, fitting.coordinates.prior, fitting.before, fit)
             fit = replace(fit, off_scale=off_scale)
+        fit = replace(fit, form=self._form_left(fitting, fit))
         return at_present(fitting, fit, self.settings.window, self.settings.drift)
+
+    def _form_left(self, fitting: Fitting, fit: Fit) -> FormLeft | None:
+        """What the form of the model leaves open of a fit."""
+        if not any(self.settings.form):
+            return None
+        before = fitting.before.form or FormLeft.of(np.array(self.settings.form), len(fit.gains))
+        with np.errstate(all="ignore"):
+            return form_left(fitting, fit, before)
 
     def mismatch(self, fit: Fit | None) -> bool:
         """Whether a fit failed or leaves more than noise."""
@@ -248,7 +258,8 @@ class Tracker:
             learned = end - tracked.since >= LEARNED * self.settings.window and fit.is_gaussian
             if learned and tracked.ground in (Ground.SAME, Ground.NEW):
                 curve = curve_of(problem)
-                self._beliefs.append((end, without_curve(fit.mode.apart_from(self._here), curve)))
+                told = without_curve(fit.mode.apart_from(self._here), curve)
+                self._beliefs.append((end, replace(told, form=fit.form)))
                 self._newest = without_curve(fit.whole, curve)
         return tracked
 
@@ -265,7 +276,8 @@ class Tracker:
         gains = problem.gain_std**2 * min((elapsed + 1.0) / GAIN_MEMORY, 1.0)
         if self._crossing is not None and end <= self._crossing.end:
             return belief.of_another_soil(self._here).drifted(np.zeros((_SOIL, _SOIL)), gains)
-        return belief.drifted(self._drift(belief, elapsed), gains)
+        form = None if belief.form is None else belief.form.drifted(self.settings.form, elapsed / GAIN_MEMORY)
+        return replace(belief.drifted(self._drift(belief, elapsed), gains), form=form)
 
     def _ended(self, t: float) -> list[int]:
         return [i for i, (end, _) in enumerate(self._beliefs) if end <= t + _SAME_TIME]
