@@ -46,12 +46,13 @@ AMBIGUOUS = 2.0
 class Undecided:
     """A window's estimate with what the decision needs besides; its traversability is still unknown.
 
-    demand is None where the draft is not known; torque_limit (W,) [N m]; stuck: the wheels
+    posterior belongs to model: what of the soil goes with its form; demand is None where the draft is not known; torque_limit (W,) [N m]; stuck: the wheels
     turn on the spot; driven: the window's data with the true draft; fresh: nothing of the window before
     may be carried over; model: with what the window leaves known of the effects' parameters.
     """
 
     result: WindowResult
+    posterior: Posterior | None
     demand: Demand | None
     torque_limit: NDArray[np.float64]
     stuck: bool
@@ -107,7 +108,8 @@ class WindowEstimator:
         tracked = self._tracker.estimate(task.window, task.end)
         fit = tracked.fit
         status, reason = self._status(task, tracked)
-        posterior = None if fit is None or status is Status.INVALID else self._honest(tracked, fit)
+        own = None if fit is None or status is Status.INVALID else self._honest(tracked, fit)
+        posterior = None if own is None or fit is None else _with_form(own, fit)
         stuck = self._stuck(task.window)
         if stuck and status is Status.VALID:
             status, reason = Status.NOT_EXCITED, "standstill"
@@ -134,7 +136,8 @@ class WindowEstimator:
         model = self._present_model(task.window, tracked, effects)
         window = _with_true_draft(task.window, effects, self.rig)
         demand = present_demand(window, self.rig.chassis, self._settings.hop, self._draft_gain(tracked))
-        return Undecided(result, demand, task.torque_limit, stuck, window, task.fresh, model)
+        known = None if own is None else Posterior(own.soil, model.with_form(own.log_covariance))
+        return Undecided(result, known, demand, task.torque_limit, stuck, window, task.fresh, model)
 
     def decide(self, window: Undecided) -> WindowResult:
         """The result with its traversability and watch; windows in their order, here or in another process."""
@@ -148,7 +151,7 @@ class WindowEstimator:
     def _decided(self, window: Undecided) -> WindowResult:
         """The result with its traversability."""
         way, self._wheels = judge(
-            window.result.posterior, window.result.status, window.demand, self.rig, window.model, window.torque_limit,
+            window.posterior, window.result.status, window.demand, self.rig, window.model, window.torque_limit,
             self.config.traversability, None if window.fresh else self._wheels,
         )  # fmt: skip
         if window.stuck:
@@ -200,7 +203,7 @@ class WindowEstimator:
     def _honest(self, tracked: Tracked, fit: Fit) -> Posterior:
         """Posterior, of both optima where there are two, widened where the residuals are larger than the noise."""
         posterior = fit.whole.posterior
-        return Posterior(posterior.soil, _with_form(posterior.log_covariance * _widening(tracked, fit), fit))
+        return Posterior(posterior.soil, posterior.log_covariance * _widening(tracked, fit))
 
     def _draft_gain(self, tracked: Tracked) -> Estimate:
         """Gain error of the load cell at the hitch: as fitted, else what is known of it beforehand."""
@@ -302,9 +305,9 @@ def _widening(tracked: Tracked, fit: Fit) -> float:
     return max(fit.chi2, 1.0) if tracked.mismatch else 1.0
 
 
-def _with_form(log_covariance: NDArray[np.float64], fit: Fit) -> NDArray[np.float64]:
-    """The covariance (6, 6) of the soil's logarithms with what the form of the model leaves open."""
-    return log_covariance if fit.form is None else log_covariance + fit.form.log_covariance
+def _with_form(own: Posterior, fit: Fit) -> Posterior:
+    """A posterior with what the form of the model leaves open besides."""
+    return own if fit.form is None else Posterior(own.soil, own.log_covariance + fit.form.log_covariance)
 
 
 def _with_true_draft(window: Window, effects: Sequence[Active], rig: Rig) -> Window:
