@@ -25,7 +25,7 @@ from soilbus.estimation.coordinates import Coordinates
 from soilbus.estimation.curve import curve_of, with_curve, without_curve
 from soilbus.estimation.effect_parameters import Free
 from soilbus.estimation.form import FormLeft, form_left
-from soilbus.estimation.gauss_newton import Fit, Foreseen, fit_window, foreseen, resume
+from soilbus.estimation.gauss_newton import Fit, Foreseen, calmed, fit_window, foreseen, resume
 from soilbus.estimation.marginal import with_whole
 from soilbus.estimation.normal_equations import Fitting
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
@@ -160,7 +160,9 @@ class Tracker:
         else:
             ahead = foreseen(problem, self._here, last, before)
             fitting, fit = ahead.fitting, resume(ahead)
-            if fit is None or not fit.converged:  # a long valley is no sign of another soil
+            if fit is not None and not fit.converged:  # a long valley is no sign of another soil
+                fit = calmed(fitting, fit)
+            if fit is None or not fit.converged:
                 fit = fit_window(problem, self._here, before)
             fitting, fit = self._on_the_way(window, fitting, fit)
             self._alarm = self._alarm_in(window, ahead, last, fit, end - since)
