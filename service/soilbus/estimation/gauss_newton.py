@@ -387,7 +387,8 @@ def calmed(fitting: Fitting, fit: Fit) -> Fit:
     with np.errstate(all="ignore"):
         calm = DenoisedProblem(fitting.problem, optimum)
         again = Fitting(calm, fitting.coordinates.prior, fitting.before)
-        found = settled(again, Place(optimum.soil, optimum.gains, calm.latents, np.inf, 1))
+        calm_place = Place(optimum.soil, optimum.gains, calm.latents, np.inf, 1)
+        found = _fit_at(again, settle(again, calm_place, MAX_ITERATIONS, enough=CONVERGED_RESUMED))
         if found is None or not found.converged:
             return fit
         near = fitting.start(found.optimum.soil, optimum.latents.entry_angle, found.optimum.gains)
