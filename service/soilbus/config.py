@@ -306,6 +306,11 @@ class Estimator(_Section):
     """Relative std of tan phi up to which a window counts as excited."""
     max_chi2: PositiveFloat = 1.1
     """Reduced chi-square, beyond its own scatter, above which the model does not describe the data."""
+    search_rate: NonNegativeFloat = 4.0
+    """Evaluations of the model on a whole window that a search for another soil may take, for each window; windows that
+    the model describes take 1 to 3 in all (field and simulated drives)."""
+    search_burst: PositiveFloat = 150.0
+    """Most of these that are kept for later: three times what 99 of 100 starts, borders and steady windows take (53)."""
 
     @model_validator(mode="after")
     def _lengths_fit(self) -> Estimator:

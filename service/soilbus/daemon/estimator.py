@@ -83,7 +83,7 @@ class WindowEstimator:
             self.rig, self.prior, self.model,
             Settings(
                 settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift, least,
-                form_of(config),
+                form_of(config), settings.search_rate, settings.search_burst,
             ),
             *self._completion,
         )  # fmt: skip
@@ -131,6 +131,7 @@ class WindowEstimator:
             position=task.track.at((tracked.since + task.end) / 2.0),
             failure=self._failure(tracked),
             gaps=self._watched_gaps(task, fit),
+            search_ended=tracked.search_ended,
         )
         effects = self._effects(fit)
         model = self._present_model(task.window, tracked, effects)
@@ -288,7 +289,7 @@ class WindowEstimator:
         if not tracked.mismatch:
             return None
         if fit is None:
-            return "not_finite"
+            return "model_mismatch" if tracked.search_ended else "not_finite"
         return "model_mismatch" if fit.chi2 > self._tracker.chi2_limit(fit) else "no_convergence"
 
     def _ambiguous(self, fit: Fit) -> bool:

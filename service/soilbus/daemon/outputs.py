@@ -99,6 +99,7 @@ def json_line(result: WindowResult, config: Config) -> str:
             "warning": {"state": str(result.watch.warning), "time_left": _finite(result.watch.time_left)},
             "capability": None if way.capability is None else _capability(way.capability),
             "chi2": result.chi2,
+            "search_ended": result.search_ended,
             "samples": result.samples,
             "rejected": result.rejected,
         },

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from soilbus.estimation.linearised import Latents, Linearised, Optimum
 from soilbus.estimation.readings import Readings
+from soilbus.estimation.search_budget import Work
 from soilbus.estimation.weights import diagonals, inverse_covariance
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.entry_angle import entry_angle_for_load
@@ -80,6 +81,7 @@ class WindowProblem(Readings):
     ) -> None:
         super().__init__(window, rig, min_speed, max_turn)
         self.model = model
+        self.work = Work()
 
     def allowed(self, gains: Array) -> Array:
         """Gains (G,) with what has a range kept inside it."""
@@ -171,6 +173,7 @@ class WindowProblem(Readings):
         Without those derivatives it serves to move the soil and the effects only.
         """
         W = self.n_wheels
+        self.work.instants += self.n
         at = self._response(soil, gains, latents)
         A = self._by_latents(at)
 

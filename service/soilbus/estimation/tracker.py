@@ -33,6 +33,7 @@ from soilbus.estimation.present import at_present
 from soilbus.estimation.recall import is_borne_out, recalled
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.scale import sinkages_off_scale
+from soilbus.estimation.search_budget import SearchBudget
 from soilbus.estimation.soil_change import Crossing, suspicion, without_crossing
 from soilbus.estimation.tracked import Ground, Settings, Tracked
 from soilbus.estimation.window import Rig, Window
@@ -128,6 +129,7 @@ class Tracker:
         """Begin anew."""
         self._here = self.prior  # of the present soil
         self._distrusted = self._in_border = False  # the last window was a mismatch; and of no soil since a border
+        self._budget = SearchBudget(self.settings.search_rate, self.settings.search_burst)
         self._fit: Fit | None = None
         self._good_until = -math.inf
         self._alarm: Alarm | None = None
@@ -137,6 +139,10 @@ class Tracker:
 
     def estimate(self, window: Window, end: float) -> Tracked:
         """One window that ends at `end` [s]; windows in their order."""
+        self._budget.next_window(len(window.t))
+        return replace(self._estimate(window, end), search_ended=self._budget.ended)
+
+    def _estimate(self, window: Window, end: float) -> Tracked:
         start = end - self.settings.window
         crossing = self._crossing
         new = crossing is not None and (self._in_border or start < crossing.end)
@@ -153,7 +159,7 @@ class Tracker:
             self._alarm = None  # another soil would have been found by now
         last = self._fit
         changed = None
-        if last is None or last.rival is not None:
+        if last is None or (last.rival is not None and self._budget.allows()):
             fitting, fit = self._afresh(window, problem, before)
             if self.mismatch(fit) and self._alarm is not None:
                 changed = self._another_soil(window, self._alarm, fit, before, None)
@@ -163,12 +169,12 @@ class Tracker:
             if fit is not None and not fit.converged:  # a long valley is no sign of another soil
                 fit = calmed(fitting, fit)
             if fit is None or not fit.converged:
-                fit = fit_window(problem, self._here, before)
+                fit = self._searched(problem, self._here, before) or fit
             fitting, fit = self._on_the_way(window, fitting, fit)
             self._alarm = self._alarm_in(window, ahead, last, fit, end - since)
             if self._alarm is not None:
                 changed = self._another_soil(window, self._alarm, fit, before, last)
-            if changed is None and self.mismatch(fit):
+            if changed is None and self.mismatch(fit) and self._budget.allows():
                 fitting, fit = self._afresh(window, problem, before)
         if changed is not None:
             return self._remembered(replace(changed, standstill=left_out[0], turning=left_out[1]), end, problem)
@@ -211,7 +217,7 @@ class Tracker:
         if self.mismatch(fit) and self._beliefs:
             there = elsewhere(self.prior)
             known = before.of_another_soil(there)
-            other = fit_window(problem, there, known)
+            other = self._searched(problem, there, known)
             if not self.mismatch(other):
                 begin = float(problem.t[0])
                 self._crossing, self._here = Crossing(begin, begin, 0.0), there
@@ -328,7 +334,7 @@ class Tracker:
                 break  # after a mismatch the wheels of both axles must agree, and agree with the draft
             waits = self.mismatch(one) and window.t[-1] < alarm.t + PATIENCE * self.settings.window
             known = self._known_at(alarm.t, second).of_another_soil(there)
-            new = fit_window(second, there, known)
+            new = self._searched(second, there, known)
             if new is None or self.mismatch(new):
                 continue
             if old is not None and not self._likelier(old, new, self._as_one(apart, self._problem(apart), before)[1]):
@@ -364,7 +370,7 @@ class Tracker:
             if problem.n_rows < 2 * MIN_NEW_ROWS:
                 break
             known = fitting.before
-            later = fit_window(problem, self._here, known)
+            later = self._searched(problem, self._here, known)
             if later is None or self._unsettled(later):
                 continue
             fall, noise = fit.cost - later.cost, fit.rows - later.rows
@@ -384,7 +390,7 @@ class Tracker:
 
     def _as_one(self, window: Window, problem: WindowProblem, before: Belief) -> tuple[Fitting, Fit | None]:
         """A window as one soil, this one, from any start."""
-        fit = fit_window(problem, self._here, before)
+        fit = self._searched(problem, self._here, before)
         return self._on_the_way(window, Fitting(problem, self._here, before), fit)
 
     def _on_the_way(self, window: Window, fitting: Fitting, fit: Fit | None) -> tuple[Fitting, Fit | None]:
@@ -395,6 +401,15 @@ class Tracker:
         if fit is None or way is None:
             return fitting, fit
         return on_the_way(fitting, fit, way, self._problem(straightened(window, self.rig, way)))
+
+    def _searched(self, problem: WindowProblem, prior: SoilPrior, before: Belief) -> Fit | None:
+        """A fit from any start; None also where the budget allows no further search."""
+        if not self._budget.allows():
+            return None
+        begun = self._budget.work.instants
+        fit = fit_window(problem, prior, before)
+        self._budget.spend(begun)
+        return fit
 
     def _likelier(self, old: Fit, new: Fit, one: Fit | None) -> bool:
         """Whether two soils explain much better what one, of the same data, explains."""
@@ -408,4 +423,6 @@ class Tracker:
 
     def _problem(self, window: Window) -> WindowProblem:
         speed, turn = self.settings.min_speed, self.settings.max_turn
-        return CompletedProblem(window, self.rig, self.model, speed, turn, self.effects, self.free)
+        problem = CompletedProblem(window, self.rig, self.model, speed, turn, self.effects, self.free)
+        problem.work = self._budget.work
+        return problem
