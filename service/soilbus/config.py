@@ -309,8 +309,8 @@ class Estimator(_Section):
     search_rate: NonNegativeFloat = 4.0
     """Evaluations of the model on a whole window that a search for another soil may take, for each window; windows that
     the model describes take 1 to 3 in all (field and simulated drives)."""
-    search_burst: PositiveFloat = 150.0
-    """Most of these that are kept for later: three times what 99 of 100 starts, borders and steady windows take (53)."""
+    search_burst: PositiveFloat = 100.0
+    """Most of these that are kept for later: three times what searches at nine of ten starts and borders take (34)."""
 
     @model_validator(mode="after")
     def _lengths_fit(self) -> Estimator:

@@ -31,6 +31,7 @@ from soilbus.hysteresis import Held, settled
 from soilbus.judgement import judge
 from soilbus.terra.effects.effect import Active, Surroundings, true_draft
 from soilbus.terra.effects.steady import CompletedModel
+from soilbus.terra.wheel import sinkage
 from soilbus.traversability import State as Way
 from soilbus.traversability import Status, Traversability
 
@@ -46,9 +47,10 @@ AMBIGUOUS = 2.0
 class Undecided:
     """A window's estimate with what the decision needs besides; its traversability is still unknown.
 
-    posterior belongs to model: what of the soil goes with its form; demand is None where the draft is not known; torque_limit (W,) [N m]; stuck: the wheels
-    turn on the spot; driven: the window's data with the true draft; fresh: nothing of the window before
-    may be carried over; model: with what the window leaves known of the effects' parameters.
+    posterior belongs to model, which knows what of the soil goes with its form.  demand is None where the draft
+    is not known; torque_limit (W,) [N m]; stuck: the wheels turn on the spot; driven: the window's data
+    with the true draft; fresh: nothing of the window before may be carried over; model: with what
+    the window leaves known of the effects' parameters and of the form.
     """
 
     result: WindowResult
@@ -131,6 +133,7 @@ class WindowEstimator:
             position=task.track.at((tracked.since + task.end) / 2.0),
             failure=self._failure(tracked),
             gaps=self._watched_gaps(task, fit),
+            z_driven=None if fit is None or posterior is None else self._driven(fit),
             search_ended=tracked.search_ended,
         )
         effects = self._effects(fit)
@@ -199,7 +202,9 @@ class WindowEstimator:
         if fit is None:
             return UncertainModel.over(CompletedModel.of(self.model, effects, speed))
         widening = _widening(tracked, fit)
-        return UncertainModel.of(self.model, *self._completion, fit.whole, len(self.rig.wheels), speed, widening, fit.form)
+        return UncertainModel.of(
+            self.model, *self._completion, fit.whole, len(self.rig.wheels), speed, widening, fit.form
+        )
 
     def _honest(self, tracked: Tracked, fit: Fit) -> Posterior:
         """Posterior, of both optima where there are two, widened where the residuals are larger than the noise."""
@@ -214,6 +219,15 @@ class WindowEstimator:
 
     def _bearing(self, posterior: Posterior) -> Estimate:
         return posterior.bearing_pressure(self._settings.z_ref, self._settings.b_ref)
+
+    def _driven(self, fit: Fit) -> tuple[float, float] | None:
+        """Sinkages [m] that nine tenths of the wheels' instants lie between."""
+        depth = sinkage(fit.optimum.latents.entry_angle, self.rig.radius)
+        known = depth[np.isfinite(depth)]
+        if not len(known):
+            return None
+        low, high = np.percentile(known, (5.0, 95.0)).tolist()
+        return low, high
 
     def _soil_class(self, posterior: Posterior | None) -> dict[str, float] | None:
         if posterior is None or self._classes is None:

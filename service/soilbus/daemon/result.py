@@ -24,7 +24,8 @@ class WindowResult:
     the largest first.  position is in the middle of the data that count: of the window, or
     of its part on a new soil.  failure is the kind of a solve that failed, None where none did.
     watch warns of immobilisation; unknown where the loop watches ten times a second itself.  gaps: reduced
-    chi-square of the channels that have not fitted for minutes, the worst first.  search_ended: the budget of
+    chi-square of the channels that have not fitted for minutes, the worst first.  z_driven: sinkages [m] between
+    which nine tenths of the wheels' instants lie.  search_ended: the budget of
     evaluations (estimator.search_rate, search_burst) ended the search for a soil that describes the data.
     """
 
@@ -45,5 +46,6 @@ class WindowResult:
     position: Position | None = None
     failure: str | None = None
     gaps: Mapping[str, float] = field(default_factory=dict)
+    z_driven: tuple[float, float] | None = None
     search_ended: bool = False
     watch: Watch = Watch()  # noqa: RUF009, immutable

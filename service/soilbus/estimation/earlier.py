@@ -76,7 +76,7 @@ class Earlier:
         return np.append(off, of_prior)
 
     def by_mean(self, soil: Array, gains: Array, shift: Array) -> tuple[Array, Array, Array]:
-        """Derivatives (R, M) of the residuals by what shifts the mean of soil and gains by (6 + G, M), precision, off."""
+        """Derivatives (R, M) of the residuals by what shifts the mean by (6 + G, M), with precision and residuals."""
         by_mean = -shift[np.concatenate([self._free, _SOIL + self._active])]
         if self._of_data:
             by_mean[_K_C] *= 1.0 + (self._before.k_c_off or 0.0)

@@ -272,21 +272,23 @@ class WindowProblem(Readings):
         By the ratios of peak and exit angle, the latter behind the axle, and by the share of the other shear law.
         """
         shape, other = (self.n, self.n_wheels), 1.0
-        slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
-        model = self.model
+        state, model = self._wheels_in_contact(soil, gains, latents)
         if model.shear_law == "exponential":  # the same, with a share that can be taken away
             model, other = replace(model, shear_law="rational", exponential_share=1.0), -1.0
-        _, d = wheel_forces_and_derivatives(
-            self._state(soil, latents.entry_angle, slip), model, ("peak", "leave", "exponential_share")
-        )
+        _, d = wheel_forces_and_derivatives(state, model, ("peak", "leave", "exponential_share"))
         by_angle, by_form = d[:, 0].reshape(3, *shape), d[:, 7:].reshape(3, 3, *shape)
         by_form[:, 1] *= -1.0
         by_form[:, 2] *= other
         turned = -by_form[0] / by_angle[0]
         out = np.empty((3, 3, *shape))
         out[:2] = by_form[1:] + by_angle[1:, None] * turned
-        out[2] = self.rig.radius * np.sin(latents.entry_angle) * turned
+        out[2] = np.reshape(state.radius, (-1, self.n_wheels)) * np.sin(latents.entry_angle) * turned
         return out
+
+    def _wheels_in_contact(self, soil: Soil, gains: Array, latents: Latents) -> tuple[WheelState, WheelModel]:
+        """States and model of the wheels at these latents."""
+        slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
+        return self._state(soil, latents.entry_angle, slip), self.model
 
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         """The wheels with the entry angle eliminated: it follows the load."""
@@ -367,7 +369,7 @@ class WindowProblem(Readings):
 
 
 def _between(some: NDArray[np.intp], values: Array, n: int) -> Array:
-    """Values (..., S, W) at some of n instants (S,), the first and the last among them, on straight lines (..., N, W)."""
+    """Values (..., S, W) at some of n instants (S,), the first and the last too, on straight lines (..., N, W)."""
     if len(some) == n:
         return values
     at = np.arange(n)

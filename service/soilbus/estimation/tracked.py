@@ -41,7 +41,7 @@ class Settings:
     min_rows: int = MIN_ROWS
     form: tuple[float, ...] = ()
     search_rate: float = 4.0
-    search_burst: float = 150.0
+    search_burst: float = 100.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -166,8 +166,8 @@ class Tracker:
         else:
             ahead = foreseen(problem, self._here, last, before)
             fitting, fit = ahead.fitting, resume(ahead)
-            if fit is not None and not fit.converged:  # a long valley is no sign of another soil
-                fit = calmed(fitting, fit)
+            if fit is not None and not fit.converged and fit.chi2 <= self.chi2_limit(fit):
+                fit = calmed(fitting, fit)  # a long valley is no sign of another soil
             if fit is None or not fit.converged:
                 fit = self._searched(problem, self._here, before) or fit
             fitting, fit = self._on_the_way(window, fitting, fit)

@@ -36,6 +36,8 @@ def summary_of(results: Sequence[WindowResult], heard: str, refused: Counter[str
     states = Counter(str(r.traversability.state) for r in results)
     lines.append("traversability " + (", ".join(f"{s} {n}" for s, n in states.most_common()) or "unknown"))
     lines.append("failed solves " + counted(Counter(r.failure for r in results if r.failure)))
+    if ended := sum(r.search_ended for r in results):
+        lines.append(f"search for another soil ended by its budget in {ended} windows (estimator.search_rate)")
     lines.append("refused samples " + counted(refused))
     return "\n".join(lines) + "\n"
 
