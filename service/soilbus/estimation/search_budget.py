@@ -27,9 +27,10 @@ class SearchBudget:
         self._left, self._window = burst, 1
         self.ended = False
 
-    def next_window(self, instants: int) -> None:
-        """A window of so many instants begins."""
-        self._left, self._window = min(self._left + self._rate, self._burst), max(instants, 1)
+    def next_window(self, instants: int, renewed: bool = False) -> None:
+        """A window of so many instants begins; renewed: the model described data lately, and may again."""
+        self._left = self._burst if renewed else min(self._left + self._rate, self._burst)
+        self._window = max(instants, 1)
         self.ended = False
 
     def allows(self) -> bool:

@@ -139,7 +139,7 @@ class Tracker:
 
     def estimate(self, window: Window, end: float) -> Tracked:
         """One window that ends at `end` [s]; windows in their order."""
-        self._budget.next_window(len(window.t))
+        self._budget.next_window(len(window.t), end - self._good_until <= RECENT * self.settings.window)
         return replace(self._estimate(window, end), search_ended=self._budget.ended)
 
     def _estimate(self, window: Window, end: float) -> Tracked:
