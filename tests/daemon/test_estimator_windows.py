@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "estimation"))
 from drives import tasks
+
 from soilbus.daemon.estimator import WindowEstimator
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -21,14 +23,12 @@ FORMLESS = [f"model.form.{name}=0" for name in ("peak", "peak_by_slip", "exit", 
 
 
 def test_what_residuals_leave_beyond_noise_widens_every_std():
-    channels = {"torque.of_mean": 0.006, "load.relative": 0.006, "ground_speed.relative": 0.005, "sinkage.absolute": 0.0025}
-    quiet = [*FORMLESS, *(f"noise.{channel}={sd}" for channel, sd in channels.items())]
-    noisy = reference_configuration(FORMLESS)
-    task = next(tasks(noisy, excited("dry_sand", 10.5), seed=2))
-    told = reference_configuration(quiet)
+    config = reference_configuration(FORMLESS)
+    task = next(tasks(config, excited("dry_sand", 10.5), seed=2))
+    variance = {name: 0.6 * values for name, values in task.window.variance.items()}  # less noise than there is
+    task = replace(task, window=replace(task.window, variance=variance))
     strict, lenient = (
-        WindowEstimator(told.model_copy(update={"estimator": told.estimator.model_copy(update={"max_chi2": limit})}))
-        for limit in (1.1, 50.0)
+        WindowEstimator(reference_configuration([*FORMLESS, f"estimator.max_chi2={limit}"])) for limit in (1.1, 50.0)
     )
     wide, narrow = strict.solve(task), lenient.solve(task)
     assert (wide.status, wide.reason, narrow.status) == (Status.DEGRADED, "model_mismatch", Status.VALID)

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from drives import tasks
+
 from soilbus.daemon.estimator import WindowEstimator
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.search_budget import SearchBudget
