@@ -77,6 +77,14 @@ def model_of(config: Config) -> WheelModel:
     return WheelModel(shear_law=config.model.shear_law, nodes=FAST_NODES)
 
 
+def form_of(config: Config) -> tuple[float, ...]:
+    """How far the form of the contact may be from the model's, as form.FORM: no farther where an effect names it."""
+    named, form = {effect.name for effect in config.model.effects}, config.model.form
+    peak = 0.0 if "stress_peak_shift" in named else 1.0
+    leave, shear = float("rut_recovery" not in named), float("exponential_shear" not in named)
+    return peak * form.peak, peak * form.peak_by_slip, leave * form.exit, shear * form.shear
+
+
 def effects_of(config: Config, wheels: Sequence[str] | None = None) -> tuple[Active, ...]:
     """The effects of model.effects with their values, in the order of the catalogue.
 

@@ -401,6 +401,11 @@ class Estimator(_Section):
     """Relative std of tan phi up to which a window counts as excited."""
     max_chi2: PositiveFloat = 1.1
     """Reduced chi-square, beyond its own scatter, above which the model does not describe the data."""
+    search_rate: NonNegativeFloat = 4.0
+    """Evaluations of the model on a whole window that a search for another soil may take, for each window; windows that
+    the model describes take 1 to 3 in all (field and simulated drives)."""
+    search_burst: PositiveFloat = 100.0
+    """Most of these that are kept for later: three times what searches at nine of ten starts and borders take (34)."""
 
     @model_validator(mode="after")
     def _lengths_fit(self) -> Estimator:
@@ -456,11 +461,30 @@ class Effect(BaseModel):
     name: str
 
 
+class Form(_Section):
+    """How far the contact of wheel and soil may differ in form from the model, as root mean squares; 0: not at all.
+
+    The greatest stress sits at (c1 + c2 s) of the entry angle, where the model has 0.5: c1 is 0.18 in loose and
+    0.43 in compact sand, c2 0.32 in both (Wong & Reece 1967, J. Terramechanics 4:81); an even
+    spread from those to the model's gives 0.32 / sqrt(3) for each.
+    """
+
+    peak: NonNegativeFloat = 0.18
+    """Of c1."""
+    peak_by_slip: NonNegativeFloat = 0.18
+    """Of c2."""
+    exit: NonNegativeFloat = 0.1
+    """Of the exit angle behind the axle over the entry angle: a rut that springs back by the square of it."""
+    shear: NonNegativeFloat = 0.7
+    """Of the share of the strength that the other shear law mobilises: either law as likely as the other."""
+
+
 class Model(_Section):
     """The wheel-soil model: base choices and added effects."""
 
     shear_law: Literal["exponential", "rational"] = "exponential"
     effects: list[Effect] = Field(default_factory=list)
+    form: Form = Form()
 
 
 class Output(_Section):

@@ -170,7 +170,7 @@ def test_stubble_is_known_to_be_misunderstood(whole):
 
 
 KEYS = {"t", "status", "soil", "bearing_pressure", "slip", "sinkage", "traversability", "chi2", "samples", "rejected"}
-MORE = {"window", "log", "reason", "state", "soil_class", "capability", "gaps", "warning"}
+MORE = {"search_ended", "window", "log", "reason", "state", "soil_class", "capability", "gaps", "warning"}
 CAPABILITY = {"max_draft_here", "max_grade_with_draft", "set_points", "forecast", "over_slip"}
 DECISION = {
     "state",
@@ -215,7 +215,7 @@ def test_json_lines_have_the_keys_of_the_design(name, whole):
                 assert forecast["torque"]["value"] == one["traversability"]["torque_required"]
         else:
             assert one["capability"] is None
-        assert set(one["bearing_pressure"]) == {"z_ref", "b_ref", "value", "std"}
+        assert set(one["bearing_pressure"]) == {"z_ref", "b_ref", "value", "std", "z_driven", "extrapolates"}
         assert one["soil"] is None or {k: set(v) for k, v in one["soil"].items()} == {
             k: {"value", "std"} for k in ("k_c", "k_phi", "n", "phi", "c", "K")
         }

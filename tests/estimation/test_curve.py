@@ -50,7 +50,7 @@ def test_without_that_unknown_a_curve_is_a_mismatch(monkeypatch):
 @pytest.mark.parametrize("seed", [100])
 def test_a_curve_that_begins_within_a_window_is_no_soil(seed, monkeypatch):
     monkeypatch.setattr("curves.END", 19.0)
-    config = reference_configuration()
+    config = reference_configuration([f"model.form.{name}=0" for name in ("peak", "peak_by_slip", "exit", "shear")])
 
     def away() -> np.ndarray:
         told = [w for w in driven(config, "loam", 75.0, seed) if w.t > 0.0]

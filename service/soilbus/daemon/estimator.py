@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.assembly import completion_of, model_of, prior_of, rig_of
+from soilbus.assembly import completion_of, form_of, model_of, prior_of, rig_of
 from soilbus.capability.assessment import Demand, OverSlip
 from soilbus.capability.demand import present_demand
 from soilbus.capability.immobilisation import SPAN, Watch, moments, watched, with_loss
@@ -33,6 +33,7 @@ from soilbus.hysteresis import Held, doubted, settled
 from soilbus.judgement import Basis, judge
 from soilbus.terra.effects.effect import Active, Surroundings, true_draft
 from soilbus.terra.effects.steady import CompletedModel
+from soilbus.terra.wheel import sinkage
 from soilbus.traversability import Status, Traversability
 
 AMBIGUOUS = 2.0
@@ -43,12 +44,14 @@ AMBIGUOUS = 2.0
 class Undecided:
     """A window's estimate with what the decision needs besides; its traversability is still unknown.
 
-    demand is None where the draft is not known; torque_limit (W,) [N m]; driven: the window's data with the
-    true draft; fresh: nothing of the window before may be carried over; model: with what the window leaves known of
-    the effects' parameters; here: whether the estimate is of the present ground.
+    posterior belongs to model, which knows what of the soil goes with its form.  demand is None where the draft
+    is not known; torque_limit (W,) [N m]; driven: the window's data with the true draft; fresh: nothing of the
+    window before may be carried over; model: with what the window leaves known of the effects' parameters and of the
+    form; here: whether the estimate is of the present ground.
     """
 
     result: WindowResult
+    posterior: Posterior | None
     demand: Demand | None
     torque_limit: NDArray[np.float64]
     driven: Window
@@ -80,7 +83,8 @@ class WindowEstimator:
         self._tracker = Tracker(
             self.rig, self.prior, self.model,
             Settings(
-                settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift, least
+                settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift, least,
+                form_of(config), settings.search_rate, settings.search_burst,
             ),
             *self._completion,
         )  # fmt: skip
@@ -105,7 +109,8 @@ class WindowEstimator:
         tracked = self._tracker.estimate(task.window, task.end)
         fit = tracked.fit
         status, reason = self._status(task, tracked)
-        posterior = None if fit is None or status is Status.INVALID else self._honest(tracked, fit)
+        own = None if fit is None or status is Status.INVALID else self._honest(tracked, fit)
+        posterior = None if own is None or fit is None else _with_form(own, fit)
         basis = self._basis(task, fit)
         if status is Status.VALID and task.end - basis.end > self.config.traversability.max_age:
             status, reason = Status.NOT_EXCITED, _gated(tracked)
@@ -129,6 +134,8 @@ class WindowEstimator:
             gaps=self._watched_gaps(task, fit),
             excitation=excitation_of(task.window, self.rig, self._settings.min_speed),
             basis=basis,
+            z_driven=None if fit is None or posterior is None else self._driven(fit),
+            search_ended=tracked.search_ended,
         )
         effects = self._effects(fit)
         model = self._present_model(task.window, tracked, effects)
@@ -139,7 +146,8 @@ class WindowEstimator:
             self._idle = np.zeros(len(self.rig.wheels), bool)
         self._idle = idle(task.window, self.rig, task.end - self._settings.hop, self._idle)
         limit = np.where(self._idle, 0.0, task.torque_limit)
-        return Undecided(result, demand, limit, window, task.fresh, model, here)
+        known = None if own is None else Posterior(own.soil, model.with_form(own.log_covariance))
+        return Undecided(result, known, demand, limit, window, task.fresh, model, here)
 
     def decide(self, window: Undecided) -> WindowResult:
         """The result with its traversability and watch; windows in their order, here or in another process."""
@@ -154,7 +162,7 @@ class WindowEstimator:
     def _decided(self, window: Undecided) -> WindowResult:
         """The result with its traversability."""
         way, self._wheels = judge(
-            window.result.posterior, window.result.status, window.demand, self.rig, window.model, window.torque_limit,
+            window.posterior, window.result.status, window.demand, self.rig, window.model, window.torque_limit,
             self.config.traversability, None if window.fresh else self._wheels,
         )  # fmt: skip
         return replace(window.result, traversability=self._settle(way, window))
@@ -207,7 +215,9 @@ class WindowEstimator:
         if fit is None:
             return UncertainModel.over(CompletedModel.of(self.model, effects, speed))
         widening = _widening(tracked, fit)
-        return UncertainModel.of(self.model, *self._completion, fit.whole, len(self.rig.wheels), speed, widening)
+        return UncertainModel.of(
+            self.model, *self._completion, fit.whole, len(self.rig.wheels), speed, widening, fit.form
+        )
 
     def _honest(self, tracked: Tracked, fit: Fit) -> Posterior:
         """Posterior, of both optima where there are two, widened where the residuals are larger than the noise."""
@@ -221,6 +231,15 @@ class WindowEstimator:
 
     def _bearing(self, posterior: Posterior) -> Estimate:
         return posterior.bearing_pressure(self._settings.z_ref, self._settings.b_ref)
+
+    def _driven(self, fit: Fit) -> tuple[float, float] | None:
+        """Sinkages [m] that nine tenths of the wheels' instants lie between."""
+        depth = sinkage(fit.optimum.latents.entry_angle, self.rig.radius)
+        known = depth[np.isfinite(depth)]
+        if not len(known):
+            return None
+        low, high = np.percentile(known, (5.0, 95.0)).tolist()
+        return low, high
 
     def _soil_class(self, posterior: Posterior | None) -> dict[str, float] | None:
         if posterior is None or self._classes is None:
@@ -296,7 +315,7 @@ class WindowEstimator:
         if not tracked.mismatch:
             return None
         if fit is None:
-            return "not_finite"
+            return "model_mismatch" if tracked.search_ended else "not_finite"
         return "model_mismatch" if fit.chi2 > self._tracker.chi2_limit(fit) else "no_convergence"
 
     def _ambiguous(self, fit: Fit) -> bool:
@@ -316,6 +335,11 @@ def _gated(tracked: Tracked) -> str:
 def _widening(tracked: Tracked, fit: Fit) -> float:
     """Factor of the covariance of a fit that leaves more than noise."""
     return max(fit.chi2, 1.0) if tracked.mismatch else 1.0
+
+
+def _with_form(own: Posterior, fit: Fit) -> Posterior:
+    """A posterior with what the form of the model leaves open besides."""
+    return own if fit.form is None else Posterior(own.soil, own.log_covariance + fit.form.log_covariance)
 
 
 def _with_true_draft(window: Window, effects: Sequence[Active], rig: Rig) -> Window:

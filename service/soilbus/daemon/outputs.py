@@ -71,7 +71,13 @@ def check_cycle_times(config: Config, database: Database) -> None:
 def json_line(result: WindowResult, config: Config) -> str:
     """The result as one JSON object (keys: DESIGN.md), SI throughout, null for the unknown."""
     way = result.traversability
-    bearing = {"z_ref": config.estimator.z_ref, "b_ref": config.estimator.b_ref, **_value_std(result.bearing)}
+    bearing = {
+        "z_ref": config.estimator.z_ref,
+        "b_ref": config.estimator.b_ref,
+        **_value_std(result.bearing),
+        "z_driven": None if result.z_driven is None else list(result.z_driven),
+        "extrapolates": _extrapolates(result, config.estimator.z_ref),
+    }
     posterior = result.posterior
     line = {
         "t": round(result.t, 6),
@@ -100,10 +106,19 @@ def json_line(result: WindowResult, config: Config) -> str:
         "warning": {"state": str(result.watch.warning), "time_left": result.watch.time_left},
         "capability": None if way.capability is None else _capability(way.capability),
         "chi2": result.chi2,
+        "search_ended": result.search_ended,
         "samples": result.samples,
         "rejected": result.rejected,
     }
     return json.dumps(known(line), allow_nan=False)
+
+
+def _extrapolates(result: WindowResult, z_ref: float) -> bool | None:
+    """Whether the bearing pressure is of a depth [m] that the wheels hardly had; None where it is not known."""
+    if result.bearing is None or result.z_driven is None:
+        return None
+    low, high = result.z_driven
+    return not low <= z_ref <= high
 
 
 def _capability(able: Capability) -> dict[str, Any]:

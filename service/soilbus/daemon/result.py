@@ -28,9 +28,11 @@ class WindowResult:
     the largest first.  position is in the middle of the data that count: of the window, or
     of its part on a new soil.  failure is the kind of a solve that failed, None where none did.
     watch warns of immobilisation; unknown where the loop watches ten times a second itself.  gaps: reduced
-    chi-square of the channels that have not fitted for minutes, the worst first.  log names the
-    recording that the window is of; None for the live bus.  excitation: how much draft and slip varied.
-    basis: what the decision rests on.
+    chi-square of the channels that have not fitted for minutes, the worst first.  z_driven: sinkages [m] between
+    which nine tenths of the wheels' instants lie.  search_ended: the budget of
+    evaluations (estimator.search_rate, search_burst) ended the search for a soil that describes the data.
+    log names the recording that the window is of; None for the live bus.  excitation: how much draft and slip
+    varied.  basis: what the decision rests on.
     """
 
     t: float
@@ -50,6 +52,8 @@ class WindowResult:
     position: Position | None = None
     failure: str | None = None
     gaps: Mapping[str, float] = field(default_factory=dict)
+    z_driven: tuple[float, float] | None = None
+    search_ended: bool = False
     watch: Watch = Watch()  # noqa: RUF009, immutable
     log: str | None = None
     excitation: Excitation = Excitation()  # noqa: RUF009, immutable

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.posterior import PARAMETERS, Estimate, Posterior, SoilPrior
 from soilbus.terra.wheel import Soil
+
+if TYPE_CHECKING:
+    from soilbus.estimation.form import FormLeft
 
 Array = NDArray[np.float64]
 
@@ -31,12 +35,14 @@ class Belief:
 
     With k_c_off it is what data alone told (`apart_from`): Gaussian in k_c, not in its logarithm.
     The covariance then is that of k_c in units of the soil's, and its mean is 1 + k_c_off of these.
+    All is of the model's configured form; form is what that leaves open, None where it was not asked for.
     """
 
     soil: Array
     gains: Array
     covariance: Array
     k_c_off: float | None = None
+    form: FormLeft | None = None
 
     @classmethod
     def of(cls, prior: SoilPrior, gain_std: Array) -> Belief:

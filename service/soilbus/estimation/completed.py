@@ -197,6 +197,12 @@ class CompletedProblem(WindowProblem):
             pull_by_effects=pull_by_effects,
         )
 
+    def _wheels_in_contact(self, soil: Soil, gains: Array, latents: Latents) -> tuple[WheelState, WheelModel]:
+        if not self.effects:
+            return super()._wheels_in_contact(soil, gains, latents)
+        wheels = self._wheels(soil, self.active(gains[self.n_sensors :]), latents, latents.entry_angle)
+        return wheels.state, wheels.model
+
     def _wheels(self, soil: Soil, active: Sequence[Active], latents: Latents, angle: Array) -> _Wheels:
         """The wheels at given entry angles: these and the circles that effects make of the wheels give the sinkages."""
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)

@@ -182,4 +182,6 @@ def settle(
             return lowest._replace(iterations=iterations)
     if best is None:
         return None
+    if not converged and lowest is not None and lowest.length < CONVERGED_RESUMED:
+        return lowest._replace(iterations=iterations)
     return Settled(near, *best, length, iterations, converged)

@@ -75,6 +75,14 @@ class Earlier:
         off[_K_C] = soil[_K_C] / self._before.soil[_K_C] - 1.0 - self._before.k_c_off
         return np.append(off, of_prior)
 
+    def by_mean(self, soil: Array, gains: Array, shift: Array) -> tuple[Array, Array, Array]:
+        """Derivatives (R, M) of the residuals by what shifts the mean by (6 + G, M), with precision and residuals."""
+        by_mean = -shift[np.concatenate([self._free, _SOIL + self._active])]
+        if self._of_data:
+            by_mean[_K_C] *= 1.0 + (self._before.k_c_off or 0.0)
+            by_mean = np.vstack([by_mean, np.zeros((1, by_mean.shape[1]))])  # the prior of its logarithm stays
+        return by_mean, self.precision, self.off(soil, gains)
+
     def slopes(self, soil: Array, by_logs: Array, by_k_c: Array | None = None) -> Array:
         """Derivatives (R, M) of the residuals, from those (F + A, M) of logarithms and gains by some M.
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.belief import Belief
+from soilbus.estimation.denoised import DenoisedProblem
 from soilbus.estimation.descent import (
     CONVERGED_RESUMED,
     FAR,
@@ -21,6 +22,7 @@ from soilbus.estimation.descent import (
     approach,
     settle,
 )
+from soilbus.estimation.form import FormLeft
 from soilbus.estimation.linearised import Bend, Latents, Linearised, Optimum
 from soilbus.estimation.normal_equations import Fitting, Place
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
@@ -125,7 +127,7 @@ class Fit:
     rival is another optimum that the data leave about as likely, where one was looked for
     and found; averaged is the mean of the whole posterior, where that was worked out (see
     `marginal`); bend: cost and evidence are those on a way that bends (see `bends`);
-    off_scale: sinkages and all else agree on no soil (see `scale`).
+    off_scale: sinkages and all else agree on no soil (see `scale`); form: what the model's form leaves open.
     All are of a constant soil until `present` moves them to the window's end.
     """
 
@@ -142,6 +144,7 @@ class Fit:
     averaged: Belief | None = None
     bend: Bend | None = None
     off_scale: bool = False
+    form: FormLeft | None = None
 
     @property
     def posterior(self) -> Posterior:
@@ -193,7 +196,9 @@ def fit_window(problem: WindowProblem, prior: SoilPrior, before: Belief | None =
         if not best.converged:
             near = approach(Fitting(problem, prior, before, with_gains=False), best.mode.soil, MAX_ITERATIONS, 0.0)
             best = best if near is None else _fit_at(fitting, settle(fitting, near, MAX_ITERATIONS)) or best
-        return _with_rival(fitting, thin, best, ends, led) if best.converged else best
+        if not best.converged:
+            return calmed(fitting, best)
+        return _with_rival(fitting, thin, best, ends, led)
 
 
 def _best(fitting: Fitting, ends: Sequence[Place]) -> tuple[Fit | None, Place | None]:
@@ -367,6 +372,42 @@ def resume(ahead: Foreseen) -> Fit | None:
         first = 0.0 if point is None or step is None else point.length(step)
         end = settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED, first, enough=CONVERGED_RESUMED)
         return _fit_at(fitting, end)
+
+
+def calmed(fitting: Fitting, fit: Fit) -> Fit:
+    """A fit that has not converged, with the optimum of the denoised problem near it; as it is where there is none.
+
+    Where loads and slips hardly vary, the fitted latents vary by noise alone, which Gauss-Newton takes for information:
+    the steps it foresees are short, and the valley that they creep along has no end that means anything.  Without
+    that noise (see `denoised`) the window is a plain regression, which prior and data make convex.
+    """
+    if not fit.chi2 < PLAUSIBLE:
+        return fit
+    optimum = fit.optimum
+    with np.errstate(all="ignore"):
+        calm = DenoisedProblem(fitting.problem, optimum)
+        again = Fitting(calm, fitting.coordinates.prior, fitting.before)
+        calm_place = Place(optimum.soil, optimum.gains, calm.latents, np.inf, 1)
+        found = _fit_at(again, settle(again, calm_place, MAX_ITERATIONS, enough=CONVERGED_RESUMED))
+        if found is None or not found.converged:
+            return fit
+        near = fitting.start(found.optimum.soil, optimum.latents.entry_angle, found.optimum.gains)
+        first = fitting.point(near)
+        place = near if first is None else fitting.moved(near, first, np.zeros(len(first.gradient)))
+        point = fitting.point(place)
+    if first is None or point is None:
+        return fit
+    return replace(
+        fit,
+        belief=found.belief,
+        mode=found.mode,
+        sinkage=found.sinkage,
+        optimum=Optimum(fitting.problem.t, place.soil, place.gains, place.latents, point.at),
+        cost=point.cost,
+        evidence=point.evidence,
+        iterations=fit.iterations + found.iterations,
+        converged=True,
+    )
 
 
 def settled(fitting: Fitting, near: Place) -> Fit | None:

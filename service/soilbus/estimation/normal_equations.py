@@ -206,6 +206,17 @@ class Fitting:
             self._around = optimum, None if solution is None else Around(directions, known, *solution)
         return self._around[1]
 
+    def spread(self, optimum: Optimum) -> Array:
+        """Derivatives (6 + G, F + A) of the soil's logarithms and the gains by coordinates and active gains there."""
+        spread = self._of_gains[1:].copy()
+        spread[:_SOIL, : len(self.free)] = self._log_directions(optimum.soil)
+        return spread
+
+    def earlier_slopes(self, optimum: Optimum) -> Array:
+        """Derivatives (R, F + A) of the residuals of what was known before."""
+        kept = np.concatenate([self.free, _SOIL + self.active])
+        return self.earlier.slopes(optimum.soil, self.spread(optimum)[kept])
+
     def directions(self, place: Place) -> Array:
         """What a column of Linearised.rows (1 + 6 + G) has of each coordinate and active gain (F + A)."""
         directions = self._of_gains.copy()

@@ -10,6 +10,8 @@ sect. 4.8).  The entry angle of each wheel follows from its load.
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +19,7 @@ from numpy.typing import NDArray
 
 from soilbus.estimation.linearised import Latents, Linearised, Optimum
 from soilbus.estimation.readings import Readings
+from soilbus.estimation.search_budget import Work
 from soilbus.estimation.weights import diagonals, inverse_covariance
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.entry_angle import entry_angle_for_load
@@ -33,6 +36,9 @@ from soilbus.terra.wheel import (
 
 Array = NDArray[np.float64]
 
+THINNED_FORM = 4
+"""Instants of which one is asked for its derivatives by the form, a smooth function of loads and slips: lines between
+them change no std of the soil by more than 3 %."""
 START_TOLERANCE = 0.02
 """Relative error of load left in the first entry angles; each linearisation mends it further."""
 MAX_TURN = 0.15
@@ -92,6 +98,7 @@ class WindowProblem(Readings):
     ) -> None:
         super().__init__(window, rig, min_speed, max_turn)
         self.model = model
+        self.work = Work()
 
     def allowed(self, gains: Array) -> Array:
         """Gains (G,) with what has a range kept inside it."""
@@ -187,6 +194,7 @@ class WindowProblem(Readings):
         Without those derivatives it serves to move the soil and the effects only.
         """
         W = self.n_wheels
+        self.work.instants += self.n
         at = self._response(soil, gains, latents)
         A = self._by_latents(at)
 
@@ -291,6 +299,48 @@ class WindowProblem(Readings):
         weighed[~self._known] = np.nan
         return weighed[:, :, 0], weighed[:, :, 1:]
 
+    def by_form(self, optimum: Optimum) -> tuple[Array, Array]:
+        """Derivatives (R, 4) of the residuals by form.FORM at an optimum, and these weighed as `Linearised`."""
+        soil, gains, latents, at = Soil(*optimum.soil.tolist()), optimum.gains, optimum.latents, optimum.at
+        W, (n, m) = self.n_wheels, at.by_latents.shape[:2]
+        some = np.unique(np.linspace(0, n - 1, math.ceil(n / THINNED_FORM)).round().astype(int))
+        by_form = _between(some, self.part(some)._contact_by_form(soil, gains, latents.part(some)), n)  # (3, 3, N, W)
+        slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
+        pull, torque, depth = np.concatenate([by_form[:, :1], by_form[:, :1] * slip, by_form[:, 1:]], axis=1)
+        rows = np.zeros((n, m, len(pull)))
+        rows[:, :W] = -torque.transpose(1, 2, 0)
+        rows[:, W] = -pull.sum(2).T
+        if self.with_sinkage:
+            rows[:, W + 1 :] = -depth.transpose(1, 2, 0)
+        rows[~self._known] = 0.0
+        variance, row_var = self._corrected(gains)[4:]
+        weighed = inverse_covariance(at.by_latents, variance, row_var, W) @ rows
+        return rows.reshape(n * m, -1), weighed.reshape(n * m, -1)
+
+    def _contact_by_form(self, soil: Soil, gains: Array, latents: Latents) -> Array:
+        """Derivatives (3, 3, N, W) of drawbar pull, torque and sinkage of wheels that carry the latent loads.
+
+        By the ratios of peak and exit angle, the latter behind the axle, and by the share of the other shear law.
+        """
+        shape, other = (self.n, self.n_wheels), 1.0
+        state, model = self._wheels_in_contact(soil, gains, latents)
+        if model.shear_law == "exponential":  # the same, with a share that can be taken away
+            model, other = replace(model, shear_law="rational", exponential_share=1.0), -1.0
+        _, d = wheel_forces_and_derivatives(state, model, ("peak", "leave", "exponential_share"))
+        by_angle, by_form = d[:, 0].reshape(3, *shape), d[:, 7:].reshape(3, 3, *shape)
+        by_form[:, 1] *= -1.0
+        by_form[:, 2] *= other
+        turned = -by_form[0] / by_angle[0]
+        out = np.empty((3, 3, *shape))
+        out[:2] = by_form[1:] + by_angle[1:, None] * turned
+        out[2] = np.reshape(state.radius, (-1, self.n_wheels)) * np.sin(latents.entry_angle) * turned
+        return out
+
+    def _wheels_in_contact(self, soil: Soil, gains: Array, latents: Latents) -> tuple[WheelState, WheelModel]:
+        """States and model of the wheels at these latents."""
+        slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
+        return self._state(soil, latents.entry_angle, slip), self.model
+
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         """The wheels with the entry angle eliminated: it follows the load."""
         shape, rim = (self.n, self.n_wheels), self.rig.radius * latents.speed
@@ -369,3 +419,13 @@ class WindowProblem(Readings):
             change -= np.tensordot(gain_step[self.n_sensors :], at.load_by_effects, 1)
         low, high = angle * 0.6, np.minimum(angle * 1.6, MAX_ENTRY_ANGLE)
         return np.asarray(np.minimum(np.maximum(angle + change / at.load_slope, low), high))
+
+
+def _between(some: NDArray[np.intp], values: Array, n: int) -> Array:
+    """Values (..., S, W) at some of n instants (S,), the first and the last too, on straight lines (..., N, W)."""
+    if len(some) == n:
+        return values
+    at = np.arange(n)
+    after = np.minimum(np.searchsorted(some, at, side="right"), len(some) - 1)
+    share = ((at - some[after - 1]) / (some[after] - some[after - 1]))[:, None]
+    return np.asarray((1.0 - share) * values[..., after - 1, :] + share * values[..., after, :])

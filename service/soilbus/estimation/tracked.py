@@ -29,6 +29,8 @@ class Settings:
 
     drift: sd of the logarithm of each soil coordinate after one window; it grows with the
     square root of time.  min_rows: residuals below which a window is not fitted.
+    search_rate, search_burst: evaluations of the model that searches may take, see SearchBudget.
+    form: root mean squares by which form.FORM may differ from the configured model's; () leaves none of it open.
     """
 
     window: float
@@ -37,6 +39,9 @@ class Settings:
     max_chi2: float
     drift: float
     min_rows: int = MIN_ROWS
+    form: tuple[float, ...] = ()
+    search_rate: float = 4.0
+    search_burst: float = 100.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +49,7 @@ class Tracked:
     """A window's fit (None without), whether the model fails to describe its data, and of which ground they are.
 
     since [s] is where the data that count begin; standstill and turning count instants left out.
+    search_ended: the budget of evaluations ended the search for a soil that describes the data.
     """
 
     fit: Fit | None
@@ -52,3 +58,4 @@ class Tracked:
     since: float
     standstill: int = 0
     turning: int = 0
+    search_ended: bool = False

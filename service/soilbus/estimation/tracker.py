@@ -24,7 +24,8 @@ from soilbus.estimation.completed import CompletedProblem
 from soilbus.estimation.coordinates import Coordinates
 from soilbus.estimation.curve import curve_of, with_curve, without_curve
 from soilbus.estimation.effect_parameters import Free
-from soilbus.estimation.gauss_newton import Fit, Foreseen, fit_window, foreseen, resume
+from soilbus.estimation.form import FormLeft, form_left
+from soilbus.estimation.gauss_newton import Fit, Foreseen, calmed, fit_window, foreseen, resume
 from soilbus.estimation.marginal import with_whole
 from soilbus.estimation.normal_equations import Fitting
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
@@ -32,6 +33,7 @@ from soilbus.estimation.present import at_present
 from soilbus.estimation.recall import is_borne_out, recalled
 from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.scale import sinkages_off_scale
+from soilbus.estimation.search_budget import SearchBudget
 from soilbus.estimation.soil_change import Crossing, suspicion, without_crossing
 from soilbus.estimation.tracked import Ground, Settings, Tracked
 from soilbus.estimation.window import Rig, Window
@@ -127,6 +129,7 @@ class Tracker:
         """Begin anew."""
         self._here = self.prior  # of the present soil
         self._distrusted = self._in_border = False  # the last window was a mismatch; and of no soil since a border
+        self._budget = SearchBudget(self.settings.search_rate, self.settings.search_burst)
         self._fit: Fit | None = None
         self._good_until = -math.inf
         self._alarm: Alarm | None = None
@@ -136,6 +139,10 @@ class Tracker:
 
     def estimate(self, window: Window, end: float) -> Tracked:
         """One window that ends at `end` [s]; windows in their order."""
+        self._budget.next_window(len(window.t), end - self._good_until <= RECENT * self.settings.window)
+        return replace(self._estimate(window, end), search_ended=self._budget.ended)
+
+    def _estimate(self, window: Window, end: float) -> Tracked:
         start = end - self.settings.window
         crossing = self._crossing
         new = crossing is not None and (self._in_border or start < crossing.end)
@@ -152,20 +159,22 @@ class Tracker:
             self._alarm = None  # another soil would have been found by now
         last = self._fit
         changed = None
-        if last is None or last.rival is not None:
+        if last is None or (last.rival is not None and self._budget.allows()):
             fitting, fit = self._afresh(window, problem, before)
             if self.mismatch(fit) and self._alarm is not None:
                 changed = self._another_soil(window, self._alarm, fit, before, None)
         else:
             ahead = foreseen(problem, self._here, last, before)
             fitting, fit = ahead.fitting, resume(ahead)
-            if fit is None or not fit.converged:  # a long valley is no sign of another soil
-                fit = fit_window(problem, self._here, before)
+            if fit is not None and not fit.converged and fit.chi2 <= self.chi2_limit(fit):
+                fit = calmed(fitting, fit)  # a long valley is no sign of another soil
+            if fit is None or not fit.converged:
+                fit = self._searched(problem, self._here, before) or fit
             fitting, fit = self._on_the_way(window, fitting, fit)
             self._alarm = self._alarm_in(window, ahead, last, fit, end - since)
             if self._alarm is not None:
                 changed = self._another_soil(window, self._alarm, fit, before, last)
-            if changed is None and self.mismatch(fit):
+            if changed is None and self.mismatch(fit) and self._budget.allows():
                 fitting, fit = self._afresh(window, problem, before)
         if changed is not None:
             return self._remembered(replace(changed, standstill=left_out[0], turning=left_out[1]), end, problem)
@@ -208,7 +217,7 @@ class Tracker:
         if self.mismatch(fit) and self._beliefs:
             there = elsewhere(self.prior)
             known = before.of_another_soil(there)
-            other = fit_window(problem, there, known)
+            other = self._searched(problem, there, known)
             if not self.mismatch(other):
                 begin = float(problem.t[0])
                 self._crossing, self._here = Crossing(begin, begin, 0.0), there
@@ -223,7 +232,16 @@ class Tracker:
             off_scale = sinkages_off_scale(fitting, fit)
             fit = with_whole(fitting.problem, fitting.coordinates.prior, fitting.before, fit)
             fit = replace(fit, off_scale=off_scale)
+        fit = replace(fit, form=self._form_left(fitting, fit))
         return at_present(fitting, fit, self.settings.window, self.settings.drift)
+
+    def _form_left(self, fitting: Fitting, fit: Fit) -> FormLeft | None:
+        """What the form of the model leaves open of a fit."""
+        if not any(self.settings.form):
+            return None
+        before = fitting.before.form or FormLeft.of(np.array(self.settings.form), len(fit.gains))
+        with np.errstate(all="ignore"):
+            return form_left(fitting, fit, before)
 
     def mismatch(self, fit: Fit | None) -> bool:
         """Whether a fit failed or leaves more than noise."""
@@ -248,7 +266,8 @@ class Tracker:
             learned = end - tracked.since >= LEARNED * self.settings.window and fit.is_gaussian
             if learned and tracked.ground in (Ground.SAME, Ground.NEW):
                 curve = curve_of(problem)
-                self._beliefs.append((end, without_curve(fit.mode.apart_from(self._here), curve)))
+                told = without_curve(fit.mode.apart_from(self._here), curve)
+                self._beliefs.append((end, replace(told, form=fit.form)))
                 self._newest = without_curve(fit.whole, curve)
         return tracked
 
@@ -265,7 +284,8 @@ class Tracker:
         gains = problem.gain_std**2 * min((elapsed + 1.0) / GAIN_MEMORY, 1.0)
         if self._crossing is not None and end <= self._crossing.end:
             return belief.of_another_soil(self._here).drifted(np.zeros((_SOIL, _SOIL)), gains)
-        return belief.drifted(self._drift(belief, elapsed), gains)
+        form = None if belief.form is None else belief.form.drifted(self.settings.form, elapsed / GAIN_MEMORY)
+        return replace(belief.drifted(self._drift(belief, elapsed), gains), form=form)
 
     def _ended(self, t: float) -> list[int]:
         return [i for i, (end, _) in enumerate(self._beliefs) if end <= t + _SAME_TIME]
@@ -314,7 +334,7 @@ class Tracker:
                 break  # after a mismatch the wheels of both axles must agree, and agree with the draft
             waits = self.mismatch(one) and window.t[-1] < alarm.t + PATIENCE * self.settings.window
             known = self._known_at(alarm.t, second).of_another_soil(there)
-            new = fit_window(second, there, known)
+            new = self._searched(second, there, known)
             if new is None or self.mismatch(new):
                 continue
             if old is not None and not self._likelier(old, new, self._as_one(apart, self._problem(apart), before)[1]):
@@ -350,7 +370,7 @@ class Tracker:
             if problem.n_rows < 2 * MIN_NEW_ROWS:
                 break
             known = fitting.before
-            later = fit_window(problem, self._here, known)
+            later = self._searched(problem, self._here, known)
             if later is None or self._unsettled(later):
                 continue
             fall, noise = fit.cost - later.cost, fit.rows - later.rows
@@ -370,7 +390,7 @@ class Tracker:
 
     def _as_one(self, window: Window, problem: WindowProblem, before: Belief) -> tuple[Fitting, Fit | None]:
         """A window as one soil, this one, from any start."""
-        fit = fit_window(problem, self._here, before)
+        fit = self._searched(problem, self._here, before)
         return self._on_the_way(window, Fitting(problem, self._here, before), fit)
 
     def _on_the_way(self, window: Window, fitting: Fitting, fit: Fit | None) -> tuple[Fitting, Fit | None]:
@@ -381,6 +401,15 @@ class Tracker:
         if fit is None or way is None:
             return fitting, fit
         return on_the_way(fitting, fit, way, self._problem(straightened(window, self.rig, way)))
+
+    def _searched(self, problem: WindowProblem, prior: SoilPrior, before: Belief) -> Fit | None:
+        """A fit from any start; None also where the budget allows no further search."""
+        if not self._budget.allows():
+            return None
+        begun = self._budget.work.instants
+        fit = fit_window(problem, prior, before)
+        self._budget.spend(begun)
+        return fit
 
     def _likelier(self, old: Fit, new: Fit, one: Fit | None) -> bool:
         """Whether two soils explain much better what one, of the same data, explains."""
@@ -394,4 +423,6 @@ class Tracker:
 
     def _problem(self, window: Window) -> WindowProblem:
         speed, turn = self.settings.min_speed, self.settings.max_turn
-        return CompletedProblem(window, self.rig, self.model, speed, turn, self.effects, self.free)
+        problem = CompletedProblem(window, self.rig, self.model, speed, turn, self.effects, self.free)
+        problem.work = self._budget.work
+        return problem

@@ -1,0 +1,56 @@
+"""Windows in, results out: what a mismatch widens, and how long a border keeps new ground from being valid."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "estimation"))
+from drives import tasks
+
+from soilbus.daemon.estimator import WindowEstimator
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
+from soilbus.traversability import Status
+
+FORMLESS = [f"model.form.{name}=0" for name in ("peak", "peak_by_slip", "exit", "shear")]
+
+
+def test_what_residuals_leave_beyond_noise_widens_every_std():
+    config = reference_configuration(FORMLESS)
+    task = next(tasks(config, excited("dry_sand", 10.5), seed=2))
+    variance = {name: 0.6 * values for name, values in task.window.variance.items()}  # less noise than there is
+    task = replace(task, window=replace(task.window, variance=variance))
+    strict, lenient = (
+        WindowEstimator(reference_configuration([*FORMLESS, f"estimator.max_chi2={limit}"])) for limit in (1.1, 50.0)
+    )
+    wide, narrow = strict.solve(task), lenient.solve(task)
+    assert (wide.status, wide.reason, narrow.status) == (Status.DEGRADED, "model_mismatch", Status.VALID)
+    assert wide.chi2 > 1.2
+    for one, other in ((wide.bearing, narrow.bearing), (wide.posterior.tan_phi(), narrow.posterior.tan_phi())):
+        assert one.value == pytest.approx(other.value, abs=0.2 * other.std)
+        assert one.std == pytest.approx(math.sqrt(wide.chi2) * other.std, rel=0.1)
+
+
+@pytest.mark.parametrize(("first", "second"), [("wet_clay", "loam"), ("dry_sand", "loam")])
+def test_ground_that_has_just_begun_is_not_valid(first, second):
+    config = reference_configuration(["estimator.hop=0.25"])
+    border, swing = 18.0, Swing(1.4, 1.8)
+    soils = (Patch(0.0, first), Patch(border, second))
+    scenario = Scenario(13.5, soils, swing, slip=Swing(0.05, 0.4), transition=0.2)
+    truth = simulate(config, scenario, seed=2).truth
+    begun = float(np.interp(border, truth["distance"], truth["t"]))
+    estimator, seen = WindowEstimator(config), 0
+    for task in tasks(config, scenario, seed=2):
+        result = estimator.solve(task)
+        if begun + 0.4 < task.end < begun + 1.4:
+            seen += 1
+            assert result.status is not Status.VALID
+            assert result.traversability.state.value != "go"
+    assert seen >= 3

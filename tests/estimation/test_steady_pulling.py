@@ -1,0 +1,44 @@
+"""Steady pulling tells little and is no error: an estimate, a decision and no gap in every window."""
+
+from __future__ import annotations
+
+import pytest
+from drives import tasks
+
+from soilbus.daemon.estimator import WindowEstimator
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Patch, Profile, Scenario, Swing
+from soilbus.terra.soils import soil_named
+from soilbus.traversability import State, Status
+
+CONFIG = reference_configuration()
+STEADY = {"speed": Profile([0, 90], [1.4, 1.4])}
+
+
+def drive(constant, seconds, spread, shift, border):
+    soils = (Patch(0.0, "loam"), Patch(border, "wet_clay"))
+    return Scenario(seconds, soils, draft=constant, slip_spread=spread, side_shift=Swing(-shift, shift), **STEADY)
+
+
+BEFORE = Profile([0, 10, 20, 30, 36, 42, 48, 50, 90], [2000, 3500, 2200, 3800, 300, 800, 200, 500, 500])
+CASES = [
+    (drive(BEFORE, 90.0, 0.001, 0.01, 42.0), 1),
+    (drive(Profile([0, 90], [600, 600]), 90.0, 0.003, 0.02, 42.0), 3),
+]
+END = 62.0
+"""Time [s] to which the drives are looked at."""
+
+
+@pytest.mark.parametrize(("scenario", "seed"), CASES)
+def test_constant_draft_after_a_border_leaves_no_gap(scenario, seed):
+    estimator, clay = WindowEstimator(CONFIG), soil_named("wet_clay")
+    results = [estimator.solve(task) for task in tasks(CONFIG, scenario, seed) if task.end < END]
+    for result in results:
+        assert result.status in (Status.VALID, Status.NOT_EXCITED)
+        assert result.posterior is not None
+        assert result.traversability.max_draft is not None
+        assert result.traversability.state is not State.GO or result.status is Status.VALID
+    truth = clay.bearing_pressure(0.02, 0.3)
+    for result in results[-10:]:
+        assert result.reason.split()[0] in ("none", "not_excited")
+        assert abs(result.bearing.value - truth) < 3.0 * result.bearing.std
