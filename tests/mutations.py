@@ -128,8 +128,8 @@ MUTATIONS = (
     ),
     Mutation(
         "the soil never drifts", "estimation/tracker.py",
-        "return belief.drifted(self._drift(belief, elapsed), gains)",
-        "return belief.drifted(0.0 * self._drift(belief, elapsed), gains)",
+        "belief.drifted(self._drift(belief, elapsed), gains)",
+        "belief.drifted(0.0 * self._drift(belief, elapsed), gains)",
         ("tests/estimation/test_drift.py::test_the_soil_of_an_hour_ago_is_no_more_than_another_soil",),
     ),
     Mutation(
