@@ -439,9 +439,11 @@ class Traversability(_Section):
     look every 0.1 s, within one second."""
     stuck_time: PositiveFloat = 1.2
     """Seconds for which a vehicle makes no way under thrust from which it is stuck; no start takes as long to show."""
+    standstill: PositiveFloat = 0.05
+    """Rim speed [m/s] below which a wheel does not turn: two impulses a second of a ring of 100 teeth at 0.5 m."""
     stall_resistance: PositiveFloat = 0.15
-    """Thrust of a standing vehicle beyond draft, slope and inertia, as a share of its weight, from which it stalls:
-    more than the motion resistance of wheels that still roll (Wong, Theory of Ground Vehicles, ch. 2)."""
+    """Thrust beyond draft, slope and inertia, as a share of the weight, from which a vehicle whose wheels do not turn
+    stalls: more than an idling drive gives, less than wheels of any size need on loam (0.2 by this model)."""
     contradiction: PositiveFloat = 3.0
     """Standard deviations by which the wheels must pull less at their present slip than predicted for it to count."""
     full_torque: Annotated[float, Field(gt=0.0, le=1.0)] = 0.95

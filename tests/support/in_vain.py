@@ -22,7 +22,7 @@ from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import SAMPLE_RATE, Patch, Profile, Scenario
 from soilbus.simulator.sensors import measure
 from soilbus.terra.soils import SOILS
-from soilbus.terra.vehicle import axle_loads
+from soilbus.terra.vehicle import GRAVITY, axle_loads
 from soilbus.terra.wheel import Soil
 from statics import WEIGHT, brute_with_rolling, wheel
 
@@ -72,6 +72,23 @@ def stop_and_try(config: Config, attempt: Try, seed: int, drives: float = 13.0, 
         )
 
     return told(continued(done, config, waits + lasts, standing), config, seed, float(done.columns["t"][-1]) + waits)
+
+
+def start_after_stop(config: Config, rate: float, top: float, seed: int, lasts: float = 8.0) -> Story:
+    """A drive on loam, a stop, a wait of 1.5 s and a start at so many m/s^2 to the speed `top` [m/s]."""
+    waits = 1.5
+    done = driven(config, seed, 13.0, 0.5)
+    resists = 0.2 * WEIGHT  # what loam holds back rolling wheels by, as by brute force
+
+    def starting(t: np.ndarray) -> dict[str, np.ndarray]:
+        ground = np.clip(rate * (t - waits - SPIN_UP), 0.0, top)
+        speeds_up = np.where((ground > 0.0) & (ground < top), rate, 0.0)
+        on = np.clip((t - waits) / SPIN_UP, 0.0, 1.0)
+        torque = on * (resists + WEIGHT / GRAVITY * speeds_up) * 0.56 / 4.0
+        rims = [ground / (1.0 - 0.04 - 0.04 * speeds_up) for _ in config.wheel]  # slips that loam needs for so little
+        return {"ground_speed": ground, "acceleration": speeds_up} | _wheels(config, rims, [torque] * len(rims))
+
+    return told(continued(done, config, waits + lasts, starting), config, seed, float(done.columns["t"][-1]) + waits)
 
 
 def halted_by_a_patch(config: Config, seed: int, deceleration: float = 1.0, lasts: float = 8.0) -> Story:

@@ -2,9 +2,8 @@
 
     slip velocity of a wheel   v_s = r omega - V
     it spins where             v_s > max(v_min, s_max r omega)
-    the vehicle stalls where   V < v_min and r omega < v_min of every wheel, while the wheels' thrust sum(T / r) exceeds
-                               what draft, slope and inertia ask by more than any ground resists, or all motors give
-                               all they can
+    the vehicle stalls where   V < v_min and no wheel turns, while the wheels' thrust sum(T / r) exceeds what draft,
+                               slope and inertia ask by `stall_resistance`, or all motors give all they can
 
 Slip 1 - V/(r omega) is not defined at standstill, its velocity is: so one rule holds from standstill to full speed.
 What lasts for `spin_time` takes the word from any estimate that says go; a vehicle that spins or stalls without making
@@ -92,7 +91,7 @@ def observed(before: TractionLoss, motion: Motion, min_speed: float, settings: S
     min_speed
         Least speed [m/s] at which motion is told from rest.
     settings
-        `max_slip`, `spin_time`, `stuck_time`, `stall_resistance`.
+        `max_slip`, `spin_time`, `stuck_time`, `standstill`, `stall_resistance`.
 
     Returns
     -------
@@ -107,7 +106,7 @@ def observed(before: TractionLoss, motion: Motion, min_speed: float, settings: S
     spinning = sum(rim - motion.ground > max(min_speed, settings.max_slip * rim) for rim in known)
     stands = motion.ground < min_speed
     forced = motion.at_limit or motion.resistance > settings.stall_resistance  # nan: not known
-    stalls = stands and forced and max(known) < min_speed
+    stalls = stands and forced and max(known) < settings.standstill
     no_way = stalls or (spinning > 0 and stands) or 2 * spinning >= len(known)
     t = motion.t
     spins = min(before.spins, t) if spinning or stalls else math.inf

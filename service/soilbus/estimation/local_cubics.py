@@ -77,7 +77,7 @@ class Series(NamedTuple):
 def curve_of(t: Array, value: Array, variance: Array) -> Curve:
     """The curve of least risk of samples at times t [s], ascending, with these variances, all (K,)."""
     best, least = _curve(t, value, 0), 2.0  # of no smoothing w0 = 1
-    for half in HALF_WIDTHS:
+    for half in HALF_WIDTHS if len(t) else ():
         curve = _curve(t, value, half)
         if not curve.half_width:
             break
