@@ -71,7 +71,7 @@ def test_the_variance_of_a_value_at_one_instant_is_what_noise_makes_of_it(half, 
 def store_of(shake: float, step: float = 0.02) -> BinStore:
     """A vehicle of one wheel whose load shakes at 4 Hz, its messages at phases of their own."""
     names = ("torque", "load", "speed", "ground_speed", "draft")
-    noise = {q: SensorNoise(absolute=0.01) for q in (*names, "sinkage", "pitch", "acceleration")}
+    noise = {q: SensorNoise(absolute=0.01) for q in (*names, "sinkage", "pitch", "acceleration", "yaw_rate")}
     chassis = Chassis(1000.0, 2.0, 1.0, 0.5, 0.5)
     rig = Rig(("W",), np.array([0.5]), np.array([0.3]), np.array([True]), chassis, noise)
     rng, store = np.random.default_rng(5), BinStore(rig, 0.1, 0.0)

@@ -23,7 +23,7 @@ from soilbus.daemon.intake import WindowTask
 from soilbus.daemon.result import WindowResult, as_of
 from soilbus.estimation.effect_parameters import active_at
 from soilbus.estimation.gauss_newton import Fit
-from soilbus.estimation.posterior import Estimate, Posterior
+from soilbus.estimation.posterior import Estimate, Posterior, SoilPrior
 from soilbus.estimation.readings import gain_names
 from soilbus.estimation.soil_class import SoilClasses, guessed
 from soilbus.estimation.tracked import MIN_ROWS, Ground, Settings, Tracked
@@ -110,7 +110,7 @@ class WindowEstimator:
         fit = tracked.fit
         status, reason = self._status(task, tracked)
         own = None if fit is None or status is Status.INVALID else self._honest(tracked, fit)
-        posterior = None if own is None or fit is None else _with_form(own, fit)
+        posterior = None if own is None or fit is None else _with_form(own, fit, self.prior)
         basis = self._basis(task, fit)
         if status is Status.VALID and task.end - basis.end > self.config.traversability.max_age:
             status, reason = Status.NOT_EXCITED, _gated(tracked)
@@ -337,9 +337,9 @@ def _widening(tracked: Tracked, fit: Fit) -> float:
     return max(fit.chi2, 1.0) if tracked.mismatch else 1.0
 
 
-def _with_form(own: Posterior, fit: Fit) -> Posterior:
+def _with_form(own: Posterior, fit: Fit, prior: SoilPrior) -> Posterior:
     """A posterior with what the form of the model leaves open besides."""
-    return own if fit.form is None else Posterior(own.soil, own.log_covariance + fit.form.log_covariance)
+    return own if fit.form is None else own.beside(fit.form.log_covariance, prior)
 
 
 def _with_true_draft(window: Window, effects: Sequence[Active], rig: Rig) -> Window:

@@ -28,7 +28,7 @@ from soilbus.estimation.gauss_newton import Fit, Start
 from soilbus.estimation.normal_equations import Fitting, Place
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
 from soilbus.estimation.weights import inverse_covariance
-from soilbus.terra.effects.effect import Late
+from soilbus.terra.effects.effect import Effect, Late
 
 Array = NDArray[np.float64]
 Cost = Callable[[float, float], float]
@@ -120,6 +120,21 @@ def late_posteriors(
             if all(fitted.beforehand[i].std > 0.0 for i in at):
                 found[effect.name, late] = _posterior(records, prior, fitted, at, heat)
     return found
+
+
+def is_late(records: Sequence[Record], prior: SoilPrior, fitted: Completion, effect: Effect, explained: float) -> bool:
+    """Whether any channel is surely later, by an effect of a fitted model, than half the time between its samples.
+
+    A stamp says when a frame was on the bus: what it holds was measured up to a cycle before, half of one in the mean.
+    Surely: by two standard deviations.
+    """
+    found = late_posteriors(records, prior, fitted, explained)
+    for quantity, late in effect.late.items():
+        if (effect.name, late) in found:
+            total = found[effect.name, late].total
+            if abs(total.value) - 2.0 * total.std > records[-1].learned.sample_time(quantity) / 2.0:
+                return True
+    return False
 
 
 def _posterior(

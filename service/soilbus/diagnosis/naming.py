@@ -9,9 +9,11 @@ from dataclasses import dataclass, replace
 from soilbus.diagnosis.candidates import STEPS, Promising, Standing, promising
 from soilbus.diagnosis.completion import Completion
 from soilbus.diagnosis.fits import Fits
+from soilbus.diagnosis.late_posterior import is_late
 from soilbus.diagnosis.verdict import (
     PLAUSIBLE,
     TEMPERATURE,
+    gap_limit,
     hopeless_from,
     price,
     probabilities,
@@ -71,6 +73,15 @@ def named(
     if not fitted:
         return None
     fitted = _compared(whole, present, fitted, explained)
+    if present.gap <= gap_limit(present.checked_rows):  # nothing disagrees: a delay within a cycle of the bus is none
+        fitted = {
+            name: (effect, fit)
+            for name, (effect, fit) in fitted.items()
+            if not effect.late
+            or is_late(whole.records, whole.prior, fit, effect, explained + present.evidence - fit.evidence)
+        }
+        if not fitted:
+            return None
     falls = {name: present.evidence - completion.evidence for name, (_, completion) in fitted.items()}
     most = max(falls.values())
     if most < asked:

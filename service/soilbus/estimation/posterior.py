@@ -119,6 +119,22 @@ class Posterior:
         covariance[np.ix_(free, free)] = (axes * wide) @ axes.T * np.outer(unit, unit)
         return Posterior(self.soil, covariance)
 
+    def beside(self, more: Array, prior: SoilPrior) -> Posterior:
+        """The same with `more` left open besides, a covariance (6, 6) of the logarithms, as by considered parameters.
+
+        C + more, of which no principal variance in units of the prior's exceeds 1, or what it was before.
+        """
+        free = prior.free
+        if not len(free):
+            return self
+        unit, at = np.outer(prior.log_std[free], prior.log_std[free]), np.ix_(free, free)
+        own = self.log_covariance[at] / unit
+        variance, axes = np.linalg.eigh(own + more[at] / unit)
+        most = max(1.0, float(np.linalg.eigvalsh(own)[-1]))
+        covariance = np.zeros_like(self.log_covariance)
+        covariance[at] = (axes * np.clip(variance, 0.0, most)) @ axes.T * unit
+        return Posterior(self.soil, covariance)
+
     def distance(self, soil: Soil) -> float:
         """How many standard deviations a soil is away, all free parameters together (Mahalanobis)."""
         free = np.flatnonzero(np.diag(self.log_covariance) > 0.0)

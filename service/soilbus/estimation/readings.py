@@ -144,6 +144,10 @@ class Readings:
         """Number of residuals that count."""
         return self._n_known
 
+    def sample_time(self, quantity: str) -> float:
+        """Time [s] between a quantity's samples, the longest of its channels."""
+        return max(series.smooth.step for series in self._curves.of(quantity))
+
     def part(self, instants: slice | NDArray[np.intp]) -> Self:
         """The same with only these of its instants."""
         part = copy(self)

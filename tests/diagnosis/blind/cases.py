@@ -18,7 +18,7 @@ from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import Soil, WheelModel, sinkage, state_on
 
-from . import contact_forms, far_forms, further_forms, outside, soil_forms, vehicle_forms
+from . import contact_forms, far_forms, further_forms, late_forms, outside, soil_forms, vehicle_forms
 from .form import SIZES, Form, Hidden, Setting, together
 
 KINDS = ("single", "pair", "outside", "plain", "hard")
@@ -30,7 +30,7 @@ SOILS = (
 DURATION = 120.0
 EARLIER = (*soil_forms.FORMS, *contact_forms.FORMS, *vehicle_forms.FORMS)
 PAIRED = (*EARLIER, *further_forms.FORMS)
-FORMS = (*PAIRED, *far_forms.FORMS)
+FORMS = (*PAIRED, *far_forms.FORMS, *late_forms.FORMS)
 PAIRS, FURTHER_PAIRS, NULLS = 24, 8, 24
 """Cases of these kinds for each seed: pairs of earlier forms, pairs with a further one, nulls."""
 _ALIKE = ({"grade", "draft_offset"}, {"draft_offset", "draft_gain"})

@@ -130,7 +130,9 @@ FORMS = (
     Form(
         "", "draft_saturated", "amplifier at its end", "1", (0.01, 0.01), 0.5, by_hooks(draft=_saturated), imitable=True
     ),
-    Form("", "draft_sticking", "hysteresis of the pin", "N", (8.0, 8.0), 500.0, by_hooks(draft=_sticking)),
+    Form(
+        "", "draft_sticking", "hysteresis of the pin", "N", (8.0, 8.0), 500.0, by_hooks(draft=_sticking), imitable=True
+    ),
     Form("", "row_spacing", "soil changes every 0.75 m", "1", (0.003, 0.003), 0.4, by_hooks(wheel=_rows)),
     Form(
         "",

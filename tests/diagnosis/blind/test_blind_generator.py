@@ -12,8 +12,10 @@ from soilbus.simulator.drive import Drive, drive
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.terra.effects.along import instants
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active, Surroundings, forces_with
+from soilbus.terra.effects.sensors import read_late
 from soilbus.terra.soils import soil_named
 from soilbus.terra.stress import Array
 from soilbus.terra.wheel import WheelModel, WheelState, state_on, wheel_forces
@@ -168,9 +170,16 @@ def signature(active: Active, standard: Drive) -> Array:
         forces = forces_with([active], state, WheelModel(), around) - wheel_forces(state, WheelModel())
     if effect.torque is not None:
         torque = effect.torque(wheels("torque"), around, active.values) - wheels("torque")
+    if (late := effect.late.get("torque")) is not None:
+        torque = read_late(wheels("torque"), instants(around.t), active.values, late) - wheels("torque")
     if effect.load is not None:
         error = effect.load(around, active.values)
+    if (late := effect.late.get("load")) is not None:
+        error = read_late(load, instants(around.t), active.values, late) - load
     along = np.zeros((2, len(load)))
+    if (late := effect.late.get("draft")) is not None:
+        draft = columns["draft"][:, None]
+        along[0] = (read_late(draft, instants(around.t), active.values, late) - draft)[:, 0]
     if effect.draft is not None:
         along[0] = effect.draft(columns["draft"], around, active.values)
     if effect.resistance is not None:
@@ -224,7 +233,11 @@ HOOKS = ("wheel", "forces", "torque", "load", "draft", "resistance")
 def test_what_the_catalogue_imitates_is_marked(form, standard):
     how = form.hide(form.large, Setting(soil_named("loam"), 0.05, np.random.default_rng(1)))
     hidden = [hook for active in how.effects for hook in HOOKS if getattr(active.effect, hook) is not None]
-    alike = [name for name, effect in CATALOGUE.items() if any(getattr(effect, hook) is not None for hook in hidden)]
+    alike = [
+        name
+        for name, effect in CATALOGUE.items()
+        if any(getattr(effect, hook) is not None or hook in effect.late for hook in hidden)
+    ]
     left = [nearest(name, signature(how.effects[0], standard), standard) for name in alike]
     assert (min(left, default=1.0) < 0.8) == form.imitable, dict(zip(alike, left, strict=True))
 

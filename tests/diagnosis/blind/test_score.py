@@ -78,7 +78,7 @@ def test_of_two_effects_the_less_visible_one_counts():
 
 def test_an_effect_broken_on_purpose_lowers_the_score():
     """Whole it is named: test_blind_subset.py."""
-    broken = replace(CATALOGUE["torque_lag"], torque=lambda torque, around, values: torque)
+    broken = replace(CATALOGUE["torque_lag"], late={})
     found = tried(the_case("single/torque_lag:averaged/medium/"), tuple((CATALOGUE | {"torque_lag": broken}).values()))
     assert found.visible > 100.0
     assert next(figures([found])).text == "visible: named first: 0 of 1 = 0 %  (>= 90 %)"
