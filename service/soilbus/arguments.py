@@ -67,7 +67,7 @@ def command_line() -> argparse.ArgumentParser:
     heard = sub.add_mutually_exclusive_group()
     heard.add_argument("--log", type=Path, metavar="LOG", help="and compare them with a recording")
     heard.add_argument(
-        "--live", type=between(1.0, 3600.0), metavar="SECONDS", help="and with so many seconds of the configured bus"
+        "--live", type=between(1.0, 3600.0), metavar="SECONDS", help="and with SECONDS of the configured bus"
     )
 
     sub = command("replay", "the service's own pipeline over recorded logs")

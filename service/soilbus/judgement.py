@@ -99,7 +99,7 @@ class Basis(NamedTuple):
 
     @property
     def end(self) -> float:
-        """The last instant that is told of [s]; minus infinity without any."""
+        """When the last instant was measured [s]; minus infinity without any."""
         return float(self.instants[-1]) - self.late if len(self.instants) else -math.inf
 
 

@@ -32,7 +32,7 @@ SO_RCVBUFFORCE = 33  # which Python does not name
 RETRY = 0.005
 """Longest wait for a frame [s] while frames of ours wait for room."""
 GARBLED_FOR = 1.0
-"""A driver that for so long [s] hands out nothing but what it cannot read is opened anew: it may never come right."""
+"""A driver that for so long [s] hands out nothing but what it cannot read is opened again: it may never come right."""
 SAY_AGAIN = 60.0
 """A fault that lasts is said in the journal this often [s]."""
 

@@ -49,9 +49,9 @@ def frame_of(message: can.Message) -> Frame:
 
 def whole(message: can.Message) -> can.Message:
     """The message; ValueError where it has other than the bytes that it says: its line was cut off."""
-    told = message.dlc if message.is_fd else min(message.dlc, 8)
-    if not (message.is_remote_frame or message.is_error_frame or len(message.data) == told):
-        raise ValueError(f"a frame of {told} bytes has {len(message.data)}")
+    stated = message.dlc if message.is_fd else min(message.dlc, 8)
+    if not (message.is_remote_frame or message.is_error_frame or len(message.data) == stated):
+        raise ValueError(f"a frame of {stated} bytes has {len(message.data)}")
     return message
 
 

@@ -89,7 +89,7 @@ def observed(before: TractionLoss, motion: Motion, min_speed: float, settings: S
     motion
         The wheels and the vehicle now.
     min_speed
-        Least speed [m/s] at which motion is told from rest.
+        Least speed [m/s] above which the vehicle moves.
     settings
         `max_slip`, `spin_time`, `stuck_time`, `standstill`, `stall_resistance`.
 

@@ -56,7 +56,7 @@ an edge, and a microsecond would decide on which side."""
 class WindowTask:
     """One window's data and what is known of its inputs; everything an estimate needs.
 
-    index counts windows since the start; epoch counts how often time began anew; start and end [s];
+    index counts windows since the start; epoch counts how often time began again; start and end [s];
     missing are needed channels never seen, poor those that are stale at the end or covered the window badly;
     implausible are channels that lie, and are not in the window;
     torque_limit (W,) [N m], nan where unknown; track knows the positions from the window's

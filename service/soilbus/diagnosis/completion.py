@@ -63,7 +63,7 @@ class Completion:
 
     free are the parameters as fitted, those held at the edge of their ranges without a
     deviation; beforehand the same as nothing was held yet.  before holds what was known when
-    each recording's turn came; told are parameters by effect and name whose posterior is no
+    each recording's turn came; reported are parameters by effect and name whose posterior is no
     Gaussian about the fit; sizes what it changes of the evidence that nobody knows how
     great effects are (see `sizes`).
     """
@@ -75,7 +75,7 @@ class Completion:
     fits: tuple[Fit, ...]
     checks: tuple[Checked, ...]
     sizes: float = 0.0
-    told: Mapping[tuple[str, str], Estimate] = field(default_factory=dict)
+    reported: Mapping[tuple[str, str], Estimate] = field(default_factory=dict)
 
     @property
     def evidence(self) -> float:
@@ -167,7 +167,7 @@ class Completion:
         for free, pull, spread in zip(self.free, belief.gains[problem.n_sensors :].tolist(), std.tolist(), strict=True):
             name = free.parameter.name + ("" if free.wheel is None else f"_{problem.rig.wheels[free.wheel]}")
             out[free.effect][name] = Estimate(free.at(pull), free.std * spread)
-        for (effect, name), estimate in self.told.items():
+        for (effect, name), estimate in self.reported.items():
             out[effect][name] = estimate
         return out
 

@@ -82,14 +82,14 @@ def with_lateness(records: Sequence[Record], prior: SoilPrior, fitted: Completio
         better = complete(records, prior, fitted.effects, _starts(fitted, found))
         if better is not None and better.evidence < fitted.evidence:
             fitted, found = better, late_posteriors(records, prior, better, explained)
-    told: dict[tuple[str, str], Estimate] = {}
+    reported: dict[tuple[str, str], Estimate] = {}
     for (name, late), posterior in found.items():
-        told |= {
+        reported |= {
             (name, late.delay): posterior.delay,
             (name, late.time_constant): posterior.time_constant,
             (name, late.total): posterior.total,
         }
-    return replace(fitted, told=told)
+    return replace(fitted, reported=reported)
 
 
 def _starts(fitted: Completion, found: Mapping[tuple[str, Late], LatePosterior]) -> list[Start]:
@@ -162,16 +162,16 @@ def _posterior(
 
     sums = float(share @ ridge.total)
 
-    def told(values: Array, sd: Array, form: float) -> Estimate:
+    def estimate_of(values: Array, sd: Array, form: float) -> Estimate:
         mean = float(share @ values)
         return Estimate(mean, float(np.sqrt(share @ (sd**2 + (values - mean) ** 2) + (form * sums) ** 2)))
 
     within = np.full(NODES, (ridge.tau[1] - ridge.tau[0]) / np.sqrt(12.0))  # of a node's own stretch
     delay = ridge.total - ridge.tau
     return LatePosterior(
-        told(delay, np.hypot(ridge.sd, within), FORM_OF_PARTS),
-        told(ridge.tau, within, FORM_OF_PARTS),
-        told(ridge.total, ridge.sd, FORM_OF_SUM),
+        estimate_of(delay, np.hypot(ridge.sd, within), FORM_OF_PARTS),
+        estimate_of(ridge.tau, within, FORM_OF_PARTS),
+        estimate_of(ridge.total, ridge.sd, FORM_OF_SUM),
         (float(delay[best]), float(ridge.tau[best])),
         heat * (cost(*here) - float(ridge.cost[best])),
     )

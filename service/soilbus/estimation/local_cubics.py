@@ -91,7 +91,7 @@ def curve_of(t: Array, value: Array, variance: Array) -> Curve:
 def faithful(curve: Curve, value: Array) -> Curve:
     """The curve through half as many of the samples (K,): its bias is a sixteenth, below noise, its noise sqrt(2).
 
-    What is late is told by how the curve moves; least risk leaves as much bias as noise, which would be a delay.
+    What is late shows in how the curve moves; least risk leaves as much bias as noise, which would be a delay.
     """
     return _curve(curve.t, value, max(curve.half_width // 2, HALF_WIDTHS[0])) if curve.half_width else curve
 

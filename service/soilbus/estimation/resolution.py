@@ -91,12 +91,12 @@ def _bin_length(channels: Iterable[_Channel], longest: float, span: float) -> fl
     """Length of the bins [s]: the longest part of the longest one at which no needed channel loses too much."""
     needed = [c for c in channels if c.needed and c.curve.step > 0.0]
     slowest = max((c.curve.step for c in needed), default=longest)
-    told = [c for c in needed if 2.0 / len(c.t) < MOST_LOST**2]  # mean squares of fewer are not known so well
+    counted = [c for c in needed if 2.0 / len(c.t) < MOST_LOST**2]  # mean squares of fewer are not known so well
     for parts in range(1, MOST_PARTS + 1):
         length = longest / parts
         if length <= slowest:
             break
-        if all(_lost(c, length, int(span / length)) <= MOST_LOST for c in told):
+        if all(_lost(c, length, int(span / length)) <= MOST_LOST for c in counted):
             return length
     return min(longest, slowest)
 

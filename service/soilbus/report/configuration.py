@@ -76,7 +76,7 @@ def survey_report(found: Survey) -> str:
     """What was heard of every mapped signal, and what the recording cannot show."""
     rows = [_heard_row(seen, found) for seen in found.seen]
     text = "\n" + table(("role", "values", "every", "from", "to", "refused", "beside the configuration"), rows)
-    return text + "".join(f"cannot be told: {line}\n" for line in found.open)
+    return text + "".join(f"cannot be decided: {line}\n" for line in found.open)
 
 
 def _heard_row(seen: Seen, found: Survey) -> tuple[str, ...]:

@@ -32,11 +32,11 @@ def is_open(diagnosis: Diagnosis) -> bool:
 def statement(diagnosis: Diagnosis) -> str:
     """One line: what was found, and whether something is left besides."""
     names = [addition.effect.name for addition in diagnosis.additions]
-    told = _found(diagnosis.verdict, names, bool(diagnosis.where))
+    text = _found(diagnosis.verdict, names, bool(diagnosis.where))
     if names and diagnosis.verdict is not Verdict.UNKNOWN and is_open(diagnosis):
         limit = gap_limit(diagnosis.gap_after.rows)
-        told += f"; something is left besides: the gap of {diagnosis.gap_after.value:.2f} is above {limit:.2f}"
-    return told
+        text += f"; something is left besides: the gap of {diagnosis.gap_after.value:.2f} is above {limit:.2f}"
+    return text
 
 
 def _found(verdict: Verdict, names: Sequence[str], disagree: bool) -> str:
@@ -74,15 +74,15 @@ def doubt(diagnosis: Diagnosis) -> str | None:
     shares = zip(diagnosis.additions, diagnosis.imitation, strict=True)
     alone = ", ".join(f"{addition.effect.name} {100.0 * share:.0f} %" for addition, share in shares)
     against = [f"{a.effect.name}: {a.effect.ruled_out}" for a in diagnosis.additions if a.effect.ruled_out]
-    told = (
+    text = (
         f"to be doubted: of what they explain together each alone explains {alone}; separate faults would add up to "
         "100 %, so these may be an imitation of something that the catalogue lacks"
     )
     if against:
-        told += f". What rules them out: {'; '.join(against)}"
+        text += f". What rules them out: {'; '.join(against)}"
     if any(addition.effect.of_tyre for addition in diagnosis.additions):
-        told += ' (say tyre = "rigid" of such wheels)'
-    return told
+        text += ' (say tyre = "rigid" of such wheels)'
+    return text
 
 
 def same_push(addition: Addition, completed: Completion) -> str | None:
@@ -117,7 +117,7 @@ def size_of(found: Detectable, size: float) -> str:
 
 
 def pressure_error(found: Detectable, before: Sequence[Posterior], config: Config) -> tuple[float, float]:
-    """Relative error of the bearing pressure under an effect that is there unseen, and the relative std that is told.
+    """Relative error of the bearing pressure under an unseen effect, and the relative std that is reported.
 
     Of the recording in which it is greatest beside that std.
     """

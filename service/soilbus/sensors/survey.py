@@ -143,7 +143,7 @@ class Survey:
         return [f.text for f in self.findings if not f.fatal]
 
 
-class NotToldError(Exception):
+class UndecidableError(Exception):
     """The recording cannot show this; the text says what and why."""
 
 
@@ -185,12 +185,12 @@ def survey(config: Config, database: Database, frames: Iterable[Frame], limits: 
 
     Raises ConfigError where configuration and database do not fit.
     """
-    told = config.model_copy(update={"wheel": _with_motor_speeds(config, database)})
+    with_motors = config.model_copy(update={"wheel": _with_motor_speeds(config, database)})
     mapped = {c.name for c in channels_of(config, database)}
     try:
-        channels = channels_of(told, database)
+        channels = channels_of(with_motors, database)
     except ConfigError:  # of a speed that nobody mapped
-        told, channels = config, channels_of(config, database)
+        with_motors, channels = config, channels_of(config, database)
     admission = Admission(channels, database, checked_messages(config))
     parts, refused, n = _heard(admission, frames)
     longest = max(parts, key=lambda part: sum(len(t) for t, _ in part.values()))
@@ -200,7 +200,7 @@ def survey(config: Config, database: Database, frames: Iterable[Frame], limits: 
         return Survey(seen, (Finding(text, True),), ())
     findings = [*_absent(seen, database), *(f for s in seen for f in _of_one(s, database, limits))]
     findings += _stuck_and_jagged(seen, longest, config, limits)
-    facts = _facts(told, mapped, longest)
+    facts = _facts(with_motors, mapped, longest)
     open_questions = [f"{_key(s.channel)}: not in this recording" for s in seen if _is_absent(s) and _is_optional(s)]
     if facts is not None:
         found, questions = _compared(facts, findings, channels, database, limits)
@@ -432,7 +432,7 @@ Check = Callable[[Facts, Limits], Iterator[Finding]]
 def _compared(
     facts: Facts, before: Iterable[Finding], channels: Iterable[Channel], database: Database, limits: Limits
 ) -> tuple[list[Finding], list[str]]:
-    """Findings of all checks, each without the channels that an earlier one has named; and what cannot be told."""
+    """Findings of all checks, each without the channels that an earlier one has named; and what cannot be decided."""
     facts = facts.less(name for f in before for name in f.channels)
     if facts.straight.sum() * facts.config.estimator.bin < limits.least_seconds:
         return [], [
@@ -444,7 +444,7 @@ def _compared(
     for check in (_weight, _ways, _gears, _slips, _balance, _levels, _sides, _yaw):
         try:
             found = list(check(facts, limits))
-        except NotToldError as reason:
+        except UndecidableError as reason:
             if not any(f.fatal for f in (*before, *findings)):  # else for want of what is at fault
                 questions.append(str(reason))
             continue
@@ -464,7 +464,7 @@ def _weight(facts: Facts, limits: Limits) -> Iterator[Finding]:
     pitch = np.where(np.isfinite(window.pitch), window.pitch, 0.0)
     measured = median(window.load.sum(axis=1) / np.cos(pitch))
     if not math.isfinite(measured):
-        raise NotToldError("not every wheel load is known: the loads cannot be compared with the mass")
+        raise UndecidableError("not every wheel load is known: the loads cannot be compared with the mass")
     weight = chassis.mass * GRAVITY
     off = measured / weight - 1.0
     if abs(off) > limits.weight / 2.0:
@@ -560,7 +560,7 @@ def _slips(facts: Facts, limits: Limits) -> Iterator[Finding]:
     drives = np.where(facts.thrust > 0.0, slip, np.nan)
     usual = np.array([median(drives[:, i]) for i in range(len(rig.wheels))])
     if not np.isfinite(usual).any():
-        raise NotToldError("no slip is known: wheel and ground speeds cannot be compared")
+        raise UndecidableError("no slip is known: wheel and ground speeds cannot be compared")
     least = float(np.nanquantile(slip, 0.05)) if np.isfinite(slip).any() else math.nan
     middle = float(np.nanmedian(usual))
     at_shaft = any(w.speed is not None and w.speed.at == "shaft" for w in facts.config.wheel)
@@ -634,12 +634,14 @@ def _balance(facts: Facts, limits: Limits) -> Iterator[Finding]:
     changes = np.stack([change(a, lag) for a in (thrust, window.draft, inertia)], axis=1)
     changes = changes[np.isfinite(changes).all(axis=1)]
     if len(changes) * bin_length < limits.least_seconds:
-        raise NotToldError(
+        raise UndecidableError(
             "torques and draft are not known together: their signs and the gear ratio cannot be compared"
         )
     given, *asked = _blocks(changes, block).T
     if asked[0].std() < limits.excited * weight:
-        raise NotToldError("the draft hardly changes: the signs of draft and torque and the gear ratio cannot be told")
+        raise UndecidableError(
+            "the draft hardly changes: the signs of draft and torque and the gear ratio cannot be decided"
+        )
     (of_draft, of_inertia), (draft_sd, inertia_sd) = _regression(given, np.stack(asked, axis=1))
     if of_draft < -limits.side_sd * draft_sd:
         yield Finding(
@@ -750,7 +752,7 @@ def _yaw(facts: Facts, limits: Limits) -> Iterator[Finding]:
     with np.errstate(invalid="ignore"):
         turns = (np.abs(window.yaw_rate) > 0.1) & (np.abs(np.sign(apart).sum(axis=0)) == len(apart))
     if turns.sum() * facts.config.estimator.bin < 2.0:
-        raise NotToldError("no turns: the sign of the yaw rate, and which wheels are left, cannot be told")
+        raise UndecidableError("no turns: the sign of the yaw rate, and which wheels are left, cannot be decided")
     if median(np.sign(apart[0] * window.yaw_rate)[turns]) < 0.0:
         yield Finding(
             "signals.yaw_rate: to the left while the left wheels go faster: its sign (positive to the left), or left"
