@@ -67,7 +67,8 @@ def detectable(
         normals = normals_of(records, prior, present, effects, free)
         for effect in effects:
             columns = [i for i, f in enumerate(free) if f.effect == effect.name]
-            one = _detectable(effect, columns, [free[i] for i in columns], normals, times, asked)
+            least = _least_lateness(effect, records[-1])
+            one = _detectable(effect, columns, [free[i] for i in columns], normals, times, asked, least)
             if effect.name not in found or _reach(one) < _reach(found[effect.name]):
                 found[effect.name] = one
     return tuple(found[effect.name] for effect in candidates)
@@ -91,6 +92,7 @@ def _detectable(
     normals: Sequence[Normal],
     times: float,
     asked: float,
+    least: float,
 ) -> Detectable:
     parameter = effect.parameters[0]
     block = np.ix_(columns, columns)
@@ -102,12 +104,17 @@ def _detectable(
         cases = [(np.sum(informations, axis=0), asked)]
     first = [i for i, f in enumerate(free) if f.parameter is parameter]
     sizes = [min(_least_size(information, i, free, needed) for information, needed in cases) for i in first]
-    size = max(sizes)
+    size = max(*sizes, least)
     unseen = min(size, _most(parameter))
     direction = np.zeros(len(free))
-    direction[first[sizes.index(size)]] = unseen / parameter.std
+    direction[first[sizes.index(max(sizes))]] = unseen / parameter.std
     error = np.array([_soil_error(normal, columns, direction) for normal in normals])
     return Detectable(effect, size if np.isfinite(size) else None, unseen, error)
+
+
+def _least_lateness(effect: Effect, record: Record) -> float:
+    """Delay [s] of an effect's first channel below which it is none (see late_posterior.is_late)."""
+    return max((record.learned.sample_time(quantity) / 2.0 for quantity in [*effect.late][:1]), default=0.0)
 
 
 def _most(parameter: Parameter) -> float:

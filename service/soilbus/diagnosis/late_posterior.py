@@ -128,13 +128,15 @@ def is_late(records: Sequence[Record], prior: SoilPrior, fitted: Completion, eff
     A stamp says when a frame was on the bus: what it holds was measured up to a cycle before, half of one in the mean.
     Surely: by two standard deviations.
     """
-    found = late_posteriors(records, prior, fitted, explained)
-    for quantity, late in effect.late.items():
-        if (effect.name, late) in found:
-            total = found[effect.name, late].total
-            if abs(total.value) - 2.0 * total.std > records[-1].learned.sample_time(quantity) / 2.0:
-                return True
-    return False
+    half = {late: records[-1].learned.sample_time(quantity) / 2.0 for quantity, late in effect.late.items()}
+    if not any(half.values()):  # nobody knows when its samples came
+        return True
+    totals = [
+        (posterior.total, half[late])
+        for (name, late), posterior in late_posteriors(records, prior, fitted, explained).items()
+        if name == effect.name
+    ]
+    return any(abs(total.value) - 2.0 * total.std > of_cycle for total, of_cycle in totals)
 
 
 def _posterior(

@@ -145,8 +145,10 @@ class Readings:
         return self._n_known
 
     def sample_time(self, quantity: str) -> float:
-        """Time [s] between a quantity's samples, the longest of its channels."""
-        return max(series.smooth.step for series in self._curves.of(quantity))
+        """Time [s] between a quantity's samples, the longest of its channels; 0 where only bins are known."""
+        names = (quantity, *(f"{quantity}.{wheel}" for wheel in self.rig.wheels))
+        curves = self._curves.window.curves
+        return max((curves[name].smooth.step for name in names if name in curves), default=0.0)
 
     def part(self, instants: slice | NDArray[np.intp]) -> Self:
         """The same with only these of its instants."""
