@@ -117,7 +117,7 @@ def test_small_blocks_that_numpy_keeps_are_taken_at_the_start(when, least, most)
 
 THREADS = """
 import sys
-from soilbus.cli import main
+from soilbus.cli.main import main
 main(sys.argv[1:])
 from threadpoolctl import threadpool_info
 print(*(pool["num_threads"] for pool in threadpool_info()))

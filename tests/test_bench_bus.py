@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soilbus.bench.bus_ear import latencies, until_middle
-from soilbus.bench.bus_load import FULL, OURS, Traffic
-from soilbus.cli import main
-from soilbus.daemon.intake import EDGE_LEAD
+from soilbus.cli.main import main
+from soilbus.pipeline.intake import EDGE_LEAD
+from soilbus.validation.bench.bus_ear import latencies, until_middle
+from soilbus.validation.bench.bus_load import FULL, OURS, Traffic
 
 
 def test_latency_is_from_the_last_mapped_frame_of_the_window():

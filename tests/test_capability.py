@@ -12,16 +12,15 @@ from scipy.optimize import brentq, minimize_scalar
 
 from drawn import assessed as assessed_within
 from drawn import by_draws, figures
-from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.capability import assessment
-from soilbus.capability.assessment import Demand, assess, slip_grid
-from soilbus.capability.balance import LEVEL, Duty, balance
-from soilbus.capability.draws import DRAWS, estimates, likely, mean_and_std, normals
-from soilbus.capability.sigma_points import LEADING, SigmaPoints
-from soilbus.capability.wheels import WheelTable, wheel_table
-from soilbus.estimation.gauss_newton import fit_window
+from soilbus.decision import capability as assessment
+from soilbus.decision.balance import LEVEL, Duty, balance
+from soilbus.decision.capability import Demand, assess, slip_grid
+from soilbus.decision.sigma_points import DRAWS, LEADING, SigmaPoints, estimates, likely, mean_and_std, normals
+from soilbus.decision.wheels import WheelTable, wheel_table
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.multistart import fit_window
+from soilbus.estimation.observation_model import WindowProblem
 from soilbus.estimation.posterior import Estimate, Posterior
-from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 from can.interfaces.virtual import VirtualBus
 
-from soilbus.cli import main
-from soilbus.config import ConfigError
-from soilbus.config_file import load_config
+from soilbus.cli.main import main
+from soilbus.config.file import load_config
+from soilbus.config.model import ConfigError
 
 FIELD = Path(__file__).resolve().parent / "field/field.toml"
 

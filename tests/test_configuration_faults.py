@@ -15,9 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
-from soilbus.cli import main
-from soilbus.config import Config, ConfigError
-from soilbus.config_file import load_config, overridden, parse_config
+from soilbus.cli.main import main
+from soilbus.config.file import load_config, overridden, parse_config
+from soilbus.config.model import Config, ConfigError
 
 FIELD = Path(__file__).resolve().parent / "field/field.toml"
 JARGON = re.compile(

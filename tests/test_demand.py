@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from soilbus.assembly import rig_of
-from soilbus.capability.demand import present_demand
+from soilbus.decision.demand import present_demand
+from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.posterior import Estimate
 from soilbus.estimation.window import BinStore
 from soilbus.simulator.reference import reference_configuration

@@ -18,7 +18,7 @@ EXTRAS = PROJECT["project"]["optional-dependencies"]
 ALL = sorted(
     {*PROJECT["build-system"]["requires"], *PROJECT["project"]["dependencies"], *chain.from_iterable(EXTRAS.values())}
 )
-LOADED_BY_THE_WORKER = ("soilbus.daemon.estimator", "soilbus.daemon.keeper", "soilbus.daemon.warm_up")
+LOADED_BY_THE_WORKER = ("soilbus.pipeline.estimator", "soilbus.daemon.state_persistence", "soilbus.daemon.warm_up")
 OF_THE_DAEMON = {"numpy", "cantools", "can", "crccheck", "pydantic"}
 
 
@@ -65,4 +65,6 @@ def test_what_only_the_worker_needs_is_in_nobody_elses_way() -> None:
     imported("soilbus.daemon.start", seen)
     assert seen.isdisjoint(LOADED_BY_THE_WORKER)
     assert "soilbus.estimation.tracker" not in seen
-    assert imported("soilbus.cli", set()) <= sys.stdlib_module_names  # the rest comes without a collector in the way
+    assert (
+        imported("soilbus.cli.main", set()) <= sys.stdlib_module_names
+    )  # the rest comes without a collector in the way

@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from soilbus.config import Traversability as Settings
-from soilbus.hysteresis import ORDER, Held, settled
-from soilbus.traversability import State, Status, state_of
+from soilbus.config.model import Traversability as Settings
+from soilbus.decision.hysteresis import ORDER, Held, settled
+from soilbus.decision.traversability import State, Status, state_of
 
 CONFIG = Settings()
 SURE_GO, SURE_CAUTION = (norm.cdf(norm.ppf(p) + CONFIG.hysteresis) for p in (CONFIG.go, CONFIG.no_go))

@@ -10,11 +10,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from soilbus.capability.assessment import OverSlip
-from soilbus.capability.immobilisation import AHEAD, CALM, LONGEST_GAP, SETTLED, Alert, Moment, Watch, watched
-from soilbus.capability.trend import Capacity, Demand
-from soilbus.simulator import boggings, firm_drives
-from soilbus.simulator.bogging_trials import (
+from soilbus.decision.capability import OverSlip
+from soilbus.decision.immobilisation import (
+    AHEAD,
+    CALM,
+    LONGEST_GAP,
+    SETTLED,
+    Alert,
+    Capacity,
+    Demand,
+    Moment,
+    Watch,
+    watched,
+)
+from soilbus.simulator.drive import drive as driven
+from soilbus.simulator.reference import reference_configuration
+from soilbus.validation import boggings, firm_drives
+from soilbus.validation.bogging_trials import (
     REACTION,
     Observation,
     Task,
@@ -27,8 +39,6 @@ from soilbus.simulator.bogging_trials import (
     warning_trials,
     watch,
 )
-from soilbus.simulator.drive import drive as driven
-from soilbus.simulator.reference import reference_configuration
 
 CONFIG = reference_configuration()
 SLIP = np.linspace(0.02, 0.6, 9)

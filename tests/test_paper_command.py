@@ -8,10 +8,10 @@ from contextlib import redirect_stdout
 
 import pytest
 
-from soilbus.cli import main
-from soilbus.estimation.paper import EXACT, SIMPSON, WheelEquations
-from soilbus.estimation.paper_tables import RUNS, SANDY_LOAM, WET_CLAY
+from soilbus.cli.main import main
 from soilbus.report import paper
+from soilbus.validation.paper import EXACT, SIMPSON, WheelEquations
+from soilbus.validation.paper_tables import RUNS, SANDY_LOAM, WET_CLAY
 
 
 @pytest.fixture(scope="module")

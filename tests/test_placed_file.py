@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from soilbus.placed_file import placed
-from soilbus.report.whole_file import NotWritten, whole_file
+from soilbus.files import NotWritten, placed, whole_file
 
 
 @pytest.fixture(params=[True, False], ids=["unnamed", "hidden"])

@@ -153,7 +153,7 @@ if __name__ == "__main__":
 """
 BESIDE = """
 import os, time
-from soilbus.daemon.replay import estimator_beside
+from soilbus.offline.replay import estimator_beside
 from soilbus.simulator.reference import reference_configuration
 os.cpu_count = lambda: 2
 with estimator_beside(reference_configuration()) as worker:
@@ -189,7 +189,7 @@ def test_an_interrupt_of_the_whole_group_ends_all_without_a_word(number):
 WRITES = """
 import sys
 from pathlib import Path
-from soilbus.report.whole_file import whole_file
+from soilbus.files import whole_file
 from soilbus.simulator.frames import write_log
 import can
 

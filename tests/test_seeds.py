@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from soilbus.cli import main
+from soilbus.cli.main import main
 
 
 @pytest.mark.parametrize("seed", ["-1", "1.5", "x", ""])

@@ -11,19 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from soilbus.assembly import rig_of
-from soilbus.capability.assessment import Demand, slip_grid
-from soilbus.capability.balance import LEVEL, Duty, balance
-from soilbus.capability.limits import Limits, largest_pull
-from soilbus.capability.wheels import wheel_table
-from soilbus.config import Traversability as Settings
+from soilbus.config.model import Traversability as Settings
+from soilbus.decision.balance import LEVEL, Duty, Limits, balance, largest_pull
+from soilbus.decision.capability import Demand, slip_grid
+from soilbus.decision.judgement import judge
+from soilbus.decision.traversability import State, Status
+from soilbus.decision.wheels import wheel_table
+from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.posterior import Posterior
-from soilbus.judgement import judge
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.effects.steady import CompletedModel
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import FAST_NODES, Soil, WheelModel
-from soilbus.traversability import State, Status
 from statics import WEIGHT, brute
 
 RIG = rig_of(reference_configuration())

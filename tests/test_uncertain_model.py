@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soilbus.assembly import completion_of, model_of, rig_of
-from soilbus.capability.assessment import Demand, assess
-from soilbus.capability.uncertain_model import UncertainModel
-from soilbus.estimation.belief import Belief
-from soilbus.estimation.effect_parameters import active_at
+from soilbus.decision.capability import Demand, assess
+from soilbus.decision.uncertain_model import UncertainModel
+from soilbus.estimation.assembly import completion_of, model_of, rig_of
+from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.nuisance_parameters import active_at
 from soilbus.estimation.posterior import Posterior
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.effects.steady import CompletedModel

@@ -11,7 +11,7 @@ def program() -> NoReturn:
     from soilbus.process import hold_standard_streams, run_and_leave
 
     hold_standard_streams()
-    from soilbus.cli import main
+    from soilbus.cli.main import main
 
     run_and_leave(main)
 

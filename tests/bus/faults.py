@@ -21,7 +21,7 @@ import can
 from soilbus.can.bus import ask_for_buffer
 
 CHANNEL = "vcan7"
-SOILBUS = [sys.executable, "-c", "import sys; from soilbus.cli import main; sys.exit(main())"]
+SOILBUS = [sys.executable, "-c", "import sys; from soilbus.cli.main import main; sys.exit(main())"]
 STAMP = struct.Struct("@ll")
 FRAME = struct.Struct("=IB3x8s")
 EXTENDED, ERROR = 1 << 31, 1 << 29

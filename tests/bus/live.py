@@ -16,7 +16,7 @@ from pathlib import Path
 
 import can
 
-SOILBUS = [sys.executable, "-c", "import sys; from soilbus.cli import main; sys.exit(main())"]
+SOILBUS = [sys.executable, "-c", "import sys; from soilbus.cli.main import main; sys.exit(main())"]
 LAST = b"the last"
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-BENCH = "import sys; from soilbus.cli import main; sys.exit(main())"
+BENCH = "import sys; from soilbus.cli.main import main; sys.exit(main())"
 
 
 @pytest.fixture(scope="module")

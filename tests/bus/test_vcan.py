@@ -30,7 +30,7 @@ from soilbus.simulator.reference import TRACTOR
 REPO = Path(__file__).resolve().parents[2]
 CONFIG = REPO / "tests/field/field.toml"
 LIVE = Path(__file__).with_name("live.py")
-SOILBUS = [sys.executable, "-c", "import sys; from soilbus.cli import main; sys.exit(main())"]
+SOILBUS = [sys.executable, "-c", "import sys; from soilbus.cli.main import main; sys.exit(main())"]
 SECONDS = 24.6  # the last window ends well before the service is stopped
 HOP = 1.0
 FIRST_WINDOW = 10.0

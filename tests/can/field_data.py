@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from cantools.database.can import Database, Message
 
-from soilbus.config import Config
-from soilbus.config_file import parse_config
+from soilbus.config.file import parse_config
+from soilbus.config.model import Config
 
 
 def _shared_field() -> Path:

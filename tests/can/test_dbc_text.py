@@ -9,9 +9,9 @@ import pytest
 from soilbus.can.dbc_files import load_databases, shipped_dbc
 from soilbus.can.dbc_text import message_names, of_messages
 from soilbus.can.mapping import channels_of
-from soilbus.config import ConfigError
-from soilbus.config_file import load_config
-from soilbus.daemon.intake import Intake
+from soilbus.config.file import load_config
+from soilbus.config.model import ConfigError
+from soilbus.pipeline.intake import Intake
 from soilbus.simulator.reference import TRACTOR
 
 FIELD = Path(__file__).resolve().parents[1] / "field/field.toml"

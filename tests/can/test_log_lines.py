@@ -9,7 +9,7 @@ import can
 import pytest
 
 from soilbus.can.log_lines import LONGEST_LINE
-from soilbus.daemon.replay import LogError, read_frames
+from soilbus.offline.replay import LogError, read_frames
 
 N = 300
 

@@ -14,8 +14,8 @@ from soilbus.can.admission import Admission
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.mapping import channels_of, checked_messages, load_databases, shipped_dbc, without_unit
 from soilbus.can.units import unit_of
-from soilbus.config import Config, ConfigError
-from soilbus.config_file import parse_config
+from soilbus.config.file import parse_config
+from soilbus.config.model import Config, ConfigError
 from soilbus.report.configuration import configuration_report
 
 G = 9.80665

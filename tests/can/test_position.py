@@ -10,8 +10,8 @@ import pytest
 
 from soilbus.can.admission import Admission
 from soilbus.can.mapping import channels_of, load_databases
-from soilbus.config import ConfigError
-from soilbus.config_file import parse_config
+from soilbus.config.file import parse_config
+from soilbus.config.model import ConfigError
 
 DBC = """VERSION ""
 BU_: X

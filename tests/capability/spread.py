@@ -13,13 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 from drawn import CONFIG, MAX_SLIP, MODEL, RIG, Compared, assessed, by_draws, compared
-from soilbus.assembly import prior_of
-from soilbus.capability.assessment import Demand, slip_grid
-from soilbus.capability.balance import balance
-from soilbus.capability.wheels import wheel_table
-from soilbus.estimation.marginal import cold_fit
+from soilbus.decision.balance import balance
+from soilbus.decision.capability import Demand, slip_grid
+from soilbus.decision.wheels import wheel_table
+from soilbus.estimation.assembly import prior_of
+from soilbus.estimation.laplace import cold_fit
+from soilbus.estimation.observation_model import WindowProblem
 from soilbus.estimation.posterior import Posterior
-from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import BinStore
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import simulate

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from soilbus.capability.trend import Peaks
+from soilbus.decision.immobilisation import Peaks
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -16,15 +16,15 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.allocator import keep_freed_memory
-from soilbus.bench.service import seconds_of_windows
 from soilbus.can.dbc_files import load_databases
-from soilbus.config import Config
-from soilbus.config import Effect as Setting
+from soilbus.config.model import Config
+from soilbus.config.model import Effect as Setting
 from soilbus.simulator.frames import frames, write_log
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.validation.bench.service import seconds_of_windows
 
 SECONDS = 24.0
 VALUE, STD = 0.05, 0.1

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from soilbus.daemon.store import Owner, State, StateError, dumped, read, write_whole
+from soilbus.daemon.state_store import Owner, State, StateError, dumped, read, write_whole
 
 OWNER = Owner("key", (), np.ones(6), np.ones(6))
 

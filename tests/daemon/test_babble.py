@@ -13,8 +13,8 @@ from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
 from soilbus.can.wire import Received
 from soilbus.daemon.notify import Notifier
-from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.service import Service
+from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.reference import reference_configuration
 
 FULL_BUS = 7500.0

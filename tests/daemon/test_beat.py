@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from soilbus.daemon.beat import EVE, SLEW, next_tick
-from soilbus.daemon.outputs import TICK
+from soilbus.daemon.tick_phase import EVE, SLEW, next_tick
+from soilbus.pipeline.outputs import TICK
 
 MOST = math.ceil(TICK / 2 / SLEW)
 

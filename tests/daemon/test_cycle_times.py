@@ -5,13 +5,20 @@ from __future__ import annotations
 import pytest
 
 from soilbus.can.dbc_files import output_database, shipped_dbc
-from soilbus.capability.immobilisation import Watch
-from soilbus.cli import main
-from soilbus.config import ConfigError
-from soilbus.daemon.outputs import FAST_FRAMES, HOP_FRAMES, check_cycle_times, forecast_frame, hop_frames, slip_frames
-from soilbus.daemon.result import WindowResult
+from soilbus.cli.main import main
+from soilbus.config.model import ConfigError
+from soilbus.decision.immobilisation import Watch
+from soilbus.decision.traversability import Status, Traversability
+from soilbus.pipeline.outputs import (
+    FAST_FRAMES,
+    HOP_FRAMES,
+    check_cycle_times,
+    forecast_frame,
+    hop_frames,
+    slip_frames,
+)
+from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.reference import TRACTOR, reference_configuration
-from soilbus.traversability import Status, Traversability
 
 
 def checked(*overrides: str) -> None:

@@ -9,19 +9,19 @@ import pytest
 
 from feeding import feed_message
 from onlooker import good_tracked, of_soft_ground, tracked_at
-from soilbus.assembly import prior_of
 from soilbus.can.dbc_files import load_databases
-from soilbus.capability.traction_loss import TractionLoss
-from soilbus.daemon.estimator import WindowEstimator
-from soilbus.daemon.intake import WindowTask
-from soilbus.daemon.pipeline import Pipeline
-from soilbus.estimation.tracked import Tracked
-from soilbus.judgement import Basis, at_present
+from soilbus.decision.judgement import Basis, at_present
+from soilbus.decision.traction_loss import TractionLoss
+from soilbus.decision.traversability import State, Status, Traversability
+from soilbus.estimation.assembly import prior_of
+from soilbus.estimation.tracker import Tracked
+from soilbus.pipeline.estimator import WindowEstimator
+from soilbus.pipeline.intake import WindowTask
+from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
-from soilbus.traversability import State, Status, Traversability
 
 CONFIG = reference_configuration()
 

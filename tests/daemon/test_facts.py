@@ -31,14 +31,14 @@ from soilbus.can.bus import LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
 from soilbus.daemon.notify import Notifier
-from soilbus.daemon.pipeline import Pipeline
-from soilbus.daemon.result import WindowResult
 from soilbus.daemon.service import Service
+from soilbus.decision.traversability import State, Status
+from soilbus.pipeline.pipeline import Pipeline
+from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.sensors import measure
-from soilbus.traversability import State, Status
 
 CONFIG = reference_configuration()
 IN, OUT = load_databases(CONFIG), output_database(CONFIG)

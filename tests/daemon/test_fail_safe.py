@@ -9,7 +9,7 @@ from __future__ import annotations
 import pytest
 
 from onlooker import CONFIG, MOMENTS, NEEDED, Drive, good_moment, good_tracked
-from soilbus.traversability import Status
+from soilbus.decision.traversability import Status
 
 LEAD = 6.5
 """Seconds of good frames after which go is due."""

@@ -16,10 +16,10 @@ from fakes import FakeClock, InlineExecutor, ScriptedBus
 from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
+from soilbus.daemon.exception_guard import REPEATED
 from soilbus.daemon.health import LONGEST_MUTE, LONGEST_SOLVE, Health
-from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.service import Service
-from soilbus.daemon.solver import REPEATED
+from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

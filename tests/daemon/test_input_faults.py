@@ -19,17 +19,17 @@ import pytest
 import log_edits as le
 from log_edits import Edit, Log, Stream
 from soilbus.can.dbc_files import load_databases
-from soilbus.config import Config
-from soilbus.config_file import load_config
-from soilbus.daemon.pipeline import Pipeline
-from soilbus.daemon.replay import read_frames
-from soilbus.daemon.result import WindowResult
+from soilbus.config.file import load_config
+from soilbus.config.model import Config
+from soilbus.decision.traversability import State, Status
+from soilbus.offline.replay import read_frames
+from soilbus.pipeline.pipeline import Pipeline
+from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
 from soilbus.terra.soils import soil_named
-from soilbus.traversability import State, Status
 
 FIELD_TOML = Path(__file__).resolve().parents[1] / "field/field.toml"
 START = 1_700_000_000.0

@@ -11,9 +11,9 @@ import pytest
 from feeding import feed_message
 from soilbus.can.candump import Frame
 from soilbus.can.dbc_files import load_databases
-from soilbus.config_file import load_config
-from soilbus.daemon.intake import Intake
-from soilbus.daemon.replay import read_frames
+from soilbus.config.file import load_config
+from soilbus.offline.replay import read_frames
+from soilbus.pipeline.intake import Intake
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

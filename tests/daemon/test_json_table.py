@@ -6,10 +6,10 @@ import json
 import re
 from pathlib import Path
 
-from soilbus.daemon.outputs import json_line
-from soilbus.daemon.result import WindowResult
+from soilbus.decision.traversability import Status, Traversability
+from soilbus.pipeline.outputs import json_line
+from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.reference import reference_configuration
-from soilbus.traversability import Status, Traversability
 
 README = Path(__file__).resolve().parents[2] / "README.md"
 NOTHING = WindowResult(1.0, 0, Status.INVALID, "no_convergence", None, None, {}, {}, Traversability(), None, 0, {})

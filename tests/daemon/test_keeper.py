@@ -15,13 +15,13 @@ from fakes import FakeClock, InlineExecutor, ScriptedBus
 from soilbus.can.bus import LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
-from soilbus.daemon.keeper import FILE, PERIOD, Keeper
 from soilbus.daemon.notify import Notifier
-from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.service import TICK, Service
-from soilbus.daemon.store import Owner, read
-from soilbus.estimation.belief import Belief
-from soilbus.estimation.recall import PERSISTENCE
+from soilbus.daemon.state_persistence import FILE, PERIOD, Keeper
+from soilbus.daemon.state_store import Owner, read
+from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.tracker import PERSISTENCE
+from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

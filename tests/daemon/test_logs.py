@@ -15,19 +15,19 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from soilbus.can.dbc_files import load_databases
-from soilbus.cli import main
-from soilbus.daemon.intake import Intake, WindowTask
-from soilbus.daemon.outputs import json_line
-from soilbus.daemon.pipeline import Pipeline
-from soilbus.daemon.recordings import recordings_of
-from soilbus.daemon.replay import LogError, estimator_beside, fed, log_names, replay
-from soilbus.daemon.result import WindowResult
+from soilbus.cli.main import main
+from soilbus.decision.traversability import Status, Traversability
+from soilbus.offline.recordings import recordings_of
+from soilbus.offline.replay import LogError, estimator_beside, fed, log_names, replay
+from soilbus.pipeline.intake import Intake, WindowTask
+from soilbus.pipeline.outputs import json_line
+from soilbus.pipeline.pipeline import Pipeline
+from soilbus.pipeline.result import WindowResult
 from soilbus.report.windows import stretches, summary
 from soilbus.simulator.frames import frames, write_log
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import TRACTOR, reference_configuration
 from soilbus.simulator.scenario import excited
-from soilbus.traversability import Status, Traversability
 
 WINDOW, SECONDS = 4.0, 9.0
 SHORT = [f"estimator.window={WINDOW}"]

@@ -17,11 +17,11 @@ from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
 from soilbus.can.wire import STAMPED, MessageWire
-from soilbus.daemon.beat import EVE
 from soilbus.daemon.notify import Notifier
-from soilbus.daemon.outputs import hop_frames
-from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.service import Service
+from soilbus.daemon.tick_phase import EVE
+from soilbus.pipeline.outputs import hop_frames
+from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

@@ -15,10 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from soilbus.can.dbc_files import load_databases
-from soilbus.config_file import load_config
-from soilbus.daemon.outputs import json_line
-from soilbus.daemon.pipeline import Pipeline
-from soilbus.traversability import State, Status
+from soilbus.config.file import load_config
+from soilbus.decision.traversability import State, Status
+from soilbus.pipeline.outputs import json_line
+from soilbus.pipeline.pipeline import Pipeline
 
 FIELD_TOML = Path(__file__).resolve().parents[1] / "field/field.toml"
 CLAY = ["soil.c.value=5000", "soil.c.std=1250", "soil.K.value=0.01", "soil.K.std=0.0025"]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from soilbus.daemon.positions import PositionTrack
+from soilbus.pipeline.positions import PositionTrack
 
 TIMEOUT = {"latitude": 2.0, "longitude": 2.0}
 

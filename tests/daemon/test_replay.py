@@ -13,10 +13,10 @@ import pytest
 
 from soilbus.can.candump import frame_of
 from soilbus.can.dbc_files import load_databases
-from soilbus.daemon.intake import coverage
-from soilbus.daemon.pipeline import Pipeline
-from soilbus.daemon.replay import LogError, estimator_beside, read_frames, read_log, replay
 from soilbus.estimation.window import BinStore, Rig, SensorNoise
+from soilbus.offline.replay import LogError, estimator_beside, read_frames, read_log, replay
+from soilbus.pipeline.intake import coverage
+from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.frames import frames, write_log
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

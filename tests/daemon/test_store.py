@@ -23,9 +23,19 @@ from hypothesis import strategies as st
 
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.mapping import channels_of
-from soilbus.daemon import store
-from soilbus.daemon.store import Owner, State, StateError, belief_of, dumped, loaded, read, stored_belief, write_whole
-from soilbus.estimation.belief import Belief
+from soilbus.daemon import state_store as store
+from soilbus.daemon.state_store import (
+    Owner,
+    State,
+    StateError,
+    belief_of,
+    dumped,
+    loaded,
+    read,
+    stored_belief,
+    write_whole,
+)
+from soilbus.estimation.gaussian import Belief
 from soilbus.simulator.reference import reference_configuration
 
 

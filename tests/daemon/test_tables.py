@@ -12,26 +12,33 @@ import pytest
 
 from availability import unavailable
 from single_wheel import NOISE, RIG, WIDTH, noisy, sweep, write_csv
-from soilbus.assembly import model_of, prior_of, rig_of, with_effects
-from soilbus.cli import main
-from soilbus.config import Config, ConfigError
-from soilbus.config_file import parse_config
-from soilbus.daemon.diagnose import diagnose_logs
-from soilbus.daemon.outputs import json_line
-from soilbus.daemon.tables import TableError, candidates, recordings_of_tables, replay_tables, runs_of, window_of_rows
-from soilbus.diagnosis.completion import complete
+from soilbus.cli.main import main
+from soilbus.config.file import parse_config
+from soilbus.config.model import Config, ConfigError
+from soilbus.decision.traversability import Status
+from soilbus.diagnosis.fitted_model import complete
 from soilbus.diagnosis.records import TooLittle, record_of_rows
 from soilbus.diagnosis.verdict import Verdict, gap_limit
-from soilbus.estimation.gauss_newton import fit_window
+from soilbus.estimation.assembly import model_of, prior_of, rig_of, with_effects
+from soilbus.estimation.multistart import fit_window
+from soilbus.estimation.observation_model import WindowProblem
 from soilbus.estimation.posterior import Posterior
-from soilbus.estimation.residuals import WindowProblem
+from soilbus.offline.diagnose import diagnose_logs
+from soilbus.offline.tables import (
+    TableError,
+    candidates,
+    recordings_of_tables,
+    replay_tables,
+    runs_of,
+    window_of_rows,
+)
+from soilbus.pipeline.outputs import json_line
 from soilbus.report.configuration import configuration_report
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active, Effect
 from soilbus.terra.effects.size import LOAD, RADIUS, for_wheel
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
-from soilbus.traversability import Status
 
 TRUTH = Soil(k_c=2e3, k_phi=1.5e6, n=0.8, phi=0.5, c=2e3, K=0.015)
 LOADS, SLIPS = (800.0, 1500.0), np.linspace(0.03, 0.6, 9)

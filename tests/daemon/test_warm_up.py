@@ -11,12 +11,12 @@ import pytest
 from soilbus.allocator import loading
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.wire import MessageWire
-from soilbus.config import ConfigError
-from soilbus.config_file import load_config
+from soilbus.config.file import load_config
+from soilbus.config.model import ConfigError
 from soilbus.daemon import start
 from soilbus.daemon.warm_up import WINDOWS, warm_up
+from soilbus.decision.traversability import Status
 from soilbus.simulator.reference import reference_configuration
-from soilbus.traversability import Status
 
 FIELD = Path(__file__).resolve().parents[1] / "field"
 VIRTUAL = ("bus.interface=virtual", "bus.channel=warm-up")

@@ -17,14 +17,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from soilbus.assembly import prior_of
-from soilbus.config import Config
-from soilbus.config_file import load_config
-from soilbus.daemon.tables import candidates, recordings_of_tables
-from soilbus.diagnosis.completion import Completion, complete
+from soilbus.config.file import load_config
+from soilbus.config.model import Config
 from soilbus.diagnosis.diagnose import Diagnosis, diagnose
+from soilbus.diagnosis.fitted_model import Completion, complete
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.verdict import gap_limit
+from soilbus.estimation.assembly import prior_of
+from soilbus.offline.tables import candidates, recordings_of_tables
 from soilbus.report.table import table
 from soilbus.terra.effects.catalogue import CATALOGUE
 

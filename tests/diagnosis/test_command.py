@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import pytest
 
 from soilbus.can.dbc_files import load_databases, shipped_dbc
-from soilbus.cli import main
-from soilbus.config_file import load_config
+from soilbus.cli.main import main
+from soilbus.config.file import load_config
 from soilbus.simulator.reference import TRACTOR
 
 SOIL_KEYS = {"k_c", "k_phi", "n", "phi", "c", "K", "bearing_pressure"}
@@ -58,7 +58,7 @@ def diagnosed(tmp_path_factory) -> Diagnosed:
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-    program = "import sys; from soilbus.cli import main; sys.exit(main())"
+    program = "import sys; from soilbus.cli.main import main; sys.exit(main())"
     return subprocess.run([sys.executable, "-c", program, *map(str, arguments)], capture_output=True, text=True)
 
 

@@ -7,14 +7,14 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from soilbus.assembly import completion_of, effects_of, rig_of, with_effects
 from soilbus.can.dbc_files import load_databases
-from soilbus.capability.assessment import slip_grid
-from soilbus.capability.balance import LEVEL, Duty, balance
-from soilbus.capability.wheels import Axles, wheel_table
-from soilbus.daemon.pipeline import Pipeline
-from soilbus.daemon.replay import fed
-from soilbus.estimation.effect_parameters import active_at
+from soilbus.decision.balance import LEVEL, Duty, balance
+from soilbus.decision.capability import slip_grid
+from soilbus.decision.wheels import Axles, wheel_table
+from soilbus.estimation.assembly import completion_of, effects_of, rig_of, with_effects
+from soilbus.estimation.nuisance_parameters import active_at
+from soilbus.offline.replay import fed
+from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.drive import drive
 from soilbus.simulator.frames import frames, write_log
 from soilbus.simulator.recording import simulate

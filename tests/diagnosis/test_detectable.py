@@ -8,13 +8,13 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from soilbus.assembly import model_of, prior_of, rig_of, with_effects
-from soilbus.diagnosis.completion import complete
 from soilbus.diagnosis.detectable import Detectable, detectable
 from soilbus.diagnosis.diagnose import Diagnosis, diagnose
+from soilbus.diagnosis.fitted_model import complete
 from soilbus.diagnosis.records import Record, record_of
 from soilbus.diagnosis.score import scores
 from soilbus.diagnosis.verdict import Verdict, price
+from soilbus.estimation.assembly import model_of, prior_of, rig_of, with_effects
 from soilbus.estimation.window import BinStore
 from soilbus.report.statement import pressure_error
 from soilbus.simulator.recording import simulate

@@ -7,16 +7,15 @@ from itertools import islice
 
 import pytest
 
-from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.diagnosis import fits as fits_module
-from soilbus.diagnosis.candidates import THINNED
-from soilbus.diagnosis.completion import complete
-from soilbus.diagnosis.fits import Fits
+from soilbus.diagnosis import search as fits_module
+from soilbus.diagnosis.fitted_model import complete
 from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.score import further_scores, scores
-from soilbus.estimation import gauss_newton
-from soilbus.estimation.descent import settle
-from soilbus.estimation.gauss_newton import Effort, fit_window
+from soilbus.diagnosis.search import THINNED, Fits
+from soilbus.estimation import multistart as gauss_newton
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.multistart import Effort, fit_window
+from soilbus.estimation.solver import settle
 from soilbus.estimation.window import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

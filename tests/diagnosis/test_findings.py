@@ -8,19 +8,19 @@ import json
 import numpy as np
 import pytest
 
-from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.daemon.diagnose import Findings
-from soilbus.daemon.recordings import Recordings
-from soilbus.diagnosis.completion import complete
 from soilbus.diagnosis.detectable import Detectable
 from soilbus.diagnosis.diagnose import Diagnosis
+from soilbus.diagnosis.fitted_model import complete
 from soilbus.diagnosis.gap import Gap
-from soilbus.diagnosis.learned import WARNING, Correction, Term
-from soilbus.diagnosis.naming import Addition
 from soilbus.diagnosis.records import record_of
+from soilbus.diagnosis.residual_terms import WARNING, Correction, Term
+from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.verdict import Verdict
 from soilbus.diagnosis.where import Disagreement
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.window import BinStore
+from soilbus.offline.diagnose import Findings
+from soilbus.offline.recordings import Recordings
 from soilbus.report.diagnosis import diagnosis_report
 from soilbus.report.findings import findings_json, findings_text
 from soilbus.simulator.recording import simulate

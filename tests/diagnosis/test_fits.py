@@ -6,11 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from soilbus.diagnosis import fits as fits_module
-from soilbus.diagnosis.candidates import Promising, Standing
-from soilbus.diagnosis.fits import Fits
-from soilbus.diagnosis.naming import _fitted
-from soilbus.estimation.gauss_newton import Effort
+from soilbus.diagnosis import search as fits_module
+from soilbus.diagnosis.search import Fits, Promising, Standing, _fitted
+from soilbus.estimation.multistart import Effort
 from soilbus.terra.effects.catalogue import CATALOGUE
 
 PAN, LUGS = CATALOGUE["hardpan"], CATALOGUE["lugs"]

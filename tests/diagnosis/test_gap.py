@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.diagnosis.completion import complete
+from soilbus.diagnosis.fitted_model import complete
 from soilbus.diagnosis.gap import CLEAR, gap_of
 from soilbus.diagnosis.records import CHECKED, HELD_OUT, record_of
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.window import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

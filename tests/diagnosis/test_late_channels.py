@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 import shaking
-from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.can.dbc_files import load_databases
-from soilbus.cli import main
-from soilbus.config_file import load_config
-from soilbus.daemon.intake import Intake
+from soilbus.cli.main import main
+from soilbus.config.file import load_config
 from soilbus.diagnosis.diagnose import Diagnosis, diagnose
 from soilbus.diagnosis.records import Record, record_of
-from soilbus.estimation.resolution import resolved_window
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.window import BinStore
+from soilbus.pipeline.intake import Intake
+from soilbus.sensors.rates import resolved_window
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Late
 

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from soilbus.assembly import completion_of, model_of, prior_of, rig_of
 from soilbus.can.dbc_files import located, shipped_dbc
-from soilbus.config import ConfigError
-from soilbus.config_edit import with_effects_text
-from soilbus.config_file import load_config
-from soilbus.diagnosis.completion import complete
+from soilbus.config.edit import with_effects_text
+from soilbus.config.file import load_config
+from soilbus.config.model import ConfigError
+from soilbus.diagnosis.fitted_model import complete
 from soilbus.diagnosis.model_out import effect_tables
 from soilbus.diagnosis.records import record_of
+from soilbus.estimation.assembly import completion_of, model_of, prior_of, rig_of
 from soilbus.estimation.window import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import TRACTOR, reference_configuration

@@ -6,11 +6,11 @@ import math
 
 import pytest
 
-from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.diagnosis.completion import complete
 from soilbus.diagnosis.diagnose import diagnose
+from soilbus.diagnosis.fitted_model import complete
 from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.verdict import TEMPERATURE, Verdict, gap_limit
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.window import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from soilbus.assembly import model_of, prior_of, rig_of, with_effects
-from soilbus.config import Config
+from soilbus.config.model import Config
 from soilbus.diagnosis.diagnose import Diagnosis, diagnose
 from soilbus.diagnosis.records import Record, record_of
+from soilbus.estimation.assembly import model_of, prior_of, rig_of, with_effects
 from soilbus.estimation.window import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

@@ -12,9 +12,9 @@ from scipy.linalg import block_diag
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
 
-from soilbus.diagnosis.sizes import SCALES, correction, evidence_of_any_size
+from soilbus.diagnosis.evidence import SCALES, correction, evidence_of_any_size
 from soilbus.diagnosis.verdict import PLAUSIBLE, hopeless, is_real, price, probabilities
-from soilbus.estimation.effect_parameters import Free, parameters_of
+from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Parameter
 

@@ -8,15 +8,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.diagnosis.completion import complete
+from soilbus.diagnosis.damped_descent import DAMPING, EASED, HELD_BACK, MAX_STEPS, _Here, _Valley, descended
+from soilbus.diagnosis.fitted_model import complete
 from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.score import scores
-from soilbus.diagnosis.slow_descent import DAMPING, EASED, HELD_BACK, MAX_STEPS, _Here, _Valley, descended
-from soilbus.estimation.belief import Belief
-from soilbus.estimation.descent import IDLE, Settled, settle
-from soilbus.estimation.gauss_newton import Effort, _fit_at
-from soilbus.estimation.normal_equations import Fitting, Place, Point
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.multistart import Effort, _fit_at
+from soilbus.estimation.solver import IDLE, Fitting, Place, Point, Settled, settle
 from soilbus.estimation.window import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

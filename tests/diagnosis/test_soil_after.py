@@ -9,7 +9,7 @@ import pytest
 
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.gap import Gap
-from soilbus.diagnosis.naming import Addition, _form_left
+from soilbus.diagnosis.search import Addition, _form_left
 from soilbus.diagnosis.verdict import Verdict
 from soilbus.estimation.posterior import Posterior
 from soilbus.terra.effects.catalogue import CATALOGUE

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from soilbus.diagnosis.detectable import Detectable
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.gap import Gap
-from soilbus.diagnosis.naming import Addition
+from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.verdict import Verdict, gap_limit, probabilities, temperatures, verdict_of
 from soilbus.diagnosis.where import Disagreement
 from soilbus.estimation.posterior import Posterior

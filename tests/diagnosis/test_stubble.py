@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from soilbus.cli import main
+from soilbus.cli.main import main
 
 FIELD = Path(__file__).resolve().parents[1] / "field/field.toml"
 

@@ -8,8 +8,8 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from soilbus.assembly import prior_of
 from soilbus.diagnosis.diagnose import diagnose
+from soilbus.estimation.assembly import prior_of
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.wheel import Soil
 

@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.diagnosis.completion import complete
+from soilbus.diagnosis.fitted_model import complete
 from soilbus.diagnosis.records import Record, record_of
 from soilbus.diagnosis.where import Disagreement, disagreements
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.window import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

@@ -17,20 +17,20 @@ from typing import NamedTuple
 import numpy as np
 from drives import errors, sweep, task_of, windows
 
-from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.config import Config
-from soilbus.daemon.estimator import WindowEstimator
-from soilbus.estimation.bound import cramer_rao
-from soilbus.estimation.completed import CompletedProblem
+from soilbus.config.model import Config
+from soilbus.decision.traversability import Status
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.change_detection import Crossing, without_crossing
+from soilbus.estimation.observation_model import CompletedProblem
 from soilbus.estimation.posterior import Posterior
-from soilbus.estimation.soil_change import Crossing, without_crossing
 from soilbus.estimation.tracker import elsewhere
 from soilbus.estimation.window import BinStore
+from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, soil_along
 from soilbus.terra.wheel import Soil
-from soilbus.traversability import Status
+from soilbus.validation.cramer_rao import cramer_rao
 
 PAIRS = ("loam:wet_clay", "wet_clay:loam", "loam:clayey_soil_38", "clayey_soil_38:loam")
 BEFORE, AFTER = 15.0, 10.0

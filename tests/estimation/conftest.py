@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.config import Config
+from soilbus.config.model import Config
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.observation_model import WindowProblem
 from soilbus.estimation.posterior import SoilPrior
-from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import BinStore, Rig, Window
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

@@ -12,16 +12,16 @@ from typing import NamedTuple
 import numpy as np
 from drives import errors, sweep, task_of, windows
 
-from soilbus.assembly import rig_of
-from soilbus.config import Config
-from soilbus.daemon.estimator import WindowEstimator
-from soilbus.estimation.curve import sides
+from soilbus.config.model import Config
+from soilbus.decision.traversability import Status
+from soilbus.estimation.assembly import rig_of
+from soilbus.estimation.path_curvature import sides
 from soilbus.estimation.window import Rig, Window
+from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
-from soilbus.traversability import Status
 
 TRACK = 1.5
 ENTERED, LEFT, END = 12.0, 25.0, 38.0

@@ -7,14 +7,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.config import Config
-from soilbus.daemon.intake import WindowTask
-from soilbus.daemon.positions import PositionTrack
+from soilbus.config.model import Config
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.posterior import Posterior
-from soilbus.estimation.tracked import Settings
-from soilbus.estimation.tracker import Tracker
+from soilbus.estimation.tracker import Settings, Tracker
 from soilbus.estimation.window import BinStore, Window
+from soilbus.pipeline.intake import WindowTask
+from soilbus.pipeline.positions import PositionTrack
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Scenario
 from soilbus.terra.wheel import Soil

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from drives import errors, tracker_of, windows
 
-from soilbus.estimation.tracked import Ground
+from soilbus.estimation.tracker import Ground
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing

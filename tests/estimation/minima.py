@@ -13,13 +13,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.config import Config
-from soilbus.config_file import load_config
-from soilbus.estimation.coordinates import BOUND, Coordinates
-from soilbus.estimation.gauss_newton import Fit, descend, fit_window
+from soilbus.config.file import load_config
+from soilbus.config.model import Config
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.multistart import Fit, descend, fit_window
+from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.parametrization import BOUND, Coordinates
 from soilbus.estimation.posterior import SoilPrior
-from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

@@ -13,12 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.config import Config
-from soilbus.estimation.coordinates import TYPICAL_DEPTH
-from soilbus.estimation.gauss_newton import fit_window
-from soilbus.estimation.residuals import WindowProblem
-from soilbus.estimation.soil_class import PRIOR_UNKNOWN, SoilClasses
+from soilbus.config.model import Config
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.multistart import fit_window
+from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.parametrization import TYPICAL_DEPTH
+from soilbus.estimation.soil_classes import PRIOR_UNKNOWN, SoilClasses
 from soilbus.estimation.tracker import TRUST
 from soilbus.estimation.window import BinStore
 from soilbus.simulator.drive import SimulationError

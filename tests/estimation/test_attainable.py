@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.stats import norm
 
-from soilbus.estimation.attainable import TILTS, attainable
+from soilbus.validation.bayes_risk_bound import TILTS, attainable
 
 GRID = np.linspace(-3.0, 3.0, 601)
 NOISE = 0.4

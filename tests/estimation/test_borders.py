@@ -7,7 +7,7 @@ import pytest
 from borders import crossed, drive, first_of_tyres, first_valid, least_sd, wrong, wrong_of_tyres
 from scipy.stats import norm
 
-from soilbus.estimation.marginal import confidence, density, longer_side
+from soilbus.estimation.laplace import confidence, density, longer_side
 from soilbus.simulator.reference import reference_configuration
 
 SPEED = 1.5

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.estimation.gauss_newton import fit_window
-from soilbus.estimation.residuals import WindowProblem
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.multistart import fit_window
+from soilbus.estimation.observation_model import WindowProblem
 from soilbus.estimation.window import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

@@ -9,11 +9,11 @@ import pytest
 from drives import tracker_of, windows
 from scipy.stats import lognorm
 
-from soilbus.assembly import prior_of
-from soilbus.estimation.belief import Belief
-from soilbus.estimation.gauss_newton import Fit, fit_window
-from soilbus.estimation.normal_equations import Fitting, Place
+from soilbus.estimation.assembly import prior_of
+from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.multistart import Fit, fit_window
 from soilbus.estimation.posterior import PARAMETERS, Posterior
+from soilbus.estimation.solver import Fitting, Place
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from soilbus.assembly import model_of, rig_of
-from soilbus.estimation.completed import CompletedProblem
-from soilbus.estimation.effect_parameters import parameters_of
+from soilbus.estimation.assembly import model_of, rig_of
+from soilbus.estimation.nuisance_parameters import parameters_of
+from soilbus.estimation.observation_model import CompletedProblem
 from soilbus.estimation.window import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from drives import B_REF, Z_REF, errors, task_of, tracker_of, windows
 
-from soilbus.daemon.estimator import WindowEstimator
-from soilbus.estimation.tracked import Ground, Tracked
+from soilbus.decision.traversability import Status
+from soilbus.estimation.tracker import Ground, Tracked
+from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, soil_along
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
-from soilbus.traversability import Status
 
 SPEED = 1.5
 CROSSED = 20.0

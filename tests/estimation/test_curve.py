@@ -9,9 +9,9 @@ import pytest
 from curves import TRACK, curved, driven
 from drives import errors, tracker_of, windows
 
-from soilbus.assembly import rig_of
-from soilbus.estimation.belief import Belief
-from soilbus.estimation.curve import curve_of, rim_difference, sides, with_curve
+from soilbus.estimation.assembly import rig_of
+from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.path_curvature import curve_of, rim_difference, sides, with_curve
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -40,7 +40,7 @@ def _names(tracker, window):
 
 def test_without_that_unknown_a_curve_is_a_mismatch(monkeypatch):
     monkeypatch.setattr("soilbus.estimation.tracker.with_curve", lambda belief, curve: belief)
-    monkeypatch.setattr("soilbus.estimation.bends.BENT", np.inf)
+    monkeypatch.setattr("soilbus.estimation.path_curvature.BENT", np.inf)
     config = reference_configuration()
     scenario = Scenario(11.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))
     window, end = next(windows(config, simulate(config, scenario, 1)))
@@ -58,7 +58,7 @@ def test_a_curve_that_begins_within_a_window_is_no_soil(seed, monkeypatch):
         return np.array([w.away for w in told])
 
     assert np.abs(away()).max() < 3.0
-    monkeypatch.setattr("soilbus.estimation.bends.BENT", np.inf)
+    monkeypatch.setattr("soilbus.estimation.path_curvature.BENT", np.inf)
     assert np.abs(away()[:, 1]).max() > 3.0
 
 

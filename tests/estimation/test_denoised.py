@@ -6,15 +6,15 @@ import minima
 import numpy as np
 import pytest
 
-from soilbus.assembly import prior_of
-from soilbus.estimation.belief import Belief
-from soilbus.estimation.bound import cramer_rao
-from soilbus.estimation.denoised import DenoisedProblem, expected
-from soilbus.estimation.gauss_newton import fit_window, settled
-from soilbus.estimation.normal_equations import Fitting, Place
+from soilbus.estimation.assembly import prior_of
+from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.multistart import fit_window, settled
+from soilbus.estimation.observation_model import DenoisedProblem, expected
+from soilbus.estimation.solver import Fitting, Place
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Swing
 from soilbus.terra.soils import SOILS
+from soilbus.validation.cramer_rao import cramer_rao
 
 
 def test_noise_alone_is_the_mean_and_signals_stay():

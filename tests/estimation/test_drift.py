@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 from drives import B_REF, Z_REF, tracker_of, windows
 
-from soilbus.assembly import rig_of
-from soilbus.estimation.gauss_newton import Fit
-from soilbus.estimation.readings import gain_names
+from soilbus.estimation.assembly import rig_of
+from soilbus.estimation.measurements import gain_names
+from soilbus.estimation.multistart import Fit
 from soilbus.estimation.window import Window
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

@@ -8,15 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from soilbus.assembly import model_of, rig_of
-from soilbus.diagnosis.slow_descent import descended
-from soilbus.estimation.belief import Belief
-from soilbus.estimation.completed import CompletedProblem
-from soilbus.estimation.coordinates import BOUND, Coordinates, at_edges, share_of_step
-from soilbus.estimation.effect_parameters import parameters_of
-from soilbus.estimation.gauss_newton import THOROUGH, Start, continued, descend, fit_window
-from soilbus.estimation.normal_equations import Fitting, Point
+from soilbus.diagnosis.damped_descent import descended
+from soilbus.estimation.assembly import model_of, rig_of
+from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.multistart import THOROUGH, Start, continued, descend, fit_window
+from soilbus.estimation.nuisance_parameters import parameters_of
+from soilbus.estimation.observation_model import CompletedProblem
+from soilbus.estimation.parametrization import BOUND, Coordinates, at_edges, share_of_step
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+from soilbus.estimation.solver import Fitting, Point
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.soils import SOILS
 

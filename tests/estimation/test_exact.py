@@ -8,18 +8,18 @@ import minima
 import numpy as np
 import pytest
 
-from soilbus.assembly import prior_of
-from soilbus.estimation import exact
-from soilbus.estimation.belief import Belief
-from soilbus.estimation.bound import cramer_rao
-from soilbus.estimation.coordinates import Coordinates
-from soilbus.estimation.exact import samples
-from soilbus.estimation.gauss_newton import fit_window
-from soilbus.estimation.marginal import counted, ridge, told_of_soil, with_whole
+from soilbus.estimation.assembly import prior_of
+from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.laplace import counted, ridge, told_of_soil, with_whole
+from soilbus.estimation.multistart import fit_window
+from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Swing
 from soilbus.terra.wheel import Soil
+from soilbus.validation import importance_sampling as exact
+from soilbus.validation.cramer_rao import cramer_rao
+from soilbus.validation.importance_sampling import samples
 
 STILL = Swing(0.0, 1e-9)
 

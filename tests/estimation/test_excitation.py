@@ -8,16 +8,16 @@ import pytest
 from drives import tasks
 from scipy.stats import binom, chi2
 
-from soilbus.assembly import prior_of
-from soilbus.daemon.estimator import WindowEstimator
-from soilbus.estimation.belief import Belief
-from soilbus.estimation.gauss_newton import fit_window
-from soilbus.estimation.marginal import with_whole
-from soilbus.simulator.monte_carlo import NORMAL_95, missed
+from soilbus.decision.traversability import State, Status
+from soilbus.estimation.assembly import prior_of
+from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.laplace import with_whole
+from soilbus.estimation.multistart import fit_window
+from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
-from soilbus.traversability import State, Status
+from soilbus.validation.monte_carlo import NORMAL_95, missed
 
 STILL, LEANING = Swing(0.0, 1e-9), Swing(-0.3, 0.3)
 SLIPS = (0.05, 0.1, 0.2, 0.35)

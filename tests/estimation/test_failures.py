@@ -12,13 +12,13 @@ from drives import tasks
 
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
-from soilbus.daemon.estimator import WindowEstimator
-from soilbus.daemon.pipeline import Pipeline
-from soilbus.daemon.states import ServiceState, state_after
+from soilbus.decision.traversability import State, Status
+from soilbus.pipeline.estimator import WindowEstimator
+from soilbus.pipeline.pipeline import Pipeline
+from soilbus.pipeline.states import ServiceState, state_after
 from soilbus.report.windows import summary
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario
-from soilbus.traversability import State, Status
 
 CONFIG = reference_configuration()
 BAD = 10

@@ -10,10 +10,10 @@ import pytest
 from drives import task_of, tasks
 
 from other_wheel import Contact, readings
-from soilbus.assembly import rig_of
-from soilbus.daemon.estimator import WindowEstimator
-from soilbus.daemon.outputs import json_line
+from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.window import window_of_samples
+from soilbus.pipeline.estimator import WindowEstimator
+from soilbus.pipeline.outputs import json_line
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.soils import soil_named

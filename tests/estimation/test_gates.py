@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from soilbus.assembly import model_of
-from soilbus.estimation.gauss_newton import fit_window
-from soilbus.estimation.residuals import WindowProblem
+from soilbus.estimation.assembly import model_of
+from soilbus.estimation.multistart import fit_window
+from soilbus.estimation.observation_model import WindowProblem
 from soilbus.estimation.window import Rig, SensorNoise, Window, forward, turning
 from soilbus.terra.soils import SOILS
 

@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from soilbus.estimation.coordinates import BOUND, Coordinates
-from soilbus.estimation.earlier import solved
-from soilbus.estimation.gauss_newton import descend, fit_window, foreseen, near, resume, starting_soils
+from soilbus.estimation.gaussian import solved
+from soilbus.estimation.multistart import descend, fit_window, foreseen, near, resume, starting_soils
+from soilbus.estimation.parametrization import BOUND, Coordinates
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.soils import SOILS

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from soilbus.estimation.local_cubics import PARTS, Series, curve_of, variance_of_one
-from soilbus.estimation.resolution import resolved_window
 from soilbus.estimation.window import BinStore, Rig, SensorNoise
+from soilbus.sensors.rates import resolved_window
 from soilbus.terra.vehicle import Chassis
 
 T = np.cumsum(np.random.default_rng(1).uniform(0.019, 0.021, 2000))

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.estimation.bound import cramer_rao
-from soilbus.estimation.marginal import cold_fit
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.laplace import cold_fit
+from soilbus.estimation.observation_model import WindowProblem
 from soilbus.estimation.posterior import SoilPrior
-from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import BinStore
-from soilbus.simulator.monte_carlo import ROUGHLY_KNOWN, SLIP
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario
 from soilbus.terra.soils import SOILS
+from soilbus.validation.cramer_rao import cramer_rao
+from soilbus.validation.monte_carlo import ROUGHLY_KNOWN, SLIP
 
 DURATION = 10.0
 

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from soilbus.assembly import prior_of
-from soilbus.estimation.coordinates import BOUND, MAX_PHI
-from soilbus.estimation.gauss_newton import descend, fit_window
+from soilbus.estimation.assembly import prior_of
+from soilbus.estimation.multistart import descend, fit_window
+from soilbus.estimation.parametrization import BOUND, MAX_PHI
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import SOILS

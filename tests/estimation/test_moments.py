@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soilbus.estimation.moments import moments_along_share
+from soilbus.estimation.parametrization import moments_along_share
 
 
 def problem(share, share_std, prior_std=1.2, miss=0.0, slope=-1.4, other_std=0.05):

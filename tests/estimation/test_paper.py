@@ -9,7 +9,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import fsolve
 
-from soilbus.estimation.paper import (
+from soilbus.terra.wheel import WheelModel, WheelState, wheel_forces
+from soilbus.validation.paper import (
     AS_PRINTED,
     EXACT,
     EXACT_EXPONENTIAL,
@@ -22,7 +23,7 @@ from soilbus.estimation.paper import (
     entry_angle,
     moduli_from_two_widths,
 )
-from soilbus.estimation.paper_noise import (
+from soilbus.validation.paper_noise import (
     LEVELS,
     Noise,
     best_depth,
@@ -32,7 +33,7 @@ from soilbus.estimation.paper_noise import (
     relative_errors,
     windows_of,
 )
-from soilbus.estimation.paper_tables import (
+from soilbus.validation.paper_tables import (
     RUNS,
     SANDY_LOAM,
     START_ERRORS,
@@ -44,7 +45,6 @@ from soilbus.estimation.paper_tables import (
     errors_in_percent,
     from_print,
 )
-from soilbus.terra.wheel import WheelModel, WheelState, wheel_forces
 
 CLAY = WET_CLAY.at(0.05)
 EVERY_EQUATIONS = (SIMPSON, AS_PRINTED, EXACT, EXACT_EXPONENTIAL, Equations(printed_slip_velocity=True))

@@ -10,14 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from soilbus.assembly import rig_of, with_effects
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.mapping import channels_of
-from soilbus.daemon.plausibility import Plausibility
-from soilbus.estimation.plausibility import implausible
-from soilbus.estimation.scene import Resolution
-from soilbus.estimation.series import lasts, runs
+from soilbus.estimation.assembly import rig_of, with_effects
 from soilbus.estimation.window import BinStore, Window, forward
+from soilbus.sensors.consistency import Plausibility, Resolution, implausible, lasts, runs
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, demo, excited

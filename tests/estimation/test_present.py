@@ -10,17 +10,17 @@ import pytest
 from drives import errors, task_of, tracker_of, windows
 from scipy.special import expit
 
-from soilbus.daemon.estimator import WindowEstimator
-from soilbus.estimation.belief import Belief
-from soilbus.estimation.gauss_newton import fit_window
-from soilbus.estimation.normal_equations import Fitting, Place
-from soilbus.estimation.present import PIECES, STEADY, at_present
+from soilbus.decision.traversability import Status
+from soilbus.estimation.drift_filter import PIECES, STEADY, at_present
+from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.multistart import fit_window
+from soilbus.estimation.solver import Fitting, Place
+from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, soil_along
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
-from soilbus.traversability import Status
 
 SPEED, STEP = 1.5, 3.0
 DRIFT = 0.03

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from drives import errors, tracker_of, windows
 
-from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.estimation.belief import Belief
-from soilbus.estimation.recall import PERSISTENCE, gain_errors, recalled
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.tracker import PERSISTENCE, gain_errors, recalled
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from soilbus.estimation.linearised import Latents
-from soilbus.estimation.readings import GAIN_QUANTITIES, differentiated_speed
-from soilbus.estimation.residuals import WindowProblem
+from soilbus.estimation.measurements import GAIN_QUANTITIES, differentiated_speed
+from soilbus.estimation.observation_model import Latents, WindowProblem
 from soilbus.estimation.window import Rig, Window, window_of_samples
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS

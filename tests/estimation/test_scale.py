@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from drives import task_of, windows
 
-from soilbus.daemon.estimator import WindowEstimator
-from soilbus.daemon.result import WindowResult
+from soilbus.decision.traversability import Status
+from soilbus.pipeline.estimator import WindowEstimator
+from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
-from soilbus.traversability import Status
 
 SOILS = ("loam", "wet_clay", "dry_sand", "clayey_soil_38")
 

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from soilbus.assembly import model_of, prior_of, rig_of
-from soilbus.estimation import screening
-from soilbus.estimation.gauss_newton import fit_window
-from soilbus.estimation.residuals import WindowProblem
-from soilbus.estimation.screening import Samples, judge
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.multistart import fit_window
+from soilbus.estimation.observation_model import WindowProblem
 from soilbus.estimation.window import BinStore, Rig, SensorNoise
+from soilbus.sensors import outliers as screening
+from soilbus.sensors.outliers import Samples, judge
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing

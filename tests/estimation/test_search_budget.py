@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from drives import tasks
 
-from soilbus.daemon.estimator import WindowEstimator
-from soilbus.estimation.residuals import WindowProblem
-from soilbus.estimation.search_budget import SearchBudget
+from soilbus.decision.traversability import Status
+from soilbus.estimation.observation_model import SearchBudget, WindowProblem
+from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
-from soilbus.traversability import Status
 
 CONFIG = reference_configuration()
 UNLIMITED = reference_configuration(["estimator.search_rate=1e9", "estimator.search_burst=1e9"])

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from reliability import WIDE_COHESION, Said, driven, shortfall, windows
 
-from soilbus.assembly import prior_of
-from soilbus.estimation.coordinates import Coordinates
-from soilbus.estimation.gauss_newton import fit_window, near
+from soilbus.estimation.assembly import prior_of
+from soilbus.estimation.multistart import fit_window, near
+from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
-from soilbus.estimation.soil_class import PRIOR_UNKNOWN, WITHIN, SoilClasses, foretelling, guessed
+from soilbus.estimation.soil_classes import PRIOR_UNKNOWN, WITHIN, SoilClasses, foretelling, guessed
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import KINDS, SOILS, UNKNOWN
 from soilbus.terra.wheel import Soil

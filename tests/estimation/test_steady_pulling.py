@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 from drives import tasks
 
-from soilbus.daemon.estimator import WindowEstimator
+from soilbus.decision.traversability import State, Status
+from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Profile, Scenario, Swing
 from soilbus.terra.soils import soil_named
-from soilbus.traversability import State, Status
 
 CONFIG = reference_configuration()
 STEADY = {"speed": Profile([0, 90], [1.4, 1.4])}

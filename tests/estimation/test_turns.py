@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from soilbus.estimation.readings import Readings
+from soilbus.estimation.measurements import Readings
 from soilbus.estimation.window import Rig, SensorNoise, Window, forward, turning
 
 MAX_TURN, TRACK = 0.15, 1.14

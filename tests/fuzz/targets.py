@@ -17,19 +17,19 @@ import numpy as np
 from cantools.database import Database
 
 from fakes import FakeClock, InlineExecutor, ScriptedBus
-from soilbus.assembly import completion_of, effects_of
 from soilbus.can.bus import LiveBus
 from soilbus.can.dbc_files import load_databases, output_database, shipped_dbc
 from soilbus.can.publish import Publisher
-from soilbus.config import Config, ConfigError
-from soilbus.config_file import load_config
-from soilbus.daemon.intake import Intake
+from soilbus.config.file import load_config
+from soilbus.config.model import Config, ConfigError
 from soilbus.daemon.notify import Notifier
-from soilbus.daemon.pipeline import Pipeline
-from soilbus.daemon.replay import LogError, read_frames
 from soilbus.daemon.service import Service
-from soilbus.daemon.store import Owner, State, StateError, belief_of, dumped, loaded, stored_belief
-from soilbus.estimation.belief import Belief
+from soilbus.daemon.state_store import Owner, State, StateError, belief_of, dumped, loaded, stored_belief
+from soilbus.estimation.assembly import completion_of, effects_of
+from soilbus.estimation.gaussian import Belief
+from soilbus.offline.replay import LogError, read_frames
+from soilbus.pipeline.intake import Intake
+from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.frames import frames, write_log
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import TRACTOR, reference_configuration

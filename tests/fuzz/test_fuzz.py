@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from soilbus.can.dbc_files import load_databases
-from soilbus.daemon.intake import Intake
+from soilbus.pipeline.intake import Intake
 
 from .mutation import mutated
 from .stream import RECORD, STEPS, frames_of

@@ -16,7 +16,7 @@ import numpy as np
 import tomlkit
 from tests.diagnosis.blind.cases import Case, cases
 
-from soilbus.cli import main
+from soilbus.cli.main import main
 from soilbus.simulator.frames import frames, write_log
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.reference import TRACTOR

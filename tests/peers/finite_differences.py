@@ -16,10 +16,10 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import least_squares
 
+from soilbus.estimation.observation_model import Latents, Linearised, WindowProblem
 from soilbus.estimation.posterior import Posterior
-from soilbus.estimation.residuals import Latents, Linearised, WindowProblem
 from soilbus.terra.entry_angle import entry_angle_for_load
-from soilbus.terra.stress import lumped_modulus
+from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.wheel import Soil, WheelState, sinkage, wheel_forces
 
 from .windows import B_REF, Z_REF, Answer, Array, Case, fit_model, reading_covariance

@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from soilbus.estimation.observation_model import WindowProblem
 from soilbus.estimation.posterior import PARAMETERS, Estimate
-from soilbus.estimation.residuals import WindowProblem
-from soilbus.terra.stress import lumped_modulus
+from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.wheel import Soil, WheelState, wheel_forces_and_derivatives
 
 from .windows import B_REF, Z_REF, Answer, Array, Case, bearing_pressure, entry_angles, fit_model

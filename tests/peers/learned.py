@@ -21,8 +21,8 @@ from sklearn.model_selection import GridSearchCV
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
+from soilbus.estimation.observation_model import WindowProblem
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
-from soilbus.estimation.residuals import WindowProblem
 from soilbus.estimation.window import Rig, SensorNoise, window_of_samples
 from soilbus.simulator.scenario import Swing, realise
 from soilbus.terra.entry_angle import entry_angle_for_load

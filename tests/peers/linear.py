@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from soilbus.estimation.posterior import Estimate
-from soilbus.terra.stress import shear_displacement
+from soilbus.terra.soil_laws import shear_displacement
 
 from .windows import Answer, Array, Case, entry_angles
 

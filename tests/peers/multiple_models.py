@@ -13,8 +13,8 @@ from collections.abc import Collection
 
 import numpy as np
 
+from soilbus.estimation.observation_model import WindowProblem
 from soilbus.estimation.posterior import PARAMETERS, Estimate
-from soilbus.estimation.residuals import WindowProblem
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
 

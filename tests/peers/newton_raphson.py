@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from soilbus.estimation.observation_model import WindowProblem
 from soilbus.estimation.posterior import Estimate
-from soilbus.estimation.residuals import WindowProblem
 from soilbus.terra.wheel import Soil, WheelState, wheel_forces_and_derivatives
 
 from .windows import B_REF, Answer, Array, Case, bearing_pressure, entry_angles, fit_model

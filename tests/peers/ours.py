@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from soilbus.estimation.gauss_newton import fit_window
+from soilbus.estimation.multistart import fit_window
 
 from .windows import B_REF, Z_REF, Answer, Case
 

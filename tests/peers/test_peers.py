@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from soilbus.estimation.gauss_newton import fit_window
+from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.posterior import PARAMETERS, Estimate
 from soilbus.terra.soils import SOILS
 

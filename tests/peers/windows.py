@@ -9,10 +9,9 @@ from functools import cache, cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.assembly import model_of, rig_of
+from soilbus.estimation.assembly import model_of, rig_of
+from soilbus.estimation.observation_model import Linearised, WindowProblem, diagonals
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
-from soilbus.estimation.residuals import Linearised, WindowProblem
-from soilbus.estimation.weights import diagonals
 from soilbus.estimation.window import BinStore, Rig
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

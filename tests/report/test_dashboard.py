@@ -17,7 +17,7 @@ from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import output_database
 from soilbus.can.publish import Publisher
 from soilbus.report.dashboard import WIDTH, panel, show
-from soilbus.report.readings import Readings
+from soilbus.report.received_frames import Readings
 from soilbus.simulator.reference import reference_configuration
 
 

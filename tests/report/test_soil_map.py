@@ -10,17 +10,17 @@ import numpy as np
 import pyogrio
 import pytest
 
-from soilbus.cli import main
-from soilbus.daemon.estimator import WindowResult
-from soilbus.daemon.positions import Position
+from soilbus.cli.main import main
+from soilbus.decision.traversability import Status, Traversability
 from soilbus.estimation.posterior import Estimate
+from soilbus.pipeline.estimator import WindowResult
+from soilbus.pipeline.positions import Position
 from soilbus.report.soil_map import soil_map
 from soilbus.simulator.course import course, positions
 from soilbus.simulator.frames import START
 from soilbus.simulator.play import scenario_over
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import TRACTOR, reference_configuration
-from soilbus.traversability import Status, Traversability
 
 WAY = course((-17.0, 179.99995), 60.0, (12.0, 3.0))  # a field in Fiji, on both sides of the antimeridian
 SECONDS = 26.0

@@ -7,7 +7,7 @@ import re
 import pytest
 from scipy.stats import lognorm
 
-from soilbus.cli import main
+from soilbus.cli.main import main
 from soilbus.report.soil_prior import prior_text
 from soilbus.simulator.reference import TRACTOR, reference_configuration
 from soilbus.terra.soils import KINDS, SOILS

@@ -12,16 +12,16 @@ import can
 import numpy as np
 import pytest
 
-from soilbus.assembly import with_effects
 from soilbus.can.bus import heard_for
 from soilbus.can.candump import Frame, frame_of
 from soilbus.can.dbc_files import load_databases, shipped_dbc
-from soilbus.cli import main
-from soilbus.config import Config
-from soilbus.config_file import load_config
-from soilbus.daemon.intake import Intake
-from soilbus.daemon.replay import read_frames
+from soilbus.cli.main import main
+from soilbus.config.file import load_config
+from soilbus.config.model import Config
+from soilbus.estimation.assembly import with_effects
 from soilbus.estimation.window import turning
+from soilbus.offline.replay import read_frames
+from soilbus.pipeline.intake import Intake
 from soilbus.sensors.survey import Survey, survey
 from soilbus.simulator.frames import frames
 from soilbus.simulator.play import scenario_over

@@ -7,19 +7,11 @@ import json
 import numpy as np
 import pytest
 
-from soilbus.assembly import rig_of
-from soilbus.cli import main
-from soilbus.simulator.draft_trials import (
-    SOILS,
-    DraftTrial,
-    Task,
-    draft_trials,
-    figures,
-    trial,
-    true_largest_draft,
-)
+from soilbus.cli.main import main
+from soilbus.estimation.assembly import rig_of
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import SOILS as KNOWN
+from soilbus.validation.draft_trials import SOILS, DraftTrial, Task, draft_trials, figures, trial, true_largest_draft
 from statics import MODEL, WHEELS, brute
 
 CONFIG = reference_configuration()

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import quad
 
 import soilbus.simulator
-from soilbus.config_file import load_config
+from soilbus.config.file import load_config
 from soilbus.simulator.drive import SimulationError, drive
 from soilbus.simulator.scenario import Patch, Scenario, Swing, demo, excited
 from soilbus.terra.soils import SOILS, soil_named

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soilbus.assembly import effects_of, with_effects
-from soilbus.cli import main
-from soilbus.config import Config, ConfigError
+from soilbus.cli.main import main
+from soilbus.config.model import Config, ConfigError
+from soilbus.estimation.assembly import effects_of, with_effects
 from soilbus.simulator.drive import drive
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.reference import reference_configuration

@@ -10,7 +10,7 @@ import pytest
 import soilbus.simulator
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.mapping import channels_of, load_databases
-from soilbus.config_file import load_config, parse_config
+from soilbus.config.file import load_config, parse_config
 from soilbus.simulator.frames import START, encoded, frames, write_log
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.scenario import demo, excited

@@ -9,14 +9,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import soilbus.simulator.monte_carlo as of_room
-from soilbus.assembly import prior_of
-from soilbus.cli import main
-from soilbus.estimation.attainable import Attainable
+import soilbus.validation.monte_carlo as of_room
+from soilbus.cli.main import main
+from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.report.monte_carlo import monte_carlo_report
 from soilbus.simulator.drive import SimulationError
-from soilbus.simulator.monte_carlo import (
+from soilbus.simulator.reference import reference_configuration
+from soilbus.terra.soils import SOILS
+from soilbus.validation.bayes_risk_bound import Attainable
+from soilbus.validation.monte_carlo import (
     MAX_PHI,
     ROUGHLY_KNOWN,
     Trial,
@@ -27,8 +29,6 @@ from soilbus.simulator.monte_carlo import (
     tasks_of,
     trials,
 )
-from soilbus.simulator.reference import reference_configuration
-from soilbus.terra.soils import SOILS
 
 CONFIG = reference_configuration(ROUGHLY_KNOWN)
 

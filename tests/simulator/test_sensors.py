@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import soilbus.simulator
-from soilbus.config import Noise
-from soilbus.config_file import load_config, parse_config
+from soilbus.config.file import load_config, parse_config
+from soilbus.config.model import Noise
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.scenario import excited
 from soilbus.simulator.sensors import disturbed

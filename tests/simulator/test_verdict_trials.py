@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from soilbus.assembly import rig_of
-from soilbus.simulator.draft_trials import true_largest_draft
+from soilbus.decision.traversability import State
+from soilbus.estimation.assembly import rig_of
 from soilbus.simulator.reference import reference_configuration
-from soilbus.simulator.verdict_trials import BINS, Call, Task, reliability, trial, verdict_trials, wilson
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS
 from soilbus.terra.vehicle import axle_loads
 from soilbus.terra.wheel import WheelModel, sinkage, state_on
-from soilbus.traversability import State
+from soilbus.validation.draft_trials import true_largest_draft
+from soilbus.validation.verdict_trials import BINS, Call, Task, reliability, trial, verdict_trials, wilson
 
 CONFIG = reference_configuration()
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.can.channels import Reason
-from soilbus.daemon.result import WindowResult
-from soilbus.traversability import Status
+from soilbus.decision.traversability import Status
+from soilbus.pipeline.result import WindowResult
 
 PAGE = 4096
 

@@ -13,12 +13,12 @@ from fakes import FakeClock, InlineExecutor
 from soilbus.can.bus import LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
-from soilbus.daemon.beat import SLEW
 from soilbus.daemon.notify import Notifier
-from soilbus.daemon.outputs import TICK
-from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.service import Service
+from soilbus.daemon.tick_phase import SLEW
 from soilbus.daemon.warm_up import warm_up
+from soilbus.pipeline.outputs import TICK
+from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import soil_named
 

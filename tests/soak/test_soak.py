@@ -6,7 +6,7 @@ from collections import Counter
 
 import pytest
 
-from soilbus.daemon.outputs import TICK
+from soilbus.pipeline.outputs import TICK
 
 from . import wire
 from .books import Hour

@@ -11,7 +11,7 @@ from multiprocessing.connection import Connection
 import can
 import numpy as np
 
-from soilbus.config import Config
+from soilbus.config.model import Config
 from soilbus.simulator.drive import Drive, drive
 from soilbus.simulator.frames import START, frames
 from soilbus.simulator.recording import Recording

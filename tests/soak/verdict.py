@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from soilbus.daemon.outputs import TICK
+from soilbus.pipeline.outputs import TICK
 
 from .run import SLACK, Soak
 

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from onlooker import CYCLE, Drive, Moment, good_moment, good_tracked
-from soilbus.config import Config
+from soilbus.config.model import Config
 from soilbus.simulator.frames import START, frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

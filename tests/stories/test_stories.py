@@ -6,11 +6,11 @@ import logging
 
 import pytest
 
-from soilbus.daemon.intake import Intake
 from soilbus.daemon.service import Service
-from soilbus.daemon.states import ServiceState
-from soilbus.traversability import State as Way
-from soilbus.traversability import Traversability
+from soilbus.decision.traversability import State as Way
+from soilbus.decision.traversability import Traversability
+from soilbus.pipeline.intake import Intake
+from soilbus.pipeline.states import ServiceState
 
 from .drives import cheap, real
 from .story import TO_ALL, TO_SOME, Event, begin, drawn, end, told

@@ -9,10 +9,10 @@ from unittest import mock
 
 import numpy as np
 
-from soilbus.assembly import model_of, rig_of
-from soilbus.capability import assessment
-from soilbus.capability.assessment import Capability, Demand, assess
-from soilbus.capability.wheels import WheelTable, wheel_table
+from soilbus.decision import capability as assessment
+from soilbus.decision.capability import Capability, Demand, assess
+from soilbus.decision.wheels import WheelTable, wheel_table
+from soilbus.estimation.assembly import model_of, rig_of
 from soilbus.estimation.posterior import Posterior
 from soilbus.simulator.reference import reference_configuration
 

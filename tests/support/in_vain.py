@@ -14,8 +14,8 @@ import can
 import numpy as np
 from scipy.optimize import brentq
 
-from soilbus.assembly import chassis_of
-from soilbus.config import Config
+from soilbus.config.model import Config
+from soilbus.estimation.assembly import chassis_of
 from soilbus.simulator.drive import Drive, drive
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import Recording

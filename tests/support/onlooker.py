@@ -26,22 +26,22 @@ from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
-from soilbus.config import Config
-from soilbus.daemon.estimator import WindowEstimator
-from soilbus.daemon.intake import WindowTask
-from soilbus.daemon.keeper import Keeper
+from soilbus.config.model import Config
 from soilbus.daemon.notify import Notifier
-from soilbus.daemon.pipeline import Pipeline
 from soilbus.daemon.service import Service
-from soilbus.daemon.store import Owner
-from soilbus.estimation.tracked import Tracked
+from soilbus.daemon.state_persistence import Keeper
+from soilbus.daemon.state_store import Owner
+from soilbus.decision.traversability import Status
+from soilbus.estimation.tracker import Tracked
 from soilbus.estimation.window import Window
+from soilbus.pipeline.estimator import WindowEstimator
+from soilbus.pipeline.intake import WindowTask
+from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.soils import SOILS
-from soilbus.traversability import Status
 
 CONFIG = reference_configuration(["estimator.window=4.0", "traversability.max_age=2.0"])
 OUT = output_database(CONFIG)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from soilbus.terra.stress import (
+from soilbus.terra.soil_laws import (
     SHEAR_LAWS,
     exponential_shear,
     lumped_modulus,

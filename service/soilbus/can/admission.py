@@ -30,7 +30,7 @@ from soilbus.can.inbox import (
     not_twice,
     popped,
     time_forward,
-)  # fmt: skip
+)
 from soilbus.can.j1939 import STANDARD_PGNS, SourceLock, group_mask, pgn_of, source_of
 from soilbus.can.validity import REASONS, CodeRule, in_si, judge_codes, judge_validity
 

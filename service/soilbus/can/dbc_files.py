@@ -10,13 +10,13 @@ from typing import Any
 
 from cantools.database.can import Database, Message
 
-from soilbus.bounded_file import read_bounded
 from soilbus.can.checksum import CHECKSUM, COUNTER
 from soilbus.can.dbc_text import message_names, of_messages
 from soilbus.can.inbox import checksum_byte_of
 from soilbus.can.j1939 import STANDARD_PGNS, pgn_of
-from soilbus.config import Config, ConfigError
-from soilbus.spelling import did_you_mean
+from soilbus.config.model import Config, ConfigError
+from soilbus.files import read_bounded
+from soilbus.words import did_you_mean
 
 LARGEST = 32 * 2**20
 """Bytes of a DBC file: five times those of one with 10 000 messages."""

@@ -12,9 +12,9 @@ from soilbus.can.channels import Channel
 from soilbus.can.dbc_files import checked_messages, load_databases, shipped_dbc
 from soilbus.can.decode import check_decodable, code_limits
 from soilbus.can.units import SI, STANDARD_GRAVITY, unit_of
-from soilbus.config import Config, ConfigError, Wheel
-from soilbus.config import Signal as Mapped
-from soilbus.spelling import did_you_mean
+from soilbus.config.model import Config, ConfigError, Wheel
+from soilbus.config.model import Signal as Mapped
+from soilbus.words import did_you_mean
 
 WHEEL_ROLES = ("torque", "speed", "load", "sinkage", "torque_limit", "motor_speed")
 POSITION_ROLES = ("latitude", "longitude")

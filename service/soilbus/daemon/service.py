@@ -15,29 +15,29 @@ from typing import TYPE_CHECKING
 from soilbus.can.bus import LiveBus
 from soilbus.can.bus_state import BusState
 from soilbus.can.publish import Publisher
-from soilbus.capability.immobilisation import Watch, watched, with_loss
-from soilbus.capability.traction_loss import NO_LOSS, observed
-from soilbus.config import Config
-from soilbus.daemon.backlog import Backlog, wait_for
-from soilbus.daemon.beat import next_tick
+from soilbus.config.model import Config
 from soilbus.daemon.bus_health import health_frame, health_text
 from soilbus.daemon.bus_time import BusTime
+from soilbus.daemon.exception_guard import INTERNAL, Solver
 from soilbus.daemon.health import Health
-from soilbus.daemon.intake import Latest
 from soilbus.daemon.notify import Notifier
-from soilbus.daemon.outputs import TICK, WINDOW_MODULUS, forecast_frame, hop_frames, slip_frames
-from soilbus.daemon.pipeline import Pipeline
-from soilbus.daemon.result import WindowResult, as_of
-from soilbus.daemon.solver import INTERNAL, Solver
-from soilbus.daemon.states import ServiceState, state_after
+from soilbus.daemon.tick_phase import next_tick
 from soilbus.daemon.totals import totals
-from soilbus.judgement import Basis, at_present
-from soilbus.traversability import State, Status, Traversability
+from soilbus.daemon.work_queue import Backlog, wait_for
+from soilbus.decision.immobilisation import Watch, watched, with_loss
+from soilbus.decision.judgement import Basis, at_present
+from soilbus.decision.traction_loss import NO_LOSS, observed
+from soilbus.decision.traversability import State, Status, Traversability
+from soilbus.pipeline.intake import Latest
+from soilbus.pipeline.outputs import TICK, WINDOW_MODULUS, forecast_frame, hop_frames, slip_frames
+from soilbus.pipeline.pipeline import Pipeline
+from soilbus.pipeline.result import WindowResult, as_of
+from soilbus.pipeline.states import ServiceState, state_after
 
 if TYPE_CHECKING:
-    from soilbus.capability.assessment import OverSlip
-    from soilbus.daemon.estimator import WindowEstimator
-    from soilbus.daemon.keeper import Keeper
+    from soilbus.daemon.state_persistence import Keeper
+    from soilbus.decision.capability import OverSlip
+    from soilbus.pipeline.estimator import WindowEstimator
 
 log = logging.getLogger(__name__)
 

@@ -17,15 +17,15 @@ from soilbus.allocator import loading
 from soilbus.can.bus import BusError, LiveBus, open_bus
 from soilbus.can.dbc_files import filters_of, load_databases, output_database
 from soilbus.can.publish import Publisher
-from soilbus.config import Config
+from soilbus.config.model import Config
 from soilbus.daemon.notify import Notifier
-from soilbus.daemon.outputs import check_cycle_times
-from soilbus.daemon.pipeline import Pipeline
-from soilbus.daemon.result import WindowResult
 from soilbus.daemon.service import Service
+from soilbus.pipeline.outputs import check_cycle_times
+from soilbus.pipeline.pipeline import Pipeline
+from soilbus.pipeline.result import WindowResult
 
 if TYPE_CHECKING:
-    from soilbus.daemon.keeper import Keeper
+    from soilbus.daemon.state_persistence import Keeper
 
 SWITCH_INTERVAL = 0.0005
 
@@ -78,8 +78,7 @@ def _load() -> None:
     room for frames, where it has no more than by default.
     """
     with loading():
-        import soilbus.daemon.estimator
-        import soilbus.daemon.keeper  # noqa: F401
+        import soilbus.daemon.state_persistence  # noqa: F401
 
 
 def _rehearse(config: Config, database: Database, ours: Database) -> None:
@@ -94,8 +93,8 @@ def _keeper(pipeline: Pipeline, environ: Mapping[str, str]) -> Keeper | None:
     folder = environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if not folder:
         return None
-    from soilbus.daemon.keeper import Keeper
-    from soilbus.daemon.store import Owner
+    from soilbus.daemon.state_persistence import Keeper
+    from soilbus.daemon.state_store import Owner
 
     writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="store")
     return Keeper(Path(folder), Owner.of(pipeline.config, pipeline.intake.channels, pipeline.database), writer)

@@ -10,10 +10,10 @@ from cantools.database.can import Database
 
 from soilbus.allocator import take_small_blocks
 from soilbus.can.publish import Publisher
-from soilbus.config import Config
-from soilbus.daemon.outputs import hop_frames
-from soilbus.daemon.pipeline import Pipeline
-from soilbus.daemon.result import WindowResult
+from soilbus.config.model import Config
+from soilbus.pipeline.outputs import hop_frames
+from soilbus.pipeline.pipeline import Pipeline
+from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.scenario import excited

@@ -19,12 +19,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.diagnosis.completion import Completion
+from soilbus.diagnosis.evidence import evidence_of_any_size
+from soilbus.diagnosis.fitted_model import Completion
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.score import Normal, moves, normals_of
-from soilbus.diagnosis.sizes import evidence_of_any_size
 from soilbus.diagnosis.verdict import price
-from soilbus.estimation.effect_parameters import Free, parameters_of
+from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect, Parameter
 

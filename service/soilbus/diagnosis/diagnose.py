@@ -7,16 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from soilbus.diagnosis.candidates import THINNED, Standing
-from soilbus.diagnosis.completion import Completion
+from soilbus.diagnosis.delays import with_lateness
 from soilbus.diagnosis.detectable import Detectable, detectable
-from soilbus.diagnosis.fits import Fits
+from soilbus.diagnosis.fitted_model import Completion
 from soilbus.diagnosis.gap import Gap, gap_of
-from soilbus.diagnosis.late_posterior import with_lateness
-from soilbus.diagnosis.learned import Correction, corrections
-from soilbus.diagnosis.naming import ASTRAY, Addition, converged, named
-from soilbus.diagnosis.reconsidered import reconsidered
 from soilbus.diagnosis.records import Record
+from soilbus.diagnosis.residual_terms import Correction, corrections
+from soilbus.diagnosis.search import ASTRAY, THINNED, Addition, Fits, Standing, converged, named, reconsidered
 from soilbus.diagnosis.verdict import Verdict, verdict_of
 from soilbus.diagnosis.where import Disagreement, disagreements
 from soilbus.estimation.posterior import Posterior, SoilPrior

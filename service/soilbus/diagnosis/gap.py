@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from soilbus.diagnosis.completion import Completion, complete
+from soilbus.diagnosis.fitted_model import Completion, complete
 from soilbus.diagnosis.records import HELD_OUT, Record
-from soilbus.estimation.gauss_newton import Start
+from soilbus.estimation.multistart import Start
 from soilbus.estimation.posterior import SoilPrior
 
 CLEAR = 1.5

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from soilbus.diagnosis.completion import Completion
+from soilbus.diagnosis.fitted_model import Completion
 from soilbus.estimation.posterior import Estimate
 
 DIGITS = 6

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.belief import Belief
-from soilbus.estimation.completed import CompletedProblem
-from soilbus.estimation.effect_parameters import Free
+from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.nuisance_parameters import Free
+from soilbus.estimation.observation_model import CompletedProblem
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.wheel import WheelModel

@@ -15,16 +15,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.diagnosis.completion import Completion
+from soilbus.diagnosis.evidence import evidence_of_any_size
+from soilbus.diagnosis.fitted_model import Completion
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.sizes import evidence_of_any_size
-from soilbus.estimation.belief import Belief
-from soilbus.estimation.earlier import solved
-from soilbus.estimation.effect_parameters import Free, parameters_of
-from soilbus.estimation.gauss_newton import Start
-from soilbus.estimation.linearised import Latents, Linearised
-from soilbus.estimation.normal_equations import Fitting, Place
+from soilbus.estimation.gaussian import Belief, solved
+from soilbus.estimation.multistart import Start
+from soilbus.estimation.nuisance_parameters import Free, parameters_of
+from soilbus.estimation.observation_model import Latents, Linearised
 from soilbus.estimation.posterior import SoilPrior
+from soilbus.estimation.solver import Fitting, Place
 from soilbus.terra.effects.effect import Effect
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from types import MappingProxyType
 
-from soilbus.diagnosis.sizes import OwnParameters
+from soilbus.diagnosis.evidence import OwnParameters
 
 
 class Verdict(StrEnum):

@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.diagnosis.completion import Checked, Completion
+from soilbus.diagnosis.fitted_model import Checked, Completion
 from soilbus.estimation.posterior import PARAMETERS
 
 Array = NDArray[np.float64]

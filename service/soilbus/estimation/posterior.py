@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.terra.stress import lumped_modulus
+from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.wheel import Soil
 
 Array = NDArray[np.float64]

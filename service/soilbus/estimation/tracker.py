@@ -1,4 +1,16 @@
-"""From window to window: what earlier windows told, and where the soil changes.
+"""What the tracker is told, and what it says of a window.
+
+What one run knew of the sensors, for the next run: the soil may be another by then, the sensors are the same.
+
+Sinkages on a scale of their own: what a window's chi-square as a whole does not see.
+
+Sinkage sensors that read a tenth too little make another soil of it, which explains the
+rest nearly as well: chi-square rises by a tenth, no more than what passes for noise, and
+bearing pressures go astray by a fifth.  But nothing in a soil makes all sinkages, or those of one wheel,
+proportionally larger, so that along this one direction the data tell it from any soil: a score test
+(Rao 1948, Proc. Camb. Phil. Soc. 44:50), at the optimum of the fit, with no fit of its own.
+
+From window to window: what earlier windows told, and where the soil changes.
 
 Each window is estimated from its own data and from what was known when it began: the
 posterior of the newest window that had ended by then, widened by the drift of the soil
@@ -12,36 +24,152 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.belief import Belief
-from soilbus.estimation.bends import bending, on_the_way, straightened
-from soilbus.estimation.completed import CompletedProblem
-from soilbus.estimation.coordinates import Coordinates
-from soilbus.estimation.curve import curve_of, with_curve, without_curve
-from soilbus.estimation.effect_parameters import Free
-from soilbus.estimation.form import FormLeft, form_left
-from soilbus.estimation.gauss_newton import Fit, Foreseen, calmed, fit_window, foreseen, resume
-from soilbus.estimation.marginal import with_whole
-from soilbus.estimation.normal_equations import Fitting
+from soilbus.estimation.change_detection import Crossing, suspicion, without_crossing
+from soilbus.estimation.drift_filter import at_present
+from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.laplace import with_whole
+from soilbus.estimation.model_form import FormLeft, form_left
+from soilbus.estimation.multistart import Fit, Foreseen, calmed, fit_window, foreseen, resume
+from soilbus.estimation.nuisance_parameters import Free
+from soilbus.estimation.observation_model import CompletedProblem, SearchBudget, WindowProblem
+from soilbus.estimation.parametrization import Coordinates
+from soilbus.estimation.path_curvature import bending, curve_of, on_the_way, straightened, with_curve, without_curve
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-from soilbus.estimation.present import at_present
-from soilbus.estimation.recall import is_borne_out, recalled
-from soilbus.estimation.residuals import WindowProblem
-from soilbus.estimation.scale import sinkages_off_scale
-from soilbus.estimation.search_budget import SearchBudget
-from soilbus.estimation.soil_change import Crossing, suspicion, without_crossing
-from soilbus.estimation.tracked import Ground, Settings, Tracked
-from soilbus.estimation.window import Rig, Window
+from soilbus.estimation.solver import Fitting
+from soilbus.estimation.window import BinStore, Rig, Window
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.soils import SOILS
-from soilbus.terra.wheel import WheelModel
+from soilbus.terra.wheel import Soil, WheelModel
+
+MIN_ROWS = 60
+"""Residuals that a window needs."""
+
+
+class Ground(StrEnum):
+    """What the data of a window are of."""
+
+    SAME = "same"
+    NEW = "new"
+    """Another soil than before, since less than a window: only its own data count."""
+    CHANGING = "changing"
+    """Too little of another soil is in to tell it; the estimate is of the one before."""
+    SETTLING = "settling"
+    """Another soil than before, whose border may go on: its data do not agree, or are of too little time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What the tracker needs to be told; times s, speeds m/s.
+
+    drift: sd of the logarithm of each soil coordinate after one window; it grows with the
+    square root of time.  min_rows: residuals below which a window is not fitted.
+    search_rate, search_burst: evaluations of the model that searches may take, see SearchBudget.
+    form: root mean squares by which form.FORM may differ from the configured model's; () leaves none of it open.
+    """
+
+    window: float
+    min_speed: float
+    max_turn: float
+    max_chi2: float
+    drift: float
+    min_rows: int = MIN_ROWS
+    form: tuple[float, ...] = ()
+    search_rate: float = 4.0
+    search_burst: float = 100.0
+
+
+@dataclass(frozen=True, slots=True)
+class Tracked:
+    """A window's fit (None without), whether the model fails to describe its data, and of which ground they are.
+
+    since [s] is where the data that count begin; standstill and turning count instants left out.
+    search_ended: the budget of evaluations ended the search for a soil that describes the data.
+    """
+
+    fit: Fit | None
+    mismatch: bool
+    ground: Ground
+    since: float
+    standstill: int = 0
+    turning: int = 0
+    search_ended: bool = False
+
 
 Array = NDArray[np.float64]
+
+PERSISTENCE = 86400.0
+"""Time [s] in which a gain error forgets all but 1/e of what it was: amplifiers drift, tyres wear."""
+_SOIL = len(PARAMETERS)
+
+
+def recalled(belief: Belief, soil: SoilPrior, gain_std: Array, elapsed: float) -> Belief:
+    """What is left of a belief after a pause of so many seconds: gains (G,), each drawn back to its prior.
+
+    Of the soil nothing is left but its prior: where the vehicle stands now nobody has
+    measured, and a window that tells little would agree with any soil.  Gain errors wander
+    about zero with the prior's std as their stationary one (Uhlenbeck & Ornstein 1930,
+    Phys. Rev. 36, 823), so that a long pause leaves the prior.
+    """
+    kept = math.exp(-elapsed / PERSISTENCE) * (gain_std > 0.0)
+    covariance = np.zeros_like(belief.covariance)
+    covariance[:_SOIL, :_SOIL] = np.diag(soil.log_std**2)
+    of_gains = kept[:, None] * belief.covariance[_SOIL:, _SOIL:] * kept
+    covariance[_SOIL:, _SOIL:] = of_gains + np.diag((1.0 - kept**2) * gain_std**2)
+    return Belief(soil.median, kept * belief.gains, covariance)
+
+
+def is_borne_out(problem: WindowProblem, soil: SoilPrior, known: Belief) -> bool:
+    """Whether a window's data are at least as likely with what is known of the gains as with their prior alone.
+
+    A sensor that was exchanged or calibrated meanwhile has another error than it had.
+    """
+    anew = fit_window(problem, soil, Belief.of(soil, problem.gain_std))
+    fit = fit_window(problem, soil, known)
+    if fit is None or not fit.converged:
+        return False
+    return anew is None or not anew.converged or fit.evidence <= anew.evidence
+
+
+def gain_errors(rig: Rig, model: WheelModel, free: Sequence[Free]) -> tuple[list[str], Array]:
+    """Names and prior std (G,) of the gain errors that every window of a vehicle has, its effects' parameters last."""
+    problem = CompletedProblem(BinStore(rig, 1.0, 0.0).window(0.0, 1.0), rig, model, 0.0, free=free)
+    return problem.gain_names, problem.gain_std
+
+
+OFF_SCALE = 25.0
+"""Fall of the cost, if sinkages were measured on another scale, from which that is no noise."""
+
+
+def sinkages_off_scale(fitting: Fitting, fit: Fit) -> bool:
+    """Whether the sinkages of all wheels, or of one, would fit much better on another scale; no where there are none.
+
+    The information that the noise of loads and speeds leaves of the scale is taken too
+    large, as if there were none: the fall of the cost is a little underestimated.
+    """
+    problem, optimum = fitting.problem, fit.optimum
+    around = fitting.around(optimum)
+    if not problem.with_sinkage or around is None:
+        return False
+    at, soil = optimum.at, Soil(*optimum.soil.tolist())
+    (n, m), wheels = at.by_latents.shape[:2], problem.n_wheels
+    sinkage = np.where(problem.has_sinkage, problem.sinkages(soil, optimum.gains, optimum.latents), 0.0)
+    weighed = at.weighed.reshape(n, m, -1)[:, m - wheels :]
+    of_wheels = np.einsum("iw,iwk->wk", sinkage, weighed)
+    of_gradient, of_information = around.explained(of_wheels @ around.directions)
+    gradient = of_wheels[:, 0] - of_gradient
+    square = np.divide(sinkage**2, problem.sinkage_var, where=problem.has_sinkage, out=np.zeros((n, wheels)))
+    information = np.diag(square.sum(axis=0)) - of_information
+    scales = np.vstack([np.ones(wheels), np.eye(wheels)[sinkage.any(axis=0)]])
+    fall = (scales @ gradient) ** 2 / np.einsum("sw,wv,sv->s", scales, information, scales)
+    return bool(fall.max() > OFF_SCALE)
+
 
 MIN_NEW_ROWS = 30
 """Residuals that each of two soils needs to be told apart."""
@@ -78,7 +206,6 @@ GAIN_MEMORY = 60.0
 WHEELBASE = 2.0
 """Length [m] that stands for the wheelbase of a rig that has none."""
 _SAME_TIME = 1e-3
-_SOIL = len(PARAMETERS)
 
 
 class Alarm(NamedTuple):

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.local_cubics import Series
-from soilbus.estimation.screening import SIDE, Samples, joined, judge
+from soilbus.sensors.outliers import SIDE, Samples, joined, judge
 from soilbus.terra.vehicle import Chassis, pull_required
 
 Array = NDArray[np.float64]

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from soilbus.daemon.result import WindowResult
-from soilbus.traversability import Status
+from soilbus.decision.traversability import Status
+from soilbus.pipeline.result import WindowResult
 
 DIAGNOSE = "record it and run soilbus diagnose"
 

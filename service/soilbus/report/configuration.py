@@ -8,12 +8,12 @@ from typing import Any
 
 from cantools.database.can import Database
 
-from soilbus.assembly import completion_of, delays_of, effects_of, rig_of
 from soilbus.can.channels import Channel
 from soilbus.can.dbc_files import checked_messages, load_databases, output_database
 from soilbus.can.mapping import channels_of, without_unit
-from soilbus.config import Config, Table
-from soilbus.daemon.outputs import check_cycle_times
+from soilbus.config.model import Config, Table
+from soilbus.estimation.assembly import completion_of, delays_of, effects_of, rig_of
+from soilbus.pipeline.outputs import check_cycle_times
 from soilbus.report.soil_prior import prior_text
 from soilbus.report.table import table
 from soilbus.sensors.survey import Seen, Survey

@@ -17,8 +17,8 @@ from rich.text import Text
 
 from soilbus.can.bus import LiveBus, open_bus
 from soilbus.can.dbc_files import filters_of, output_database
-from soilbus.config import Config
-from soilbus.report.readings import Readings
+from soilbus.config.model import Config
+from soilbus.report.received_frames import Readings
 
 COLOURS = {"go": "green", "caution": "yellow", "no_go": "red", "unknown": "white"}
 PARAMETERS = {

@@ -7,10 +7,10 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from soilbus.report.table import table
-from soilbus.simulator.bogging_trials import ENOUGH_TIME, ENOUGH_WAY, FELT, REACTION, WarningFigures
-from soilbus.simulator.draft_trials import SPREAD, DraftFigures
-from soilbus.simulator.firm_drives import EASY, HARD
-from soilbus.simulator.verdict_trials import Bin, Reliability
+from soilbus.validation.bogging_trials import ENOUGH_TIME, ENOUGH_WAY, FELT, REACTION, WarningFigures
+from soilbus.validation.draft_trials import SPREAD, DraftFigures
+from soilbus.validation.firm_drives import EASY, HARD
+from soilbus.validation.verdict_trials import Bin, Reliability
 
 SHARED = """The drives are simulated with the estimator's own wheel-soil model, noise and priors about the true soil:
 the figures show that numbers and intervals follow from the model, not that the model is the field's."""

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.daemon.diagnose import Findings
-from soilbus.diagnosis.completion import Completion
+from soilbus.diagnosis.fitted_model import Completion
 from soilbus.diagnosis.verdict import PAYS, PAYS_BESIDE
 from soilbus.diagnosis.where import channels
+from soilbus.offline.diagnose import Findings
 from soilbus.report.findings import (
     admission_line,
     chance_text,

@@ -7,15 +7,15 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from soilbus.config import Config
-from soilbus.daemon.diagnose import Findings
-from soilbus.daemon.outputs import known
-from soilbus.diagnosis.completion import Completion
-from soilbus.diagnosis.learned import WARNING, Correction
-from soilbus.diagnosis.naming import Addition
+from soilbus.config.model import Config
+from soilbus.diagnosis.fitted_model import Completion
+from soilbus.diagnosis.residual_terms import WARNING, Correction
+from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.verdict import gap_limit
 from soilbus.diagnosis.where import Disagreement
 from soilbus.estimation.posterior import Estimate, Posterior
+from soilbus.offline.diagnose import Findings
+from soilbus.pipeline.outputs import known
 from soilbus.report.statement import (
     doubt,
     is_open,

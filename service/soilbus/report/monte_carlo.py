@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 
 from soilbus.report.table import table
-from soilbus.simulator.monte_carlo import DURATIONS, SOILS, Cell, Exact
+from soilbus.validation.monte_carlo import DURATIONS, SOILS, Cell, Exact
 
 MAX_RMS = 1.15
 COVERAGE = (0.93, 0.97)

@@ -8,7 +8,9 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-from soilbus.estimation.paper import (
+from soilbus.report.paper_noise import K_L_bound, noise_summary, noise_table, noise_text
+from soilbus.report.table import table
+from soilbus.validation.paper import (
     AS_PRINTED,
     EXACT,
     EXACT_EXPONENTIAL,
@@ -20,8 +22,9 @@ from soilbus.estimation.paper import (
     WheelEquations,
     moduli_from_two_widths,
 )
-from soilbus.estimation.paper_noise import LEVELS
-from soilbus.estimation.paper_tables import (
+from soilbus.validation.paper_corrections import corrections
+from soilbus.validation.paper_noise import LEVELS
+from soilbus.validation.paper_tables import (
     RUNS,
     SANDY_LOAM,
     START_ERRORS,
@@ -36,9 +39,6 @@ from soilbus.estimation.paper_tables import (
     errors_in_percent,
     from_print,
 )
-from soilbus.report.paper_corrections import corrections
-from soilbus.report.paper_noise import K_L_bound, noise_summary, noise_table, noise_text
-from soilbus.report.table import table
 
 WIDTH = 118
 PARAMETERS = ("phi [deg]", "K_L", "n")

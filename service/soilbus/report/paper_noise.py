@@ -6,8 +6,10 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from soilbus.estimation.paper import EXACT, SIMPSON, Equations
-from soilbus.estimation.paper_noise import (
+from soilbus.report.table import table
+from soilbus.terra.soil_laws import Array
+from soilbus.validation.paper import EXACT, SIMPSON, Equations
+from soilbus.validation.paper_noise import (
     LEVELS,
     Noise,
     best_depth,
@@ -17,9 +19,7 @@ from soilbus.estimation.paper_noise import (
     relative_errors,
     windows_of,
 )
-from soilbus.estimation.paper_tables import SANDY_LOAM, WET_CLAY, Trial
-from soilbus.report.table import table
-from soilbus.terra.stress import Array
+from soilbus.validation.paper_tables import SANDY_LOAM, WET_CLAY, Trial
 
 DRAWS = 500
 WINDOWS = 20

@@ -12,10 +12,10 @@ from collections.abc import Iterable
 from datetime import UTC, datetime
 from typing import Any
 
-from soilbus.config import Config, ConfigError
-from soilbus.daemon.outputs import known
-from soilbus.daemon.result import WindowResult
+from soilbus.config.model import Config, ConfigError
 from soilbus.estimation.posterior import Estimate
+from soilbus.pipeline.outputs import known
+from soilbus.pipeline.result import WindowResult
 
 DECIMALS = 7
 """Of a degree: a centimetre."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from soilbus.assembly import prior_of
-from soilbus.config import Config
+from soilbus.config.model import Config
+from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.posterior import PARAMETERS
 from soilbus.report.table import table
 from soilbus.terra.soils import KINDS, SOILS

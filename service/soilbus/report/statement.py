@@ -10,11 +10,11 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from soilbus.config import Config
-from soilbus.diagnosis.completion import Completion
+from soilbus.config.model import Config
 from soilbus.diagnosis.detectable import Detectable
 from soilbus.diagnosis.diagnose import Diagnosis
-from soilbus.diagnosis.naming import Addition
+from soilbus.diagnosis.fitted_model import Completion
+from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.verdict import AT_TIMES, Verdict, gap_limit
 from soilbus.estimation.posterior import Posterior, bearing_pressure
 from soilbus.terra.effects.vehicle import GRADE_BESIDE_PITCH

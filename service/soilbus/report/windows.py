@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from soilbus.can.admission import LONGEST_GAP
-from soilbus.daemon.pipeline import Pipeline
-from soilbus.daemon.result import WindowResult
+from soilbus.decision.traversability import Status
+from soilbus.pipeline.pipeline import Pipeline
+from soilbus.pipeline.result import WindowResult
 from soilbus.report.advice import advice, of_use
 from soilbus.report.page import html_table, page, picture
-from soilbus.traversability import Status
 
 SEAM = 5.0
 """Room [s] between two recordings in a plot."""

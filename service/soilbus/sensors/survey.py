@@ -27,17 +27,15 @@ import numpy as np
 from cantools.database.can import Database
 from numpy.typing import NDArray
 
-from soilbus.assembly import rig_of
 from soilbus.can.admission import Admission
 from soilbus.can.channels import Channel, Reason
 from soilbus.can.dbc_files import checked_messages
 from soilbus.can.mapping import OPTIONAL_ROLES, POSITION_ROLES, channels_of
 from soilbus.can.units import SI, unit_of
-from soilbus.config import Config, ConfigError, Signal
-from soilbus.daemon.plausibility import resolution_of
-from soilbus.estimation.plausibility import implausible, without
-from soilbus.estimation.series import change, median
+from soilbus.config.model import Config, ConfigError, Signal
+from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.window import BinStore, Rig, Window, forward, pairs, pull_given, turning
+from soilbus.sensors.consistency import change, implausible, median, resolution_of, without
 from soilbus.terra.vehicle import GRAVITY, axle_loads, slip_ratio
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from soilbus.terra.earth import moved
-from soilbus.terra.stress import Array
+from soilbus.terra.soil_laws import Array
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,11 +20,11 @@ from soilbus.can.channels import Channel
 from soilbus.can.checksum import COUNTER, column_checksums
 from soilbus.can.mapping import channels_of, load_databases
 from soilbus.can.publish import checksum_byte, value_codes
-from soilbus.config import Config, Wheel
-from soilbus.placed_file import placed
+from soilbus.config.model import Config, Wheel
+from soilbus.files import placed
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.sensors import channel_rng
-from soilbus.terra.stress import Array
+from soilbus.terra.soil_laws import Array
 
 START = 1_700_000_000.0
 """Time stamp [s] of a recording's first instant: logs hold wall clock time."""

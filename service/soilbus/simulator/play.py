@@ -9,13 +9,13 @@ from pathlib import Path
 import can
 
 from soilbus.can.bus import bus_fault, open_bus
-from soilbus.config import Config
+from soilbus.config.model import Config
 from soilbus.simulator.course import NORTHWARD, Course
 from soilbus.simulator.frames import frames, write_log
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import Patch, Scenario, Swing
-from soilbus.spelling import did_you_mean
 from soilbus.terra.soils import SOILS
+from soilbus.words import did_you_mean
 
 _MEAN_SPEED = 1.4
 

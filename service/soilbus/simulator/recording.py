@@ -9,7 +9,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from soilbus.can.channels import Column
-from soilbus.config import Config
+from soilbus.config.model import Config
 from soilbus.simulator.drive import drive
 from soilbus.simulator.scenario import Scenario
 from soilbus.simulator.sensors import measure

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from soilbus.config import Config
-from soilbus.config_file import load_config
+from soilbus.config.file import load_config
+from soilbus.config.model import Config
 
 TRACTOR = Path(__file__).with_name("tractor.toml")
 

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.simulator.course import NORTHWARD, Course
+from soilbus.terra.soil_laws import Array
 from soilbus.terra.soils import soil_named
-from soilbus.terra.stress import Array
 from soilbus.terra.wheel import Soil
 
 SAMPLE_RATE = 50.0

@@ -6,15 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from soilbus.terra.stress import Array
-from soilbus.terra.wheel import (
-    MAX_ENTRY_ANGLE,
-    MIN_ENTRY_ANGLE,
-    WheelModel,
-    WheelState,
-    in_chunks,
-    load_and_slope,
-)
+from soilbus.terra.soil_laws import Array
+from soilbus.terra.wheel import MAX_ENTRY_ANGLE, MIN_ENTRY_ANGLE, WheelModel, WheelState, in_chunks, load_and_slope
 
 
 def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolerance: float = 1e-12) -> Array:

@@ -14,9 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.terra.pan import by_pan, pan_stresses, reaching
-from soilbus.terra.stress import Array, lumped_modulus
-from soilbus.terra.stresses import (
+from soilbus.terra.contact_stress import (
     Stress,
     by_exponential_share,
     by_leave,
@@ -30,6 +28,8 @@ from soilbus.terra.stresses import (
     stresses,
     unit_of,
 )
+from soilbus.terra.hardpan import by_pan, pan_stresses, reaching
+from soilbus.terra.soil_laws import Array, lumped_modulus
 from soilbus.terra.wheel_state import EXACT_NODES as EXACT_NODES
 from soilbus.terra.wheel_state import FAST_NODES as FAST_NODES
 from soilbus.terra.wheel_state import WheelModel as WheelModel

@@ -10,7 +10,7 @@ from functools import cache, cached_property
 
 import numpy as np
 
-from soilbus.config import Config, Prior
+from soilbus.config.model import Config, Prior
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from soilbus.simulator.scenario import Swing
-from soilbus.terra.stress import Array
+from soilbus.terra.soil_laws import Array
 from soilbus.terra.wheel import WheelState
 
 from .form import Form, Hidden, Setting, by_hooks

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from soilbus.config import Config
+from soilbus.config.model import Config
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import Scenario
 from soilbus.terra.effects.effect import Active, Effect

@@ -9,7 +9,7 @@ import numpy as np
 
 from soilbus.can.channels import Column
 from soilbus.simulator.recording import Recording
-from soilbus.terra.stress import Array
+from soilbus.terra.soil_laws import Array
 
 from .form import Form, Hidden, Setting, by_hooks
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import SAMPLE_RATE
-from soilbus.terra.stress import Array
+from soilbus.terra.soil_laws import Array
 
 from .form import Form, Hidden, Setting, by_hooks
 

@@ -16,8 +16,8 @@ from soilbus.terra.effects.along import instants
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active, Surroundings, forces_with
 from soilbus.terra.effects.sensors import read_late
+from soilbus.terra.soil_laws import Array
 from soilbus.terra.soils import soil_named
-from soilbus.terra.stress import Array
 from soilbus.terra.wheel import WheelModel, WheelState, state_on, wheel_forces
 
 from . import outside

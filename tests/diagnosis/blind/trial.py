@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from soilbus.assembly import model_of, prior_of, rig_of
 from soilbus.diagnosis.diagnose import NotFitted, diagnose
 from soilbus.diagnosis.records import Record, record_of
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.window import BinStore
 from soilbus.terra.effects.catalogue import CATALOGUE

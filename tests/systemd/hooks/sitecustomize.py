@@ -8,8 +8,8 @@ import time
 
 from soilbus.can.bus import LiveBus
 from soilbus.daemon import health
-from soilbus.daemon.estimator import WindowEstimator
 from soilbus.daemon.service import Service
+from soilbus.pipeline.estimator import WindowEstimator
 
 health.LONGEST_SOLVE = health.LONGEST_MUTE = 3.0
 step, estimate, send = Service.step, WindowEstimator.estimate, LiveBus.send

@@ -1,1 +1,0 @@
-"""What a soil lets the vehicle do, with standard deviations: pull, grade, slip, sinkage, torque."""

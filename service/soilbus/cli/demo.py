@@ -1,0 +1,145 @@
+"""`soilbus demo`: a simulated tractor, the service and a dashboard, without hardware.
+
+Three parties on one bus: the tractor's ECUs (simulator) send, the service estimates, the
+dashboard reads only the service's frames.  On vcan where the kernel has it, else on
+python-can's in-process virtual bus.  Time is compressed: the tractor's seconds pass
+faster, so the service's times are shortened by the same factor.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager
+
+import can
+from rich.console import Console
+
+from soilbus.can.bus import BusError, LiveBus, open_bus
+from soilbus.can.dbc_files import filters_of, output_database
+from soilbus.config.model import Config
+from soilbus.daemon.start import start_service
+from soilbus.pipeline.result import WindowResult
+from soilbus.report.dashboard import show
+from soilbus.report.received_frames import Readings
+from soilbus.report.table import table
+from soilbus.simulator.frames import frames
+from soilbus.simulator.play import send_in_time
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import demo as demo_scenario
+
+SPEED_UP = 8.0
+SEED = 1
+SHOWN_EVERY = 4.0
+
+
+def run_demo(duration: float) -> None:
+    """Drive `duration` simulated seconds from loam onto wet clay and show what the service says."""
+    console = Console()
+    real = reference_configuration()
+    recording = simulate(real, demo_scenario(duration), SEED)
+    messages = _every_second(frames(recording, real))
+    results: list[WindowResult] = []
+    with _bus_settings() as overrides:
+        where = "vcan" if any("socketcan" in o for o in overrides) else "the in-process virtual bus"
+        console.print(f"Simulated tractor on {where}: loam, then wet clay; {SPEED_UP:.0f} times as fast as real time.")
+        config = reference_configuration(overrides + _compressed(real))
+        ours = output_database(config)
+        bus = config.bus.model_dump()
+        ear = LiveBus(lambda: open_bus(bus, filters_of(ours)), time.monotonic, time.sleep)
+        with open_bus(bus, []) as tractor, closing(ear):
+            ear.open()
+            service = start_service(config, wait=False, on_window=results.append, rehearse=False)
+            sender = threading.Thread(target=send_in_time, args=(messages, tractor.send, SPEED_UP), daemon=True)
+            worker = threading.Thread(target=service.run, daemon=True)
+            worker.start()
+            sender.start()
+            show(Readings(ours), ear, console, done=lambda: not sender.is_alive())
+            service.stop()
+            worker.join(timeout=2.0)
+    console.print("\n" + _story(results), highlight=False, end="")
+
+
+def _every_second(messages: Iterable[can.Message]) -> list[can.Message]:
+    """Half of each message's frames: compressed time would ask too much of a small machine's bus."""
+    seen: Counter[int] = Counter()
+    kept = []
+    for message in messages:
+        seen[message.arbitration_id] += 1
+        if seen[message.arbitration_id] % 2:
+            kept.append(message)
+    return kept
+
+
+def _compressed(config: Config) -> list[str]:
+    """Overrides that shorten the service's times as the tractor's time is shortened.
+
+    And the vehicle's lengths with them: it drives past a border in so much less time, and
+    loads only know their ratios.
+    """
+    sizes = {
+        "estimator.window": config.estimator.window,
+        "estimator.hop": 2.0 * config.estimator.hop,
+        "estimator.bin": config.estimator.bin,
+    }
+    if config.vehicle is not None:
+        lengths = config.vehicle.model_dump(exclude={"mass"}, exclude_none=True)
+        sizes |= {f"vehicle.{name}": length for name, length in lengths.items()}
+    return [f"{key}={size / SPEED_UP}" for key, size in sizes.items()]
+
+
+@contextmanager
+def _bus_settings() -> Iterator[list[str]]:
+    """Overrides for a vcan of our own if we may make one, else for the virtual bus."""
+    name = "soilbusdemo"
+    made = _ip("link", "add", "dev", name, "type", "vcan") and _ip("link", "set", name, "up")
+    try:
+        overrides = ["bus.interface=socketcan", f"bus.channel={name}"]
+        if made and _works(overrides):
+            yield overrides
+        else:
+            yield ["bus.interface=virtual", f"bus.channel={name}"]
+    finally:
+        if made:
+            _ip("link", "del", name)
+
+
+def _works(overrides: list[str]) -> bool:
+    try:
+        open_bus(reference_configuration(overrides).bus.model_dump()).shutdown()
+    except BusError:
+        return False
+    return True
+
+
+def _ip(*words: str) -> bool:
+    try:
+        return subprocess.run(["ip", *words], capture_output=True, check=False).returncode == 0
+    except OSError:
+        return False
+
+
+def _story(results: list[WindowResult]) -> str:
+    """The windows some seconds apart, as a table."""
+    rows, due = [], 0.0
+    start = results[0].t if results else 0.0
+    for r in results:
+        t = (r.t - start) * SPEED_UP
+        if t + 1e-6 < due:
+            continue
+        due = t + SHOWN_EVERY
+        draft = r.traversability.max_draft
+        rows.append(
+            (
+                f"{t + 10.0:.0f}",
+                str(r.status),
+                "-" if r.bearing is None else f"{r.bearing.value / 1e3:.1f} ± {r.bearing.std / 1e3:.1f}",
+                "-" if draft is None else f"{draft.value:.0f} ± {draft.std:.0f}",
+                str(r.traversability.state).upper().replace("_", "-"),
+            )
+        )
+    return table(("tractor's s", "window", "bearing pressure, kPa", "max. draft, N", "decision"), rows)

@@ -1,0 +1,60 @@
+"""A configuration file with other effects, everything else as it was, comments included."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+
+from soilbus.can.dbc_files import located
+from soilbus.config.file import load_config, overridden
+
+EffectTable = Mapping[str, Any]
+"""name, and for each parameter {value, std} or, where wheels have their own, such a table for each wheel."""
+
+
+def with_effects_text(
+    path: Path, overrides: Iterable[str], effects: Sequence[EffectTable], place: Path, notes: Iterable[str] = ()
+) -> str:
+    """The text of the file at `path` with overrides in force and these effects, to be kept in the folder `place`.
+
+    DBC files are named so that they are found from there.  `notes` become comments at the
+    effects.  Raises ConfigError as load_config().
+    """
+    config = load_config(path, overrides)
+    document = overridden(tomlkit.parse(path.read_text(encoding="utf-8")), overrides)
+    if "model" not in document:
+        document["model"] = tomlkit.table()
+    document["model"]["effects"] = _array(effects)
+    for note in notes:
+        document["model"].add(tomlkit.comment(note))
+    if config.dbc.input:
+        document["dbc"]["input"] = [_from(place, config.folder, name) for name in config.dbc.input]
+    if (renamed := _from(place, config.folder, config.output.dbc)) != config.output.dbc:
+        document["output"]["dbc"] = renamed
+    return tomlkit.dumps(document)
+
+
+def _array(effects: Sequence[EffectTable]) -> Any:
+    array = tomlkit.array().multiline(len(effects) > 0)
+    for effect in effects:
+        array.append(_inline(effect))
+    return array
+
+
+def _inline(table: Mapping[str, Any]) -> Any:
+    inline = tomlkit.inline_table()
+    for key, value in table.items():
+        inline[key] = _inline(value) if isinstance(value, Mapping) else value
+    return inline
+
+
+def _from(place: Path, folder: Path, name: str) -> str:
+    """How a DBC file that a configuration in `folder` calls `name` is called by one in `place`."""
+    file = located(folder, name)
+    if located(place, name).resolve() == file.resolve():
+        return name
+    return os.path.relpath(file.resolve(), place.resolve())

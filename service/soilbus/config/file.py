@@ -1,0 +1,96 @@
+"""A configuration, from a file with KEY=VALUE overrides or as nested mappings -> a checked Config."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from soilbus.config.faults import fault_lines
+from soilbus.config.model import Config, ConfigError
+from soilbus.files import read_bounded
+
+LARGEST = 2**20
+"""Bytes of a configuration: a thousand times those of a tractor's."""
+_SHOWN = 60
+"""Characters of an override that a fault repeats."""
+
+
+def load_config(path: Path | str, overrides: Iterable[str] = ()) -> Config:
+    """Read a TOML file, apply KEY=VALUE overrides (dotted paths), check everything.
+
+    Raises ConfigError with one line for each fault.
+    """
+    path = Path(path)
+    try:
+        raw = tomllib.loads(read_bounded(path, LARGEST, regular=False).decode())
+    except OSError as error:
+        raise ConfigError([f"{path}: {error.strerror or error}"]) from None
+    except (ValueError, RecursionError) as error:
+        raise ConfigError([f"{path}: not TOML: {_why(error)}"]) from None
+    return parse_config(overridden(raw, overrides), folder=path.parent, source=str(path))
+
+
+def parse_config(raw: Mapping[str, Any], folder: Path = Path("."), source: str = "configuration") -> Config:
+    """Check a configuration given as nested mappings; ConfigError lists every fault."""
+    if "folder" in raw:
+        raise ConfigError([f"{source}: folder: unknown key"])
+    try:
+        return Config.model_validate({**raw, "folder": folder})
+    except ValidationError as error:
+        raise ConfigError(f"{source}: {line}" for line in fault_lines(raw, error)) from None
+
+
+def overridden(raw: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
+    """The nested mappings, changed in place by KEY=VALUE overrides; ConfigError for one that cannot be."""
+    for text in overrides:
+        _override(raw, text)
+    return raw
+
+
+def _override(raw: dict[str, Any], text: str) -> None:
+    key, equals, value = text.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not all(parts):
+        raise ConfigError([f"--set {text}: expected KEY=VALUE with a dotted key"])
+    try:
+        parsed = tomllib.loads(f"x = {value}")["x"]
+    except tomllib.TOMLDecodeError:
+        parsed = value.strip()
+    except (ValueError, RecursionError) as error:
+        raise ConfigError([f"--set {text[:_SHOWN]}...: {_why(error)}"]) from None
+    here: Any = raw
+    for i, part in enumerate(parts[:-1]):
+        here = _child(here, part, ".".join(parts[: i + 1]), text)
+    if isinstance(here, list):
+        raise ConfigError([f"--set {text}: {'.'.join(parts[:-1])} is a list"])
+    here[parts[-1]] = parsed
+
+
+def _why(error: ValueError | RecursionError) -> str:
+    """What the parser of TOML has against a text; an integer's digits and the depth it only minds by the way."""
+    if isinstance(error, RecursionError):
+        return "tables or lists nested too deeply"
+    if isinstance(error, (tomllib.TOMLDecodeError, UnicodeDecodeError)):
+        return str(error)
+    return "a number with too many digits"
+
+
+def _child(here: Any, part: str, path: str, text: str) -> Any:
+    """The table (or the wheel by name or number) that one step of a dotted key leads to."""
+    if isinstance(here, list):
+        for i, item in enumerate(here):
+            if part in (str(i), item.get("name") if isinstance(item, dict) else None):
+                return item
+        names = [item["name"] for item in here if isinstance(item, dict) and isinstance(item.get("name"), str)]
+        raise ConfigError([f"--set {text}: no {path}; there are {', '.join(names)}"])
+    child = here.setdefault(part, {})
+    if isinstance(child, str):  # "Message.Signal", or the name of a column, grows into its table form
+        here[part] = {"column" if path.startswith("table.") else "signal": child}
+        child = here[part]
+    if not isinstance(child, (dict, list)):
+        raise ConfigError([f"--set {text}: {path} is a value, not a table"])
+    return child

@@ -1,0 +1,532 @@
+"""TOML file -> typed, checked configuration.
+
+Every key, unit and default of soilbus stands here and nowhere else; an unknown key is an
+error.  Values are SI; a quantity in another unit says so in its name.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    field_validator,
+    model_validator,
+)
+
+from soilbus.words import did_you_mean
+
+CONTROL_FREE_NAME = r"^[A-Za-z0-9_-]{1,16}$"
+Name = Annotated[str, Field(pattern=CONTROL_FREE_NAME)]
+SignalName = Annotated[str, Field(pattern=r"^[^.\s]+\.[^.\s]+$")]
+
+
+class ConfigError(Exception):
+    """The configuration cannot be used; `faults` holds one line for each fault, whatever the names in it hold."""
+
+    def __init__(self, faults: Iterable[str]) -> None:
+        self.faults = [_printable(fault) for fault in faults]
+        super().__init__("\n".join(self.faults))
+
+
+def _printable(text: str) -> str:
+    """The text with line breaks and other control characters as Python writes them."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+@dataclass(frozen=True)
+class Usual:
+    """From the least to the greatest value that a real machine has; what lies outside is a slip of the pen.
+
+    `slips` are units in which the quantity is often written by mistake, with their SI value:
+    the one that makes the most ordinary value of it is named.
+    """
+
+    low: float
+    high: float
+    unit: str
+    slips: tuple[tuple[str, float], ...] = ()
+
+    def __call__(self, value: float) -> float:
+        """The same value; ValueError for one that no machine has."""
+        if not self.low <= value <= self.high:
+            raise ValueError(self._fault(value))
+        return value
+
+    def _fault(self, value: float) -> str:
+        unit = f" {self.unit}" if self.unit else ""
+        text = f"{value:g}{unit} is not from {self.low:g} to {self.high:g}{unit}"
+        middle = math.sqrt(max(self.low, self.high / 50.0) * self.high)
+        sensible = [(n, value * size) for n, size in self.slips if self.low <= value * size <= self.high]
+        if not sensible:
+            return text
+        name, meant = min(sensible, key=lambda slip: abs(math.log(max(slip[1], 1e-9) / middle)))
+        return f"{text}; is it in {name}? {value:g} {name} are {meant:.4g}{unit}"
+
+
+_SHORT = (("mm", 1e-3), ("cm", 1e-2))
+# From the smallest rovers and single-wheel test beds of the literature (radius 85 mm) to the largest
+# articulated tractors and harvesters (30 t, tyres of 2.2 m diameter), with a margin.
+RADIUS = Usual(0.05, 1.5, "m", _SHORT)
+WIDTH = Usual(0.02, 2.0, "m", _SHORT)
+MASS = Usual(20.0, 6.0e4, "kg", (("t", 1e3),))
+WHEELBASE = Usual(0.2, 8.0, "m", _SHORT)
+CG_AHEAD = Usual(0.02, 8.0, "m", _SHORT)
+HEIGHT = Usual(0.02, 4.0, "m", _SHORT)
+HITCH_HEIGHT = Usual(0.0, 2.5, "m", _SHORT)
+TRACK = Usual(0.15, 5.0, "m", _SHORT)
+GEAR_RATIO = Usual(0.1, 1000.0, "")
+WHEEL_TORQUE = Usual(5.0, 2.0e5, "N m", (("kN m", 1e3),))
+WINDOW = Usual(0.5, 600.0, "s", (("ms", 1e-3),))
+SHARE = Usual(0.0, 1.0, "", (("%", 1e-2),))
+# Soils: Wong, Theory of Ground Vehicles (2008), table 2.3, has phi of 6 to 38 degrees, n of 0.11 to 1.6, k_phi of
+# 43 to 5880 kN/m^(n+2), k_c up to 102 kN/m^(n+1), c up to 69 kPa, K of a few mm to cm; simulants reach n of 1.3.
+ANGLE = Usual(0.0, 1.05, "rad", (("degrees", math.pi / 180.0),))
+EXPONENT = Usual(0.0, 3.0, "")
+MODULUS_C = Usual(0.0, 1.0e7, "N/m^(n+1)")
+MODULUS_PHI = Usual(6.0e3, 1.0e9, "N/m^(n+2)", (("kN/m^(n+2)", 1e3),))
+COHESION = Usual(0.0, 1.0e6, "Pa")
+SHEAR_LENGTH = Usual(0.0, 0.5, "m", _SHORT)
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=False)
+
+
+class Bus(BaseModel):
+    """Handed to python-can; keys that are not ours go to the interface as they are."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+    interface: str = "socketcan"
+    channel: str = "can0"
+
+    @model_validator(mode="after")
+    def _no_typing_error(self) -> Bus:
+        for key in self.model_extra or {}:
+            if meant := did_you_mean(key, type(self).model_fields):
+                raise ValueError(f"{key}: unknown key{meant}")
+        return self
+
+
+class Dbc(_Section):
+    """DBC files that describe the vehicle's frames, beside the configuration or ours by name."""
+
+    input: list[str] = Field(default_factory=list)
+    checked: list[str] = Field(default_factory=list)
+    """Messages of the vehicle's own DBC that are believed only with a right Counter and Checksum (dbc/README.md)."""
+
+
+class Vehicle(_Section):
+    """Longitudinal vehicle; lengths m, mass kg, heights above the ground."""
+
+    mass: Annotated[PositiveFloat, AfterValidator(MASS)]
+    wheelbase: Annotated[PositiveFloat, AfterValidator(WHEELBASE)]
+    cg_ahead_of_rear_axle: Annotated[PositiveFloat, AfterValidator(CG_AHEAD)]
+    cg_height: Annotated[PositiveFloat, AfterValidator(HEIGHT)]
+    hitch_height: Annotated[NonNegativeFloat, AfterValidator(HITCH_HEIGHT)] = 0.5
+    track: Annotated[PositiveFloat, AfterValidator(TRACK)] | None = None
+    """Distance between the middles of the left and the right wheels; turns a yaw rate into a difference of speeds."""
+
+    @model_validator(mode="after")
+    def _cg_between_axles(self) -> Vehicle:
+        if self.cg_ahead_of_rear_axle >= self.wheelbase:
+            raise ValueError("cg_ahead_of_rear_axle must be less than wheelbase")
+        return self
+
+
+class Signal(_Section):
+    """Where a role's value comes from: "Message.Signal", or a table with more to say.
+
+    `sign` flips a sensor mounted the other way round.  `valid` names a signal (or a
+    signal of the same message) that must hold one of `valid_values` for the value to
+    count.  `at` tells on which side of the gear a torque or speed is measured.
+    `timeout` [s] is the age from which the channel counts as stale.  `delay` [s] is how much
+    earlier what a sample tells was true: a radar's filter, a receiver's solution, a queue.
+    """
+
+    signal: SignalName
+    sign: Literal[1, -1] = 1
+    at: Literal["wheel", "shaft"] | None = None
+    valid: str | None = None
+    valid_values: list[int] = Field(default_factory=lambda: [1])
+    timeout: PositiveFloat | None = None
+    delay: Annotated[float, Field(ge=-1.0, le=2.0)] = 0.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_text(cls, value: Any) -> Any:
+        return {"signal": value} if isinstance(value, str) else value
+
+
+class Wheel(_Section):
+    """One wheel and its sensors; radius is the rolling radius [m], width the tyre's [m].
+
+    `max_torque` [N m] is the motor's limit at the wheel where no signal tells it.  Only the
+    wheel of a test rig has no axle.  A rigid wheel has no tyre that could flatten or wear.
+    """
+
+    name: Name
+    axle: Literal["front", "rear"] | None = None
+    radius: Annotated[PositiveFloat, AfterValidator(RADIUS)]
+    width: Annotated[PositiveFloat, AfterValidator(WIDTH)]
+    tyre: Literal["flexible", "rigid"] = "flexible"
+    gear_ratio: Annotated[PositiveFloat, AfterValidator(GEAR_RATIO)] = 1.0
+    max_torque: Annotated[PositiveFloat, AfterValidator(WHEEL_TORQUE)] | None = None
+    torque: Signal | None = None
+    speed: Signal | None = None
+    load: Signal | None = None
+    sinkage: Signal | None = None
+    torque_limit: Signal | None = None
+    motor_speed: Signal | None = None
+    """Only to find out a speed sensor that lies."""
+
+    @model_validator(mode="after")
+    def _can_be_used(self) -> Wheel:
+        if self.torque is not None and self.load is None:
+            raise ValueError(f"wheel {self.name} has a torque but no load: map `load` to its load cell")
+        if self.torque is not None and self.speed is None:
+            raise ValueError(f"wheel {self.name} has a torque but no speed: map `speed`, else it has no slip")
+        return self
+
+    @property
+    def lacking(self) -> list[str]:
+        """The roles that are not mapped of those without which the wheel counts for nothing."""
+        return [role for role in ("torque", "speed", "load") if getattr(self, role) is None]
+
+
+class Signals(_Section):
+    """Signals of the whole vehicle."""
+
+    ground_speed: Signal | None = None
+    draft: Signal | None = None
+    pitch: Signal | None = None
+    acceleration: Signal | None = None
+    yaw_rate: Signal | None = None
+    """Positive to the left [rad/s]; tells turns from wheels that spin on one side."""
+    latitude: Signal | None = None
+    """WGS84, positive north; only for the map."""
+    longitude: Signal | None = None
+    """WGS84, positive east."""
+
+    @model_validator(mode="after")
+    def _whole_position(self) -> Signals:
+        if (self.latitude is None) != (self.longitude is None):
+            raise ValueError("a position needs both latitude and longitude")
+        return self
+
+
+class Column(_Section):
+    """A column of a table: its name, or a table with the factor that brings it to SI."""
+
+    column: Annotated[str, Field(min_length=1)]
+    factor: float = 1.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_text(cls, value: Any) -> Any:
+        return {"column": value} if isinstance(value, str) else value
+
+    @field_validator("factor")
+    @classmethod
+    def _not_zero(cls, value: float) -> float:
+        if value == 0.0:
+            raise ValueError("a factor of 0 leaves nothing of the column")
+        return value
+
+
+class Table(_Section):
+    """A test rig's table, each row one steady state: where its quantities stand.
+
+    wheel_load [N], drawbar_pull [N] positive forward, torque [N m] about the axle, slip
+    (1 - V/(r omega)), sinkage [m], t [s].  The soil bed is the same in all rows, or in those
+    with the same value of the column `run`.  Only rows that equal `where` count.
+    """
+
+    wheel_load: Column
+    slip: Column
+    drawbar_pull: Column | None = None
+    torque: Column | None = None
+    sinkage: Column | None = None
+    t: Column | None = None
+    run: Annotated[str, Field(min_length=1)] | None = None
+    where: dict[str, Any] = Field(default_factory=dict)
+
+    @field_validator("where")
+    @classmethod
+    def _comparable(cls, value: dict[str, Any]) -> dict[str, Any]:
+        for column, wanted in value.items():
+            if isinstance(wanted, bool) or not isinstance(wanted, (str, int, float)):
+                raise ValueError(f"{column} must be a text or a number")
+        return value
+
+    @model_validator(mode="after")
+    def _tells_something(self) -> Table:
+        if self.drawbar_pull is self.torque is self.sinkage is None:
+            raise ValueError("map at least one of drawbar_pull, torque and sinkage: nothing to compare the model with")
+        return self
+
+    @property
+    def columns(self) -> dict[str, Column]:
+        """The mapped columns of numbers, by role."""
+        roles = ("wheel_load", "slip", "drawbar_pull", "torque", "sinkage", "t")
+        return {role: column for role in roles if (column := getattr(self, role)) is not None}
+
+
+class Noise(_Section):
+    """One channel's error: sd of each sample and sd of a gain fixed over a recording.
+
+    The sd of a sample adds three parts in quadrature: `absolute` (the channel's SI
+    unit), `relative` (of the reading), `of_mean` (of the window's mean magnitude).
+    """
+
+    absolute: NonNegativeFloat = 0.0
+    relative: Annotated[NonNegativeFloat, AfterValidator(SHARE)] = 0.0
+    of_mean: Annotated[NonNegativeFloat, AfterValidator(SHARE)] = 0.0
+    gain: Annotated[NonNegativeFloat, AfterValidator(SHARE)] = 0.0
+
+    @model_validator(mode="after")
+    def _not_perfect(self) -> Noise:
+        if self.absolute + self.relative + self.of_mean == 0.0:
+            raise ValueError("a sensor without any noise cannot be weighed: give absolute, relative or of_mean")
+        return self
+
+
+class NoiseOfChannels(_Section):
+    """Noise of each channel; the defaults are those of a well-instrumented tractor."""
+
+    torque: Noise = Noise(of_mean=0.02, gain=0.01)
+    load: Noise = Noise(relative=0.02, gain=0.01)
+    speed: Noise = Noise(relative=0.003, gain=0.002)
+    ground_speed: Noise = Noise(relative=0.01, gain=0.003)
+    draft: Noise = Noise(absolute=60.0, gain=0.01)
+    sinkage: Noise = Noise(absolute=0.005)
+    pitch: Noise = Noise(absolute=0.003)
+    acceleration: Noise = Noise(absolute=0.02)
+    yaw_rate: Noise = Noise(absolute=0.01)
+    slip: Noise = Noise(absolute=0.005)
+    """Of a table that tells slip itself; its gain is the relative error of 1 - slip."""
+
+    @field_validator("sinkage", "pitch", "acceleration", "yaw_rate")
+    @classmethod
+    def _without_gain(cls, noise: Noise) -> Noise:
+        if noise.gain:
+            raise ValueError("a fixed gain error of this sensor is not estimated: say it in absolute or relative")
+        return noise
+
+
+class Prior(_Section):
+    """What is known of a soil parameter beforehand; std = 0 holds it at value."""
+
+    value: NonNegativeFloat
+    std: NonNegativeFloat
+
+    @model_validator(mode="after")
+    def _free_is_positive(self) -> Prior:
+        if self.std > 0.0 and self.value == 0.0:
+            raise ValueError("value must be above 0 unless std = 0 holds it")
+        return self
+
+
+def _prior(usual: Usual) -> AfterValidator:
+    """Check of a prior: its value, if it has one, and its std must be ones that soils have."""
+
+    def checked(prior: Prior) -> Prior:
+        for key, value in (("value", prior.value), ("std", prior.std)):
+            try:
+                if value > 0.0 and (key == "value" or value > usual.high):
+                    usual(value)
+            except ValueError as error:
+                raise ValueError(f"{key}: {error}") from None
+        return prior
+
+    return AfterValidator(checked)
+
+
+class SoilPrior(_Section):
+    """Prior of each soil parameter (SI, phi in rad), for tilled soils of all textures.
+
+    `soilbus check` names the known soils outside of it: stiff clays of 69 kPa, for one.
+    A free parameter's prior is log-normal with median `value`; std/value is its
+    coefficient of variation.
+    """
+
+    k_c: Annotated[Prior, _prior(MODULUS_C)] = Prior(value=6.0e3, std=1.2e4)
+    k_phi: Annotated[Prior, _prior(MODULUS_PHI)] = Prior(value=8.0e5, std=1.4e6)
+    n: Annotated[Prior, _prior(EXPONENT)] = Prior(value=0.6, std=0.4)
+    phi: Annotated[Prior, _prior(ANGLE)] = Prior(value=0.40, std=0.20)
+    c: Annotated[Prior, _prior(COHESION)] = Prior(value=3.0e3, std=2.0e3)
+    K: Annotated[Prior, _prior(SHEAR_LENGTH)] = Prior(value=0.02, std=0.01)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _complete(cls, value: Any) -> Any:
+        """What one key of a parameter leaves open keeps its default."""
+        if not isinstance(value, Mapping):
+            return value
+        defaults = {name: field.default for name, field in cls.model_fields.items()}
+        return {
+            name: {**defaults[name].model_dump(), **prior} if name in defaults and isinstance(prior, Mapping) else prior
+            for name, prior in value.items()
+        }
+
+
+class Estimator(_Section):
+    """Window estimation; times s, speeds m/s, lengths m."""
+
+    window: Annotated[PositiveFloat, AfterValidator(WINDOW)] = 10.0
+    hop: PositiveFloat = 1.0
+    soil_drift: NonNegativeFloat = 0.015
+    """How far the soil may wander in the time of one window, as sd of a relative change."""
+    bin: PositiveFloat = 0.1
+    """Samples are averaged over bins of this length before the fit."""
+    min_speed: PositiveFloat = 0.2
+    """Below it slip is not judged (standstill gate)."""
+    max_turn: PositiveFloat = 0.15
+    """Relative difference of speeds left and right in a turn above which slip is not judged (turn gate)."""
+    z_ref: PositiveFloat = 0.02
+    b_ref: PositiveFloat = 0.3
+    max_bearing_std: PositiveFloat = 0.10
+    """Relative std of the bearing pressure up to which a window counts as excited."""
+    max_tan_phi_std: PositiveFloat = 0.15
+    """Relative std of tan phi up to which a window counts as excited."""
+    max_chi2: PositiveFloat = 1.1
+    """Reduced chi-square, beyond its own scatter, above which the model does not describe the data."""
+    search_rate: NonNegativeFloat = 4.0
+    """Evaluations of the model on a whole window that a search for another soil may take, for each window; windows that
+    the model describes take 1 to 3 in all (field and simulated drives)."""
+    search_burst: PositiveFloat = 100.0
+    """Most of these that are kept for later: three times what searches at nine of ten starts and borders take (34)."""
+
+    @model_validator(mode="after")
+    def _lengths_fit(self) -> Estimator:
+        if not self.bin <= self.hop <= self.window:
+            raise ValueError("bin <= hop <= window must hold")
+        return self
+
+
+class Traversability(_Section):
+    """When soilbus says go; draft N, slopes rad."""
+
+    max_slip: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.6
+    max_sinkage: PositiveFloat = 0.25
+    """Sinkage [m] that no wheel may pass: ground clearance."""
+    margin: NonNegativeFloat = 0.15
+    """Share of the present demand that must be left over."""
+    go: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.95
+    """Probability from which the state is go."""
+    no_go: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.50
+    """Probability below which the state is no_go."""
+    hysteresis: NonNegativeFloat = 0.25
+    """Standard deviations by which a better state must pass its threshold."""
+    hold: PositiveInt = 2
+    """Windows in a row that must speak for a better state."""
+    max_age: PositiveFloat = 3.0
+    """Seconds after the last instant that it rests on from which a posterior no longer supports go."""
+    min_share: Annotated[float, Field(gt=0.0, le=1.0)] = 0.15
+    """Share of a window that must be measured on the present ground: since it changed, since a wheel last spun."""
+    spin_time: PositiveFloat = 0.4
+    """Seconds for which a wheel beyond max_slip, or thrust that moves nothing, ends go: with means over 0.3 s and a
+    look every 0.1 s, within one second."""
+    stuck_time: PositiveFloat = 1.2
+    """Seconds for which a vehicle makes no way under thrust from which it is stuck; no start takes as long to show."""
+    standstill: PositiveFloat = 0.05
+    """Rim speed [m/s] below which a wheel does not turn: two impulses a second of a ring of 100 teeth at 0.5 m."""
+    stall_resistance: PositiveFloat = 0.15
+    """Thrust beyond draft, slope and inertia, as a share of the weight, from which a vehicle whose wheels do not turn
+    stalls: more than an idling drive gives, less than wheels of any size need on loam (0.2 by this model)."""
+    contradiction: PositiveFloat = 3.0
+    """Standard deviations by which the wheels must pull less at their present slip than predicted for it to count."""
+    full_torque: Annotated[float, Field(gt=0.0, le=1.0)] = 0.95
+    """Share of its torque limit from which a motor gives all it can: ripple and gain error of a torque sensor."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Traversability:
+        if self.no_go >= self.go:
+            raise ValueError("no_go must be less than go")
+        return self
+
+
+class Effect(BaseModel):
+    """A physical effect of the catalogue with its parameters."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+    name: str
+
+
+class Form(_Section):
+    """How far the contact of wheel and soil may differ in form from the model, as root mean squares; 0: not at all.
+
+    The greatest stress sits at (c1 + c2 s) of the entry angle, where the model has 0.5: c1 is 0.18 in loose and
+    0.43 in compact sand, c2 0.32 in both (Wong & Reece 1967, J. Terramechanics 4:81); an even
+    spread from those to the model's gives 0.32 / sqrt(3) for each.
+    """
+
+    peak: NonNegativeFloat = 0.18
+    """Of c1."""
+    peak_by_slip: NonNegativeFloat = 0.18
+    """Of c2."""
+    exit: NonNegativeFloat = 0.1
+    """Of the exit angle behind the axle over the entry angle: a rut that springs back by the square of it."""
+    shear: NonNegativeFloat = 0.7
+    """Of the share of the strength that the other shear law mobilises: either law as likely as the other."""
+
+
+class Model(_Section):
+    """The wheel-soil model: base choices and added effects."""
+
+    shear_law: Literal["exponential", "rational"] = "exponential"
+    effects: list[Effect] = Field(default_factory=list)
+    form: Form = Form()
+
+
+class Output(_Section):
+    """What soilbus sends."""
+
+    dbc: str = "soilbus.dbc"
+
+
+class Config(_Section):
+    """The whole configuration."""
+
+    bus: Bus = Bus()
+    dbc: Dbc = Dbc()
+    vehicle: Vehicle | None = None
+    wheel: list[Wheel] = Field(default_factory=list, max_length=8)
+    signals: Signals = Signals()
+    table: Table | None = None
+    noise: NoiseOfChannels = NoiseOfChannels()
+    soil: SoilPrior = SoilPrior()
+    estimator: Estimator = Estimator()
+    traversability: Traversability = Traversability()
+    model: Model = Model()
+    output: Output = Output()
+    folder: Path = Field(default=Path("."), exclude=True)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Config:
+        names = [w.name for w in self.wheel]
+        for name in {n for n in names if names.count(n) > 1}:
+            raise ValueError(f"two wheels are named {name}")
+        if len(self.wheel) > 1 and self.vehicle is None:
+            raise ValueError("several wheels need a [vehicle]")
+        if self.table is not None and (self.vehicle is not None or len(self.wheel) != 1):
+            raise ValueError("[table] is of a test rig: exactly one [[wheel]] and no [vehicle]")
+        for w in self.wheel:
+            if w.axle is None and self.table is None:
+                raise ValueError(f"wheel {w.name}: axle: missing")
+        return self
+
+    @property
+    def soil_prior(self) -> dict[str, Prior]:
+        """Prior by parameter name, in the order k_c, k_phi, n, phi, c, K."""
+        return {name: getattr(self.soil, name) for name in SoilPrior.model_fields}

@@ -1,0 +1,258 @@
+"""What outlives the process: one JSON file that is whole or is not there, and that is believed only after checks.
+
+Written to a file beside it, brought to the disk, then renamed, so that a power cut at any
+moment leaves the old file or the new one.  Read back, a file counts only if it is of this
+format and version, belongs to this very configuration, has the checksum it says, and holds
+a belief that this vehicle's estimator could have had.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import stat
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from cantools.database.can import Database
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, NonNegativeInt, PositiveInt, ValidationError
+
+from soilbus.can.channels import Channel
+from soilbus.config.model import Config
+from soilbus.estimation.assembly import completion_of, model_of, prior_of, rig_of
+from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.parametrization import MAX_PHI
+from soilbus.estimation.posterior import PARAMETERS
+from soilbus.estimation.tracker import elsewhere, gain_errors
+
+Array = NDArray[np.float64]
+
+FORMAT, VERSION = "soilbus state", 1
+LARGEST = 1 << 20
+"""Bytes of a file beyond which it is not ours."""
+FAR = 8.0
+"""Prior standard deviations beyond which no belief of ours lies, and by which its own may be wider."""
+SECTIONS = {"vehicle", "wheel", "signals", "noise", "soil", "estimator", "model"}
+"""Sections of the configuration that a belief depends on."""
+_PHI = PARAMETERS.index("phi")
+
+
+class StateError(Exception):
+    """A stored state cannot be used; one line on why."""
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class StoredBelief(_Model):
+    """A belief and when it was had [s, Unix]; SI, gains relative, covariance of the soil's logarithms and the gains."""
+
+    at: NonNegativeFloat
+    soil: dict[str, NonNegativeFloat]
+    gains: dict[str, float]
+    covariance: list[list[float]]
+
+
+class State(_Model):
+    """What is stored: when [s, Unix], how often the service was started, the belief, counters since the first start."""
+
+    at: NonNegativeFloat
+    starts: PositiveInt
+    belief: StoredBelief | None
+    totals: dict[Annotated[str, Field(max_length=80)], NonNegativeInt] = Field(max_length=1000)
+
+
+class _File(_Model):
+    """The envelope; `checksum` is the SHA-256 of the state's canonical JSON."""
+
+    format: str
+    version: int
+    key: str
+    checksum: str
+    state: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Owner:
+    """Whose state a file may hold: the digest of all that a belief depends on, and what bounds such a belief.
+
+    median, std: of the soil parameters (6,) and gain errors (G,) named in `gains`; std 0 is held.
+    """
+
+    key: str
+    gains: tuple[str, ...]
+    median: Array
+    std: Array
+
+    @classmethod
+    def of(cls, config: Config, channels: Iterable[Channel], database: Database) -> Owner:
+        """The vehicle of a configuration, with the signals that its channels come from."""
+        prior = prior_of(config)
+        names, gain_std = gain_errors(rig_of(config), model_of(config), completion_of(config)[1])
+        return cls(
+            _digest([config.model_dump(mode="json", include=SECTIONS), [_wiring(c, database) for c in channels]]),
+            tuple(names),
+            np.concatenate([prior.median, np.zeros(len(names))]),
+            np.concatenate([elsewhere(prior).log_std, gain_std]),
+        )
+
+
+def stored_belief(belief: Belief, at: float, owner: Owner) -> StoredBelief:
+    """The belief as it is stored; StateError for one that could not be read back."""
+    _check(belief, owner)
+    return StoredBelief(
+        at=at,
+        soil=dict(zip(PARAMETERS, belief.soil.tolist(), strict=True)),
+        gains=dict(zip(owner.gains, belief.gains.tolist(), strict=True)),
+        covariance=belief.covariance.tolist(),
+    )
+
+
+def belief_of(stored: StoredBelief, owner: Owner) -> Belief:
+    """The belief that was stored; StateError where this vehicle's estimator cannot have had it."""
+    if tuple(stored.soil) != PARAMETERS or tuple(stored.gains) != owner.gains:
+        raise StateError("the belief is of other parameters")
+    rows = stored.covariance
+    if len(rows) != len(owner.std) or any(len(row) != len(owner.std) for row in rows):
+        raise StateError("the belief's covariance has another shape")
+    belief = Belief(np.array(list(stored.soil.values())), np.array(list(stored.gains.values())), np.array(rows))
+    _check(belief, owner)
+    return belief
+
+
+def _check(belief: Belief, owner: Owner) -> None:
+    """Raises StateError unless the belief is finite, physical, and has a proper covariance."""
+    if not all(np.isfinite(part).all() for part in (belief.soil, belief.gains, belief.covariance)):
+        raise StateError("the belief is not finite")
+    n_soil = len(PARAMETERS)
+    free, median = owner.std[:n_soil] > 0.0, owner.median[:n_soil]
+    physical = (belief.soil[free] > 0.0).all() and belief.soil[_PHI] <= max(MAX_PHI, median[_PHI])
+    if physical:
+        off = np.concatenate([np.log(belief.soil[free]) - np.log(median[free]), belief.gains])
+        std = np.concatenate([owner.std[:n_soil][free], owner.std[n_soil:]])
+        physical = (np.abs(off) <= FAR * std).all() and np.allclose(belief.soil[~free], median[~free])
+    if not physical:
+        raise StateError("the belief is out of physical bounds")
+    _check_covariance(belief.covariance, owner.std)
+
+
+def _check_covariance(covariance: Array, std: Array) -> None:
+    """Raises StateError unless it (N, N) is symmetric and positive definite, and zero for what is held (std (N,) 0)."""
+    held, variance = std == 0.0, np.diag(covariance)
+    if covariance[held].any() or covariance[:, held].any() or not (variance[~held] > 0.0).all():
+        raise StateError("the belief's covariance is not positive definite")
+    if (variance > (FAR * std) ** 2).any():
+        raise StateError("the belief's covariance is out of bounds")
+    scale = np.sqrt(variance[~held])
+    with np.errstate(over="ignore"):
+        correlation = covariance[np.ix_(~held, ~held)] / np.outer(scale, scale)
+    if not np.allclose(correlation, correlation.T, rtol=0.0, atol=1e-9):
+        raise StateError("the belief's covariance is not symmetric")
+    try:
+        if not (np.abs(correlation) < 1.0 + 1e-9).all():
+            raise np.linalg.LinAlgError
+        np.linalg.cholesky(correlation)
+    except np.linalg.LinAlgError:
+        raise StateError("the belief's covariance is not positive definite") from None
+
+
+def dumped(state: State, owner: Owner) -> bytes:
+    """The file's content."""
+    content = state.model_dump()
+    envelope = {"format": FORMAT, "version": VERSION, "key": owner.key, "checksum": _digest(content), "state": content}
+    return (json.dumps(envelope, allow_nan=False) + "\n").encode()
+
+
+def loaded(content: bytes, owner: Owner) -> State:
+    """The state in a file's content; StateError where it cannot be used, whatever the bytes are."""
+    try:
+        raw = json.loads(content)
+    except (ValueError, RecursionError):
+        raise StateError("it is damaged: not JSON") from None
+    if not isinstance(raw, dict) or raw.get("format") != FORMAT:
+        raise StateError("it is not a state of soilbus")
+    if raw.get("version") != VERSION:
+        raise StateError(f"it is of version {str(raw.get('version'))[:20]}, this is {VERSION}")
+    try:
+        file = _File.model_validate(raw)
+        if file.checksum != _digest(file.state):
+            raise StateError("it is damaged: wrong checksum")
+        if file.key != owner.key:
+            raise StateError("it belongs to another configuration")
+        state = State.model_validate(file.state)
+    except (ValidationError, ValueError, RecursionError, OverflowError) as error:
+        raise StateError(f"it is damaged: {_one_line(error)}") from None
+    if state.belief is not None:
+        belief_of(state.belief, owner)
+    return state
+
+
+def read(path: Path, owner: Owner) -> State | None:
+    """The state in a file, None where there is no file; StateError where it cannot be used."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW)
+        with open(descriptor, "rb") as file:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise StateError("it is no file")
+            content = file.read(LARGEST + 1)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise StateError(error.strerror or str(error)) from None
+    if len(content) > LARGEST:
+        raise StateError("it is too large to be a state of soilbus")
+    return loaded(content, owner)
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Put the file in the place of the old one, on the disk; OSError where that fails, the old one stays then."""
+    beside = path.with_name(path.name + ".new")
+    try:
+        with open(beside, "wb", opener=_private) as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(beside, path)
+    except OSError:
+        with suppress(OSError):
+            beside.unlink()
+        raise
+    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def _private(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o600)  # a pipe in its place halts nobody
+
+
+def _digest(content: Any) -> str:
+    """SHA-256 of the canonical JSON."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def _wiring(channel: Channel, database: Database) -> list[Any]:
+    """Where a channel's values come from, down to the bit."""
+    message = database.get_message_by_name(channel.message)
+    signals = [message.get_signal_by_name(s) for s in (channel.signal, channel.valid_signal) if s is not None]
+    return [
+        channel.name, channel.factor, channel.offset, channel.low, channel.high, list(channel.valid_values),
+        message.frame_id, message.is_extended_frame, message.length,
+        *([s.start, s.length, s.byte_order, s.is_signed, s.is_float, float(s.scale), float(s.offset)] for s in signals),
+    ]  # fmt: skip
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, ValidationError):
+        first = error.errors()[0]
+        return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:200]
+    return " ".join(str(error).split())[:200]

@@ -1,0 +1,95 @@
+"""The windows that the worker has, and their results in order."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, wait
+from typing import NamedTuple
+
+from soilbus.allocator import Tidying
+from soilbus.pipeline.intake import WindowTask
+from soilbus.pipeline.result import WindowResult
+
+MAX_PENDING = 3
+"""Windows that may wait for the worker."""
+TIDIED, NEEDED, SPARE = 60, 4_000_000, 2_500_000
+"""After each so many windows memory that is free is given back, but for the bytes that the next window needs, and
+those that a day's scattered rests will take."""
+
+
+class Pending(NamedTuple):
+    """A window that the worker has, ended at a monotonic time [s] in an epoch of the intake."""
+
+    future: Future[WindowResult]
+    at: float
+    epoch: int
+
+
+def wait_for(future: Future[WindowResult], longest: float) -> None:
+    """Returns when the result is there, or after `longest` [s]."""
+    wait([future], longest)
+
+
+class Backlog:
+    """What `workers` (one thread) has to solve; it works beside the loop, which never waits for it for long.
+
+    `waiting` waits for a future, so many seconds at most.
+    """
+
+    def __init__(
+        self,
+        workers: Executor,
+        solve: Callable[[WindowTask], WindowResult],
+        now: float,
+        waiting: Callable[[Future[WindowResult], float], None] = wait_for,
+    ) -> None:
+        self._workers, self._solve, self._waiting = workers, solve, waiting
+        self._pending: deque[Pending] = deque()
+        self._busy_since = now
+        self._tidy = Tidying(NEEDED, SPARE)
+        self.solved = 0
+        """Windows solved since the start."""
+
+    def __bool__(self) -> bool:
+        return bool(self._pending)
+
+    @property
+    def solving_since(self) -> float | None:
+        """When the worker began with the oldest window, or got it [s]; None where it has none."""
+        return self._busy_since if self._pending else None
+
+    @property
+    def has_result(self) -> bool:
+        """Whether the oldest window is solved."""
+        return bool(self._pending) and self._pending[0].future.done()
+
+    def add(self, task: WindowTask, ended: float, epoch: int, now: float) -> int:
+        """Give the worker a window that ended at a monotonic time [s]; how many it cannot keep up with are dropped."""
+        if not self._pending:
+            self._busy_since = now
+        self._pending.append(Pending(self._workers.submit(self._solve, task), ended, epoch))
+        dropped = 0
+        while len(self._pending) > MAX_PENDING and self._pending[1].future.cancel():
+            del self._pending[1]
+            dropped += 1
+        return dropped
+
+    def wait(self, longest: float) -> None:
+        """Until the oldest window is solved, `longest` [s] at most."""
+        if self._pending and longest > 0.0:
+            self._waiting(self._pending[0].future, longest)
+
+    def results(self, now: float) -> Iterator[tuple[WindowResult, Pending]]:
+        """The windows that are solved, in their order; once in a while the worker then tidies up."""
+        while self.has_result:
+            pending = self._pending.popleft()
+            self._busy_since = now
+            self.solved += 1
+            yield pending.future.result(), pending
+            if self.solved % TIDIED == 0:
+                self._workers.submit(self._tidy)
+
+    def close(self) -> None:
+        """Solve no more."""
+        self._workers.shutdown(wait=False, cancel_futures=True)

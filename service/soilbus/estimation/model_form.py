@@ -1,0 +1,115 @@
+"""What the form of the wheel-soil model leaves open of a window's estimate.
+
+No soil's contact has exactly the configured form: the greatest stress may sit elsewhere than the model has
+it, the rut may come up again behind the axle, the shear strength may be mobilised by the other law.  Along
+a few form parameters f (prior: `Spread`) the window is linear about its optimum,
+
+    residuals = r + J theta + B f,    prior factor: theta - S_0 f,
+
+with theta the soil's coordinates and the active gains.  The estimate stays that of the configured form, f = 0:
+theta(f) = S f with S = -H^-1 (J' W B - H_0 S_0), H = J' W J + H_0, is what another form would have made of the same
+data (a considered parameter: Schmidt 1966; Tapley, Schutz & Born, Statistical Orbit Determination, 2004,
+ch. 6).  What the residuals tell of f has a mean and a covariance; their second moment M about f = 0
+is how far the estimate may be off by its form, and S M S' adds to its covariance: less than by the prior
+alone where the data speak for the configured form, as much where they cannot tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.estimation.gaussian import solved
+from soilbus.estimation.posterior import PARAMETERS
+from soilbus.terra.wheel import WheelModel
+
+if TYPE_CHECKING:
+    from soilbus.estimation.multistart import Fit
+    from soilbus.estimation.solver import Fitting
+
+Array = NDArray[np.float64]
+
+FORM = ("peak", "peak_by_slip", "exit", "shear")
+"""Form parameters: of the angle of greatest stress over the entry angle, of its change with slip, of the exit angle
+behind the axle over the entry angle, and the share of the shear strength that the other law mobilises."""
+_SOIL = len(PARAMETERS)
+
+
+@dataclass(frozen=True, slots=True)
+class FormLeft:
+    """What a window, and those before it, leave open by the form.
+
+    by_form (6 + G, 4): derivatives of the soil's logarithms and of the gains by FORM; mean (4,) and covariance (4, 4):
+    what the data tell of these, 0 being the configured form.
+    """
+
+    by_form: Array
+    mean: Array
+    covariance: Array
+
+    @classmethod
+    def of(cls, spread: Array, n_gains: int) -> FormLeft:
+        """Before any data: the prior, root mean squares (4,) about the configured form."""
+        return cls(np.zeros((_SOIL + n_gains, len(FORM))), np.zeros(len(FORM)), np.diag(np.asarray(spread) ** 2))
+
+    def drifted(self, spread: Sequence[float], share: float) -> FormLeft:
+        """Later: the form may have changed by this share of the prior variance, up to all of it."""
+        return replace(self, covariance=self.covariance + min(share, 1.0) * np.diag(np.asarray(spread) ** 2))
+
+    @property
+    def moment(self) -> Array:
+        """Second moment (4, 4) about the configured form."""
+        return self.covariance + np.outer(self.mean, self.mean)
+
+    @property
+    def log_covariance(self) -> Array:
+        """What the form adds to the covariance (6, 6) of the soil's logarithms."""
+        of_soil = self.by_form[:_SOIL]
+        return np.asarray(of_soil @ self.moment @ of_soil.T)
+
+
+def formed(model: WheelModel, step: Array) -> WheelModel:
+    """The model with the form parameters so far (4,) from its own."""
+    peak, by_slip, leave, other = step.tolist()
+    if model.shear_law == "exponential":  # the same, with a share that can be taken away
+        model, other = replace(model, shear_law="rational", exponential_share=1.0), -other
+    return replace(
+        model,
+        peak_c1=model.peak_c1 + peak,
+        peak_c2=model.peak_c2 + by_slip,
+        exit_ratio=model.exit_ratio - leave,
+        exponential_share=model.exponential_share + other,
+        one_off=True,
+    )
+
+
+def form_left(fitting: Fitting, fit: Fit, before: FormLeft) -> FormLeft:
+    """What a window's fit leaves open, given what was left before it; that where the window tells nothing."""
+    problem, optimum = fitting.problem, fit.optimum
+    around = fitting.around(optimum)
+    open_ = np.flatnonzero(np.diag(before.covariance) > 0.0)
+    if around is None or not len(open_):
+        return before
+    rows, weighed = problem.by_form(optimum)
+    rows, weighed = rows[:, open_], weighed[:, open_]
+    by_prior, precision, off = fitting.earlier.by_mean(optimum.soil, optimum.gains, before.by_form[:, open_])
+    slopes = fitting.earlier_slopes(optimum)
+    columns = weighed.T @ optimum.at.rows
+    mixed = (columns @ around.directions) + by_prior.T @ precision @ slopes
+    gradient = columns[:, 0] + by_prior.T @ (precision @ off)
+    information = rows.T @ weighed + by_prior.T @ precision @ by_prior
+    own = solved(before.covariance[np.ix_(open_, open_)], before.mean[open_])
+    if own is None:
+        return before
+    of_gradient, of_information = around.explained(mixed)
+    told = solved(information - of_information + own[1], own[0] - gradient + of_gradient)
+    if told is None:
+        return before
+    by_form, mean, covariance = np.zeros_like(before.by_form), np.zeros(len(FORM)), np.zeros((len(FORM),) * 2)
+    by_form[:, open_] = -fitting.spread(optimum) @ around.covariance @ mixed.T
+    mean[open_], covariance[np.ix_(open_, open_)] = told
+    return FormLeft(by_form, mean, covariance)

@@ -1,0 +1,56 @@
+"""From recorded logs, or tables of a test rig, to a diagnosis."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from soilbus.can.dbc_files import load_databases
+from soilbus.config.model import Config
+from soilbus.diagnosis.diagnose import Diagnosis, NotFitted, diagnose
+from soilbus.estimation.assembly import possible_effects, prior_of
+from soilbus.estimation.posterior import Posterior
+from soilbus.offline.recordings import Recordings, recordings_of
+from soilbus.offline.tables import candidates, recordings_of_tables
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """A diagnosis with what it was made from; seconds is how long it took without reading [s]."""
+
+    diagnosis: Diagnosis
+    recordings: Recordings
+    config: Config
+    seconds: float
+
+    def soils(self) -> list[tuple[str, Posterior, Posterior]]:
+        """Name, soil before and soil after of the first part of each log."""
+        names, found = [record.name for record in self.recordings.records], self.diagnosis
+        return [(names[i], found.soil_before(i), found.soil_after(i)) for i in self.recordings.first]
+
+
+def diagnose_logs(config: Config, logs: Sequence[Path], say: Callable[[str], None] | None = None) -> Findings:
+    """Reads the logs and diagnoses them together; `say` is told what is being done.  With [table] logs are tables.
+
+    Raises LogError and TooLittle as recordings_of(), NotFitted where the present model
+    cannot be fitted, ConfigError where configuration and database do not fit.
+    """
+    tell = say or (lambda _: None)
+    if config.table is None:
+        recordings = recordings_of(
+            config, load_databases(config), logs, lambda frames, _: tell(f"reading, {frames} frames") if say else None
+        )
+        catalogue = possible_effects(config)
+    else:
+        recordings = recordings_of_tables(config, logs)
+        catalogue = candidates(config, recordings.records)
+    begin = time.perf_counter()
+    try:
+        diagnosis = diagnose(recordings.records, prior_of(config), catalogue, tell)
+    except np.linalg.LinAlgError as error:
+        raise NotFitted(f"the recordings do not determine the model: {error}") from None
+    return Findings(diagnosis, recordings, config, time.perf_counter() - begin)

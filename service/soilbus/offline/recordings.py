@@ -1,0 +1,94 @@
+"""Recorded logs as the diagnosis wants them: each as a whole, through the daemon's own admission and bins."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from cantools.database.can import Database
+
+from soilbus.config.model import Config
+from soilbus.diagnosis.records import Record, TooLittle, record_of
+from soilbus.estimation.assembly import completion_of, model_of, rig_of
+from soilbus.estimation.window import Window
+from soilbus.offline.replay import fed, log_names
+from soilbus.pipeline.intake import Intake
+
+
+@dataclass(frozen=True, slots=True)
+class Recordings:
+    """Logs of one vehicle: records, samples in them, refused ones by reason, parts too short to be used.
+
+    A log is one record, or one for each part where its clock was set or it is silent for
+    long; `first` holds the number of the first record of each log.
+    """
+
+    records: tuple[Record, ...]
+    first: tuple[int, ...]
+    samples: int
+    rejected: dict[str, int]
+    too_short: tuple[str, ...]
+
+
+def recordings_of(
+    config: Config, database: Database, logs: Sequence[Path], progress: Callable[[int, float], None] | None = None
+) -> Recordings:
+    """Reads the logs.
+
+    Raises LogError for a log that cannot be read to its end or is of another bus, TooLittle
+    for one without a usable part, ConfigError where configuration and database do not fit.
+    """
+    rig, model, settings = rig_of(config), model_of(config), config.estimator
+    effects, free = completion_of(config, in_time=False)
+    records: list[Record] = []
+    first, too_short, rejected, samples = [], [], Counter[str](), 0
+    for path, log in zip(logs, log_names(logs), strict=True):
+        intake = Intake(config, database, {})
+        first.append(len(records))
+        fault: TooLittle | None = None
+        for i, window in enumerate(parts(intake, path, progress)):
+            samples += window.samples
+            name = log if i == 0 else f"{log}, part {i + 1}"
+            try:
+                record = record_of(name, window, rig, model, settings.min_speed, settings.max_turn)
+            except TooLittle as error:
+                fault = fault or error
+                too_short.append(name)
+                continue
+            records.append(record.completed(effects, free))
+        rejected += intake.refusals.total
+        if len(records) == first[-1]:
+            raise TooLittle(_why(log, intake, fault))
+    return Recordings(tuple(records), tuple(first), samples, dict(rejected.most_common()), tuple(too_short))
+
+
+def parts(intake: Intake, log: Path, progress: Callable[[int, float], None] | None = None) -> Iterator[Window]:
+    """The windows of a log, each as long as its clock was not set and it was not silent for long.
+
+    Raises LogError for a log that cannot be read to its end.
+    """
+    whole: list[Window] = []
+
+    def end() -> None:
+        intake.ingest()
+        window = intake.taken_whole()
+        if window is not None:
+            whole.append(window)
+
+    intake.admission.at_break = end
+    for now in fed(intake, log, progress):
+        yield from whole
+        whole.clear()
+        intake.ingest(now)
+    end()
+    yield from whole
+
+
+def _why(log: str, intake: Intake, fault: TooLittle | None) -> str:
+    """What is wrong with a log without a usable part."""
+    admitted = intake.admission.counts.admitted
+    unheard = [channel.name for channel in intake.needed if not admitted[channel.message]]
+    what = f"{log}: no usable instant in it" if fault is None else str(fault)
+    return what + (f"; never heard: {', '.join(unheard)}" if unheard else "")

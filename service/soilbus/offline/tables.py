@@ -1,0 +1,286 @@
+"""Tables of a test rig: rows of steady states, read as what the estimator and the diagnosis work with.
+
+A table tells slip, not speeds.  So the wheel turns at a rim speed of our own choice and the
+ground speed follows from the slip: all of the slip's error is in the ground speed.  Nothing
+that depends on the true speed can be told then; see `candidates`.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.can.log_lines import LogLines
+from soilbus.config.model import Column, Config, Table
+from soilbus.diagnosis.records import Record, TooLittle, record_of_rows
+from soilbus.estimation.assembly import completion_of, model_of, possible_effects, rig_of
+from soilbus.estimation.measurements import MAX_SLIP, MIN_SLIP
+from soilbus.estimation.window import Rig, Window, window_of_samples
+from soilbus.offline.recordings import Recordings
+from soilbus.offline.replay import LogError, log_names
+from soilbus.pipeline.estimator import WindowEstimator
+from soilbus.pipeline.intake import WindowTask, column_means
+from soilbus.pipeline.positions import PositionTrack
+from soilbus.pipeline.result import WindowResult
+from soilbus.terra.effects.effect import Effect
+from soilbus.terra.effects.size import for_wheel
+from soilbus.terra.vehicle import slip_ratio
+
+Array = NDArray[np.float64]
+Columns = Mapping[str, Sequence[Any]]
+
+ROW = 1.0
+"""Time [s] from one row to the next where the table has none."""
+RIM_SPEED = 100.0
+"""Rim speed of the stand-in, in units of the least speed at which slip is judged: no slip is a standstill."""
+MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
+"""Texts, in small letters, of a cell without a value."""
+OF_TRUE_SPEED = frozenset({"rate_stiffening", "inertia"})
+OF_TIME = frozenset({"torque_lag", "channel_lag", "soil_drift", "grade"})
+OF_SEVERAL_WHEELS = frozenset({"multipass"})
+
+
+class TableError(LogError):
+    """A table cannot be read; the text says in one line where and why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Rows of one soil bed as a window (N rows, one wheel), and rows left out by reason."""
+
+    name: str
+    window: Window
+    rejected: dict[str, int]
+
+
+def runs_of(config: Config, path: Path) -> list[Run]:
+    """The runs of a CSV or Parquet file in the order of their first rows.
+
+    A cell that is empty or says so (nan, NA, null) is missing; without a load or a slip a
+    row is left out, and counted.  TableError for a file that cannot be read, a column that
+    is not there, a cell that is no number, or where no row is left.
+    """
+    table = config.table
+    if table is None:
+        raise TableError(f"{path}: the configuration has no [table] that maps its columns")
+    columns = _columns(path, _needed(table))
+    chosen = _chosen(path, columns, table.where)
+    if not chosen:
+        raise TableError(f"{path}: no row in it" + (" that [table] where asks for" if table.where else ""))
+    values = {role: _numbers(path, columns, column, chosen) for role, column in table.columns.items()}
+    names = [path.name] * len(chosen)
+    if table.run is not None:
+        names = [f"{path.name}, {str(columns[table.run][row]).strip()}" for row in chosen]
+    rig, runs = rig_of(config), []
+    for name in dict.fromkeys(names):
+        members = np.array([i for i, other in enumerate(names) if other == name])
+        runs.append(_run(name, {role: v[members] for role, v in values.items()}, rig, config))
+    if not any(len(run.window.t) for run in runs):
+        reasons = ", ".join(sorted({reason for run in runs for reason in run.rejected}))
+        raise TableError(f"{path}: no usable row in it ({reasons})")
+    return runs
+
+
+def replay_tables(config: Config, paths: Sequence[Path]) -> Iterator[WindowResult]:
+    """Each run as one window of the daemon's own estimator; t is its last row's. TableError as runs_of()."""
+    estimator = WindowEstimator(config)
+    named = zip(paths, log_names(paths), strict=True)
+    runs = ((name, run) for path, name in named for run in runs_of(config, path) if len(run.window.t))
+    for index, (name, run) in enumerate(runs):
+        yield replace(estimator.solve(_task(index, run, estimator.rig)), log=name)
+
+
+def _task(index: int, run: Run, rig: Rig) -> WindowTask:
+    window = run.window
+    slip = slip_ratio(rig.radius, window.speed, window.ground_speed[:, None])
+    return WindowTask(
+        index=index,
+        start=float(window.t[0]),
+        end=float(window.t[-1]),
+        window=window,
+        slip=dict(zip(rig.wheels, column_means(slip), strict=True)),
+        missing=(),
+        poor=(),
+        torque_limit=np.full(len(rig.wheels), math.nan),
+        track=PositionTrack({}),
+        rejected=run.rejected,
+        fresh=True,
+    )
+
+
+def recordings_of_tables(config: Config, paths: Sequence[Path]) -> Recordings:
+    """The runs of tables as the diagnosis wants them; TableError as runs_of(), TooLittle for a table of short runs."""
+    rig, model = rig_of(config), model_of(config)
+    effects, free = completion_of(config)
+    records: list[Record] = []
+    first, too_short, rejected, samples = [], [], Counter[str](), 0
+    for path in paths:
+        first.append(len(records))
+        for run in runs_of(config, path):
+            samples += run.window.samples
+            rejected += Counter(run.rejected)
+            try:
+                record = record_of_rows(run.name, run.window, rig, model)
+            except TooLittle as error:
+                too_short.append(run.name)
+                fault = error
+                continue
+            records.append(record.completed(effects, free))
+        if len(records) == first[-1]:
+            raise fault
+    return Recordings(tuple(records), tuple(first), samples, dict(rejected.most_common()), tuple(too_short))
+
+
+def candidates(config: Config, records: Sequence[Record]) -> list[Effect]:
+    """The effects that a table can tell, and the wheel can have, with priors for one of this size and load.
+
+    Not those of the true speed, of other wheels, nor, without a column of times, those
+    that run along with time: the order of rows is that of slip or load as often as not.
+    """
+    unknown = OF_TRUE_SPEED | OF_SEVERAL_WHEELS
+    if config.table is None or config.table.t is None:
+        unknown |= OF_TIME
+    load = float(np.mean(np.concatenate([record.learned.load[:, 0] for record in records])))
+    radius = config.wheel[0].radius
+    return [for_wheel(effect, load, radius) for effect in possible_effects(config) if effect.name not in unknown]
+
+
+def _run(name: str, values: Mapping[str, Array], rig: Rig, config: Config) -> Run:
+    n = len(values["slip"])
+    t = np.asarray(values.get("t", np.arange(n) * ROW), np.float64)
+    load, slip = values["wheel_load"], values["slip"]
+    with np.errstate(invalid="ignore"):
+        faults = {
+            "no_load": ~np.isfinite(load),
+            "no_slip": ~np.isfinite(slip),
+            "no_time": ~np.isfinite(t),
+            "load_range": load <= 0.0,
+            "slip_range": (slip >= MAX_SLIP) | (slip <= MIN_SLIP),
+        }
+    reasons = [next((reason for reason, at in faults.items() if at[i]), "") for i in range(n)]
+    kept = np.flatnonzero([not reason for reason in reasons])
+    kept = kept[np.argsort(t[kept], kind="stable")]
+    rejected = Counter(reason for reason in reasons if reason)
+    rim_speed = RIM_SPEED * config.estimator.min_speed
+    window = window_of_rows(rig, t[kept], {role: v[kept] for role, v in values.items()}, rim_speed)
+    return Run(name, window, dict(sorted(rejected.items())))
+
+
+def window_of_rows(rig: Rig, t: Array, values: Mapping[str, Array], rim_speed: float = 1.0) -> Window:
+    """A window of rows at times t [s] (N,) with quantities (N,) by the roles of a table, in SI; nan is missing.
+
+    The wheel turns at rim_speed [m/s] exactly, and the ground speed has the slip's variance.
+    """
+    wheel, slip, noise = rig.wheels[0], values["slip"], rig.noise["ground_speed"]
+    samples = {
+        f"load.{wheel}": values["wheel_load"],
+        f"speed.{wheel}": np.full(len(t), rim_speed) / rig.radius[0],
+        "ground_speed": rim_speed * (1.0 - slip),
+    }
+    for role, name in (("drawbar_pull", "draft"), ("torque", f"torque.{wheel}"), ("sinkage", f"sinkage.{wheel}")):
+        if role in values:
+            samples[name] = values[role]
+    window = window_of_samples(rig, t, samples)
+    level = float(np.abs(slip).mean()) if len(slip) else 0.0
+    variance = noise.absolute**2 + (noise.relative * slip) ** 2 + (noise.of_mean * level) ** 2
+    return replace(window, variance={**window.variance, "ground_speed": rim_speed**2 * variance})
+
+
+def _needed(table: Table) -> list[str]:
+    """Names of the columns that must be there."""
+    mapped = [column.column for column in table.columns.values()]
+    return list(dict.fromkeys([*mapped, *([table.run] if table.run else []), *table.where]))
+
+
+def _columns(path: Path, needed: Sequence[str]) -> Columns:
+    """The needed columns of a file."""
+    readers = {".csv": _csv, ".parquet": _parquet, ".pq": _parquet}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise TableError(f"{path}: not a table: {', '.join(readers)} can be read")
+    try:
+        return reader(path, needed)
+    except OSError as error:
+        raise TableError(f"{path}: {error.strerror or _one_line(error)}") from None
+
+
+def _csv(path: Path, needed: Sequence[str]) -> Columns:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as lines:
+            rows = [row for row in csv.reader(LogLines(lines), strict=True) if row]
+    except (ValueError, csv.Error) as error:
+        raise TableError(f"{path}: not CSV text ({_one_line(error)})") from None
+    header = [name.strip() for name in rows[0]] if rows else []
+    _check_columns(path, header, needed)
+    for i, row in enumerate(rows[1:], 1):
+        if len(row) != len(header):
+            raise TableError(f"{path}: row {i} has {len(row)} cells under a header of {len(header)}")
+    places = {name: header.index(name) for name in needed}
+    return {name: [row[place] for row in rows[1:]] for name, place in places.items()}
+
+
+def _parquet(path: Path, needed: Sequence[str]) -> Columns:
+    try:
+        arrow: Any = import_module("pyarrow")  # typed only in part
+        parquet: Any = import_module("pyarrow.parquet")
+    except ModuleNotFoundError:
+        raise TableError(f"{path}: a Parquet file needs the extra soilbus[tables]") from None
+    try:
+        _check_columns(path, parquet.read_schema(path).names, needed)
+        table = parquet.read_table(path, columns=list(needed))
+    except arrow.ArrowException as error:
+        raise TableError(f"{path}: not a Parquet file that can be read ({_one_line(error)})") from None
+    return {name: table.column(name).to_pylist() for name in needed}
+
+
+def _check_columns(path: Path, header: Sequence[str], needed: Sequence[str]) -> None:
+    if missing := [name for name in needed if name not in header]:
+        raise TableError(f"{path}: no column {', '.join(missing)}; it has {', '.join(header) or 'none'}")
+    if twice := [name for name in needed if header.count(name) > 1]:
+        raise TableError(f"{path}: two columns are named {', '.join(twice)}")
+
+
+def _chosen(path: Path, columns: Columns, where: Mapping[str, Any]) -> list[int]:
+    """Numbers of the rows that `where` asks for."""
+    n = len(next(iter(columns.values())))
+    return [i for i in range(n) if all(_equal(columns[name][i], wanted) for name, wanted in where.items())]
+
+
+def _equal(cell: Any, wanted: Any) -> bool:
+    if isinstance(wanted, str):
+        return str(cell).strip() == wanted
+    try:
+        return math.isclose(float(cell), wanted, rel_tol=1e-6, abs_tol=1e-12)
+    except (TypeError, ValueError):
+        return False
+
+
+def _numbers(path: Path, columns: Columns, column: Column, rows: Sequence[int]) -> Array:
+    """A column's numbers in SI at these rows, nan where missing."""
+    cells = columns[column.column]
+    return np.array([_number(path, column.column, row, cells[row]) for row in rows]) * column.factor
+
+
+def _number(path: Path, column: str, row: int, cell: Any) -> float:
+    if cell is None or str(cell).strip().lower() in MISSING:
+        return math.nan
+    try:
+        value = math.inf if isinstance(cell, bool) else float(cell)
+    except (TypeError, ValueError):
+        value = math.inf
+    if not math.isfinite(value):
+        raise TableError(f"{path}: row {row + 1}, column {column}: {cell!r} is not a number")
+    return value
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:100] or type(error).__name__

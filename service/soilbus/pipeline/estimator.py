@@ -1,0 +1,365 @@
+"""Windows of measured data in, results out: soil, capability, decision."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.config.model import Config
+from soilbus.decision.capability import Demand, OverSlip
+from soilbus.decision.demand import present_demand
+from soilbus.decision.hysteresis import Held, doubted, settled
+from soilbus.decision.immobilisation import SPAN, Watch, moments, watched, with_loss
+from soilbus.decision.judgement import Basis, judge
+from soilbus.decision.traction_loss import NO_LOSS, idle, motion_of, observed
+from soilbus.decision.traversability import Status, Traversability
+from soilbus.decision.uncertain_model import UncertainModel
+from soilbus.decision.wheels import WheelTable
+from soilbus.estimation.assembly import completion_of, form_of, model_of, prior_of, rig_of
+from soilbus.estimation.measurements import gain_names
+from soilbus.estimation.multistart import Fit
+from soilbus.estimation.nuisance_parameters import active_at
+from soilbus.estimation.posterior import Estimate, Posterior, SoilPrior
+from soilbus.estimation.soil_classes import SoilClasses, guessed
+from soilbus.estimation.tracker import MIN_ROWS, Ground, Settings, Tracked, Tracker
+from soilbus.estimation.window import Rig, Window
+from soilbus.pipeline.excitation import excitation_of
+from soilbus.pipeline.intake import WindowTask
+from soilbus.pipeline.model_gap import GapWatch, squares
+from soilbus.pipeline.result import WindowResult, as_of
+from soilbus.terra.effects.effect import Active, Surroundings, true_draft
+from soilbus.terra.effects.steady import CompletedModel
+from soilbus.terra.wheel import sinkage
+
+AMBIGUOUS = 2.0
+"""Standard deviations of bearing pressure or tan phi by which another optimum makes a window ambiguous."""
+
+
+@dataclass(frozen=True, slots=True)
+class Undecided:
+    """A window's estimate with what the decision needs besides; its traversability is still unknown.
+
+    posterior belongs to model, which knows what of the soil goes with its form.  demand is None where the draft
+    is not known; torque_limit (W,) [N m]; driven: the window's data with the true draft; fresh: nothing of the
+    window before may be carried over; model: with what the window leaves known of the effects' parameters and of the
+    form; here: whether the estimate is of the present ground.
+    """
+
+    result: WindowResult
+    posterior: Posterior | None
+    demand: Demand | None
+    torque_limit: NDArray[np.float64]
+    driven: Window
+    fresh: bool
+    model: UncertainModel
+    here: bool
+
+
+class WindowEstimator:
+    """Solves one window after the other: the tracker's soil, its status, the decision."""
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.rig, self.prior, self.model = rig_of(config), prior_of(config), model_of(config)
+        self._completion = completion_of(config)
+        self._settings = config.estimator
+        self._wheels: WheelTable | None = None
+        self._gap = GapWatch(config.estimator.window, config.estimator.hop)
+        self._held = Held()
+        self._valid_at: float | None = None
+        self._watch = Watch()
+        self._curve: OverSlip | None = None
+        self._loss = NO_LOSS
+        self._idle = np.zeros(len(self.rig.wheels), bool)
+        self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
+        self._guess = guessed(self.prior, prior_of(Config()))
+        settings = config.estimator
+        least = MIN_ROWS if config.table is None else 1  # a table's rows are chosen with care, and few
+        self._tracker = Tracker(
+            self.rig, self.prior, self.model,
+            Settings(
+                settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift, least,
+                form_of(config), settings.search_rate, settings.search_burst,
+            ),
+            *self._completion,
+        )  # fmt: skip
+
+    @property
+    def tracker(self) -> Tracker:
+        """What carries soil and gains from window to window."""
+        return self._tracker
+
+    def solve(self, task: WindowTask) -> WindowResult:
+        """Estimate, decision and watch of one window."""
+        return self.decide(self.estimate(task))
+
+    def solve_unwatched(self, task: WindowTask) -> WindowResult:
+        """Estimate and decision, for those who watch more often themselves; the result's watch stays unknown."""
+        return self._decided(self.estimate(task))
+
+    def estimate(self, task: WindowTask) -> Undecided:
+        """Soil and status of one window."""
+        if task.fresh:
+            self._tracker.forget()
+        tracked = self._tracker.estimate(task.window, task.end)
+        fit = tracked.fit
+        status, reason = self._status(task, tracked)
+        own = None if fit is None or status is Status.INVALID else self._honest(tracked, fit)
+        posterior = None if own is None or fit is None else _with_form(own, fit, self.prior)
+        basis = self._basis(task, fit)
+        if status is Status.VALID and task.end - basis.end > self.config.traversability.max_age:
+            status, reason = Status.NOT_EXCITED, _gated(tracked)
+        result = WindowResult(
+            t=task.end,
+            index=task.index,
+            status=status,
+            reason=reason,
+            posterior=posterior,
+            bearing=None if posterior is None else self._bearing(posterior),
+            slip=task.slip,
+            sinkage=self._sinkage(fit if posterior is not None else None),
+            traversability=Traversability(),
+            chi2=None if fit is None else fit.chi2,
+            samples=task.window.samples,
+            rejected=task.rejected,
+            iterations=0 if fit is None else fit.iterations,
+            soil_class=self._soil_class(posterior),
+            position=task.track.at((tracked.since + task.end) / 2.0),
+            failure=self._failure(tracked),
+            gaps=self._watched_gaps(task, fit),
+            excitation=excitation_of(task.window, self.rig, self._settings.min_speed),
+            basis=basis,
+            z_driven=None if fit is None or posterior is None else self._driven(fit),
+            search_ended=tracked.search_ended,
+        )
+        effects = self._effects(fit)
+        model = self._present_model(task.window, tracked, effects)
+        window = _with_true_draft(task.window, effects, self.rig)
+        demand = present_demand(window, self.rig.chassis, self._settings.hop, self._draft_gain(tracked))
+        here = tracked.ground not in (Ground.CHANGING, Ground.SETTLING)
+        if task.fresh:
+            self._idle = np.zeros(len(self.rig.wheels), bool)
+        self._idle = idle(task.window, self.rig, task.end - self._settings.hop, self._idle)
+        limit = np.where(self._idle, 0.0, task.torque_limit)
+        known = None if own is None else Posterior(own.soil, model.with_form(own.log_covariance))
+        return Undecided(result, known, demand, limit, window, task.fresh, model, here)
+
+    def decide(self, window: Undecided) -> WindowResult:
+        """The result with its traversability and watch; windows in their order, here or in another process."""
+        result = self._decided(window)
+        self._look(window)
+        able = result.traversability.capability
+        if able is not None and result.status is Status.VALID:
+            self._curve = able.over_slip
+        now = as_of(result, self._loss, result.t, self.config)
+        return replace(now, watch=with_loss(self._watch, self._loss))
+
+    def _decided(self, window: Undecided) -> WindowResult:
+        """The result with its traversability."""
+        way, self._wheels = judge(
+            window.posterior, window.result.status, window.demand, self.rig, window.model, window.torque_limit,
+            self.config.traversability, None if window.fresh else self._wheels,
+        )  # fmt: skip
+        return replace(window.result, traversability=self._settle(way, window))
+
+    def _settle(self, way: Traversability, window: Undecided) -> Traversability:
+        """The state that the windows before allow, and how old the last valid one is."""
+        if window.fresh:
+            self._held, self._valid_at = Held(), None
+        result = window.result
+        if result.status is Status.VALID:
+            self._valid_at = result.t
+        if window.here:
+            self._held = settled(self._held, way.probability, result.status, self.config.traversability)
+        else:  # the estimate is of the ground before
+            self._held, way = doubted(self._held), Traversability(torque_available=way.torque_available)
+        return replace(
+            way, state=self._held.state, since_valid=None if self._valid_at is None else result.t - self._valid_at
+        )
+
+    def _watched_gaps(self, task: WindowTask, fit: Fit | None) -> Mapping[str, float]:
+        """The channels that have not fitted for minutes; windows with poor inputs have no say."""
+        if task.fresh:
+            self._gap.forget()
+        if fit is not None and not task.missing and not task.poor:
+            self._gap.take(task.end, squares(fit.optimum.at, len(self.rig.wheels)))
+        return self._gap.gaps()
+
+    def _look(self, window: Undecided) -> None:
+        """Watch the last hop with what was known of the soil before it."""
+        if window.fresh:
+            self._watch, self._curve, self._loss = Watch(), None, NO_LOSS
+        since = window.result.t - self._settings.hop
+        driven = window.driven
+        for i in np.flatnonzero(driven.t > since).tolist():
+            few = driven.rows(np.arange(max(i + 1 - SPAN, 0), i + 1))
+            if (motion := motion_of(few, self.rig, window.torque_limit, self.config.traversability)) is not None:
+                self._loss = observed(self._loss, motion, self._settings.min_speed, self.config.traversability)
+        for moment in moments(window.driven, self.rig, since, self._settings.min_speed):
+            self._watch = watched(self._watch, moment.t, moment.slip, moment.pull, self._curve, moment.inertia)
+
+    def _effects(self, fit: Fit | None) -> list[Active]:
+        """The effects with their parameters as a fit leaves them, else as configured."""
+        effects, free = self._completion
+        pulls = np.zeros(len(free)) if fit is None else fit.gains[len(fit.gains) - len(free) :]
+        return active_at(effects, free, pulls, len(self.rig.wheels))
+
+    def _present_model(self, window: Window, tracked: Tracked, effects: Sequence[Active]) -> UncertainModel:
+        """The model for the decision, at the window's usual speed."""
+        speed, fit = self._usual_speed(window), tracked.fit
+        if fit is None:
+            return UncertainModel.over(CompletedModel.of(self.model, effects, speed))
+        widening = _widening(tracked, fit)
+        return UncertainModel.of(
+            self.model, *self._completion, fit.whole, len(self.rig.wheels), speed, widening, fit.form
+        )
+
+    def _honest(self, tracked: Tracked, fit: Fit) -> Posterior:
+        """Posterior, of both optima where there are two, widened where the residuals are larger than the noise."""
+        return fit.whole.posterior.widened(_widening(tracked, fit), self.prior)
+
+    def _draft_gain(self, tracked: Tracked) -> Estimate:
+        """Gain error of the load cell at the hitch: as fitted, else what is known of it beforehand."""
+        if tracked.fit is None or tracked.mismatch:
+            return Estimate(0.0, self.rig.noise["draft"].gain)
+        return tracked.fit.whole.gain(gain_names(self.rig).index("draft"))
+
+    def _bearing(self, posterior: Posterior) -> Estimate:
+        return posterior.bearing_pressure(self._settings.z_ref, self._settings.b_ref)
+
+    def _driven(self, fit: Fit) -> tuple[float, float] | None:
+        """Sinkages [m] that nine tenths of the wheels' instants lie between."""
+        depth = sinkage(fit.optimum.latents.entry_angle, self.rig.radius)
+        known = depth[np.isfinite(depth)]
+        if not len(known):
+            return None
+        low, high = np.percentile(known, (5.0, 95.0)).tolist()
+        return low, high
+
+    def _soil_class(self, posterior: Posterior | None) -> dict[str, float] | None:
+        if posterior is None or self._classes is None:
+            return None
+        here = self._tracker.here
+        return self._classes.probabilities(posterior, self._guess if here is self.prior else here)
+
+    def _sinkage(self, fit: Fit | None) -> dict[str, float | None]:
+        if fit is None:
+            return dict.fromkeys(self.rig.wheels)
+        known = zip(self.rig.wheels, fit.sinkage.tolist(), strict=True)
+        return {wheel: z if math.isfinite(z) else None for wheel, z in known}
+
+    def _usual_speed(self, window: Window) -> float:
+        """Mean ground speed [m/s] while the vehicle moves, the least one where it does not."""
+        moving = window.ground_speed[window.ground_speed > self._settings.min_speed]
+        return float(moving.mean()) if len(moving) else self._settings.min_speed
+
+    def _basis(self, task: WindowTask, fit: Fit | None) -> Basis:
+        """The instants that a fit rests on, and how far the vehicle has driven since the last of them."""
+        instants = np.empty(0) if fit is None else fit.optimum.t
+        end = instants[-1] + self._settings.bin / 2.0 if len(instants) else -math.inf
+        since = task.window.ground_speed[task.window.t > end]
+        known = since[np.isfinite(since)]
+        unseen = float(known.mean()) * len(since) * self._settings.bin if len(known) else 0.0
+        return Basis(instants, self._settings.bin, unseen, task.late)
+
+    def _status(self, task: WindowTask, tracked: Tracked) -> tuple[Status, str]:
+        """Status and its reason; a sensor that lies is the reason of all that may follow from it."""
+        status, reason = self._status_of_the_rest(task, tracked)
+        follows = reason.split()[0] in ("none", "input_stale", "model_mismatch", "no_convergence")
+        return status, " ".join(["implausible", *task.implausible]) if task.implausible and follows else reason
+
+    def _status_of_the_rest(self, task: WindowTask, tracked: Tracked) -> tuple[Status, str]:
+        fit = tracked.fit
+        if task.missing:
+            return Status.INVALID, "input_missing " + " ".join(task.missing)
+        if fit is None and not tracked.mismatch:
+            if tracked.standstill + tracked.turning > 0:
+                return Status.NOT_EXCITED, _gated(tracked)
+            return Status.INVALID, "input_stale " + " ".join(task.poor) if task.poor else "no_convergence"
+        failure = self._failure(tracked)
+        if fit is None or failure is not None:
+            status = Status.DEGRADED if fit is not None and fit.converged else Status.INVALID
+            return status, "model_mismatch" if failure == "model_mismatch" else "no_convergence"
+        if task.poor:
+            return Status.DEGRADED, "input_stale " + " ".join(task.poor)
+        if self._hardly_new(tracked, task.end):
+            return Status.NOT_EXCITED, "not_excited new_soil"
+        if fit.off_scale:
+            return Status.DEGRADED, "model_mismatch"
+        if self._ambiguous(fit):
+            return Status.NOT_EXCITED, "ambiguous"
+        posterior = fit.whole.posterior
+        bearing, tan_phi = self._bearing(posterior), posterior.tan_phi()
+        lacking = {
+            "load_range": bearing.std > self._settings.max_bearing_std * bearing.value,
+            "slip_range": tan_phi.std > self._settings.max_tan_phi_std * tan_phi.value,
+        }
+        if any(lacking.values()):
+            return Status.NOT_EXCITED, " ".join(["not_excited", *(name for name, it_is in lacking.items() if it_is)])
+        return Status.VALID, "none"
+
+    def _hardly_new(self, tracked: Tracked, end: float) -> bool:
+        """Whether the window has too little of the soil that has just begun."""
+        if tracked.ground in (Ground.CHANGING, Ground.SETTLING):
+            return True
+        return tracked.since > end - self.config.traversability.min_share * self._settings.window
+
+    def _failure(self, tracked: Tracked) -> str | None:
+        """In what way a solve failed: not_finite, model_mismatch or no_convergence; None where it did not."""
+        fit = tracked.fit
+        if not tracked.mismatch:
+            return None
+        if fit is None:
+            return "model_mismatch" if tracked.search_ended else "not_finite"
+        return "model_mismatch" if fit.chi2 > self._tracker.chi2_limit(fit) else "no_convergence"
+
+    def _ambiguous(self, fit: Fit) -> bool:
+        """Whether another soil, about as likely, has a bearing pressure or tan phi that the fit excludes."""
+        if fit.rival is None:
+            return False
+        one, other = fit.posterior, fit.rival.belief.posterior
+        pairs = ((self._bearing(one), self._bearing(other)), (one.tan_phi(), other.tan_phi()))
+        return any(abs(a.value - b.value) > AMBIGUOUS * a.std for a, b in pairs)
+
+
+def _gated(tracked: Tracked) -> str:
+    """Why most of the instants were left out that were."""
+    return "standstill" if tracked.standstill >= tracked.turning else "turning"
+
+
+def _widening(tracked: Tracked, fit: Fit) -> float:
+    """Factor of the covariance of a fit that leaves more than noise."""
+    return max(fit.chi2, 1.0) if tracked.mismatch else 1.0
+
+
+def _with_form(own: Posterior, fit: Fit, prior: SoilPrior) -> Posterior:
+    """A posterior with what the form of the model leaves open besides."""
+    return own if fit.form is None else own.beside(fit.form.log_covariance, prior)
+
+
+def _with_true_draft(window: Window, effects: Sequence[Active], rig: Rig) -> Window:
+    """The window without the errors of its load cell at the hitch."""
+    if not any(active.effect.draft for active in effects) or not len(window.t):
+        return window
+    return replace(window, draft=true_draft(effects, window.draft, _surroundings(window, rig)))
+
+
+def _surroundings(window: Window, rig: Rig) -> Surroundings:
+    """What effects may depend on, as measured."""
+    t = (window.t - window.t[0])[:, None]
+    return Surroundings(
+        t=t,
+        distance=np.zeros_like(t),
+        load=window.load,
+        ground_speed=window.ground_speed[:, None],
+        wheel_speed=window.speed,
+        rear=~rig.front,
+        draft=window.draft[:, None],
+        acceleration=window.acceleration[:, None],
+        mass=0.0 if rig.chassis is None else rig.chassis.mass,
+        duration=float(t[-1, 0]),
+    )

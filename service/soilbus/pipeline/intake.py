@@ -1,0 +1,387 @@
+"""Frames in, windows of measured data out.
+
+Time is what the frames' stamps say.  Windows are counted from the first sample of a
+mapped channel, so the same frames always give the same windows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from cantools.database.can import Database
+from numpy.typing import NDArray
+
+from soilbus.can.admission import LONGEST_GAP, Admission
+from soilbus.can.channels import Channel, Decoded
+from soilbus.can.dbc_files import checked_messages
+from soilbus.can.mapping import OPTIONAL_ROLES, POSITION_ROLES, channels_of
+from soilbus.config.model import Config
+from soilbus.decision.traction_loss import Motion, motion_of
+from soilbus.estimation.assembly import delays_of, rig_of
+from soilbus.estimation.window import (
+    VEHICLE_QUANTITIES,
+    WHEEL_QUANTITIES,
+    BinStore,
+    Window,
+    forward,
+    inertia_of,
+    pull_given,
+)
+from soilbus.pipeline.positions import PositionTrack
+from soilbus.sensors.consistency import Plausibility, without
+from soilbus.sensors.outliers import WILD
+from soilbus.sensors.rates import resolved_window
+from soilbus.terra.vehicle import slip_ratio
+
+Array = NDArray[np.float64]
+
+DEFAULT_TIMEOUT = 1.0
+LIMIT_SAMPLES = 3
+"""Reported torque limits of which the median is in force: one wild sample moves nothing."""
+COVERAGE_BLOCK = 0.5
+MIN_COVERAGE = 0.95
+SLIP_SPAN = 0.3
+EDGE_LEAD = 0.005
+"""Bins begin this long before the first sample [s]: else each frame of its message would fall on
+an edge, and a microsecond would decide on which side."""
+
+
+@dataclass(frozen=True, slots=True)
+class WindowTask:
+    """One window's data and what is known of its inputs; everything an estimate needs.
+
+    index counts windows since the start; epoch counts how often time began again; start and end [s];
+    missing are needed channels never seen, poor those that are stale at the end or covered the window badly;
+    implausible are channels that lie, and are not in the window;
+    torque_limit (W,) [N m], nan where unknown; track knows the positions from the window's
+    middle on; fresh: nothing of the window before may be carried over; late: by so much [s] the latest channel is late,
+    and all wait for it.
+    """
+
+    index: int
+    start: float
+    end: float
+    window: Window
+    slip: dict[str, float | None]
+    missing: tuple[str, ...]
+    poor: tuple[str, ...]
+    torque_limit: Array
+    track: PositionTrack
+    rejected: dict[str, int]
+    fresh: bool
+    implausible: tuple[str, ...] = ()
+    late: float = 0.0
+    epoch: int = 0
+
+
+class Latest(NamedTuple):
+    """Slip ratio by wheel, pull [N] (draft, slope, inertia) of the last moments, the inertia in it, and the motion.
+
+    None where unknown.
+    """
+
+    slip: dict[str, float | None]
+    pull: float | None
+    inertia: float = 0.0
+    motion: Motion | None = None
+
+
+@dataclass(slots=True)
+class Refusals:
+    """Refused samples by reason, kept as long as a window may ask for them; `used` counts the samples not refused."""
+
+    entries: list[tuple[str, Array]] = field(default_factory=list)
+    total: Counter[str] = field(default_factory=Counter)
+    used: int = 0
+
+    def add(self, decoded: Decoded) -> None:
+        """Take note of what one batch of frames used and refused."""
+        self.used += sum(len(column.t) for column in decoded.columns.values())
+        for (_, reason), times in decoded.refused.items():
+            self.note(str(reason), times)
+        for reason, n in decoded.untimed.items():
+            self.total[str(reason)] += n
+
+    def note_wild(self, times: Array) -> None:
+        """Take note of samples that were used until they were found wild."""
+        self.note(WILD, times)
+        self.used -= len(times)
+
+    def note(self, reason: str, times: Array) -> None:
+        """Take note of samples refused for one reason at these times [s], ascending."""
+        if len(times):
+            self.entries.append((reason, times))
+            self.total[reason] += len(times)
+
+    def within(self, start: float, end: float) -> dict[str, int]:
+        """Counts by reason from start to end [s]; what is older is forgotten."""
+        self.entries = [(r, t) for r, t in self.entries if t[-1] >= start]
+        counts: Counter[str] = Counter()
+        for reason, t in self.entries:
+            counts[reason] += int(np.count_nonzero((t >= start) & (t < end)))
+        return {r: n for r, n in sorted(counts.items()) if n}
+
+
+class ReportedLimits:
+    """Greatest torque [N m] that each motor has reported, else the configured one (W,), nan where neither is known.
+
+    What a motor has reported holds until it reports another limit, however long it is silent and whatever becomes of
+    the clock.  The median of the last few samples is not moved by a wild one.
+    """
+
+    def __init__(self, wheels: Sequence[str], configured: Sequence[float]) -> None:
+        self._configured = dict(zip(wheels, configured, strict=True))
+        self._reported: dict[str, tuple[Array, Array]] = {}
+
+    def add(self, wheel: str, t: Array, value: Array) -> None:
+        """Samples (N,) of one wheel at the times t [s]."""
+        if wheel in self._configured:
+            old_t, old = self._reported.get(wheel, (t[:0], value[:0]))
+            self._reported[wheel] = np.append(old_t, t), np.append(old, value)
+
+    def at(self, t: float) -> Array:
+        """The limits (W,) in force at the time t [s]."""
+        return np.array([self._of(wheel, t) for wheel in self._configured])
+
+    def _of(self, wheel: str, now: float) -> float:
+        t, value = self._reported.get(wheel, (np.empty(0), np.empty(0)))
+        last = value[t <= now][-LIMIT_SAMPLES:]
+        return float(np.median(last)) if len(last) else self._configured[wheel]
+
+    def drop_before(self, end: float) -> None:
+        """Forget what is no longer among the last samples at the time `end` [s]."""
+        for wheel, (t, value) in self._reported.items():
+            first = max(int(np.count_nonzero(t <= end)) - LIMIT_SAMPLES, 0)
+            self._reported[wheel] = t[first:], value[first:]
+
+    def forget_times(self) -> None:
+        """The clock was set: what was reported was reported before all that follows."""
+        self._reported = {wheel: (np.full(len(t), -math.inf), value) for wheel, (t, value) in self._reported.items()}
+
+
+class Intake:
+    """Admission, bins and freshness of one vehicle's channels.
+
+    Channels that are late by their `delay` and by `delays` [s] by quantity (those of the
+    configuration's effects where none are given) are put beside what was true with them: all
+    others wait for the latest one.  So each window is whole, and tells of as long before its
+    end; whether a channel is fresh goes by the stamps of its frames.  Raises ConfigError where
+    configuration and database do not fit.
+    """
+
+    def __init__(self, config: Config, database: Database, delays: Mapping[str, float] | None = None) -> None:
+        self._config, self._database, self._delays = config, database, delays
+        self.channels = channels_of(config, database)
+        self.admission = Admission(self.channels, database, checked_messages(config))
+        self.rig = rig_of(config)
+        self.refusals = Refusals()
+        self.needed = tuple(c for c in self.channels if self._is_needed(c))
+        self._positions = PositionTrack(
+            {c.name: c.timeout or DEFAULT_TIMEOUT for c in self.channels if c.quantity in POSITION_ROLES}
+        )
+        self._plausibility = Plausibility(self.rig, self.channels, database, config.estimator)
+        of_effects = delays_of(config) if delays is None else delays
+        late = {c.name: c.delay + of_effects.get(c.quantity, 0.0) for c in self.channels}
+        self._latest = max([0.0, *late.values()])
+        self._waits = {name: self._latest - delay for name, delay in late.items() if self._latest != delay}
+        self._settings = config.estimator
+        self._binned = frozenset(self.rig.channels)
+        limits = {w.name: w.max_torque for w in config.wheel}
+        self._decision = config.traversability
+        self._limits = ReportedLimits(self.rig.wheels, [limits[name] or math.nan for name in self.rig.wheels])
+        self._index = 0
+        self.epoch = 0
+        self._ready: list[WindowTask] = []
+        self._bins: BinStore | None = None
+        self._restart()
+        self.admission.at_break = self.begin_anew
+
+    def of_another_recording(self) -> Intake:
+        """An intake that knows nothing of what this one heard; both count windows, frames and refusals together."""
+        other = Intake(self._config, self._database, self._delays)
+        other.admission.counts, other._index = self.admission.counts, self._index
+        other.refusals.total, other.refusals.used = self.refusals.total, self.refusals.used
+        return other
+
+    def _is_needed(self, channel: Channel) -> bool:
+        if channel.wheel:
+            return channel.wheel in self.rig.wheels and channel.quantity in ("torque", "speed", "load")
+        return channel.quantity not in OPTIONAL_ROLES
+
+    def begin_anew(self) -> None:
+        """What comes next is a recording of its own: its clock was set, or the bus was silent for long."""
+        ready = self.finish(self.admission.newest)
+        self._restart()
+        self._ready = ready
+
+    def _restart(self) -> None:
+        self.epoch += 1  # nothing of the one before may be carried over
+        self._bins = None
+        self._fresh = True
+        self._positions.forget()
+        self._plausibility.forget()
+        self._limits.forget_times()
+        self._lying: tuple[str, ...] = ()
+        self.next_end = math.inf
+        self.last_seen: dict[str, float] = {}
+        self._newest = -math.inf  # stamp of the latest sample, admitted or refused
+
+    def _screen_the_rest(self) -> None:
+        """Count the wild samples that came after the last window too."""
+        if self._bins is not None:
+            self._bins.window(self._newest, self._newest + self._bins.bin_length)
+            self.refusals.note_wild(self._bins.new_wild())
+
+    def ingest(self, until: float = math.inf) -> None:
+        """Decode the frames filed so far that are older than `until` [s] and put them into bins."""
+        decoded = self.admission.take(until)
+        self.refusals.add(decoded)
+        if (times := _times(decoded)) is not None:
+            first, last = times
+            self._newest = max(self._newest, last)
+            if self._bins is None:
+                self._bins = BinStore(self.rig, self._settings.bin, first - EDGE_LEAD)
+                self.next_end = first - EDGE_LEAD + self._settings.window
+        heard = {name: (c.t, c.value) for name, c in decoded.columns.items() if len(c.t)}
+        self.last_seen |= {name: float(t[-1]) for name, (t, _) in heard.items()}
+        for name, (t, value) in heard.items():
+            if name.startswith("torque_limit."):
+                self._limits.add(name.removeprefix("torque_limit."), t, value)
+        self._positions.add(heard)
+        for name in heard.keys() & self._waits.keys():
+            t, value = heard[name]
+            heard[name] = t + self._waits[name], value
+        self._plausibility.add(heard)
+        if self._bins is not None:
+            self._bins.add({name: samples for name, samples in heard.items() if name in self._binned})
+
+    def due(self, now: float) -> list[WindowTask]:
+        """Every window that ended at or before `now` [s] and was not handed out yet."""
+        tasks, self._ready = self._ready, []
+        if self._bins is None:
+            self.ingest(now)
+        while self._bins is not None and self.next_end <= now:
+            self.ingest(self.next_end)
+            if self.next_end - self._newest > LONGEST_GAP:
+                self._screen_the_rest()
+                self._restart()
+                break
+            tasks.append(self._task(self._bins, self.next_end))
+            self.next_end += self._settings.hop
+        return tasks
+
+    def finish(self, now: float) -> list[WindowTask]:
+        """Windows still open at the end of a recording that lasts until `now` [s]."""
+        tasks = self.due(now)
+        self.ingest(math.inf)
+        tasks += self.due(now)
+        self._screen_the_rest()
+        return tasks
+
+    def taken_whole(self) -> Window | None:
+        """All that was ingested since the clock was last set, as one window; what comes later begins anew.
+
+        Its bins are as short as the recording's spectrum asks for (see `resolution`); the one
+        that has just begun is left out.  None where there is no sample.
+        """
+        bins, end = self._bins, max(self.last_seen.values(), default=-math.inf)
+        window = None
+        if bins is not None and end - bins.origin >= bins.bin_length:
+            end = bins.origin + math.floor((end - bins.origin) / bins.bin_length) * bins.bin_length
+            window = forward(resolved_window(bins, end))
+            self.refusals.note_wild(bins.new_wild())
+        self._restart()
+        return window
+
+    def _task(self, bins: BinStore, end: float) -> WindowTask:
+        start = end - self._settings.window
+        window, self._lying = self._plausibility.screened(forward(bins.window(start, end)))
+        self.refusals.note_wild(bins.new_wild())
+        missing = tuple(c.name for c in self.needed if c.name not in self.last_seen)
+        covered = dict(zip(self.rig.channels, coverage(window).tolist(), strict=True))
+        badly_covered = [c.name for c in self.needed if covered[c.name] < MIN_COVERAGE]
+        poor = tuple(dict.fromkeys(self.stale(end) + badly_covered))
+        task = WindowTask(
+            index=self._index,
+            start=start,
+            end=end,
+            window=window,
+            slip=self._slip(window),
+            missing=missing if self.rig.wheels else (*missing, "wheels"),
+            poor=poor,
+            torque_limit=self._limits.at(end),
+            track=self._positions.copy(),
+            rejected=self.refusals.within(start, end),
+            fresh=self._fresh,
+            late=self._latest,
+            implausible=self._lying,
+            epoch=self.epoch,
+        )
+        self._fresh = False
+        self._index += 1
+        bins.drop_before(start + self._settings.hop)
+        self._positions.drop_before((start + end) / 2.0 + self._settings.hop)
+        self._plausibility.drop_before(start + self._settings.hop)
+        self._limits.drop_before(end)
+        return task
+
+    def stale(self, now: float) -> list[str]:
+        """Needed channels without an admitted sample within their time-out before `now` [s]."""
+        return [
+            c.name
+            for c in self.needed
+            if not now - self.last_seen.get(c.name, -math.inf) <= (c.timeout or DEFAULT_TIMEOUT)  # nor nan
+        ]
+
+    def latest(self, now: float) -> Latest:
+        """Slip and pull over the last moments before `now` [s]."""
+        if self._bins is None or not abs(now - self._newest) <= LONGEST_GAP:  # nor nan: no bins for years of silence
+            return Latest(dict.fromkeys(self.rig.wheels), None)
+        last = math.floor((now - self._bins.origin) / self._settings.bin) * self._settings.bin + self._bins.origin
+        window = without(self._bins.glimpse(last - SLIP_SPAN, last), self.rig, set(self._lying))
+        if self.rig.chassis is None:
+            return Latest(self._slip(window), None)
+        pull, inertia = pull_given(window, self.rig.chassis), inertia_of(window, self.rig.chassis)
+        given = column_means(pull[:, None])[0]
+        motion = motion_of(forward(window), self.rig, self._limits.at(now), self._decision)
+        part = 0.0 if given is None else float(inertia[np.isfinite(pull)].mean())
+        return Latest(self._slip(window), given, part, motion)
+
+    def _slip(self, window: Window) -> dict[str, float | None]:
+        window = forward(window)
+        ground = window.ground_speed[:, None]
+        slip = slip_ratio(self.rig.radius, window.speed, ground)
+        slip = np.where((ground > self._settings.min_speed) & (slip > -1.0), slip, np.nan)
+        return dict(zip(self.rig.wheels, column_means(slip), strict=True))
+
+
+def _times(decoded: Decoded) -> tuple[float, float] | None:
+    """Times of the earliest and of the latest sample, admitted or refused; None where there is none."""
+    ends = [(c.t[0], c.t[-1]) for c in decoded.columns.values() if len(c.t)]
+    ends += [(known.min(), known.max()) for t in decoded.refused.values() if len(known := t[np.isfinite(t)])]
+    return (float(min(first for first, _ in ends)), float(max(last for _, last in ends))) if ends else None
+
+
+def column_means(rows: Array) -> list[float | None]:
+    """Mean of each column of (N, W) over its finite entries; None for a column without any."""
+    known = np.isfinite(rows)
+    count = known.sum(0)
+    total = np.where(known, rows, 0.0).sum(0)
+    return [float(s / n) if n else None for s, n in zip(total, count, strict=True)]
+
+
+def coverage(window: Window) -> Array:
+    """Share of the window's half seconds in which each of the rig's channels has a sample, (channels,)."""
+    quantities = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
+    known = np.isfinite(np.column_stack([getattr(window, q) for q in quantities]))
+    if len(known) < 2:
+        return np.zeros(known.shape[1])
+    block = ((window.t - window.t[0]) / COVERAGE_BLOCK + 1e-6).astype(int)
+    begins = [0, *(np.flatnonzero(block[1:] != block[:-1]) + 1)]
+    share: Array = np.logical_or.reduceat(known, begins).sum(0) / (block[-1] + 1)
+    return share

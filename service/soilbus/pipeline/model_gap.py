@@ -1,0 +1,74 @@
+"""The daemon's own watch on the gap between model and data: chi-square by channel over minutes.
+
+A window that does not fit is a window; a channel that does not fit for minutes is a missing
+effect.  Of a residual r whose instant has the inverse covariance M, r (M r) is 1 in the mean
+where model and noise are right, so chi-square divides among the channels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from soilbus.estimation.observation_model import Linearised
+
+SPAN = 120.0
+"""Seconds over which chi-square is averaged."""
+LEAST_SPAN = 60.0
+"""Seconds of windows that there must be."""
+LIMIT = 1.15
+"""Reduced chi-square of a channel from which a gap is told."""
+DEVIATIONS = 5.0
+"""Standard deviations of it beyond 1 that it must be besides."""
+
+
+class Square(NamedTuple):
+    """Sum of a channel's squared residuals, in units of the noise, and how many there are."""
+
+    total: float
+    rows: int
+
+
+def squares(at: Linearised, n_wheels: int) -> dict[str, Square]:
+    """Those of torque, draft and, where it is measured, sinkage in one fitted window."""
+    per_instant = at.by_latents.shape[1]
+    square = (at.rows[:, 0] * at.weighed[:, 0]).reshape(-1, per_instant)
+    known = at.weighed.any(axis=1).reshape(-1, per_instant)
+    parts = {"torque": slice(n_wheels), "draft": slice(n_wheels, n_wheels + 1), "sinkage": slice(n_wheels + 1, None)}
+    found = {name: Square(float(square[:, part].sum()), int(np.sum(known[:, part]))) for name, part in parts.items()}
+    return {name: of_channel for name, of_channel in found.items() if of_channel.rows}
+
+
+class GapWatch:
+    """Chi-square of each channel over the last minutes of windows that overlap (window and hop in s)."""
+
+    def __init__(self, window: float, hop: float) -> None:
+        self._overlap = window / hop
+        self._seen: deque[tuple[float, Mapping[str, Square]]] = deque()
+
+    def forget(self) -> None:
+        """Begin anew."""
+        self._seen.clear()
+
+    def take(self, end: float, found: Mapping[str, Square]) -> None:
+        """One window that ended at `end` [s]."""
+        self._seen.append((end, found))
+        while self._seen[0][0] < end - SPAN:
+            self._seen.popleft()
+
+    def gaps(self) -> dict[str, float]:
+        """Reduced chi-square of the channels that have not fitted for minutes, the worst first."""
+        if not self._seen or self._seen[-1][0] - self._seen[0][0] < LEAST_SPAN:
+            return {}
+        out = {}
+        for channel in {name for _, found in self._seen for name in found}:
+            parts = [found[channel] for _, found in self._seen if channel in found]
+            rows = sum(part.rows for part in parts)
+            chi2 = sum(part.total for part in parts) / rows
+            if chi2 > max(LIMIT, 1.0 + DEVIATIONS * math.sqrt(2.0 * self._overlap / rows)):
+                out[channel] = chi2
+        return dict(sorted(out.items(), key=lambda item: -item[1]))

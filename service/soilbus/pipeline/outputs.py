@@ -1,0 +1,245 @@
+"""One window's result as a JSON line and as values of our frames."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+from cantools.database.can import Database
+
+from soilbus.config.model import Config, ConfigError
+from soilbus.decision.immobilisation import Watch
+from soilbus.pipeline.result import WindowResult
+from soilbus.pipeline.states import state_after
+from soilbus.terra.soils import UNKNOWN
+
+if TYPE_CHECKING:
+    from soilbus.decision.capability import Capability
+    from soilbus.estimation.posterior import Estimate
+
+WINDOW_MODULUS = 251
+"""The frames' 8-bit window number counts 0..250."""
+
+TICK = 0.1
+"""Cycle [s] of the frames that others act on."""
+FAST_FRAMES = ("WheelSlip", "WheelSlip2", "Traversability", "TorqueDemand", "DemandForecast")
+
+LONG = 1e6
+"""A time [s] that is longer than any signal holds."""
+
+MOST_CLASSES = 3
+"""Known soils that a window names."""
+
+PARAMETER_FRAMES = {
+    # JSON name: (message, SI value of one unit of the DBC)
+    "k_c": ("SoilCohesiveModulus", 1e3),
+    "k_phi": ("SoilFrictionalModulus", 1e3),
+    "n": ("SoilSinkageExponent", 1.0),
+    "phi": ("SoilFrictionAngle", math.pi / 180.0),
+    "c": ("SoilCohesion", 1e3),
+    "K": ("SoilShearModulus", 1e-3),
+}
+
+
+HOP_FRAMES = (
+    "SoilStrength", "SoilClass", *(message for message, _ in PARAMETER_FRAMES.values()), "DraftCapability",
+    "GradeCapability", "TractionAdvice", "TractionLimits", "WheelSinkage", "WheelSinkage2",
+)  # fmt: skip
+"""Go out once each window."""
+
+
+def check_cycle_times(config: Config, database: Database) -> None:
+    """Raises ConfigError where frames would come less often than the DBC tells their readers (GenMsgCycleTime).
+
+    Readers judge silence by it, and would take each pause for the end of soilbus.
+    """
+    told = {m.name: (m.cycle_time or math.inf) / 1e3 for m in database.messages}
+    faults = []
+    for frames, every in ((FAST_FRAMES, TICK), (HOP_FRAMES, config.estimator.hop)):
+        if late := [name for name in frames if told[name] < every * (1.0 - 1e-9)]:
+            faults.append(
+                f"output.dbc: {config.output.dbc} promises {', '.join(late)} every {1e3 * told[late[0]]:g} ms, but"
+                f" soilbus sends every {1e3 * every:g} ms: set GenMsgCycleTime in a copy of the DBC that both sides use"
+                + (", or a shorter estimator.hop" if frames is HOP_FRAMES else "")
+            )
+    if faults:
+        raise ConfigError(faults)
+
+
+def json_line(result: WindowResult, config: Config) -> str:
+    """The result as one JSON object (keys: DESIGN.md), SI throughout, null for the unknown."""
+    way = result.traversability
+    bearing = {
+        "z_ref": config.estimator.z_ref,
+        "b_ref": config.estimator.b_ref,
+        **_value_std(result.bearing),
+        "z_driven": None if result.z_driven is None else list(result.z_driven),
+        "extrapolates": _extrapolates(result, config.estimator.z_ref),
+    }
+    posterior = result.posterior
+    line = {
+        "t": round(result.t, 6),
+        "log": result.log,
+        "window": result.index,
+        "status": str(result.status),
+        "state": str(state_after(result)),
+        "reason": result.reason,
+        "soil": None if posterior is None else {k: _value_std(e) for k, e in posterior.parameters().items()},
+        "bearing_pressure": bearing,
+        "soil_class": None if result.soil_class is None else likeliest(result.soil_class),
+        "slip": result.slip,
+        "sinkage": result.sinkage,
+        "traversability": {
+            "state": str(way.state),
+            "probability": way.probability,
+            "torque_required": way.torque_required,
+            "torque_available": way.torque_available,
+            "max_draft": _value_std(way.max_draft),
+            "max_grade": _value_std(way.max_grade),
+            "limit": way.limit,
+            "age": result.t - result.basis.end,
+            "since_valid": way.since_valid,
+        },
+        "gaps": dict(result.gaps),
+        "warning": {"state": str(result.watch.warning), "time_left": result.watch.time_left},
+        "capability": None if way.capability is None else _capability(way.capability),
+        "chi2": result.chi2,
+        "search_ended": result.search_ended,
+        "samples": result.samples,
+        "rejected": result.rejected,
+    }
+    return json.dumps(known(line), allow_nan=False)
+
+
+def _extrapolates(result: WindowResult, z_ref: float) -> bool | None:
+    """Whether the bearing pressure is of a depth [m] that the wheels hardly had; None where it is not known."""
+    if result.bearing is None or result.z_driven is None:
+        return None
+    low, high = result.z_driven
+    return not low <= z_ref <= high
+
+
+def _capability(able: Capability) -> dict[str, Any]:
+    """What traversability does not say already."""
+    forecast = able.forecast
+    return {
+        "max_draft_here": _value_std(able.max_draft_here),
+        "max_grade_with_draft": _value_std(able.max_grade_with_draft),
+        "set_points": {
+            axle: {"efficiency": _value_std(point.efficiency), "pull": _value_std(point.pull)}
+            for axle, point in able.set_points.items()
+        },
+        "forecast": None
+        if forecast is None
+        else {
+            "slip": _value_std(forecast.slip),
+            "torque": _value_std(forecast.torque),
+            "sinkage": {wheel: _value_std(depth) for wheel, depth in forecast.sinkage.items()},
+        },
+        "over_slip": {
+            column: getattr(able.over_slip, column).tolist()
+            for column in ("slip", "pull", "pull_std", "torque", "torque_std")
+        },
+    }
+
+
+def likeliest(soil_class: Mapping[str, float]) -> dict[str, float]:
+    """The few most likely known soils and `unknown`, likeliest first."""
+    known = [name for name in soil_class if name != UNKNOWN][:MOST_CLASSES]
+    return {name: p for name, p in soil_class.items() if name in known or name == UNKNOWN}
+
+
+def _value_std(estimate: Estimate | None) -> dict[str, float | None]:
+    return {"value": None, "std": None} if estimate is None else {"value": estimate.value, "std": estimate.std}
+
+
+def hop_frames(result: WindowResult) -> Iterator[tuple[str, dict[str, Any]]]:
+    """(message, values in the DBC's units) of the frames that go out once each window."""
+    common = {"Window": result.index % WINDOW_MODULUS, "Status": str(result.status)}
+    bearing, way = result.bearing, result.traversability
+    yield (
+        "SoilStrength",
+        common | {"Chi2": result.chi2} | _pair("BearingPressure", "BearingPressureStd", bearing, 1e3),
+    )
+    yield "SoilClass", common | _kind(result.soil_class)
+    parameters = {} if result.posterior is None else result.posterior.parameters()
+    for name, (message, unit) in PARAMETER_FRAMES.items():
+        yield message, common | _pair("Value", "Std", parameters.get(name), unit)
+    yield "DraftCapability", common | _pair("MaxDraft", "MaxDraftStd", way.max_draft, 1.0)
+    yield "GradeCapability", common | _pair("MaxGrade", "MaxGradeStd", way.max_grade, 1.0)
+    yield "TractionAdvice", common | _advice(way.capability)
+    yield "TractionLimits", common | {"LimitingCause": way.limit} | _limits(way.capability)
+    for message, values in _by_wheel("WheelSinkage", "SinkageWheel", result.sinkage, 1e-3):
+        yield message, common | values
+
+
+def _pair(value: str, std: str, estimate: Estimate | None, unit: float) -> dict[str, float | None]:
+    if estimate is None:
+        return {value: None, std: None}
+    return {value: estimate.value / unit, std: estimate.std / unit}
+
+
+def _kind(soil_class: Mapping[str, float] | None) -> dict[str, str | float | None]:
+    if soil_class is None:
+        return {"Kind": None, "Probability": None, "UnknownProbability": None}
+    kind, probability = next(iter(soil_class.items()))
+    return {"Kind": kind, "Probability": probability, "UnknownProbability": soil_class[UNKNOWN]}
+
+
+def _advice(able: Capability | None) -> dict[str, float | None]:
+    points = {} if able is None else able.set_points
+    values = {}
+    for axle, name in (("front", "Front"), ("rear", "Rear")):
+        point = points.get(axle)
+        values[f"SlipForEfficiency{name}"] = None if point is None else _value(point.efficiency)
+        values[f"SlipForPull{name}"] = None if point is None else _value(point.pull)
+    return values
+
+
+def _limits(able: Capability | None) -> dict[str, float | None]:
+    draft, grade = (None, None) if able is None else (able.max_draft_here, able.max_grade_with_draft)
+    return _pair("MaxDraft", "MaxDraftStd", draft, 1.0) | _pair("MaxGrade", "MaxGradeStd", grade, 1.0)
+
+
+def forecast_frame(result: WindowResult | None, watch: Watch) -> tuple[str, dict[str, Any]]:
+    """(message, values) of the forecast, from a result that may still be trusted (else None), and of the warning."""
+    able = None if result is None else result.traversability.capability
+    forecast = None if able is None else able.forecast
+    return "DemandForecast", {
+        "Slip": None if forecast is None else forecast.slip.value,
+        "SlipStd": None if forecast is None else forecast.slip.std,
+        "Sinkage": None if forecast is None else forecast.deepest.value * 1e3,
+        "TimeLeft": None if watch.time_left is None else min(watch.time_left, LONG),
+        "Warning": str(watch.warning),
+        "Window": None if result is None else result.index % WINDOW_MODULUS,
+        "Status": None if result is None else str(result.status),
+    }
+
+
+def known(value: Any) -> Any:
+    """What JSON can say of nested dicts, lists and numbers: null for every number that is not finite."""
+    if isinstance(value, Mapping):
+        return {key: known(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [known(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _value(estimate: Estimate | None) -> float | None:
+    return None if estimate is None else estimate.value
+
+
+def slip_frames(slip: Mapping[str, float | None]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """(message, values) of the wheel slips, wheels in the order of the configuration."""
+    return _by_wheel("WheelSlip", "SlipWheel", slip, 1.0)
+
+
+def _by_wheel(
+    message: str, signal: str, values: Mapping[str, float | None], unit: float
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    numbered = [(i, None if v is None else v / unit) for i, v in enumerate(values.values(), start=1)]
+    yield message, {f"{signal}{i}": v for i, v in numbered if i <= 4}
+    if len(numbered) > 4:
+        yield message + "2", {f"{signal}{i}": v for i, v in numbered if i > 4}

@@ -1,0 +1,133 @@
+"""How the cost of a fit grows with samples and wheels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.config.model import Config
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.multistart import fit_window
+from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.posterior import SoilPrior
+from soilbus.estimation.solver import Fitting, Place
+from soilbus.estimation.window import BinStore
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import excited
+from soilbus.validation.bench.figure import Figure, in_turn
+
+Array = NDArray[np.float64]
+
+WHEELS = (1, 2, 4, 8)
+LENGTHS = (5.0, 10.0, 20.0, 40.0)
+ROUNDS = 12
+STEPS = 5
+"""Gauss-Newton steps that are timed in a row."""
+TARGET = 1.1
+
+
+def exponents() -> dict[str, Figure]:
+    """How a Gauss-Newton step's time grows where it grows most: at the most wheels, at the longest window.
+
+    The exponents are those of doubling wheels or window to the largest size, where the
+    fixed cost hides least.  A fit takes about a dozen steps whatever the size.
+    """
+    sizes, works, iterations = [], [], []
+    for wheels in WHEELS:
+        for problem, prior in _problems(wheels):
+            fit = fit_window(problem, prior)
+            if fit is None:
+                raise AssertionError(f"no fit of {wheels} wheels and {problem.n} instants")
+            sizes.append(wheels * problem.n)
+            iterations.append(fit.iterations)
+            works.append(_steps(problem, prior, fit.mode.soil))
+    size, times = np.array(sizes, float), in_turn(works, ROUNDS) / STEPS
+    fixed, each = line(size, times)
+    off = float(np.max(np.abs((fixed + each * size) / times - 1.0)))
+    grid = times.reshape(len(WHEELS), len(LENGTHS))
+    what = "exponent of one Gauss-Newton step's time"
+    more = (
+        f"A Gauss-Newton step takes {1e3 * fixed:.1f} ms + {1e6 * each:.1f} us each wheel-instant, to "
+        f"{100.0 * off:.0f} %. In ms, in us each wheel-instant, and how many a cold fit takes:",
+        *_rows(1e3 * times, 1e6 * times / size, iterations),
+    )
+    return {
+        "wheels_exponent": Figure(
+            float(np.log2(grid[-1, -1] / grid[-2, -1])), TARGET,
+            f"{WHEELS[-2]} wheels {1e3 * grid[-2, -1]:.1f} ms, {WHEELS[-1]} wheels {1e3 * grid[-1, -1]:.1f} ms",
+            f"{what}, {LENGTHS[-1]:g} s window", at_most=True, digits=2,
+        ),
+        "samples_exponent": Figure(
+            float(np.log2(grid[-1, -1] / grid[-1, -2])), TARGET,
+            f"{LENGTHS[-2]:g} s {1e3 * grid[-1, -2]:.1f} ms, {LENGTHS[-1]:g} s {1e3 * grid[-1, -1]:.1f} ms",
+            f"{what}, {WHEELS[-1]} wheels", at_most=True, digits=2, more=more,
+        ),
+    }  # fmt: skip
+
+
+def line(size: Array, times: Array) -> tuple[float, float]:
+    """Fixed time [s] and time each wheel-instant [s] of the straight line that is relatively closest; (M,) each."""
+    (fixed, each), *_ = np.linalg.lstsq(np.column_stack([1.0 / times, size / times]), np.ones(len(times)))
+    return float(fixed), float(each)
+
+
+def _steps(problem: WindowProblem, prior: SoilPrior, soil: Array) -> Callable[[], Any]:
+    """Some Gauss-Newton steps at the optimum."""
+    fitting = Fitting(problem, prior, Belief.of(prior, problem.gain_std))
+
+    def moved(place: Place) -> Place:
+        point = fitting.point(place)
+        step = None if point is None else point.step()
+        if point is None or step is None:
+            raise AssertionError("a Gauss-Newton step failed at the optimum")
+        return fitting.moved(place, point, step)
+
+    start = moved(moved(fitting.start(soil)))
+
+    def work() -> None:
+        place = start
+        for _ in range(STEPS):
+            place = moved(place)
+
+    return work
+
+
+def _problems(wheels: int) -> Iterator[tuple[WindowProblem, SoilPrior]]:
+    """Windows of all lengths of a tractor with so many wheels, half of them on each axle; one: a test rig."""
+    config = _configuration(max(wheels, 2))
+    recording = simulate(config, excited("loam", max(LENGTHS)), seed=1)
+    samples = {name: (column.t, column.value) for name, column in recording.channels.items()}
+    if wheels == 1:
+        config = config.model_copy(update={"wheel": config.wheel[:1], "vehicle": None})
+        pull = recording.truth[f"drawbar_pull.{config.wheel[0].name}"]
+        noise = config.noise.draft.absolute * np.random.default_rng(1).standard_normal(len(pull))
+        samples["draft"] = recording.truth["t"], pull + noise
+    rig, settings = rig_of(config), config.estimator
+    store = BinStore(rig, settings.bin, 0.0)
+    store.add({name: samples[name] for name in rig.channels if name in samples})
+    for length in LENGTHS:
+        yield WindowProblem(store.window(0.0, length), rig, model_of(config), settings.min_speed), prior_of(config)
+
+
+def _configuration(wheels: int) -> Config:
+    """The reference tractor with more or fewer wheels, and as much heavier or lighter."""
+    config = reference_configuration()
+    axles = [next(w for w in config.wheel if w.axle == axle) for axle in ("front", "rear")]
+    fitted = [w.model_copy(update={"name": f"{w.name}{i}"}) for w in axles for i in range(wheels // 2)]
+    if config.vehicle is None:
+        raise AssertionError("the reference tractor is a vehicle")
+    vehicle = config.vehicle.model_copy(update={"mass": config.vehicle.mass * wheels / len(config.wheel)})
+    return config.model_copy(update={"wheel": fitted, "vehicle": vehicle})
+
+
+def _rows(times: Array, each: Array, iterations: Sequence[int]) -> list[str]:
+    """A line for each number of wheels."""
+    cells = [f"{t:8.1f}{e:6.1f}{i:4d}" for t, e, i in zip(times, each, iterations, strict=True)]
+    rows = [cells[i : i + len(LENGTHS)] for i in range(0, len(cells), len(LENGTHS))]
+    head = "wheels" + "".join(f"{f'{length:g} s':>18}" for length in LENGTHS)
+    return [head, *(f"{wheels:6d}" + "".join(row) for wheels, row in zip(WHEELS, rows, strict=True))]

@@ -1,0 +1,31 @@
+"""A recorded log through the daemon's pipeline, beside reading it alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from soilbus.can.dbc_files import load_databases
+from soilbus.offline.replay import estimator_beside, read_log, replay
+from soilbus.pipeline.pipeline import Pipeline
+from soilbus.simulator.reference import reference_configuration
+from soilbus.validation.bench.figure import Figure, wall_time
+
+
+def replay_realtime_factor(log: Path, seconds: float) -> Figure:
+    """A recording of so many seconds, 1 s hop, against reading it with python-can alone."""
+    config = reference_configuration()
+
+    def whole() -> None:
+        with estimator_beside(config) as workers:
+            for _ in replay(Pipeline(config, load_databases(config)), [log], workers=workers):
+                pass
+
+    def only_read() -> None:
+        for _ in read_log(log):
+            pass
+
+    ours, peer = wall_time(whole, 3), wall_time(only_read, 3)
+    return Figure(
+        seconds / ours, 150.0, f"reading alone {peer:.2f} s, whole replay {ours:.2f} s",
+        f"{seconds:.0f} s, four wheels, 1 s hop",
+    )  # fmt: skip

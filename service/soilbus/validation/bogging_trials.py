@@ -1,0 +1,251 @@
+"""Simulated boggings and firm ground: how long before slip passes its limit soilbus warns, and how often in vain."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.config.model import Config
+from soilbus.decision.capability import OverSlip
+from soilbus.decision.immobilisation import Alert, Moment, Watch, moments, watched
+from soilbus.decision.traversability import Status
+from soilbus.estimation.assembly import rig_of
+from soilbus.estimation.window import BinStore
+from soilbus.pipeline.estimator import WindowEstimator
+from soilbus.simulator.drive import drive
+from soilbus.simulator.recording import Recording, simulate
+from soilbus.simulator.scenario import Swing
+from soilbus.validation.boggings import KINDS, Trouble, bogging
+from soilbus.validation.firm_drives import EASY, FIRM_DRIVE, FIRM_KINDS, HARD, firm_ground
+from soilbus.validation.monte_carlo import Each
+from soilbus.validation.windows import task_of
+
+Array = NDArray[np.float64]
+
+HALVES = ("report", "tune")
+LOOK = 0.1
+"""Time [s] between two looks, as in the service."""
+ENOUGH_TIME, ENOUGH_WAY = 3.0, 3.0
+"""Warning ahead that is enough: [s] or [m]."""
+REACTION = 1.0
+"""Time [s] without which no change is told from noise."""
+FELT = 0.05
+"""Loss, as a share of the largest draft, that slip and pull can tell from their noise."""
+EARLIEST = 5.0
+"""Slip that passes within this time [s] of the first window cannot be foreseen: no drive to judge by."""
+
+
+class Task(NamedTuple):
+    """One drive: a kind of boggings.KINDS or firm_drives.FIRM_KINDS."""
+
+    config: Config
+    kind: str
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class WarningTrial:
+    """One drive: seconds watched, warnings begun before slip passed, and where it did the lead of the last one.
+
+    lead [s] and way [m] are nan where slip never passed, or at once (EARLIEST), and 0 where
+    it passed unwarned.  possible and possible_way are what went by from when the ground could be felt
+    to give way (FELT), or the first window, until slip passed: nobody can warn earlier.
+    """
+
+    kind: str
+    seconds: float
+    warnings: int
+    lead: float
+    way: float
+    possible: float = np.inf
+    possible_way: float = np.inf
+
+    @property
+    def in_time(self) -> bool:
+        """Whether the warning was early enough."""
+        return self.lead >= ENOUGH_TIME or self.way >= ENOUGH_WAY
+
+    @property
+    def sudden(self) -> bool:
+        """Whether slip passed too soon after the first sign for any warning to be early enough."""
+        speed = self.possible_way / self.possible if 0.0 < self.possible < np.inf else 0.0
+        return self.possible < ENOUGH_TIME + REACTION and self.possible_way < ENOUGH_WAY + REACTION * speed
+
+
+@dataclass(frozen=True, slots=True)
+class WarningFigures:
+    """One kind.
+
+    Boggings: how many that could be foreseen in time, how many of these were, median and
+    least lead [s]; how many were too sudden, and the median delay [s] of their warnings behind
+    the first sign.  Firm ground: hours and false warnings.
+    """
+
+    kind: str
+    boggings: int
+    warned: int
+    lead: float
+    least: float
+    sudden: int
+    delay: float
+    hours: float
+    false: int
+
+
+class Observation(NamedTuple):
+    """One drive as the watch sees it: moments, and pull over slip from the times [s] on at which it is known.
+
+    end [s] is when slip passed its limit (passed) or the drive ended, felt [s] when the ground could first
+    be felt to give way; way is the distance [m] driven at times t [s] (both (N,)).
+    """
+
+    moments: list[Moment]
+    curves: list[tuple[float, OverSlip]]
+    start: float
+    end: float
+    passed: bool
+    t: Array
+    way: Array
+    felt: float
+
+
+def trial(task: Task) -> WarningTrial:
+    """Drive, estimate every hop as the service does, and watch."""
+    return judged(task.kind, observed(task))
+
+
+def observed(task: Task) -> Observation:
+    """Drive and estimate."""
+    config, rig = task.config, rig_of(task.config)
+    rng = np.random.default_rng([task.seed, 3])
+    if task.kind in FIRM_KINDS:
+        trouble = Trouble(firm_ground(config, task.kind, rng))
+    else:
+        trouble = bogging(config, task.kind, rng)
+    recording = simulate(config, trouble.scenario, task.seed, trouble.effects)
+    truth = recording.truth
+    slip = np.mean([truth[f"slip.{wheel}"] for wheel in rig.wheels], axis=0)
+    start = config.estimator.window
+    passed = truth["t"][(slip > config.traversability.max_slip) & (truth["t"] > start)]
+    end = float(passed[0]) if len(passed) else float(truth["t"][-1])
+    looks, curves = _looks(recording, config, end)
+    felt = _felt(task, trouble, end) if len(passed) else end
+    return Observation(
+        looks, curves, start, end, len(passed) > 0, truth["t"], truth["distance"], felt
+    )  # fmt: skip
+
+
+def _felt(task: Task, trouble: Trouble, end: float) -> float:
+    """From when on, until the end [s], the largest draft that the way truly holds is less by FELT than at the start.
+
+    0 where it is not: then the demand is what grows.
+    """
+    limit = task.config.traversability.max_slip
+    even = replace(trouble.scenario, draft=None, slip=Swing(limit, limit), slip_spread=0.0, side_shift=Swing(0.0, 0.0))
+    truth = drive(task.config, even, task.seed, trouble.effects).columns
+    mass = task.config.vehicle.mass if task.config.vehicle else 0.0
+    held, t = truth["draft"] + mass * truth["acceleration"], truth["t"]
+    firm = t[(held >= (1.0 - FELT) * held[0]) & (t <= end)]
+    return float(firm[-1]) if len(firm) and firm[-1] < t[t <= end][-1] else 0.0
+
+
+def judged(kind: str, seen: Observation) -> WarningTrial:
+    """What the watch makes of a drive."""
+    t, warned = watch(seen)
+    begins = t[1:][warned[1:] & ~warned[:-1]]
+    seconds = seen.end - seen.start
+    if not seen.passed or seconds <= EARLIEST:
+        return WarningTrial(kind, seconds, len(begins), np.nan, np.nan)
+    lead = seen.end - float(begins[-1]) if len(begins) and warned[-1] else 0.0
+    possible = seen.end - min(max(seen.felt, seen.start), seen.end)
+    way, possible_way = (_way(seen, seen.end - s) for s in (lead, possible))
+    return WarningTrial(kind, seconds, len(begins), lead, way, possible, possible_way)
+
+
+def _way(seen: Observation, since: float) -> float:
+    """Distance [m] driven from a time [s] until the end."""
+    return float(np.interp(seen.end, seen.t, seen.way) - np.interp(since, seen.t, seen.way))
+
+
+def watch(seen: Observation) -> tuple[Array, NDArray[np.bool_]]:
+    """Times [s] (N,) of the looks, and whether each warned."""
+    state, curve, curves, out = Watch(), None, iter(seen.curves), []
+    due = next(curves, None)
+    for moment in seen.moments:
+        while due is not None and moment.t >= due[0]:
+            curve, due = due[1], next(curves, None)
+        state = watched(state, moment.t, moment.slip, moment.pull, curve, moment.inertia)
+        out.append((moment.t, state.warning is Alert.IMMOBILISATION))
+    t, warned = np.array(out, float).reshape(-1, 2).T
+    return t, warned > 0.5
+
+
+def _looks(recording: Recording, config: Config, end: float) -> tuple[list[Moment], list[tuple[float, OverSlip]]]:
+    """The moments until the end [s], and from their times on the curves of windows that the service calls valid."""
+    rig, settings = rig_of(config), config.estimator
+    estimator, no_limit = WindowEstimator(config), np.full(len(rig.radius), np.nan)
+    store = BinStore(rig, LOOK, 0.0)
+    store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
+    curves = []
+    for due in np.arange(settings.window, end, settings.hop).tolist():
+        window = store.window(due - settings.window, due)
+        result = estimator.solve_unwatched(task_of(window, due, config, no_limit, fresh=due == settings.window))
+        able = result.traversability.capability
+        if able is not None and result.status is Status.VALID:
+            curves.append((due, able.over_slip))
+    return list(moments(store.window(0.0, end), rig, 0.0, settings.min_speed)), curves
+
+
+def half_of(seed: int) -> str:
+    """The half of all drives that one with this seed is in: thresholds may be set by "tune" drives alone."""
+    return "tune" if seed % 2 else "report"
+
+
+def warning_trials(
+    config: Config, boggings: int, hours: float, seed: int, each: Each = map, half: str = "report"
+) -> tuple[WarningFigures, ...]:
+    """Figures of so many boggings, evenly of all kinds, and of so many hours without one, half of them hard.
+
+    All drives are of one half (half_of).  The same seed gives the same drives.  Raises SimulationError where the
+    vehicle cannot be driven, ValueError for another half.
+    """
+    if half not in HALVES:
+        raise ValueError(f"no half of the drives is called {half}; known: {', '.join(HALVES)}")
+    firm = math.ceil(3600.0 * hours / (FIRM_DRIVE - config.estimator.window))
+    kinds = [KINDS[i % len(KINDS)] for i in range(boggings)] + [
+        HARD[i // 2 % len(HARD)] if i % 2 else EASY for i in range(firm)
+    ]
+    key = np.random.SeedSequence([seed, zlib.crc32(b"warnings")])
+    seeds = [int(s) // 2 * 2 + HALVES.index(half) for s in key.generate_state(len(kinds))]
+    trials = list(each(trial, [Task(config, kind, s) for kind, s in zip(kinds, seeds, strict=True)]))
+    return tuple(
+        figures(kind, found)
+        for kind in (*KINDS, *FIRM_KINDS)
+        if (found := [t for t in trials if t.kind == kind])
+    )  # fmt: skip
+
+
+def figures(kind: str, trials: Sequence[WarningTrial]) -> WarningFigures:
+    """The figures of some trials of one kind: boggings are those whose slip passed."""
+    bogged = [t for t in trials if np.isfinite(t.lead)]
+    asked = [t for t in bogged if not t.sudden]
+    rest = [t for t in trials if t.kind in FIRM_KINDS]
+    leads = np.array([t.lead for t in asked])
+    delays = [t.possible - t.lead for t in bogged if t.sudden]
+    return WarningFigures(
+        kind=kind,
+        boggings=len(asked),
+        warned=sum(t.in_time for t in asked),
+        lead=float(np.median(leads)) if len(asked) else float("nan"),
+        least=float(leads.min()) if len(asked) else float("nan"),
+        sudden=len(delays),
+        delay=float(np.median(delays)) if delays else float("nan"),
+        hours=sum(t.seconds for t in rest) / 3600.0,
+        false=sum(t.warnings for t in rest),
+    )

@@ -1,0 +1,172 @@
+"""Simulated drives: the largest draft foretold from one window, beside the one that the soil truly holds.
+
+Each drive has a soil of its own about one of a few, works at moderate slips, and is
+estimated from one window alone, cold.  The truth is solved by the simulator's own
+equilibrium, slip by slip.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.config.model import Config
+from soilbus.decision.capability import assess
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.laplace import cold_fit
+from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.window import BinStore, Rig
+from soilbus.simulator.equilibrium import Mechanics, Situation, solve
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.terra.soils import soil_named
+from soilbus.terra.vehicle import axle_loads
+from soilbus.terra.wheel import Soil, WheelModel, sinkage
+from soilbus.validation.monte_carlo import NORMAL_95, Each, missed
+
+Array = NDArray[np.float64]
+
+SOILS = ("rubicon_sandy_loam_43", "north_gower_clayey_loam_46", "upland_sandy_loam_51")
+SPREAD = 0.1
+"""Sd of the logarithms by which a drive's soil parameters leave those of the named soil."""
+LOW_SLIP, HIGH_SLIP = (0.04, 0.10), (0.20, 0.40)
+"""Between which the lowest and the highest slip of a drive lie."""
+SLIPS = np.linspace(0.02, 1.0, 50)
+"""At which the truth is solved, in units of the greatest slip allowed."""
+
+
+class Task(NamedTuple):
+    """One drive."""
+
+    config: Config
+    soil: str
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class DraftTrial:
+    """Largest draft on the level [N]: foretold with its std, and true; nan where the fit failed."""
+
+    soil: str
+    foretold: float
+    std: float
+    true: float
+
+
+@dataclass(frozen=True, slots=True)
+class DraftFigures:
+    """All drives on one soil: median of |relative error|, median error, share of 95 % intervals that hold the truth."""
+
+    soil: str
+    drives: int
+    failed: int
+    error: float
+    bias: float
+    coverage: float
+    true: float
+
+
+def draft_trials(
+    config: Config, drives: int, seed: int, soils: Sequence[str] = SOILS, each: Each = map
+) -> Iterator[DraftFigures]:
+    """Figures of each soil from so many drives, then of all soils; the same seed gives the same drives.
+
+    `each` is the built-in map or that of monte_carlo.processes.  Raises KeyError for an
+    unknown soil, SimulationError where the tractor cannot drive on one.
+    """
+    everything: list[DraftTrial] = []
+    for name in soils:
+        key = np.random.SeedSequence([seed, zlib.crc32(name.encode())])
+        tasks = [Task(config, name, int(s)) for s in key.generate_state(drives)]
+        everything += (of_soil := list(each(trial, tasks)))
+        yield figures(name, of_soil)
+    yield figures("all", everything)
+
+
+def trial(task: Task) -> DraftTrial:
+    """Simulate, estimate, foretell, and solve for the truth."""
+    config, name, seed = task
+    rng = np.random.default_rng([seed, 2])
+    soil = Soil(*(np.asarray(soil_named(name)) * np.exp(SPREAD * rng.standard_normal(6))).tolist())
+    slip = Swing(rng.uniform(*LOW_SLIP), rng.uniform(*HIGH_SLIP))
+    duration = config.estimator.window
+    recording = simulate(config, Scenario(duration, (Patch(0.0, name, soil),), slip=slip), seed)
+    rig, model, settings = rig_of(config), model_of(config), config.traversability
+    store = BinStore(rig, config.estimator.bin, 0.0)
+    store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
+    prior = missed(prior_of(config), soil, np.random.default_rng([seed, 1]))
+    fit = cold_fit(WindowProblem(store.window(0.0, duration), rig, model, config.estimator.min_speed), prior)
+    limit = np.array([wheel.max_torque or np.nan for wheel in config.wheel])
+    truth = true_largest_draft(soil, rig, limit, settings.max_slip, WheelModel(shear_law=config.model.shear_law))
+    if fit is None or not fit.converged:
+        return DraftTrial(name, np.nan, np.nan, truth)
+    able, _ = assess(fit.whole.posterior, rig, model, None, limit, settings.max_slip, settings.max_sinkage)
+    if able is None:
+        return DraftTrial(name, np.nan, np.nan, truth)
+    return DraftTrial(name, able.max_draft.value, able.max_draft.std, truth)
+
+
+def true_largest_draft(
+    soil: Soil, rig: Rig, torque_limit: Array, max_slip: float, model: WheelModel, max_sinkage: float = np.inf
+) -> float:
+    """Largest draft [N] held steadily on level ground at any slip up to max_slip; nan where there is none.
+
+    torque_limit (W,) [N m], nan where there is none; no wheel may sink below max_sinkage [m].
+    Raises ValueError for a rig without a chassis.
+    """
+    if rig.chassis is None:
+        raise ValueError("a draft needs the vehicle's mass and geometry")
+    slips = max_slip * SLIPS
+    shape = (len(rig.radius), len(slips))
+    share = 1.0 / np.where(rig.front, rig.front.sum(), (~rig.front).sum())
+    free, drawn = (np.where(rig.front, *axle_loads(rig.chassis, draft, 0.0, 0.0)) * share for draft in (0.0, 1.0))
+    none = np.zeros(len(slips))
+
+    def each_wheel(values: Any) -> Array:
+        return np.broadcast_to(np.asarray(values, float)[:, None], shape)
+
+    found = solve(
+        Situation(
+            t=none,
+            distance=none,
+            ground_speed=none + 1.0,
+            acceleration=none,
+            resistance=none,
+            level_load=each_wheel(free),
+            load_per_draft=each_wheel(drawn - free),
+            deviation=np.zeros(shape),
+            radius=each_wheel(rig.radius),
+            width=each_wheel(rig.width),
+            soil=np.broadcast_to(np.asarray(soil)[:, None, None], (6, *shape)),
+            demand=none + np.inf,
+            slip_limit=slips,
+            torque_limit=each_wheel(np.where(np.isfinite(torque_limit), torque_limit, np.inf)),
+            least_draft=none - np.inf,
+        ),
+        Mechanics(model, ~rig.front, rig.chassis.mass, 0.0, 0.0),
+    )
+    usable = found.found & (sinkage(found.entry_angle, rig.radius[:, None]) <= max_sinkage).all(axis=0)
+    return float(found.draft[usable].max()) if usable.any() else float("nan")
+
+
+def figures(soil: str, trials: Sequence[DraftTrial]) -> DraftFigures:
+    """The figures of some trials; nan where all failed."""
+    good = [t for t in trials if np.isfinite(t.foretold)]
+    foretold, std, true = (np.array([getattr(t, of) for t in good]) for of in ("foretold", "std", "true"))
+    if not good:
+        return DraftFigures(soil, len(trials), len(trials), *[float("nan")] * 4)
+    error = foretold / true - 1.0
+    return DraftFigures(
+        soil=soil,
+        drives=len(trials),
+        failed=len(trials) - len(good),
+        error=float(np.median(np.abs(error))),
+        bias=float(np.median(error)),
+        coverage=float(np.mean(np.abs(foretold - true) < NORMAL_95 * std)),
+        true=float(np.median(true)),
+    )

@@ -1,0 +1,362 @@
+"""Windows of simulated drives, estimated one by one, beside the Cramér-Rao bound.
+
+Each window is a drive of its own: its own slips and loads, noise and gain errors, and a
+prior whose medians miss the truth by as much as it says (log-normal about the true soil,
+for every free parameter), so that all is as the estimator believes it to be.  It is
+estimated from nothing else, as the first window after a start is.  Errors, standard
+deviations and bounds are those of logarithms.
+
+The bound is local: it knows how the window would change with a soil next to the true one.
+Where the soils that the window allows are not next to it, an estimate may miss it: what is at least
+missed follows from the bounds of all these soils and how probable they are (`exact`, see `attainable`).
+For the same reason no interval holds each single soil 95 times in 100, but soils
+that lie about it as they may (`around`).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from typing import Any, NamedTuple, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.allocator import keep_freed_memory
+from soilbus.config.model import Config
+from soilbus.estimation.assembly import completion_of, model_of, prior_of, rig_of
+from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.laplace import with_whole
+from soilbus.estimation.multistart import fit_window
+from soilbus.estimation.observation_model import CompletedProblem, WindowProblem
+from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
+from soilbus.estimation.window import BinStore
+from soilbus.simulator.drive import SimulationError
+from soilbus.simulator.recording import Recording, simulate
+from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.terra.soils import soil_named
+from soilbus.terra.wheel import Soil
+from soilbus.validation.bayes_risk_bound import Attainable, attainable
+from soilbus.validation.cramer_rao import cramer_rao
+from soilbus.validation.importance_sampling import samples
+from soilbus.workers import workers
+
+Array = NDArray[np.float64]
+
+SOILS = ("loam", "wet_clay", "dry_sand")
+DURATIONS = (2.0, 10.0, 60.0)
+SLIP = Swing(0.05, 0.40)
+ROUGHLY_KNOWN = ("soil.c.value=3000", "soil.c.std=750", "soil.K.value=0.02", "soil.K.std=0.005")
+"""Settings with which cohesion and shear modulus are known to 25 %."""
+MAX_PHI = 1.2
+"""A prior that is off by more than this friction angle [rad] is drawn again: the model ends at a right angle."""
+MAX_DRAWN = 20
+"""Soils around a named one that are tried until the tractor gets on."""
+NORMAL_95 = 1.959964
+_PHI = PARAMETERS.index("phi")
+
+
+class Task(NamedTuple):
+    """One drive to be simulated and estimated, with and without sinkage sensors.
+
+    exact is how many samples of the exact posterior are drawn beside each fit, around the std of the
+    free parameters' logarithms about the named soil's (0: that soil).
+    """
+
+    config: Config
+    soil: str
+    duration: float
+    seed: int
+    exact: int = 0
+    around: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One window: error, std and bound (6 + 1,) of the parameters' logarithms and the bearing pressure's.
+
+    What is held has no error and no bound.  All of it is nan where the fit failed.  exact is None
+    where no exact posterior was drawn from.
+    """
+
+    error: Array
+    std: Array
+    bound: Array
+    chi2: float
+    converged: bool
+    seconds: float
+    exact: Attainable | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """All windows of one soil, duration [s] and fit of sensors.
+
+    quantities names the free parameters and the bearing pressure; for each (Q,) rms is the
+    root mean square of errors over their windows' bounds, bias their mean, coverage the
+    share of 95 % intervals that hold the truth, bound the root mean square of the bounds.
+    These and chi2, the mean of the reduced chi-squares, are of the windows that converged;
+    failed and not_converged count the others.  seconds is the median processor time of a fit.
+    exact is None without samples of exact posteriors.
+    """
+
+    soil: str
+    duration: float
+    sinkage: bool
+    windows: int
+    failed: int
+    not_converged: int
+    quantities: tuple[str, ...]
+    rms: Array
+    bias: Array
+    coverage: Array
+    bound: Array
+    chi2: float
+    seconds: float
+    exact: Exact | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Exact:
+    """What could be attained in some windows, in units of the bounds, of each quantity (Q,).
+
+    least: no estimate has a root mean square error below this on all soils that the windows allow, and
+    its standard deviation by chance.  best: that of the estimate with the least one on average over these soils,
+    at the true one.  ours: that of ours; share is ours over best and scatter its standard deviation by
+    chance, for the windows are the same.  effective is the median of how many independent samples a
+    posterior is told by.
+    """
+
+    windows: int
+    least: Array
+    least_scatter: Array
+    best: Array
+    ours: Array
+    share: Array
+    scatter: Array
+    effective: float
+
+
+_T = TypeVar("_T")
+_R = TypeVar("_R")
+
+
+class Each(Protocol):
+    """Does a work for each task, here or in other processes: the built-in map, or that of `processes`."""
+
+    def __call__(self, work: Callable[[_T], _R], tasks: Iterable[_T], /) -> Iterable[_R]:
+        """The results in the order of the tasks."""
+
+
+def monte_carlo(
+    config: Config,
+    windows: int,
+    seed: int,
+    soils: Sequence[str] = SOILS,
+    durations: Sequence[float] = DURATIONS,
+    each: Each = map,
+    exact: int = 0,
+    around: float = 0.0,
+) -> Iterator[Cell]:
+    """Cells of all soils and durations, each with and without sinkage sensors (the same drives).
+
+    With so many samples of the exact posterior of each window; with a soil of its
+    own for each drive, log-normal `around` the named one.  `each` is the built-in map, or that
+    of `processes`.  The same seed gives the same windows.  Raises KeyError for an unknown soil
+    and SimulationError where the tractor cannot drive on one.
+    """
+    for name in soils:
+        soil_named(name)
+    places = list(product(soils, durations))
+    tasks = [task for place in places for task in tasks_of(config, *place, windows, seed, exact, around)]
+    results = iter(each(trials, tasks))
+    for soil, duration in places:
+        pairs = [next(results) for _ in range(windows)]
+        for sinkage, of_cell in zip((True, False), zip(*pairs, strict=True), strict=True):
+            yield summary(soil, duration, sinkage, of_cell)
+
+
+@contextmanager
+def processes(count: int) -> Iterator[Each]:
+    """A map over so many processes, each with one thread; the built-in one for less than two."""
+    if count < 2:
+        yield map
+        return
+    with workers(count, "spawn", keep_freed_memory) as pool:
+        yield partial(pool.map, chunksize=4)
+
+
+def tasks_of(
+    config: Config, soil: str, duration: float, windows: int, seed: int, exact: int = 0, around: float = 0.0
+) -> list[Task]:
+    """Independent drives on a soil, the same ones whatever else is asked for."""
+    # The simulator's of_mean noise and the estimator's refer to the same window.
+    hop = min(config.estimator.hop, duration)
+    of_window = config.estimator.model_copy(update={"window": duration, "hop": hop})
+    of_cell = config.model_copy(update={"estimator": of_window})
+    key = [seed, zlib.crc32(soil.encode()), round(1e3 * duration)]
+    seeds = np.random.SeedSequence(key).generate_state(windows)
+    return [Task(of_cell, soil, duration, int(s), exact, around) for s in seeds]
+
+
+def trials(task: Task) -> tuple[Trial, Trial]:
+    """A drive simulated, and its window estimated with and without sinkage sensors.
+
+    Raises SimulationError where the tractor cannot drive on, KeyError for an unknown soil.
+    """
+    recording, soil = _driven(task)
+    prior = missed(prior_of(task.config), soil, np.random.default_rng([task.seed, 1]))
+    with_sinkage, without = (_trial(recording, task, prior, soil, fitted) for fitted in (True, False))
+    return with_sinkage, without
+
+
+def _driven(task: Task) -> tuple[Recording, Soil]:
+    """The drive and its soil: the named one, or the first drawn around it on which the tractor gets on."""
+    config, name, duration, seed, _, around = task
+    rng, named = np.random.default_rng([seed, 3]), soil_named(name)
+    spread = np.where(prior_of(config).log_std > 0.0, around, 0.0)
+    for _ in range(MAX_DRAWN if around else 1):
+        soil = missed(SoilPrior(np.asarray(named), spread), named, rng).median if around else np.asarray(named)
+        of_drive = Soil(*soil.tolist())
+        with suppress(SimulationError) if around else nullcontext():
+            recording = simulate(config, Scenario(duration, (Patch(0.0, name, of_drive),), slip=SLIP), seed)
+            if recording.bogged_at is None:
+                return recording, of_drive
+    raise SimulationError(f"the tractor gets stuck on {name}")
+
+
+def missed(prior: SoilPrior, soil: Soil, rng: np.random.Generator) -> SoilPrior:
+    """A prior of the same spread that was told of this soil: medians log-normal about it, held ones right."""
+    while True:
+        median = np.asarray(soil) * np.exp(prior.log_std * rng.standard_normal(len(soil)))
+        if median[_PHI] < MAX_PHI:
+            return SoilPrior(median, prior.log_std)
+
+
+def _trial(recording: Recording, task: Task, prior: SoilPrior, soil: Soil, sinkage: bool) -> Trial:
+    config, _, duration, seed, drawn, _ = task
+    names = [n for n in rig_of(config).channels if n in recording.channels and (sinkage or not n.startswith("sinkage"))]
+    noisy, noiseless = (_problem(recording, config, duration, names, of_truth) for of_truth in (False, True))
+    bound = cramer_rao(noiseless, prior, soil)
+    begin = time.thread_time()
+    found, before = fit_window(noisy, prior), Belief.of(prior, noisy.gain_std)
+    fit = with_whole(noisy, prior, before, found) if found is not None and found.converged else found
+    seconds = time.thread_time() - begin
+    if fit is None or found is None:
+        nothing = np.full(len(PARAMETERS) + 1, np.nan)
+        return Trial(nothing, nothing, nothing, np.nan, False, seconds)
+    (value, std), (truth, least) = (_logarithms(p, config) for p in (fit.whole.posterior, bound))
+    trial = Trial(value - truth, std, least, fit.chi2, fit.converged, seconds)
+    if not drawn or not fit.converged:
+        return trial
+    posterior = samples(noisy, prior, before, found, drawn, np.random.default_rng([seed, 2]))
+    if posterior is None:
+        return trial
+    soils = zip(np.exp(posterior.logs).tolist(), posterior.bound, strict=True)
+    told = [_logarithms(Posterior(Soil(*soil), covariance), config) for soil, covariance in soils]
+    value, bound_of_each = (np.array(column) for column in zip(*told, strict=True))
+    return replace(trial, exact=attainable(value, posterior.share, bound_of_each, truth))
+
+
+def _problem(
+    recording: Recording, config: Config, duration: float, names: Iterable[str], of_truth: bool
+) -> WindowProblem:
+    """The window of these channels as measured, or as it truly was at the times of the samples."""
+    rig, truth = rig_of(config), recording.truth
+    columns = {name: recording.channels[name] for name in names}
+    store = BinStore(rig, config.estimator.bin, 0.0)
+    store.add({
+        name: (column.t, np.interp(column.t, truth["t"], truth[name]) if of_truth else column.value)
+        for name, column in columns.items()
+    })  # fmt: skip
+    window, settings = store.window(0.0, duration), config.estimator
+    return CompletedProblem(
+        window, rig, model_of(config), settings.min_speed, settings.max_turn, *completion_of(config)
+    )
+
+
+def _logarithms(posterior: Posterior, config: Config) -> tuple[Array, Array]:
+    """Logarithms (7,) of the parameters and the bearing pressure, and their std."""
+    bearing = posterior.bearing_pressure(config.estimator.z_ref, config.estimator.b_ref)
+    soil = np.append(np.asarray(posterior.soil), bearing.value)
+    with np.errstate(divide="ignore"):
+        logarithms = np.log(soil)
+    return logarithms, np.append(np.sqrt(np.diag(posterior.log_covariance)), bearing.std / bearing.value)
+
+
+def summary(soil: str, duration: float, sinkage: bool, windows: Sequence[Trial]) -> Cell:
+    """The figures of one cell; nan where no window converged."""
+    good = [trial for trial in windows if trial.converged]
+    names = (*PARAMETERS, "bearing_pressure")
+    error, std, bound = (np.array([getattr(t, of) for t in good]).reshape(-1, 7) for of in ("error", "std", "bound"))
+    free = bound.any(axis=0)
+    error, std, bound = error[:, free], std[:, free], bound[:, free]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = error / bound
+        count = np.float64(len(good))
+        return Cell(
+            soil=soil,
+            duration=duration,
+            sinkage=sinkage,
+            windows=len(windows),
+            failed=sum(not np.isfinite(trial.chi2) for trial in windows),
+            not_converged=sum(bool(np.isfinite(trial.chi2)) and not trial.converged for trial in windows),
+            quantities=tuple(names[i] for i in np.flatnonzero(free)),
+            rms=np.sqrt((share**2).sum(axis=0) / count),
+            bias=share.sum(axis=0) / count,
+            coverage=(np.abs(error) < NORMAL_95 * std).sum(axis=0) / count,
+            bound=np.sqrt((bound**2).sum(axis=0) / count),
+            chi2=float(sum(trial.chi2 for trial in good) / count),
+            seconds=float(np.median([trial.seconds for trial in windows])),
+            exact=_exact([trial for trial in good if trial.exact is not None], np.asarray(free)),
+        )
+
+
+def _exact(windows: Sequence[Trial], free: NDArray[np.bool_]) -> Exact | None:
+    """The figures of windows whose exact posteriors are known; None without any."""
+    known = [(trial, trial.exact) for trial in windows if trial.exact is not None]
+    if not known:
+        return None
+    ours = np.array([trial.error / trial.bound for trial, _ in known])[:, free] ** 2
+    best = np.array([exact.error / trial.bound for trial, exact in known])[:, free] ** 2
+    risk, weight = (np.array([getattr(exact, of) for _, exact in known])[..., free] for of in ("risk", "weight"))
+    average = risk.sum(axis=0) / weight.sum(axis=0)
+    off = np.sqrt(((risk - average * weight) ** 2).sum(axis=0)) / weight.sum(axis=0)
+    tilt = average.argmax(axis=0), np.arange(average.shape[1])
+    square = ours.sum(0) / best.sum(0)
+    return Exact(
+        windows=len(known),
+        least=np.sqrt(average[tilt]),
+        least_scatter=0.5 * off[tilt] / np.sqrt(average[tilt]),
+        best=np.sqrt(best.mean(0)),
+        ours=np.sqrt(ours.mean(0)),
+        share=np.sqrt(square),
+        scatter=0.5 * np.sqrt(square) * np.sqrt(((ours - square * best) ** 2).sum(0)) / ours.sum(0),
+        effective=float(np.median([exact.effective for _, exact in known])),
+    )
+
+
+def as_json(cell: Cell) -> dict[str, Any]:
+    """The cell's figures as plain objects; null for what is not a number."""
+
+    def number(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    columns = {"rms": cell.rms, "bias": cell.bias, "coverage": cell.coverage, "bound": cell.bound}
+    if cell.exact is not None:
+        columns |= {"least": cell.exact.least, "least_scatter": cell.exact.least_scatter}
+        columns |= {"best": cell.exact.best, "rms_beside_best": cell.exact.ours}
+    return {
+        "soil": cell.soil, "duration": cell.duration, "sinkage": cell.sinkage, "windows": cell.windows,
+        "failed": cell.failed, "not_converged": cell.not_converged, "chi2": number(cell.chi2), "seconds": cell.seconds,
+        "quantities": {
+            name: {figure: number(float(column[i])) for figure, column in columns.items()}
+            for i, name in enumerate(cell.quantities)
+        },
+    }  # fmt: skip

@@ -1,0 +1,259 @@
+"""Simulated drives: the probability that the present demand can be met, beside whether it truly can.
+
+Each drive has a soil of its own about one of the table's, harder and softer, works at
+slips and a draft of its own, and ends in one call: a probability and a state from one
+window, cold, by the service's own estimator: what it does not call valid is never called
+go.  The truth is solved by the simulator's own equilibrium for the demand that the sensors
+saw with noise.  Torque and sinkage limits are drawn too, so that every cause comes to its
+turn.  Most demands are far from the limit, where any call is easy; so three drives in four
+ask for a margin that is drawn from the estimate to make all probabilities alike frequent.
+It depends on the measurements alone: whoever knows them and no more must still find calls
+of p come true with frequency p.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.config.model import Config, Prior
+from soilbus.config.model import Traversability as Settings
+from soilbus.decision.capability import Demand
+from soilbus.decision.demand import present_demand
+from soilbus.decision.judgement import judge
+from soilbus.decision.traversability import State, Traversability
+from soilbus.estimation.assembly import prior_of, rig_of
+from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+from soilbus.estimation.window import BinStore, Rig, Window
+from soilbus.pipeline.estimator import WindowEstimator
+from soilbus.simulator.drive import SimulationError
+from soilbus.simulator.recording import Recording, simulate
+from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.terra.soils import KINDS, soil_named
+from soilbus.terra.wheel import Soil, WheelModel
+from soilbus.validation.draft_trials import true_largest_draft
+from soilbus.validation.monte_carlo import MAX_PHI, NORMAL_95, Each, missed
+from soilbus.validation.windows import task_of
+
+Array = NDArray[np.float64]
+
+SPREAD = 0.2
+"""Sd of the logarithms by which a drive's soil parameters leave those of the table's soil."""
+LOW_SLIP, HIGH_SLIP = (0.03, 0.12), (0.15, 0.55)
+"""Between which the lowest and the highest slip of a drive lie."""
+TORQUE, SINKAGE = (400.0, 1600.0), (0.02, 0.15)
+"""Between which a motor's torque limit at the wheel [N m] and a sinkage limit [m] are drawn."""
+NEAR = 0.75
+"""Share of drives that ask for a margin near the limit."""
+LEAST = 1e-3
+BINS = 10
+MAX_DRAWS = 100
+
+
+class Task(NamedTuple):
+    """One drive."""
+
+    config: Config
+    seed: int
+
+
+class Ground(NamedTuple):
+    """What a drive finds: soil, torque limits (W,) [N m] (nan: none) and a sinkage limit [m]."""
+
+    name: str
+    soil: Soil
+    torque_limit: Array
+    max_sinkage: float
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """One call: probability that the demand can be met (nan: none), state, what limits, and whether it truly can."""
+
+    soil: str
+    probability: float
+    state: State
+    limit: str | None
+    true: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Bin:
+    """Calls with a probability of low to high: count, mean, share that came true, and its 95 % interval."""
+
+    low: float
+    high: float
+    calls: int
+    mean: float
+    true: float
+    least: float
+    most: float
+
+
+@dataclass(frozen=True, slots=True)
+class Reliability:
+    """All calls.
+
+    Brier is the mean square of probability less outcome; brier_expected and brier_std are
+    its mean and sd if calls of p come true with frequency p.  excess is the outcomes'
+    count less the probabilities' sum, over its sd.  wrong_go counts the drives called go that
+    cannot; wrong_go_expected the sum of what their probabilities left open.
+    """
+
+    drives: int
+    failed: int
+    brier: float
+    brier_expected: float
+    brier_std: float
+    excess: float
+    go: int
+    wrong_go: int
+    wrong_go_expected: float
+    bins: tuple[Bin, ...]
+
+
+def verdict_trials(config: Config, drives: int, seed: int, each: Each = map) -> Reliability:
+    """Figures of so many drives; the same seed gives the same drives.
+
+    `each` is the built-in map or that of monte_carlo.processes.  Raises SimulationError
+    where the vehicle cannot be driven.
+    """
+    key = np.random.SeedSequence([seed, zlib.crc32(b"verdicts")])
+    return reliability(list(each(trial, [Task(config, int(s)) for s in key.generate_state(drives)])))
+
+
+def trial(task: Task) -> Call:
+    """Simulate, estimate, call, and solve for the truth."""
+    config, seed = task
+    rig, rng = rig_of(config), np.random.default_rng([seed, 4])
+    ground, recording = _driven(config, seed, rng)
+    settings = config.traversability.model_copy(update={"max_sinkage": ground.max_sinkage})
+    measured, exact = (_window(recording, config, rig, of_truth) for of_truth in (False, True))
+    told = _told(config, missed(prior_of(config), ground.soil, np.random.default_rng([seed, 1])))
+    task_of_window = task_of(measured, config.estimator.window, told, ground.torque_limit, fresh=True)
+    estimate = WindowEstimator(told).estimate(task_of_window)
+    posterior, status, demand = estimate.result.posterior, estimate.result.status, estimate.demand
+    asked = present_demand(exact, rig.chassis, config.estimator.hop)
+    if posterior is None or asked is None or demand is None:
+        return Call(ground.name, math.nan, State.UNKNOWN, None, False)
+
+    def judged(by: Settings) -> Traversability:
+        return judge(posterior, status, demand, rig, estimate.model, ground.torque_limit, by)[0]
+
+    way = judged(settings)
+    if rng.random() < NEAR and (margin := _margin(way, demand, rng)) is not None:
+        settings = settings.model_copy(update={"margin": margin})
+        way = judged(settings)
+    probability = math.nan if way.probability is None else way.probability
+    return Call(ground.name, probability, way.state, way.limit, _can(config, ground, settings, asked.pull))
+
+
+def _told(config: Config, prior: SoilPrior) -> Config:
+    """The configuration with another prior of the soil."""
+    std = prior.median * np.sqrt(np.expm1(prior.log_std**2))
+    pairs = zip(PARAMETERS, prior.median.tolist(), std.tolist(), strict=True)
+    soil = config.soil.model_copy(update={name: Prior(value=value, std=s) for name, value, s in pairs})
+    return config.model_copy(update={"soil": soil})
+
+
+def _margin(way: Traversability, demand: Demand, rng: np.random.Generator) -> float | None:
+    """A margin with which the pull suffices with a probability drawn from all; None where no pull does."""
+    if way.capability is None or (most := way.capability.likely_pull) is None or demand.pull <= 0.0:
+        return None
+    sure = NormalDist().inv_cdf(rng.uniform(LEAST, 1.0 - LEAST))
+    return (most.value - sure * math.hypot(most.std, demand.std)) / demand.pull - 1.0
+
+
+def _can(config: Config, ground: Ground, settings: Settings, asked: float) -> bool:
+    """Whether the soil truly holds the pull asked for [N] and its margin within all limits."""
+    model = WheelModel(shear_law=config.model.shear_law)
+    most = true_largest_draft(
+        ground.soil, rig_of(config), ground.torque_limit, settings.max_slip, model, ground.max_sinkage
+    )
+    return most >= asked + settings.margin * max(asked, 0.0)
+
+
+def _driven(config: Config, seed: int, rng: np.random.Generator) -> tuple[Ground, Recording]:
+    """The first ground drawn that the vehicle can cross for a window, and the drive over it."""
+    for _ in range(MAX_DRAWS):
+        ground = _ground(config, rng)
+        slip = Swing(rng.uniform(*LOW_SLIP), rng.uniform(*HIGH_SLIP))
+        scenario = Scenario(config.estimator.window, (Patch(0.0, ground.name, ground.soil),), slip=slip)
+        try:
+            recording = simulate(config, scenario, seed)
+        except SimulationError:
+            continue
+        if recording.bogged_at is None:
+            return ground, recording
+    raise SimulationError(f"no ground of {MAX_DRAWS} can be driven on")
+
+
+def _ground(config: Config, rng: np.random.Generator) -> Ground:
+    name = str(rng.choice(KINDS))
+    while True:
+        soil = Soil(*(np.asarray(soil_named(name)) * np.exp(SPREAD * rng.standard_normal(6))).tolist())
+        if soil.phi < MAX_PHI:
+            break
+    torque_limit = np.array([wheel.max_torque or np.nan for wheel in config.wheel])
+    max_sinkage, kind = config.traversability.max_sinkage, rng.integers(3)
+    if kind == 1:
+        torque_limit = np.full(len(torque_limit), rng.uniform(*TORQUE))
+    if kind == 2:
+        max_sinkage = rng.uniform(*SINKAGE)
+    return Ground(name, soil, torque_limit, max_sinkage)
+
+
+def _window(recording: Recording, config: Config, rig: Rig, of_truth: bool) -> Window:
+    """The window as measured, or as it truly was at the times of the samples."""
+    truth, duration = recording.truth, config.estimator.window
+    columns = {n: c for n in rig.channels if (c := recording.channels.get(n)) is not None}
+    store = BinStore(rig, config.estimator.bin, 0.0)
+    store.add({n: (c.t, np.interp(c.t, truth["t"], truth[n]) if of_truth else c.value) for n, c in columns.items()})
+    return store.window(0.0, duration)
+
+
+def reliability(calls: Sequence[Call]) -> Reliability:
+    """The figures of some calls; nan where there is none."""
+    made = [c for c in calls if math.isfinite(c.probability)]
+    p, true = np.array([c.probability for c in made]), np.array([c.true for c in made], float)
+    go = np.array([c.state is State.GO for c in made], bool)
+    n, spread = max(len(made), 1), p * (1.0 - p)
+    brier = float(np.mean((p - true) ** 2)) if made else math.nan
+    total_std = math.sqrt(float(spread.sum()))
+    return Reliability(
+        drives=len(calls),
+        failed=len(calls) - len(made),
+        brier=brier,
+        brier_expected=float(spread.mean()) if made else math.nan,
+        brier_std=math.sqrt(float((spread * (1.0 - 2.0 * p) ** 2).sum())) / n,
+        excess=float((true - p).sum()) / total_std if total_std > 0.0 else math.nan,
+        go=int(go.sum()),
+        wrong_go=int((go & (true < 0.5)).sum()),
+        wrong_go_expected=float((1.0 - p)[go].sum()),
+        bins=tuple(_bin(i, p, true) for i in range(BINS)),
+    )
+
+
+def _bin(i: int, p: Array, true: Array) -> Bin:
+    inside = np.minimum((p * BINS).astype(int), BINS - 1) == i
+    n, hits = int(inside.sum()), float(true[inside].sum())
+    least, most = wilson(hits, n)
+    mean, share = (float(p[inside].mean()), hits / n) if n else (math.nan, math.nan)
+    return Bin(i / BINS, (i + 1) / BINS, n, mean, share, least, most)
+
+
+def wilson(hits: float, n: int) -> tuple[float, float]:
+    """95 % interval of a binomial frequency (Wilson 1927); 0 to 1 for no trials."""
+    if n == 0:
+        return 0.0, 1.0
+    z2 = NORMAL_95**2
+    centre = (hits + z2 / 2.0) / (n + z2)
+    half = NORMAL_95 * math.sqrt(hits * (n - hits) / n + z2 / 4.0) / (n + z2)
+    return max(centre - half, 0.0), min(centre + half, 1.0)
