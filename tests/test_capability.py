@@ -21,7 +21,7 @@ from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import WindowProblem
 from soilbus.estimation.posterior import Estimate, Posterior
-from soilbus.estimation.window import BinStore
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing

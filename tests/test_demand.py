@@ -10,7 +10,7 @@ import pytest
 from soilbus.decision.demand import present_demand
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.posterior import Estimate
-from soilbus.estimation.window import BinStore
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.vehicle import GRAVITY
 

@@ -20,7 +20,7 @@ from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.laplace import cold_fit
 from soilbus.estimation.observation_model import WindowProblem
 from soilbus.estimation.posterior import Posterior
-from soilbus.estimation.window import BinStore
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from soilbus.estimation.assembly import effects_of, rig_of, with_effects
-from soilbus.estimation.window import BinStore
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.model_gap import LEAST_SPAN, GapWatch, Square
 from soilbus.pipeline.positions import PositionTrack
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited

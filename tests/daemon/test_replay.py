@@ -13,10 +13,11 @@ import pytest
 
 from soilbus.can.candump import frame_of
 from soilbus.can.dbc_files import load_databases
-from soilbus.estimation.window import BinStore, Rig, SensorNoise
+from soilbus.estimation.window import Rig, SensorNoise
 from soilbus.offline.replay import LogError, estimator_beside, read_frames, read_log, replay
 from soilbus.pipeline.intake import coverage
 from soilbus.pipeline.pipeline import Pipeline
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.frames import frames, write_log
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

@@ -8,7 +8,7 @@ from soilbus.diagnosis.fitted_model import complete
 from soilbus.diagnosis.records import Record, record_of
 from soilbus.diagnosis.score import further_scores, scores
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.estimation.window import BinStore
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited

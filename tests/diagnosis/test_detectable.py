@@ -15,8 +15,8 @@ from soilbus.diagnosis.records import Record, record_of
 from soilbus.diagnosis.score import scores
 from soilbus.diagnosis.verdict import Verdict, price
 from soilbus.estimation.assembly import model_of, prior_of, rig_of, with_effects
-from soilbus.estimation.window import BinStore
 from soilbus.report.statement import pressure_error
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, excited

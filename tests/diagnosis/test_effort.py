@@ -16,7 +16,7 @@ from soilbus.estimation import multistart as gauss_newton
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import Effort, fit_window
 from soilbus.estimation.solver import settle
-from soilbus.estimation.window import BinStore
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited

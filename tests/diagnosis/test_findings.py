@@ -18,11 +18,11 @@ from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.verdict import Verdict
 from soilbus.diagnosis.where import Disagreement
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.estimation.window import BinStore
 from soilbus.offline.diagnose import Findings
 from soilbus.offline.recordings import Recordings
 from soilbus.report.diagnosis import diagnosis_report
 from soilbus.report.findings import findings_json, findings_text
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited

@@ -17,8 +17,8 @@ from soilbus.config.file import load_config
 from soilbus.diagnosis.diagnose import Diagnosis, diagnose
 from soilbus.diagnosis.records import Record, record_of
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.estimation.window import BinStore
 from soilbus.pipeline.intake import Intake
+from soilbus.sensors.bins import BinStore
 from soilbus.sensors.rates import resolved_window
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Late

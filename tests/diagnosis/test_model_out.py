@@ -18,7 +18,7 @@ from soilbus.diagnosis.fitted_model import complete
 from soilbus.diagnosis.model_out import effect_tables
 from soilbus.diagnosis.records import record_of
 from soilbus.estimation.assembly import completion_of, model_of, prior_of, rig_of
-from soilbus.estimation.window import BinStore
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import TRACTOR, reference_configuration
 from soilbus.simulator.scenario import excited

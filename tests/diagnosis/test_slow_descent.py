@@ -16,7 +16,7 @@ from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.gaussian import Belief
 from soilbus.estimation.multistart import Effort, _fit_at
 from soilbus.estimation.solver import IDLE, Fitting, Place, Point, Settled, settle
-from soilbus.estimation.window import BinStore
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited

@@ -24,8 +24,8 @@ from soilbus.estimation.change_detection import Crossing, without_crossing
 from soilbus.estimation.observation_model import CompletedProblem
 from soilbus.estimation.posterior import Posterior
 from soilbus.estimation.tracker import elsewhere
-from soilbus.estimation.window import BinStore
 from soilbus.pipeline.estimator import WindowEstimator
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, soil_along

@@ -12,7 +12,8 @@ from soilbus.config.model import Config
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.observation_model import WindowProblem
 from soilbus.estimation.posterior import SoilPrior
-from soilbus.estimation.window import BinStore, Rig, Window
+from soilbus.estimation.window import Rig, Window
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing

@@ -11,9 +11,10 @@ from soilbus.config.model import Config
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.posterior import Posterior
 from soilbus.estimation.tracker import Settings, Tracker
-from soilbus.estimation.window import BinStore, Window
+from soilbus.estimation.window import Window
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.positions import PositionTrack
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Scenario
 from soilbus.terra.wheel import Soil

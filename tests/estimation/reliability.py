@@ -20,7 +20,7 @@ from soilbus.estimation.observation_model import WindowProblem
 from soilbus.estimation.parametrization import TYPICAL_DEPTH
 from soilbus.estimation.soil_classes import PRIOR_UNKNOWN, SoilClasses
 from soilbus.estimation.tracker import TRUST
-from soilbus.estimation.window import BinStore
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

@@ -10,7 +10,7 @@ import pytest
 from soilbus.estimation.assembly import model_of, rig_of
 from soilbus.estimation.nuisance_parameters import parameters_of
 from soilbus.estimation.observation_model import CompletedProblem
-from soilbus.estimation.window import BinStore
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from soilbus.estimation.local_cubics import PARTS, Series, curve_of, variance_of_one
-from soilbus.estimation.window import BinStore, Rig, SensorNoise
+from soilbus.estimation.window import Rig, SensorNoise
+from soilbus.sensors.bins import BinStore
 from soilbus.sensors.rates import resolved_window
 from soilbus.terra.vehicle import Chassis
 

@@ -9,7 +9,7 @@ from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.laplace import cold_fit
 from soilbus.estimation.observation_model import WindowProblem
 from soilbus.estimation.posterior import SoilPrior
-from soilbus.estimation.window import BinStore
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario

@@ -13,7 +13,8 @@ from scipy.stats import norm
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.mapping import channels_of
 from soilbus.estimation.assembly import rig_of, with_effects
-from soilbus.estimation.window import BinStore, Window, forward
+from soilbus.estimation.window import Window, forward
+from soilbus.sensors.bins import BinStore
 from soilbus.sensors.consistency import Plausibility, Resolution, implausible, lasts, runs
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.reference import reference_configuration

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import WindowProblem
-from soilbus.estimation.window import BinStore, Rig, SensorNoise
+from soilbus.estimation.window import Rig, SensorNoise
 from soilbus.sensors import outliers as screening
+from soilbus.sensors.bins import BinStore
 from soilbus.sensors.outliers import Samples, judge
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration

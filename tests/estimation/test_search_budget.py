@@ -9,7 +9,8 @@ import pytest
 from drives import tasks
 
 from soilbus.decision.traversability import Status
-from soilbus.estimation.observation_model import SearchBudget, WindowProblem
+from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.tracker import SearchBudget
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited

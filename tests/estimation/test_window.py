@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from soilbus.estimation.window import BinStore, Rig, SensorNoise, window_of_samples
+from soilbus.estimation.window import Rig, SensorNoise, window_of_samples
+from soilbus.sensors.bins import BinStore
 
 NOISE = {
     "torque": SensorNoise(of_mean=0.02, gain=0.01),

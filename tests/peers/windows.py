@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from soilbus.estimation.assembly import model_of, rig_of
 from soilbus.estimation.observation_model import Linearised, WindowProblem, diagonals
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
-from soilbus.estimation.window import BinStore, Rig
+from soilbus.estimation.window import Rig
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing

@@ -85,31 +85,6 @@ class Work:
     instants: int = 0
 
 
-class SearchBudget:
-    """Evaluations of whole windows: `rate` come with each window, at most `burst` are kept for later."""
-
-    def __init__(self, rate: float, burst: float) -> None:
-        self.work = Work()
-        self._rate, self._burst = rate, burst
-        self._left, self._window = burst, 1
-        self.ended = False
-
-    def next_window(self, instants: int, renewed: bool = False) -> None:
-        """A window of so many instants begins; renewed: the model described data lately, and may again."""
-        self._left = self._burst if renewed else min(self._left + self._rate, self._burst)
-        self._window = max(instants, 1)
-        self.ended = False
-
-    def allows(self) -> bool:
-        """Whether there is anything left for a search; where not, the window's search has ended."""
-        self.ended = self.ended or self._left <= 0.0
-        return self._left > 0.0
-
-    def spend(self, begun: int) -> None:
-        """A search has ended that began at so many instants of work; the last one may cost more than was left."""
-        self._left -= (self.work.instants - begun) / self._window
-
-
 Array = NDArray[np.float64]
 
 

@@ -38,12 +38,13 @@ from soilbus.estimation.laplace import with_whole
 from soilbus.estimation.model_form import FormLeft, form_left
 from soilbus.estimation.multistart import Fit, Foreseen, calmed, fit_window, foreseen, resume
 from soilbus.estimation.nuisance_parameters import Free
-from soilbus.estimation.observation_model import CompletedProblem, SearchBudget, WindowProblem
+from soilbus.estimation.observation_model import CompletedProblem, WindowProblem, Work
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.path_curvature import bending, curve_of, on_the_way, straightened, with_curve, without_curve
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Fitting
-from soilbus.estimation.window import BinStore, Rig, Window
+from soilbus.estimation.window import Rig, Window
+from soilbus.sensors.bins import BinStore
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil, WheelModel
@@ -219,6 +220,31 @@ def elsewhere(prior: SoilPrior) -> SoilPrior:
     """Prior of a soil that the vehicle came upon: at least as wide as known soils differ, what is held stays held."""
     soils = np.log(list(SOILS.values()))
     return SoilPrior(prior.median, np.where(prior.log_std > 0.0, np.maximum(prior.log_std, soils.std(0)), 0.0))
+
+
+class SearchBudget:
+    """Evaluations of whole windows: `rate` come with each window, at most `burst` are kept for later."""
+
+    def __init__(self, rate: float, burst: float) -> None:
+        self.work = Work()
+        self._rate, self._burst = rate, burst
+        self._left, self._window = burst, 1
+        self.ended = False
+
+    def next_window(self, instants: int, renewed: bool = False) -> None:
+        """A window of so many instants begins; renewed: the model described data lately, and may again."""
+        self._left = self._burst if renewed else min(self._left + self._rate, self._burst)
+        self._window = max(instants, 1)
+        self.ended = False
+
+    def allows(self) -> bool:
+        """Whether there is anything left for a search; where not, the window's search has ended."""
+        self.ended = self.ended or self._left <= 0.0
+        return self._left > 0.0
+
+    def spend(self, begun: int) -> None:
+        """A search has ended that began at so many instants of work; the last one may cost more than was left."""
+        self._left -= (self.work.instants - begun) / self._window
 
 
 class Tracker:

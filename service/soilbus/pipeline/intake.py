@@ -23,16 +23,9 @@ from soilbus.can.mapping import OPTIONAL_ROLES, POSITION_ROLES, channels_of
 from soilbus.config.model import Config
 from soilbus.decision.traction_loss import Motion, motion_of
 from soilbus.estimation.assembly import delays_of, rig_of
-from soilbus.estimation.window import (
-    VEHICLE_QUANTITIES,
-    WHEEL_QUANTITIES,
-    BinStore,
-    Window,
-    forward,
-    inertia_of,
-    pull_given,
-)
+from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, Window, forward, inertia_of, pull_given
 from soilbus.pipeline.positions import PositionTrack
+from soilbus.sensors.bins import BinStore
 from soilbus.sensors.consistency import Plausibility, without
 from soilbus.sensors.outliers import WILD
 from soilbus.sensors.rates import resolved_window

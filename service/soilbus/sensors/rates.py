@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.local_cubics import PARTS, Curve, Series, curve_of, faithful, variance_of_one
-from soilbus.estimation.window import BinStore, NoiseTable, Window, made_window
+from soilbus.estimation.window import NoiseTable, Window, made_window
+from soilbus.sensors.bins import BinStore
 from soilbus.sensors.outliers import Samples
 
 Array = NDArray[np.float64]

@@ -34,7 +34,8 @@ from soilbus.can.mapping import OPTIONAL_ROLES, POSITION_ROLES, channels_of
 from soilbus.can.units import SI, unit_of
 from soilbus.config.model import Config, ConfigError, Signal
 from soilbus.estimation.assembly import rig_of
-from soilbus.estimation.window import BinStore, Rig, Window, forward, pairs, pull_given, turning
+from soilbus.estimation.window import Rig, Window, forward, pairs, pull_given, turning
+from soilbus.sensors.bins import BinStore
 from soilbus.sensors.consistency import change, implausible, median, resolution_of, without
 from soilbus.terra.vehicle import GRAVITY, axle_loads, slip_ratio
 

@@ -16,8 +16,8 @@ from soilbus.decision.capability import OverSlip
 from soilbus.decision.immobilisation import Alert, Moment, Watch, moments, watched
 from soilbus.decision.traversability import Status
 from soilbus.estimation.assembly import rig_of
-from soilbus.estimation.window import BinStore
 from soilbus.pipeline.estimator import WindowEstimator
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.drive import drive
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Swing

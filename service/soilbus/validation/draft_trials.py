@@ -20,7 +20,8 @@ from soilbus.decision.capability import assess
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.laplace import cold_fit
 from soilbus.estimation.observation_model import WindowProblem
-from soilbus.estimation.window import BinStore, Rig
+from soilbus.estimation.window import Rig
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.equilibrium import Mechanics, Situation, solve
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing

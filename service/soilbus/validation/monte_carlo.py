@@ -36,7 +36,7 @@ from soilbus.estimation.laplace import with_whole
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import CompletedProblem, WindowProblem
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
-from soilbus.estimation.window import BinStore
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing

@@ -31,8 +31,9 @@ from soilbus.decision.judgement import judge
 from soilbus.decision.traversability import State, Traversability
 from soilbus.estimation.assembly import prior_of, rig_of
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-from soilbus.estimation.window import BinStore, Rig, Window
+from soilbus.estimation.window import Rig, Window
 from soilbus.pipeline.estimator import WindowEstimator
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing

@@ -13,7 +13,7 @@ from soilbus.diagnosis.diagnose import NotFitted, diagnose
 from soilbus.diagnosis.records import Record, record_of
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.posterior import Estimate, Posterior
-from soilbus.estimation.window import BinStore
+from soilbus.sensors.bins import BinStore
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Effect
 

@@ -15,7 +15,7 @@ from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import WindowProblem
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.solver import Fitting, Place
-from soilbus.estimation.window import BinStore
+from soilbus.sensors.bins import BinStore
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited

@@ -1,0 +1,158 @@
+"""Samples -> bins: sums over short spans of time, without single outliers.
+
+Each sample is added once, however many windows it ends up in; a bin without one holds nan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.estimation.window import NoiseTable, Rig, Window, made_window
+from soilbus.sensors.outliers import SIDE, Samples, joined, judge
+
+Array = NDArray[np.float64]
+
+GLIMPSE_BACK = 1.0
+"""Samples of so many seconds before a glimpse help to judge those in it."""
+
+
+class BinStore:
+    """Sums and counts of samples by bin and channel, over a sliding span of time.
+
+    Bins are counted from `origin`; each sample is added once, however many windows it
+    ends up in.  Wild samples (see `screening`) are left out; one that looks wild among the
+    last four of its channel is judged anew when more is known.
+    """
+
+    def __init__(self, rig: Rig, bin_length: float, origin: float) -> None:
+        self.rig = rig
+        self.bin_length = bin_length
+        self.origin = origin
+        self._index = {name: i for i, name in enumerate(rig.channels)}
+        self._noise = NoiseTable.of(rig)
+        self._first = 0
+        self._totals = np.zeros((3, 0, len(self._index)))  # count, sum of values, sum of times
+        self._recent: list[Samples] = []
+        self._wild: list[Array] = []
+
+    def add(self, samples: Mapping[str, tuple[Array, Array]]) -> None:
+        """Add samples (t [s], value in SI; both (N,)) by channel; those before the span are dropped."""
+        if not samples:
+            return
+        rows = np.array([self._index[name] for name in samples], np.int16)
+        column = np.repeat(rows, [len(t) for t, _ in samples.values()])
+        since = np.concatenate([t for t, _ in samples.values()]) - self.origin
+        value = np.concatenate([v for _, v in samples.values()])
+        self._recent.append(Samples(column, since, value, np.zeros(len(value), bool)))
+
+    def window(self, start: float, end: float) -> Window:
+        """The bins from start to end [s], both rounded to whole bins."""
+        low, high = self._span(start, end)
+        samples, wild, later = judge(self._taken(high), self._noise.sd)
+        new = ~samples.settled
+        self._totals = self._with(self._totals, samples.pick(new & ~wild), high)
+        again = new & wild & (later < SIDE)
+        if wild.any():
+            self._wild.append(samples.t[new & wild & ~again] + self.origin)
+        settled = samples._replace(settled=~again)
+        self._recent.append(settled.pick(later < 2 * SIDE))
+        return self._made(self._totals, low, high)
+
+    def glimpse(self, start: float, end: float) -> Window:
+        """As `window`, but nothing is decided: later windows are the same as without it."""
+        low, high = self._span(start, end)
+        recent = list(self._recent)
+        samples = self._taken(high)
+        self._recent = recent
+        near = self._bins(samples) >= low - round(GLIMPSE_BACK / self.bin_length)
+        samples, wild, _ = judge(samples.pick(near), self._noise.sd)
+        totals = self._with(self._totals.copy(), samples.pick(~(samples.settled | wild)), high)
+        return self._made(totals, low, high)
+
+    def screened(self, end: float) -> Samples:
+        """The samples before `end` [s] that are not wild, their times [s] counted from `origin`; nothing is decided."""
+        recent = list(self._recent)
+        samples, wild, _ = judge(self._taken(round((end - self.origin) / self.bin_length)), self._noise.sd)
+        self._recent = recent
+        return samples.pick(~wild)
+
+    def new_wild(self) -> Array:
+        """Times [s] of the samples found wild for good since the last call, ascending."""
+        found = np.sort(np.concatenate([np.zeros(0), *self._wild]))
+        self._wild.clear()
+        return found
+
+    def drop_before(self, t: float) -> None:
+        """Forget the bins that end before t."""
+        gone = int(np.floor((t - self.origin) / self.bin_length + 1e-9)) - self._first
+        if gone > 0:
+            self._totals = self._totals[:, gone:]
+            self._first += gone
+
+    def _span(self, start: float, end: float) -> tuple[int, int]:
+        """Numbers of the bins that begin nearest to start and end [s], counted from the first one kept."""
+        low, high = (round((t - self.origin) / self.bin_length) - self._first for t in (start, end))
+        return max(low, 0), max(high, 0)
+
+    def _bins(self, samples: Samples) -> NDArray[np.intp]:
+        return np.floor(samples.t / self.bin_length + 1e-9).astype(np.intp) - self._first
+
+    def _taken(self, high: int) -> Samples:
+        """Takes the recent samples before bin `high` out of the store; those before the span are dropped."""
+        recent = joined(self._recent)
+        bins = self._bins(recent)
+        self._recent = []
+        if len(bins) and not (bins.min() >= 0 and bins.max() < high):
+            self._recent = [recent.pick(bins >= high)]
+            recent = recent.pick((bins >= 0) & (bins < high))
+        return recent
+
+    def _with(self, totals: Array, samples: Samples, high: int) -> Array:
+        """Totals with these samples added, at least up to the bin `high`; the array is changed if it is long enough."""
+        short = high - totals.shape[1]
+        if short > 0:
+            totals = np.concatenate([totals, np.zeros((3, max(short, 64), totals.shape[2]))], axis=1)
+        if not len(samples.t):
+            return totals
+        bins = self._bins(samples)
+        low = int(bins.min())
+        shape = high - low, totals.shape[2]
+        place = (bins - low) * shape[1] + samples.column
+        for total, weights in zip(totals, (None, samples.value, samples.t), strict=True):
+            total[low:high] += np.bincount(place, weights, shape[0] * shape[1]).reshape(shape)
+        return totals
+
+    def _made(self, totals: Array, low: int, high: int) -> Window:
+        count, total, time = totals[:, low:high]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean, since = total / count, time / count
+        centre: Array = (self._first + low + np.arange(len(mean), dtype=np.float64) + 0.5) * self.bin_length
+        mean, worth = _at_centres(mean, since, centre)
+        return made_window(self._noise, self.origin + centre, mean, count * worth, count)
+
+
+def _at_centres(mean: Array, since: Array, centre: Array) -> tuple[Array, Array]:
+    """Bin means moved to the bins' centres along the slope between neighbouring bins.
+
+    mean and since (mean sample time) are (N, channels), centre is (N,).  Messages of
+    different phase have different mean times in a bin; a few ms matter where slip
+    changes within a second.  Second, what share of its samples a moved mean is worth:
+    moved by a share d of the bin, it has 1 + d^2 / 2 times the variance, that of a slope
+    between two neighbours as noisy as itself.
+    """
+    if len(mean) < 3:
+        return mean, np.ones(mean.shape)
+    slope = np.full(mean.shape, np.nan)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        step = (mean[1:] - mean[:-1]) / (since[1:] - since[:-1])
+        slope[1:-1] = (mean[2:] - mean[:-2]) / (since[2:] - since[:-2])
+    slope[0], slope[-1] = step[0], step[-1]
+    slope[1:-1] = np.where(np.isfinite(slope[1:-1]), slope[1:-1], step[:-1])
+    slope[1:-1] = np.where(np.isfinite(slope[1:-1]), slope[1:-1], step[1:])
+    away = np.where(np.isfinite(slope), centre[:, None] - since, 0.0)
+    return mean + np.where(np.isfinite(slope), slope, 0.0) * away, 1.0 / (
+        1.0 + (away / (centre[1] - centre[0])) ** 2 / 2.0
+    )
