@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from soilbus.can.dbc_files import load_databases, shipped_dbc
+from soilbus.can.dbc_files import load_databases
 from soilbus.can.dbc_text import message_names, of_messages
 from soilbus.can.mapping import channels_of
-from soilbus.config.file import load_config
+from soilbus.config.file import load_config, shipped_dbc
 from soilbus.config.model import ConfigError
 from soilbus.pipeline.intake import Intake
 from soilbus.simulator.reference import TRACTOR

@@ -9,12 +9,13 @@ from typing import Any
 import pytest
 
 from field_data import field_config, needs_field
-from soilbus.can import dbc_files
 from soilbus.can.admission import Admission
 from soilbus.can.checksum import frame_checksum
-from soilbus.can.mapping import channels_of, checked_messages, load_databases, shipped_dbc, without_unit
+from soilbus.can.dbc_files import checked_messages, load_databases
+from soilbus.can.mapping import channels_of, without_unit
 from soilbus.can.units import unit_of
-from soilbus.config.file import parse_config
+from soilbus.config import file
+from soilbus.config.file import parse_config, shipped_dbc
 from soilbus.config.model import Config, ConfigError
 from soilbus.report.configuration import configuration_report
 
@@ -222,7 +223,7 @@ def test_shipped_files_are_found_by_name_and_checked(tmp_path: Path, monkeypatch
     guard = ' SG_ Counter : 8|4@1+ (1,0) [0|15] "" X\n SG_ Checksum : 16|8@1+ (1,0) [0|255] "" X\n'
     text = f'BO_ 300 Ours: 3 X\n SG_ A : 0|8@1+ (1,0) [0|1] "" X\n{guard}'
     (package / "dbc" / "ours.dbc").write_text(text, encoding="utf-8")
-    monkeypatch.setattr(dbc_files, "_PACKAGE", package)
+    monkeypatch.setattr(file, "DBC_FOLDERS", (package / "dbc",))
     assert shipped_dbc("ours.dbc") == package / "dbc" / "ours.dbc"
     for name in ("theirs.dbc", "../soilbus/dbc/ours.dbc", ""):
         with pytest.raises(FileNotFoundError):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from soilbus.can.dbc_files import output_database, shipped_dbc
+from soilbus.can.dbc_files import output_database
 from soilbus.cli.main import main
+from soilbus.config.file import shipped_dbc
 from soilbus.config.model import ConfigError
 from soilbus.decision.immobilisation import Watch
 from soilbus.decision.traversability import Status, Traversability

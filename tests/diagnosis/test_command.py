@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from soilbus.can.dbc_files import load_databases, shipped_dbc
+from soilbus.can.dbc_files import load_databases
 from soilbus.cli.main import main
-from soilbus.config.file import load_config
+from soilbus.config.file import load_config, shipped_dbc
 from soilbus.simulator.reference import TRACTOR
 
 SOIL_KEYS = {"k_c", "k_phi", "n", "phi", "c", "K", "bearing_pressure"}

@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from soilbus.can.dbc_files import located, shipped_dbc
 from soilbus.config.edit import with_effects_text
-from soilbus.config.file import load_config
+from soilbus.config.file import load_config, located, shipped_dbc
 from soilbus.config.model import ConfigError
 from soilbus.diagnosis.fitted_model import complete
 from soilbus.diagnosis.model_out import effect_tables

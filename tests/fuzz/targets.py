@@ -18,9 +18,9 @@ from cantools.database import Database
 
 from fakes import FakeClock, InlineExecutor, ScriptedBus
 from soilbus.can.bus import LiveBus
-from soilbus.can.dbc_files import load_databases, output_database, shipped_dbc
+from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
-from soilbus.config.file import load_config
+from soilbus.config.file import load_config, shipped_dbc
 from soilbus.config.model import Config, ConfigError
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.service import Service

@@ -14,9 +14,9 @@ import pytest
 
 from soilbus.can.bus import heard_for
 from soilbus.can.candump import Frame, frame_of
-from soilbus.can.dbc_files import load_databases, shipped_dbc
+from soilbus.can.dbc_files import load_databases
 from soilbus.cli.main import main
-from soilbus.config.file import load_config
+from soilbus.config.file import load_config, shipped_dbc
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import with_effects
 from soilbus.estimation.window import turning

@@ -13,7 +13,6 @@ import soilbus.validation.monte_carlo as of_room
 from soilbus.cli.main import main
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-from soilbus.report.monte_carlo import monte_carlo_report
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import SOILS
@@ -29,6 +28,7 @@ from soilbus.validation.monte_carlo import (
     tasks_of,
     trials,
 )
+from soilbus.validation.monte_carlo_report import monte_carlo_report
 
 CONFIG = reference_configuration(ROUGHLY_KNOWN)
 

@@ -14,39 +14,14 @@ from soilbus.can.checksum import CHECKSUM, COUNTER
 from soilbus.can.dbc_text import message_names, of_messages
 from soilbus.can.inbox import checksum_byte_of
 from soilbus.can.j1939 import STANDARD_PGNS, pgn_of
+from soilbus.config.file import DBC_FOLDERS, located, shipped_dbc
 from soilbus.config.model import Config, ConfigError
 from soilbus.files import read_bounded
 from soilbus.words import did_you_mean
 
 LARGEST = 32 * 2**20
 """Bytes of a DBC file: five times those of one with 10 000 messages."""
-_PACKAGE = Path(__file__).resolve().parents[1]
-
-
 _SIGNAL = re.compile(r"(\w+)\.\w+")
-
-
-def shipped_dbc(name: str) -> Path:
-    """Path of a DBC file that comes with soilbus: in a checkout's dbc/ or the installed package.
-
-    Raises FileNotFoundError when there is none of that name.
-    """
-    if name and Path(name).name == name:
-        for folder in (_PACKAGE / "dbc", _PACKAGE.parents[1] / "dbc"):
-            if (folder / name).is_file():
-                return folder / name
-    raise FileNotFoundError(f"soilbus ships no {name}")
-
-
-def located(folder: Path, name: str) -> Path:
-    """Path of the DBC file that a configuration in this folder calls so: beside it, or ours by name."""
-    beside = folder / name
-    if beside.is_file():
-        return beside
-    try:
-        return shipped_dbc(name)
-    except FileNotFoundError:
-        return beside
 
 
 def load_databases(config: Config, mapped_only: bool = False) -> Database:
@@ -148,7 +123,7 @@ def filters_of(database: Database) -> list[dict[str, Any]]:
 
 def _dbc_names(folder: Path) -> set[str]:
     """Names of the DBC files beside a configuration, and of ours."""
-    folders = (folder, _PACKAGE / "dbc", _PACKAGE.parents[1] / "dbc")
+    folders = (folder, *DBC_FOLDERS)
     return {path.name for place in folders for path in place.glob("*.dbc")}
 
 

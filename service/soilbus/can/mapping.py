@@ -9,9 +9,10 @@ from typing import NamedTuple
 from cantools.database.can import Database, Message, Signal
 
 from soilbus.can.channels import Channel
-from soilbus.can.dbc_files import checked_messages, load_databases, shipped_dbc
+from soilbus.can.dbc_files import checked_messages, load_databases
 from soilbus.can.decode import check_decodable, code_limits
 from soilbus.can.units import SI, STANDARD_GRAVITY, unit_of
+from soilbus.config.file import shipped_dbc
 from soilbus.config.model import Config, ConfigError, Wheel
 from soilbus.config.model import Signal as Mapped
 from soilbus.words import did_you_mean

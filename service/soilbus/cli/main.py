@@ -312,7 +312,7 @@ def _watch(args: argparse.Namespace) -> None:
 
 
 def _paper(args: argparse.Namespace) -> None:
-    from soilbus.report.paper import paper_report
+    from soilbus.validation.paper_report import paper_report
 
     print(paper_report(args.sinkage, args.seed), end="")
 
@@ -320,10 +320,10 @@ def _paper(args: argparse.Namespace) -> None:
 def _montecarlo(args: argparse.Namespace) -> None:
     import json
 
-    from soilbus.report.monte_carlo import monte_carlo_report, with_progress
     from soilbus.simulator.drive import SimulationError
     from soilbus.simulator.reference import reference_configuration
     from soilbus.validation.monte_carlo import ROUGHLY_KNOWN, as_json, monte_carlo, processes
+    from soilbus.validation.monte_carlo_report import monte_carlo_report, with_progress
 
     config = _configured(args) if args.config else reference_configuration([*ROUGHLY_KNOWN, *args.set])
     try:
@@ -342,9 +342,9 @@ def _montecarlo(args: argparse.Namespace) -> None:
 def _decisions(args: argparse.Namespace) -> None:
     import json
 
-    from soilbus.report.decisions import as_json, decisions_report
     from soilbus.simulator.drive import SimulationError
     from soilbus.validation.bogging_trials import warning_trials
+    from soilbus.validation.decisions_report import as_json, decisions_report
     from soilbus.validation.draft_trials import draft_trials
     from soilbus.validation.monte_carlo import processes
     from soilbus.validation.verdict_trials import verdict_trials

@@ -9,8 +9,7 @@ from typing import Any
 
 import tomlkit
 
-from soilbus.can.dbc_files import located
-from soilbus.config.file import load_config, overridden
+from soilbus.config.file import load_config, located, overridden
 
 EffectTable = Mapping[str, Any]
 """name, and for each parameter {value, std} or, where wheels have their own, such a table for each wheel."""

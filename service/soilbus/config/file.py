@@ -18,6 +18,10 @@ LARGEST = 2**20
 _SHOWN = 60
 """Characters of an override that a fault repeats."""
 
+_PACKAGE = Path(__file__).resolve().parents[1]
+DBC_FOLDERS = (_PACKAGE / "dbc", _PACKAGE.parents[1] / "dbc")
+"""Where our own DBC files are: in the installed package, in a checkout."""
+
 
 def load_config(path: Path | str, overrides: Iterable[str] = ()) -> Config:
     """Read a TOML file, apply KEY=VALUE overrides (dotted paths), check everything.
@@ -94,3 +98,26 @@ def _child(here: Any, part: str, path: str, text: str) -> Any:
     if not isinstance(child, (dict, list)):
         raise ConfigError([f"--set {text}: {path} is a value, not a table"])
     return child
+
+
+def shipped_dbc(name: str) -> Path:
+    """Path of a DBC file that comes with soilbus: in a checkout's dbc/ or the installed package.
+
+    Raises FileNotFoundError when there is none of that name.
+    """
+    if name and Path(name).name == name:
+        for folder in DBC_FOLDERS:
+            if (folder / name).is_file():
+                return folder / name
+    raise FileNotFoundError(f"soilbus ships no {name}")
+
+
+def located(folder: Path, name: str) -> Path:
+    """Path of the DBC file that a configuration in this folder calls so: beside it, or ours by name."""
+    beside = folder / name
+    if beside.is_file():
+        return beside
+    try:
+        return shipped_dbc(name)
+    except FileNotFoundError:
+        return beside

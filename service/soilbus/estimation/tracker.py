@@ -43,8 +43,7 @@ from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.path_curvature import bending, curve_of, on_the_way, straightened, with_curve, without_curve
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Fitting
-from soilbus.estimation.window import Rig, Window
-from soilbus.sensors.bins import BinStore
+from soilbus.estimation.window import Rig, Window, window_of_samples
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil, WheelModel
@@ -140,7 +139,7 @@ def is_borne_out(problem: WindowProblem, soil: SoilPrior, known: Belief) -> bool
 
 def gain_errors(rig: Rig, model: WheelModel, free: Sequence[Free]) -> tuple[list[str], Array]:
     """Names and prior std (G,) of the gain errors that every window of a vehicle has, its effects' parameters last."""
-    problem = CompletedProblem(BinStore(rig, 1.0, 0.0).window(0.0, 1.0), rig, model, 0.0, free=free)
+    problem = CompletedProblem(window_of_samples(rig, np.array([0.5]), {}), rig, model, 0.0, free=free)
     return problem.gain_names, problem.gain_std
 
 

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-from soilbus.report.paper_noise import K_L_bound, noise_summary, noise_table, noise_text
 from soilbus.report.table import table
 from soilbus.validation.paper import (
     AS_PRINTED,
@@ -24,6 +23,7 @@ from soilbus.validation.paper import (
 )
 from soilbus.validation.paper_corrections import corrections
 from soilbus.validation.paper_noise import LEVELS
+from soilbus.validation.paper_noise_report import K_L_bound, noise_summary, noise_table, noise_text
 from soilbus.validation.paper_tables import (
     RUNS,
     SANDY_LOAM,
