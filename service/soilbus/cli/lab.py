@@ -1,0 +1,87 @@
+"""Commands of the lab: paper, montecarlo, decisions, bench."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from contextlib import nullcontext
+
+from soilbus.cli.common import WorkError, configured, configured_or_reference, need_extra
+from soilbus.files import whole_file
+
+
+def paper(args: argparse.Namespace) -> None:
+    """`soilbus paper`: the tables of Xi et al. 2024 beside ours."""
+    from soilbus.validation.paper_report import paper_report
+
+    print(paper_report(args.sinkage, args.seed), end="")
+
+
+def montecarlo(args: argparse.Namespace) -> None:
+    """`soilbus montecarlo`: errors of simulated windows beside the Cramér-Rao bound."""
+    import json
+
+    from soilbus.simulator.drive import SimulationError
+    from soilbus.simulator.reference import reference_configuration
+    from soilbus.validation.monte_carlo import ROUGHLY_KNOWN, as_json, monte_carlo, processes
+    from soilbus.validation.monte_carlo_report import monte_carlo_report, with_progress
+
+    config = configured(args) if args.config else reference_configuration([*ROUGHLY_KNOWN, *args.set])
+    try:
+        with processes(os.cpu_count() or 1) as each:
+            more = {"exact": args.exact, "around": args.around}
+            cells = list(with_progress(monte_carlo(config, args.windows, args.seed, each=each, **more)))
+    except SimulationError as error:
+        raise WorkError(str(error)) from None
+    if args.json is not None:
+        with whole_file(args.json) as out:
+            out.write(json.dumps([as_json(cell) for cell in cells], indent=1) + "\n")
+    if str(args.json) != "-":
+        print(monte_carlo_report(cells), end="")
+
+
+def decisions(args: argparse.Namespace) -> None:
+    """`soilbus decisions`: predictions beside what simulated drives then do."""
+    import json
+
+    from soilbus.simulator.drive import SimulationError
+    from soilbus.validation.bogging_trials import warning_trials
+    from soilbus.validation.decisions_report import as_json, decisions_report
+    from soilbus.validation.draft_trials import draft_trials
+    from soilbus.validation.monte_carlo import processes
+    from soilbus.validation.verdict_trials import verdict_trials
+
+    config = configured_or_reference(args)
+    try:
+        with processes(os.cpu_count() or 1) as each:
+            drafts = list(draft_trials(config, args.drives, args.seed, each=each))
+            calls = verdict_trials(config, args.calls, args.seed, each=each)
+            warnings = warning_trials(config, args.boggings, args.hours, args.seed, each=each)
+    except SimulationError as error:
+        raise WorkError(str(error)) from None
+    if args.json is not None:
+        with whole_file(args.json) as out:
+            out.write(json.dumps(as_json(drafts, calls, warnings), indent=1) + "\n")
+    if str(args.json) != "-":
+        print(decisions_report(drafts, calls, warnings), end="")
+
+
+def bench(args: argparse.Namespace) -> None:
+    """`soilbus bench`: performance figures beside their peers."""
+    import json
+
+    from soilbus.can.bus import BusError
+    from soilbus.validation.bench import as_results, bench_report, run_bench
+    from soilbus.validation.bench.bus import NotMeasured, bus_figures
+
+    if args.bus is None:
+        need_extra("scipy", "peers", "bench")
+    with nullcontext() if args.json is None else whole_file(args.json) as out:  # first, for it takes a minute
+        try:
+            results = run_bench() if args.bus is None else as_results(bus_figures(args.bus, args.seconds))
+        except (AssertionError, BusError, ModuleNotFoundError, NotMeasured) as error:
+            raise WorkError(f"bench: {error}") from None
+        if out is not None:
+            out.write(json.dumps(results, indent=1) + "\n")
+    if str(args.json) != "-":
+        print(bench_report(results), end="")
