@@ -9,7 +9,7 @@ from contextlib import redirect_stdout
 import pytest
 
 from soilbus.cli.main import main
-from soilbus.report import paper
+from soilbus.validation import paper_report as paper
 from soilbus.validation.paper import EXACT, SIMPSON, WheelEquations
 from soilbus.validation.paper_tables import RUNS, SANDY_LOAM, WET_CLAY
 
