@@ -10,7 +10,7 @@ import pytest
 from soilbus.decision.demand import present_demand
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.posterior import Estimate
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.vehicle import GRAVITY
 
@@ -20,7 +20,7 @@ T = np.arange(0.0, 10.0, 0.02)
 
 
 def window_of(draft, pitch):
-    store = BinStore(RIG, 0.1, 0.0)
+    store = Bins(RIG, 0.1, 0.0)
     store.add({"draft": (T, draft), **({} if pitch is None else {"pitch": (T, pitch)})})
     return store.window(0.0, 10.0)
 

@@ -8,7 +8,7 @@ import pytest
 from soilbus.decision.capability import Demand, assess
 from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.estimation.assembly import completion_of, model_of, rig_of
-from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.nuisance_parameters import active_at
 from soilbus.estimation.posterior import Posterior
 from soilbus.simulator.reference import reference_configuration
@@ -36,7 +36,7 @@ def given(text: str):
     return reference_configuration([f"model.effects=[{text.replace(chr(39), chr(34))}]"])
 
 
-def belief_of(config, seed: int = 3) -> tuple[Belief, np.ndarray]:
+def belief_of(config, seed: int = 3) -> tuple[Gaussian, np.ndarray]:
     """A joint belief with correlations all over, as windows leave it, and its std."""
     _, free = completion_of(config)
     std = np.concatenate([LOG_STD, np.full(SENSORS, 0.005), [float(f.std > 0.0) for f in free]])
@@ -44,10 +44,10 @@ def belief_of(config, seed: int = 3) -> tuple[Belief, np.ndarray]:
     correlation = np.corrcoef(mixed)
     correlation[0, 1:] = correlation[1:, 0] = 0.4 * correlation[0, 1:]
     pulls = np.concatenate([np.zeros(SENSORS), np.full(len(free), 0.1)])
-    return Belief(np.array(SOILS["loam"]), pulls, correlation * np.outer(std, std)), std
+    return Gaussian(np.array(SOILS["loam"]), pulls, correlation * np.outer(std, std)), std
 
 
-def of_draw(config, belief, draw, torque_limit, demand):
+def of_draw(config, gaussian, draw, torque_limit, demand):
     """The capability of one soil with one set of effects, both exactly known."""
     effects, free = completion_of(config)
     model = CompletedModel.of(model_of(config), active_at(effects, free, draw[6 + SENSORS :], 4), SPEED)
@@ -58,15 +58,15 @@ def of_draw(config, belief, draw, torque_limit, demand):
 @pytest.mark.parametrize("name", MODELS)
 def test_deviations_with_effects_equal_monte_carlo(name):
     config = given(MODELS[name])
-    belief, _ = belief_of(config)
+    gaussian, _ = belief_of(config)
     torque_limit = np.full(4, 1300.0 if name == "drivetrain_loss" else np.nan)
     demand = Demand(2500.0, 20.0, 0.03)
-    uncertain = UncertainModel.of(model_of(config), *completion_of(config), belief, 4, SPEED)
-    able, _ = assess(belief.posterior, rig_of(config), uncertain, demand, torque_limit, 0.6, 0.3)
-    held, _ = assess(belief.posterior, rig_of(config), uncertain.mean, demand, torque_limit, 0.6, 0.3)
-    mean = np.concatenate([np.log(belief.soil), belief.gains])
-    draws = np.random.default_rng(11).multivariate_normal(mean, belief.covariance, DRAWS, method="eigh")
-    drawn = [of_draw(config, belief, draw, torque_limit, demand) for draw in draws]
+    uncertain = UncertainModel.of(model_of(config), *completion_of(config), gaussian, 4, SPEED)
+    able, _ = assess(gaussian.posterior, rig_of(config), uncertain, demand, torque_limit, 0.6, 0.3)
+    held, _ = assess(gaussian.posterior, rig_of(config), uncertain.mean, demand, torque_limit, 0.6, 0.3)
+    mean = np.concatenate([np.log(gaussian.soil), gaussian.gains])
+    draws = np.random.default_rng(11).multivariate_normal(mean, gaussian.covariance, DRAWS, method="eigh")
+    drawn = [of_draw(config, gaussian, draw, torque_limit, demand) for draw in draws]
     for quantity in (
         lambda a: a.max_draft, lambda a: a.max_pull, lambda a: a.max_grade, lambda a: a.forecast.slip,
         lambda a: a.forecast.torque, lambda a: a.forecast.deepest,

@@ -18,9 +18,9 @@ from soilbus.decision.capability import Demand, slip_grid
 from soilbus.decision.wheels import wheel_table
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.laplace import cold_fit
-from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import Posterior
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -48,10 +48,10 @@ def posterior_of(case: Case, seed: int) -> Posterior | None:
         recording = simulate(config, Scenario(10.0, (Patch(0.0, case.soil),), slip=DRIVES[case.drive]), seed)
     except SimulationError:
         return None
-    store = BinStore(RIG, 0.1, 0.0)
+    store = Bins(RIG, 0.1, 0.0)
     channels = [n for n in RIG.channels if n in recording.channels and (case.sinkage or not n.startswith("sinkage"))]
     store.add({n: (recording.channels[n].t, recording.channels[n].value) for n in channels})
-    fit = cold_fit(WindowProblem(store.window(0.0, 10.0), RIG, MODEL, CONFIG.estimator.min_speed), prior_of(config))
+    fit = cold_fit(ObservationModel(store.window(0.0, 10.0), RIG, MODEL, CONFIG.estimator.min_speed), prior_of(config))
     return None if fit is None or not fit.converged else fit.whole.posterior
 
 

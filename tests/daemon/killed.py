@@ -22,7 +22,7 @@ def store_forever(path: Path, number: int, told: int) -> None:
     while True:
         number += 1
         totals = {f"{number}.{i}": i for i in range(number % 900)}
-        write_whole(path, dumped(State(at=0.0, starts=number, belief=None, totals=totals), OWNER))
+        write_whole(path, dumped(State(at=0.0, starts=number, gaussian=None, totals=totals), OWNER))
         os.write(told, number.to_bytes(8, "big"))
 
 

@@ -9,7 +9,7 @@ from time import perf_counter, sleep
 import pytest
 
 from fakes import FakeClock, InlineExecutor
-from soilbus.daemon.work_queue import MAX_PENDING, TIDIED, Backlog
+from soilbus.daemon.work_queue import MAX_PENDING, TIDIED, WorkQueue
 
 
 class Later(Executor):
@@ -30,7 +30,7 @@ class Later(Executor):
 
 def test_results_come_in_their_order_with_their_ends():
     worker = Later()
-    backlog = Backlog(worker, lambda task: f"result of {task}", 5.0)
+    backlog = WorkQueue(worker, lambda task: f"result of {task}", 5.0)
     assert [backlog.add(task, 10.0 + task, 7, 10.5 + task) for task in (0, 1)] == [0, 0]
     assert list(backlog.results(12.0)) == []
     assert backlog.solving_since == 10.5
@@ -48,7 +48,7 @@ def test_results_come_in_their_order_with_their_ends():
 
 def test_what_the_worker_cannot_keep_up_with_is_dropped_but_for_the_newest_and_the_one_it_has():
     worker = Later()
-    backlog = Backlog(worker, lambda task: task, 0.0)
+    backlog = WorkQueue(worker, lambda task: task, 0.0)
     worker_has = backlog.add(0, 0.0, 0, 0.0)
     worker.jobs[0][0].set_running_or_notify_cancel()
     dropped = [backlog.add(task, 0.0, 0, 0.0) for task in range(1, 6)]
@@ -66,7 +66,7 @@ def test_what_the_worker_cannot_keep_up_with_is_dropped_but_for_the_newest_and_t
 @pytest.mark.parametrize(("solved", "waited"), [(False, 0.04), (True, 0.0)])
 def test_the_loop_waits_for_a_result_and_no_longer(solved, waited):
     clock, worker = FakeClock(), Later()
-    backlog = Backlog(worker, lambda task: task, clock(), clock.wait_for)
+    backlog = WorkQueue(worker, lambda task: task, clock(), clock.wait_for)
     backlog.wait(0.04)
     assert clock() == 1000.0  # for nothing
     backlog.add(0, clock(), 0, clock())
@@ -79,7 +79,7 @@ def test_the_loop_waits_for_a_result_and_no_longer(solved, waited):
 
 def test_a_real_result_ends_the_wait():
     with ThreadPoolExecutor(max_workers=1) as worker:
-        backlog = Backlog(worker, lambda task: sleep(0.01), 0.0)
+        backlog = WorkQueue(worker, lambda task: sleep(0.01), 0.0)
         backlog.add(0, 0.0, 0, 0.0)
         begin = perf_counter()
         backlog.wait(60.0)
@@ -90,7 +90,7 @@ def test_a_real_result_ends_the_wait():
 def test_free_memory_is_given_back_once_in_a_while_and_after_the_result_is_out(monkeypatch):
     done: list[str] = []
     monkeypatch.setattr("soilbus.daemon.work_queue.Tidying", lambda needed, spare: partial(done.append, "tidy"))
-    backlog = Backlog(InlineExecutor(), lambda task: task, 0.0)
+    backlog = WorkQueue(InlineExecutor(), lambda task: task, 0.0)
     for task in range(2 * TIDIED + 1):
         backlog.add(task, 0.0, 0, 0.0)
         for result, _ in backlog.results(0.0):

@@ -14,7 +14,7 @@ from soilbus.decision.judgement import Basis, at_present
 from soilbus.decision.traction_loss import TractionLoss
 from soilbus.decision.traversability import State, Status, Traversability
 from soilbus.estimation.assembly import prior_of
-from soilbus.estimation.tracker import Tracked
+from soilbus.estimation.tracker import TrackerOutput
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.pipeline import Pipeline
@@ -36,7 +36,7 @@ def tasks() -> list[WindowTask]:
 
 
 @pytest.fixture(scope="module")
-def firm() -> Tracked:
+def firm() -> TrackerOutput:
     return good_tracked()
 
 
@@ -52,7 +52,7 @@ def decided(tasks, told):
     return found
 
 
-def of(tracked: Tracked, share: float = 1.0, **changed) -> Tracked:
+def of(tracked: TrackerOutput, share: float = 1.0, **changed) -> TrackerOutput:
     """What is said of windows of which the soil fills such a share."""
     return replace(tracked, since=share, **changed)
 
@@ -79,7 +79,7 @@ def test_a_window_that_does_not_fit_is_the_less_sure(tasks, firm):
     """A reduced chi-square of 4 leaves a quarter of what the data told, and all that was known before."""
     fit = replace(firm.fit, form=None)
     fits = decided(tasks[:1], [of(firm, fit=fit)])[0]
-    misfits = decided(tasks[:1], [of(firm, fit=replace(fit, cost=4.0 * fit.rows), mismatch=True)])[0]
+    misfits = decided(tasks[:1], [of(firm, fit=replace(fit, neg2_log_posterior=4.0 * fit.rows), mismatch=True)])[0]
     assert (misfits.status, misfits.reason) == (Status.DEGRADED, "model_mismatch")
     known = np.diag(prior_of(CONFIG).log_std ** -2)
     told = np.linalg.inv(fits.posterior.log_covariance) - known

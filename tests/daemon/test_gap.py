@@ -10,7 +10,7 @@ from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.model_gap import LEAST_SPAN, GapWatch, Square
 from soilbus.pipeline.positions import PositionTrack
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
@@ -24,7 +24,7 @@ def results(effects):
     hidden = effects_of(with_effects(config, effects))
     recording = simulate(config, excited("loam", SECONDS), 4, hidden)
     rig, length = rig_of(config), config.estimator.window
-    store = BinStore(rig, config.estimator.bin, 0.0)
+    store = Bins(rig, config.estimator.bin, 0.0)
     store.add({n: (c.t, c.value) for n, c in recording.channels.items() if n in rig.channels})
     estimator = WindowEstimator(config)
     for i, end in enumerate(np.arange(length, SECONDS + 0.05, config.estimator.hop).tolist()):

@@ -17,9 +17,9 @@ from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.service import TICK, Service
-from soilbus.daemon.state_persistence import FILE, PERIOD, Keeper
+from soilbus.daemon.state_persistence import FILE, PERIOD, StatePersistence
 from soilbus.daemon.state_store import Owner, read
-from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.tracker import PERSISTENCE
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.frames import frames
@@ -30,7 +30,7 @@ from soilbus.simulator.scenario import excited
 CONFIG = reference_configuration()
 DATABASE = load_databases(CONFIG)
 OWNER = Owner.of(CONFIG, Pipeline(CONFIG, DATABASE).intake.channels, DATABASE)
-BELIEF = Belief(OWNER.median[:6], OWNER.median[6:], np.diag(OWNER.std**2))
+BELIEF = Gaussian(OWNER.median[:6], OWNER.median[6:], np.diag(OWNER.std**2))
 DURATION = 14.0
 
 
@@ -50,8 +50,8 @@ class Hung(Executor):
         return Future()
 
 
-def keeper_in(folder: Path, clock, writer: Executor | None = None) -> Keeper:
-    return Keeper(folder, OWNER, writer or InlineExecutor(), lambda: 1.7e9 + clock())
+def keeper_in(folder: Path, clock, writer: Executor | None = None) -> StatePersistence:
+    return StatePersistence(folder, OWNER, writer or InlineExecutor(), lambda: 1.7e9 + clock())
 
 
 def stored(folder: Path):
@@ -60,7 +60,7 @@ def stored(folder: Path):
     return state
 
 
-def service_with(keeper: Keeper | None, clock: FakeClock, messages=()) -> tuple[Service, ScriptedBus]:
+def service_with(keeper: StatePersistence | None, clock: FakeClock, messages=()) -> tuple[Service, ScriptedBus]:
     wire = ScriptedBus(clock, messages)
     bus = LiveBus(lambda: wire, clock, clock.sleep)
     pipeline = Pipeline(CONFIG, DATABASE)
@@ -131,7 +131,7 @@ def test_a_folder_that_cannot_be_written_is_one_warning_until_it_can(tmp_path: P
     folder.mkdir()
     minutes(2)
     assert len(caplog.records) == 1
-    assert stored(folder).belief is not None
+    assert stored(folder).gaussian is not None
     (folder / FILE).unlink()
     folder.rmdir()
     minutes(3)
@@ -153,18 +153,18 @@ def test_a_belief_keeps_its_age_until_there_is_a_new_one(tmp_path: Path):
     clock = FakeClock()
     first = keeper_in(tmp_path, clock)
     first.close(BELIEF, {})
-    began = stored(tmp_path).belief.at
+    began = stored(tmp_path).gaussian.at
     clock.now += 500.0
     second = keeper_in(tmp_path, clock)
     assert second.recalled.elapsed == 500.0
-    assert np.array_equal(second.recalled.belief.covariance, BELIEF.covariance)
+    assert np.array_equal(second.recalled.gaussian.covariance, BELIEF.covariance)
     second.tick(clock(), None, dict)
-    assert stored(tmp_path).belief.at == began
-    other = Belief(BELIEF.soil, BELIEF.gains + 1e-3, BELIEF.covariance)
+    assert stored(tmp_path).gaussian.at == began
+    other = Gaussian(BELIEF.soil, BELIEF.gains + 1e-3, BELIEF.covariance)
     for _ in range(3):
         clock.now += PERIOD
         second.tick(clock(), other, dict)
-        assert stored(tmp_path).belief.at == began + 560.0
+        assert stored(tmp_path).gaussian.at == began + 560.0
     clock.now -= 1e6
     assert keeper_in(tmp_path, clock).recalled.elapsed == PERSISTENCE
 
@@ -173,9 +173,9 @@ def test_a_belief_that_cannot_be_is_not_stored(tmp_path: Path):
     clock = FakeClock()
     keeper = keeper_in(tmp_path, clock)
     keeper.tick(clock(), BELIEF, dict)
-    known = stored(tmp_path).belief
-    keeper.close(Belief(BELIEF.soil * np.nan, BELIEF.gains, BELIEF.covariance), {"windows": 3})
-    assert stored(tmp_path).belief == known
+    known = stored(tmp_path).gaussian
+    keeper.close(Gaussian(BELIEF.soil * np.nan, BELIEF.gains, BELIEF.covariance), {"windows": 3})
+    assert stored(tmp_path).gaussian == known
     assert stored(tmp_path).totals == {"windows": 3}
 
 
@@ -187,7 +187,7 @@ def test_a_run_leaves_what_it_learnt_and_the_next_one_knows_the_sensors(recordin
     service.stop()
     service.run()
     state = stored(tmp_path)
-    assert state.belief.gains == dict(zip(OWNER.gains, learnt.gains.tolist(), strict=True))
+    assert state.gaussian.gains == dict(zip(OWNER.gains, learnt.gains.tolist(), strict=True))
     assert state.totals["windows"] == service.windows > 3
     assert state.totals["frames"] == sum(service.intake.admission.counts.received.values()) > 1000
     assert state.totals["bus.sent"] == service.bus.counts.sent

@@ -17,7 +17,7 @@ from soilbus.estimation.window import Rig, SensorNoise
 from soilbus.offline.replay import LogError, estimator_beside, read_frames, read_log, replay
 from soilbus.pipeline.intake import coverage
 from soilbus.pipeline.pipeline import Pipeline
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.frames import frames, write_log
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -86,7 +86,7 @@ def test_coverage_counts_half_seconds_with_a_sample(bin_length: float) -> None:
     quantities = ("torque", "load", "speed", "sinkage", "ground_speed", "draft", "pitch", "acceleration", "yaw_rate")
     noise = dict.fromkeys(quantities, SensorNoise(absolute=1.0))
     rig = Rig(("A", "B"), np.ones(2), np.ones(2), np.array([True, False]), None, noise)
-    store = BinStore(rig, bin_length, 0.0)
+    store = Bins(rig, bin_length, 0.0)
     steady, late = np.arange(0.01, 10.0, 0.02), np.arange(4.01, 10.0, 0.02)
     sparse = np.array([0.1, 0.2, 7.3])
     samples = {"torque.A": steady, "load.B": late, "draft": sparse}

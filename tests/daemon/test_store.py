@@ -28,14 +28,14 @@ from soilbus.daemon.state_store import (
     Owner,
     State,
     StateError,
-    belief_of,
     dumped,
+    gaussian_of,
     loaded,
     read,
-    stored_belief,
+    stored_gaussian,
     write_whole,
 )
-from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.gaussian import Gaussian
 from soilbus.simulator.reference import reference_configuration
 
 
@@ -50,16 +50,16 @@ N = len(OWNER.std)
 FREE = OWNER.std > 0.0
 
 
-def belief_with(seed: int) -> Belief:
+def belief_with(seed: int) -> Gaussian:
     """One that an estimator might have had."""
     rng = np.random.default_rng(seed)
     root = 0.1 * rng.standard_normal((N, N + 2)) * OWNER.std[:, None]
     off = 0.5 * OWNER.std * rng.standard_normal(N)
-    return Belief(OWNER.median[:6] * np.exp(off[:6]), off[6:], root @ root.T)
+    return Gaussian(OWNER.median[:6] * np.exp(off[:6]), off[6:], root @ root.T)
 
 
-def state_with(belief: Belief | None, **changed) -> State:
-    stored = None if belief is None else stored_belief(belief, 1.7e9, OWNER)
+def state_with(gaussian: Gaussian | None, **changed) -> State:
+    stored = None if gaussian is None else stored_gaussian(gaussian, 1.7e9, OWNER)
     return State(
         **{"at": 1.7e9, "starts": 3, "belief": stored, "totals": {"windows": 5, "failed.internal": 2}} | changed
     )
@@ -79,12 +79,12 @@ def sealed(change) -> bytes:
 @settings(deadline=None, derandomize=True, max_examples=30)
 @given(st.integers(0, 2**31))
 def test_what_comes_back_is_bit_for_bit_what_was_stored(seed):
-    belief = belief_with(seed)
-    state = loaded(dumped(state_with(belief), OWNER), OWNER)
-    assert state == state_with(belief)
-    back = belief_of(state.belief, OWNER)
+    gaussian = belief_with(seed)
+    state = loaded(dumped(state_with(gaussian), OWNER), OWNER)
+    assert state == state_with(gaussian)
+    back = gaussian_of(state.gaussian, OWNER)
     for part in ("soil", "gains", "covariance"):
-        assert np.array_equal(getattr(back, part), getattr(belief, part))
+        assert np.array_equal(getattr(back, part), getattr(gaussian, part))
 
 
 @settings(deadline=None, derandomize=True, max_examples=150)
@@ -206,23 +206,23 @@ def test_what_is_held_and_what_effects_have_is_stored_too():
     assert len(owner.gains) > len(OWNER.gains)
     std = np.where(held, 0.0, 0.1 * owner.std)
     gains = np.where(np.arange(len(owner.gains)) >= len(OWNER.gains), -3.0, 0.0) * owner.std[6:]  # pulls of parameters
-    belief = Belief(owner.median[:6], gains, np.diag(std**2))
-    state = State(at=0.0, starts=1, belief=stored_belief(belief, 0.0, owner), totals={})
-    assert np.array_equal(belief_of(loaded(dumped(state, owner), owner).belief, owner).gains, gains)
-    other = Belief(belief.soil + np.eye(6)[0], belief.gains, belief.covariance)
+    gaussian = Gaussian(owner.median[:6], gains, np.diag(std**2))
+    state = State(at=0.0, starts=1, gaussian=stored_gaussian(gaussian, 0.0, owner), totals={})
+    assert np.array_equal(gaussian_of(loaded(dumped(state, owner), owner).gaussian, owner).gains, gains)
+    other = Gaussian(gaussian.soil + np.eye(6)[0], gaussian.gains, gaussian.covariance)
     with pytest.raises(StateError, match="physical"):
-        stored_belief(other, 0.0, owner)
+        stored_gaussian(other, 0.0, owner)
 
 
 def test_a_belief_that_could_not_be_read_back_is_not_stored():
-    belief = belief_with(2)
+    gaussian = belief_with(2)
     for spoilt in (
-        Belief(belief.soil * np.nan, belief.gains, belief.covariance),
-        Belief(belief.soil, belief.gains + 1.0, belief.covariance),
-        Belief(belief.soil, belief.gains, -belief.covariance),
+        Gaussian(gaussian.soil * np.nan, gaussian.gains, gaussian.covariance),
+        Gaussian(gaussian.soil, gaussian.gains + 1.0, gaussian.covariance),
+        Gaussian(gaussian.soil, gaussian.gains, -gaussian.covariance),
     ):
         with pytest.raises(StateError):
-            stored_belief(spoilt, 0.0, OWNER)
+            stored_gaussian(spoilt, 0.0, OWNER)
 
 
 @pytest.mark.parametrize(

@@ -16,12 +16,12 @@ from soilbus.cli.main import main
 from soilbus.config.file import parse_config
 from soilbus.config.model import Config, ConfigError
 from soilbus.decision.traversability import Status
-from soilbus.diagnosis.fitted_model import complete
+from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import TooLittle, record_of_rows
 from soilbus.diagnosis.verdict import Verdict, gap_limit
 from soilbus.estimation.assembly import model_of, prior_of, rig_of, with_effects
 from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import Posterior
 from soilbus.offline.diagnose import diagnose_logs
 from soilbus.offline.tables import (
@@ -99,7 +99,7 @@ def test_units_are_brought_to_si_and_a_missing_cell_is_nan_never_zero(tmp_path):
     np.testing.assert_allclose(window.torque[:, 0], [np.nan, 5.0, 6.0])
     np.testing.assert_allclose(window.sinkage[:, 0], [1e-3, 2e-3, np.nan])
     np.testing.assert_allclose(1.0 - window.ground_speed / (0.3 * window.speed[:, 0]), [0.1, 0.2, 0.3])
-    problem = WindowProblem(window, rig_of(config), model_of(config), config.estimator.min_speed)
+    problem = ObservationModel(window, rig_of(config), model_of(config), config.estimator.min_speed)
     assert problem.n_rows == 6  # nine cells of three channels, three of them missing
 
 
@@ -210,7 +210,7 @@ def test_estimates_from_twenty_rows_cover_the_truth(missing):
         values |= {"torque": rows["torque"], "sinkage": rows["sink"]}
         values = {role: v for role, v in values.items() if role not in missing}
         window = window_of_rows(the_rig, np.arange(len(rows["slip"])), values)
-        fit = fit_window(WindowProblem(window, the_rig, model, min_speed=0.0), prior)
+        fit = fit_window(ObservationModel(window, the_rig, model, min_speed=0.0), prior)
         assert fit is not None
         bearing, tan_phi = fit.posterior.bearing_pressure(0.02, WIDTH), fit.posterior.tan_phi()
         true_bearing = (truth.k_c / WIDTH + truth.k_phi) * 0.02**truth.n
@@ -268,7 +268,7 @@ def test_six_rows_with_nothing_missing_show_no_gap():
             continue
         values = {"wheel_load": rows["load"], "slip": rows["slip"], "drawbar_pull": rows["pull"]}
         window = window_of_rows(the_rig, np.arange(6.0), values | {"torque": rows["torque"], "sinkage": rows["sink"]})
-        gaps.append(complete([record_of_rows("", window, the_rig, model)], prior, ()).gap)
+        gaps.append(fit_model([record_of_rows("", window, the_rig, model)], prior, ()).gap)
     assert np.mean(gaps) == pytest.approx(1.0, abs=0.35)  # 25 times 6 residuals: sd 0.12, and the model is not linear
     assert np.mean(np.array(gaps) > gap_limit(6)) <= 0.08
 

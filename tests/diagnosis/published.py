@@ -20,7 +20,7 @@ import numpy as np
 from soilbus.config.file import load_config
 from soilbus.config.model import Config
 from soilbus.diagnosis.diagnose import Diagnosis, diagnose
-from soilbus.diagnosis.fitted_model import Completion, complete
+from soilbus.diagnosis.fitted_model import FittedModel, fit_model
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.verdict import gap_limit
 from soilbus.estimation.assembly import prior_of
@@ -75,19 +75,19 @@ def configuration(rig: str, wheel: str, errors: float = 1.0) -> Config:
     return load_config(RIGS / f"{rig}.toml", changes)
 
 
-def diagnosed(rig: str, wheel: str, errors: float, points: Path, told: Completion | None = None) -> Diagnosis:
+def diagnosed(rig: str, wheel: str, errors: float, points: Path, told: FittedModel | None = None) -> Diagnosis:
     """The diagnosis of one wheel's points; `told` is what another wheel told of the same soil."""
     config = configuration(rig, wheel, errors)
     records = records_of(config, points, told)
     return diagnose(records, prior_of(config), candidates(config, records))
 
 
-def records_of(config: Config, points: Path, told: Completion | None = None) -> tuple[Record, ...]:
+def records_of(config: Config, points: Path, told: FittedModel | None = None) -> tuple[Record, ...]:
     """One wheel's points; `told` as diagnosed()."""
     records = recordings_of_tables(config, [points]).records
     if told is None:
         return records
-    return tuple(r.completed(told.effects, told.free, told.fits[-1].belief) for r in records)
+    return tuple(r.completed(told.effects, told.free, told.fits[-1].gaussian) for r in records)
 
 
 class Beside(NamedTuple):
@@ -103,22 +103,26 @@ def lugs_beside_a_shifted_peak(errors: float, points: Path = POINTS) -> dict[str
     "nothing" is the known model by itself.
     """
     config = configuration("ding2011", "smooth", errors)
-    smooth = complete(records_of(config, points), prior_of(config), [CATALOGUE["slip_sinkage"]])
+    smooth = fit_model(records_of(config, points), prior_of(config), [CATALOGUE["slip_sinkage"]])
     assert smooth is not None
     config = configuration("ding2011", "lugged", errors)
     records, prior = records_of(config, points, smooth), prior_of(config)
     fits = {
-        name: complete(records, prior, [*smooth.effects, *(CATALOGUE[n] for n in added)])
+        name: fit_model(records, prior, [*smooth.effects, *(CATALOGUE[n] for n in added)])
         for name, *added in (("nothing",), ("lugs", "lugs"), ("stress_peak_shift", "stress_peak_shift"))
     }
     known = fits["nothing"]
     assert known is not None
-    return {n: Beside(known.evidence - fit.evidence, strain(fit)) for n, fit in fits.items() if fit is not None}
+    return {
+        n: Beside(known.neg2_log_evidence - fit.neg2_log_evidence, strain(fit))
+        for n, fit in fits.items()
+        if fit is not None
+    }
 
 
-def strain(completion: Completion) -> float:
+def strain(completion: FittedModel) -> float:
     """How far a fit has gone from what was known of the soil before, as chi-square per parameter."""
-    before, after = completion.before[-1], completion.fits[-1].belief
+    before, after = completion.before[-1], completion.fits[-1].gaussian
     free = np.flatnonzero(np.diag(before.covariance)[:6] > 0.0)
     off = np.log(after.soil[free] / before.soil[free])
     return float(off @ np.linalg.solve(before.covariance[np.ix_(free, free)], off)) / len(free)

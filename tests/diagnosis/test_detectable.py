@@ -10,13 +10,13 @@ import pytest
 
 from soilbus.diagnosis.detectable import Detectable, detectable
 from soilbus.diagnosis.diagnose import Diagnosis, diagnose
-from soilbus.diagnosis.fitted_model import complete
+from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import Record, record_of
 from soilbus.diagnosis.score import scores
 from soilbus.diagnosis.verdict import Verdict, price
 from soilbus.estimation.assembly import model_of, prior_of, rig_of, with_effects
 from soilbus.report.statement import pressure_error
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
@@ -37,7 +37,7 @@ VALIDATED = ("slip_sinkage", "torque_lag", "multipass", "rolling_radius")
 
 def driven(scenario: Scenario, seed: int, *effects: str, without: str = "") -> Record:
     rig = rig_of(CONFIG)
-    store = BinStore(rig, 0.1, 0.0)
+    store = Bins(rig, 0.1, 0.0)
     channels = simulate(with_effects(CONFIG, effects), scenario, seed=seed).channels
     store.add({n: (c.t, c.value) for n, c in channels.items() if n in rig.channels and n != without})
     return record_of("drive", store.window(0.0, scenario.duration), rig, model_of(CONFIG), 0.2, 0.15)
@@ -101,7 +101,7 @@ def test_more_of_the_same_drive_shows_less_and_a_sensor_less_shows_more():
 
 
 def shown_by(record: Record) -> tuple[Detectable, ...]:
-    base = complete([record], PRIOR, ())
+    base = fit_model([record], PRIOR, ())
     assert base is not None
     candidates = [CATALOGUE[n] for n in ("torque_lag", "multipass", "slip_sinkage", "draft_offset", "draft_gain")]
     return detectable([record], PRIOR, base, candidates)
@@ -110,9 +110,9 @@ def shown_by(record: Record) -> tuple[Detectable, ...]:
 def test_an_effect_that_no_datum_tells_of_has_no_evidence_either_way():
     """Without a draft its load cell has neither an offset nor a gain: the evidence stays exactly as it is."""
     record = driven(dataclasses.replace(RICH, duration=20.0), 3, without="draft")
-    base = complete([record], PRIOR, ())
+    base = fit_model([record], PRIOR, ())
     for score in scores([record], PRIOR, base, [CATALOGUE["draft_offset"], CATALOGUE["draft_gain"]]):
-        assert (score.fall, score.evidence) == pytest.approx((0.0, 0.0), abs=1e-9)
+        assert (score.fall, score.neg2_log_evidence) == pytest.approx((0.0, 0.0), abs=1e-9)
 
 
 def test_of_a_great_gap_an_effect_must_explain_a_good_part():

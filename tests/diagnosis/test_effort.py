@@ -8,15 +8,15 @@ from itertools import islice
 import pytest
 
 from soilbus.diagnosis import search as fits_module
-from soilbus.diagnosis.fitted_model import complete
+from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.score import further_scores, scores
 from soilbus.diagnosis.search import THINNED, Fits
 from soilbus.estimation import multistart as gauss_newton
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.estimation.multistart import Effort, fit_window
-from soilbus.estimation.solver import settle
-from soilbus.sensors.bins import BinStore
+from soilbus.estimation.multistart import DescentOptions, fit_window
+from soilbus.estimation.solver import descend_jointly
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
@@ -35,7 +35,7 @@ SLIP_SINKAGE = CATALOGUE["slip_sinkage"]
 @pytest.fixture(scope="module")
 def record():
     rig = rig_of(CONFIG)
-    store = BinStore(rig, 0.1, 0.0)
+    store = Bins(rig, 0.1, 0.0)
     hidden = Active(SLIP_SINKAGE, {"exponent": 0.3, "softening": 0.0, "dug": 0.0})
     channels = simulate(CONFIG, excited("loam", DURATION), 11, (hidden,)).channels
     store.add({name: (c.t, c.value) for name, c in channels.items() if name in rig.channels})
@@ -44,28 +44,28 @@ def record():
 
 @pytest.fixture(scope="module")
 def base(record):
-    return complete([record], PRIOR, ())
+    return fit_model([record], PRIOR, ())
 
 
 def fall_of(effect, record, foretold_for=None):
     """Of -2 log evidence by an effect; foretold for so many residuals."""
-    before = complete([record], PRIOR, ())
+    before = fit_model([record], PRIOR, ())
     (score,) = scores([record], PRIOR, before, [effect])
-    after = complete([record], PRIOR, [effect], score.starts)
+    after = fit_model([record], PRIOR, [effect], score.starts)
     rows = foretold_for or before.rows
     return before.foreseen(rows) - after.foreseen(rows)
 
 
 def test_a_few_instants_foretell_what_an_effect_explains_of_all(record):
     true = fall_of(SLIP_SINKAGE, record)
-    rows = complete([record], PRIOR, ()).rows
+    rows = fit_model([record], PRIOR, ()).rows
     foretold = fall_of(SLIP_SINKAGE, record.thinned(THINNED), rows)
     assert true > 100.0
     assert foretold == pytest.approx(true, abs=3.0 * 2.0 * math.sqrt(THINNED * true))
 
 
 def test_what_is_foreseen_for_the_rows_there_are_is_the_evidence(base):
-    assert base.foreseen(base.rows) == pytest.approx(base.evidence)
+    assert base.foreseen(base.rows) == pytest.approx(base.neg2_log_evidence)
 
 
 def test_scores_from_further_starts_are_the_same_together_as_alone(record, base):
@@ -75,7 +75,7 @@ def test_scores_from_further_starts_are_the_same_together_as_alone(record, base)
     for name, score in together.items():
         (alone,) = further_scores([record], PRIOR, base, [CATALOGUE[name]])
         assert score.effect is CATALOGUE[name]
-        assert score.evidence == pytest.approx(alone.evidence, rel=1e-6, abs=1e-6)
+        assert score.neg2_log_evidence == pytest.approx(alone.neg2_log_evidence, rel=1e-6, abs=1e-6)
         assert score.starts[0].gains == pytest.approx(alone.starts[0].gains, rel=1e-6, abs=1e-9)
 
 
@@ -84,19 +84,21 @@ def test_a_model_is_fitted_once_from_one_start(record, base, monkeypatch):
 
     def counted(*args):
         calls.append(args)
-        return complete(*args)
+        return fit_model(*args)
 
     monkeypatch.setattr(fits_module, "complete", counted)
-    fits, hopeless = Fits([record], PRIOR), Effort(hopeless=0.3 * base.cost)
+    fits, give_up_above = Fits([record], PRIOR), DescentOptions(give_up_above=0.3 * base.neg2_log_posterior)
     (score,) = scores([record], PRIOR, base, [SLIP_SINKAGE])
     assert (
-        fits.of([SLIP_SINKAGE], [score.starts], hopeless) is None is fits.of([SLIP_SINKAGE], [score.starts], hopeless)
+        fits.of([SLIP_SINKAGE], [score.starts], give_up_above)
+        is None
+        is fits.of([SLIP_SINKAGE], [score.starts], give_up_above)
     )
     assert len(calls) == 1
     settled = fits.of([SLIP_SINKAGE], [score.starts])
     assert settled.converged
     assert len(calls) == 2
-    assert fits.of([SLIP_SINKAGE], [score.starts], hopeless) is settled is fits.of([SLIP_SINKAGE])
+    assert fits.of([SLIP_SINKAGE], [score.starts], give_up_above) is settled is fits.of([SLIP_SINKAGE])
     assert len(calls) == 2
 
 
@@ -108,7 +110,7 @@ def test_no_descent_of_a_window_begins_where_another_did(monkeypatch):
 
     def counted(fitting, near, *args, **kwargs):
         began.append((fitting.problem.n, near.soil.tobytes()))
-        return settle(fitting, near, *args, **kwargs)
+        return descend_jointly(fitting, near, *args, **kwargs)
 
     monkeypatch.setattr(gauss_newton, "settle", counted)
     assert fit_window(problem, prior) is not None
@@ -117,7 +119,14 @@ def test_no_descent_of_a_window_begins_where_another_did(monkeypatch):
 
 def test_a_fit_that_will_stay_above_a_hopeless_cost_is_given_up(record, base):
     (score,) = scores([record], PRIOR, base, [SLIP_SINKAGE])
-    found = complete([record], PRIOR, [SLIP_SINKAGE], score.starts)
-    assert complete([record], PRIOR, [SLIP_SINKAGE], score.starts, Effort(hopeless=found.cost - 5.0)) is None
-    kept = complete([record], PRIOR, [SLIP_SINKAGE], score.starts, Effort(hopeless=found.cost + 5.0))
-    assert kept.cost == pytest.approx(found.cost, abs=0.1)
+    found = fit_model([record], PRIOR, [SLIP_SINKAGE], score.starts)
+    assert (
+        fit_model(
+            [record], PRIOR, [SLIP_SINKAGE], score.starts, DescentOptions(give_up_above=found.neg2_log_posterior - 5.0)
+        )
+        is None
+    )
+    kept = fit_model(
+        [record], PRIOR, [SLIP_SINKAGE], score.starts, DescentOptions(give_up_above=found.neg2_log_posterior + 5.0)
+    )
+    assert kept.neg2_log_posterior == pytest.approx(found.neg2_log_posterior, abs=0.1)

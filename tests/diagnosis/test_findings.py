@@ -10,7 +10,7 @@ import pytest
 
 from soilbus.diagnosis.detectable import Detectable
 from soilbus.diagnosis.diagnose import Diagnosis
-from soilbus.diagnosis.fitted_model import complete
+from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.gap import Gap
 from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.residual_terms import WARNING, Correction, Term
@@ -22,7 +22,7 @@ from soilbus.offline.diagnose import Findings
 from soilbus.offline.recordings import Recordings
 from soilbus.report.diagnosis import diagnosis_report
 from soilbus.report.findings import findings_json, findings_text
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
@@ -37,11 +37,11 @@ OFFSET = Addition(CATALOGUE["draft_offset"], 0.6, {"grade": 0.3, "bulldozing": 0
 @pytest.fixture(scope="module")
 def findings() -> Findings:
     """A plain drive, said to be ambiguous."""
-    rig, store = rig_of(CONFIG), BinStore(rig_of(CONFIG), 0.1, 0.0)
+    rig, store = rig_of(CONFIG), Bins(rig_of(CONFIG), 0.1, 0.0)
     channels = simulate(CONFIG, excited("loam", 24.0), seed=2).channels
     store.add({name: (c.t, c.value) for name, c in channels.items() if name in rig.channels})
     record = record_of("<a & b>.log", store.window(0.0, 24.0), rig, model_of(CONFIG), 0.2, 0.15)
-    base, completed = (complete([record], prior_of(CONFIG), effects) for effects in ((), (OFFSET.effect,)))
+    base, completed = (fit_model([record], prior_of(CONFIG), effects) for effects in ((), (OFFSET.effect,)))
     assert base is not None
     assert completed is not None
     where = (Disagreement("draft", "", "slip 0.20..0.35", 312.0, 0.0), Disagreement("load", "FL", "gain", 0.031, 1e-5))
@@ -99,7 +99,7 @@ def test_pages_show_names_as_text_and_one_picture_where_nothing_was_added(findin
 
 
 def test_what_is_not_finite_is_null(findings):
-    check = dataclasses.replace(findings.diagnosis.base.checks[0], evidence=float("nan"))
+    check = dataclasses.replace(findings.diagnosis.base.checks[0], neg2_log_evidence=float("nan"))
     base = dataclasses.replace(findings.diagnosis.base, checks=(check,))
     place = Disagreement("draft", "", "everywhere", float("inf"), 0.0)
     told = findings_json(with_verdict(findings, Verdict.AMBIGUOUS, base=base, where=(place,)))

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from soilbus.diagnosis.fitted_model import complete
+from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.gap import CLEAR, gap_of
 from soilbus.diagnosis.records import CHECKED, HELD_OUT, record_of
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
@@ -25,7 +25,7 @@ SECONDS = 36.0
 
 
 def record_with(effects=()):
-    rig, store = rig_of(CONFIG), BinStore(rig_of(CONFIG), 0.1, 0.0)
+    rig, store = rig_of(CONFIG), Bins(rig_of(CONFIG), 0.1, 0.0)
     channels = simulate(CONFIG, excited("loam", SECONDS), 4, effects).channels
     store.add({name: (c.t, c.value) for name, c in channels.items() if name in rig.channels})
     return record_of("drive", store.window(0.0, SECONDS), rig, model_of(CONFIG), 0.2, 0.15)
@@ -40,8 +40,8 @@ def record():
 @pytest.mark.parametrize("effects", [(), ("draft_gain",)])
 def test_the_gap_is_that_of_fits_to_each_choice_of_blocks(record, effects):
     catalogue = [CATALOGUE[name] for name in effects]
-    told = gap_of([record], PRIOR, complete([record], PRIOR, catalogue))
-    fits = [complete([record.with_held_out(fold)], PRIOR, catalogue) for fold in range(CHECKED)]
+    told = gap_of([record], PRIOR, fit_model([record], PRIOR, catalogue))
+    fits = [fit_model([record.with_held_out(fold)], PRIOR, catalogue) for fold in range(CHECKED)]
     rows = [fit.checked_rows for fit in fits]
     assert told.rows == sum(rows)
     expected = sum(fit.gap * n for fit, n in zip(fits, rows, strict=True)) / sum(rows)
@@ -60,7 +60,7 @@ def test_every_instant_is_held_out_once(record):
 
 def test_where_no_others_can_be_held_out_the_gap_is_of_those_that_are(record):
     """Tables, a model that did not converge, and a gap of which a third of the blocks tells enough."""
-    found = complete([record], PRIOR, ())
+    found = fit_model([record], PRIOR, ())
     alone = (found.gap, found.checked_rows)
     assert gap_of([replace(record, whole=None, fold=None)], PRIOR, found) == alone
     creeping = replace(found, fits=tuple(replace(fit, converged=False) for fit in found.fits))

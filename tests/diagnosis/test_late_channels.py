@@ -18,7 +18,7 @@ from soilbus.diagnosis.diagnose import Diagnosis, diagnose
 from soilbus.diagnosis.records import Record, record_of
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.pipeline.intake import Intake
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.sensors.rates import resolved_window
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Late
@@ -29,7 +29,7 @@ CONFIG = load_config(FIELD)
 
 def record_of_drive(drive: shaking.Recording) -> Record:
     rig, settings = rig_of(CONFIG), CONFIG.estimator
-    store = BinStore(rig, settings.bin, 0.0)
+    store = Bins(rig, settings.bin, 0.0)
     store.add({name: samples for name, samples in drive.channels.items() if name in rig.channels})
     window = resolved_window(store, math.floor(drive.truth["t"][-1]))
     return record_of("drive", window, rig, model_of(CONFIG), settings.min_speed, settings.max_turn)

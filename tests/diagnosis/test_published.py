@@ -7,11 +7,11 @@ import math
 import pytest
 
 from soilbus.diagnosis.diagnose import diagnose
-from soilbus.diagnosis.fitted_model import complete
+from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.verdict import TEMPERATURE, Verdict, gap_limit
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
@@ -65,11 +65,11 @@ def test_the_smooth_wheels_soil_is_strained_by_the_lugged_wheel(points, ding, er
     """Something differs between them beside what both share; six points each do not tell what for sure."""
     config = configuration("ding2011", "lugged", errors)
     records = records_of(config, points, ding["smooth", errors].completed)
-    shown = complete(records, prior_of(config), records[0].learned.effects)
+    shown = fit_model(records, prior_of(config), records[0].learned.effects)
     assert shown.names == ("slip_sinkage",)
     assert strain(shown) > 1.5
     again = records_of(configuration("ding2011", "smooth", errors), points, ding["smooth", errors].completed)
-    assert strain(complete(again, prior_of(config), again[0].learned.effects)) < 0.5  # its own points do not
+    assert strain(fit_model(again, prior_of(config), again[0].learned.effects)) < 0.5  # its own points do not
 
 
 @pytest.mark.parametrize("errors", [2.0, 3.0])
@@ -97,7 +97,7 @@ def test_the_papers_shear_law_against_exponential_soil_is_named():
     recording = simulate(reference_configuration(), excited("dry_sand", seconds), 3, ())
     config = reference_configuration(['model.shear_law="rational"'])
     rig = rig_of(config)
-    bins = BinStore(rig, config.estimator.bin, 0.0)
+    bins = Bins(rig, config.estimator.bin, 0.0)
     bins.add({name: (c.t, c.value) for name, c in recording.channels.items() if name in rig.channels})
     settings = config.estimator
     window = bins.window(0.0, seconds)

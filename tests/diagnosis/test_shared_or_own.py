@@ -11,7 +11,7 @@ from soilbus.config.model import Config
 from soilbus.diagnosis.diagnose import Diagnosis, diagnose
 from soilbus.diagnosis.records import Record, record_of
 from soilbus.estimation.assembly import model_of, prior_of, rig_of, with_effects
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
@@ -30,7 +30,7 @@ PITCH_OF_OFFSET = 400.0 / (CONFIG.vehicle.mass * GRAVITY)
 
 
 def field(config: Config, truth: Config, soil: str, slope: float, seed: int) -> Record:
-    store = BinStore(rig_of(config), 0.1, 0.0)
+    store = Bins(rig_of(config), 0.1, 0.0)
     scenario = dataclasses.replace(excited(soil, SECONDS), slope=((0.0, slope),))
     channels = simulate(truth, scenario, seed=seed).channels
     known = rig_of(config).channels if config.signals.pitch else [c for c in rig_of(config).channels if c != "pitch"]

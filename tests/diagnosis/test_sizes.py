@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
 
 from soilbus.diagnosis.evidence import SCALES, correction, evidence_of_any_size
-from soilbus.diagnosis.verdict import PLAUSIBLE, hopeless, is_real, price, probabilities
+from soilbus.diagnosis.verdict import PLAUSIBLE, is_real, out_of_reach, price, probabilities
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Parameter
@@ -108,8 +108,8 @@ def test_alike_names_share_the_probability_and_form_errors_leave_some_to_others(
     assert alike["c"] < PLAUSIBLE
     clear = probabilities({"a": 1100.0, "b": 850.0}, 0.0)
     assert 0.9 < clear["a"] < 1.0 - PLAUSIBLE
-    assert not hopeless(250.0, 1100.0)
-    assert hopeless(1090.0, 1100.0)
+    assert not out_of_reach(250.0, 1100.0)
+    assert out_of_reach(1090.0, 1100.0)
 
 
 def test_a_further_effect_beside_a_great_one_is_doubted():

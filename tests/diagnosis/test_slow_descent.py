@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from soilbus.diagnosis.damped_descent import DAMPING, EASED, HELD_BACK, MAX_STEPS, _Here, _Valley, descended
-from soilbus.diagnosis.fitted_model import complete
+from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.score import scores
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.estimation.gaussian import Belief
-from soilbus.estimation.multistart import Effort, _fit_at
-from soilbus.estimation.solver import IDLE, Fitting, Place, Point, Settled, settle
-from soilbus.sensors.bins import BinStore
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.multistart import DescentOptions, _fit_at
+from soilbus.estimation.solver import IDLE, Descent, Iterate, Objective, QuadraticModel, descend_jointly
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
@@ -25,14 +25,14 @@ from soilbus.terra.effects.effect import Active
 
 CONFIG = reference_configuration()
 PRIOR = prior_of(CONFIG)
-NOTHING = Effort().nothing
+NOTHING = DescentOptions().nothing
 
 
 class Banana:
     """Rosenbrock's valley (1960, Comput. J. 3:175) as residuals 10 STEEP (y - x^2) and 1 - x."""
 
     STEEP = 10.0
-    bend, turned = Fitting.bend, Fitting.turned
+    bend, turned = Objective.bend, Objective.turned
 
     def __init__(self) -> None:
         self.asked = 0
@@ -53,25 +53,25 @@ class Banana:
         r, J = rows[:, 0], rows[:, 1:]
         none = np.zeros((2, 2))
         at = SimpleNamespace(rows=rows, weighed=rows)
-        return Point(J.T @ J, none, none, J.T @ r, float(r @ r), np.zeros((0, 2)), at)
+        return QuadraticModel(J.T @ J, none, none, J.T @ r, float(r @ r), np.zeros((0, 2)), at)
 
 
 def begun(banana):
-    place = Place(np.array([-1.0, 1.0]), np.zeros(0), None, np.inf, 0)
+    place = Iterate(np.array([-1.0, 1.0]), np.zeros(0), None, np.inf, 0)
     return _Here(place, banana.point(place))
 
 
 def test_steps_that_bend_follow_a_valley_that_does():
     banana = Banana()
     here, valley = begun(banana), _Valley(banana)
-    while here.point.cost > 1e-6 and banana.asked < 100:
+    while here.point.neg2_log_posterior > 1e-6 and banana.asked < 100:
         here, _ = valley.along(here, here.point.step())
     damped, damping = Banana(), DAMPING
     there = begun(damped)
-    while there.point.cost > 1e-6 and damped.asked < 1000:
+    while there.point.neg2_log_posterior > 1e-6 and damped.asked < 1000:
         place = damped.moved(*there, there.point.step(damping))
         point = damped.point(place)
-        falls = point.cost < there.point.cost
+        falls = point.neg2_log_posterior < there.point.neg2_log_posterior
         damping *= EASED if falls else HELD_BACK
         there = _Here(place, point) if falls else there
     assert banana.asked <= MAX_STEPS
@@ -100,7 +100,7 @@ def record():
 
 def recorded(soil="loam", hidden=()):
     rig = rig_of(CONFIG)
-    store = BinStore(rig, 0.1, 0.0)
+    store = Bins(rig, 0.1, 0.0)
     channels = simulate(CONFIG, excited(soil, 60.0), 5, hidden).channels
     store.add({name: (c.t, c.value) for name, c in channels.items() if name in rig.channels})
     return record_of("x", store.window(0.0, 60.0), rig, model_of(CONFIG), 0.2, 0.15)
@@ -109,20 +109,20 @@ def recorded(soil="loam", hidden=()):
 def test_what_a_slow_descent_tells_is_the_cost_with_the_latents_at_their_best():
     """With latents as measured it seems too low, and then no step lowers it."""
     record = recorded("wet_clay")
-    known = complete([record], PRIOR, ())
+    known = fit_model([record], PRIOR, ())
     problem, optimum = record.learned, known.fits[0].mode
-    fitting = Fitting(problem, PRIOR, Belief.of(PRIOR, problem.gain_std))
+    fitting = Objective(problem, PRIOR, Gaussian.of(PRIOR, problem.gain_std))
     place = fitting.start(optimum.soil, gains=optimum.gains)
     point = fitting.point(place)
-    assert point.cost < known.cost - 5.0
-    fast = _fit_at(fitting, Settled(place, place, point, np.inf, 1, converged=False))
-    slow = descended(fitting, fast, Effort())
-    here = Place(slow.optimum.soil, slow.optimum.gains, slow.optimum.latents, slow.cost, 0)
+    assert point.neg2_log_posterior < known.neg2_log_posterior - 5.0
+    fast = _fit_at(fitting, Descent(place, place, point, np.inf, 1, converged=False))
+    slow = descended(fitting, fast, DescentOptions())
+    here = Iterate(slow.optimum.soil, slow.optimum.gains, slow.optimum.latents, slow.neg2_log_posterior, 0)
     for _ in range(3):
         here = fitting.moved(here, fitting.point(here), np.zeros(len(point.gradient)))
     assert slow.converged
-    assert slow.cost == pytest.approx(fitting.point(here).cost, abs=NOTHING)
-    assert slow.cost == pytest.approx(known.cost, abs=2.0 * NOTHING)
+    assert slow.neg2_log_posterior == pytest.approx(fitting.point(here).neg2_log_posterior, abs=NOTHING)
+    assert slow.neg2_log_posterior == pytest.approx(known.neg2_log_posterior, abs=2.0 * NOTHING)
 
 
 def test_fits_go_on_from_where_a_parameter_was_held_at_the_edge_of_its_range():
@@ -131,22 +131,22 @@ def test_fits_go_on_from_where_a_parameter_was_held_at_the_edge_of_its_range():
     highest = {"softening": 1.0, "exponent": 0.05, "dug": 0.1}
     narrow = replace(effect, parameters=tuple(replace(p, high=highest[p.name]) for p in effect.parameters))
     record = recorded(hidden=(Active(effect, {"exponent": 0.3, "softening": 0.0, "dug": 0.0}),))
-    held = complete([record], PRIOR, [narrow])
+    held = fit_model([record], PRIOR, [narrow])
     i = [f.parameter.name for f in held.free].index("exponent")
     assert (held.free[i].std, held.free[i].value) == (0.0, 0.05)
     (start,) = held.as_starts()
     assert held.beforehand[i].std > 0.0
     assert held.beforehand[i].at(start.gains[record.learned.n_sensors + i]) == pytest.approx(0.05)
-    again = complete([record], PRIOR, [narrow], [start])
+    again = fit_model([record], PRIOR, [narrow], [start])
     assert again.fits[0].iterations == 1
-    assert again.evidence == pytest.approx(held.evidence, abs=0.1)
+    assert again.neg2_log_evidence == pytest.approx(held.neg2_log_evidence, abs=0.1)
     (score,) = scores([record], PRIOR, held, [CATALOGUE["lugs"]])
     assert held.beforehand[i].at(score.starts[0].gains[record.learned.n_sensors + i]) == pytest.approx(0.05, abs=1e-3)
 
 
 def test_a_start_with_other_effects_has_those_that_are_new_absent(record):
     slip, lugs = CATALOGUE["slip_sinkage"], CATALOGUE["lugs"]
-    one = complete([record], PRIOR, [slip])
+    one = fit_model([record], PRIOR, [slip])
     (own,), (both,), (none,) = one.as_starts(), one.as_starts([lugs, slip]), one.as_starts([])
     n_sensors, n_lugs = record.learned.n_sensors, len(lugs.parameters)
     assert both.gains[n_sensors : n_sensors + n_lugs].tolist() == [0.0] * n_lugs
@@ -163,7 +163,9 @@ class Flat:
     def point(self, place):
         self.asked += 1
         cost = self.costs[min(self.asked, len(self.costs)) - 1]
-        return SimpleNamespace(cost=cost, step=lambda: np.ones(1), length=lambda step: 0.5, information=np.eye(1))
+        return SimpleNamespace(
+            neg2_log_posterior=cost, step=lambda: np.ones(1), length=lambda step: 0.5, information=np.eye(1)
+        )
 
     def moved(self, place, point, step):
         return place + 1
@@ -172,12 +174,12 @@ class Flat:
 def test_a_fit_whose_cost_no_longer_falls_ends_where_it_was_least():
     costs = [10.0, 9.0, 9.4, 9.1, 8.9, 8.8]
     flat = Flat(costs)
-    end = settle(flat, Trial(0), 30, refusals=0, nothing=0.3)
+    end = descend_jointly(flat, Trial(0), 30, refusals=0, nothing=0.3)
     assert end.converged
     assert flat.asked == 2 + IDLE
-    assert (end.last, end.place, end.point.cost) == (1, 2, 9.0)
+    assert (end.last, end.place, end.point.neg2_log_posterior) == (1, 2, 9.0)
     unending = Flat(costs)
-    assert not settle(unending, Trial(0), 30, refusals=0).converged
+    assert not descend_jointly(unending, Trial(0), 30, refusals=0).converged
     assert unending.asked == 30
 
 

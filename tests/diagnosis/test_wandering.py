@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from soilbus.diagnosis.fitted_model import complete
+from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import record_of
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
@@ -17,7 +17,7 @@ DURATION = 40.0
 def wandering(rate: float, seed: int):
     """A drive on loam during which the zero at the hitch wanders at a rate [N/s] to 300 N at its end."""
     config = reference_configuration()
-    store = BinStore(rig_of(config), 0.1, 0.0)
+    store = Bins(rig_of(config), 0.1, 0.0)
     channels = simulate(config, excited("loam", DURATION), seed=seed).channels
     columns = {name: (c.t, c.value) for name, c in channels.items() if name in rig_of(config).channels}
     t, draft = columns["draft"]
@@ -27,7 +27,7 @@ def wandering(rate: float, seed: int):
 
 def test_each_recording_has_a_wander_of_its_own():
     records = [wandering(6.0, 3), wandering(-6.0, 4)]
-    found = complete(records, prior_of(reference_configuration()), [CATALOGUE["draft_offset"]])
+    found = fit_model(records, prior_of(reference_configuration()), [CATALOGUE["draft_offset"]])
     assert found.gap < 1.1
     first, second = (found.fits[i].mode.gains[found.checks[i].problem.n_sensors :] for i in range(2))
     drift = [f.parameter.name for f in found.free].index("drift")
@@ -41,7 +41,7 @@ def test_each_recording_has_a_wander_of_its_own():
 def test_what_each_recording_has_of_its_own_is_as_unknown_in_the_next_one_as_in_the_first():
     """What is the vehicle's is better known then, and stays so."""
     records = [wandering(8.0, 3), wandering(3.0, 4)]
-    found = complete(records, prior_of(reference_configuration()), [CATALOGUE["draft_offset"]])
+    found = fit_model(records, prior_of(reference_configuration()), [CATALOGUE["draft_offset"]])
     n = found.checks[0].problem.n_sensors
     place = {f.parameter.name: 6 + n + i for i, f in enumerate(found.free)}
     before = found.before[1]

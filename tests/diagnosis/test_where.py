@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from soilbus.diagnosis.fitted_model import complete
+from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import Record, record_of
 from soilbus.diagnosis.where import Disagreement, disagreements
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
@@ -29,13 +29,13 @@ def recorded(soil: str, seconds: float, seed: int, channel: str = "", error=None
         t, value = columns[channel]
         truth = {n: np.interp(t, recording.truth["t"], recording.truth[n]) for n in ("slip.RL", "ground_speed")}
         columns[channel] = t, value + error(t, truth["slip.RL"], truth["ground_speed"])
-    store = BinStore(RIG, 0.1, 0.0)
+    store = Bins(RIG, 0.1, 0.0)
     store.add(columns)
     return record_of("drive", store.window(0.0, seconds), RIG, model_of(CONFIG), 0.2, 0.15)
 
 
 def places(record: Record) -> list[Disagreement]:
-    base = complete([record], prior_of(CONFIG), ())
+    base = fit_model([record], prior_of(CONFIG), ())
     assert base is not None
     return disagreements(base)
 

@@ -20,12 +20,12 @@ from drives import errors, sweep, task_of, windows
 from soilbus.config.model import Config
 from soilbus.decision.traversability import Status
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.estimation.change_detection import Crossing, without_crossing
-from soilbus.estimation.observation_model import CompletedProblem
+from soilbus.estimation.change_detection import Transition, without_transition
+from soilbus.estimation.observation_model import ObservationModelWithEffects
 from soilbus.estimation.posterior import Posterior
 from soilbus.estimation.tracker import elsewhere
 from soilbus.pipeline.estimator import WindowEstimator
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, soil_along
@@ -136,14 +136,14 @@ def least_sd(config: Config, driven: Drive, t: float) -> float:
     recording, end = driven.recording, driven.left + t
     rig = rig_of(config)
     rig = replace(rig, noise={name: noise._replace(gain=0.0) for name, noise in rig.noise.items()})
-    store = BinStore(rig, config.estimator.bin, 0.0)
+    store = Bins(rig, config.estimator.bin, 0.0)
     channels, truth = recording.channels, recording.truth
     times = {name: channels[name].t for name in rig.channels if name in channels}
     store.add({name: (at, np.interp(at, truth["t"], truth[name])) for name, at in times.items()})
-    border = Crossing(driven.on, driven.on, driven.left - driven.on)
-    window = without_crossing(store.window(driven.on, end), border, rig.front)
+    border = Transition(driven.on, driven.on, driven.left - driven.on)
+    window = without_transition(store.window(driven.on, end), border, rig.front)
     settings = config.estimator
-    problem = CompletedProblem(window, rig, model_of(config), settings.min_speed, settings.max_turn)
+    problem = ObservationModelWithEffects(window, rig, model_of(config), settings.min_speed, settings.max_turn)
     bound = cramer_rao(problem, elsewhere(prior_of(config)), driven.soils[1].parameters())
     bearing = bound.bearing_pressure(settings.z_ref, settings.b_ref)
     return bearing.std / bearing.value

@@ -10,10 +10,10 @@ import pytest
 
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.window import Rig, Window
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -36,8 +36,8 @@ class Case:
     def prior(self) -> SoilPrior:
         return prior_of(self.config)
 
-    def problem(self, window: Window | None = None, rig: Rig | None = None) -> WindowProblem:
-        return WindowProblem(window or self.window, rig or self.rig, model_of(self.config), 0.2)
+    def problem(self, window: Window | None = None, rig: Rig | None = None) -> ObservationModel:
+        return ObservationModel(window or self.window, rig or self.rig, model_of(self.config), 0.2)
 
 
 def case(soil: Soil, seed: int, overrides: Iterable[str] = (), without: Iterable[str] = ()) -> Case:
@@ -50,7 +50,7 @@ def case(soil: Soil, seed: int, overrides: Iterable[str] = (), without: Iterable
     rig = rig_of(config)
     channels = simulate(config, scenario, seed).channels
     wanted = [name for name in rig.channels if name in channels and name.partition(".")[0] not in without]
-    store = BinStore(rig, config.estimator.bin, 0.0)
+    store = Bins(rig, config.estimator.bin, 0.0)
     store.add({name: (channels[name].t, channels[name].value) for name in wanted})
     return Case(soil, config, rig, store.window(0.0, 10.0))
 

@@ -14,7 +14,7 @@ from soilbus.estimation.tracker import Settings, Tracker
 from soilbus.estimation.window import Window
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.positions import PositionTrack
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Scenario
 from soilbus.terra.wheel import Soil
@@ -34,7 +34,7 @@ def tracker_of(config: Config) -> Tracker:
 def windows(config: Config, recording: Recording) -> Iterator[tuple[Window, float]]:
     """Each window of a recording with its end [s]."""
     rig, length = rig_of(config), config.estimator.window
-    store = BinStore(rig, config.estimator.bin, 0.0)
+    store = Bins(rig, config.estimator.bin, 0.0)
     store.add({n: (c.t, c.value) for n, c in recording.channels.items() if n in rig.channels})
     for end in np.arange(length, recording.truth["t"][-1] + 0.05, config.estimator.hop).tolist():
         yield store.window(end - length, end), end
@@ -61,7 +61,7 @@ def tasks(config: Config, scenario: Scenario, seed: int, without: str = "none") 
     """The windows of a drive, hop by hop, but for the channels of one quantity."""
     rig, channels = rig_of(config), simulate(config, scenario, seed).channels
     wanted = [c for c in rig.channels if c in channels and c.partition(".")[0] != without]
-    store = BinStore(rig, config.estimator.bin, 0.0)
+    store = Bins(rig, config.estimator.bin, 0.0)
     store.add({c: (channels[c].t, channels[c].value) for c in wanted})
     length = config.estimator.window
     for i, end in enumerate(np.arange(length, scenario.duration + 0.05, config.estimator.hop).tolist()):

@@ -16,11 +16,11 @@ import numpy as np
 from soilbus.config.file import load_config
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.estimation.multistart import Fit, descend, fit_window
-from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.multistart import Fit, fit_from_soil, fit_window
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.parametrization import BOUND, Coordinates
 from soilbus.estimation.posterior import SoilPrior
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -39,7 +39,7 @@ class Case(NamedTuple):
     """A window with its prior."""
 
     name: str
-    problem: WindowProblem
+    problem: ObservationModel
     prior: SoilPrior
 
 
@@ -68,14 +68,14 @@ def constant(slip: float) -> Swing:
 def window(
     config: Config, soil: str, seconds: float = 10.0, slip: Swing = EXCITED, sinkage: bool = True, seed: int = 1,
     side_shift: Swing = LEANING,
-) -> WindowProblem:  # fmt: skip
+) -> ObservationModel:  # fmt: skip
     """A window of a simulated drive on a known soil."""
     scenario = Scenario(seconds, (Patch(0.0, soil),), slip=slip, side_shift=side_shift)
     rig, channels = rig_of(config), simulate(config, scenario, seed).channels
     wanted = [c for c in rig.channels if c in channels and (sinkage or not c.startswith("sinkage"))]
-    store = BinStore(rig, config.estimator.bin, 0.0)
+    store = Bins(rig, config.estimator.bin, 0.0)
     store.add({c: (channels[c].t, channels[c].value) for c in wanted})
-    return WindowProblem(store.window(0.0, seconds), rig, model_of(config), config.estimator.min_speed)
+    return ObservationModel(store.window(0.0, seconds), rig, model_of(config), config.estimator.min_speed)
 
 
 def told(soil: str) -> list[str]:
@@ -121,9 +121,9 @@ def apart(fit: Fit, other: Fit) -> float:
     return float(np.max(np.abs(off[free] / std[free]), initial=0.0))
 
 
-def descents(problem: WindowProblem, prior: SoilPrior, count: int, seed: int) -> tuple[list[Fit], int]:
+def descents(problem: ObservationModel, prior: SoilPrior, count: int, seed: int) -> tuple[list[Fit], int]:
     """The descents that converged, and how many did not."""
-    ends = [descend(problem, prior, s) for s in starts(prior, float(problem.rig.width.mean()), count, seed)]
+    ends = [fit_from_soil(problem, prior, s) for s in starts(prior, float(problem.rig.width.mean()), count, seed)]
     good = [end for end in ends if end is not None and end.converged]
     return good, count - len(good)
 
@@ -136,17 +136,30 @@ def ends_of(case: Case, count: int, seed: int) -> Ends:
     begin = time.process_time()
     good, failed = descents(case.problem, case.prior, count, seed)
     seconds = (time.process_time() - begin) / count
-    best = min([*good, fit], key=lambda end: end.cost)
-    as_good = [end for end in good if end.cost < best.cost + SAME_COST]
+    best = min([*good, fit], key=lambda end: end.neg2_log_posterior)
+    as_good = [end for end in good if end.neg2_log_posterior < best.neg2_log_posterior + SAME_COST]
     same = sum(apart(end, best) < SAME_SOIL for end in as_good)
-    worse = [end.cost - best.cost for end in good if end.cost >= best.cost + SAME_COST]
-    return Ends(same, len(as_good) - same, worse, failed, fit, fit.cost - best.cost, apart(fit, best), seconds)
+    worse = [
+        end.neg2_log_posterior - best.neg2_log_posterior
+        for end in good
+        if end.neg2_log_posterior >= best.neg2_log_posterior + SAME_COST
+    ]
+    return Ends(
+        same,
+        len(as_good) - same,
+        worse,
+        failed,
+        fit,
+        fit.neg2_log_posterior - best.neg2_log_posterior,
+        apart(fit, best),
+        seconds,
+    )
 
 
 def line(name: str, ends: Ends, count: int) -> str:
     """One line of the table."""
     shares = "  ".join(f"{100.0 * n / count:5.1f}" for n in (ends.same, ends.other, len(ends.worse), ends.failed))
-    said = "-" if ends.fit.rival is None else f"rival, share {ends.fit.rival.share:.2f}"
+    said = "-" if ends.fit.second_mode is None else f"rival, share {ends.fit.second_mode.share:.2f}"
     return f"{name:38s} {shares}   {ends.above:7.3f} {ends.off:6.2f}  {1e3 * ends.seconds:5.1f}  {said}"
 
 

@@ -16,11 +16,11 @@ import numpy as np
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.parametrization import TYPICAL_DEPTH
 from soilbus.estimation.soil_classes import PRIOR_UNKNOWN, SoilClasses
 from soilbus.estimation.tracker import TRUST
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -64,7 +64,7 @@ def windows(count: int, seed: int, seconds: float, slip: float = 0.4) -> Iterato
         yield Said(classes.probabilities(fit.posterior, prior), truth)
 
 
-def driven(config: Config, soil: Soil, seed: list[int], seconds: float, slip: float = 0.4) -> WindowProblem | None:
+def driven(config: Config, soil: Soil, seed: list[int], seconds: float, slip: float = 0.4) -> ObservationModel | None:
     """One window on a soil; None where the tractor cannot drive on it."""
     scenario = Scenario(seconds, (Patch(0.0, "this", soil),), slip=Swing(0.05, slip))
     try:
@@ -74,9 +74,9 @@ def driven(config: Config, soil: Soil, seed: list[int], seconds: float, slip: fl
     if recording.bogged_at is not None:
         return None
     rig, channels = rig_of(config), recording.channels
-    store = BinStore(rig, config.estimator.bin, 0.0)
+    store = Bins(rig, config.estimator.bin, 0.0)
     store.add({name: (channels[name].t, channels[name].value) for name in rig.channels if name in channels})
-    return WindowProblem(store.window(0.0, seconds), rig, model_of(config), config.estimator.min_speed)
+    return ObservationModel(store.window(0.0, seconds), rig, model_of(config), config.estimator.min_speed)
 
 
 def shortfall(said: list[Said]) -> float:

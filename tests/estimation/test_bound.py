@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import binom, chi2
 
 from soilbus.estimation.assembly import rig_of
-from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.window import window_of_samples
 from soilbus.simulator.reference import reference_configuration
@@ -83,7 +83,7 @@ def test_bound_is_the_inverse_information_of_everything_unknown(held, fitted):
             difference = [readings(rig, a[:6], a[6:20], a[20:])[used] for a in (up, down)]
             jacobian[rows, column] = (difference[0] - difference[1]) / (2.0 * h) / sd
     free = [k for k in range(6) if k not in held]
-    problem = WindowProblem(window, rig, MODEL, 0.2)
+    problem = ObservationModel(window, rig, MODEL, 0.2)
     known = np.concatenate([log_std[free], problem.gain_std])
     unknown = [*free, *range(6, jacobian.shape[1])]
     information = jacobian[:, unknown].T @ jacobian[:, unknown]
@@ -104,7 +104,7 @@ def test_without_data_the_bound_is_the_prior():
     rig, soil = rig_of(reference_configuration()), KNOWN["loam"]
     nothing = window_of_samples(rig, np.arange(5.0), {})
     log_std = np.array([0.8, 0.9, 0.0, 0.3, 0.25, 0.25])
-    bound = cramer_rao(WindowProblem(nothing, rig, MODEL, 0.2), SoilPrior(np.asarray(soil), log_std), soil)
+    bound = cramer_rao(ObservationModel(nothing, rig, MODEL, 0.2), SoilPrior(np.asarray(soil), log_std), soil)
     assert bound.log_covariance == pytest.approx(np.diag(log_std**2))
 
 

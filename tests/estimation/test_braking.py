@@ -7,8 +7,8 @@ import pytest
 
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.observation_model import WindowProblem
-from soilbus.sensors.bins import BinStore
+from soilbus.estimation.observation_model import ObservationModel
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -38,9 +38,9 @@ def test_errors_are_as_large_as_the_posterior_says(what):
             )
             rig = rig_of(config)
             heard = simulate(config, Scenario(10.0, (Patch(0.0, "this", soil),), **DRIVES[what]), 1000 * k + seed)
-            store = BinStore(rig, 0.1, 0.0)
+            store = Bins(rig, 0.1, 0.0)
             store.add({n: (heard.channels[n].t, heard.channels[n].value) for n in rig.channels if n in heard.channels})
-            problem = WindowProblem(store.window(0.0, 10.0), rig, model_of(config), 0.2)
+            problem = ObservationModel(store.window(0.0, 10.0), rig, model_of(config), 0.2)
             fit = fit_window(problem, prior_of(config))
             assert fit.converged
             bearing, tan_phi = fit.posterior.bearing_pressure(0.02, 0.3), fit.posterior.tan_phi()

@@ -10,10 +10,10 @@ from drives import tracker_of, windows
 from scipy.stats import lognorm
 
 from soilbus.estimation.assembly import prior_of
-from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import Fit, fit_window
 from soilbus.estimation.posterior import PARAMETERS, Posterior
-from soilbus.estimation.solver import Fitting, Place
+from soilbus.estimation.solver import Iterate, Objective
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -46,11 +46,11 @@ def test_what_data_told_and_the_prior_are_together_what_they_were(simulated):
     mode = fit_window(problem, prior).mode
     told = mode.apart_from(prior)
     assert told.covariance[K_C, K_C] > mode.covariance[K_C, K_C]
-    fitting = Fitting(problem, prior, told)
-    known = fitting.before_at(Place(mode.soil, mode.gains, None, np.inf, 0))
+    fitting = Objective(problem, prior, told)
+    known = fitting.before_at(Iterate(mode.soil, mode.gains, None, np.inf, 0))
     scale = np.sqrt(np.diag(known.information))
     assert known.gradient / scale == pytest.approx(0.0, abs=1e-6)
-    directions = fitting.directions(Place(mode.soil, mode.gains, None, np.inf, 0))[1:]
+    directions = fitting.directions(Iterate(mode.soil, mode.gains, None, np.inf, 0))[1:]
     directions[: len(mode.soil)] /= mode.soil[:, None]  # of logarithms
     covariance = directions @ np.linalg.inv(known.information) @ directions.T
     assert covariance == pytest.approx(mode.covariance, rel=1e-6, abs=1e-12)
@@ -62,7 +62,7 @@ def test_two_that_tell_k_c_badly_tell_it_as_their_product_does(simulated):
     prior = one.prior
     mode = fit_window(one.problem(), prior).mode
     told = replace(mode.apart_from(prior), k_c_off=-2.0)  # a k_c below zero would fit best
-    fitting = Fitting(one.problem(), prior, told)
+    fitting = Objective(one.problem(), prior, told)
     k_c = mode.soil[K_C] * np.exp(np.linspace(-3.0, 1.0, 41))
     along = told.covariance[:, K_C] / told.covariance[K_C, K_C]
     shift = k_c / mode.soil[K_C] + 1.0
@@ -70,7 +70,7 @@ def test_two_that_tell_k_c_badly_tell_it_as_their_product_does(simulated):
     for k, off in zip(k_c, shift, strict=True):
         soil, gains = told.soil * np.exp(along[:6] * off), told.gains + along[6:] * off
         soil[K_C] = k
-        costs.append(fitting.before_at(Place(soil, gains, None, np.inf, 0)).cost)
+        costs.append(fitting.before_at(Iterate(soil, gains, None, np.inf, 0)).neg2_log_prior)
     of_data = shift**2 / told.covariance[K_C, K_C]
     of_prior = (np.log(k_c / prior.median[K_C]) / prior.log_std[K_C]) ** 2
     expected = of_data + of_prior
@@ -91,8 +91,8 @@ def test_what_is_given_or_moved_stays_told_by_data(simulated):
 
 def test_a_prior_without_doubt_about_k_c_has_nothing_apart():
     prior = prior_of(reference_configuration(["soil.k_c.std=0"]))
-    belief = Belief.of(prior, np.zeros(0))
-    assert belief.apart_from(prior) is belief
+    gaussian = Gaussian.of(prior, np.zeros(0))
+    assert gaussian.apart_from(prior) is gaussian
 
 
 @pytest.mark.parametrize("seed", [1, 2])

@@ -9,8 +9,8 @@ import pytest
 
 from soilbus.estimation.assembly import model_of, rig_of
 from soilbus.estimation.nuisance_parameters import parameters_of
-from soilbus.estimation.observation_model import CompletedProblem
-from soilbus.sensors.bins import BinStore
+from soilbus.estimation.observation_model import ObservationModelWithEffects
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
@@ -24,15 +24,15 @@ PULL = 0.3
 
 
 @pytest.fixture(scope="module")
-def problems() -> dict[str, CompletedProblem]:
+def problems() -> dict[str, ObservationModelWithEffects]:
     """By shear law, 6 s of a drive."""
     found = {}
     for law in ("exponential", "rational"):
         config = reference_configuration([f"model.shear_law={law}"])
-        rig, store = rig_of(config), BinStore(rig_of(config), 0.1, 0.0)
+        rig, store = rig_of(config), Bins(rig_of(config), 0.1, 0.0)
         channels = simulate(reference_configuration(), excited("loam", 6.0), seed=3).channels
         store.add({name: (c.t, c.value) for name, c in channels.items() if name in rig.channels})
-        found[law] = CompletedProblem(store.window(0.0, 6.0), rig, model_of(config), 0.2)
+        found[law] = ObservationModelWithEffects(store.window(0.0, 6.0), rig, model_of(config), 0.2)
     return found
 
 

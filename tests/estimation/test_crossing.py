@@ -9,7 +9,7 @@ import pytest
 from drives import B_REF, Z_REF, errors, task_of, tracker_of, windows
 
 from soilbus.decision.traversability import Status
-from soilbus.estimation.tracker import Ground, Tracked
+from soilbus.estimation.tracker import Ground, TrackerOutput
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -21,7 +21,7 @@ SPEED = 1.5
 CROSSED = 20.0
 
 
-def off(tracked: Tracked, soil: str) -> float:
+def off(tracked: TrackerOutput, soil: str) -> float:
     """Error of the bearing pressure in its standard deviations."""
     return errors(tracked.fit.posterior, SOILS[soil])[0]
 
@@ -165,7 +165,7 @@ def test_a_window_that_fails_leaves_what_is_known_alone():
             wild = window.torque * nonsense.choice([-3.0, 3.0], window.torque.shape)
             bad = disturbed.estimate(replace(window, torque=wild), end)
             assert bad.mismatch
-            assert all(at != end for at, _ in disturbed._beliefs)
+            assert all(at != end for at, _ in disturbed._gaussians)
         else:
             last = disturbed.estimate(window, end)
     expected = undisturbed.estimate(*drive[-1])

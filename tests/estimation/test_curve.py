@@ -10,7 +10,7 @@ from curves import TRACK, curved, driven
 from drives import errors, tracker_of, windows
 
 from soilbus.estimation.assembly import rig_of
-from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.path_curvature import curve_of, rim_difference, sides, with_curve
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -39,7 +39,7 @@ def _names(tracker, window):
 
 
 def test_without_that_unknown_a_curve_is_a_mismatch(monkeypatch):
-    monkeypatch.setattr("soilbus.estimation.tracker.with_curve", lambda belief, curve: belief)
+    monkeypatch.setattr("soilbus.estimation.tracker.with_curve", lambda gaussian, curve: gaussian)
     monkeypatch.setattr("soilbus.estimation.path_curvature.BENT", np.inf)
     config = reference_configuration()
     scenario = Scenario(11.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))
@@ -73,7 +73,7 @@ def test_only_differences_between_the_sides_are_freed_and_by_as_much_as_the_rims
     case = simulated(SOILS["loam"], 3)
     problem = case.problem(curved(case.window, case.rig, 1.0 / 50.0))
     assert rim_difference(problem) == pytest.approx(TRACK / 100.0, abs=0.007)
-    before = Belief.of(case.prior, problem.gain_std)
+    before = Gaussian.of(case.prior, problem.gain_std)
     added = with_curve(before, curve_of(problem)).covariance - before.covariance
     speeds = [6 + problem.gain_names.index(f"speed.{wheel}") for wheel in case.rig.wheels]
     assert np.flatnonzero(added.any(axis=0)).tolist() == speeds

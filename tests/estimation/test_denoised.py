@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from soilbus.estimation.assembly import prior_of
-from soilbus.estimation.gaussian import Belief
-from soilbus.estimation.multistart import fit_window, settled
-from soilbus.estimation.observation_model import DenoisedProblem, expected
-from soilbus.estimation.solver import Fitting, Place
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.multistart import fit_window, refine
+from soilbus.estimation.observation_model import DenoisedObservationModel, expected
+from soilbus.estimation.solver import Iterate, Objective
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Swing
 from soilbus.terra.soils import SOILS
@@ -40,10 +40,10 @@ def test_a_window_without_variation_tells_no_more_than_the_bound():
     for seed in range(8):
         problem = minima.window(config, "wet_clay", 10.0, minima.constant(0.1), False, 40 + seed, still)
         fit = fit_window(problem, prior)
-        calm = DenoisedProblem(problem, fit.optimum)
-        before = Belief.of(prior, problem.gain_std)
-        place = Place(fit.optimum.soil, fit.optimum.gains, calm.latents, np.inf, 1)
-        top = settled(Fitting(calm, prior, before), place)
+        calm = DenoisedObservationModel(problem, fit.optimum)
+        before = Gaussian.of(prior, problem.gain_std)
+        place = Iterate(fit.optimum.soil, fit.optimum.gains, calm.latents, np.inf, 1)
+        top = refine(Objective(calm, prior, before), place)
         bound = cramer_rao(calm, prior, soil).log_covariance[2, 2]
         ratio.append([one.mode.covariance[2, 2] / bound for one in (fit, top)])
     fitted, denoised = np.sqrt(np.median(ratio, axis=0))

@@ -10,13 +10,13 @@ from scipy.optimize import lsq_linear
 
 from soilbus.diagnosis.damped_descent import descended
 from soilbus.estimation.assembly import model_of, rig_of
-from soilbus.estimation.gaussian import Belief
-from soilbus.estimation.multistart import THOROUGH, Start, continued, descend, fit_window
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.multistart import DEFAULT_OPTIONS, Start, fit_from, fit_from_soil, fit_window
 from soilbus.estimation.nuisance_parameters import parameters_of
-from soilbus.estimation.observation_model import CompletedProblem
+from soilbus.estimation.observation_model import ObservationModelWithEffects
 from soilbus.estimation.parametrization import BOUND, Coordinates, at_edges, share_of_step
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-from soilbus.estimation.solver import Fitting, Point
+from soilbus.estimation.solver import Objective, QuadraticModel
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.soils import SOILS
 
@@ -30,7 +30,9 @@ def test_a_step_never_leaves_the_edges_and_with_one_it_is_the_best_there_is(seed
     rng = np.random.default_rng(seed)
     root, target = np.tril(rng.normal(size=(4, 4)), -1) + np.eye(4), rng.normal(size=4)
     none = np.zeros((4, 4))
-    point = Point(root.T @ root, none, none, root.T @ target, 0.0, np.diag(edges)[np.array(edges) != 0.0], None)
+    point = QuadraticModel(
+        root.T @ root, none, none, root.T @ target, 0.0, np.diag(edges)[np.array(edges) != 0.0], None
+    )
     step = point.step()
     assert np.all(step * np.array(edges) <= 1e-12)
     cost = float(np.sum((root @ step + target) ** 2))
@@ -67,7 +69,7 @@ def test_a_fit_converges_with_a_parameter_at_its_bound(simulated):
     log_std = case.prior.log_std.copy()
     log_std[C] = 0.0  # the others are where they are with c held at the bound
     median = np.where(np.arange(6) == C, bound, case.prior.median)
-    held = descend(case.problem(), SoilPrior(median, log_std), WET_CLAY._replace(c=bound))
+    held = fit_from_soil(case.problem(), SoilPrior(median, log_std), WET_CLAY._replace(c=bound))
     std = np.sqrt(np.diag(held.posterior.log_covariance))
     free = std > 0.0
     assert np.abs(np.log(fit.mode.soil / held.mode.soil)[free] / std[free]).max() < 0.05
@@ -78,17 +80,17 @@ def bulldozed(simulated):
     """A drive under a model with bulldozing that it has not: as likely less than none as more."""
     case = simulated(SOILS["loam"], 11)
     rig, config = rig_of(case.config), case.config
-    plain = CompletedProblem(case.window, rig, model_of(config), config.estimator.min_speed)
+    plain = ObservationModelWithEffects(case.window, rig, model_of(config), config.estimator.min_speed)
     effect = CATALOGUE["bulldozing"]
     return plain.completed([effect], parameters_of(effect, plain.n_wheels)), case.prior
 
 
 def test_parameters_of_effects_stay_inside_their_ranges(bulldozed):
     problem, prior = bulldozed
-    before = Belief.of(prior, problem.gain_std)
+    before = Gaussian.of(prior, problem.gain_std)
     gains = np.concatenate([np.zeros(problem.n_sensors), np.ones(len(problem.free))])
-    fast = continued(problem, prior, before, Start(np.asarray(SOILS["loam"]), gains), problem.n_sensors)
-    fit = descended(Fitting(problem, prior, before), fast, THOROUGH)
+    fast = fit_from(problem, prior, before, Start(np.asarray(SOILS["loam"]), gains), problem.n_sensors)
+    fit = descended(Objective(problem, prior, before), fast, DEFAULT_OPTIONS)
     assert fit.converged
     low, high = problem.gain_bounds()
     for found in (fast, fit):
@@ -100,11 +102,11 @@ def test_parameters_of_effects_stay_inside_their_ranges(bulldozed):
 
 def test_angles_solved_anew_carry_the_loads_with_the_effects_as_they_are(simulated):
     case = simulated(SOILS["loam"], 12)
-    plain = CompletedProblem(case.window, rig_of(case.config), model_of(case.config), 0.2)
+    plain = ObservationModelWithEffects(case.window, rig_of(case.config), model_of(case.config), 0.2)
     effect = CATALOGUE["multipass"]
     problem = plain.completed([effect], parameters_of(effect, plain.n_wheels))
     gains = np.concatenate([np.zeros(problem.n_sensors), [1.0, 0.5, 0.3, -0.8]])
-    fitting = Fitting(problem, case.prior, Belief.of(case.prior, problem.gain_std))
+    fitting = Objective(problem, case.prior, Gaussian.of(case.prior, problem.gain_std))
     place = fitting.start(np.asarray(SOILS["loam"]), gains=gains)
     place.latents.entry_angle *= 1.1
     point = fitting.point(fitting.carried(place))

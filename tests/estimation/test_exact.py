@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from soilbus.estimation.assembly import prior_of
-from soilbus.estimation.gaussian import Belief
-from soilbus.estimation.laplace import counted, ridge, told_of_soil, with_whole
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.laplace import attainable_variance, counted, profile_over_n, with_nested_laplace
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import SoilPrior
@@ -30,7 +30,7 @@ def ill_told():
     config = reference_configuration([*minima.told("wet_clay"), "soil.k_c.value=43680", "soil.k_c.std=20000"])
     problem = minima.window(config, "wet_clay", 4.0, minima.constant(0.15), True, 5, STILL)
     prior = prior_of(config)
-    return problem, prior, Belief.of(prior, problem.gain_std), fit_window(problem, prior)
+    return problem, prior, Gaussian.of(prior, problem.gain_std), fit_window(problem, prior)
 
 
 def test_the_average_along_n_has_the_moments_of_the_exact_posterior(ill_told):
@@ -38,9 +38,9 @@ def test_the_average_along_n_has_the_moments_of_the_exact_posterior(ill_told):
     found = samples(problem, prior, before, fit, 500, np.random.default_rng(1))
     assert found.share.sum() == pytest.approx(1.0)
     assert found.effective > 60.0
-    whole = with_whole(problem, prior, before, fit).whole
-    along = ridge(problem, prior, before, fit)
-    nodes = told_of_soil(along, prior, before)
+    whole = with_nested_laplace(problem, prior, before, fit).whole
+    along = profile_over_n(problem, prior, before, fit)
+    nodes = attainable_variance(along, prior, before)
     u = [node.u for node in along.nodes]
     told = np.array([np.interp(found.logs[:, 2], u, column) for column in nodes.T]).T
     assert told[:, 0].max() > 2.0 * told[:, 0].min()  # k_c is said as its error counts, so this is worth a look
@@ -62,14 +62,14 @@ def test_the_average_along_n_has_the_moments_of_the_exact_posterior(ill_told):
 
 def test_where_moments_leave_the_share_of_k_c_no_deviation_the_draws_are_by_the_curvature(ill_told, monkeypatch):
     problem, prior, before, fit = ill_told
-    along = ridge(problem, prior, before, fit)
+    along = profile_over_n(problem, prior, before, fit)
 
     def without_deviation(node):
         """As at a share of k_c next to nothing: its logarithm and that of k_phi go together."""
-        covariance = node.fit.belief.covariance.copy()
+        covariance = node.fit.gaussian.covariance.copy()
         covariance[0], covariance[:, 0] = covariance[1], covariance[:, 1]
         covariance[0, 0] = covariance[1, 1]
-        return node._replace(fit=replace(node.fit, belief=replace(node.fit.belief, covariance=covariance)))
+        return node._replace(fit=replace(node.fit, gaussian=replace(node.fit.gaussian, covariance=covariance)))
 
     flat = along._replace(nodes=[without_deviation(node) for node in along.nodes])
     told = samples(problem, prior, before, fit, 500, np.random.default_rng(1))
@@ -89,7 +89,7 @@ def moments(found):
 def test_each_soil_has_the_bound_of_a_window_on_it(ill_told):
     problem, prior, before, fit = ill_told
     found = samples(problem, prior, before, fit, 300, np.random.default_rng(1))
-    calm = ridge(problem, prior, before, fit).problem
+    calm = profile_over_n(problem, prior, before, fit).problem
     for i in np.argsort(found.share)[-20:]:
         bound = cramer_rao(calm, prior, Soil(*np.exp(found.logs[i]).tolist())).log_covariance
         std, told = (np.sqrt(each.diagonal()) for each in (bound, found.bound[i]))
@@ -100,5 +100,5 @@ def test_each_soil_has_the_bound_of_a_window_on_it(ill_told):
 def test_without_a_ridge_there_are_no_samples(ill_told):
     problem, prior, _, _ = ill_told
     held = SoilPrior(prior.median, np.where(np.arange(6) == 0, 0.0, prior.log_std))
-    before, fit = Belief.of(held, problem.gain_std), fit_window(problem, held)
+    before, fit = Gaussian.of(held, problem.gain_std), fit_window(problem, held)
     assert samples(problem, held, before, fit, 10, np.random.default_rng(1)) is None

@@ -10,8 +10,8 @@ from scipy.stats import binom, chi2
 
 from soilbus.decision.traversability import State, Status
 from soilbus.estimation.assembly import prior_of
-from soilbus.estimation.gaussian import Belief
-from soilbus.estimation.laplace import with_whole
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.laplace import with_nested_laplace
 from soilbus.estimation.multistart import fit_window
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.reference import reference_configuration
@@ -45,7 +45,7 @@ def of_drive(soil, sinkage, seed):
     config = rough(soil)
     problem = minima.window(config, soil, 10.0, minima.constant(SLIPS[seed % 4]), sinkage, 100 + seed, STILL)
     prior = missed(prior_of(config), SOILS[soil], np.random.default_rng([seed, 9]))
-    whole = with_whole(problem, prior, Belief.of(prior, problem.gain_std), fit_window(problem, prior)).whole
+    whole = with_nested_laplace(problem, prior, Gaussian.of(prior, problem.gain_std), fit_window(problem, prior)).whole
     return deviations(whole.posterior, soil)
 
 

@@ -125,7 +125,10 @@ def test_an_ambiguous_window_says_so_and_never_go():
     config = TWO
     problem = minima.window(config, "wet_clay", seed=3)
     fit = minima.fit_window(problem, minima.prior_of(config))
-    one, other = fit.posterior.bearing_pressure(0.02, 0.3), fit.rival.belief.posterior.bearing_pressure(0.02, 0.3)
+    one, other = (
+        fit.posterior.bearing_pressure(0.02, 0.3),
+        fit.second_mode.gaussian.posterior.bearing_pressure(0.02, 0.3),
+    )
     assert abs(one.value - other.value) > 2.0 * one.std
     scenario = Scenario(10.0, (Patch(0.0, "wet_clay"),), slip=minima.EXCITED)
     result = WindowEstimator(config).solve(next(tasks(config, scenario, 3)))
@@ -155,5 +158,5 @@ def test_no_belief_grows_from_one_of_two_optima():
         result = estimator.solve(task)
         if result.reason == "ambiguous":
             told += 1
-            assert not estimator._tracker._beliefs
+            assert not estimator._tracker._gaussians
     assert told > 0

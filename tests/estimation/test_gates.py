@@ -9,7 +9,7 @@ import pytest
 
 from soilbus.estimation.assembly import model_of
 from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.window import Rig, SensorNoise, Window, forward, turning
 from soilbus.terra.soils import SOILS
 
@@ -166,8 +166,8 @@ def test_a_sharp_turn_does_harm_and_is_left_out(simulated):
         bent = dataclasses.replace(case.window, speed=case.window.speed * (1.0 + 0.1 * side))  # 7.5 m: a headland
         assert turning(bent, case.rig, MAX_TURN).mean() > 0.95
         model = model_of(case.config)
-        gated = WindowProblem(bent, case.rig, model, 0.2, MAX_TURN)
+        gated = ObservationModel(bent, case.rig, model, 0.2, MAX_TURN)
         assert gated.turning == turning(bent, case.rig, MAX_TURN).sum() == len(bent.t) - gated.n
-        tan_phi = fit_window(WindowProblem(bent, case.rig, model, 0.2, np.inf), case.prior).posterior.tan_phi()
+        tan_phi = fit_window(ObservationModel(bent, case.rig, model, 0.2, np.inf), case.prior).posterior.tan_phi()
         off.append((tan_phi.value - np.tan(case.soil.phi)) / tan_phi.std)
     assert np.sqrt(np.mean(np.square(off))) > 5.0

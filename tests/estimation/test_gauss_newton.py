@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from soilbus.estimation.gaussian import solved
-from soilbus.estimation.multistart import descend, fit_window, foreseen, near, resume, starting_soils
+from soilbus.estimation.gaussian import solve_with_inverse
+from soilbus.estimation.multistart import fit_from_soil, fit_warm, fit_window, near, starting_soils, warm_start
 from soilbus.estimation.parametrization import BOUND, Coordinates
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.window import Rig, Window
@@ -78,22 +78,22 @@ def test_the_same_optimum_from_all_starts(wet_clay, wet_clay_fit):
     problem, prior = wet_clay.problem(), wet_clay.prior
     unlike = ("loam", "clayey_soil_38", "dry_sand", "heavy_clay_40", "wet_clay")
     for start in (Soil(*prior.median), *(near(prior, SOILS[name]) for name in unlike)):
-        fit = descend(problem, prior, start)
+        fit = fit_from_soil(problem, prior, start)
         assert fit.converged
-        assert fit.cost == pytest.approx(wet_clay_fit.cost, abs=0.01)
+        assert fit.neg2_log_posterior == pytest.approx(wet_clay_fit.neg2_log_posterior, abs=0.01)
         assert np.abs(deviations(fit, wet_clay_fit.posterior.soil)).max() < 0.05
         assert fit.posterior.log_covariance == pytest.approx(wet_clay_fit.posterior.log_covariance, rel=0.01, abs=1e-6)
 
 
 def test_resuming_from_any_neighbour_ends_where_a_fresh_fit_does(wet_clay, wet_clay_fit, simulated):
     problem, prior = wet_clay.problem(), wet_clay.prior
-    again = resume(foreseen(problem, prior, wet_clay_fit))
+    again = fit_warm(warm_start(problem, prior, wet_clay_fit))
     assert again.converged
     assert again.iterations <= 3
     assert np.abs(deviations(again, wet_clay_fit.posterior.soil)).max() < 0.05
     other = simulated(SOILS["wet_clay"], 51)
     neighbour = fit_window(other.problem(), prior)
-    fit = resume(foreseen(problem, prior, neighbour))
+    fit = fit_warm(warm_start(problem, prior, neighbour))
     assert fit.converged
     assert np.abs(deviations(fit, wet_clay_fit.posterior.soil)).max() < 0.05
 
@@ -255,7 +255,7 @@ def test_order_of_wheels_does_not_matter(wet_clay, wet_clay_fit):
     window = dataclasses.replace(wet_clay.window, variance=variance, **wheel)
     fit = fit_window(wet_clay.problem(window, mixed), wet_clay.prior)
     assert np.abs(deviations(fit, wet_clay_fit.posterior.soil)).max() < 1e-3
-    assert fit.cost == pytest.approx(wet_clay_fit.cost, rel=1e-6)
+    assert fit.neg2_log_posterior == pytest.approx(wet_clay_fit.neg2_log_posterior, rel=1e-6)
     assert fit.sinkage == pytest.approx(wet_clay_fit.sinkage[order], rel=1e-4)
 
 
@@ -311,10 +311,10 @@ def test_solved():
     root = np.random.default_rng(0).normal(size=(5, 5)) * np.geomspace(1e-6, 1e6, 5)
     information = root.T @ root
     gradient = information @ np.arange(5.0)
-    step, inverse = solved(information, gradient)
+    step, inverse = solve_with_inverse(information, gradient)
     scale = np.sqrt(np.diag(information))  # spread over twelve decades
     assert step * scale == pytest.approx(np.arange(5.0) * scale, rel=1e-8, abs=1e-6)
     assert inverse * np.outer(scale, scale) == pytest.approx(np.linalg.inv(information / np.outer(scale, scale)))
     with np.errstate(all="ignore"):
-        assert solved(np.zeros((2, 2)), np.zeros(2)) is None
-        assert solved(np.full((2, 2), np.nan), np.zeros(2)) is None
+        assert solve_with_inverse(np.zeros((2, 2)), np.zeros(2)) is None
+        assert solve_with_inverse(np.full((2, 2), np.nan), np.zeros(2)) is None

@@ -7,7 +7,7 @@ import pytest
 
 from soilbus.estimation.local_cubics import PARTS, Series, curve_of, variance_of_one
 from soilbus.estimation.window import Rig, SensorNoise
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.sensors.rates import resolved_window
 from soilbus.terra.vehicle import Chassis
 
@@ -69,13 +69,13 @@ def test_the_variance_of_a_value_at_one_instant_is_what_noise_makes_of_it(half, 
     assert variance_of_one(half, n, round(phase * PARTS)) == pytest.approx(told.var(), rel=0.04)
 
 
-def store_of(shake: float, step: float = 0.02) -> BinStore:
+def store_of(shake: float, step: float = 0.02) -> Bins:
     """A vehicle of one wheel whose load shakes at 4 Hz, its messages at phases of their own."""
     names = ("torque", "load", "speed", "ground_speed", "draft")
     noise = {q: SensorNoise(absolute=0.01) for q in (*names, "sinkage", "pitch", "acceleration", "yaw_rate")}
     chassis = Chassis(1000.0, 2.0, 1.0, 0.5, 0.5)
     rig = Rig(("W",), np.array([0.5]), np.array([0.3]), np.array([True]), chassis, noise)
-    rng, store = np.random.default_rng(5), BinStore(rig, 0.1, 0.0)
+    rng, store = np.random.default_rng(5), Bins(rig, 0.1, 0.0)
     samples = {}
     for name in names:
         t = rng.uniform(0.0, step) + step * np.arange(int(20.0 / step))

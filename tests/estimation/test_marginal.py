@@ -7,9 +7,9 @@ import pytest
 
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.laplace import cold_fit
-from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import SoilPrior
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario
@@ -26,11 +26,11 @@ def test_without_noise_a_window_that_tells_k_c_says_the_truth(seed):
     config, soil = reference_configuration(ROUGHLY_KNOWN), SOILS["wet_clay"]
     rig, truth = rig_of(config), SoilPrior(np.asarray(soil), prior_of(config).log_std)
     drive = simulate(config, Scenario(DURATION, (Patch(0.0, "wet_clay", soil),), slip=SLIP), seed)
-    store = BinStore(rig, config.estimator.bin, 0.0)
+    store = Bins(rig, config.estimator.bin, 0.0)
     fitted = [name for name in rig.channels if name in drive.channels and not name.startswith("sinkage")]
     times = {name: drive.channels[name].t for name in fitted}
     store.add({name: (t, np.interp(t, drive.truth["t"], drive.truth[name])) for name, t in times.items()})
-    problem = WindowProblem(store.window(0.0, DURATION), rig, model_of(config), config.estimator.min_speed)
+    problem = ObservationModel(store.window(0.0, DURATION), rig, model_of(config), config.estimator.min_speed)
     told = cold_fit(problem, truth).whole.posterior
     bound = cramer_rao(problem, truth, soil)
     std = np.sqrt(np.diag(bound.log_covariance))

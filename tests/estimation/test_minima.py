@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from soilbus.estimation.assembly import prior_of
-from soilbus.estimation.multistart import descend, fit_window
+from soilbus.estimation.multistart import fit_from_soil, fit_window
 from soilbus.estimation.parametrization import BOUND, MAX_PHI
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.simulator.reference import reference_configuration
@@ -40,7 +40,7 @@ def test_random_starts_of_the_prior_end_at_what_the_fit_finds(soil, seconds, sli
     assert ends.other == 0
     assert not ends.worse
     assert ends.failed <= 0.1 * STARTS
-    assert ends.fit.rival is None
+    assert ends.fit.second_mode is None
 
 
 @pytest.fixture(scope="module")
@@ -54,20 +54,22 @@ def test_two_optima_as_likely_are_a_fit_with_a_rival(torn):
     problem, prior = torn
     fit = fit_window(problem, prior)
     assert fit.converged
-    rival = fit.rival
+    rival = fit.second_mode
     assert 0.05 < rival.share <= 0.5
-    again = descend(problem, prior, rival.belief.posterior.soil)  # it is an optimum indeed
+    again = fit_from_soil(problem, prior, rival.gaussian.posterior.soil)  # it is an optimum indeed
     assert again.converged
     assert minima.apart(again, fit) > 2.0
-    assert again.mode.posterior.distance(rival.belief.posterior.soil) < 0.1
-    assert rival.share == pytest.approx(1.0 / (1.0 + math.exp(0.5 * (again.evidence - fit.evidence))), abs=0.01)
+    assert again.mode.posterior.distance(rival.gaussian.posterior.soil) < 0.1
+    assert rival.share == pytest.approx(
+        1.0 / (1.0 + math.exp(0.5 * (again.neg2_log_evidence - fit.neg2_log_evidence))), abs=0.01
+    )
 
 
 def test_what_is_passed_on_covers_both_optima(torn):
     fit = fit_window(*torn)
-    one, other, whole = fit.belief, fit.rival.belief, fit.whole
+    one, other, whole = fit.gaussian, fit.second_mode.gaussian, fit.whole
     off = np.log(other.soil / one.soil)
-    share = fit.rival.share
+    share = fit.second_mode.share
     for k in range(6):
         expected = (1.0 - share) * one.covariance[k, k] + share * (other.covariance[k, k] + off[k] ** 2)
         assert whole.covariance[k, k] == pytest.approx(expected)
@@ -80,9 +82,9 @@ def test_what_is_passed_on_covers_both_optima(torn):
 def test_held_or_inseparable_moduli_have_no_rival(torn):
     problem, prior = torn
     held = SoilPrior(prior.median, np.where(np.arange(6) == PARAMETERS.index("k_c"), 0.0, prior.log_std))
-    assert fit_window(problem, held).rival is None
+    assert fit_window(problem, held).second_mode is None
     config = reference_configuration([f"wheel.{w}.width=0.3" for w in ("FL", "FR", "RL", "RR")])
-    assert fit_window(minima.window(config, "wet_clay", 2.0, seed=3), prior).rival is None
+    assert fit_window(minima.window(config, "wet_clay", 2.0, seed=3), prior).second_mode is None
 
 
 @pytest.fixture(scope="module")
@@ -145,13 +147,13 @@ def test_whatever_the_data_every_fit_is_physical(harms, rows, seed, short):
     assert fit.posterior.soil.phi <= MAX_PHI < 0.5 * math.pi
     away = np.abs(np.log(soil / prior.median)) / prior.log_std
     assert away.max() < BOUND * (1.0 + 1e-9)
-    for belief in (fit.mode, fit.belief, fit.whole):
-        assert np.isfinite(belief.gains).all()
-        spread = np.sqrt(np.diag(belief.covariance))
+    for gaussian in (fit.mode, fit.gaussian, fit.whole):
+        assert np.isfinite(gaussian.gains).all()
+        spread = np.sqrt(np.diag(gaussian.covariance))
         assert np.isfinite(spread).all()
-        scaled = belief.covariance[spread > 0.0][:, spread > 0.0] / np.outer(*[spread[spread > 0.0]] * 2)
+        scaled = gaussian.covariance[spread > 0.0][:, spread > 0.0] / np.outer(*[spread[spread > 0.0]] * 2)
         assert np.linalg.eigvalsh(scaled).min() > -1e-9
-        known = prior.log_std * np.where(K_C & (belief is not fit.mode), LESS_SURE, 1.0 + 1e-6)
-        assert (spread[:6] <= known).all() or (fit.rival is not None and belief is fit.whole)
-    assert math.isfinite(fit.cost) or not fit.converged
-    assert math.isfinite(fit.evidence) or not fit.converged
+        known = prior.log_std * np.where(K_C & (gaussian is not fit.mode), LESS_SURE, 1.0 + 1e-6)
+        assert (spread[:6] <= known).all() or (fit.second_mode is not None and gaussian is fit.whole)
+    assert math.isfinite(fit.neg2_log_posterior) or not fit.converged
+    assert math.isfinite(fit.neg2_log_evidence) or not fit.converged

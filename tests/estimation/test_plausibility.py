@@ -14,7 +14,7 @@ from soilbus.can.dbc_files import load_databases
 from soilbus.can.mapping import channels_of
 from soilbus.estimation.assembly import rig_of, with_effects
 from soilbus.estimation.window import Window, forward
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.sensors.consistency import Plausibility, Resolution, implausible, lasts, runs
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.reference import reference_configuration
@@ -63,7 +63,7 @@ def named(recording: Recording) -> set[str]:
 def windows(recording: Recording):
     """Forward windows each 2 s, with the speeds of the motors."""
     length, samples = CONFIG.estimator.window, {n: (c.t, c.value) for n, c in recording.channels.items()}
-    store = BinStore(RIG, CONFIG.estimator.bin, 0.0)
+    store = Bins(RIG, CONFIG.estimator.bin, 0.0)
     store.add({n: s for n, s in samples.items() if n in RIG.channels})
     for end in np.arange(length, recording.truth["t"][-1] + 0.05, 2.0).tolist():
         window = forward(store.window(end - length, end))

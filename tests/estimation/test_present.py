@@ -11,10 +11,10 @@ from drives import errors, task_of, tracker_of, windows
 from scipy.special import expit
 
 from soilbus.decision.traversability import Status
-from soilbus.estimation.drift_filter import PIECES, STEADY, at_present
-from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.drift_filter import PIECES, STEADY, at_window_end
+from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.solver import Fitting, Place
+from soilbus.estimation.solver import Iterate, Objective
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -84,13 +84,15 @@ def test_no_valid_window_on_a_soil_that_drifts_much_is_wrong(seed):
 def test_the_filter_is_the_joint_solution_for_the_soils_of_all_pieces(drift, simulated):
     case = simulated(SOILS["loam"], 3)
     problem = case.problem()
-    before = Belief.of(case.prior, problem.gain_std)
+    before = Gaussian.of(case.prior, problem.gain_std)
     fit = fit_window(problem, case.prior, before)
-    now = at_present(Fitting(problem, case.prior, before), fit, 10.0, drift).mode  # of which the linear window tells
+    now = at_window_end(
+        Objective(problem, case.prior, before), fit, 10.0, drift
+    ).mode  # of which the linear window tells
 
     # The same by dense systems: soil of piece 0, 1, ..., then gains, then a steady change or none.
-    fitting = Fitting(problem, case.prior, before)
-    place = Place(fit.optimum.soil, fit.optimum.gains, fit.optimum.latents, 0.0, 0)
+    fitting = Objective(problem, case.prior, before)
+    place = Iterate(fit.optimum.soil, fit.optimum.gains, fit.optimum.latents, 0.0, 0)
     at, directions = fit.optimum.at, fitting.directions(place)
     free, kept = len(fitting.free), directions.shape[1]
     known = fitting.before_at(place)
@@ -100,7 +102,7 @@ def test_the_filter_is_the_joint_solution_for_the_soils_of_all_pieces(drift, sim
     for steady in (0, free):
         n = free * PIECES + kept - free + steady
         information, gradient = np.zeros((n, n)), np.zeros(n)
-        cost = at.chi2 + known.cost
+        cost = at.chi2 + known.neg2_log_prior
 
         def of(piece, instant, n=n, steady=steady):
             """What the window's unknowns at an instant in a piece have of all these."""
@@ -147,13 +149,13 @@ def test_the_filter_is_the_joint_solution_for_the_soils_of_all_pieces(drift, sim
 def test_what_does_not_drift_stays_as_it_was(simulated):
     case = simulated(SOILS["wet_clay"], 4)
     problem = case.problem()
-    before = Belief.of(case.prior, problem.gain_std)
+    before = Gaussian.of(case.prior, problem.gain_std)
     fit = fit_window(problem, case.prior, before)
-    fitting = Fitting(problem, case.prior, before)
-    assert at_present(fitting, fit, 10.0, 0.0) is fit
-    still = at_present(fitting, fit, 10.0, 1e-5).belief
-    np.testing.assert_allclose(np.log(still.soil / fit.belief.soil), 0.0, atol=2e-3)
-    np.testing.assert_allclose(np.diag(still.covariance), np.diag(fit.belief.covariance), rtol=0.02)
+    fitting = Objective(problem, case.prior, before)
+    assert at_window_end(fitting, fit, 10.0, 0.0) is fit
+    still = at_window_end(fitting, fit, 10.0, 1e-5).gaussian
+    np.testing.assert_allclose(np.log(still.soil / fit.gaussian.soil), 0.0, atol=2e-3)
+    np.testing.assert_allclose(np.diag(still.covariance), np.diag(fit.gaussian.covariance), rtol=0.02)
 
 
 @pytest.mark.parametrize(("overrides", "wheels"), [((), 4), ((), 2), (("soil.k_c.std=0",), 4)])
@@ -161,22 +163,22 @@ def test_all_that_a_fit_says_moves_as_its_mode_does_and_is_less_sure(overrides, 
     config = reference_configuration(overrides)
     config = config if wheels == 4 else minima.two_wheels(config)
     problem, prior = minima.window(config, "wet_clay", seed=3), minima.prior_of(config)
-    before = Belief.of(prior, problem.gain_std)
+    before = Gaussian.of(prior, problem.gain_std)
     fit = fit_window(problem, prior, before)
-    fit = replace(fit, averaged=fit.mode.mixed(fit.mode, 0.5))
-    fitting = Fitting(problem, prior, before)
-    now = at_present(fitting, fit, 10.0, 0.03)
-    assert (fit.rival is None) == (wheels == 4)
-    assert (fit.belief is fit.mode) == (now.belief is now.mode) == (bool(overrides) or wheels == 2)
+    fit = replace(fit, marginalised=fit.mode.mixed(fit.mode, 0.5))
+    fitting = Objective(problem, prior, before)
+    now = at_window_end(fitting, fit, 10.0, 0.03)
+    assert (fit.second_mode is None) == (wheels == 4)
+    assert (fit.gaussian is fit.mode) == (now.gaussian is now.mode) == (bool(overrides) or wheels == 2)
 
     def step(old, new):
         at = fitting.coordinates.position
         return np.concatenate([at(new.soil) - at(old.soil), new.gains - old.gains])
 
-    pairs = [(fit.belief, now.belief), (fit.averaged, now.averaged)]
-    if fit.rival is not None:
-        pairs.append((fit.rival.belief, now.rival.belief))
-        assert now.rival.share == fit.rival.share
+    pairs = [(fit.gaussian, now.gaussian), (fit.marginalised, now.marginalised)]
+    if fit.second_mode is not None:
+        pairs.append((fit.second_mode.gaussian, now.second_mode.gaussian))
+        assert now.second_mode.share == fit.second_mode.share
     moved = step(fit.mode, now.mode)
     assert np.abs(moved).max() > 0.01
     free = np.concatenate([prior.free, 6 + fitting.active])
@@ -186,4 +188,8 @@ def test_all_that_a_fit_says_moves_as_its_mode_does_and_is_less_sure(overrides, 
         added = (new.covariance - old.covariance)[np.ix_(free, free)] / np.outer(std, std)
         assert old is fit.mode or np.linalg.eigvalsh(added).min() > -1e-9  # the mode's is taken at another soil
         assert np.diag(added)[: len(prior.free)].min() > 0.0
-    assert (now.cost, now.evidence, now.chi2) == (fit.cost, fit.evidence, fit.chi2)
+    assert (now.neg2_log_posterior, now.neg2_log_evidence, now.chi2) == (
+        fit.neg2_log_posterior,
+        fit.neg2_log_evidence,
+        fit.chi2,
+    )

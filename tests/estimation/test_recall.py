@@ -10,8 +10,8 @@ import pytest
 from drives import errors, tracker_of, windows
 
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.estimation.gaussian import Belief
-from soilbus.estimation.tracker import PERSISTENCE, gain_errors, recalled
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.tracker import PERSISTENCE, gain_errors, prior_from_last_run
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -32,7 +32,7 @@ def drive(first: str, second: str, seed: int):
     return [w for w in known if w[1] < BORDER], next(w for w in known if w[1] > BORDER + 2.0 + CONFIG.estimator.window)
 
 
-def learned(before) -> Belief:
+def learned(before) -> Gaussian:
     """What a run leaves behind."""
     tracker = tracker_of(CONFIG)
     for window, end in before:
@@ -41,11 +41,11 @@ def learned(before) -> Belief:
     return tracker.newest
 
 
-def first_fit(window, belief: Belief | None, elapsed: float = NIGHT):
+def first_fit(window, gaussian: Gaussian | None, elapsed: float = NIGHT):
     """Of a run that knew this beforehand."""
     tracker = tracker_of(CONFIG)
-    if belief is not None:
-        tracker.recall(belief, elapsed)
+    if gaussian is not None:
+        tracker.recall(gaussian, elapsed)
     tracker.forget()  # as the first window of every run asks
     tracked = tracker.estimate(*window)
     assert not tracked.mismatch
@@ -61,27 +61,27 @@ def onto_clay():
 def test_gains_wander_about_their_prior_as_long_as_nobody_looks():
     rng = np.random.default_rng(1)
     root = 0.1 * rng.standard_normal((20, 20)) * np.concatenate([np.ones(6), GAIN_STD])[:, None]
-    belief = Belief(PRIOR.median * 2.0, GAIN_STD * rng.standard_normal(14), root @ root.T)
+    gaussian = Gaussian(PRIOR.median * 2.0, GAIN_STD * rng.standard_normal(14), root @ root.T)
     for elapsed in (0.0, 60.0, PERSISTENCE, 30 * PERSISTENCE):
-        left = recalled(belief, PRIOR, GAIN_STD, elapsed)
+        left = prior_from_last_run(gaussian, PRIOR, GAIN_STD, elapsed)
         # simulated: dg = -g dt / T + sqrt(2 / T) std dW, whose steps over any time are known exactly
         still = math.exp(-elapsed / PERSISTENCE)
-        at_first = rng.multivariate_normal(belief.gains, belief.covariance[6:, 6:], 200_000, method="cholesky")
+        at_first = rng.multivariate_normal(gaussian.gains, gaussian.covariance[6:, 6:], 200_000, method="cholesky")
         wandered = still * at_first + math.sqrt(1 - still**2) * GAIN_STD * rng.standard_normal(at_first.shape)
         assert left.gains == pytest.approx(wandered.mean(0), abs=0.02 * GAIN_STD.max())
         scale = np.outer(GAIN_STD, GAIN_STD)
         assert left.covariance[6:, 6:] / scale == pytest.approx(np.cov(wandered.T) / scale, abs=0.02)
         assert np.array_equal(left.soil, PRIOR.median)
         assert np.array_equal(left.covariance[:6], np.diag(np.concatenate([PRIOR.log_std**2, np.zeros(14)]))[:6])
-    prior = Belief.of(PRIOR, GAIN_STD)
+    prior = Gaussian.of(PRIOR, GAIN_STD)
     assert left.covariance == pytest.approx(prior.covariance)
     assert np.abs(left.gains / GAIN_STD).max() < 1e-12
 
 
 def test_a_gain_that_is_held_stays_held():
     std = np.where(np.arange(14) % 2, GAIN_STD, 0.0)
-    belief = Belief.of(PRIOR, GAIN_STD)
-    left = recalled(replace(belief, gains=GAIN_STD), PRIOR, std, 0.0)
+    gaussian = Gaussian.of(PRIOR, GAIN_STD)
+    left = prior_from_last_run(replace(gaussian, gains=GAIN_STD), PRIOR, std, 0.0)
     assert (left.gains == std).all()
     assert (np.diag(left.covariance)[6:] == std**2).all()
 
@@ -97,23 +97,23 @@ def test_a_tractor_that_was_moved_meanwhile_is_not_drawn_to_the_old_soil(first, 
 
 
 def test_known_gains_make_the_first_window_surer(onto_clay):
-    belief, after = onto_clay
-    fit, anew = first_fit(after, belief), first_fit(after, None)
+    gaussian, after = onto_clay
+    fit, anew = first_fit(after, gaussian), first_fit(after, None)
     assert np.abs(errors(fit.posterior, SOILS["wet_clay"])).max() < 3.0
     assert fit.posterior.tan_phi().std < 0.97 * anew.posterior.tan_phi().std
     assert not np.array_equal(fit.gains, anew.gains)
 
 
 def test_gains_that_the_data_speak_against_are_forgotten(onto_clay):
-    belief, _ = onto_clay
+    gaussian, _ = onto_clay
     for seed in (6, 7):  # the simulator draws other gains for each recording: the sensors were all exchanged
         _, of_other_sensors = drive("loam", "dry_sand", seed)
-        fit, anew = first_fit(of_other_sensors, belief, 600.0), first_fit(of_other_sensors, None)
-        assert np.array_equal(fit.belief.soil, anew.belief.soil)
-        assert np.array_equal(fit.belief.covariance, anew.belief.covariance)
+        fit, anew = first_fit(of_other_sensors, gaussian, 600.0), first_fit(of_other_sensors, None)
+        assert np.array_equal(fit.gaussian.soil, anew.gaussian.soil)
+        assert np.array_equal(fit.gaussian.covariance, anew.gaussian.covariance)
 
 
 def test_after_years_nothing_is_left(onto_clay):
-    belief, after = onto_clay
-    fit, anew = first_fit(after, belief, 1e9), first_fit(after, None)
-    assert fit.belief.soil == pytest.approx(anew.belief.soil, rel=1e-6)
+    gaussian, after = onto_clay
+    fit, anew = first_fit(after, gaussian, 1e9), first_fit(after, None)
+    assert fit.gaussian.soil == pytest.approx(anew.gaussian.soil, rel=1e-6)

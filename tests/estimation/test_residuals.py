@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from soilbus.estimation.measurements import GAIN_QUANTITIES, differentiated_speed
-from soilbus.estimation.observation_model import Latents, WindowProblem
+from soilbus.estimation.observation_model import Latents, ObservationModel
 from soilbus.estimation.window import Rig, Window, window_of_samples
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS
@@ -65,7 +65,7 @@ def cost_of_instant(window: Window, rig: Rig, i: int, soil: Soil, gains: dict[st
     return 2.0 * least_squares(residuals, np.zeros(2 * W + 1), jacobian, xtol=1e-10, ftol=1e-13, gtol=1e-9).cost
 
 
-def converged(problem: WindowProblem, soil: Soil, gains: np.ndarray):
+def converged(problem: ObservationModel, soil: Soil, gains: np.ndarray):
     """The linearisation at the best latents for a held soil and gains."""
     latents = problem.start(soil)
     none = np.zeros(6), np.zeros(len(gains))
@@ -83,7 +83,7 @@ def few(simulated):
     window.torque[1, 0] = np.nan
     window.sinkage[2] = np.nan
     rng = np.random.default_rng(3)
-    problem = WindowProblem(window, case.rig, MODEL, 0.2)
+    problem = ObservationModel(window, case.rig, MODEL, 0.2)
     soil = Soil(*(np.asarray(case.soil) * np.exp(rng.normal(0.0, 0.03, 6))))
     gains = problem.gain_std * rng.standard_normal(len(problem.gain_std))
     return window, case.rig, problem, soil, gains
@@ -145,7 +145,7 @@ def test_covariance_of_residuals_equals_monte_carlo(simulated):
         noise = rig.noise[name.partition(".")[0]]
         sd = np.sqrt(noise.absolute**2 + ((noise.relative**2 + noise.of_mean**2) * value**2))
         noisy[name] = value + sd * rng.standard_normal(n)
-    problem = WindowProblem(window_of_samples(rig, np.arange(n, dtype=float), noisy), rig, MODEL, 0.2)
+    problem = ObservationModel(window_of_samples(rig, np.arange(n, dtype=float), noisy), rig, MODEL, 0.2)
     none = np.zeros(len(problem.gain_std))
     latents = Latents(*(np.broadcast_to(a, (n, *np.shape(a))).copy() for a in (load, speed)), np.full(n, 1.5), None)
     latents.entry_angle = np.full((n, 4), np.nan)

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.window import Rig, SensorNoise
 from soilbus.sensors import outliers as screening
-from soilbus.sensors.bins import BinStore
-from soilbus.sensors.outliers import Samples, judge
+from soilbus.sensors.bins import Bins
+from soilbus.sensors.outliers import Samples, outlier_test
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -62,13 +62,13 @@ class Drive:
         return sum(len(t) for t, _ in self.columns.values())
 
     def window(self, columns=None):
-        store = BinStore(self.rig, 0.1, 0.0)
+        store = Bins(self.rig, 0.1, 0.0)
         store.add(columns or self.columns)
         return store.window(0.0, 10.0)
 
     def errors(self, window):
         """Relative errors of bearing pressure, tan phi and n, and reduced chi-square."""
-        fit = fit_window(WindowProblem(window, self.rig, model_of(self.config), 0.2), prior_of(self.config))
+        fit = fit_window(ObservationModel(window, self.rig, model_of(self.config), 0.2), prior_of(self.config))
         got = fit.posterior.bearing_pressure(0.02, 0.3).value, np.tan(fit.posterior.soil.phi), fit.posterior.soil.n
         truth = self.soil.bearing_pressure(0.02, 0.3), np.tan(self.soil.phi), self.soil.n
         return np.array(got) / truth - 1.0, fit.chi2
@@ -142,7 +142,7 @@ TIMES = 0.02 * np.arange(N)
 
 def found(value: np.ndarray, t: np.ndarray = TIMES) -> np.ndarray:
     samples = Samples(np.zeros(len(t), np.int16), t, np.asarray(value, float), np.zeros(len(t), bool))
-    return np.flatnonzero(judge(samples, lambda count, size, level: np.ones(len(size))).wild)
+    return np.flatnonzero(outlier_test(samples, lambda count, size, level: np.ones(len(size))).wild)
 
 
 def noise(seed: int) -> np.ndarray:
@@ -233,7 +233,7 @@ def test_channels_do_not_mix():
     value[[3, 7, 46, 47, 346]] += 20.0  # in the first channel, and at the ends of the others
     mixed = np.random.default_rng(6).permutation(347)
     samples = Samples(column[mixed], t[mixed], value[mixed], np.zeros(347, bool))
-    judged = judge(samples, lambda count, size, level: np.ones(len(size)))
+    judged = outlier_test(samples, lambda count, size, level: np.ones(len(size)))
     assert np.sort(judged.samples.value[judged.wild]) == pytest.approx(np.sort(value[[7, 46, 47, 346]]))
     last = [6, 46, 346]
     assert judged.later[last].tolist() == [0, 0, 0]
@@ -264,7 +264,7 @@ def recording(seed: int, share: float = 0.02):
 
 def slid(columns, cuts, rng=None, origin: float = 0.0):
     """Windows of 3 s each second, and the times found wild; samples come in batches that end at the cuts."""
-    store = BinStore(RIG, 0.1, origin)
+    store = Bins(RIG, 0.1, origin)
     windows, wild = [], []
     hops = np.arange(3.0, END + 0.1)
     begin = 0.0
@@ -320,7 +320,7 @@ def test_a_doubtful_last_sample_is_asked_again():
     step = np.where(t < 2.97, 0.0, 100.0) + rng.standard_normal(len(t))  # one sample before 3 s
     spike = rng.standard_normal(len(t))
     spike[149] = 40.0
-    store = BinStore(RIG, 0.1, 0.0)
+    store = Bins(RIG, 0.1, 0.0)
     store.add({"draft": (t, step), "pitch": (t, spike)})
     first = store.window(0.0, 3.0)
     assert first.samples == 300 - 2
@@ -335,7 +335,7 @@ def test_a_doubtful_last_sample_is_asked_again():
 
 def test_windows_of_the_past_change_nothing():
     columns = recording(12)
-    store, other = BinStore(RIG, 0.1, 0.0), BinStore(RIG, 0.1, 0.0)
+    store, other = Bins(RIG, 0.1, 0.0), Bins(RIG, 0.1, 0.0)
     store.add(columns)
     other.add(columns)
     first = store.window(0.0, 5.0)
@@ -352,7 +352,7 @@ def test_a_glimpse_is_screened_and_sees_what_came_last():
     t = np.arange(0.001, 2.0, 0.02)
     value = rng.standard_normal(100)
     value[98] = 1e4
-    store = BinStore(RIG, 0.1, 0.0)
+    store = Bins(RIG, 0.1, 0.0)
     store.add({"draft": (t, value)})
     for _ in range(2):
         seen = store.glimpse(1.7, 2.0)
@@ -366,7 +366,7 @@ def test_late_samples_are_judged_when_they_come():
     value = np.random.default_rng(10).standard_normal(200)
     late = np.isin(np.arange(200), [90, 91, 120])
     value[91] = 50.0
-    store = BinStore(RIG, 0.1, 0.0)
+    store = Bins(RIG, 0.1, 0.0)
     store.add({"draft": (t[~late], value[~late])})
     assert store.window(0.0, 3.0).samples == 147
     store.add({"draft": (t[late], value[late])})
@@ -379,7 +379,7 @@ def test_relative_noise_at_rest_has_a_floor():
     rig = Rig(
         ("A",), np.array([0.5]), np.array([0.3]), np.array([True]), None, NOISE | {"speed": SensorNoise(relative=0.002)}
     )
-    store = BinStore(rig, 0.1, 0.0)
+    store = Bins(rig, 0.1, 0.0)
     t = np.arange(0.001, 5.0, 0.02)
     value = np.zeros(250)
     value[[30, 100, 101, 180]] = 0.001

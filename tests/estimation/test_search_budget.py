@@ -9,7 +9,7 @@ import pytest
 from drives import tasks
 
 from soilbus.decision.traversability import Status
-from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.tracker import SearchBudget
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.reference import reference_configuration
@@ -30,13 +30,13 @@ def with_draft(task, sign):
 
 def solved(config, drive, monkeypatch):
     """Results of a drive, and the evaluations of a whole window that each took."""
-    count, linearise = [0], WindowProblem.linearise
+    count, linearise = [0], ObservationModel.linearise
 
     def counted(self, *args, **kwargs):
         count[0] += self.n
         return linearise(self, *args, **kwargs)
 
-    monkeypatch.setattr(WindowProblem, "linearise", counted)
+    monkeypatch.setattr(ObservationModel, "linearise", counted)
     estimator, results, spent = WindowEstimator(config), [], []
     for task in drive:
         before = count[0]

@@ -12,7 +12,7 @@ from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.multistart import fit_window, near
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
-from soilbus.estimation.soil_classes import PRIOR_UNKNOWN, WITHIN, SoilClasses, foretelling, guessed
+from soilbus.estimation.soil_classes import PRIOR_UNKNOWN, WITHIN, SoilClasses, guessed, ranked_by_likelihood
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import KINDS, SOILS, UNKNOWN
 from soilbus.terra.wheel import Soil
@@ -53,12 +53,12 @@ def test_a_posterior_without_a_guess_is_weighed_as_bayes_does():
     covariance = np.diag([1.0, 0.3, 0.2, 0.1, 0.5, 0.3]) ** 2
     covariance[1, 2] = covariance[2, 1] = 0.5 * 0.3 * 0.2
     measured = rng.multivariate_normal(about[1:], covariance[1:, 1:], 40_000)
-    evidence = [
+    likelihood = [
         np.mean(np.exp(-0.5 * (((measured - centre[1:]) / spread[1:]) ** 2).sum(1)) / np.prod(spread[1:]))
         for centre, spread in zip(CLASSES.centre, CLASSES.spread, strict=True)
     ]
     prior = np.append(np.full(len(KINDS), (1.0 - PRIOR_UNKNOWN) / len(KINDS)), PRIOR_UNKNOWN)
-    expected = dict(zip(CLASSES.names, prior * evidence / (prior @ evidence), strict=True))
+    expected = dict(zip(CLASSES.names, prior * likelihood / (prior @ likelihood), strict=True))
     said = CLASSES.probabilities(posterior_about(about, covariance), NO_GUESS)
     assert next(iter(said)) == max(expected, key=expected.__getitem__)
     assert sum(p > 0.02 for p in expected.values()) >= 4  # a case with something to weigh
@@ -190,7 +190,7 @@ def test_start_values_are_the_soils_that_foretell_the_window(simulated, sensors)
     without = {"all": (), "no sinkage": ("sinkage",), "no draft": ("draft",), "only torque": ("sinkage", "draft")}
     problem = simulated(SOILS["upland_sandy_loam_51"], 6, without=without[sensors]).problem()
     soils = [near(PRIOR, SOILS[name]) for name in KINDS]
-    order = [KINDS[soils.index(soil)] for soil in foretelling(problem, soils)]
+    order = [KINDS[soils.index(soil)] for soil in ranked_by_likelihood(problem, soils)]
     assert order[0] == "upland_sandy_loam_51"
     assert sorted(order) == sorted(KINDS)
     assert set(order[-3:]) & {"snow_us", "snow_sweden"}  # which do not carry it

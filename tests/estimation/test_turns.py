@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from soilbus.estimation.measurements import Readings
+from soilbus.estimation.measurements import Measurements
 from soilbus.estimation.window import Rig, SensorNoise, Window, forward, turning
 
 MAX_TURN, TRACK = 0.15, 1.14
@@ -122,7 +122,7 @@ def test_diagonal_spin_before_a_vehicle_is_stuck_keeps_its_samples(yaw):
     ground = 1.0 - 0.75 * into
     spinning, held = 1.25 + 1.75 * into, ground / 0.8
     rims = np.stack([spinning, held, held, spinning], axis=1)
-    kept = Readings(drive(rims, ground, yaw), rig(), 0.2, MAX_TURN)
+    kept = Measurements(drive(rims, ground, yaw), rig(), 0.2, MAX_TURN)
     assert kept.turning == 0
     assert len(kept.t) == n
     assert kept.usable.all()

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from soilbus.estimation.window import Rig, SensorNoise, window_of_samples
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 
 NOISE = {
     "torque": SensorNoise(of_mean=0.02, gain=0.01),
@@ -30,7 +30,7 @@ SEED = st.integers(0, 2**32 - 1)
 
 def filled(columns, origin=0.0, pieces=1, rng=None):
     """A store that got the columns in several batches, in random order where there is an rng."""
-    store = BinStore(RIG, 0.1, origin)
+    store = Bins(RIG, 0.1, origin)
     for i in range(pieces) if rng is None else rng.permutation(pieces):
         batch = {}
         for name, (t, value) in columns.items():

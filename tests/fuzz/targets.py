@@ -24,9 +24,9 @@ from soilbus.config.file import load_config, shipped_dbc
 from soilbus.config.model import Config, ConfigError
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.service import Service
-from soilbus.daemon.state_store import Owner, State, StateError, belief_of, dumped, loaded, stored_belief
+from soilbus.daemon.state_store import Owner, State, StateError, dumped, gaussian_of, loaded, stored_gaussian
 from soilbus.estimation.assembly import completion_of, effects_of
-from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.gaussian import Gaussian
 from soilbus.offline.replay import LogError, read_frames
 from soilbus.pipeline.intake import Intake
 from soilbus.pipeline.pipeline import Pipeline
@@ -252,10 +252,10 @@ def check_state(data: bytes) -> int:
         except StateError as error:
             _told([str(error)])
             continue
-        if state.belief is not None:
-            belief = belief_of(state.belief, owner())
-            assert np.isfinite(belief.soil).all()
-            assert np.linalg.eigvalsh(belief.covariance).min() > -1e-9 * belief.covariance.max()
+        if state.gaussian is not None:
+            gaussian = gaussian_of(state.gaussian, owner())
+            assert np.isfinite(gaussian.soil).all()
+            assert np.linalg.eigvalsh(gaussian.covariance).min() > -1e-9 * gaussian.covariance.max()
     return 0
 
 
@@ -276,9 +276,9 @@ def owner() -> Owner:
 
 def _state_seeds() -> list[bytes]:
     n, std = len(owner().median), owner().std
-    belief = Belief(owner().median[:6], np.zeros(n - 6), np.diag((0.5 * std) ** 2))
-    states = [stored_belief(belief, 1.7e9, owner()), None]
-    return [dumped(State(at=1.7e9, starts=2, belief=b, totals={"windows": 7}), owner()) for b in states]
+    gaussian = Gaussian(owner().median[:6], np.zeros(n - 6), np.diag((0.5 * std) ** 2))
+    states = [stored_gaussian(gaussian, 1.7e9, owner()), None]
+    return [dumped(State(at=1.7e9, starts=2, gaussian=b, totals={"windows": 7}), owner()) for b in states]
 
 
 def _told(faults: list[str], where: str = "") -> int:

@@ -16,7 +16,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import least_squares
 
-from soilbus.estimation.observation_model import Latents, Linearised, WindowProblem
+from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModel
 from soilbus.estimation.posterior import Posterior
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soil_laws import lumped_modulus
@@ -74,7 +74,7 @@ def fit(case: Case) -> Posterior | None:
 
 
 def _whitened(
-    problem: WindowProblem, at: Linearised, latents: Latents, frozen: Array
+    problem: ObservationModel, at: Linearisation, latents: Latents, frozen: Array
 ) -> Callable[[Soil, Array], Array]:
     """Readings less model of torques, draft balance and sinkages, whitened, by soil and gains (G,)."""
     rig, W = problem.rig, problem.n_wheels

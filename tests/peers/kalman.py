@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import PARAMETERS, Estimate
 from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.wheel import Soil, WheelState, wheel_forces_and_derivatives
@@ -48,7 +48,7 @@ def estimate(case: Case) -> Answer | None:
     return {"phi": Estimate(phi, std_phi), "n": Estimate(n, std_n), "bearing": Estimate(pressure.value, spread)}
 
 
-def _reading(problem: WindowProblem, i: int, known: Soil, x: Array) -> tuple[Array, Array, Array]:
+def _reading(problem: ObservationModel, i: int, known: Soil, x: Array) -> tuple[Array, Array, Array]:
     """Innovation (2 W + 1,) of loads, torques and pull, its slopes by phi and n, and the noise's covariance."""
     rig, angle = problem.rig, entry_angles(problem)[i]
     K_L = lumped_modulus(known.k_c, known.k_phi, rig.width)

@@ -21,7 +21,7 @@ from sklearn.model_selection import GridSearchCV
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
 from soilbus.estimation.window import Rig, SensorNoise, window_of_samples
 from soilbus.simulator.scenario import Swing, realise
@@ -80,7 +80,7 @@ def targets(soil: Soil) -> list[float]:
     return [soil.bearing_pressure(Z_REF, B_REF), *(getattr(soil, name) for name in TARGETS[1:])]
 
 
-def features(problem: WindowProblem, told: Soil) -> Array:
+def features(problem: ObservationModel, told: Soil) -> Array:
     """How sinkage, torque and pull depend on slip and load in this window, and c and K as told."""
     thrust = problem.torque / problem.rig.radius / problem.load
     log_sinkage = np.log(np.maximum(problem.sinkage, 1e-3))
@@ -112,7 +112,7 @@ def training_case(rng: np.random.Generator) -> Case:
         for q, noise in rig.noise.items()
     }
     window = window_of_samples(replace(rig, noise=fewer), t, _noisy(samples, fewer, rng))
-    return Case(soil, told_about(soil, rng), frozenset(), WindowProblem(window, rig, fit_model(), 0.2))
+    return Case(soil, told_about(soil, rng), frozenset(), ObservationModel(window, rig, fit_model(), 0.2))
 
 
 def _drive(rig: Rig, soil: Soil, rng: np.random.Generator) -> tuple[Array, dict[str, Array]] | None:

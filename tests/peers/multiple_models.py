@@ -13,7 +13,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import PARAMETERS, Estimate
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
@@ -38,7 +38,7 @@ def _alike(one: Soil, other: Soil) -> bool:
     return all(abs(getattr(one, name) / getattr(other, name) - 1.0) < DOUBLE for name in ("k_phi", "n", "phi"))
 
 
-def of_hypotheses(problem: WindowProblem, hypotheses: Collection[Soil]) -> Answer | None:
+def of_hypotheses(problem: ObservationModel, hypotheses: Collection[Soil]) -> Answer | None:
     """Mean and spread of the hypotheses' parameters, equally likely beforehand."""
     log_likelihood = np.array([_log_likelihood(problem, soil) for soil in hypotheses])
     if not np.isfinite(log_likelihood).any():
@@ -55,7 +55,7 @@ def _mean(value: Array, probability: Array) -> Estimate:
     return Estimate(mean, float(np.sqrt(probability @ (value - mean) ** 2)))
 
 
-def _log_likelihood(problem: WindowProblem, soil: Soil) -> float:
+def _log_likelihood(problem: ObservationModel, soil: Soil) -> float:
     """Of a whole window, up to a constant: the product over its instants."""
     with np.errstate(all="ignore"):
         at = at_measured(problem, soil)

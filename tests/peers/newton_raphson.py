@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import Estimate
 from soilbus.terra.wheel import Soil, WheelState, wheel_forces_and_derivatives
 
@@ -48,7 +48,7 @@ def estimate(case: Case) -> Answer | None:
     }
 
 
-def _relative_misfit(problem: WindowProblem, known: Soil, x: Array, tyre: Array) -> tuple[Array, Array]:
+def _relative_misfit(problem: ObservationModel, known: Soil, x: Array, tyre: Array) -> tuple[Array, Array]:
     """Model less reading over reading, of loads, torques and the pull, and derivatives by the unknowns."""
     rig, shape = problem.rig, problem.load.shape
     K_L = np.broadcast_to(x[2:][tyre], shape)

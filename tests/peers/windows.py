@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.assembly import model_of, rig_of
-from soilbus.estimation.observation_model import Linearised, WindowProblem, diagonals
+from soilbus.estimation.observation_model import Linearisation, ObservationModel, diagonals
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
 from soilbus.estimation.window import Rig
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -43,7 +43,7 @@ class Case:
     soil: Soil
     told: Soil
     exact: frozenset[str]
-    problem: WindowProblem
+    problem: ObservationModel
 
     @property
     def known(self) -> Soil:
@@ -92,9 +92,9 @@ def simulated_case(soil: Soil, seed: int, noise_free: bool = False) -> Case:
     scenario = Scenario(LENGTH, (Patch(0.0, "this", soil),), slip=Swing(0.05, 0.40))
     recording = simulate(reference_configuration(quiet), scenario, seed)
     rig, estimator = reference_rig(), reference_configuration().estimator
-    store = BinStore(rig, estimator.bin, 0.0)
+    store = Bins(rig, estimator.bin, 0.0)
     store.add({name: (c.t, c.value) for name, c in recording.channels.items() if name in rig.channels})
-    problem = WindowProblem(store.window(0.0, LENGTH), rig, fit_model(), estimator.min_speed)
+    problem = ObservationModel(store.window(0.0, LENGTH), rig, fit_model(), estimator.min_speed)
     return Case(soil, told_about(soil, np.random.default_rng([seed, 77])), frozenset(), problem)
 
 
@@ -105,17 +105,17 @@ _NOISY = {
 }  # fmt: skip
 
 
-def entry_angles(problem: WindowProblem) -> Array:
+def entry_angles(problem: ObservationModel) -> Array:
     """Entry angles [rad] (N, W) that the sinkage sensors tell (eq. 1)."""
     return np.arccos(1.0 - np.maximum(problem.sinkage, 1e-4) / problem.rig.radius)
 
 
-def at_measured(problem: WindowProblem, soil: Soil) -> Linearised:
+def at_measured(problem: ObservationModel, soil: Soil) -> Linearisation:
     """Our residuals at a soil, with loads and speeds at their measured values."""
     return problem.linearise(soil, np.zeros(len(problem.gain_std)), problem.start(soil))
 
 
-def reading_covariance(problem: WindowProblem, at: Linearised) -> Array:
+def reading_covariance(problem: ObservationModel, at: Linearisation) -> Array:
     """Covariance (N, m, m) of an instant's torques, draft balance and sinkages against the model.
 
     The noise of loads and speeds travels through the linearised model: the noise model of

@@ -29,10 +29,10 @@ from soilbus.can.publish import Publisher
 from soilbus.config.model import Config
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.service import Service
-from soilbus.daemon.state_persistence import Keeper
+from soilbus.daemon.state_persistence import StatePersistence
 from soilbus.daemon.state_store import Owner
 from soilbus.decision.traversability import Status
-from soilbus.estimation.tracker import Tracked
+from soilbus.estimation.tracker import TrackerOutput
 from soilbus.estimation.window import Window
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask
@@ -79,7 +79,7 @@ def good_moment(seed: int = 3) -> Moment:
     return {i: messages[-MOMENTS:] for i, messages in found.items()}
 
 
-def good_tracked(seed: int = 3) -> Tracked:
+def good_tracked(seed: int = 3) -> TrackerOutput:
     """What the tracker says of a window of a good drive."""
     config = reference_configuration()
     pipeline = Pipeline(config, load_databases(config))
@@ -93,14 +93,16 @@ def good_tracked(seed: int = 3) -> Tracked:
     return next(t for t, r in zip(found, results, strict=True) if r.status is Status.VALID)
 
 
-def of_soft_ground(tracked: Tracked) -> Tracked:
+def of_soft_ground(tracked: TrackerOutput) -> TrackerOutput:
     """The same, as sure of it, of a ground that holds nothing."""
     soft = np.array(SOILS["wet_clay"]) * [0.05, 0.05, 1.0, 0.3, 0.2, 1.0]
-    fit = dataclasses.replace(tracked.fit, belief=dataclasses.replace(tracked.fit.whole, soil=soft), averaged=None)
-    return dataclasses.replace(tracked, fit=dataclasses.replace(fit, rival=None))
+    fit = dataclasses.replace(
+        tracked.fit, gaussian=dataclasses.replace(tracked.fit.whole, soil=soft), marginalised=None
+    )
+    return dataclasses.replace(tracked, fit=dataclasses.replace(fit, second_mode=None))
 
 
-def tracked_at(tracked: Tracked, window: Window, **changed: Any) -> Tracked:
+def tracked_at(tracked: TrackerOutput, window: Window, **changed: Any) -> TrackerOutput:
     """The same of a window's own instants."""
     optimum = tracked.fit.optimum
     optimum = dataclasses.replace(optimum, t=optimum.t - optimum.t[-1] + window.t[-1])
@@ -324,7 +326,9 @@ class Drive:
     `tracked` is what the tracker says of every window on firm ground; None: a real one, which finds out.
     """
 
-    def __init__(self, moment: Moment, tracked: Tracked | None, config: Config = CONFIG, cycle: float = CYCLE) -> None:
+    def __init__(
+        self, moment: Moment, tracked: TrackerOutput | None, config: Config = CONFIG, cycle: float = CYCLE
+    ) -> None:
         self.clock, self.config = FakeClock(), config
         self.max_age = config.traversability.max_age
         self.tracked = tracked
@@ -342,7 +346,9 @@ class Drive:
         pipeline = Pipeline(self.config, IN)
         pipeline.new_estimator = lambda: self.content(WindowEstimator(self.config))
         owner = Owner.of(self.config, pipeline.intake.channels, IN)
-        keeper = Keeper(Path(self.folder.name), owner, InlineExecutor(), lambda: self.clock.now + self.wire.offset)
+        keeper = StatePersistence(
+            Path(self.folder.name), owner, InlineExecutor(), lambda: self.clock.now + self.wire.offset
+        )
         bus = LiveBus(self.open, self.clock, self.clock.sleep, OWN)
         self.handed: dict[float, Handed] = {}
         self.lives: dict[int, int] = {}

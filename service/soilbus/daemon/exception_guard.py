@@ -11,7 +11,7 @@ from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.result import WindowResult
 
 if TYPE_CHECKING:
-    from soilbus.estimation.gaussian import Belief
+    from soilbus.estimation.gaussian import Gaussian
     from soilbus.pipeline.estimator import WindowEstimator
 
 log = logging.getLogger(__name__)
@@ -22,7 +22,7 @@ REPEATED = 3
 """Such windows in a row from which the service is in fault."""
 
 
-class Solver:
+class GuardedEstimator:
     """Solves windows with an estimator.
 
     `first` makes it, in the worker, when it is first needed; `anew` makes another one, that knows nothing.
@@ -41,7 +41,7 @@ class Solver:
         return self._estimator
 
     @property
-    def newest(self) -> Belief | None:
+    def newest(self) -> Gaussian | None:
         """What the present estimator knows; None as long as there is none."""
         return None if self._estimator is None else self._estimator.tracker.newest
 

@@ -18,12 +18,12 @@ from soilbus.can.publish import Publisher
 from soilbus.config.model import Config
 from soilbus.daemon.bus_health import health_frame, health_text
 from soilbus.daemon.bus_time import BusTime
-from soilbus.daemon.exception_guard import INTERNAL, Solver
+from soilbus.daemon.exception_guard import INTERNAL, GuardedEstimator
 from soilbus.daemon.health import Health
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.tick_phase import next_tick
 from soilbus.daemon.totals import totals
-from soilbus.daemon.work_queue import Backlog, wait_for
+from soilbus.daemon.work_queue import WorkQueue, wait_for
 from soilbus.decision.immobilisation import Watch, watched, with_loss
 from soilbus.decision.judgement import Basis, at_present
 from soilbus.decision.traction_loss import NO_LOSS, observed
@@ -35,7 +35,7 @@ from soilbus.pipeline.result import WindowResult, as_of
 from soilbus.pipeline.states import ServiceState, state_after
 
 if TYPE_CHECKING:
-    from soilbus.daemon.state_persistence import Keeper
+    from soilbus.daemon.state_persistence import StatePersistence
     from soilbus.decision.capability import OverSlip
     from soilbus.pipeline.estimator import WindowEstimator
 
@@ -78,14 +78,14 @@ class Service:
         workers: Executor,
         clock: Callable[[], float] = time.monotonic,
         on_window: Callable[[WindowResult], None] | None = None,
-        opened_keeper: Callable[[], Keeper | None] = lambda: None,
+        opened_keeper: Callable[[], StatePersistence | None] = lambda: None,
         waiting: Callable[[Future[WindowResult], float], None] = wait_for,
     ) -> None:
         self.config, self.bus, self.publisher = config, bus, publisher
         self.intake = pipeline.intake
         self._pipeline, self._opened_keeper = pipeline, opened_keeper
-        self._solver = Solver(self._first_estimator, pipeline.new_estimator)
-        self._keeper: Keeper | None = None
+        self._solver = GuardedEstimator(self._first_estimator, pipeline.new_estimator)
+        self._keeper: StatePersistence | None = None
         self.notifier, self.clock, self.on_window = notifier, clock, on_window
         self.result: WindowResult | None = None
         self.deadline_misses = 0
@@ -95,7 +95,7 @@ class Service:
         self._curve: tuple[OverSlip | None, float] = None, -math.inf
         self._stopping = False
         self._started = clock()
-        self._backlog = Backlog(workers, self._solver.solve, self._started, waiting)
+        self._backlog = WorkQueue(workers, self._solver.solve, self._started, waiting)
         workers.submit(lambda: self._solver.estimator)  # where it raises, the first window does again, and says so
         self._ended = -math.inf  # monotonic time of the end of the present result's window
         self._interrupted = self._started  # monotonic time at which inputs failed last

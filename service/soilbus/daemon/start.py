@@ -25,7 +25,7 @@ from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 
 if TYPE_CHECKING:
-    from soilbus.daemon.state_persistence import Keeper
+    from soilbus.daemon.state_persistence import StatePersistence
 
 SWITCH_INTERVAL = 0.0005
 
@@ -88,13 +88,15 @@ def _rehearse(config: Config, database: Database, ours: Database) -> None:
     warm_up(config, database, ours)
 
 
-def _keeper(pipeline: Pipeline, environ: Mapping[str, str]) -> Keeper | None:
+def _keeper(pipeline: Pipeline, environ: Mapping[str, str]) -> StatePersistence | None:
     """In the worker: keeps the state in the folder that systemd made for it; None where there is none."""
     folder = environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if not folder:
         return None
-    from soilbus.daemon.state_persistence import Keeper
+    from soilbus.daemon.state_persistence import StatePersistence
     from soilbus.daemon.state_store import Owner
 
     writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="store")
-    return Keeper(Path(folder), Owner.of(pipeline.config, pipeline.intake.channels, pipeline.database), writer)
+    return StatePersistence(
+        Path(folder), Owner.of(pipeline.config, pipeline.intake.channels, pipeline.database), writer
+    )

@@ -10,8 +10,8 @@ from concurrent.futures import Executor, Future, wait
 from pathlib import Path
 from typing import NamedTuple
 
-from soilbus.daemon.state_store import Owner, State, StateError, belief_of, dumped, read, stored_belief, write_whole
-from soilbus.estimation.gaussian import Belief
+from soilbus.daemon.state_store import Owner, State, StateError, dumped, gaussian_of, read, stored_gaussian, write_whole
+from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.tracker import PERSISTENCE
 
 log = logging.getLogger(__name__)
@@ -26,11 +26,11 @@ FILE = "state.json"
 class Recalled(NamedTuple):
     """What another run knew, so many seconds ago."""
 
-    belief: Belief
+    gaussian: Gaussian
     elapsed: float
 
 
-class Keeper:
+class StatePersistence:
     """Keeps one vehicle's state in a folder; `writer` is a thread of its own, `wall` the time of day [s, Unix].
 
     A state that cannot be used is one warning, and everything begins anew.  So is a folder
@@ -40,8 +40,8 @@ class Keeper:
     def __init__(self, folder: Path, owner: Owner, writer: Executor, wall: Callable[[], float] = time.time) -> None:
         self._path, self._owner, self._writer, self._wall = folder / FILE, owner, writer, wall
         self._before = self._read()
-        self._stored = None if self._before is None else self._before.belief
-        self._seen: Belief | None = None
+        self._stored = None if self._before is None else self._before.gaussian
+        self._seen: Gaussian | None = None
         self._writing: Future[None] | None = None
         self._fails = False
         self._next = float("-inf")
@@ -49,22 +49,22 @@ class Keeper:
     @property
     def recalled(self) -> Recalled | None:
         """What the run before knew; of unknown age, and then taken for old, where the clock was set back since."""
-        if self._before is None or self._before.belief is None:
+        if self._before is None or self._before.gaussian is None:
             return None
-        elapsed = self._wall() - self._before.belief.at
-        return Recalled(belief_of(self._before.belief, self._owner), elapsed if elapsed >= 0.0 else PERSISTENCE)
+        elapsed = self._wall() - self._before.gaussian.at
+        return Recalled(gaussian_of(self._before.gaussian, self._owner), elapsed if elapsed >= 0.0 else PERSISTENCE)
 
-    def tick(self, now: float, belief: Belief | None, counts: Callable[[], Mapping[str, int]]) -> None:
+    def tick(self, now: float, gaussian: Gaussian | None, counts: Callable[[], Mapping[str, int]]) -> None:
         """Have the state written if that is due at the monotonic time `now` [s]; returns at once."""
         if now < self._next:
             return
         self._next = now + PERIOD
         if self._writing is None or self._writing.done():
-            self._write(belief, counts())
+            self._write(gaussian, counts())
 
-    def close(self, belief: Belief | None, counts: Mapping[str, int]) -> None:
+    def close(self, gaussian: Gaussian | None, counts: Mapping[str, int]) -> None:
         """Have the last state written; waits for it, but not long."""
-        self._write(belief, counts)
+        self._write(gaussian, counts)
         if self._writing is not None:
             wait([self._writing], LONGEST_LAST)
         self._writer.shutdown(wait=False)
@@ -76,24 +76,24 @@ class Keeper:
             log.warning("stored state %s is not used, everything begins anew: %s", self._path, error)
             return None
 
-    def _write(self, belief: Belief | None, counts: Mapping[str, int]) -> None:
-        """`belief` is None as long as this run has none: then the one of the run before stays."""
-        is_new, self._seen = belief is not None and belief is not self._seen, belief
-        self._writing = self._writer.submit(self._store, belief if is_new else None, dict(counts))
+    def _write(self, gaussian: Gaussian | None, counts: Mapping[str, int]) -> None:
+        """`gaussian` is None as long as this run has none: then the one of the run before stays."""
+        is_new, self._seen = gaussian is not None and gaussian is not self._seen, gaussian
+        self._writing = self._writer.submit(self._store, gaussian if is_new else None, dict(counts))
 
-    def _store(self, belief: Belief | None, counts: Mapping[str, int]) -> None:
+    def _store(self, gaussian: Gaussian | None, counts: Mapping[str, int]) -> None:
         """In the writer's thread."""
         at = max(self._wall(), 0.0)
-        if belief is not None:
+        if gaussian is not None:
             try:
-                self._stored = stored_belief(belief, at, self._owner)
+                self._stored = stored_gaussian(gaussian, at, self._owner)
             except StateError as error:
                 log.info("the present belief is not stored: %s", error)
         before = self._before
         totals = Counter(counts) + Counter({} if before is None else before.totals)
         starts = 1 if before is None else before.starts + 1
         try:
-            content = dumped(State(at=at, starts=starts, belief=self._stored, totals=dict(totals)), self._owner)
+            content = dumped(State(at=at, starts=starts, gaussian=self._stored, totals=dict(totals)), self._owner)
             write_whole(self._path, content)
         except Exception as error:  # whatever it is, a thread's error would be told to nobody
             if not self._fails:

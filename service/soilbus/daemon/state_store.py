@@ -26,7 +26,7 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, NonNegative
 from soilbus.can.channels import Channel
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import completion_of, model_of, prior_of, rig_of
-from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.parametrization import MAX_PHI
 from soilbus.estimation.posterior import PARAMETERS
 from soilbus.estimation.tracker import elsewhere, gain_errors
@@ -51,7 +51,7 @@ class _Model(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
-class StoredBelief(_Model):
+class StoredGaussian(_Model):
     """A belief and when it was had [s, Unix]; SI, gains relative, covariance of the soil's logarithms and the gains."""
 
     at: NonNegativeFloat
@@ -65,7 +65,7 @@ class State(_Model):
 
     at: NonNegativeFloat
     starts: PositiveInt
-    belief: StoredBelief | None
+    gaussian: StoredGaussian | None
     totals: dict[Annotated[str, Field(max_length=80)], NonNegativeInt] = Field(max_length=1000)
 
 
@@ -104,43 +104,43 @@ class Owner:
         )
 
 
-def stored_belief(belief: Belief, at: float, owner: Owner) -> StoredBelief:
+def stored_gaussian(gaussian: Gaussian, at: float, owner: Owner) -> StoredGaussian:
     """The belief as it is stored; StateError for one that could not be read back."""
-    _check(belief, owner)
-    return StoredBelief(
+    _check(gaussian, owner)
+    return StoredGaussian(
         at=at,
-        soil=dict(zip(PARAMETERS, belief.soil.tolist(), strict=True)),
-        gains=dict(zip(owner.gains, belief.gains.tolist(), strict=True)),
-        covariance=belief.covariance.tolist(),
+        soil=dict(zip(PARAMETERS, gaussian.soil.tolist(), strict=True)),
+        gains=dict(zip(owner.gains, gaussian.gains.tolist(), strict=True)),
+        covariance=gaussian.covariance.tolist(),
     )
 
 
-def belief_of(stored: StoredBelief, owner: Owner) -> Belief:
+def gaussian_of(stored: StoredGaussian, owner: Owner) -> Gaussian:
     """The belief that was stored; StateError where this vehicle's estimator cannot have had it."""
     if tuple(stored.soil) != PARAMETERS or tuple(stored.gains) != owner.gains:
         raise StateError("the belief is of other parameters")
     rows = stored.covariance
     if len(rows) != len(owner.std) or any(len(row) != len(owner.std) for row in rows):
         raise StateError("the belief's covariance has another shape")
-    belief = Belief(np.array(list(stored.soil.values())), np.array(list(stored.gains.values())), np.array(rows))
-    _check(belief, owner)
-    return belief
+    gaussian = Gaussian(np.array(list(stored.soil.values())), np.array(list(stored.gains.values())), np.array(rows))
+    _check(gaussian, owner)
+    return gaussian
 
 
-def _check(belief: Belief, owner: Owner) -> None:
+def _check(gaussian: Gaussian, owner: Owner) -> None:
     """Raises StateError unless the belief is finite, physical, and has a proper covariance."""
-    if not all(np.isfinite(part).all() for part in (belief.soil, belief.gains, belief.covariance)):
+    if not all(np.isfinite(part).all() for part in (gaussian.soil, gaussian.gains, gaussian.covariance)):
         raise StateError("the belief is not finite")
     n_soil = len(PARAMETERS)
     free, median = owner.std[:n_soil] > 0.0, owner.median[:n_soil]
-    physical = (belief.soil[free] > 0.0).all() and belief.soil[_PHI] <= max(MAX_PHI, median[_PHI])
+    physical = (gaussian.soil[free] > 0.0).all() and gaussian.soil[_PHI] <= max(MAX_PHI, median[_PHI])
     if physical:
-        off = np.concatenate([np.log(belief.soil[free]) - np.log(median[free]), belief.gains])
+        off = np.concatenate([np.log(gaussian.soil[free]) - np.log(median[free]), gaussian.gains])
         std = np.concatenate([owner.std[:n_soil][free], owner.std[n_soil:]])
-        physical = (np.abs(off) <= FAR * std).all() and np.allclose(belief.soil[~free], median[~free])
+        physical = (np.abs(off) <= FAR * std).all() and np.allclose(gaussian.soil[~free], median[~free])
     if not physical:
         raise StateError("the belief is out of physical bounds")
-    _check_covariance(belief.covariance, owner.std)
+    _check_covariance(gaussian.covariance, owner.std)
 
 
 def _check_covariance(covariance: Array, std: Array) -> None:
@@ -189,8 +189,8 @@ def loaded(content: bytes, owner: Owner) -> State:
         state = State.model_validate(file.state)
     except (ValidationError, ValueError, RecursionError, OverflowError) as error:
         raise StateError(f"it is damaged: {_one_line(error)}") from None
-    if state.belief is not None:
-        belief_of(state.belief, owner)
+    if state.gaussian is not None:
+        gaussian_of(state.gaussian, owner)
     return state
 
 

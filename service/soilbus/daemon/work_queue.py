@@ -31,7 +31,7 @@ def wait_for(future: Future[WindowResult], longest: float) -> None:
     wait([future], longest)
 
 
-class Backlog:
+class WorkQueue:
     """What `workers` (one thread) has to solve; it works beside the loop, which never waits for it for long.
 
     `waiting` waits for a future, so many seconds at most.

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.model_form import FormLeft, formed
 from soilbus.estimation.nuisance_parameters import Free, active_at
 from soilbus.estimation.posterior import PARAMETERS
@@ -62,7 +62,7 @@ class UncertainModel:
 
     @classmethod
     def of(
-        cls, model: WheelModel, effects: Sequence[Effect], free: Sequence[Free], belief: Belief, n_wheels: int,
+        cls, model: WheelModel, effects: Sequence[Effect], free: Sequence[Free], gaussian: Gaussian, n_wheels: int,
         ground_speed: float, widening: float = 1.0, form: FormLeft | None = None,
     ) -> UncertainModel:  # fmt: skip
         """With what a window has left of the effects' parameters, at a ground speed [m/s].
@@ -74,8 +74,8 @@ class UncertainModel:
         def at(pulls: Array, model: WheelModel = model) -> CompletedModel:
             return CompletedModel.of(model, active_at(effects, free, pulls, n_wheels), ground_speed)
 
-        first = len(belief.gains) - len(free)
-        pulls = belief.gains[first:]
+        first = len(gaussian.gains) - len(free)
+        pulls = gaussian.gains[first:]
         mean = at(pulls)
         names = {active.effect.name for active in mean.effects}
         places = np.flatnonzero([f.effect in names and f.std > 0.0 for f in free])
@@ -83,14 +83,14 @@ class UncertainModel:
         if not len(places):
             return cls(mean, tuple(of_form), len(of_form))
         of_effects = _SOIL + first + places
-        variance, axes = np.linalg.eigh(belief.covariance[np.ix_(of_effects, of_effects)])
+        variance, axes = np.linalg.eigh(gaussian.covariance[np.ix_(of_effects, of_effects)])
         doubts = []
         for size, axis in zip(variance.tolist(), axes.T, strict=True):
             if size <= _LEAST:
                 continue
             step = np.zeros(len(free))
             step[places] = axis * np.sqrt(size)
-            shift = belief.covariance[:_SOIL, of_effects] @ axis / np.sqrt(size)
+            shift = gaussian.covariance[:_SOIL, of_effects] @ axis / np.sqrt(size)
             way = _way_inside(free, pulls, step)
             scale = way * np.sqrt(widening / (1.0 + (widening - 1.0) * min(size, 1.0)))
             doubts.append(Doubt(at(pulls + scale * step), scale * shift))

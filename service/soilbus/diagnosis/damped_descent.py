@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.multistart import Effort, Fit
-from soilbus.estimation.observation_model import Linearised, Optimum
-from soilbus.estimation.solver import Fitting, Place, Point
+from soilbus.estimation.multistart import DescentOptions, Fit
+from soilbus.estimation.observation_model import Linearisation, Optimum
+from soilbus.estimation.solver import Iterate, Objective, QuadraticModel
 
 Array = NDArray[np.float64]
 
@@ -48,11 +48,11 @@ BENT, SHORTER = 4.0, 0.5
 class _Here(NamedTuple):
     """A place and the normal equations there."""
 
-    place: Place
-    point: Point
+    place: Iterate
+    point: QuadraticModel
 
 
-def descended(fitting: Fitting, fast: Fit, effort: Effort) -> Fit | None:
+def descended(fitting: Objective, fast: Fit, effort: DescentOptions) -> Fit | None:
     """The optimum below where the fast descent ended.
 
     It ends where no more is foreseen than decides nothing, or what is foreseen is above what is hopeless.  None where
@@ -60,9 +60,9 @@ def descended(fitting: Fitting, fast: Fit, effort: Effort) -> Fit | None:
     """
     ground, end = _Ground(fitting), fast.optimum
     with np.errstate(all="ignore"):
-        ended = Place(end.soil, fitting.problem.allowed(end.gains), end.latents, fast.cost, 0)
+        ended = Iterate(end.soil, fitting.problem.allowed(end.gains), end.latents, fast.neg2_log_posterior, 0)
         point = fitting.with_before(ended, end.at)
-        if point is None or _foreseen(point, point.step()) > effort.hopeless:
+        if point is None or _foreseen(point, point.step()) > effort.give_up_above:
             return None
         here = ground.at(ended, end.at)
         if here is None:
@@ -70,7 +70,7 @@ def descended(fitting: Fitting, fast: Fit, effort: Effort) -> Fit | None:
         valley, damping, falling, steps = _Valley(fitting), DAMPING, np.inf, 0
         while damping < MOST_DAMPING and steps < MAX_STEPS:
             enough, full = _enough(fitting, here.point, effort.nothing), here.point.step()
-            worth = min(here.point.cost - effort.nothing, effort.hopeless)
+            worth = min(here.point.neg2_log_posterior - effort.nothing, effort.give_up_above)
             if full is None or falling < enough or _foreseen(here.point, full) > worth:
                 break
             there, tried = valley.along(here, full) if ground.is_even(here.point) else (None, 0)
@@ -82,7 +82,7 @@ def descended(fitting: Fitting, fast: Fit, effort: Effort) -> Fit | None:
                 there, steps = ground.damped(here, damping), steps + 1
                 damping *= HELD_BACK if there is None else EASED
             if there is not None:
-                falling, here = here.point.cost - there.point.cost, there
+                falling, here = here.point.neg2_log_posterior - there.point.neg2_log_posterior, there
         return _fit(fitting, *here, steps, converged=steps < MAX_STEPS)
 
 
@@ -90,14 +90,14 @@ def descended(fitting: Fitting, fast: Fit, effort: Effort) -> Fit | None:
 class _Ground:
     """Places with their latents where they fit best; `even` where the linear model brings them there by itself."""
 
-    fitting: Fitting
+    fitting: Objective
     even: bool = False
 
-    def is_even(self, point: Point) -> bool:
+    def is_even(self, point: QuadraticModel) -> bool:
         """Whether one linear step brings the latents to their best: where the last one did, and near the optimum."""
-        return self.even or point.cost < NEAR * self.fitting.problem.n_rows
+        return self.even or point.neg2_log_posterior < NEAR * self.fitting.problem.n_rows
 
-    def at(self, place: Place, at: Linearised | None = None) -> _Here | None:
+    def at(self, place: Iterate, at: Linearisation | None = None) -> _Here | None:
         """A place, which may be linearised already, with its latents at their best, and the normal equations there."""
         point = self.fitting.point(place) if at is None else self.fitting.with_before(place, at)
         if point is None:
@@ -106,14 +106,17 @@ class _Ground:
         if self.is_even(point):
             return here
         there = _followed(self.fitting, here)
-        self.even = there is not None and abs(there.point.cost - point.cost) < EVEN * point.cost
+        self.even = (
+            there is not None
+            and abs(there.point.neg2_log_posterior - point.neg2_log_posterior) < EVEN * point.neg2_log_posterior
+        )
         return there
 
     def damped(self, here: _Here, damping: float) -> _Here | None:
         """The place after a damped step, where it costs less."""
         step = here.point.step(damping)
         there = None if step is None else self.at(self.fitting.moved(*here, step))
-        return there if there is not None and there.point.cost < here.point.cost else None
+        return there if there is not None and there.point.neg2_log_posterior < here.point.neg2_log_posterior else None
 
     def honest(self, here: _Here, enough: float) -> _Here | None:
         """The same place with its latents at their best where that costs more: no step lowers what it seemed to cost.
@@ -123,7 +126,11 @@ class _Ground:
         if not self.is_even(here.point):
             return None
         there, self.even = _followed(self.fitting, here), False
-        return there if there is not None and there.point.cost > here.point.cost + enough else None
+        return (
+            there
+            if there is not None and there.point.neg2_log_posterior > here.point.neg2_log_posterior + enough
+            else None
+        )
 
 
 @dataclass(slots=True)
@@ -134,7 +141,7 @@ class _Valley:
     residuals along a full step as the last ones foretell it, None where they do not.
     """
 
-    fitting: Fitting
+    fitting: Objective
     share: float = 1.0
     bend: Array | None = None
 
@@ -154,7 +161,7 @@ class _Valley:
             if step is None or there is None:
                 self.share, self.bend = SHORTER * self.share, None
                 continue
-            foretold, fall = share * (2.0 - share) * length, point.cost - there.point.cost
+            foretold, fall = share * (2.0 - share) * length, point.neg2_log_posterior - there.point.neg2_log_posterior
             bend = self.fitting.bend(place, point, step, there.point) / share**2
             if fall > GOOD * foretold:
                 left = 1.0 - share
@@ -162,7 +169,7 @@ class _Valley:
                 self.share = min(further * share / left, 1.0) if left > 0.0 else 1.0
                 self.bend = bend * left**2 if left > 0.0 else None
                 return there, tried
-            if fall > 0.0 and (least is None or there.point.cost < least.point.cost):
+            if fall > 0.0 and (least is None or there.point.neg2_log_posterior < least.point.neg2_log_posterior):
                 least = there
             straight = share * (length * share / (foretold - fall)) ** (1.0 / 3.0)  # the bend costs share^4
             self.share = min(share, BENT * straight) if self.bend is None else SHORTER * share
@@ -170,37 +177,37 @@ class _Valley:
         return least, MAX_TRIED
 
 
-def _foreseen(point: Point, full: Array | None) -> float:
+def _foreseen(point: QuadraticModel, full: Array | None) -> float:
     """The cost after a full step (F + A,), if all were linear; infinite where there is none."""
-    return np.inf if full is None else point.cost - point.length(full)
+    return np.inf if full is None else point.neg2_log_posterior - point.length(full)
 
 
-def _at(fitting: Fitting, place: Place) -> _Here | None:
+def _at(fitting: Objective, place: Iterate) -> _Here | None:
     point = fitting.point(place)
     return None if point is None else _Here(place, point)
 
 
-def _followed(fitting: Fitting, here: _Here) -> _Here | None:
+def _followed(fitting: Objective, here: _Here) -> _Here | None:
     """The place with its latents where the linear model there says that they fit best."""
     return _at(fitting, fitting.moved(*here, np.zeros(len(here.point.gradient))))
 
 
-def _enough(fitting: Fitting, point: Point, nothing: float) -> float:
+def _enough(fitting: Objective, point: QuadraticModel, nothing: float) -> float:
     """Fall of the cost at a point below which a step was the last."""
-    return max(nothing, ENOUGH_FAR * (point.cost - NEAR * fitting.problem.n_rows))
+    return max(nothing, ENOUGH_FAR * (point.neg2_log_posterior - NEAR * fitting.problem.n_rows))
 
 
-def _fit(fitting: Fitting, place: Place, point: Point, steps: int, converged: bool) -> Fit | None:
-    beliefs = fitting.beliefs(place, point, place.soil)
-    if beliefs is None:
+def _fit(fitting: Objective, place: Iterate, point: QuadraticModel, steps: int, converged: bool) -> Fit | None:
+    gaussians = fitting.gaussians(place, point, place.soil)
+    if gaussians is None:
         return None
     return Fit(
-        belief=beliefs[1],
-        mode=beliefs[1],
+        gaussian=gaussians[1],
+        mode=gaussians[1],
         sinkage=fitting.problem.mean_sinkage(place.as_soil(), place.gains, place.latents),
         optimum=Optimum(fitting.problem.t, place.soil, place.gains, place.latents, point.at),
-        cost=point.cost,
-        evidence=point.evidence,
+        neg2_log_posterior=point.neg2_log_posterior,
+        neg2_log_evidence=point.neg2_log_evidence,
         rows=fitting.problem.n_rows,
         iterations=steps,
         converged=converged,

@@ -19,15 +19,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.diagnosis.fitted_model import Completion, complete
+from soilbus.diagnosis.fitted_model import FittedModel, fit_model
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.verdict import temperature
-from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import Fit, Start
 from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.observation_model import inverse_covariance
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
-from soilbus.estimation.solver import Fitting, Place
+from soilbus.estimation.solver import Iterate, Objective
 from soilbus.terra.effects.effect import Effect, Late
 
 Array = NDArray[np.float64]
@@ -46,7 +46,7 @@ SETTLED = 2.0
 """Fall of the tempered -2 log posterior along a ridge from which a fit is taken up again there."""
 
 
-class LatePosterior(NamedTuple):
+class DelayPosterior(NamedTuple):
     """Mean and sd [s] of dead time, time constant and their sum; where the cost is least, and by how much."""
 
     delay: Estimate
@@ -72,16 +72,16 @@ class _Ridge(NamedTuple):
         return np.asarray(mass / mass.sum())
 
 
-def with_lateness(records: Sequence[Record], prior: SoilPrior, fitted: Completion, explained: float) -> Completion:
+def with_delays(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, explained: float) -> FittedModel:
     """A fitted model that tells how late channels are by their posteriors; from where the cost is least along these.
 
     explained: fall of -2 log evidence by its effects.
     """
-    found = late_posteriors(records, prior, fitted, explained)
+    found = delay_posteriors(records, prior, fitted, explained)
     if any(posterior.fall > SETTLED * temperature(explained) for posterior in found.values()):
-        better = complete(records, prior, fitted.effects, _starts(fitted, found))
-        if better is not None and better.evidence < fitted.evidence:
-            fitted, found = better, late_posteriors(records, prior, better, explained)
+        better = fit_model(records, prior, fitted.effects, _starts(fitted, found))
+        if better is not None and better.neg2_log_evidence < fitted.neg2_log_evidence:
+            fitted, found = better, delay_posteriors(records, prior, better, explained)
     reported: dict[tuple[str, str], Estimate] = {}
     for (name, late), posterior in found.items():
         reported |= {
@@ -92,7 +92,7 @@ def with_lateness(records: Sequence[Record], prior: SoilPrior, fitted: Completio
     return replace(fitted, reported=reported)
 
 
-def _starts(fitted: Completion, found: Mapping[tuple[str, Late], LatePosterior]) -> list[Start]:
+def _starts(fitted: FittedModel, found: Mapping[tuple[str, Late], DelayPosterior]) -> list[Start]:
     """Where these fits ended, with channels as late as is likeliest."""
     starts = []
     n_sensors = fitted.checks[0].problem.n_sensors
@@ -107,11 +107,11 @@ def _starts(fitted: Completion, found: Mapping[tuple[str, Late], LatePosterior])
     return starts
 
 
-def late_posteriors(
-    records: Sequence[Record], prior: SoilPrior, fitted: Completion, explained: float
-) -> dict[tuple[str, Late], LatePosterior]:
+def delay_posteriors(
+    records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, explained: float
+) -> dict[tuple[str, Late], DelayPosterior]:
     """The posterior of each channel that a fitted model lets be late, by effect and names of the parameters."""
-    found: dict[tuple[str, Late], LatePosterior] = {}
+    found: dict[tuple[str, Late], DelayPosterior] = {}
     heat = temperature(explained)
     for effect in fitted.effects:
         for late in effect.late.values():
@@ -122,7 +122,7 @@ def late_posteriors(
     return found
 
 
-def is_late(records: Sequence[Record], prior: SoilPrior, fitted: Completion, effect: Effect, explained: float) -> bool:
+def is_late(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, effect: Effect, explained: float) -> bool:
     """Whether any channel is surely later, by an effect of a fitted model, than half the time between its samples.
 
     A stamp says when a frame was on the bus: what it holds was measured up to a cycle before, half of one in the mean.
@@ -133,15 +133,15 @@ def is_late(records: Sequence[Record], prior: SoilPrior, fitted: Completion, eff
         return True
     totals = [
         (posterior.total, half[late])
-        for (name, late), posterior in late_posteriors(records, prior, fitted, explained).items()
+        for (name, late), posterior in delay_posteriors(records, prior, fitted, explained).items()
         if name == effect.name
     ]
     return any(abs(total.value) - 2.0 * total.std > of_cycle for total, of_cycle in totals)
 
 
 def _posterior(
-    records: Sequence[Record], prior: SoilPrior, fitted: Completion, at: tuple[int, int], heat: float
-) -> LatePosterior:
+    records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, at: tuple[int, int], heat: float
+) -> DelayPosterior:
     first, second = (fitted.beforehand[i] for i in at)
     here = tuple(fitted.free[i].at(_pull(fitted, i)) for i in at)
     parts = [_Part(record, prior, fitted, i, at) for i, record in enumerate(records)]
@@ -170,7 +170,7 @@ def _posterior(
 
     within = np.full(NODES, (ridge.tau[1] - ridge.tau[0]) / np.sqrt(12.0))  # of a node's own stretch
     delay = ridge.total - ridge.tau
-    return LatePosterior(
+    return DelayPosterior(
         estimate_of(delay, np.hypot(ridge.sd, within), FORM_OF_PARTS),
         estimate_of(ridge.tau, within, FORM_OF_PARTS),
         estimate_of(ridge.total, ridge.sd, FORM_OF_SUM),
@@ -215,7 +215,7 @@ def _downhill(
 class _Part:
     """One recording, linear about its fit in all but how late one channel is."""
 
-    def __init__(self, record: Record, prior: SoilPrior, fitted: Completion, i: int, at: tuple[int, int]) -> None:
+    def __init__(self, record: Record, prior: SoilPrior, fitted: FittedModel, i: int, at: tuple[int, int]) -> None:
         self.fit: Fit = fitted.fits[i]
         free = tuple(fitted.beforehand[k] if k in at else f for k, f in enumerate(fitted.free))
         self.problem = record.learned.completed(fitted.effects, free)
@@ -226,8 +226,8 @@ class _Part:
         for f, k, column in zip(self.free, at, self.columns, strict=True):
             self.gains[column] = f.pull_at(fitted.free[k].at(float(self.gains[column])))
         optimum = self.fit.optimum
-        fitting = Fitting(self.problem, prior, before)
-        place = Place(optimum.soil, self.gains, optimum.latents, np.inf, 0)
+        fitting = Objective(self.problem, prior, before)
+        place = Iterate(optimum.soil, self.gains, optimum.latents, np.inf, 0)
         point = fitting.point(place)
         if point is None:
             raise np.linalg.LinAlgError("the model is not finite where it was fitted")
@@ -255,7 +255,9 @@ class _Part:
         at = self.point.at
         gradient = self.point.gradient + self.directions.T @ (at.rows.T @ weighed.ravel())
         fall = gradient @ np.linalg.solve(self.point.information, gradient)
-        return float(self.point.cost + 2.0 * at.weighed[:, 0] @ off.ravel() + (off * weighed).sum() - fall)
+        return float(
+            self.point.neg2_log_posterior + 2.0 * at.weighed[:, 0] @ off.ravel() + (off * weighed).sum() - fall
+        )
 
 
 def _alone(free: Sequence[Free], at: tuple[int, int]) -> list[Free]:
@@ -264,13 +266,13 @@ def _alone(free: Sequence[Free], at: tuple[int, int]) -> list[Free]:
     return [free[i] if i in at else replace(free[i], value=0.0, std=0.0) for i in own]
 
 
-def _without(before: Belief, columns: Sequence[int]) -> Belief:
+def _without(before: Gaussian, columns: Sequence[int]) -> Gaussian:
     """What was known before of all but these gains, which are held."""
     covariance = before.covariance.copy()
     held = [_SOIL + c for c in columns]
     covariance[held] = covariance[:, held] = 0.0
-    return Belief(before.soil, before.gains, covariance)
+    return Gaussian(before.soil, before.gains, covariance)
 
 
-def _pull(fitted: Completion, i: int) -> float:
+def _pull(fitted: FittedModel, i: int) -> float:
     return float(fitted.fits[-1].mode.gains[fitted.checks[-1].problem.n_sensors + i])

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.diagnosis.evidence import evidence_of_any_size
-from soilbus.diagnosis.fitted_model import Completion
+from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.score import Normal, moves, normals_of
 from soilbus.diagnosis.verdict import price
@@ -56,7 +56,7 @@ class Detectable:
 
 
 def detectable(
-    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect]
+    records: Sequence[Record], prior: SoilPrior, present: FittedModel, candidates: Sequence[Effect]
 ) -> tuple[Detectable, ...]:
     """Every candidate, as the present model fitted to these recordings could have shown it."""
     asked = price(0.0, present.gap, present.checked_rows, present.rows)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from soilbus.diagnosis.delays import with_lateness
+from soilbus.diagnosis.delays import with_delays
 from soilbus.diagnosis.detectable import Detectable, detectable
-from soilbus.diagnosis.fitted_model import Completion
+from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.gap import Gap, gap_of
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.residual_terms import Correction, corrections
@@ -43,8 +43,8 @@ class Diagnosis:
     verdict: Verdict
     where: tuple[Disagreement, ...]
     additions: tuple[Addition, ...]
-    base: Completion
-    completed: Completion
+    base: FittedModel
+    completed: FittedModel
     learned: tuple[Correction, ...]
     gap_before: Gap
     gap_after: Gap
@@ -86,17 +86,19 @@ def diagnose(
     while len(additions) < MAX_EFFECTS:
         progress(f"looking for effect {len(additions) + 1}")
         left = [effect for effect in candidates if effect.name not in present.names]
-        found = named(whole, few, Standing.of(present, whole, few), left, base.evidence - present.evidence)
+        found = named(
+            whole, few, Standing.of(present, whole, few), left, base.neg2_log_evidence - present.neg2_log_evidence
+        )
         if found is None:
             break
         addition, present = found
         additions.append(addition)
         if len(additions) > 1 and present.gap < ASTRAY:
             additions, present = reconsidered(whole, few, base, present, additions, candidates)
-    present = converged(whole, base.evidence, present)
+    present = converged(whole, base.neg2_log_evidence, present)
     if any(effect.late for effect in present.effects):
         progress("telling delays from low passes")
-        present = with_lateness(records, prior, present, base.evidence - present.evidence)
+        present = with_delays(records, prior, present, base.neg2_log_evidence - present.neg2_log_evidence)
     additions.sort(key=lambda addition: -addition.falls[addition.effect.name])
     progress("holding out every block in turn")
     before = gap_of(records, prior, base)
@@ -115,7 +117,7 @@ def diagnose(
 
 
 def shares_alone(
-    whole: Fits, base: Completion, present: Completion, additions: Sequence[Addition]
+    whole: Fits, base: FittedModel, present: FittedModel, additions: Sequence[Addition]
 ) -> tuple[float, ...]:
     """What each effect explains alone, as a share of what all explain together; empty where nothing is to be doubted.
 
@@ -126,8 +128,10 @@ def shares_alone(
     if len(additions) < MAX_EFFECTS:
         return ()
     alone = [whole.of((*base.effects, addition.effect)) for addition in additions]
-    together = base.evidence - present.evidence
-    shares = tuple(0.0 if one is None else max(base.evidence - one.evidence, 0.0) / together for one in alone)
+    together = base.neg2_log_evidence - present.neg2_log_evidence
+    shares = tuple(
+        0.0 if one is None else max(base.neg2_log_evidence - one.neg2_log_evidence, 0.0) / together for one in alone
+    )
     return () if abs(sum(shares) - 1.0) < OVERLAP else shares
 
 

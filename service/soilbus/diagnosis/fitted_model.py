@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from soilbus.diagnosis.damped_descent import descended
 from soilbus.diagnosis.evidence import OwnParameters, correction, own_parameters
 from soilbus.diagnosis.records import Record
-from soilbus.estimation.gaussian import Belief
-from soilbus.estimation.multistart import THOROUGH, Effort, Fit, Start, continued, fit_window
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.multistart import DEFAULT_OPTIONS, DescentOptions, Fit, Start, fit_from, fit_window
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
-from soilbus.estimation.observation_model import CompletedProblem, Latents, Linearised
+from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModelWithEffects
 from soilbus.estimation.parametrization import at_edges
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
-from soilbus.estimation.solver import Fitting, Place
+from soilbus.estimation.solver import Iterate, Objective
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.wheel import Soil
 
@@ -44,10 +44,10 @@ class Checked:
     the noise: with a dozen rows learned from that is no less than the noise itself.
     """
 
-    problem: CompletedProblem
+    problem: ObservationModelWithEffects
     latents: Latents
-    at: Linearised
-    evidence: float
+    at: Linearisation
+    neg2_log_evidence: float
     chi2: float
 
     @property
@@ -57,7 +57,7 @@ class Checked:
 
 
 @dataclass(frozen=True, slots=True)
-class Completion:
+class FittedModel:
     """A model with effects as fitted: one Fit and one Checked for each recording.
 
     free are the parameters as fitted, those held at the edge of their ranges without a
@@ -70,31 +70,31 @@ class Completion:
     effects: tuple[Effect, ...]
     free: tuple[Free, ...]
     beforehand: tuple[Free, ...]
-    before: tuple[Belief, ...]
+    before: tuple[Gaussian, ...]
     fits: tuple[Fit, ...]
     checks: tuple[Checked, ...]
     sizes: float = 0.0
     reported: Mapping[tuple[str, str], Estimate] = field(default_factory=dict)
 
     @property
-    def evidence(self) -> float:
+    def neg2_log_evidence(self) -> float:
         """-2 log of the likelihood of all data, whatever soils, gains and parameters may be, up to a constant."""
-        return sum(fit.evidence for fit in self.fits) + self.predicted + self.sizes
+        return sum(fit.neg2_log_evidence for fit in self.fits) + self.predicted + self.sizes
 
     def foreseen(self, rows: int) -> float:
         """The evidence from so many residuals like these: what the model leaves of them grows with them alone."""
-        left = self.cost + self.gap * self.checked_rows
-        return self.evidence + (rows / self.rows - 1.0) * left
+        left = self.neg2_log_posterior + self.gap * self.checked_rows
+        return self.neg2_log_evidence + (rows / self.rows - 1.0) * left
 
     @property
     def predicted(self) -> float:
         """-2 log of the likelihood of the held-out blocks after the others, up to the same."""
-        return sum(check.evidence for check in self.checks)
+        return sum(check.neg2_log_evidence for check in self.checks)
 
     @property
-    def cost(self) -> float:
+    def neg2_log_posterior(self) -> float:
         """-2 log posterior of what was learned from, up to a constant."""
-        return sum(fit.cost for fit in self.fits)
+        return sum(fit.neg2_log_posterior for fit in self.fits)
 
     @property
     def gap(self) -> float:
@@ -160,10 +160,12 @@ class Completion:
 
     def parameters(self) -> dict[str, dict[str, Estimate]]:
         """Value and std of each parameter by effect, as the last recording leaves them; wheels' own as name_WHEEL."""
-        belief, problem = self.fits[-1].mode, self.checks[-1].problem
-        std = np.sqrt(np.diag(belief.covariance))[_SOIL + problem.n_sensors :]
+        gaussian, problem = self.fits[-1].mode, self.checks[-1].problem
+        std = np.sqrt(np.diag(gaussian.covariance))[_SOIL + problem.n_sensors :]
         out: dict[str, dict[str, Estimate]] = {name: {} for name in self.names}
-        for free, pull, spread in zip(self.free, belief.gains[problem.n_sensors :].tolist(), std.tolist(), strict=True):
+        for free, pull, spread in zip(
+            self.free, gaussian.gains[problem.n_sensors :].tolist(), std.tolist(), strict=True
+        ):
             name = free.parameter.name + ("" if free.wheel is None else f"_{problem.rig.wheels[free.wheel]}")
             out[free.effect][name] = Estimate(free.at(pull), free.std * spread)
         for (effect, name), estimate in self.reported.items():
@@ -171,13 +173,13 @@ class Completion:
         return out
 
 
-def complete(
+def fit_model(
     records: Sequence[Record],
     prior: SoilPrior,
     effects: Sequence[Effect],
     starts: Sequence[Start] | None = None,
-    effort: Effort = THOROUGH,
-) -> Completion | None:
+    effort: DescentOptions = DEFAULT_OPTIONS,
+) -> FittedModel | None:
     """A model with these effects fitted to all recordings; None where a fit fails, or is given up.
 
     Parameters of effects that the records' model has already keep the prior they have
@@ -208,7 +210,7 @@ def complete(
     ]
     added = [effect for effect in effects if effect not in present.effects]
     sizes = sum(_sizes(effect, free, fits, checks) for effect in added)
-    return Completion(tuple(effects), free, beforehand, tuple(befores), tuple(fits), tuple(checks), sizes)
+    return FittedModel(tuple(effects), free, beforehand, tuple(befores), tuple(fits), tuple(checks), sizes)
 
 
 def _fits(
@@ -217,10 +219,10 @@ def _fits(
     effects: Sequence[Effect],
     free: tuple[Free, ...],
     starts: Sequence[Start] | None,
-    effort: Effort,
-) -> tuple[list[Belief], list[Fit]] | None:
+    effort: DescentOptions,
+) -> tuple[list[Gaussian], list[Fit]] | None:
     """What was known before each recording, and its fit."""
-    befores: list[Belief] = []
+    befores: list[Gaussian] = []
     fits: list[Fit] = []
     for i, record in enumerate(records):
         problem = record.learned.completed(effects, free)
@@ -233,7 +235,9 @@ def _fits(
     return befores, fits
 
 
-def _held_at_edges(problem: CompletedProblem, fits: Sequence[Fit], free: tuple[Free, ...]) -> tuple[Free, ...] | None:
+def _held_at_edges(
+    problem: ObservationModelWithEffects, fits: Sequence[Fit], free: tuple[Free, ...]
+) -> tuple[Free, ...] | None:
     """The parameters with those held that would leave their range; None where none would, or fits did not converge."""
     gains = fits[-1].mode.gains
     edges = at_edges(gains, *problem.gain_bounds())[problem.n_sensors :].tolist()
@@ -277,19 +281,23 @@ def _of_parameters(fit: Fit, n_sensors: int, members: Sequence[int]) -> tuple[Ar
     return fit.mode.gains[gains], fit.mode.covariance[np.ix_(_SOIL + gains, _SOIL + gains)]
 
 
-def _of_first(record: Record, prior: SoilPrior, problem: CompletedProblem) -> Belief:
+def _of_first(record: Record, prior: SoilPrior, problem: ObservationModelWithEffects) -> Gaussian:
     """What is known before the first recording; nothing yet of effects that its model had not."""
-    before = Belief.of(prior, problem.gain_std)
+    before = Gaussian.of(prior, problem.gain_std)
     if record.known is None:
         return before
     gains, covariance = before.gains.copy(), before.covariance.copy()
     n = len(record.known.gains)
     gains[:n], covariance[: _SOIL + n, : _SOIL + n] = record.known.gains, record.known.covariance
-    return Belief(record.known.soil, gains, covariance)
+    return Gaussian(record.known.soil, gains, covariance)
 
 
 def _fitted(
-    problem: CompletedProblem, prior: SoilPrior, before: Belief, start: Start | None, effort: Effort
+    problem: ObservationModelWithEffects,
+    prior: SoilPrior,
+    before: Gaussian,
+    start: Start | None,
+    effort: DescentOptions,
 ) -> Fit | None:
     """From the given start, or from anywhere; a fit that has not converged goes on from where it is, slowly."""
     if start is None:
@@ -297,14 +305,16 @@ def _fitted(
         if fit is None or fit.converged:
             return fit
         start = Start(fit.mode.soil, fit.mode.gains)
-    fit = continued(problem, prior, before, start, problem.n_sensors, effort)
+    fit = fit_from(problem, prior, before, start, problem.n_sensors, effort)
     if fit is None or fit.converged:
         return fit
-    slow = descended(Fitting(problem, prior, before), fit, effort)
-    return None if (slow or fit).cost > effort.hopeless else slow or fit
+    slow = descended(Objective(problem, prior, before), fit, effort)
+    return None if (slow or fit).neg2_log_posterior > effort.give_up_above else slow or fit
 
 
-def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects: Sequence[Effect]) -> Belief:
+def _of_next(
+    known: Gaussian, prior: SoilPrior, problem: ObservationModelWithEffects, effects: Sequence[Effect]
+) -> Gaussian:
     """What one recording tells of the next: all but the soil and what belongs to one recording only."""
     after = known.of_another_soil(prior)
     by_name = {effect.name: effect for effect in effects}
@@ -318,13 +328,13 @@ def _of_next(known: Belief, prior: SoilPrior, problem: CompletedProblem, effects
         covariance[_SOIL + i] = covariance[:, _SOIL + i] = 0.0
         covariance[_SOIL + i, _SOIL + i] = problem.gain_std[i] ** 2
         gains[i] = 0.0
-    return Belief(after.soil, gains, covariance)
+    return Gaussian(after.soil, gains, covariance)
 
 
-def check(problem: CompletedProblem, prior: SoilPrior, fit: Fit, near: Latents | None = None) -> Checked:
+def check(problem: ObservationModelWithEffects, prior: SoilPrior, fit: Fit, near: Latents | None = None) -> Checked:
     """Held-out blocks under a model fitted to the others; near are their latents under a model much like it."""
     soil, gains = Soil(*fit.mode.soil.tolist()), fit.mode.gains
-    fitting = Fitting(problem, prior, fit.mode)
+    fitting = Objective(problem, prior, fit.mode)
     rounds = CHECK_ROUNDS if near is None or len(near.load) != problem.n else CHECK_AGAIN
     with np.errstate(all="ignore"):
         latents = fitting.near(fit.mode.soil, gains, near).latents
@@ -333,9 +343,9 @@ def check(problem: CompletedProblem, prior: SoilPrior, fit: Fit, near: Latents |
         for _ in range(rounds - 1):
             latents = problem.updated(at, latents, np.zeros(_SOIL), np.zeros(len(gains)))
             at = problem.linearise(soil, gains, latents)
-        point = fitting.with_before(Place(fit.mode.soil, gains, latents, np.inf, 0), at)
+        point = fitting.with_before(Iterate(fit.mode.soil, gains, latents, np.inf, 0), at)
         step = None if point is None else point.step()
     if point is None or step is None:
         return Checked(problem, latents, at, np.inf, np.inf)
     length = point.length(step)
-    return Checked(problem, latents, at, point.evidence - length, point.cost - length)
+    return Checked(problem, latents, at, point.neg2_log_evidence - length, point.neg2_log_posterior - length)

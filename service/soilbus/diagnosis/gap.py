@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from soilbus.diagnosis.fitted_model import Completion, complete
+from soilbus.diagnosis.fitted_model import FittedModel, fit_model
 from soilbus.diagnosis.records import HELD_OUT, Record
 from soilbus.estimation.multistart import Start
 from soilbus.estimation.posterior import SoilPrior
@@ -29,7 +29,7 @@ class Gap(NamedTuple):
     rows: int
 
 
-def gap_of(records: Sequence[Record], prior: SoilPrior, found: Completion) -> Gap:
+def gap_of(records: Sequence[Record], prior: SoilPrior, found: FittedModel) -> Gap:
     """The gap of a model that was fitted to these records, over all blocks, each held out in turn.
 
     Over those held out already where that tells enough (beyond CLEAR), where others cannot be
@@ -45,7 +45,7 @@ def gap_of(records: Sequence[Record], prior: SoilPrior, found: Completion) -> Ga
         if len(parts) < len(records):
             return alone
         starts = [_start(record, fold, start) for record, start in zip(records, found.as_starts(), strict=True)]
-        again = complete(parts, prior, found.effects, starts)
+        again = fit_model(parts, prior, found.effects, starts)
         if again is None or not math.isfinite(again.gap):
             return alone
         chi2 += again.gap * again.checked_rows

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from soilbus.diagnosis.fitted_model import Completion
+from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.estimation.posterior import Estimate
 
 DIGITS = 6
 
 
-def effect_tables(completion: Completion) -> tuple[list[dict[str, Any]], list[str]]:
+def effect_tables(completion: FittedModel) -> tuple[list[dict[str, Any]], list[str]]:
     """A table for each effect, {name, parameter = {value, std}}, and notes on those left out.
 
     A parameter that every wheel has for itself is a table by wheel.  Left out is what

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.nuisance_parameters import Free
-from soilbus.estimation.observation_model import CompletedProblem
+from soilbus.estimation.observation_model import ObservationModelWithEffects
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.wheel import WheelModel
@@ -42,13 +42,13 @@ class Record:
     """
 
     name: str
-    learned: CompletedProblem
-    checked: CompletedProblem
-    known: Belief | None = None
-    whole: CompletedProblem | None = None
+    learned: ObservationModelWithEffects
+    checked: ObservationModelWithEffects
+    known: Gaussian | None = None
+    whole: ObservationModelWithEffects | None = None
     fold: NDArray[np.intp] | None = None
 
-    def completed(self, effects: Sequence[Effect], free: Sequence[Free], known: Belief | None = None) -> Record:
+    def completed(self, effects: Sequence[Effect], free: Sequence[Free], known: Gaussian | None = None) -> Record:
         """The same under a model with these effects and parameters, of which so much is known."""
         learned, checked = (part.completed(effects, free) for part in (self.learned, self.checked))
         whole = None if self.whole is None else self.whole.completed(effects, free)
@@ -70,7 +70,7 @@ class Record:
 
 def record_of(name: str, window: Window, rig: Rig, model: WheelModel, min_speed: float, max_turn: float) -> Record:
     """One recording divided into blocks; TooLittle where it has not enough usable instants."""
-    problem = CompletedProblem(window, rig, model, min_speed, max_turn)
+    problem = ObservationModelWithEffects(window, rig, model, min_speed, max_turn)
     fold = folds(problem.since)
     parts = np.flatnonzero(fold != HELD_OUT), np.flatnonzero(fold == HELD_OUT)
     if min(map(len, parts)) < FEWEST:
@@ -86,7 +86,7 @@ def record_of_rows(name: str, window: Window, rig: Rig, model: WheelModel) -> Re
     only part small slips from large.  So it is every third row in the order of slip, that
     has its neighbours among the others.
     """
-    problem = CompletedProblem(window, rig, model, min_speed=0.0)
+    problem = ObservationModelWithEffects(window, rig, model, min_speed=0.0)
     if problem.n < FEWEST_ROWS:
         raise TooLittle(f"{name}: {problem.n} usable rows are too few to learn from some and check with others")
     rank = np.argsort(np.argsort(problem.slip.mean(1), kind="stable"))

@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.diagnosis.fitted_model import Checked, Completion
+from soilbus.diagnosis.fitted_model import Checked, FittedModel
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.where import channels
-from soilbus.estimation.observation_model import CompletedProblem, Latents, Linearised
+from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModelWithEffects
 from soilbus.terra.wheel import sinkage
 
 Array = NDArray[np.float64]
@@ -66,7 +66,7 @@ class _Sample(NamedTuple):
     regressors: dict[str, Array]
 
 
-def corrections(records: list[Record], completion: Completion) -> list[Correction]:
+def corrections(records: list[Record], completion: FittedModel) -> list[Correction]:
     """Descriptions of what the model leaves, channel by channel, the one that explains most first."""
     found = []
     names = channels(records[0].learned.rig.wheels, records[0].learned.with_sinkage)
@@ -81,7 +81,7 @@ def corrections(records: list[Record], completion: Completion) -> list[Correctio
     return sorted(found, key=lambda correction: -correction.explained)
 
 
-def _samples(records: list[Record], completion: Completion, place: int) -> Iterator[tuple[_Sample, _Sample]]:
+def _samples(records: list[Record], completion: FittedModel, place: int) -> Iterator[tuple[_Sample, _Sample]]:
     for record, fit, check in zip(records, completion.fits, completion.checks, strict=True):
         learned = record.learned.completed(completion.effects, completion.free)
         of_fit = _sample(learned, fit.optimum.at, fit.optimum.latents, fit.optimum.gains, place)
@@ -92,7 +92,9 @@ def _of_check(check: Checked, gains: Array, place: int) -> _Sample:
     return _sample(check.problem, check.at, check.latents, gains, place)
 
 
-def _sample(problem: CompletedProblem, at: Linearised, latents: Latents, gains: Array, place: int) -> _Sample:
+def _sample(
+    problem: ObservationModelWithEffects, at: Linearisation, latents: Latents, gains: Array, place: int
+) -> _Sample:
     z, _ = problem.standardised(at, gains)
     W, r = problem.n_wheels, problem.rig.radius
     known = np.isfinite(z[:, place])

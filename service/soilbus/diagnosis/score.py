@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.diagnosis.evidence import evidence_of_any_size
-from soilbus.diagnosis.fitted_model import Completion
+from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.records import Record
-from soilbus.estimation.gaussian import Belief, solved
+from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
 from soilbus.estimation.multistart import Start
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
-from soilbus.estimation.observation_model import Latents, Linearised
+from soilbus.estimation.observation_model import Latents, Linearisation
 from soilbus.estimation.posterior import SoilPrior
-from soilbus.estimation.solver import Fitting, Place
+from soilbus.estimation.solver import Iterate, Objective
 from soilbus.terra.effects.effect import Effect
 
 Array = NDArray[np.float64]
@@ -38,7 +38,7 @@ class Score:
 
     effect: Effect
     fall: float
-    evidence: float
+    neg2_log_evidence: float
     starts: tuple[Start, ...]
 
 
@@ -50,18 +50,18 @@ class Normal:
     answer (F + A, P) how the present parameters follow the effects'; present is that model.
     """
 
-    fitting: Fitting
-    place: Place
-    at: Linearised
+    fitting: Objective
+    place: Iterate
+    at: Linearisation
     by_effects: Array
     left: Array
     answer: Array
     checked: Latents
-    present: Completion
+    present: FittedModel
 
 
 def scores(
-    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect]
+    records: Sequence[Record], prior: SoilPrior, present: FittedModel, candidates: Sequence[Effect]
 ) -> list[Score]:
     """The candidates in the order of what they are foreseen to explain, the best first."""
     n_wheels = len(records[0].learned.rig.wheels)
@@ -71,11 +71,11 @@ def scores(
     for effect in candidates:
         columns = np.array([i for i, f in enumerate(free) if f.effect == effect.name])
         found.append(_score(effect, columns, free, normals))
-    return sorted(found, key=lambda score: score.evidence)
+    return sorted(found, key=lambda score: score.neg2_log_evidence)
 
 
 def further_scores(
-    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect]
+    records: Sequence[Record], prior: SoilPrior, present: FittedModel, candidates: Sequence[Effect]
 ) -> list[Score]:
     """The best score of each candidate from where its parameters may start besides, of those that have such starts.
 
@@ -88,7 +88,7 @@ def further_scores(
         by_name = {move.effect.name: move for move in group}
         for score in scores(records, prior, present, [move.moved for move in by_name.values()]):
             move, best = by_name[score.effect.name], found.get(score.effect.name)
-            if best is None or score.evidence < best.evidence:
+            if best is None or score.neg2_log_evidence < best.neg2_log_evidence:
                 starts = tuple(_offset(start, move.offsets) for start in score.starts)
                 found[score.effect.name] = replace(score, effect=move.effect, starts=starts)
     return list(found.values())
@@ -127,7 +127,11 @@ def _offset(start: Start, offsets: Sequence[float]) -> Start:
 
 
 def normals_of(
-    records: Sequence[Record], prior: SoilPrior, present: Completion, candidates: Sequence[Effect], free: Sequence[Free]
+    records: Sequence[Record],
+    prior: SoilPrior,
+    present: FittedModel,
+    candidates: Sequence[Effect],
+    free: Sequence[Free],
 ) -> list[Normal]:
     """The normal equations of each recording for candidates with these parameters."""
     return [_normal(r, prior, present, i, candidates, free) for i, r in enumerate(records)]
@@ -136,7 +140,7 @@ def normals_of(
 def _normal(
     record: Record,
     prior: SoilPrior,
-    present: Completion,
+    present: FittedModel,
     i: int,
     candidates: Sequence[Effect],
     free: Sequence[Free],
@@ -145,17 +149,17 @@ def _normal(
     fit, before, P = present.fits[i], present.before[i], len(free)
     covariance = np.zeros((len(before.covariance) + P,) * 2)
     covariance[:-P, :-P], covariance[-P:, -P:] = before.covariance, np.eye(P)
-    extended = Belief(before.soil, np.concatenate([before.gains, np.zeros(P)]), covariance)
+    extended = Gaussian(before.soil, np.concatenate([before.gains, np.zeros(P)]), covariance)
     gains = np.concatenate([fit.optimum.gains, np.zeros(P)])
-    place = Place(fit.optimum.soil, gains, fit.optimum.latents, np.inf, 0)
-    fitting = Fitting(problem, prior, extended)
+    place = Iterate(fit.optimum.soil, gains, fit.optimum.latents, np.inf, 0)
+    fitting = Objective(problem, prior, extended)
     with np.errstate(all="ignore"):
         point = fitting.point(place)
     if point is None:
         raise np.linalg.LinAlgError("the model is not finite where it was fitted")
     base, new = slice(None, -P), slice(-P, None)
     information = point.information
-    inverse = solved(information[base, base], np.zeros(len(information) - P))
+    inverse = solve_with_inverse(information[base, base], np.zeros(len(information) - P))
     if inverse is None:
         raise np.linalg.LinAlgError("the present model's information is singular")
     answer = inverse[1] @ information[base, new]
@@ -174,10 +178,10 @@ def _score(effect: Effect, columns: NDArray[np.intp], free: Sequence[Free], norm
         parts = [(left, gradient)]
     solutions = [_within(left + np.eye(len(own)), gradient, own) for left, gradient in parts]
     fall = sum(solution.fall for solution in solutions)
-    evidence = sum(solution.evidence for solution in solutions)
+    neg2_log_evidence = sum(solution.neg2_log_evidence for solution in solutions)
     steps = [solution.step for solution in solutions] * (1 if effect.of_record else len(normals))
     starts = tuple(_start(n, columns, step) for n, step in zip(normals, steps, strict=True))
-    return Score(effect, fall, evidence, starts)
+    return Score(effect, fall, neg2_log_evidence, starts)
 
 
 class _Solution(NamedTuple):
@@ -185,7 +189,7 @@ class _Solution(NamedTuple):
 
     step: Array
     fall: float
-    evidence: float
+    neg2_log_evidence: float
 
 
 def _within(information: Array, gradient: Array, free: Sequence[Free]) -> _Solution:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from soilbus.diagnosis.delays import is_late
 from soilbus.diagnosis.evidence import OwnParameters
-from soilbus.diagnosis.fitted_model import Completion, complete
+from soilbus.diagnosis.fitted_model import FittedModel, fit_model
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.score import Score, further_scores, scores
 from soilbus.diagnosis.verdict import (
@@ -24,18 +24,18 @@ from soilbus.diagnosis.verdict import (
     PLAUSIBLE,
     TEMPERATURE,
     gap_limit,
-    hopeless,
-    hopeless_from,
     least_that_pays,
+    out_of_reach,
+    out_of_reach_from,
     price,
     probabilities,
     temperatures,
 )
-from soilbus.estimation.multistart import THOROUGH, Effort, Start
+from soilbus.estimation.multistart import DEFAULT_OPTIONS, DescentOptions, Start
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
 
-_Scores = Callable[[Sequence[Record], SoilPrior, Completion, Sequence[Effect]], list[Score]]
+_Scores = Callable[[Sequence[Record], SoilPrior, FittedModel, Sequence[Effect]], list[Score]]
 
 NOTHING = 1.0
 """Fall of the cost by which an effect explains nothing."""
@@ -49,17 +49,17 @@ class Fits:
 
     def __init__(self, records: Sequence[Record], prior: SoilPrior) -> None:
         self.records, self.prior = tuple(records), prior
-        self._converged: dict[frozenset[str], Completion] = {}
-        self._begun: dict[tuple[Hashable, ...], Completion | None] = {}
-        self._scored: dict[Hashable, tuple[Completion, list[Score]]] = {}
+        self._converged: dict[frozenset[str], FittedModel] = {}
+        self._begun: dict[tuple[Hashable, ...], FittedModel | None] = {}
+        self._scored: dict[Hashable, tuple[FittedModel, list[Score]]] = {}
 
     def of(
         self,
         effects: Sequence[Effect],
         starts: Sequence[Sequence[Start]] = (),
-        effort: Effort = THOROUGH,
+        effort: DescentOptions = DEFAULT_OPTIONS,
         foreseen: Sequence[float] = (),
-    ) -> Completion | None:
+    ) -> FittedModel | None:
         """The best fit with these effects from any of the starts (one Start for each recording), or from anywhere.
 
         None where all fits fail.  A start of which no better evidence is foreseen than a fit came to that converged
@@ -70,50 +70,52 @@ class Fits:
         if best is not None and not _explains_nothing(best, self._with_fewer(names)):
             return best
         for i, start in enumerate(starts or (None,)):
-            if best is not None and best.converged and i < len(foreseen) and best.evidence <= foreseen[i]:
+            if best is not None and best.converged and i < len(foreseen) and best.neg2_log_evidence <= foreseen[i]:
                 continue
             best = _better(best, self._from(start, effects, effort))
         with_fewer = self._with_fewer(names)
-        if with_fewer is not None and math.isinf(effort.hopeless) and _explains_nothing(best, with_fewer):
+        if with_fewer is not None and math.isinf(effort.give_up_above) and _explains_nothing(best, with_fewer):
             best = _better(best, self._from(with_fewer.as_starts(effects), effects, effort))
         if best is not None and best.converged:
             self._converged[names] = best
         return best
 
-    def scores(self, present: Completion, candidates: Sequence[Effect]) -> list[Score]:
+    def scores(self, present: FittedModel, candidates: Sequence[Effect]) -> list[Score]:
         """As score.scores() of a model fitted to these recordings, once."""
         return self._once(scores, present, candidates)
 
-    def further_scores(self, present: Completion, candidates: Sequence[Effect]) -> list[Score]:
+    def further_scores(self, present: FittedModel, candidates: Sequence[Effect]) -> list[Score]:
         """As score.further_scores() of a model fitted to these recordings, once."""
         return self._once(further_scores, present, candidates)
 
-    def _once(self, told: _Scores, present: Completion, candidates: Sequence[Effect]) -> list[Score]:
+    def _once(self, told: _Scores, present: FittedModel, candidates: Sequence[Effect]) -> list[Score]:
         key = told, id(present), tuple(effect.name for effect in candidates)
         if key not in self._scored:
             self._scored[key] = present, told(self.records, self.prior, present, candidates)
         return self._scored[key][1]
 
-    def _from(self, start: Sequence[Start] | None, effects: Sequence[Effect], effort: Effort) -> Completion | None:
+    def _from(
+        self, start: Sequence[Start] | None, effects: Sequence[Effect], effort: DescentOptions
+    ) -> FittedModel | None:
         """The fit from one start, at hand where it was asked for before."""
         begun = (frozenset(effect.name for effect in effects), _key(start), effort)
         if begun not in self._begun:
-            self._begun[begun] = complete(self.records, self.prior, effects, start, effort)
+            self._begun[begun] = fit_model(self.records, self.prior, effects, start, effort)
         return self._begun[begun]
 
-    def _with_fewer(self, names: frozenset[str]) -> Completion | None:
+    def _with_fewer(self, names: frozenset[str]) -> FittedModel | None:
         """The fit that costs least of those with some of the effects: one with all of them can cost no more."""
         fits = [fit for less, fit in self._converged.items() if less < names]
-        return min(fits, key=lambda fit: fit.cost, default=None)
+        return min(fits, key=lambda fit: fit.neg2_log_posterior, default=None)
 
 
-def _explains_nothing(fit: Completion | None, with_fewer: Completion | None) -> bool:
+def _explains_nothing(fit: FittedModel | None, with_fewer: FittedModel | None) -> bool:
     """Whether a model costs no less than one with some of its effects: from elsewhere they may find their place."""
-    return with_fewer is not None and (fit is None or fit.cost > with_fewer.cost - NOTHING)
+    return with_fewer is not None and (fit is None or fit.neg2_log_posterior > with_fewer.neg2_log_posterior - NOTHING)
 
 
-def _better(one: Completion | None, other: Completion | None) -> Completion | None:
-    return one if other is None or (one is not None and one.evidence <= other.evidence) else other
+def _better(one: FittedModel | None, other: FittedModel | None) -> FittedModel | None:
+    return one if other is None or (one is not None and one.neg2_log_evidence <= other.neg2_log_evidence) else other
 
 
 def _key(starts: Sequence[Start] | None) -> Hashable:
@@ -142,7 +144,7 @@ BEHIND_UNSETTLED = 250.0
 """Cost on a few instants above the least one's from which a candidate is given up, converged or not."""
 STEPS = 12
 """Steps of the soil, and then of everything, in which a candidate that explains much is fitted."""
-ROUGH = Effort(STEPS, enough=0.1, little=5e-3)
+ROUGH = DescentOptions(STEPS, enough=0.1, little=5e-3)
 """The same where few instants tell which candidates to fit to all."""
 WORTH_TRYING = -2.0
 """Foreseen change of -2 log evidence above which a candidate does not count."""
@@ -158,26 +160,32 @@ class Standing(NamedTuple):
     and in all.
     """
 
-    known: Completion
+    known: FittedModel
     fits: Fits
-    few: Completion | None
-    evidence: float
-    cost: float
+    few: FittedModel | None
+    neg2_log_evidence: float
+    neg2_log_posterior: float
     gap: float
     checked_rows: int
     rows: int
 
     @classmethod
-    def of(cls, known: Completion, whole: Fits, few: Fits) -> Standing:
+    def of(cls, known: FittedModel, whole: Fits, few: Fits) -> Standing:
         """A model fitted to all, and from there to the few."""
-        told = known.evidence, known.cost, known.gap, known.checked_rows, known.rows
+        told = known.neg2_log_evidence, known.neg2_log_posterior, known.gap, known.checked_rows, known.rows
         return cls(known, whole, few.of(known.effects, [known.as_starts()], ROUGH), *told)
 
     @classmethod
-    def foretold(cls, known: Completion, few: Fits, rows: int) -> Standing:
+    def foretold(cls, known: FittedModel, few: Fits, rows: int) -> Standing:
         """A model fitted to the few alone, of so many residuals in all."""
         times = rows / known.rows
-        told = known.foreseen(rows), times * known.cost, known.gap, round(times * known.checked_rows), rows
+        told = (
+            known.foreseen(rows),
+            times * known.neg2_log_posterior,
+            known.gap,
+            round(times * known.checked_rows),
+            rows,
+        )
         return cls(known, few, known, *told)
 
     @property
@@ -216,7 +224,7 @@ def promising(
     if before is not None:
         further = few.further_scores(before, candidates)
         of_all = ((present.rows / fit.rows, found) for fit, found in ((present.known, foreseen), (before, further)))
-        most = max(times * -score.evidence for times, found in of_all for score in found)
+        most = max(times * -score.neg2_log_evidence for times, found in of_all for score in found)
         if most >= CLEAR or present.known is before:
             trials = _trials(few, before, worth_trying(foreseen, further, again), present.rows)
             return _of_trials(trials, explained, present.rows)
@@ -227,11 +235,11 @@ class _Trial(NamedTuple):
     """A candidate's fit to a few instants, and the fall of -2 log evidence of all that it foretells."""
 
     effect: Effect
-    completion: Completion
+    completion: FittedModel
     fall: float
 
 
-def _trials(few: Fits, before: Completion, found: Mapping[str, Sequence[Score]], rows: int) -> list[_Trial]:
+def _trials(few: Fits, before: FittedModel, found: Mapping[str, Sequence[Score]], rows: int) -> list[_Trial]:
     """The fits to the few of those found, the best first, with falls foretold of so many residuals."""
     trials: list[_Trial] = []
     least = math.inf
@@ -239,7 +247,7 @@ def _trials(few: Fits, before: Completion, found: Mapping[str, Sequence[Score]],
         completion = fitted_to_few(few, before, of_one, least + BEHIND_UNSETTLED)
         if completion is not None:
             trials.append(_Trial(of_one[0].effect, completion, fall_foretold(before, completion, rows)))
-            least = min(least, completion.cost)
+            least = min(least, completion.neg2_log_posterior)
     return sorted(trials, key=lambda trial: -trial.fall)
 
 
@@ -247,7 +255,7 @@ def _of_trials(trials: Sequence[_Trial], explained: float, rows: int) -> Promisi
     """Those that count, the best first; to be fitted to all are the first ones that are not behind for good."""
     best = trials[0].fall if trials else 0.0
     settled = bool(trials) and trials[0].completion.converged
-    kept = [t for t in trials if t.fall > 0.0 and not hopeless(best - t.fall, explained + best)][:COUNTED]
+    kept = [t for t in trials if t.fall > 0.0 and not out_of_reach(best - t.fall, explained + best)][:COUNTED]
     open_still = [t for t in kept if not (settled and t.completion.converged and best - t.fall > BEHIND)]
     fits = [(t.effect, t.completion.as_starts()) for t in open_still[:FITTED]]
     behind = {t.effect.name: best - t.fall for t in kept}
@@ -262,16 +270,16 @@ def _of_trials(trials: Sequence[_Trial], explained: float, rows: int) -> Promisi
 def _of_scores(found: Iterable[Score], least: float) -> Promising:
     """The best score of each candidate that counts; those that come near what they must explain are fitted."""
     best: dict[str, Score] = {}
-    for score in sorted(found, key=lambda score: score.evidence):
-        if score.evidence < WORTH_TRYING:
+    for score in sorted(found, key=lambda score: score.neg2_log_evidence):
+        if score.neg2_log_evidence < WORTH_TRYING:
             best.setdefault(score.effect.name, score)
     chosen = list(best.values())[:COUNTED]
-    enough = WORTH_FITTING * max([least, *(-s.evidence for s in chosen)])
-    fitted = [(s.effect, s.starts) for s in chosen if -s.evidence > enough]
-    return Promising(fitted, {s.effect.name: -s.evidence for s in chosen[len(fitted) :]}, {}, {})
+    enough = WORTH_FITTING * max([least, *(-s.neg2_log_evidence for s in chosen)])
+    fitted = [(s.effect, s.starts) for s in chosen if -s.neg2_log_evidence > enough]
+    return Promising(fitted, {s.effect.name: -s.neg2_log_evidence for s in chosen[len(fitted) :]}, {}, {})
 
 
-def fall_foretold(before: Completion, after: Completion, rows: int) -> float:
+def fall_foretold(before: FittedModel, after: FittedModel, rows: int) -> float:
     """Fall of -2 log evidence between two fits to the few, foretold of so many residuals."""
     return before.foreseen(rows) - after.foreseen(rows)
 
@@ -283,16 +291,16 @@ def worth_trying(
     first = foreseen[:TRIED]
     named = [score for score in foreseen[len(first) :] if again is not None and score.effect.name in again]
     found: dict[str, list[Score]] = {}
-    for score in (*first, *named, *sorted(further, key=lambda score: score.evidence)[:FURTHER]):
-        if score.evidence < WORTH_TRYING:
+    for score in (*first, *named, *sorted(further, key=lambda score: score.neg2_log_evidence)[:FURTHER]):
+        if score.neg2_log_evidence < WORTH_TRYING:
             found.setdefault(score.effect.name, []).append(score)
     return found
 
 
-def fitted_to_few(few: Fits, present: Completion, found: Sequence[Score], hopeless: float) -> Completion | None:
+def fitted_to_few(few: Fits, present: FittedModel, found: Sequence[Score], give_up_above: float) -> FittedModel | None:
     """The best fit of one candidate to a few instants; from further starts only where more is foreseen of them."""
-    starts, foreseen = [s.starts for s in found], [present.evidence + s.evidence for s in found]
-    return few.of((*present.effects, found[0].effect), starts, ROUGH._replace(hopeless=hopeless), foreseen)
+    starts, foreseen = [s.starts for s in found], [present.neg2_log_evidence + s.neg2_log_evidence for s in found]
+    return few.of((*present.effects, found[0].effect), starts, ROUGH._replace(give_up_above=give_up_above), foreseen)
 
 
 ASTRAY = 3.0
@@ -332,8 +340,8 @@ def named(
     candidates: Sequence[Effect],
     explained: float,
     again: Collection[str] | None = None,
-    at_hand: Completion | None = None,
-) -> tuple[Addition, Completion] | None:
+    at_hand: FittedModel | None = None,
+) -> tuple[Addition, FittedModel] | None:
     """The best effect to add to the present model, which explains so much, and the model with it; None where none pays.
 
     `again` are names that were fitted in an earlier round for the same place; at_hand is the model with one of them.
@@ -351,11 +359,13 @@ def named(
             name: (effect, fit)
             for name, (effect, fit) in fitted.items()
             if not effect.late
-            or is_late(whole.records, whole.prior, fit, effect, explained + present.evidence - fit.evidence)
+            or is_late(
+                whole.records, whole.prior, fit, effect, explained + present.neg2_log_evidence - fit.neg2_log_evidence
+            )
         }
         if not fitted:
             return None
-    falls = {name: present.evidence - completion.evidence for name, (_, completion) in fitted.items()}
+    falls = {name: present.neg2_log_evidence - completion.neg2_log_evidence for name, (_, completion) in fitted.items()}
     most = max(falls.values())
     if most < asked:
         return None
@@ -373,13 +383,16 @@ def named(
 
 
 def _compared(
-    whole: Fits, present: Standing, fitted: dict[str, tuple[Effect, Completion]], explained: float
-) -> dict[str, tuple[Effect, Completion]]:
+    whole: Fits, present: Standing, fitted: dict[str, tuple[Effect, FittedModel]], explained: float
+) -> dict[str, tuple[Effect, FittedModel]]:
     """The candidates with fits that can be compared: those among which the best one may be have converged."""
-    least = min(fit.evidence for _, fit in fitted.values())
-    within = hopeless_from(explained + present.evidence - least)
+    least = min(fit.neg2_log_evidence for _, fit in fitted.values())
+    within = out_of_reach_from(explained + present.neg2_log_evidence - least)
     return {
-        name: (effect, converged(whole, present.evidence, fit) if fit.evidence - least < within else fit)
+        name: (
+            effect,
+            converged(whole, present.neg2_log_evidence, fit) if fit.neg2_log_evidence - least < within else fit,
+        )
         for name, (effect, fit) in fitted.items()
     }
 
@@ -391,33 +404,33 @@ def _form_left(chances: Mapping[str, float], candidates: Iterable[Effect]) -> fl
 
 
 def _fitted(
-    whole: Fits, present: Standing, counted: Promising, explained: float, asked: float, at_hand: Completion | None
-) -> tuple[dict[str, tuple[Effect, Completion]], dict[str, float]]:
+    whole: Fits, present: Standing, counted: Promising, explained: float, asked: float, at_hand: FittedModel | None
+) -> tuple[dict[str, tuple[Effect, FittedModel]], dict[str, float]]:
     """Candidates with their fits to all data by name, and falls of -2 log evidence that those given up stay below."""
-    fitted: dict[str, tuple[Effect, Completion]] = {}
+    fitted: dict[str, tuple[Effect, FittedModel]] = {}
     at_most: dict[str, float] = {}
     behind = worthless = math.inf
     for effect, starts in counted.fits:
         if at_hand is not None and present.names | {effect.name} == set(at_hand.names):
-            completion: Completion | None = at_hand
+            completion: FittedModel | None = at_hand
         else:
-            completion = whole.of((*present.effects, effect), [starts], Effort(STEPS, min(behind, worthless)))
+            completion = whole.of((*present.effects, effect), [starts], DescentOptions(STEPS, min(behind, worthless)))
         if completion is None:
-            at_most[effect.name] = max(present.cost - min(behind, worthless), 0.0)
+            at_most[effect.name] = max(present.neg2_log_posterior - min(behind, worthless), 0.0)
             continue
         fitted[effect.name] = effect, completion
-        fall = present.evidence - completion.evidence
-        behind = min(behind, completion.cost + hopeless_from(explained + fall))
-        worthless = present.cost - SHARE_OF_PRICE * asked if fall < asked else math.inf
+        fall = present.neg2_log_evidence - completion.neg2_log_evidence
+        behind = min(behind, completion.neg2_log_posterior + out_of_reach_from(explained + fall))
+        worthless = present.neg2_log_posterior - SHARE_OF_PRICE * asked if fall < asked else math.inf
     return fitted, at_most
 
 
-def converged(whole: Fits, evidence: float, completion: Completion) -> Completion:
+def converged(whole: Fits, neg2_log_evidence: float, completion: FittedModel) -> FittedModel:
     """The same, or where further steps lead if they were too few, and it is better than that and not astray."""
-    if completion.converged or completion.evidence > evidence or completion.gap > ASTRAY:
+    if completion.converged or completion.neg2_log_evidence > neg2_log_evidence or completion.gap > ASTRAY:
         return completion
     further = whole.of(completion.effects, [completion.as_starts()])
-    return completion if further is None or further.evidence > completion.evidence else further
+    return completion if further is None or further.neg2_log_evidence > completion.neg2_log_evidence else further
 
 
 SAME = 1.0
@@ -427,11 +440,11 @@ SAME = 1.0
 def reconsidered(
     whole: Fits,
     few: Fits,
-    base: Completion,
-    present: Completion,
+    base: FittedModel,
+    present: FittedModel,
     additions: Sequence[Addition],
     candidates: Sequence[Effect],
-) -> tuple[list[Addition], Completion]:
+) -> tuple[list[Addition], FittedModel]:
     """The additions and the model with them, each effect named beside those that are there now."""
     chosen, looked = list(additions), set[frozenset[str]]()
     while stale := [a for a in chosen if a.beside != (others := _others(a, present)) and others not in looked]:
@@ -445,12 +458,14 @@ def reconsidered(
             chosen[place] = told
         if told is None or isinstance(told, Addition):
             continue
-        found = named(whole, few, told, left, base.evidence - told.evidence, addition.falls, present)
-        if found is None and told.fits is whole and told.evidence < present.evidence + PAYS:
+        found = named(whole, few, told, left, base.neg2_log_evidence - told.neg2_log_evidence, addition.falls, present)
+        if found is None and told.fits is whole and told.neg2_log_evidence < present.neg2_log_evidence + PAYS:
             present = told.known
             del chosen[place]
-        elif found is not None and found[1].evidence < present.evidence + SAME:
-            if present.evidence - found[1].evidence < PAYS:  # what stands beside is named as well beside the other
+        elif found is not None and found[1].neg2_log_evidence < present.neg2_log_evidence + SAME:
+            if (
+                present.neg2_log_evidence - found[1].neg2_log_evidence < PAYS
+            ):  # what stands beside is named as well beside the other
                 chosen = [a.beside_another(addition.effect, found[0].effect) for a in chosen]
             chosen[place], present = found
     order = {name: i for i, name in enumerate(present.names)}
@@ -460,8 +475,8 @@ def reconsidered(
 def _without_it(
     whole: Fits,
     few: Fits,
-    base: Completion,
-    present: Completion,
+    base: FittedModel,
+    present: FittedModel,
     addition: Addition,
     candidates: Sequence[Effect],
 ) -> Addition | Standing | None:
@@ -473,9 +488,9 @@ def _without_it(
     here, without = few.of(present.effects, [present.as_starts()], ROUGH), _without(few, present, effect, ROUGH)
     fall = 0.0 if here is None or without is None else fall_foretold(without, here, rows)
     if here is None or without is None or fall < CLEAR:
-        fitted = _without(whole, present, effect, Effort(STEPS))
+        fitted = _without(whole, present, effect, DescentOptions(STEPS))
         return None if fitted is None else Standing.of(fitted, whole, few)
-    explained = base.evidence - present.evidence
+    explained = base.neg2_log_evidence - present.neg2_log_evidence
     if _rivals(few, without, addition, candidates, here, explained, rows):
         return Standing.foretold(without, few, rows)
     (chance,) = probabilities({effect.name: fall}, explained - fall).values()
@@ -485,10 +500,10 @@ def _without_it(
 
 def _rivals(
     few: Fits,
-    without: Completion,
+    without: FittedModel,
     addition: Addition,
     candidates: Sequence[Effect],
-    here: Completion,
+    here: FittedModel,
     explained: float,
     rows: int,
 ) -> bool:
@@ -497,18 +512,18 @@ def _rivals(
     found = worth_trying(*scores, addition.falls)
     for rival in candidates:
         if rival.name in found and rival.name != addition.effect.name:
-            completion = fitted_to_few(few, without, found[rival.name], here.cost + BEHIND_UNSETTLED)
-            if completion is not None and not hopeless(fall_foretold(completion, here, rows), explained):
+            completion = fitted_to_few(few, without, found[rival.name], here.neg2_log_posterior + BEHIND_UNSETTLED)
+            if completion is not None and not out_of_reach(fall_foretold(completion, here, rows), explained):
                 return True
     return False
 
 
-def _others(addition: Addition, present: Completion) -> frozenset[str]:
+def _others(addition: Addition, present: FittedModel) -> frozenset[str]:
     """Names of the present model's effects but that one's."""
     return frozenset(present.names) - {addition.effect.name}
 
 
-def _without(fits: Fits, present: Completion, effect: Effect, effort: Effort) -> Completion | None:
+def _without(fits: Fits, present: FittedModel, effect: Effect, effort: DescentOptions) -> FittedModel | None:
     """The present model less one effect, fitted from where it stands but for the latents: they followed the effect."""
     left = [e for e in present.effects if e.name != effect.name]
     starts = [start._replace(near=False) for start in present.as_starts(left)]

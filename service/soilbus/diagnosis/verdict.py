@@ -76,12 +76,12 @@ def probabilities(
     return dict(sorted(chances.items(), key=lambda item: -item[1]))
 
 
-def hopeless(behind: float, explained: float) -> bool:
+def out_of_reach(behind: float, explained: float) -> bool:
     """Whether a name so far behind the best one in -2 log evidence cannot get into the set."""
-    return behind > hopeless_from(explained)
+    return behind > out_of_reach_from(explained)
 
 
-def hopeless_from(explained: float) -> float:
+def out_of_reach_from(explained: float) -> float:
     """How far behind that is."""
     return HOPELESS * _great_temperature(explained)
 

@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.diagnosis.fitted_model import Checked, Completion
+from soilbus.diagnosis.fitted_model import Checked, FittedModel
 from soilbus.estimation.posterior import PARAMETERS
 
 Array = NDArray[np.float64]
@@ -56,7 +56,7 @@ class _Look:
     deviations: float
 
 
-def disagreements(completion: Completion) -> list[Disagreement]:
+def disagreements(completion: FittedModel) -> list[Disagreement]:
     """All significant disagreements of the held-out blocks, the clearest first."""
     looks = [look for i, check in enumerate(completion.checks) for look in _looks(check, completion, i)]
     looks += list(_gain_looks(completion))
@@ -76,10 +76,10 @@ def channels(wheels: Sequence[str], with_sinkage: bool) -> list[tuple[str, str]]
     return names + ([("sinkage", w) for w in wheels] if with_sinkage else [])
 
 
-def _looks(check: Checked, completion: Completion, record: int) -> Iterator[_Look]:
-    problem, belief = check.problem, completion.fits[record].mode
-    z, by = problem.standardised(check.at, belief.gains)
-    by = by * np.concatenate([belief.soil, np.ones(len(belief.gains))])
+def _looks(check: Checked, completion: FittedModel, record: int) -> Iterator[_Look]:
+    problem, gaussian = check.problem, completion.fits[record].mode
+    z, by = problem.standardised(check.at, gaussian.gains)
+    by = by * np.concatenate([gaussian.soil, np.ones(len(gaussian.gains))])
     raw = check.at.rows[:, 0].reshape(z.shape)
     W = problem.n_wheels
     slip = 1.0 - check.latents.ground_speed[:, None] / (problem.rig.radius * check.latents.speed)
@@ -95,12 +95,12 @@ def _looks(check: Checked, completion: Completion, record: int) -> Iterator[_Loo
         for region, members in _regions(regressors, known):
             n = len(members)
             mean, slope = z[members, i].mean(), by[members, i].mean(0)
-            sd = math.sqrt(1.0 / n + float(slope @ belief.covariance @ slope))
+            sd = math.sqrt(1.0 / n + float(slope @ gaussian.covariance @ slope))
             yield _Look(channel, wheel, region, float(raw[members, i].mean()), mean / sd)
         n = int(known.sum())
         if n >= FEWEST:
             square = float((z[known, i] ** 2).mean())
-            left_open = belief.covariance @ (by[known, i].T @ by[known, i])  # of I + M: M's trace, and that of M^2
+            left_open = gaussian.covariance @ (by[known, i].T @ by[known, i])  # of I + M: M's trace, and that of M^2
             expected, of_squares = float(left_open.trace()), float((left_open @ left_open).trace())
             sd = math.sqrt(2.0 * (n + 2.0 * expected + of_squares)) / n
             yield _Look(channel, wheel, "scatter", math.sqrt(square), (square - 1.0 - expected / n) / sd)
@@ -123,13 +123,13 @@ def _regions(regressors: dict[str, Array], known: NDArray[np.bool_]) -> Iterator
                 yield f"{name} {low:.3g}..{high:.3g}", members
 
 
-def _gain_looks(completion: Completion) -> Iterator[_Look]:
+def _gain_looks(completion: FittedModel) -> Iterator[_Look]:
     """Gain errors that are larger than they may be: a fit hides an effect in them."""
-    problem, belief = completion.checks[-1].problem, completion.fits[-1].mode
+    problem, gaussian = completion.checks[-1].problem, completion.fits[-1].mode
     for i in range(problem.n_sensors):
         std = float(problem.gain_std[i])
-        told = std**2 - float(belief.covariance[_SOIL + i, _SOIL + i])  # what the data moved it by, were it noise
+        told = std**2 - float(gaussian.covariance[_SOIL + i, _SOIL + i])  # what the data moved it by, were it noise
         if std > 0.0 and told > 0.01 * std**2:
             quantity, _, wheel = problem.gain_names[i].partition(".")
-            gain = float(belief.gains[i])
+            gain = float(gaussian.gains[i])
             yield _Look(quantity, wheel, "gain", gain, gain / math.sqrt(told))

@@ -14,22 +14,24 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.gaussian import Belief
-from soilbus.estimation.observation_model import Linearised
-from soilbus.estimation.solver import Fitting, Place
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.observation_model import Linearisation
+from soilbus.estimation.solver import Iterate, Objective
 from soilbus.estimation.window import Window
 
 Array = NDArray[np.float64]
 
 
-class Suspicion(NamedTuple):
+class ChangeStatistic(NamedTuple):
     """First instant (index) that may be on another soil, and the log likelihood ratio that speaks for it."""
 
     instant: int
     ratio: float
 
 
-def suspicion(fitting: Fitting, before: Belief, place: Place, at: Linearised, first: int, enough: float) -> Suspicion:
+def change_statistic(
+    fitting: Objective, before: Gaussian, place: Iterate, at: Linearisation, first: int, enough: float
+) -> ChangeStatistic:
     """The likeliest beginning of another soil among the instants from `first` on.
 
     The residuals are linearised at a place that earlier data told (`at`); `before` is what
@@ -37,13 +39,13 @@ def suspicion(fitting: Fitting, before: Belief, place: Place, at: Linearised, fi
     """
     n, m = at.by_latents.shape[:2]
     if first >= n:
-        return Suspicion(max(n - 1, 0), 0.0)
+        return ChangeStatistic(max(n - 1, 0), 0.0)
     rows, weighed = (a.reshape(n, m, -1)[first:] for a in (at.rows, at.weighed))
     misfit = np.einsum("im,im->i", rows[:, :, 0], weighed[:, :, 0])
     count = np.count_nonzero(rows.any(axis=2), axis=1).astype(float)
     ratio = _ratio(misfit, count)
     if ratio.max() <= enough:
-        return Suspicion(first + int(np.argmax(ratio)), float(ratio.max()))
+        return ChangeStatistic(first + int(np.argmax(ratio)), float(ratio.max()))
     known = fitting.given(before)
     by_known = known.directions(place)
     gradient = np.einsum("imk,im->ik", weighed, rows[:, :, 0]) @ by_known
@@ -52,7 +54,7 @@ def suspicion(fitting: Fitting, before: Belief, place: Place, at: Linearised, fi
     begin = int(np.argmax(_ratio(misfit - _explained(gradient, information + told), count)))
     # From there on together: another point within what is known must not pass for another soil.
     left = misfit[begin:].sum() - _explained(gradient[begin:].sum(0), information[begin:].sum(0) + told)
-    return Suspicion(first + begin, float(_ratio(left[None], count[begin:].sum(keepdims=True))[0]))
+    return ChangeStatistic(first + begin, float(_ratio(left[None], count[begin:].sum(keepdims=True))[0]))
 
 
 def _explained(gradient: Array, information: Array) -> Array:
@@ -72,7 +74,7 @@ def _ratio(misfit: Array, count: Array) -> Array:
         return np.where(count > 0.0, 0.5 * count * (excess - 1.0 - np.log(excess)), 0.0)
 
 
-class Crossing(NamedTuple):
+class Transition(NamedTuple):
     """Wheels come onto another soil: the front ones from `begin` to `end` [s], the rear ones `lag` [s] later."""
 
     begin: float
@@ -80,7 +82,7 @@ class Crossing(NamedTuple):
     lag: float
 
 
-def without_crossing(window: Window, crossing: Crossing, front: NDArray[np.bool_]) -> Window:
+def without_transition(window: Window, crossing: Transition, front: NDArray[np.bool_]) -> Window:
     """The window without what wheels measured on the way from one soil to the other.
 
     Before crossing.begin everything counts as of the first soil, and a wheel counts again

@@ -29,10 +29,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.gaussian import Belief, solved
+from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
 from soilbus.estimation.multistart import Fit
-from soilbus.estimation.path_curvature import along_bends
-from soilbus.estimation.solver import Around, Fitting, Place
+from soilbus.estimation.path_curvature import by_curvature
+from soilbus.estimation.solver import GaussianApproximation, Iterate, Objective
 
 Array = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ STEADY = 7.0
 _ENDS = np.arange(1.0, PIECES + 1.0) / PIECES
 
 
-class Change(NamedTuple):
+class DriftStep(NamedTuple):
     """From the optimum of a constant soil to the present one: step (F + A,) to take off, covariance, -2 log evidence.
 
     Of coordinates and active gains; evidences of one window compare with each other alone.
@@ -51,10 +51,10 @@ class Change(NamedTuple):
 
     step: Array
     covariance: Array
-    evidence: float
+    neg2_log_evidence: float
 
 
-def at_present(fitting: Fitting, fit: Fit, window: float, drift: float) -> Fit:
+def at_window_end(fitting: Objective, fit: Fit, window: float, drift: float) -> Fit:
     """The fit with everything it believes of a soil that wanders.
 
     drift: sd by which each coordinate of the soil changes in the time of one window [s].
@@ -66,7 +66,7 @@ def at_present(fitting: Fitting, fit: Fit, window: float, drift: float) -> Fit:
     optimum, still = fit.optimum, fitting.around(fit.optimum)
     if still is None:
         return fit
-    place, free = Place(optimum.soil, optimum.gains, optimum.latents, fit.cost, 0), len(fitting.free)
+    place, free = Iterate(optimum.soil, optimum.gains, optimum.latents, fit.neg2_log_posterior, 0), len(fitting.free)
     likely = _changes(_joint(fitting, fit, still, window, drift), len(still.step), free, drift)
     if not likely:
         return fit
@@ -77,19 +77,25 @@ def at_present(fitting: Fitting, fit: Fit, window: float, drift: float) -> Fit:
     now = replace(place, soil=fitting.coordinates.moved(place.soil, -step[:free]), gains=gains)
     mode = fitting.believed(now, covariance)
 
-    def moved(belief: Belief) -> Belief:
-        return mode if belief is fit.mode else fitting.changed(belief, still.step - step, covariance - still.covariance)
+    def moved(gaussian: Gaussian) -> Gaussian:
+        return (
+            mode
+            if gaussian is fit.mode
+            else fitting.changed(gaussian, still.step - step, covariance - still.covariance)
+        )
 
     return replace(
         fit,
         mode=mode,
-        belief=moved(fit.belief),
-        rival=None if fit.rival is None else fit.rival._replace(belief=moved(fit.rival.belief)),
-        averaged=None if fit.averaged is None else moved(fit.averaged),
+        gaussian=moved(fit.gaussian),
+        second_mode=None
+        if fit.second_mode is None
+        else fit.second_mode._replace(gaussian=moved(fit.second_mode.gaussian)),
+        marginalised=None if fit.marginalised is None else moved(fit.marginalised),
     )
 
 
-def _changes(joint: Array, told: int, free: int, drift: float) -> list[Change]:
+def _changes(joint: Array, told: int, free: int, drift: float) -> list[DriftStep]:
     """How the soil may have changed: it wanders, or changes steadily besides; without what is not finite."""
     walk, steady = len(joint) - free, STEADY * drift
     both = [_change(joint[:walk, :walk], told)]
@@ -100,7 +106,7 @@ def _changes(joint: Array, told: int, free: int, drift: float) -> list[Change]:
     return [change for change in both if change is not None]
 
 
-def _joint(fitting: Fitting, fit: Fit, still: Around, window: float, drift: float) -> Array:
+def _joint(fitting: Objective, fit: Fit, still: GaussianApproximation, window: float, drift: float) -> Array:
     """Cost, half its gradient and information of the last piece's soil, gains, bends, and of a steady change (F,).
 
     The last, of the coordinates in the time of a window, as if nothing were known of it beforehand.
@@ -117,7 +123,7 @@ def _joint(fitting: Fitting, fit: Fit, still: Around, window: float, drift: floa
     then = np.eye(told, rows.shape[1] - 1)  # what was known before is of the soil then
     then[:free, steady] = ago[0] * np.eye(free)
     joint = np.zeros((rows.shape[1],) * 2)
-    joint[0, 0] = before.cost
+    joint[0, 0] = before.neg2_log_prior
     joint[1:, 1:] = then.T @ before.information @ then
     joint[0, 1:] = joint[1:, 0] = then.T @ before.gradient
     of_bends = np.arange(1 + told, len(joint) - free)
@@ -139,32 +145,32 @@ def _joint(fitting: Fitting, fit: Fit, still: Around, window: float, drift: floa
     return joint
 
 
-def _by_bends(fitting: Fitting, fit: Fit) -> tuple[Array, Array]:
+def _by_bends(fitting: Objective, fit: Fit) -> tuple[Array, Array]:
     """Derivatives (N m, K) of the residuals by bends in their standard deviations, and these weighed."""
     m = fit.optimum.at.by_latents.shape[1]
     if not fit.bend:
         none = np.zeros((len(fit.optimum.t) * m, 0))
         return none, none
     of_bends = np.repeat(fit.bend.bends, m, axis=0)
-    by_curve, weighed = along_bends(fitting, fit)
+    by_curve, weighed = by_curvature(fitting, fit)
     return of_bends * by_curve.reshape(-1, 1), of_bends * weighed.reshape(-1, 1)
 
 
-def _change(joint: Array, told: int, room: float = 0.0) -> Change | None:
+def _change(joint: Array, told: int, room: float = 0.0) -> DriftStep | None:
     """What the first `told` unknowns change; room: -2 log of the density beforehand of the others at zero."""
-    solution = solved(joint[1:, 1:], joint[1:, 0])
+    solution = solve_with_inverse(joint[1:, 1:], joint[1:, 0])
     if solution is None:
         return None
     step, covariance = solution
     cost = float(joint[0, 0] - joint[0, 1:] @ step)
-    evidence = cost + room + float(np.linalg.slogdet(joint[1:, 1:])[1])
-    return Change(step[:told], covariance[:told, :told], evidence)
+    neg2_log_evidence = cost + room + float(np.linalg.slogdet(joint[1:, 1:])[1])
+    return DriftStep(step[:told], covariance[:told, :told], neg2_log_evidence)
 
 
-def _averaged(likely: list[Change]) -> tuple[Array, Array]:
+def _averaged(likely: list[DriftStep]) -> tuple[Array, Array]:
     """Mean and covariance of changes that were as likely as each other before the data."""
-    evidence = np.array([change.evidence for change in likely])
-    probability = np.exp(-0.5 * (evidence - evidence.min()))
+    neg2_log_evidence = np.array([change.neg2_log_evidence for change in likely])
+    probability = np.exp(-0.5 * (neg2_log_evidence - neg2_log_evidence.min()))
     probability /= probability.sum()
     steps = np.array([change.step for change in likely])
     step = probability @ steps

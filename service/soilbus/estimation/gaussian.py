@@ -28,7 +28,7 @@ FAINT = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Belief:
+class Gaussian:
     """Typical soil (6,) in SI and gain errors (G,), with their covariance (6 + G, 6 + G).
 
     Typical by its mean in the coordinates in which a window is nearest to Gaussian (see
@@ -49,7 +49,7 @@ class Belief:
     form: FormLeft | None = None
 
     @classmethod
-    def of(cls, prior: SoilPrior, gain_std: Array) -> Belief:
+    def of(cls, prior: SoilPrior, gain_std: Array) -> Gaussian:
         """Before any window: the configured prior, and gain errors of this std (G,)."""
         variance = np.concatenate([prior.log_std, gain_std]) ** 2
         return cls(prior.median, np.zeros(len(gain_std)), np.diag(variance))
@@ -63,29 +63,29 @@ class Belief:
         """What is known of one gain error."""
         return Estimate(float(self.gains[index]), float(np.sqrt(self.covariance[_SOIL + index, _SOIL + index])))
 
-    def mixed(self, other: Belief, share: float) -> Belief:
+    def mixed(self, other: Gaussian, share: float) -> Gaussian:
         """The same with the spread, about it, of what is this with probability 1 - share and another with share."""
         held = np.diag(self.covariance)[:_SOIL] == 0.0
         off = np.concatenate([np.where(held, 0.0, np.log(other.soil / self.soil)), other.gains - self.gains])
         of_other = other.covariance + np.outer(off, off)
         return replace(self, covariance=(1.0 - share) * self.covariance + share * of_other)
 
-    def given(self, parameter: int, log: float) -> Belief:
+    def given(self, parameter: int, log: float) -> Gaussian:
         """What is known of everything else if the logarithm of a free parameter is this: held from then on."""
         along = self.covariance[:, parameter] / self.covariance[parameter, parameter]
         covariance = self.covariance - np.outer(along, self.covariance[parameter])
         covariance[parameter] = covariance[:, parameter] = 0.0
         return self.moved(along * (log - np.log(self.soil[parameter])), covariance)
 
-    def moved(self, step: Array, covariance: Array) -> Belief:
+    def moved(self, step: Array, covariance: Array) -> Gaussian:
         """The same after a step (6 + G,) of the logarithms and gains, with another covariance."""
         soil, gains = self.soil * np.exp(step[:_SOIL]), self.gains + step[_SOIL:]
         if self.k_c_off is None:
-            return Belief(soil, gains, covariance)
+            return Gaussian(soil, gains, covariance)
         soil[_K_C] = self.soil[_K_C]
-        return Belief(soil, gains, covariance, self.k_c_off + float(step[_K_C]))
+        return Gaussian(soil, gains, covariance, self.k_c_off + float(step[_K_C]))
 
-    def apart_from(self, prior: SoilPrior) -> Belief:
+    def apart_from(self, prior: SoilPrior) -> Gaussian:
         """What data alone told, where this is the mode of what they and the prior of log k_c say, with its curvature.
 
         Forces are all but linear in k_c, so that windows add up as Gaussians of k_c, and everything that makes up for
@@ -104,22 +104,22 @@ class Belief:
         own = float(self.covariance[_K_C, _K_C])
         return own if self.k_c_off is None else 1.0 / (1.0 / own + float(prior.log_std[_K_C] ** -2))
 
-    def drifted(self, soil: Array, gains: Array) -> Belief:
+    def drifted(self, soil: Array, gains: Array) -> Gaussian:
         """Later: the soil's logarithms may have changed with covariance (6, 6), the gains with variance (G,)."""
         covariance = self.covariance.copy()
         covariance[:_SOIL, :_SOIL] += soil
         covariance[range(_SOIL, len(covariance)), range(_SOIL, len(covariance))] += gains
         return replace(self, covariance=covariance)
 
-    def of_another_soil(self, prior: SoilPrior) -> Belief:
+    def of_another_soil(self, prior: SoilPrior) -> Gaussian:
         """What is left on another soil, of which only the prior is known: the gains."""
         covariance = self.covariance.copy()
         covariance[:_SOIL] = covariance[:, :_SOIL] = 0.0
         covariance[range(_SOIL), range(_SOIL)] = prior.log_std**2
-        return Belief(prior.median, self.gains, covariance)
+        return Gaussian(prior.median, self.gains, covariance)
 
 
-class Known(NamedTuple):
+class PriorQuadratic(NamedTuple):
     """What was known before, as a parabola of coordinates and active gains: information, half its gradient, cost.
 
     of_data: of the gradient, what data told of which k_c is Gaussian.
@@ -127,11 +127,11 @@ class Known(NamedTuple):
 
     information: Array
     gradient: Array
-    cost: float
+    neg2_log_prior: float
     of_data: Array
 
 
-class Earlier:
+class PriorFactor:
     """What was known before of the free parameters and active gains (F + A).
 
     Each has a residual: its logarithm's, or the gain's, deviation.  Of what data alone told
@@ -142,11 +142,11 @@ class Earlier:
     least, which no cost counts.
     """
 
-    def __init__(self, before: Belief, prior: SoilPrior, active: NDArray[np.intp]) -> None:
+    def __init__(self, before: Gaussian, prior: SoilPrior, active: NDArray[np.intp]) -> None:
         """Active are the gains that are not held; raises ValueError where `before` has no proper covariance."""
         self._before, self._prior, self._free, self._active = before, prior, prior.free, active
         kept = np.concatenate([self._free, _SOIL + active])
-        inverse = solved(before.covariance[kept[:, None], kept], np.zeros(len(kept)))
+        inverse = solve_with_inverse(before.covariance[kept[:, None], kept], np.zeros(len(kept)))
         if inverse is None:
             raise ValueError("what was known before has no proper covariance")
         self.precision = inverse[1]
@@ -159,7 +159,7 @@ class Earlier:
             self.precision[-1, -1] = prior.log_std[_K_C] ** -2
             self.surplus = self._least()
 
-    def seen_from(self, soil: Array, gains: Array, by_logs: Array) -> Known:
+    def seen_from(self, soil: Array, gains: Array, by_logs: Array) -> PriorQuadratic:
         """From a soil (6,) with gains (G,); by_logs (F + A, F + A): derivatives of logarithms and gains."""
         off, slopes = self.off(soil, gains), self.slopes(soil, by_logs)
         pull = self.precision @ off
@@ -167,7 +167,7 @@ class Earlier:
         if self._of_data:
             of_data = gradient.copy()
             of_data[_K_C] -= pull[-1]
-        return Known(slopes.T @ self.precision @ slopes, gradient, float(off @ pull) - self.surplus, of_data)
+        return PriorQuadratic(slopes.T @ self.precision @ slopes, gradient, float(off @ pull) - self.surplus, of_data)
 
     def off(self, soil: Array, gains: Array) -> Array:
         """The residuals (R,) of a soil (6,) with gains (G,)."""
@@ -207,7 +207,7 @@ class Earlier:
         return float(np.min(off**2 / before.covariance[_K_C, _K_C] + deviation**2))
 
 
-def solved(information: Array, gradient: Array) -> tuple[Array, Array] | None:
+def solve_with_inverse(information: Array, gradient: Array) -> tuple[Array, Array] | None:
     """information^-1 gradient and information^-1, (F,) and (F, F); None where it is singular."""
     scale = 1.0 / np.sqrt(information.diagonal())
     scales = scale[:, None] * scale

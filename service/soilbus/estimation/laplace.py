@@ -26,12 +26,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.gaussian import Belief, solved
-from soilbus.estimation.multistart import Fit, fit_window, settled
-from soilbus.estimation.observation_model import DenoisedProblem, WindowProblem
+from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
+from soilbus.estimation.multistart import Fit, fit_window, refine
+from soilbus.estimation.observation_model import DenoisedObservationModel, ObservationModel
 from soilbus.estimation.parametrization import BOUND, Coordinates
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-from soilbus.estimation.solver import Fitting, Place
+from soilbus.estimation.solver import Iterate, Objective
 from soilbus.terra.wheel import Soil
 
 Array = NDArray[np.float64]
@@ -68,23 +68,23 @@ class Node(NamedTuple):
     @property
     def unlikelihood(self) -> float:
         """-2 log of the posterior density of n."""
-        return self.fit.evidence + self.known
+        return self.fit.neg2_log_evidence + self.known
 
     @property
     def misfit(self) -> float:
         """-2 log of the profile likelihood of n: of the likeliest soil with this n."""
-        return self.fit.cost + self.known
+        return self.fit.neg2_log_posterior + self.known
 
 
-class Ridge(NamedTuple):
+class ProfileOverN(NamedTuple):
     """Fits along n on both sides of the optimum `top`, down to where they are unlikely, in the order of n."""
 
-    problem: DenoisedProblem
+    problem: DenoisedObservationModel
     top: Fit
     nodes: list[Node]
 
 
-def with_whole(problem: WindowProblem, prior: SoilPrior, before: Belief, found: Fit) -> Fit:
+def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, before: Gaussian, found: Fit) -> Fit:
     """The fit with mean and covariance of the whole posterior, where its top may not tell them.
 
     That is where n is badly known or there is a rival.  There the noise of loads and speeds
@@ -93,64 +93,64 @@ def with_whole(problem: WindowProblem, prior: SoilPrior, before: Belief, found: 
     held fit's belief, so its moments along k_c's share count; the present soil (`present`)
     comes after.
     """
-    spread = math.sqrt(max(found.mode.covariance[_N, _N], found.belief.covariance[_N, _N]))
-    if spread < WELL_KNOWN and found.rival is None:
+    spread = math.sqrt(max(found.mode.covariance[_N, _N], found.gaussian.covariance[_N, _N]))
+    if spread < WELL_KNOWN and found.second_mode is None:
         return found
     with np.errstate(all="ignore"):
-        along = ridge(problem, prior, before, found)
+        along = profile_over_n(problem, prior, before, found)
         if along is None:
             return found
         coordinates = Coordinates(prior, float(problem.rig.width.mean()))
-        told = told_of_soil(along, prior, before) if len(along.nodes) > 2 else None
-        whole = along.top.belief if told is None else _averaged(along.nodes, told, coordinates, before)
+        told = attainable_variance(along, prior, before) if len(along.nodes) > 2 else None
+        whole = along.top.gaussian if told is None else _averaged(along.nodes, told, coordinates, before)
     finite = np.isfinite(whole.soil).all() and np.isfinite(whole.covariance).all()
-    if not finite or found.rival is not None:  # beside its rival an optimum is told as it was found
-        return replace(found, averaged=whole) if finite else found
-    return replace(found, belief=along.top.belief, mode=along.top.mode, averaged=whole)
+    if not finite or found.second_mode is not None:  # beside its rival an optimum is told as it was found
+        return replace(found, marginalised=whole) if finite else found
+    return replace(found, gaussian=along.top.gaussian, mode=along.top.mode, marginalised=whole)
 
 
-def cold_fit(problem: WindowProblem, prior: SoilPrior) -> Fit | None:
+def cold_fit(problem: ObservationModel, prior: SoilPrior) -> Fit | None:
     """A window on its own, as the service tells its first one: fitted, and with its whole posterior."""
     fit = fit_window(problem, prior)
     if fit is None or not fit.converged:
         return fit
-    return with_whole(problem, prior, Belief.of(prior, problem.gain_std), fit)
+    return with_nested_laplace(problem, prior, Gaussian.of(prior, problem.gain_std), fit)
 
 
-def ridge(problem: WindowProblem, prior: SoilPrior, before: Belief, found: Fit) -> Ridge | None:
+def profile_over_n(problem: ObservationModel, prior: SoilPrior, before: Gaussian, found: Fit) -> ProfileOverN | None:
     """The ridge through an optimum; without nodes where k_c, k_phi and n are not all free and the tyres unlike.
 
     None where the descent finds no optimum of the denoised problem.
     """
     optimum = found.optimum
-    calm = DenoisedProblem(problem, optimum)
-    top = _converged(Fitting(calm, prior, before), Place(optimum.soil, optimum.gains, calm.latents, np.inf, 1))
+    calm = DenoisedObservationModel(problem, optimum)
+    top = _converged(Objective(calm, prior, before), Iterate(optimum.soil, optimum.gains, calm.latents, np.inf, 1))
     if top is None:
         return None
     if not prior.log_std[[_K_C, _K_PHI, _N]].all() or np.ptp(problem.rig.width) == 0.0:
-        return Ridge(calm, top, [])
+        return ProfileOverN(calm, top, [])
     first = _held(calm, prior, before, top, math.log(top.mode.soil[_N]), None)
     if first is None:
-        return Ridge(calm, top, [])
+        return ProfileOverN(calm, top, [])
     step = min(math.sqrt(top.mode.covariance[_N, _N]), LONGEST)
     covariance = top.mode.covariance
     slope = covariance[:, _N] / covariance[_N, _N]
     down, up = (_along(calm, prior, before, first, slope, way, step) for way in (-1.0, 1.0))
-    return Ridge(calm, top, [*reversed(down), first, *up])
+    return ProfileOverN(calm, top, [*reversed(down), first, *up])
 
 
-def _converged(fitting: Fitting, near: Place) -> Fit | None:
+def _converged(fitting: Objective, near: Iterate) -> Fit | None:
     """The optimum near a place; None where there is none."""
     for _ in range(MAX_TRIES):
-        fit = settled(fitting, near)
+        fit = refine(fitting, near)
         if fit is None or fit.converged:
             return fit
-        near = Place(fit.optimum.soil, fit.optimum.gains, fit.optimum.latents, np.inf, 1)
+        near = Iterate(fit.optimum.soil, fit.optimum.gains, fit.optimum.latents, np.inf, 1)
     return None
 
 
 def _along(
-    problem: WindowProblem, prior: SoilPrior, before: Belief, top: Node, slope: Array, way: float, step: float
+    problem: ObservationModel, prior: SoilPrior, before: Gaussian, top: Node, slope: Array, way: float, step: float
 ) -> list[Node]:
     """Nodes to one side; slope (6 + G,) is how logarithms of the soil and gains change with that of n at the top."""
     nodes: list[Node] = []
@@ -173,7 +173,7 @@ def _place(fit: Fit) -> Array:
 
 
 def _held(
-    problem: WindowProblem, prior: SoilPrior, before: Belief, near: Fit, u: float, slope: Array | None
+    problem: ObservationModel, prior: SoilPrior, before: Gaussian, near: Fit, u: float, slope: Array | None
 ) -> Node | None:
     """A fit with n held, from the optimum of one nearby, moved along the slope (6 + G,) of the ridge there."""
     soil, gains, n = near.optimum.soil.copy(), near.optimum.gains, math.exp(u)
@@ -188,24 +188,24 @@ def _held(
     deviation = (u - math.log(before.soil[_N])) / math.sqrt(before.covariance[_N, _N])
     median, log_std = prior.median.copy(), prior.log_std.copy()
     median[_N], log_std[_N] = n, 0.0
-    fitting = Fitting(problem, SoilPrior(median, log_std), before.given(_N, u))
+    fitting = Objective(problem, SoilPrior(median, log_std), before.given(_N, u))
     latents = problem.carried(near.optimum.latents, Soil(*soil.tolist()), gains)
-    fit = _converged(fitting, Place(soil, gains, latents, np.inf, 1))
+    fit = _converged(fitting, Iterate(soil, gains, latents, np.inf, 1))
     return None if fit is None else Node(u, fit, deviation**2 + fitting.earlier.surplus)
 
 
-def told_of_soil(along: Ridge, prior: SoilPrior, before: Belief) -> Array | None:
+def attainable_variance(along: ProfileOverN, prior: SoilPrior, before: Gaussian) -> Array | None:
     """Variance (nodes, 2) of log k_c and log n that a window on the soil of each node could leave at best.
 
     None where it is not to be told.
     """
-    fitting = Fitting(along.problem, prior, before)
+    fitting = Objective(along.problem, prior, before)
     columns = np.searchsorted(fitting.free, [_K_C, _N])
     variance = []
     for node in along.nodes:
-        place = Place(node.fit.optimum.soil, node.fit.optimum.gains, node.fit.optimum.latents, np.inf, 1)
+        place = Iterate(node.fit.optimum.soil, node.fit.optimum.gains, node.fit.optimum.latents, np.inf, 1)
         point = fitting.with_before(place, node.fit.optimum.at)
-        inverse = None if point is None else solved(point.information, point.gradient)
+        inverse = None if point is None else solve_with_inverse(point.information, point.gradient)
         if inverse is None:
             return None
         variance.append(inverse[1].diagonal()[columns])
@@ -223,7 +223,7 @@ def counted(centre: Array, told: Array) -> tuple[Array, Array]:
     return of_all / of_all.sum(), of_k_c / of_k_c.sum()
 
 
-def _averaged(nodes: list[Node], told: Array, coordinates: Coordinates, before: Belief) -> Belief:
+def _averaged(nodes: list[Node], told: Array, coordinates: Coordinates, before: Gaussian) -> Gaussian:
     """Mean of all nodes and of what lies between them, by straight lines, and its spread about that.
 
     Soils of the ridge let a window tell its soil as unlike as by a factor of ten: the mean is where the mean
@@ -231,7 +231,7 @@ def _averaged(nodes: list[Node], told: Array, coordinates: Coordinates, before: 
     """
     n, free = len(PARAMETERS), coordinates.free
     active = n + np.flatnonzero(np.diag(before.covariance)[n:] > 0.0)
-    beliefs = [node.fit.belief for node in nodes]
+    gaussians = [node.fit.gaussian for node in nodes]
     u = np.array([node.u for node in nodes])
     fine = np.linspace(u[0], u[-1], FINE)
     probable = density(u, np.array([node.unlikelihood for node in nodes]), fine)
@@ -239,11 +239,11 @@ def _averaged(nodes: list[Node], told: Array, coordinates: Coordinates, before: 
     share = np.array([np.interp(fine, u, one) for one in np.eye(len(u))])
     left = _next(fine, probable, told[:, 0] @ share)
     known = 1.0 - left / before.variance_of_k_c(coordinates.prior)
-    place = np.array([[*coordinates.position(b.soil), *b.gains[active - n]] for b in beliefs])
+    place = np.array([[*coordinates.position(b.soil), *b.gains[active - n]] for b in gaussians])
     unbiased = np.array([_unbiased_k_c(node, before, coordinates.prior) for node in nodes])
     place[:, _K_C] += known * (unbiased - place[:, _K_C])
     along = place.T @ share
-    own = np.array([_in_coordinates(b.covariance, coordinates.log_directions(b.soil), free, active) for b in beliefs])
+    own = np.array([_in_coordinates(b.covariance, coordinates.log_directions(b.soil), free, active) for b in gaussians])
     centre = known * weight + (1.0 - known) * probable
     of_all, of_k_c = counted(centre, share.T @ told)
     mean = along @ of_all
@@ -252,12 +252,12 @@ def _averaged(nodes: list[Node], told: Array, coordinates: Coordinates, before: 
     doubt = longer_side(fine - fine @ probable, weight)  # how unlike both distributions are counts, too
     spread = doubt * (off * weight) @ off.T
     covariance = np.tensordot(share @ weight, own, axes=1) + spread
-    soil, gains = coordinates.soil_at(mean[: len(free)]), beliefs[0].gains.copy()
+    soil, gains = coordinates.soil_at(mean[: len(free)]), gaussians[0].gains.copy()
     gains[active - n] = mean[len(free) :]
     by_coordinates = np.zeros((n + len(gains), len(mean)))
     by_coordinates[:n, : len(free)] = coordinates.log_directions(soil)
     by_coordinates[active, len(free) + np.arange(len(active))] = 1.0
-    return Belief(soil, gains, by_coordinates @ covariance @ by_coordinates.T)
+    return Gaussian(soil, gains, by_coordinates @ covariance @ by_coordinates.T)
 
 
 def _in_coordinates(covariance: Array, directions: Array, free: Indices, active: Indices) -> Array:
@@ -274,7 +274,7 @@ def _next(fine: Array, probable: Array, value: Array) -> float:
     return float(np.interp(mean + math.sqrt((fine - mean) ** 2 @ probable), fine, value))
 
 
-def _unbiased_k_c(node: Node, before: Belief, prior: SoilPrior) -> float:
+def _unbiased_k_c(node: Node, before: Gaussian, prior: SoilPrior) -> float:
     """Logarithm of k_c given n of which the mean over windows on one soil is that soil's, to second order.
 
     The model is all but linear in k_c, and so the mean of the posterior of its logarithm is biased down, and

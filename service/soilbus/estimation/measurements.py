@@ -39,7 +39,7 @@ def gain_names(rig: Rig) -> list[str]:
     return [n for q in GAIN_QUANTITIES for n in ([f"{q}.{w}" for w in rig.wheels] if q in per_wheel else [q])]
 
 
-class Readings:
+class Measurements:
     """The usable instants (N) of a window: arrays (N, W) of the wheels and (N,) of the vehicle, in SI.
 
     Each has its variance and a mask of what is known; both are zero where it is not.

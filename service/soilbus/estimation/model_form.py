@@ -23,13 +23,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.gaussian import solved
+from soilbus.estimation.gaussian import solve_with_inverse
 from soilbus.estimation.posterior import PARAMETERS
 from soilbus.terra.wheel import WheelModel
 
 if TYPE_CHECKING:
     from soilbus.estimation.multistart import Fit
-    from soilbus.estimation.solver import Fitting
+    from soilbus.estimation.solver import Objective
 
 Array = NDArray[np.float64]
 
@@ -87,7 +87,7 @@ def formed(model: WheelModel, step: Array) -> WheelModel:
     )
 
 
-def form_left(fitting: Fitting, fit: Fit, before: FormLeft) -> FormLeft:
+def form_left(fitting: Objective, fit: Fit, before: FormLeft) -> FormLeft:
     """What a window's fit leaves open, given what was left before it; that where the window tells nothing."""
     problem, optimum = fitting.problem, fit.optimum
     around = fitting.around(optimum)
@@ -102,11 +102,11 @@ def form_left(fitting: Fitting, fit: Fit, before: FormLeft) -> FormLeft:
     mixed = (columns @ around.directions) + by_prior.T @ precision @ slopes
     gradient = columns[:, 0] + by_prior.T @ (precision @ off)
     information = rows.T @ weighed + by_prior.T @ precision @ by_prior
-    own = solved(before.covariance[np.ix_(open_, open_)], before.mean[open_])
+    own = solve_with_inverse(before.covariance[np.ix_(open_, open_)], before.mean[open_])
     if own is None:
         return before
     of_gradient, of_information = around.explained(mixed)
-    told = solved(information - of_information + own[1], own[0] - gradient + of_gradient)
+    told = solve_with_inverse(information - of_information + own[1], own[0] - gradient + of_gradient)
     if told is None:
         return before
     by_form, mean, covariance = np.zeros_like(before.by_form), np.zeros(len(FORM)), np.zeros((len(FORM),) * 2)

@@ -11,21 +11,28 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.model_form import FormLeft
-from soilbus.estimation.observation_model import Bend, DenoisedProblem, Latents, Linearised, Optimum, WindowProblem
+from soilbus.estimation.observation_model import (
+    CurvedPathFit,
+    DenoisedObservationModel,
+    Latents,
+    Linearisation,
+    ObservationModel,
+    Optimum,
+)
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
-from soilbus.estimation.soil_classes import foretelling
+from soilbus.estimation.soil_classes import ranked_by_likelihood
 from soilbus.estimation.solver import (
     CONVERGED_RESUMED,
     FAR,
     LEFT_OVER_RESUMED,
     LITTLE,
-    Fitting,
-    Place,
-    Settled,
-    approach,
-    settle,
+    Descent,
+    Iterate,
+    Objective,
+    descend_jointly,
+    descend_soil,
 )
 from soilbus.terra.soils import KINDS, SOILS
 from soilbus.terra.wheel import Soil
@@ -83,7 +90,7 @@ class Start(NamedTuple):
     checked: Latents | None = None
 
 
-class Effort(NamedTuple):
+class DescentOptions(NamedTuple):
     """What a fit is worth that is compared with others by cost.
 
     most: steps, half as many as long as the latents are as measured; hopeless: a cost such
@@ -92,7 +99,7 @@ class Effort(NamedTuple):
     """
 
     most: int = MAX_ITERATIONS
-    hopeless: float = math.inf
+    give_up_above: float = math.inf
     enough: float = COMPARED
     little: float = LITTLE
 
@@ -102,13 +109,13 @@ class Effort(NamedTuple):
         return SLOWLY * self.enough
 
 
-THOROUGH = Effort()
+DEFAULT_OPTIONS = DescentOptions()
 
 
-class Rival(NamedTuple):
+class SecondMode(NamedTuple):
     """Another optimum than a fit's, by mode and curvature, and its share of the probability of both (Laplace)."""
 
-    belief: Belief
+    gaussian: Gaussian
     share: float
 
 
@@ -130,92 +137,104 @@ class Fit:
     All are of a constant soil until `present` moves them to the window's end.
     """
 
-    belief: Belief
-    mode: Belief
+    gaussian: Gaussian
+    mode: Gaussian
     sinkage: Array
     optimum: Optimum
-    cost: float
-    evidence: float
+    neg2_log_posterior: float
+    neg2_log_evidence: float
     rows: int
     iterations: int
     converged: bool
-    rival: Rival | None = None
-    averaged: Belief | None = None
-    bend: Bend | None = None
+    second_mode: SecondMode | None = None
+    marginalised: Gaussian | None = None
+    bend: CurvedPathFit | None = None
     off_scale: bool = False
     form: FormLeft | None = None
 
     @property
     def posterior(self) -> Posterior:
         """What is known of the soil."""
-        return self.belief.posterior
+        return self.gaussian.posterior
 
     @property
-    def whole(self) -> Belief:
+    def whole(self) -> Gaussian:
         """Soil and gains to be reported and passed on: the average where there is one, else both optima, or belief."""
-        if self.averaged is not None:
-            return self.averaged
-        return self.belief if self.rival is None else self.belief.mixed(self.rival.belief, self.rival.share)
+        if self.marginalised is not None:
+            return self.marginalised
+        return (
+            self.gaussian
+            if self.second_mode is None
+            else self.gaussian.mixed(self.second_mode.gaussian, self.second_mode.share)
+        )
 
     @property
     def is_gaussian(self) -> bool:
         """Whether the whole posterior is much as its top says; else it cannot be the prior of later windows."""
-        if self.averaged is None or self.rival is not None:
-            return self.rival is None
-        known = np.flatnonzero(np.diag(self.belief.covariance) > 0.0)
-        own, whole = (b.covariance[np.ix_(known, known)] for b in (self.belief, self.averaged))
+        if self.marginalised is None or self.second_mode is not None:
+            return self.second_mode is None
+        known = np.flatnonzero(np.diag(self.gaussian.covariance) > 0.0)
+        own, whole = (b.covariance[np.ix_(known, known)] for b in (self.gaussian, self.marginalised))
         wider = np.linalg.eigvals(np.linalg.solve(own, whole)).real
-        return bool(self.posterior.distance(self.averaged.posterior.soil) < ALIKE and wider.max() < WIDER**2)
+        return bool(self.posterior.distance(self.marginalised.posterior.soil) < ALIKE and wider.max() < WIDER**2)
 
     @property
     def gains(self) -> Array:
         """Relative errors of the sensors (G,), by problem.gain_names."""
-        return self.belief.gains
+        return self.gaussian.gains
 
     @property
     def chi2(self) -> float:
         """Reduced chi-square."""
-        return self.cost / max(self.rows, 1)
+        return self.neg2_log_posterior / max(self.rows, 1)
 
 
-def fit_window(problem: WindowProblem, prior: SoilPrior, before: Belief | None = None) -> Fit | None:
+def fit_window(problem: ObservationModel, prior: SoilPrior, before: Gaussian | None = None) -> Fit | None:
     """Posterior of a window of which nothing is known: descents from several soils, of which the best counts.
 
     `before` is what earlier windows told, in place of the prior.  None if no descent ends
     at a finite optimum.
     """
-    before = Belief.of(prior, problem.gain_std) if before is None else before
-    fitting = Fitting(problem, prior, before)
-    thin = Fitting(problem.thinned(THINNED), prior, before, with_gains=False)
+    before = Gaussian.of(prior, problem.gain_std) if before is None else before
+    fitting = Objective(problem, prior, before)
+    thin = Objective(problem.thinned(THINNED), prior, before, with_gains=False)
     with np.errstate(all="ignore"):
         ends = _ends(thin)
         best, led = _best(fitting, ends)
         if best is None or best.chi2 > PLAUSIBLE:
             return best
         if not best.converged:
-            near = approach(Fitting(problem, prior, before, with_gains=False), best.mode.soil, MAX_ITERATIONS, 0.0)
-            best = best if near is None else _fit_at(fitting, settle(fitting, near, MAX_ITERATIONS)) or best
+            near = descend_soil(
+                Objective(problem, prior, before, with_gains=False), best.mode.soil, MAX_ITERATIONS, 0.0
+            )
+            best = best if near is None else _fit_at(fitting, descend_jointly(fitting, near, MAX_ITERATIONS)) or best
         if not best.converged:
-            return calmed(fitting, best)
+            return refit_denoised(fitting, best)
         return _with_rival(fitting, thin, best, ends, led)
 
 
-def _best(fitting: Fitting, ends: Sequence[Place]) -> tuple[Fit | None, Place | None]:
+def _best(fitting: Objective, ends: Sequence[Iterate]) -> tuple[Fit | None, Iterate | None]:
     """Where the first of the optima on a few instants, the best first, leads that leads to one of all, and that one."""
-    unlike = [end for i, end in enumerate(ends) if i == 0 or end.cost > ends[i - 1].cost * (1.0 + SAME_END)]
+    unlike = [
+        end
+        for i, end in enumerate(ends)
+        if i == 0 or end.neg2_log_posterior > ends[i - 1].neg2_log_posterior * (1.0 + SAME_END)
+    ]
     best, led = None, None
     for end in unlike[:MAX_SETTLED]:
-        most = MAX_ITERATIONS if end.cost < HOPELESS * THINNED else MAX_HOPELESS
+        most = MAX_ITERATIONS if end.neg2_log_posterior < HOPELESS * THINNED else MAX_HOPELESS
         start = replace(fitting.start(end.soil), trials=end.trials)
-        fit = _fit_at(fitting, settle(fitting, start, most))
-        if fit is not None and (best is None or (fit.converged, -fit.cost) > (best.converged, -best.cost)):
+        fit = _fit_at(fitting, descend_jointly(fitting, start, most))
+        if fit is not None and (
+            best is None or (fit.converged, -fit.neg2_log_posterior) > (best.converged, -best.neg2_log_posterior)
+        ):
             best, led = fit, end
         if best is not None and best.converged:
             break
     return best, led
 
 
-def _with_rival(fitting: Fitting, thin: Fitting, found: Fit, ends: Sequence[Place], led: Place | None) -> Fit:
+def _with_rival(fitting: Objective, thin: Objective, found: Fit, ends: Sequence[Iterate], led: Iterate | None) -> Fit:
     """The more likely of an optimum and another one, with the other as its rival.
 
     The other is one of the ends on a few instants, but what `led` here, or the one across from what was found.
@@ -226,17 +245,19 @@ def _with_rival(fitting: Fitting, thin: Fitting, found: Fit, ends: Sequence[Plac
     end = _other_end(fitting, thin, found, ends, led) if np.ptp(fitting.problem.rig.width) > 0.0 else None
     if end is None:
         return found
-    other = _fit_at(fitting, settle(fitting, fitting.start(end.soil), MAX_ITERATIONS))
+    other = _fit_at(fitting, descend_jointly(fitting, fitting.start(end.soil), MAX_ITERATIONS))
     if other is None or not other.converged:
         return found
-    better, worse = (found, other) if found.evidence <= other.evidence else (other, found)
-    share = 1.0 / (1.0 + math.exp(min(0.5 * (worse.evidence - better.evidence), 50.0)))
+    better, worse = (found, other) if found.neg2_log_evidence <= other.neg2_log_evidence else (other, found)
+    share = 1.0 / (1.0 + math.exp(min(0.5 * (worse.neg2_log_evidence - better.neg2_log_evidence), 50.0)))
     if share < RARE or better.mode.posterior.distance(worse.mode.posterior.soil) < APART:
         return better
-    return replace(better, belief=better.mode, rival=Rival(worse.mode, share))
+    return replace(better, gaussian=better.mode, second_mode=SecondMode(worse.mode, share))
 
 
-def _other_end(fitting: Fitting, thin: Fitting, found: Fit, ends: Sequence[Place], led: Place | None) -> Place | None:
+def _other_end(
+    fitting: Objective, thin: Objective, found: Fit, ends: Sequence[Iterate], led: Iterate | None
+) -> Iterate | None:
     """Where a descent on a few instants ended about as low as at what was found, and far from it."""
     ill_told = math.sqrt(found.mode.covariance[_K_C, _K_C]) > ILL_TOLD
     apart = len({end.soil.tobytes() for end in ends}) > 1
@@ -245,13 +266,13 @@ def _other_end(fitting: Fitting, thin: Fitting, found: Fit, ends: Sequence[Place
         return None
     position = thin.coordinates.position(found.mode.soil)
 
-    def off(end: Place) -> float:
+    def off(end: Iterate) -> float:
         return here.length(thin.coordinates.position(end.soil) - position)
 
-    def is_elsewhere(end: Place) -> bool:
-        return end.cost < FAR_ABOVE * here.cost and off(end) > FAR**2
+    def is_elsewhere(end: Iterate) -> bool:
+        return end.neg2_log_posterior < FAR_ABOVE * here.neg2_log_posterior and off(end) > FAR**2
 
-    def led_here(end: Place) -> bool:
+    def led_here(end: Iterate) -> bool:
         return led is not None and np.array_equal(end.soil, led.soil)
 
     nearest = min(map(off, ends))
@@ -259,32 +280,35 @@ def _other_end(fitting: Fitting, thin: Fitting, found: Fit, ends: Sequence[Place
     start = fitting.coordinates.across(found.mode.soil) if ill_told and known is None else None
     if start is None:
         return known
-    end = approach(thin, start, MAX_APPROACH)
+    end = descend_soil(thin, start, MAX_APPROACH)
     return end if end is not None and is_elsewhere(end) else None
 
 
-def _ends(thin: Fitting) -> list[Place]:
+def _ends(thin: Objective) -> list[Iterate]:
     """Optima on a few instants of the window, the best first.
 
     Descents from unlike soils that meet at a plausible cost are proof enough; otherwise
     every start is tried.
     """
-    ends: list[Place] = []
+    ends: list[Iterate] = []
     for start in starting_soils(thin.problem, thin.coordinates.prior, thin.before):
-        end = approach(thin, np.asarray(start), MAX_APPROACH, known=ends)
+        end = descend_soil(thin, np.asarray(start), MAX_APPROACH, known=ends)
         if end is None:
             continue
-        met = any(abs(end.cost - other.cost) < SAME_END * other.cost for other in ends)
+        met = any(
+            abs(end.neg2_log_posterior - other.neg2_log_posterior) < SAME_END * other.neg2_log_posterior
+            for other in ends
+        )
         ends.append(end)
-        if met and end.cost < PLAUSIBLE * thin.problem.n_rows:
+        if met and end.neg2_log_posterior < PLAUSIBLE * thin.problem.n_rows:
             break
-    return sorted(ends, key=lambda end: end.cost)
+    return sorted(ends, key=lambda end: end.neg2_log_posterior)
 
 
-def starting_soils(problem: WindowProblem, prior: SoilPrior, before: Belief | None = None) -> Iterator[Soil]:
+def starting_soils(problem: ObservationModel, prior: SoilPrior, before: Gaussian | None = None) -> Iterator[Soil]:
     """What is believed (else the prior median), loam, and the known soils that foretell the window best."""
     yield Soil(*(prior.median if before is None else before.soil).tolist())
-    likeliest, *others = foretelling(problem, [near(prior, SOILS[kind]) for kind in KINDS])
+    likeliest, *others = ranked_by_likelihood(problem, [near(prior, SOILS[kind]) for kind in KINDS])
     yield likeliest
     yield near(prior, SOILS["loam"])
     yield from others[: MAX_KINDS - 1]
@@ -296,37 +320,45 @@ def near(prior: SoilPrior, soil: Soil) -> Soil:
     return Soil(*np.clip(soil, prior.median / reach, prior.median * reach).tolist())
 
 
-def descend(problem: WindowProblem, prior: SoilPrior, start: Soil, before: Belief | None = None) -> Fit | None:
+def fit_from_soil(
+    problem: ObservationModel, prior: SoilPrior, start: Soil, before: Gaussian | None = None
+) -> Fit | None:
     """Gauss-Newton from one start; None where the numbers stop being finite.
 
     Far from the optimum only the soil moves, with the latents at their measured values:
     latents and gains would take up whatever a wrong soil leaves.  Near it everything is
     relinearised together.
     """
-    before = Belief.of(prior, problem.gain_std) if before is None else before
+    before = Gaussian.of(prior, problem.gain_std) if before is None else before
     soil = np.where(prior.log_std > 0.0, np.asarray(start, float), prior.median)
     with np.errstate(all="ignore"):
-        near = approach(Fitting(problem, prior, before, with_gains=False), soil, MAX_ITERATIONS)
-        fitting = Fitting(problem, prior, before)
-        return None if near is None else _fit_at(fitting, settle(fitting, near, MAX_ITERATIONS))
+        near = descend_soil(Objective(problem, prior, before, with_gains=False), soil, MAX_ITERATIONS)
+        fitting = Objective(problem, prior, before)
+        return None if near is None else _fit_at(fitting, descend_jointly(fitting, near, MAX_ITERATIONS))
 
 
-def continued(
-    problem: WindowProblem,
+def fit_from(
+    problem: ObservationModel,
     prior: SoilPrior,
-    before: Belief,
+    before: Gaussian,
     start: Start,
     first: int,
-    effort: Effort = THOROUGH,
+    effort: DescentOptions = DEFAULT_OPTIONS,
 ) -> Fit | None:
     """Descent from a start, of whose gains those from the `first` on move with the soil from the beginning.
 
     Where a fit of the same model ended is near the optimum: everything moves from there,
     unless the numbers stop being finite.  The first step that makes things worse ends it: a slower descent is better.
     """
-    fitting, (most, hopeless, enough, little) = Fitting(problem, prior, before), effort
+    fitting, (most, give_up_above, enough, little) = Objective(problem, prior, before), effort
     compared = partial(
-        settle, fitting, left_over=enough, refusals=0, hopeless=hopeless, enough=enough, nothing=effort.nothing
+        descend_jointly,
+        fitting,
+        left_over=enough,
+        refusals=0,
+        give_up_above=give_up_above,
+        enough=enough,
+        nothing=effort.nothing,
     )
     gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
     with np.errstate(all="ignore"):
@@ -335,32 +367,32 @@ def continued(
             fit = _fit_at(fitting, compared(place, MAX_RESUMED))
             if fit is not None:
                 return fit
-        moving = Fitting(problem, prior, before, first=first)
-        near = approach(moving, start.soil, most // 2, little, gains, hopeless=AS_MEASURED * hopeless)
+        moving = Objective(problem, prior, before, first=first)
+        near = descend_soil(moving, start.soil, most // 2, little, gains, give_up_above=AS_MEASURED * give_up_above)
         if near is None:
             return None
         return _fit_at(fitting, compared(near, most))
 
 
 @dataclass(frozen=True, slots=True)
-class Foreseen:
+class WarmStart:
     """A window as the one just before lets expect it: linearised at that one's optimum."""
 
-    fitting: Fitting
-    place: Place
-    at: Linearised
+    fitting: Objective
+    place: Iterate
+    at: Linearisation
 
 
-def foreseen(problem: WindowProblem, prior: SoilPrior, last: Fit, before: Belief | None = None) -> Foreseen:
+def warm_start(problem: ObservationModel, prior: SoilPrior, last: Fit, before: Gaussian | None = None) -> WarmStart:
     """A window at the optimum of the one just before, where what both share is linearised already."""
-    fitting = Fitting(problem, prior, Belief.of(prior, problem.gain_std) if before is None else before)
+    fitting = Objective(problem, prior, Gaussian.of(prior, problem.gain_std) if before is None else before)
     with np.errstate(all="ignore"):
         latents, at = problem.after(last.optimum)
     soil = np.where(prior.log_std > 0.0, last.optimum.soil, prior.median)
-    return Foreseen(fitting, Place(soil, last.optimum.gains, latents, np.inf, 1), at)
+    return WarmStart(fitting, Iterate(soil, last.optimum.gains, latents, np.inf, 1), at)
 
 
-def resume(ahead: Foreseen) -> Fit | None:
+def fit_warm(ahead: WarmStart) -> Fit | None:
     """Descent from the optimum of the window just before; the first step costs nothing more."""
     fitting, near = ahead.fitting, ahead.place
     with np.errstate(all="ignore"):
@@ -369,11 +401,11 @@ def resume(ahead: Foreseen) -> Fit | None:
         if point is not None and step is not None:
             near = fitting.moved(near, point, step)
         first = 0.0 if point is None or step is None else point.length(step)
-        end = settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED, first, enough=CONVERGED_RESUMED)
+        end = descend_jointly(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED, first, enough=CONVERGED_RESUMED)
         return _fit_at(fitting, end)
 
 
-def calmed(fitting: Fitting, fit: Fit) -> Fit:
+def refit_denoised(fitting: Objective, fit: Fit) -> Fit:
     """A fit that has not converged, with the optimum of the denoised problem near it; as it is where there is none.
 
     Where loads and slips hardly vary, the fitted latents vary by noise alone, which Gauss-Newton takes for information:
@@ -384,10 +416,10 @@ def calmed(fitting: Fitting, fit: Fit) -> Fit:
         return fit
     optimum = fit.optimum
     with np.errstate(all="ignore"):
-        calm = DenoisedProblem(fitting.problem, optimum)
-        again = Fitting(calm, fitting.coordinates.prior, fitting.before)
-        calm_place = Place(optimum.soil, optimum.gains, calm.latents, np.inf, 1)
-        found = _fit_at(again, settle(again, calm_place, MAX_ITERATIONS, enough=CONVERGED_RESUMED))
+        calm = DenoisedObservationModel(fitting.problem, optimum)
+        again = Objective(calm, fitting.coordinates.prior, fitting.before)
+        calm_place = Iterate(optimum.soil, optimum.gains, calm.latents, np.inf, 1)
+        found = _fit_at(again, descend_jointly(again, calm_place, MAX_ITERATIONS, enough=CONVERGED_RESUMED))
         if found is None or not found.converged:
             return fit
         near = fitting.start(found.optimum.soil, optimum.latents.entry_angle, found.optimum.gains)
@@ -398,35 +430,35 @@ def calmed(fitting: Fitting, fit: Fit) -> Fit:
         return fit
     return replace(
         fit,
-        belief=found.belief,
+        gaussian=found.gaussian,
         mode=found.mode,
         sinkage=found.sinkage,
         optimum=Optimum(fitting.problem.t, place.soil, place.gains, place.latents, point.at),
-        cost=point.cost,
-        evidence=point.evidence,
+        neg2_log_posterior=point.neg2_log_posterior,
+        neg2_log_evidence=point.neg2_log_evidence,
         iterations=fit.iterations + found.iterations,
         converged=True,
     )
 
 
-def settled(fitting: Fitting, near: Place) -> Fit | None:
+def refine(fitting: Objective, near: Iterate) -> Fit | None:
     """Descent from a place near the optimum; None where the numbers stop being finite."""
-    return _fit_at(fitting, settle(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED))
+    return _fit_at(fitting, descend_jointly(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED))
 
 
-def _fit_at(fitting: Fitting, end: Settled | None) -> Fit | None:
+def _fit_at(fitting: Objective, end: Descent | None) -> Fit | None:
     """The end of a descent, with what is known there; None where the numbers stopped being finite."""
-    beliefs = None if end is None else fitting.beliefs(end.place, end.point, end.last.soil)
-    if end is None or beliefs is None:
+    gaussians = None if end is None else fitting.gaussians(end.place, end.point, end.last.soil)
+    if end is None or gaussians is None:
         return None
     fallen = end.length if end.converged else 0.0
     return Fit(
-        belief=beliefs[0] if end.converged else beliefs[1],
-        mode=beliefs[1],
+        gaussian=gaussians[0] if end.converged else gaussians[1],
+        mode=gaussians[1],
         sinkage=fitting.problem.mean_sinkage(end.place.as_soil(), end.place.gains, end.place.latents),
         optimum=Optimum(fitting.problem.t, end.last.soil, end.last.gains, end.last.latents, end.point.at),
-        cost=end.point.cost - fallen,
-        evidence=end.point.evidence - fallen,
+        neg2_log_posterior=end.point.neg2_log_posterior - fallen,
+        neg2_log_evidence=end.point.neg2_log_evidence - fallen,
         rows=fitting.problem.n_rows,
         iterations=end.iterations,
         converged=end.converged,

@@ -56,7 +56,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.measurements import Readings
+from soilbus.estimation.measurements import Measurements
 from soilbus.estimation.nuisance_parameters import Free, active_at, varied_at
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.dual import UNIT, Dual, slope_of, value_of
@@ -114,7 +114,7 @@ class Latents:
 
 
 @dataclass(slots=True)
-class Linearised:
+class Linearisation:
     """Residuals and derivatives at one point, with what an update of the latents needs.
 
     The columns of `rows` and `weighed` (R, 1 + 6 + G) are the residual and its derivatives
@@ -143,12 +143,12 @@ class Linearised:
         """Sum of squares of the whitened residuals."""
         return float(self.normal[0, 0])
 
-    def followed_by(self, shared: int, new: Linearised) -> Linearised:
+    def followed_by(self, shared: int, new: Linearisation) -> Linearisation:
         """The last `shared` instants of this and then those of another, linearised at the same soil and gains."""
         first = len(self.off) - shared
         row = first * self.by_latents.shape[1]
         rows, weighed = (np.concatenate([a[row:], b]) for a, b in ((self.rows, new.rows), (self.weighed, new.weighed)))
-        return Linearised(
+        return Linearisation(
             rows=rows,
             weighed=weighed,
             normal=rows.T @ weighed,
@@ -173,10 +173,10 @@ class Optimum:
     soil: Array
     gains: Array
     latents: Latents
-    at: Linearised
+    at: Linearisation
 
 
-class Bend(NamedTuple):
+class CurvedPathFit(NamedTuple):
     """Optimum of a window before its data were freed of a bending way, and how large bends (N, K) may be beforehand."""
 
     optimum: Optimum
@@ -274,7 +274,7 @@ class Response(NamedTuple):
     pull_by_effects: Array
 
 
-class Lateness(NamedTuple):
+class DelayTerms(NamedTuple):
     """What readings of channels that are not late would tell besides these, and its derivatives by the effects.
 
     torque (N, W) [N m], measured (N, 2 W + 1) of the latents, demand (N,) [N]; by_torque (P, N, W) and so on.
@@ -291,7 +291,7 @@ class Lateness(NamedTuple):
     by_predicted: Array
 
 
-class WindowProblem(Readings):
+class ObservationModel(Measurements):
     """One window's data and the model that is to explain it, ready to be linearised at any soil."""
 
     def __init__(
@@ -309,11 +309,11 @@ class WindowProblem(Readings):
         """Least and greatest gains (G,), infinite where any will do."""
         return np.full(len(self.gain_std), -np.inf), np.full(len(self.gain_std), np.inf)
 
-    def lateness(self, gains: Array, latents: Latents, torque: Array) -> Lateness | None:
+    def lateness(self, gains: Array, latents: Latents, torque: Array) -> DelayTerms | None:
         """Of gains (G,) and latents, with these torques (N, W) of the model; None where nothing is late."""
         return None
 
-    def thinned(self, most: int) -> WindowProblem:
+    def thinned(self, most: int) -> ObservationModel:
         """The same window with at most so many of its usable instants, evenly spread."""
         if self.n <= most:
             return self
@@ -343,7 +343,7 @@ class WindowProblem(Readings):
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(np.where(self.usable, self.sinkages(soil, gains, latents), 0.0).sum(0) / known)
 
-    def after(self, before: Optimum) -> tuple[Latents, Linearised]:
+    def after(self, before: Optimum) -> tuple[Latents, Linearisation]:
         """Latents and model of this window at the optimum of one that ends a little earlier.
 
         Instants that both share are taken over; the others are linearised at the measured
@@ -389,7 +389,7 @@ class WindowProblem(Readings):
             angle.ravel(), slip.ravel(), self._radius, self._width, K_L, soil.n, np.tan(soil.phi), soil.c, soil.K
         )
 
-    def linearise(self, soil: Soil, gains: Array, latents: Latents, by_sensors: bool = True) -> Linearised:
+    def linearise(self, soil: Soil, gains: Array, latents: Latents, by_sensors: bool = True) -> Linearisation:
         """Whitened residuals and derivatives at a soil, gains (G,) and latents; by_sensors: also by the sensors' gains.
 
         Without those derivatives it serves to move the soil and the effects only.
@@ -438,7 +438,7 @@ class WindowProblem(Readings):
             rows[self._missing] = 0.0
         weighed = inverse_covariance(A, variance, row_var, W) @ rows
         flat, weighed = rows.reshape(-1, rows.shape[2]), weighed.reshape(-1, rows.shape[2])
-        return Linearised(
+        return Linearisation(
             rows=flat,
             weighed=weighed,
             normal=flat.T @ weighed,
@@ -454,7 +454,7 @@ class WindowProblem(Readings):
             load_by_effects=at.load_by_effects,
         )
 
-    def late_residuals(self, late: Lateness | None, A: Array, gains: Array) -> Array:
+    def late_residuals(self, late: DelayTerms | None, A: Array, gains: Array) -> Array:
         """What late readings are off (N, m) at gains (G,), A (N, m, 2 W + 1) the residuals' derivatives by latents."""
         residual, W = np.zeros(A.shape[:2]), self.n_wheels
         if late is not None:
@@ -486,7 +486,7 @@ class WindowProblem(Readings):
         row_var[:, W] += self.draft_var * (of_draft**2 - 1.0)
         return of_torque, of_latents, of_draft, self._measured * of_latents, self._measured_var * of_latents**2, row_var
 
-    def standardised(self, at: Linearised, gains: Array) -> tuple[Array, Array]:
+    def standardised(self, at: Linearisation, gains: Array) -> tuple[Array, Array]:
         """Each residual given the others of its instant, over its std (N, m), and the derivatives (N, m, 6 + G).
 
         Rows of an instant: torque of each wheel, the draft balance, sinkage of each wheel
@@ -501,7 +501,7 @@ class WindowProblem(Readings):
         return weighed[:, :, 0], weighed[:, :, 1:]
 
     def by_form(self, optimum: Optimum) -> tuple[Array, Array]:
-        """Derivatives (R, 4) of the residuals by form.FORM at an optimum, and these weighed as `Linearised`."""
+        """Derivatives (R, 4) of the residuals by form.FORM at an optimum, and these weighed as `Linearisation`."""
         soil, gains, latents, at = Soil(*optimum.soil.tolist()), optimum.gains, optimum.latents, optimum.at
         W, (n, m) = self.n_wheels, at.by_latents.shape[:2]
         some = np.unique(np.linspace(0, n - 1, math.ceil(n / THINNED_FORM)).round().astype(int))
@@ -597,7 +597,7 @@ class WindowProblem(Readings):
             wheel_rows[:, :, 2 * W] = by_ground[kind]
         return A
 
-    def updated(self, at: Linearised, latents: Latents, soil_step: Array, gain_step: Array) -> Latents:
+    def updated(self, at: Linearisation, latents: Latents, soil_step: Array, gain_step: Array) -> Latents:
         """Latents after a step (6,) of the soil and (G,) of the gains, by the linear model."""
         N, W = self.n, self.n_wheels
         left = (at.weighed @ np.concatenate([[1.0], soil_step, gain_step])).reshape(N, 1, at.by_latents.shape[1])
@@ -609,7 +609,9 @@ class WindowProblem(Readings):
         more = load - latents.load - at.load_by_slip * slip_change
         return Latents(load, speed, ground, self.turned(at, latents.entry_angle, soil_step, gain_step, more))
 
-    def turned(self, at: Linearised, angle: Array, soil_step: Array, gain_step: Array, more_load: Any = 0.0) -> Array:
+    def turned(
+        self, at: Linearisation, angle: Array, soil_step: Array, gain_step: Array, more_load: Any = 0.0
+    ) -> Array:
         """Entry angles (N, W) after a step (6,) of the soil and (G,) of the gains, by the linear model.
 
         more_load (N, W) [N] is what wheels then carry besides, short of what a change of slip carries.
@@ -632,10 +634,10 @@ def _between(some: NDArray[np.intp], values: Array, n: int) -> Array:
     return np.asarray((1.0 - share) * values[..., after - 1, :] + share * values[..., after, :])
 
 
-class DenoisedProblem(WindowProblem):
+class DenoisedObservationModel(ObservationModel):
     """The problem near one of its optima, with latents as they are expected to be: only the entry angles follow."""
 
-    def __init__(self, problem: WindowProblem, optimum: Optimum) -> None:
+    def __init__(self, problem: ObservationModel, optimum: Optimum) -> None:
         self.__dict__.update(vars(problem))
         self._problem = problem
         W, fitted = problem.n_wheels, optimum.latents
@@ -664,7 +666,7 @@ class DenoisedProblem(WindowProblem):
         """Sinkage [m] of each wheel at each instant (N, W)."""
         return self._problem.sinkages(soil, gains, latents)
 
-    def linearise(self, soil: Soil, gains: Array, latents: Latents, by_sensors: bool = True) -> Linearised:
+    def linearise(self, soil: Soil, gains: Array, latents: Latents, by_sensors: bool = True) -> Linearisation:
         """Residuals and derivatives at the expected latents, weighed as at the optimum; updates leave these alone."""
         at = self._problem.linearise(soil, gains, latents, by_sensors)
         W, change = self.n_wheels, self._by_noise - at.by_latents
@@ -735,7 +737,7 @@ class _Wheels(NamedTuple):
     around: Surroundings
 
 
-class CompletedProblem(WindowProblem):
+class ObservationModelWithEffects(ObservationModel):
     """One window's data and the model with effects; `free` are the effects' parameters (P)."""
 
     def __init__(
@@ -934,7 +936,7 @@ class CompletedProblem(WindowProblem):
         )
         return by_draft, by_acceleration
 
-    def lateness(self, gains: Array, latents: Latents, torque: Array) -> Lateness | None:
+    def lateness(self, gains: Array, latents: Latents, torque: Array) -> DelayTerms | None:
         """Of readings y that are late by d and a low pass of tau: x(t) = (1 + tau d/dt) y(t + d).
 
         y(t + d) is y(t) + s(t + d) - s(t) with the curve s of the readings (see local_cubics): the noise of an instant
@@ -973,7 +975,7 @@ class CompletedProblem(WindowProblem):
         measured[:, :W], measured[:, 2 * W] = load[0] * self.usable, ground[0][:, 0]
         by_measured[:, :, :W], by_measured[:, :, 2 * W] = load[1] * self.usable, ground[1][:, :, 0]
         weight = 0.0 if self.rig.chassis is None else self.rig.chassis.mass * GRAVITY * np.cos(self.pitch)
-        return Lateness(
+        return DelayTerms(
             torque=read[0],
             measured=measured,
             demand=draft[0][:, 0] + weight * pitch[0][:, 0],

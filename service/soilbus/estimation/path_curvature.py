@@ -25,12 +25,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.gaussian import Belief
-from soilbus.estimation.measurements import Readings
-from soilbus.estimation.multistart import Fit, fit_window, settled
-from soilbus.estimation.observation_model import Bend, WindowProblem
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.measurements import Measurements
+from soilbus.estimation.multistart import Fit, fit_window, refine
+from soilbus.estimation.observation_model import CurvedPathFit, ObservationModel
 from soilbus.estimation.posterior import PARAMETERS
-from soilbus.estimation.solver import Fitting
+from soilbus.estimation.solver import Objective
 from soilbus.estimation.window import Rig, Window, pairs
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ def sides(rig: Rig) -> Array:
     return side
 
 
-def rim_differences(readings: Readings) -> Array:
+def rim_differences(readings: Measurements) -> Array:
     """Half the relative difference of rim speeds between the sides at each instant (N,); nan where not all turn."""
     side = sides(readings.rig)
     known = side != 0.0
@@ -55,7 +55,7 @@ def rim_differences(readings: Readings) -> Array:
     return np.where(readings.usable[:, known].all(axis=1), (rim @ side) / rim[:, known].sum(axis=1), np.nan)
 
 
-def rim_difference(readings: Readings) -> float:
+def rim_difference(readings: Measurements) -> float:
     """Root mean square of these over the window, 0 where none is known."""
     apart = rim_differences(readings)
     known = apart[np.isfinite(apart)]
@@ -74,7 +74,7 @@ class Curve(NamedTuple):
     of_gains: float
 
 
-def curve_of(readings: Readings) -> Curve:
+def curve_of(readings: Measurements) -> Curve:
     """The curve that a window may be driven on."""
     side = np.zeros(_SOIL + len(readings.gain_std))
     first = readings.gain_names.index(f"speed.{readings.rig.wheels[0]}")
@@ -83,12 +83,12 @@ def curve_of(readings: Readings) -> Curve:
     return Curve(side, rim_difference(readings), float(of_mean @ of_mean))
 
 
-def with_curve(belief: Belief, curve: Curve) -> Belief:
+def with_curve(gaussian: Gaussian, curve: Curve) -> Gaussian:
     """What is known before a window whose curve is not: as sharp as the rim speeds allow, either way."""
-    return replace(belief, covariance=belief.covariance + np.outer(curve.side, curve.side * curve.std**2))
+    return replace(gaussian, covariance=gaussian.covariance + np.outer(curve.side, curve.side * curve.std**2))
 
 
-def without_curve(belief: Belief, curve: Curve) -> Belief:
+def without_curve(gaussian: Gaussian, curve: Curve) -> Gaussian:
     """What a window leaves known for later ones: its curve is not theirs, and hides what the speed sensors have of it.
 
     Of that only its prior is left.
@@ -96,14 +96,14 @@ def without_curve(belief: Belief, curve: Curve) -> Belief:
     side = curve.side
     count = np.count_nonzero(side)
     if not count:
-        return belief
-    covariance = with_curve(belief, curve).covariance
+        return gaussian
+    covariance = with_curve(gaussian, curve).covariance
     mean_along = covariance @ side / count
     spread = float(side @ mean_along) / count + curve.of_gains
     if not spread > 0.0:
-        return belief
-    step = -mean_along / spread * float(side[_SOIL:] @ belief.gains) / count
-    return belief.moved(step, covariance - np.outer(mean_along, mean_along) / spread)
+        return gaussian
+    step = -mean_along / spread * float(side[_SOIL:] @ gaussian.gains) / count
+    return gaussian.moved(step, covariance - np.outer(mean_along, mean_along) / spread)
 
 
 APART = 1.0
@@ -114,7 +114,7 @@ FIRST_GAIN = 1 + len(PARAMETERS)
 """Column of Linearised.rows of the first gain."""
 
 
-class Way(NamedTuple):
+class CurvedPath(NamedTuple):
     """How the way bends: relative speeds (K,) beside the window's own curve at knots (K,) [s], and what they cost.
 
     occam: logarithm, squared, of the room that they had beforehand over what the window leaves of it.
@@ -122,11 +122,11 @@ class Way(NamedTuple):
 
     knots: Array
     relative: Array
-    cost: float
+    neg2_log_prior: float
     occam: float
 
 
-def bends(readings: Readings) -> tuple[Array, Array]:
+def curvature_basis(readings: Measurements) -> tuple[Array, Array]:
     """How large (K,) a curve may be at each knot, and the relative speeds (N, K) at the instants by such curves.
 
     As in `curve`, by the rim speeds: there and in the whole window.
@@ -146,7 +146,7 @@ def knots_of(t: Array) -> Array:
     return np.asarray(t[-1] - APART * np.arange(count, -1, -1))
 
 
-def along_bends(fitting: Fitting, fit: Fit) -> tuple[Array, Array]:
+def by_curvature(fitting: Objective, fit: Fit) -> tuple[Array, Array]:
     """Derivatives (N, m) of the residuals by a curve at their own instant, as a relative speed, and these weighed."""
     problem, at = fitting.problem, fit.optimum.at
     columns = [FIRST_GAIN + problem.gain_names.index(f"speed.{wheel}") for wheel in problem.rig.wheels]
@@ -154,7 +154,7 @@ def along_bends(fitting: Fitting, fit: Fit) -> tuple[Array, Array]:
     return (at.rows[:, columns] @ side).reshape(shape), (at.weighed[:, columns] @ side).reshape(shape)
 
 
-def bending(fitting: Fitting, fit: Fit | None) -> Way | None:
+def detected_curvature(fitting: Objective, fit: Fit | None) -> CurvedPath | None:
     """How the way bends, by the window linearised at the optimum of a fit; None where the data do not say so."""
     problem = fitting.problem
     if fit is None or not fit.converged or not sides(problem.rig).any():
@@ -163,8 +163,8 @@ def bending(fitting: Fitting, fit: Fit | None) -> Way | None:
     around = fitting.around(optimum)
     if around is None:
         return None
-    std, by_bends = bends(fitting.problem)
-    by_curve, weighed = along_bends(fitting, fit)
+    std, by_bends = curvature_basis(fitting.problem)
+    by_curve, weighed = by_curvature(fitting, fit)
     rows = optimum.at.rows.reshape(*weighed.shape, -1)
     across = by_bends.T @ (weighed[:, None] @ rows)[:, 0]
     of_gradient, of_information = around.explained(across @ around.directions)
@@ -175,16 +175,18 @@ def bending(fitting: Fitting, fit: Fit | None) -> Way | None:
     fall = -float(gradient @ bend)
     if not fall > BENT:
         return None
-    return Way(knots_of(optimum.t), bend * std, float(bend @ bend), float(np.linalg.slogdet(information)[1]))
+    return CurvedPath(knots_of(optimum.t), bend * std, float(bend @ bend), float(np.linalg.slogdet(information)[1]))
 
 
-def straightened(window: Window, rig: Rig, way: Way) -> Window:
+def straightened(window: Window, rig: Rig, way: CurvedPath) -> Window:
     """The window with the wheels' speeds as without these bends."""
     relative = np.interp(window.t, way.knots, way.relative)
     return replace(window, speed=window.speed / (1.0 + relative[:, None] * sides(rig)))
 
 
-def on_the_way(fitting: Fitting, fit: Fit, way: Way, straight: WindowProblem) -> tuple[Fitting, Fit]:
+def fit_on_curved_path(
+    fitting: Objective, fit: Fit, way: CurvedPath, straight: ObservationModel
+) -> tuple[Objective, Fit]:
     """The fit of the straightened data; where there is none that is better, the one there was.
 
     Bends may have led that far astray, so it is no more than a place to begin.
@@ -192,13 +194,18 @@ def on_the_way(fitting: Fitting, fit: Fit, way: Way, straight: WindowProblem) ->
     prior, before, optimum = fitting.coordinates.prior, fitting.before, fit.optimum
     if straight.n != fitting.problem.n:
         return fitting, fit
-    again = Fitting(straight, prior, before)
+    again = Objective(straight, prior, before)
     with np.errstate(all="ignore"):
-        new = settled(again, again.start(optimum.soil, optimum.latents.entry_angle, optimum.gains))
+        new = refine(again, again.start(optimum.soil, optimum.latents.entry_angle, optimum.gains))
     if new is None or not new.converged:
         new = fit_window(straight, prior, before)
-    if new is None or not new.converged or new.cost + way.cost > fit.cost:
+    if new is None or not new.converged or new.neg2_log_posterior + way.neg2_log_prior > fit.neg2_log_posterior:
         return fitting, fit
-    cost, evidence = new.cost + way.cost, new.evidence + way.cost + way.occam
-    bend = Bend(optimum, bends(fitting.problem)[1])
-    return again, replace(new, cost=cost, evidence=min(fit.evidence, evidence), bend=bend)
+    cost, neg2_log_evidence = (
+        new.neg2_log_posterior + way.neg2_log_prior,
+        new.neg2_log_evidence + way.neg2_log_prior + way.occam,
+    )
+    bend = CurvedPathFit(optimum, curvature_basis(fitting.problem)[1])
+    return again, replace(
+        new, neg2_log_posterior=cost, neg2_log_evidence=min(fit.neg2_log_evidence, neg2_log_evidence), bend=bend
+    )

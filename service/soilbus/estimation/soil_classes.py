@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.terra.entry_angle import entry_angle_for_load
@@ -142,7 +142,7 @@ def _evidence(posterior: Posterior, guess: SoilPrior, width: float, scale: Array
     return _Evidence(free[counted], direction / scale, direction @ towards / strength, 1.0 / strength)
 
 
-def foretelling(problem: WindowProblem, soils: Sequence[Soil]) -> list[Soil]:
+def ranked_by_likelihood(problem: ObservationModel, soils: Sequence[Soil]) -> list[Soil]:
     """The soils, those first that foretell torque, pull and sinkage of a window best at its loads and slips."""
     few = problem.thinned(FEW)
     radius, shape = few.rig.radius, (len(soils), *few.load.shape)

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.gaussian import Belief, Earlier, Known, solved
-from soilbus.estimation.observation_model import Latents, Linearised, Optimum, WindowProblem
+from soilbus.estimation.gaussian import Gaussian, PriorFactor, PriorQuadratic, solve_with_inverse
+from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModel, Optimum
 from soilbus.estimation.parametrization import (
     MAX_STEP,
     TYPICAL_DEPTH,
@@ -41,13 +41,13 @@ _K_C, _K_PHI, _N = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n"))
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class Iterate:
     """A soil (6,) in SI with gains (G,) and latents, what it costs, and how many evaluations led there."""
 
     soil: Array
     gains: Array
     latents: Latents
-    cost: float
+    neg2_log_posterior: float
     trials: int
 
     def as_soil(self) -> Soil:
@@ -56,7 +56,7 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
+class QuadraticModel:
     """Normal equations by the free coordinates (F) and active gains (A) at one place.
 
     information (F + A, F + A) is Gauss-Newton's, of which `known` is what was known
@@ -69,9 +69,9 @@ class Point:
     known: Array
     bend: Array
     gradient: Array
-    cost: float
+    neg2_log_posterior: float
     edges: Array
-    at: Linearised
+    at: Linearisation
 
     def step(self, damping: float = 0.0, gradient: Array | None = None) -> Array | None:
         """Step (F + A,) to the minimum, held back in proportion to the diagonal; None where there is none.
@@ -96,16 +96,18 @@ class Point:
         return step if np.isfinite(step).all() else None
 
     @property
-    def evidence(self) -> float:
+    def neg2_log_evidence(self) -> float:
         """-2 log of the data's likelihood whatever the soil may be (Laplace), up to the same constant."""
-        return self.cost + float(np.linalg.slogdet(self.information)[1] - np.linalg.slogdet(self.known)[1])
+        return self.neg2_log_posterior + float(
+            np.linalg.slogdet(self.information)[1] - np.linalg.slogdet(self.known)[1]
+        )
 
     def length(self, step: Array) -> float:
         """Squared length of a step in standard deviations."""
         return float(step @ self.information @ step)
 
 
-class Around(NamedTuple):
+class GaussianApproximation(NamedTuple):
     """A window that is linear about an optimum: what its data and what was known before tell there.
 
     directions (1 + 6 + G, F + A): as Fitting.directions; known: what was known before; step (F + A,), to be taken
@@ -113,7 +115,7 @@ class Around(NamedTuple):
     """
 
     directions: Array
-    known: Known
+    known: PriorQuadratic
     step: Array
     covariance: Array
 
@@ -122,11 +124,11 @@ class Around(NamedTuple):
         return mixed @ self.step, mixed @ self.covariance @ mixed.T
 
 
-class Fitting:
+class Objective:
     """A window's residuals together with what was known before (`earlier`): free coordinates (F), active gains (A)."""
 
     def __init__(
-        self, problem: WindowProblem, prior: SoilPrior, before: Belief, with_gains: bool = True, first: int = 0
+        self, problem: ObservationModel, prior: SoilPrior, before: Gaussian, with_gains: bool = True, first: int = 0
     ) -> None:
         """Raises ValueError where `before` has no proper covariance; gains before the `first` one are held."""
         self.problem, self.before = problem, before
@@ -141,26 +143,26 @@ class Fitting:
         self._of_gains = np.zeros((7 + len(before.gains), len(self._identity)))
         self._of_gains[7 + self.active] = self._identity[len(self.free) :]
         self._by_sensors = with_gains and first == 0
-        self.earlier = Earlier(before, prior, self.active)
-        self._last: tuple[Array, Array, Known] | None = None
-        self._around: tuple[Optimum, Around | None] | None = None
+        self.earlier = PriorFactor(before, prior, self.active)
+        self._last: tuple[Array, Array, PriorQuadratic] | None = None
+        self._around: tuple[Optimum, GaussianApproximation | None] | None = None
 
-    def given(self, before: Belief) -> Fitting:
+    def given(self, before: Gaussian) -> Objective:
         """The same with something else known before."""
-        return Fitting(self.problem, self.coordinates.prior, before)
+        return Objective(self.problem, self.coordinates.prior, before)
 
-    def start(self, soil: Array, guess: Array | None = None, gains: Array | None = None) -> Place:
+    def start(self, soil: Array, guess: Array | None = None, gains: Array | None = None) -> Iterate:
         """A soil with gains as believed, or these (G,), and latents as measured; angles solved from a guess (N, W)."""
         gains = self.before.gains if gains is None else gains
-        return Place(soil, gains, self.problem.start(Soil(*soil.tolist()), guess, gains), np.inf, 0)
+        return Iterate(soil, gains, self.problem.start(Soil(*soil.tolist()), guess, gains), np.inf, 0)
 
-    def near(self, soil: Array, gains: Array, latents: Latents | None) -> Place:
+    def near(self, soil: Array, gains: Array, latents: Latents | None) -> Iterate:
         """A soil with gains (G,) and the latents foreseen there where they are of these instants, else as measured."""
         if latents is None or latents.load.shape != (self.problem.n, self.problem.n_wheels):
             return self.start(soil, gains=gains)
-        return Place(soil, gains, latents, np.inf, 0)
+        return Iterate(soil, gains, latents, np.inf, 0)
 
-    def restarted(self, place: Place, point: Point, step: Array) -> Place:
+    def restarted(self, place: Iterate, point: QuadraticModel, step: Array) -> Iterate:
         """The place after a step (F + A,) with latents as measured, as they are at this place already."""
         free, gains = len(self.free), place.gains.copy()
         step = self.reach(place, step) * step
@@ -169,12 +171,12 @@ class Fitting:
         angle = self.problem.turned(point.at, place.latents.entry_angle, soil - place.soil, gains - place.gains)
         return self._reached(place, point, soil, gains, replace(place.latents, entry_angle=angle))
 
-    def point(self, place: Place) -> Point | None:
+    def point(self, place: Iterate) -> QuadraticModel | None:
         """The normal equations at a place; None where the model is not finite."""
         at = self.problem.linearise(place.as_soil(), place.gains, place.latents, self._by_sensors)
         return self.with_before(place, at)
 
-    def with_before(self, place: Place, at: Linearised) -> Point | None:
+    def with_before(self, place: Iterate, at: Linearisation) -> QuadraticModel | None:
         """Those of residuals linearised already."""
         free = len(self.free)
         directions = self.directions(place)
@@ -182,22 +184,22 @@ class Fitting:
             directions = np.delete(directions, slice(7, 7 + self.problem.n_sensors), axis=0)
         gradient = directions.T @ at.normal[:, 0]
         known = self.before_at(place)
-        cost = at.chi2 + known.cost
+        cost = at.chi2 + known.neg2_log_prior
         if not math.isfinite(cost):
             return None
         bend = np.zeros_like(self._identity)
         bend[:free, :free] = self.coordinates.bend((gradient + known.of_data)[:free])
-        return Point(
+        return QuadraticModel(
             information=directions.T @ at.normal @ directions + known.information,
             known=known.information,
             bend=bend,
             gradient=gradient + known.gradient,
-            cost=cost,
+            neg2_log_posterior=cost,
             edges=self._edges(place),
             at=at,
         )
 
-    def before_at(self, place: Place) -> Known:
+    def before_at(self, place: Iterate) -> PriorQuadratic:
         """What was known before, seen from a place; asked again from the last one's soil and gains, it is at hand."""
         if self._last is None or self._last[0] is not place.soil or self._last[1] is not place.gains:
             by_logs = self._identity.copy()
@@ -205,14 +207,16 @@ class Fitting:
             self._last = place.soil, place.gains, self.earlier.seen_from(place.soil, place.gains, by_logs)
         return self._last[2]
 
-    def around(self, optimum: Optimum) -> Around | None:
+    def around(self, optimum: Optimum) -> GaussianApproximation | None:
         """The linear window about an optimum, at hand when asked for it again; None where it tells nothing."""
         if self._around is None or self._around[0] is not optimum:
-            place = Place(optimum.soil, optimum.gains, optimum.latents, math.nan, 0)
+            place = Iterate(optimum.soil, optimum.gains, optimum.latents, math.nan, 0)
             directions, known = self.directions(place), self.before_at(place)
             by_unknowns = directions.T @ optimum.at.normal
-            solution = solved(by_unknowns @ directions + known.information, by_unknowns[:, 0] + known.gradient)
-            self._around = optimum, None if solution is None else Around(directions, known, *solution)
+            solution = solve_with_inverse(
+                by_unknowns @ directions + known.information, by_unknowns[:, 0] + known.gradient
+            )
+            self._around = optimum, None if solution is None else GaussianApproximation(directions, known, *solution)
         return self._around[1]
 
     def spread(self, optimum: Optimum) -> Array:
@@ -226,13 +230,13 @@ class Fitting:
         kept = np.concatenate([self.free, _SOIL + self.active])
         return self.earlier.slopes(optimum.soil, self.spread(optimum)[kept])
 
-    def directions(self, place: Place) -> Array:
+    def directions(self, place: Iterate) -> Array:
         """What a column of Linearised.rows (1 + 6 + G) has of each coordinate and active gain (F + A)."""
         directions = self._of_gains.copy()
         directions[1:7, : len(self.free)] = place.soil[:, None] * self._log_directions(place.soil)
         return directions
 
-    def moved(self, place: Place, point: Point, step: Array) -> Place:
+    def moved(self, place: Iterate, point: QuadraticModel, step: Array) -> Iterate:
         """The place after a step (F + A,), with the latents that the linear model foresees."""
         free = len(self.free)
         step = self.reach(place, step) * step
@@ -242,12 +246,12 @@ class Fitting:
         latents = self.problem.updated(point.at, place.latents, soil - place.soil, gain_step)
         return self._reached(place, point, soil, place.gains + gain_step, latents)
 
-    def bend(self, place: Place, point: Point, step: Array, there: Point) -> Array:
+    def bend(self, place: Iterate, point: QuadraticModel, step: Array, there: QuadraticModel) -> Array:
         """Second derivative of the residuals (R,) along a step (F + A,) that led from the place to `there`."""
         straight = point.at.rows @ (self.directions(place) @ step)
         return np.asarray(2.0 * (there.at.rows[:, 0] - point.at.rows[:, 0] - straight))
 
-    def turned(self, place: Place, point: Point, share: float, bend: Array) -> Array | None:
+    def turned(self, place: Iterate, point: QuadraticModel, share: float, bend: Array) -> Array | None:
         """A share of the full step that bends (R,) as the valley does (F + A,); None where there is no step.
 
         Geodesic acceleration: Transtrum & Sethna 2012, arXiv:1201.5885.
@@ -255,7 +259,7 @@ class Fitting:
         turning = self.directions(place).T @ (point.at.weighed.T @ bend)
         return point.step(gradient=share * point.gradient + 0.5 * share**2 * turning)
 
-    def _edges(self, place: Place) -> Array:
+    def _edges(self, place: Iterate) -> Array:
         """Directions (E, F + A) in which no step from there can go."""
         of_soil = self.coordinates.edges(place.soil)
         if not (self._has_bounds or len(of_soil)):
@@ -267,7 +271,7 @@ class Fitting:
         edges[len(of_soil) + np.arange(len(own)), len(self.free) + own] = at[own]
         return edges
 
-    def reach(self, place: Place, step: Array) -> float:
+    def reach(self, place: Iterate, step: Array) -> float:
         """Share of a step (F + A,) that can be taken."""
         free = len(self.free)
         of_soil = self.coordinates.reach(place.soil, step[:free])
@@ -277,27 +281,27 @@ class Fitting:
         room = np.where(step[free:] > 0.0, high, low) - place.gains[self.active]
         return min(of_soil, share_of_step(room, step[free:]))
 
-    def _reached(self, place: Place, point: Point, soil: Array, gains: Array, latents: Latents) -> Place:
+    def _reached(self, place: Iterate, point: QuadraticModel, soil: Array, gains: Array, latents: Latents) -> Iterate:
         """Soil (6,), gains (G,) and foreseen latents as a place, with the entry angles solved where they turn far."""
         turn = np.abs(latents.entry_angle / place.latents.entry_angle - 1.0).max(initial=0.0)
         if turn > (LONG_TURN_WITH_EFFECTS if len(point.at.load_by_effects) else LONG_TURN):
             latents = self.problem.carried(latents, Soil(*soil.tolist()), gains)
-        return Place(soil, gains, latents, point.cost, place.trials)
+        return Iterate(soil, gains, latents, point.neg2_log_posterior, place.trials)
 
-    def carried(self, place: Place) -> Place:
+    def carried(self, place: Iterate) -> Iterate:
         """The same place with the entry angles solved anew: linear models in a row may have lost them."""
         return replace(place, latents=self.problem.carried(place.latents, place.as_soil(), place.gains))
 
-    def beliefs(self, place: Place, point: Point, at: Array) -> tuple[Belief, Belief] | None:
+    def gaussians(self, place: Iterate, point: QuadraticModel, at: Array) -> tuple[Gaussian, Gaussian] | None:
         """What this optimum tells, by its moments and by its curvature; None where the information is singular.
 
         The point is of a soil (6,) one step away, `at`.  Without moments that are finite both are the curvature's.
         """
-        inverse = solved(point.information, point.gradient)
+        inverse = solve_with_inverse(point.information, point.gradient)
         if inverse is None:
             return None
         covariance = inverse[1]
-        mode = self._belief(place.soil, place.gains, covariance, at)
+        mode = self._gaussian(place.soil, place.gains, covariance, at)
         if not {_K_C, _K_PHI} <= set(self.free.tolist()) or covariance[_K_PHI, _K_PHI] > WELL_TOLD**2:
             return mode, mode
         moments = self._moments(place, point)
@@ -308,9 +312,9 @@ class Fitting:
         soil = self.coordinates.soil_at(self.coordinates.position(place.soil) + step[:free])
         gains[self.active] += step[free:]
         by_share = self._by_share(soil)
-        return self._belief(soil, gains, by_share @ moments.covariance @ by_share.T), mode
+        return self._gaussian(soil, gains, by_share @ moments.covariance @ by_share.T), mode
 
-    def _moments(self, place: Place, point: Point) -> Moments | None:
+    def _moments(self, place: Iterate, point: QuadraticModel) -> Moments | None:
         """Moments of the logarithm of k_c's share in K_L, the other coordinates and the gains, about the optimum."""
         others = np.arange(1, len(point.gradient))
         by_share = self._by_share(place.soil)
@@ -338,23 +342,23 @@ class Fitting:
         by_share[_K_C, : len(self.free)] += np.where(self.free == _N, -soil[_N] * np.log(TYPICAL_DEPTH), 0.0)
         return by_share
 
-    def _belief(self, soil: Array, gains: Array, covariance: Array, at: Array | None = None) -> Belief:
+    def _gaussian(self, soil: Array, gains: Array, covariance: Array, at: Array | None = None) -> Gaussian:
         """The belief with this covariance (F + A, F + A) of coordinates and active gains, there or at a soil nearby."""
         free = len(self.free)
         spread = self._of_gains[1:].copy()
         spread[:_SOIL, :free] = self._log_directions(soil if at is None else at)
-        return Belief(soil, gains, spread @ covariance @ spread.T)
+        return Gaussian(soil, gains, spread @ covariance @ spread.T)
 
-    def believed(self, place: Place, covariance: Array) -> Belief:
+    def believed(self, place: Iterate, covariance: Array) -> Gaussian:
         """A place with the covariance (F + A, F + A) of its coordinates and active gains."""
-        return self._belief(place.soil, place.gains, covariance)
+        return self._gaussian(place.soil, place.gains, covariance)
 
-    def changed(self, belief: Belief, step: Array, covariance: Array) -> Belief:
+    def changed(self, gaussian: Gaussian, step: Array, covariance: Array) -> Gaussian:
         """A belief after a step (F + A,) that brings as much covariance (F + A, F + A) with it."""
-        free, gains = len(self.free), belief.gains.copy()
+        free, gains = len(self.free), gaussian.gains.copy()
         gains[self.active] += step[free:]
-        added = self._belief(self.coordinates.moved(belief.soil, step[:free]), gains, covariance)
-        return replace(added, covariance=belief.covariance + added.covariance)
+        added = self._gaussian(self.coordinates.moved(gaussian.soil, step[:free]), gains, covariance)
+        return replace(added, covariance=gaussian.covariance + added.covariance)
 
     def _log_directions(self, soil: Array) -> Array:
         return self.coordinates.log_directions(soil)
@@ -397,33 +401,33 @@ FAR = 10.0
 """Standard deviations on a few instants beyond which an end is not the optimum looked at."""
 
 
-class Settled(NamedTuple):
+class Descent(NamedTuple):
     """Where a descent ended: the place one step on from the `last` one, whose `point` foresaw it.
 
     length is the squared length of that step in posterior standard deviations.
     """
 
-    place: Place
-    last: Place
-    point: Point
+    place: Iterate
+    last: Iterate
+    point: QuadraticModel
     length: float
     iterations: int
     converged: bool
 
 
-def approach(
-    fitting: Fitting,
+def descend_soil(
+    fitting: Objective,
     soil: Array,
     most: int,
     least: float = ENOUGH,
     gains: Array | None = None,
-    known: Sequence[Place] = (),
-    hopeless: float = np.inf,
-) -> Place | None:
+    known: Sequence[Iterate] = (),
+    give_up_above: float = np.inf,
+) -> Iterate | None:
     """Levenberg-damped steps of the soil and the active gains, latents as measured, until they are short.
 
     A descent that is foreseen to end at one of the `known` places ends there at once; one
-    that is foreseen to cost more than `hopeless`, or that has no further step, is None.
+    that is foreseen to cost more than `give_up_above`, or that has no further step, is None.
     """
     place = fitting.start(soil, gains=gains)
     point = fitting.point(place)
@@ -433,27 +437,27 @@ def approach(
         if step is None:
             return None
         length = point.length(step)
-        if point.cost - length > hopeless:
+        if point.neg2_log_posterior - length > give_up_above:
             return None
         if length < SETTLING or trials >= most or damping > 1e6:
-            return replace(place, cost=point.cost, trials=trials)
+            return replace(place, neg2_log_posterior=point.neg2_log_posterior, trials=trials)
         for end in known:
             if _leads_to(fitting, place, point, step, end):
                 return replace(end, trials=trials)
         new_place = fitting.restarted(place, point, step)
         new = fitting.point(new_place)
         trials += 1
-        if new is None or new.cost >= point.cost:
+        if new is None or new.neg2_log_posterior >= point.neg2_log_posterior:
             damping, ease = 10.0 * damping, 1.0
             continue
-        enough = point.cost - new.cost < least * point.cost
+        enough = point.neg2_log_posterior - new.neg2_log_posterior < least * point.neg2_log_posterior
         place, point, damping, ease = new_place, new, damping * ease, 0.1
         if enough:
-            return replace(place, cost=point.cost, trials=trials)
+            return replace(place, neg2_log_posterior=point.neg2_log_posterior, trials=trials)
     return None
 
 
-def _leads_to(fitting: Fitting, place: Place, point: Point, step: Array, end: Place) -> bool:
+def _leads_to(fitting: Objective, place: Iterate, point: QuadraticModel, step: Array, end: Iterate) -> bool:
     """Whether a step of the soil comes so near to where another descent ended that this one will end there too.
 
     Only a short step is trusted to tell.
@@ -464,7 +468,7 @@ def _leads_to(fitting: Fitting, place: Place, point: Point, step: Array, end: Pl
     return point.length(off) < FAR**2
 
 
-def _stride(point: Point, last: Array, share: float, step: Array) -> float:
+def _stride(point: QuadraticModel, last: Array, share: float, step: Array) -> float:
     """How many times a step to go that follows this share of the last one (Aitken's extrapolation).
 
     More than once where steps shrink slowly, less where they turn back.
@@ -473,40 +477,40 @@ def _stride(point: Point, last: Array, share: float, step: Array) -> float:
     return min(1.0 / max(1.0 - left, 1.0 / MAX_STRIDE), MAX_STRIDE) if abs(left) > SLOWLY else 1.0
 
 
-def settle(
-    fitting: Fitting,
-    near: Place,
+def descend_jointly(
+    fitting: Objective,
+    near: Iterate,
     most: int,
     left_over: float = LEFT_OVER,
     before: float = 0.0,
     refusals: int = MAX_REFUSED,
-    hopeless: float = np.inf,
+    give_up_above: float = np.inf,
     enough: float = CONVERGED,
     nothing: float = 0.0,
-) -> Settled | None:
+) -> Descent | None:
     """Steps of soil, gains and latents together from a place near the optimum.
 
     `before` is the squared length of the step that led there, if it was one of these; a step
     of less than `enough` is the last, and one after which the cost twice fell by less than
     `nothing` though little more was foreseen: along a bent valley steps overshoot for ever.
-    Given up after more `refusals` in a row, and where the foreseen cost is above `hopeless`.
+    Given up after more `refusals` in a row, and where the foreseen cost is above `give_up_above`.
     None where the numbers stop being finite.
 
     A step that makes things worse is taken back and tried again shorter: damping would
     hold back just the weak directions, along which the steps overshoot.
     """
-    best: tuple[Place, Point] | None = None
+    best: tuple[Iterate, QuadraticModel] | None = None
     share, length, refused = 1.0, np.inf, 0
     iterations, converged = near.trials, False
     last_step: Array | None = None
     last_share = 1.0
     worse = np.inf
-    lowest: Settled | None = None
+    lowest: Descent | None = None
     idle = 0
     for _ in range(most):
         iterations += 1
         point = fitting.point(near)
-        if best is not None and (point is None or point.cost > best[1].cost + worse):
+        if best is not None and (point is None or point.neg2_log_posterior > best[1].neg2_log_posterior + worse):
             near, point = best
             if refused == 1:
                 near = fitting.carried(near)
@@ -521,7 +525,7 @@ def settle(
         full = None if point is None else point.step()
         if point is None or full is None:
             return None
-        worse = WORSE if best is not None else WORSE + AT_FIRST * point.cost
+        worse = WORSE if best is not None else WORSE + AT_FIRST * point.neg2_log_posterior
         best = (near, point)
         length = point.length(full)
         if last_step is not None and share == 1.0:
@@ -530,15 +534,19 @@ def settle(
         last_step, last_share = full, share
         converged = length < enough or (share == 1.0 and length * length < left_over * before)
         before = length if share == 1.0 else 0.0
-        if converged or point.cost - length > hopeless:
+        if converged or point.neg2_log_posterior - length > give_up_above:
             break
-        idle = idle + 1 if lowest is not None and lowest.point.cost - point.cost < nothing else 0
-        if lowest is None or point.cost < lowest.point.cost:
-            lowest = Settled(near, *best, length, iterations, converged=True)
+        idle = (
+            idle + 1
+            if lowest is not None and lowest.point.neg2_log_posterior - point.neg2_log_posterior < nothing
+            else 0
+        )
+        if lowest is None or point.neg2_log_posterior < lowest.point.neg2_log_posterior:
+            lowest = Descent(near, *best, length, iterations, converged=True)
         if nothing > 0.0 and idle >= IDLE and lowest.length < NEARLY:
             return lowest._replace(iterations=iterations)
     if best is None:
         return None
     if not converged and lowest is not None and lowest.length < CONVERGED_RESUMED:
         return lowest._replace(iterations=iterations)
-    return Settled(near, *best, length, iterations, converged)
+    return Descent(near, *best, length, iterations, converged)

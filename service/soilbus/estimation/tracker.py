@@ -31,18 +31,25 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.change_detection import Crossing, suspicion, without_crossing
-from soilbus.estimation.drift_filter import at_present
-from soilbus.estimation.gaussian import Belief
-from soilbus.estimation.laplace import with_whole
+from soilbus.estimation.change_detection import Transition, change_statistic, without_transition
+from soilbus.estimation.drift_filter import at_window_end
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.laplace import with_nested_laplace
 from soilbus.estimation.model_form import FormLeft, form_left
-from soilbus.estimation.multistart import Fit, Foreseen, calmed, fit_window, foreseen, resume
+from soilbus.estimation.multistart import Fit, WarmStart, fit_warm, fit_window, refit_denoised, warm_start
 from soilbus.estimation.nuisance_parameters import Free
-from soilbus.estimation.observation_model import CompletedProblem, WindowProblem, Work
+from soilbus.estimation.observation_model import ObservationModel, ObservationModelWithEffects, Work
 from soilbus.estimation.parametrization import Coordinates
-from soilbus.estimation.path_curvature import bending, curve_of, on_the_way, straightened, with_curve, without_curve
+from soilbus.estimation.path_curvature import (
+    curve_of,
+    detected_curvature,
+    fit_on_curved_path,
+    straightened,
+    with_curve,
+    without_curve,
+)
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-from soilbus.estimation.solver import Fitting
+from soilbus.estimation.solver import Objective
 from soilbus.estimation.window import Rig, Window, window_of_samples
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.soils import SOILS
@@ -86,7 +93,7 @@ class Settings:
 
 
 @dataclass(frozen=True, slots=True)
-class Tracked:
+class TrackerOutput:
     """A window's fit (None without), whether the model fails to describe its data, and of which ground they are.
 
     since [s] is where the data that count begin; standstill and turning count instants left out.
@@ -109,7 +116,7 @@ PERSISTENCE = 86400.0
 _SOIL = len(PARAMETERS)
 
 
-def recalled(belief: Belief, soil: SoilPrior, gain_std: Array, elapsed: float) -> Belief:
+def prior_from_last_run(gaussian: Gaussian, soil: SoilPrior, gain_std: Array, elapsed: float) -> Gaussian:
     """What is left of a belief after a pause of so many seconds: gains (G,), each drawn back to its prior.
 
     Of the soil nothing is left but its prior: where the vehicle stands now nobody has
@@ -118,28 +125,28 @@ def recalled(belief: Belief, soil: SoilPrior, gain_std: Array, elapsed: float) -
     Phys. Rev. 36, 823), so that a long pause leaves the prior.
     """
     kept = math.exp(-elapsed / PERSISTENCE) * (gain_std > 0.0)
-    covariance = np.zeros_like(belief.covariance)
+    covariance = np.zeros_like(gaussian.covariance)
     covariance[:_SOIL, :_SOIL] = np.diag(soil.log_std**2)
-    of_gains = kept[:, None] * belief.covariance[_SOIL:, _SOIL:] * kept
+    of_gains = kept[:, None] * gaussian.covariance[_SOIL:, _SOIL:] * kept
     covariance[_SOIL:, _SOIL:] = of_gains + np.diag((1.0 - kept**2) * gain_std**2)
-    return Belief(soil.median, kept * belief.gains, covariance)
+    return Gaussian(soil.median, kept * gaussian.gains, covariance)
 
 
-def is_borne_out(problem: WindowProblem, soil: SoilPrior, known: Belief) -> bool:
+def passes_prior_conflict_test(problem: ObservationModel, soil: SoilPrior, known: Gaussian) -> bool:
     """Whether a window's data are at least as likely with what is known of the gains as with their prior alone.
 
     A sensor that was exchanged or calibrated meanwhile has another error than it had.
     """
-    anew = fit_window(problem, soil, Belief.of(soil, problem.gain_std))
+    anew = fit_window(problem, soil, Gaussian.of(soil, problem.gain_std))
     fit = fit_window(problem, soil, known)
     if fit is None or not fit.converged:
         return False
-    return anew is None or not anew.converged or fit.evidence <= anew.evidence
+    return anew is None or not anew.converged or fit.neg2_log_evidence <= anew.neg2_log_evidence
 
 
 def gain_errors(rig: Rig, model: WheelModel, free: Sequence[Free]) -> tuple[list[str], Array]:
     """Names and prior std (G,) of the gain errors that every window of a vehicle has, its effects' parameters last."""
-    problem = CompletedProblem(window_of_samples(rig, np.array([0.5]), {}), rig, model, 0.0, free=free)
+    problem = ObservationModelWithEffects(window_of_samples(rig, np.array([0.5]), {}), rig, model, 0.0, free=free)
     return problem.gain_names, problem.gain_std
 
 
@@ -147,7 +154,7 @@ OFF_SCALE = 25.0
 """Fall of the cost, if sinkages were measured on another scale, from which that is no noise."""
 
 
-def sinkages_off_scale(fitting: Fitting, fit: Fit) -> bool:
+def sinkages_off_scale(fitting: Objective, fit: Fit) -> bool:
     """Whether the sinkages of all wheels, or of one, would fit much better on another scale; no where there are none.
 
     The information that the noise of loads and speeds leaves of the scale is taken too
@@ -208,7 +215,7 @@ WHEELBASE = 2.0
 _SAME_TIME = 1e-3
 
 
-class Alarm(NamedTuple):
+class ChangePoint(NamedTuple):
     """When the data first disagreed with the soil known [s], and how fast the vehicle then was [m/s]."""
 
     t: float
@@ -260,7 +267,7 @@ class Tracker:
     ) -> None:
         self.rig, self.prior, self.model, self.settings = rig, prior, model, settings
         self.effects, self.free = tuple(effects), tuple(free)
-        self._recalled: tuple[Belief, float] | None = None
+        self._recalled: tuple[Gaussian, float] | None = None
         self.forget()
 
     @property
@@ -269,13 +276,13 @@ class Tracker:
         return self._here
 
     @property
-    def newest(self) -> Belief | None:
+    def newest(self) -> Gaussian | None:
         """What the newest window told of which later ones build on the data; None before there is one."""
         return self._newest
 
-    def recall(self, belief: Belief, elapsed: float) -> None:
+    def recall(self, gaussian: Gaussian, elapsed: float) -> None:
         """Begin, now and whenever anew, with what another run knew of the gains so many seconds ago."""
-        self._recalled = belief, elapsed
+        self._recalled = gaussian, elapsed
 
     def forget(self) -> None:
         """Begin anew."""
@@ -284,17 +291,17 @@ class Tracker:
         self._budget = SearchBudget(self.settings.search_rate, self.settings.search_burst)
         self._fit: Fit | None = None
         self._good_until = -math.inf
-        self._alarm: Alarm | None = None
-        self._crossing: Crossing | None = None
-        self._beliefs: list[tuple[float, Belief]] = []
-        self._newest: Belief | None = None
+        self._alarm: ChangePoint | None = None
+        self._crossing: Transition | None = None
+        self._gaussians: list[tuple[float, Gaussian]] = []
+        self._newest: Gaussian | None = None
 
-    def estimate(self, window: Window, end: float) -> Tracked:
+    def estimate(self, window: Window, end: float) -> TrackerOutput:
         """One window that ends at `end` [s]; windows in their order."""
         self._budget.next_window(len(window.t), end - self._good_until <= RECENT * self.settings.window)
         return replace(self._estimate(window, end), search_ended=self._budget.ended)
 
-    def _estimate(self, window: Window, end: float) -> Tracked:
+    def _estimate(self, window: Window, end: float) -> TrackerOutput:
         start = end - self.settings.window
         crossing = self._crossing
         new = crossing is not None and (self._in_border or start < crossing.end)
@@ -304,22 +311,22 @@ class Tracker:
         left_out = problem.standstill, problem.turning
         if problem.n_rows < self.settings.min_rows:
             self._fit = None
-            return Tracked(None, False, Ground.SAME, since, *left_out)
+            return TrackerOutput(None, False, Ground.SAME, since, *left_out)
         self._forget_before(start)
         before = self._known_at(since, problem)
         if self._alarm is not None and self._alarm.t <= end - RECENT * self.settings.window:
             self._alarm = None  # another soil would have been found by now
         last = self._fit
         changed = None
-        if last is None or (last.rival is not None and self._budget.allows()):
+        if last is None or (last.second_mode is not None and self._budget.allows()):
             fitting, fit = self._afresh(window, problem, before)
             if self.mismatch(fit) and self._alarm is not None:
                 changed = self._another_soil(window, self._alarm, fit, before, None)
         else:
-            ahead = foreseen(problem, self._here, last, before)
-            fitting, fit = ahead.fitting, resume(ahead)
+            ahead = warm_start(problem, self._here, last, before)
+            fitting, fit = ahead.fitting, fit_warm(ahead)
             if fit is not None and not fit.converged and fit.chi2 <= self.chi2_limit(fit):
-                fit = calmed(fitting, fit)  # a long valley is no sign of another soil
+                fit = refit_denoised(fitting, fit)  # a long valley is no sign of another soil
             if fit is None or not fit.converged:
                 fit = self._searched(problem, self._here, before) or fit
             fitting, fit = self._on_the_way(window, fitting, fit)
@@ -338,9 +345,11 @@ class Tracker:
             since, ground = max(self._crossing.end, start), self._new_ground(self._crossing, fit, end)
         else:
             ground = Ground.SAME
-        return self._remembered(Tracked(fit, self.mismatch(fit), ground, since, *left_out), end, problem)
+        return self._remembered(TrackerOutput(fit, self.mismatch(fit), ground, since, *left_out), end, problem)
 
-    def _alarm_in(self, window: Window, ahead: Foreseen, last: Fit, fit: Fit | None, filled: float) -> Alarm | None:
+    def _alarm_in(
+        self, window: Window, ahead: WarmStart, last: Fit, fit: Fit | None, filled: float
+    ) -> ChangePoint | None:
         """The first sign of another soil in a window of which the present one fills so much [s], if there is any.
 
         As long as nothing explains the data since, the alarm stays what it was.
@@ -356,38 +365,38 @@ class Tracker:
         first = int(np.searchsorted(t, float(last.optimum.t[-1]) - LOOK_BACK * length))
         place = replace(last.whole, soil=last.optimum.soil, gains=last.optimum.gains)
         known = place.drifted(self._drift(place, SINCE_THE_MIDDLE), np.zeros(len(place.gains)))
-        doubt = suspicion(ahead.fitting, known, ahead.place, ahead.at, first, ALARM)
+        doubt = change_statistic(ahead.fitting, known, ahead.place, ahead.at, first, ALARM)
         if doubt.ratio <= ALARM and fit is not None and fit.chi2 <= self.chi2_limit(fit):
             return None
         begin = float(t[doubt.instant])
         near = window.ground_speed[(window.t >= begin - 1.0) & (window.t <= begin)]
-        return Alarm(begin, max(float(np.nanmean(near)), self.settings.min_speed))
+        return ChangePoint(begin, max(float(np.nanmean(near)), self.settings.min_speed))
 
-    def _afresh(self, window: Window, problem: WindowProblem, before: Belief) -> tuple[Fitting, Fit | None]:
+    def _afresh(self, window: Window, problem: ObservationModel, before: Gaussian) -> tuple[Objective, Fit | None]:
         """A fit that starts anywhere; what was known of the soil counts only where it agrees with the data."""
         fitting, fit = self._as_one(window, problem, before)
-        if self.mismatch(fit) and self._beliefs:
+        if self.mismatch(fit) and self._gaussians:
             there = elsewhere(self.prior)
             known = before.of_another_soil(there)
             other = self._searched(problem, there, known)
             if not self.mismatch(other):
                 begin = float(problem.t[0])
-                self._crossing, self._here = Crossing(begin, begin, 0.0), there
-                return Fitting(problem, there, known), other
+                self._crossing, self._here = Transition(begin, begin, 0.0), there
+                return Objective(problem, there, known), other
         return fitting, fit
 
-    def _told(self, fitting: Fitting, fit: Fit | None) -> Fit | None:
+    def _told(self, fitting: Objective, fit: Fit | None) -> Fit | None:
         """A fit that is going to be reported: with the whole posterior, of the soil at the window's end."""
         if fit is None or not fit.converged:
             return fit
         if not self.mismatch(fit):
             off_scale = sinkages_off_scale(fitting, fit)
-            fit = with_whole(fitting.problem, fitting.coordinates.prior, fitting.before, fit)
+            fit = with_nested_laplace(fitting.problem, fitting.coordinates.prior, fitting.before, fit)
             fit = replace(fit, off_scale=off_scale)
         fit = replace(fit, form=self._form_left(fitting, fit))
-        return at_present(fitting, fit, self.settings.window, self.settings.drift)
+        return at_window_end(fitting, fit, self.settings.window, self.settings.drift)
 
-    def _form_left(self, fitting: Fitting, fit: Fit) -> FormLeft | None:
+    def _form_left(self, fitting: Objective, fit: Fit) -> FormLeft | None:
         """What the form of the model leaves open of a fit."""
         if not any(self.settings.form):
             return None
@@ -404,7 +413,7 @@ class Tracker:
         deviations = TRUST_AGAIN if self._distrusted else TRUST
         return self.settings.max_chi2 + deviations * math.sqrt(2.0 / max(fit.rows, 1))
 
-    def _remembered(self, tracked: Tracked, end: float, problem: WindowProblem) -> Tracked:
+    def _remembered(self, tracked: TrackerOutput, end: float, problem: ObservationModel) -> TrackerOutput:
         """The same, taken note of; a failed or bad fit leaves what is known alone."""
         fit = tracked.fit
         self._fit = None
@@ -419,50 +428,50 @@ class Tracker:
             if learned and tracked.ground in (Ground.SAME, Ground.NEW):
                 curve = curve_of(problem)
                 told = without_curve(fit.mode.apart_from(self._here), curve)
-                self._beliefs.append((end, replace(told, form=fit.form)))
+                self._gaussians.append((end, replace(told, form=fit.form)))
                 self._newest = without_curve(fit.whole, curve)
         return tracked
 
-    def _known_at(self, t: float, problem: WindowProblem) -> Belief:
+    def _known_at(self, t: float, problem: ObservationModel) -> Gaussian:
         """What windows that had ended by t [s] tell of the soil from t on, and of the sensors on whatever curve."""
         return with_curve(self._told_by(t, problem), curve_of(problem))
 
-    def _told_by(self, t: float, problem: WindowProblem) -> Belief:
+    def _told_by(self, t: float, problem: ObservationModel) -> Gaussian:
         ended = self._ended(t)
         if not ended:
             return self._known_at_first(problem)
-        end, belief = self._beliefs[ended[-1]]
+        end, gaussian = self._gaussians[ended[-1]]
         elapsed = (t - end) / self.settings.window
         gains = problem.gain_std**2 * min((elapsed + 1.0) / GAIN_MEMORY, 1.0)
         if self._crossing is not None and end <= self._crossing.end:
-            return belief.of_another_soil(self._here).drifted(np.zeros((_SOIL, _SOIL)), gains)
-        form = None if belief.form is None else belief.form.drifted(self.settings.form, elapsed / GAIN_MEMORY)
-        return replace(belief.drifted(self._drift(belief, elapsed), gains), form=form)
+            return gaussian.of_another_soil(self._here).drifted(np.zeros((_SOIL, _SOIL)), gains)
+        form = None if gaussian.form is None else gaussian.form.drifted(self.settings.form, elapsed / GAIN_MEMORY)
+        return replace(gaussian.drifted(self._drift(gaussian, elapsed), gains), form=form)
 
     def _ended(self, t: float) -> list[int]:
-        return [i for i, (end, _) in enumerate(self._beliefs) if end <= t + _SAME_TIME]
+        return [i for i, (end, _) in enumerate(self._gaussians) if end <= t + _SAME_TIME]
 
-    def _known_at_first(self, problem: WindowProblem) -> Belief:
+    def _known_at_first(self, problem: ObservationModel) -> Gaussian:
         """Before any window: the prior, and the gains of another run unless the data speak against them."""
         if self._recalled is not None:
-            known = recalled(self._recalled[0], self._here, problem.gain_std, self._recalled[1])
-            if is_borne_out(problem, self._here, known):
+            known = prior_from_last_run(self._recalled[0], self._here, problem.gain_std, self._recalled[1])
+            if passes_prior_conflict_test(problem, self._here, known):
                 return known
             self._recalled = None
-        return Belief.of(self._here, problem.gain_std)
+        return Gaussian.of(self._here, problem.gain_std)
 
     def _forget_before(self, start: float) -> None:
         """Only the newest of the beliefs that windows from `start` [s] on may build on is kept, and what follows it."""
-        self._beliefs = self._beliefs[max([0, *self._ended(start)]) :]
+        self._gaussians = self._gaussians[max([0, *self._ended(start)]) :]
 
-    def _drift(self, belief: Belief, elapsed: float) -> Array:
+    def _drift(self, gaussian: Gaussian, elapsed: float) -> Array:
         """Covariance (6, 6) by which the soil's logarithms drift in so many windows."""
-        directions = Coordinates(self._here, float(self.rig.width.mean())).log_directions(belief.soil)
+        directions = Coordinates(self._here, float(self.rig.width.mean())).log_directions(gaussian.soil)
         return np.asarray(self.settings.drift**2 * elapsed * (directions @ directions.T))
 
     def _another_soil(
-        self, window: Window, alarm: Alarm, one: Fit | None, before: Belief, last: Fit | None
-    ) -> Tracked | None:
+        self, window: Window, alarm: ChangePoint, one: Fit | None, before: Gaussian, last: Fit | None
+    ) -> TrackerOutput | None:
         """The window as two soils, the second from the alarm on, if that is much likelier than `one`; else None.
 
         Without a last fit, or where the first soil is out of the window, the second alone.
@@ -470,8 +479,8 @@ class Tracker:
         first = self._problem(window.rows(np.flatnonzero(window.t < alarm.t - _SAME_TIME)))
         ahead = None
         if last is not None and first.n_rows >= MIN_NEW_ROWS:
-            ahead = foreseen(first, self._here, last, before)
-        old = None if ahead is None else resume(ahead)
+            ahead = warm_start(first, self._here, last, before)
+        old = None if ahead is None else fit_warm(ahead)
         if self.mismatch(old):
             old = None
         if old is None and not self.mismatch(one):
@@ -479,7 +488,7 @@ class Tracker:
         there = elsewhere(self.prior)
         waits = True
         for crossing in self._crossings(alarm, float(window.t[0])):
-            apart = without_crossing(window, crossing, self.rig.front)
+            apart = without_transition(window, crossing, self.rig.front)
             second = self._problem(apart.rows(np.flatnonzero(apart.t >= crossing.end)))
             arrived = crossing.end + crossing.lag if self._distrusted else crossing.end
             if second.n_rows < MIN_NEW_ROWS or window.t[-1] < arrived:
@@ -492,13 +501,13 @@ class Tracker:
             if old is not None and not self._likelier(old, new, self._as_one(apart, self._problem(apart), before)[1]):
                 return None
             self._crossing, self._here = crossing, there
-            told = self._told(Fitting(second, there, known), new)
-            return Tracked(told, False, self._new_ground(crossing, told, float(window.t[-1])), crossing.end)
+            told = self._told(Objective(second, there, known), new)
+            return TrackerOutput(told, False, self._new_ground(crossing, told, float(window.t[-1])), crossing.end)
         if ahead is None or old is None or not waits:
             return None
-        return Tracked(self._told(ahead.fitting, old), False, Ground.CHANGING, float(window.t[0]))
+        return TrackerOutput(self._told(ahead.fitting, old), False, Ground.CHANGING, float(window.t[0]))
 
-    def _new_ground(self, crossing: Crossing, fit: Fit | None, end: float) -> Ground:
+    def _new_ground(self, crossing: Transition, fit: Fit | None, end: float) -> Ground:
         """Whether the border before a window that ends at `end` [s] is over: a long one may go on."""
         length = crossing.end - crossing.begin
         sharp = length < crossing.lag + self.settings.window / 100.0  # shorter than the vehicle
@@ -510,14 +519,14 @@ class Tracker:
         """Whether a fit of a new soil leaves more than noise alone mostly does."""
         return not fit.converged or fit.chi2 > self.settings.max_chi2 + SETTLED * math.sqrt(2.0 / max(fit.rows, 1))
 
-    def _past_the_border(self, window: Window, fitting: Fitting, fit: Fit) -> tuple[Fitting, Fit]:
+    def _past_the_border(self, window: Window, fitting: Objective, fit: Fit) -> tuple[Objective, Fit]:
         """The fit of the data after a border longer than was thought, if those left out are why they do not agree."""
         crossing = self._crossing
         assert crossing is not None  # else there is no border
         begin = max(crossing.end, float(window.t[0]))
         for end in (begin + share * (float(window.t[-1]) - begin) for share in LONGER):
             longer = crossing._replace(end=end)
-            apart = without_crossing(window, longer, self.rig.front)
+            apart = without_transition(window, longer, self.rig.front)
             problem = self._problem(apart.rows(np.flatnonzero(apart.t >= longer.end)))
             if problem.n_rows < 2 * MIN_NEW_ROWS:
                 break
@@ -525,36 +534,36 @@ class Tracker:
             later = self._searched(problem, self._here, known)
             if later is None or self._unsettled(later):
                 continue
-            fall, noise = fit.cost - later.cost, fit.rows - later.rows
+            fall, noise = fit.neg2_log_posterior - later.neg2_log_posterior, fit.rows - later.rows
             if fall > noise + OF_BORDER:
                 self._crossing = longer
-                return Fitting(problem, self._here, known), later
+                return Objective(problem, self._here, known), later
         return fitting, fit
 
-    def _crossings(self, alarm: Alarm, start: float) -> list[Crossing]:
+    def _crossings(self, alarm: ChangePoint, start: float) -> list[Transition]:
         """Borders of growing length that begin at the alarm; of those over before `start` [s] only the last."""
         chassis = self.rig.chassis
         lag = (WHEELBASE if chassis is None else chassis.wheelbase) / alarm.speed
         ends = [alarm.t + share * lag for share in BORDERS]
         over = sum(end <= start for end in ends)
         apart = 0.0 if chassis is None else lag
-        return [Crossing(alarm.t - _SAME_TIME, end, apart) for end in ends[max(over - 1, 0) :]]
+        return [Transition(alarm.t - _SAME_TIME, end, apart) for end in ends[max(over - 1, 0) :]]
 
-    def _as_one(self, window: Window, problem: WindowProblem, before: Belief) -> tuple[Fitting, Fit | None]:
+    def _as_one(self, window: Window, problem: ObservationModel, before: Gaussian) -> tuple[Objective, Fit | None]:
         """A window as one soil, this one, from any start."""
         fit = self._searched(problem, self._here, before)
-        return self._on_the_way(window, Fitting(problem, self._here, before), fit)
+        return self._on_the_way(window, Objective(problem, self._here, before), fit)
 
-    def _on_the_way(self, window: Window, fitting: Fitting, fit: Fit | None) -> tuple[Fitting, Fit | None]:
+    def _on_the_way(self, window: Window, fitting: Objective, fit: Fit | None) -> tuple[Objective, Fit | None]:
         """A fit of a window freed of the bends of its way, where it has any; just after a border that would hide it."""
         if self._crossing is not None and float(window.t[-1]) < self._crossing.end + self.settings.window:
             return fitting, fit
-        way = bending(fitting, fit)
+        way = detected_curvature(fitting, fit)
         if fit is None or way is None:
             return fitting, fit
-        return on_the_way(fitting, fit, way, self._problem(straightened(window, self.rig, way)))
+        return fit_on_curved_path(fitting, fit, way, self._problem(straightened(window, self.rig, way)))
 
-    def _searched(self, problem: WindowProblem, prior: SoilPrior, before: Belief) -> Fit | None:
+    def _searched(self, problem: ObservationModel, prior: SoilPrior, before: Gaussian) -> Fit | None:
         """A fit from any start; None also where the budget allows no further search."""
         if not self._budget.allows():
             return None
@@ -565,16 +574,20 @@ class Tracker:
 
     def _likelier(self, old: Fit, new: Fit, one: Fit | None) -> bool:
         """Whether two soils explain much better what one, of the same data, explains."""
-        return one is None or not one.converged or one.evidence - old.evidence - new.evidence >= CHANGED
+        return (
+            one is None
+            or not one.converged
+            or one.neg2_log_evidence - old.neg2_log_evidence - new.neg2_log_evidence >= CHANGED
+        )
 
     def _of_this_soil(self, window: Window) -> Window:
         if self._crossing is None:
             return window
-        window = without_crossing(window, self._crossing, self.rig.front)
+        window = without_transition(window, self._crossing, self.rig.front)
         return window.rows(np.flatnonzero(window.t >= self._crossing.end))
 
-    def _problem(self, window: Window) -> WindowProblem:
+    def _problem(self, window: Window) -> ObservationModel:
         speed, turn = self.settings.min_speed, self.settings.max_turn
-        problem = CompletedProblem(window, self.rig, self.model, speed, turn, self.effects, self.free)
+        problem = ObservationModelWithEffects(window, self.rig, self.model, speed, turn, self.effects, self.free)
         problem.work = self._budget.work
         return problem

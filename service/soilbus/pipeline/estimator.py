@@ -25,7 +25,7 @@ from soilbus.estimation.multistart import Fit
 from soilbus.estimation.nuisance_parameters import active_at
 from soilbus.estimation.posterior import Estimate, Posterior, SoilPrior
 from soilbus.estimation.soil_classes import SoilClasses, guessed
-from soilbus.estimation.tracker import MIN_ROWS, Ground, Settings, Tracked, Tracker
+from soilbus.estimation.tracker import MIN_ROWS, Ground, Settings, Tracker, TrackerOutput
 from soilbus.estimation.window import Rig, Window
 from soilbus.pipeline.excitation import excitation_of
 from soilbus.pipeline.intake import WindowTask
@@ -208,7 +208,7 @@ class WindowEstimator:
         pulls = np.zeros(len(free)) if fit is None else fit.gains[len(fit.gains) - len(free) :]
         return active_at(effects, free, pulls, len(self.rig.wheels))
 
-    def _present_model(self, window: Window, tracked: Tracked, effects: Sequence[Active]) -> UncertainModel:
+    def _present_model(self, window: Window, tracked: TrackerOutput, effects: Sequence[Active]) -> UncertainModel:
         """The model for the decision, at the window's usual speed."""
         speed, fit = self._usual_speed(window), tracked.fit
         if fit is None:
@@ -218,11 +218,11 @@ class WindowEstimator:
             self.model, *self._completion, fit.whole, len(self.rig.wheels), speed, widening, fit.form
         )
 
-    def _honest(self, tracked: Tracked, fit: Fit) -> Posterior:
+    def _honest(self, tracked: TrackerOutput, fit: Fit) -> Posterior:
         """Posterior, of both optima where there are two, widened where the residuals are larger than the noise."""
         return fit.whole.posterior.widened(_widening(tracked, fit), self.prior)
 
-    def _draft_gain(self, tracked: Tracked) -> Estimate:
+    def _draft_gain(self, tracked: TrackerOutput) -> Estimate:
         """Gain error of the load cell at the hitch: as fitted, else what is known of it beforehand."""
         if tracked.fit is None or tracked.mismatch:
             return Estimate(0.0, self.rig.noise["draft"].gain)
@@ -266,13 +266,13 @@ class WindowEstimator:
         unseen = float(known.mean()) * len(since) * self._settings.bin if len(known) else 0.0
         return Basis(instants, self._settings.bin, unseen, task.late)
 
-    def _status(self, task: WindowTask, tracked: Tracked) -> tuple[Status, str]:
+    def _status(self, task: WindowTask, tracked: TrackerOutput) -> tuple[Status, str]:
         """Status and its reason; a sensor that lies is the reason of all that may follow from it."""
         status, reason = self._status_of_the_rest(task, tracked)
         follows = reason.split()[0] in ("none", "input_stale", "model_mismatch", "no_convergence")
         return status, " ".join(["implausible", *task.implausible]) if task.implausible and follows else reason
 
-    def _status_of_the_rest(self, task: WindowTask, tracked: Tracked) -> tuple[Status, str]:
+    def _status_of_the_rest(self, task: WindowTask, tracked: TrackerOutput) -> tuple[Status, str]:
         fit = tracked.fit
         if task.missing:
             return Status.INVALID, "input_missing " + " ".join(task.missing)
@@ -302,13 +302,13 @@ class WindowEstimator:
             return Status.NOT_EXCITED, " ".join(["not_excited", *(name for name, it_is in lacking.items() if it_is)])
         return Status.VALID, "none"
 
-    def _hardly_new(self, tracked: Tracked, end: float) -> bool:
+    def _hardly_new(self, tracked: TrackerOutput, end: float) -> bool:
         """Whether the window has too little of the soil that has just begun."""
         if tracked.ground in (Ground.CHANGING, Ground.SETTLING):
             return True
         return tracked.since > end - self.config.traversability.min_share * self._settings.window
 
-    def _failure(self, tracked: Tracked) -> str | None:
+    def _failure(self, tracked: TrackerOutput) -> str | None:
         """In what way a solve failed: not_finite, model_mismatch or no_convergence; None where it did not."""
         fit = tracked.fit
         if not tracked.mismatch:
@@ -319,19 +319,19 @@ class WindowEstimator:
 
     def _ambiguous(self, fit: Fit) -> bool:
         """Whether another soil, about as likely, has a bearing pressure or tan phi that the fit excludes."""
-        if fit.rival is None:
+        if fit.second_mode is None:
             return False
-        one, other = fit.posterior, fit.rival.belief.posterior
+        one, other = fit.posterior, fit.second_mode.gaussian.posterior
         pairs = ((self._bearing(one), self._bearing(other)), (one.tan_phi(), other.tan_phi()))
         return any(abs(a.value - b.value) > AMBIGUOUS * a.std for a, b in pairs)
 
 
-def _gated(tracked: Tracked) -> str:
+def _gated(tracked: TrackerOutput) -> str:
     """Why most of the instants were left out that were."""
     return "standstill" if tracked.standstill >= tracked.turning else "turning"
 
 
-def _widening(tracked: Tracked, fit: Fit) -> float:
+def _widening(tracked: TrackerOutput, fit: Fit) -> float:
     """Factor of the covariance of a fit that leaves more than noise."""
     return max(fit.chi2, 1.0) if tracked.mismatch else 1.0
 

@@ -25,9 +25,9 @@ from soilbus.decision.traction_loss import Motion, motion_of
 from soilbus.estimation.assembly import delays_of, rig_of
 from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, Window, forward, inertia_of, pull_given
 from soilbus.pipeline.positions import PositionTrack
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.sensors.consistency import Plausibility, without
-from soilbus.sensors.outliers import WILD
+from soilbus.sensors.outliers import OUTLIER
 from soilbus.sensors.rates import resolved_window
 from soilbus.terra.vehicle import slip_ratio
 
@@ -102,7 +102,7 @@ class Refusals:
 
     def note_wild(self, times: Array) -> None:
         """Take note of samples that were used until they were found wild."""
-        self.note(WILD, times)
+        self.note(OUTLIER, times)
         self.used -= len(times)
 
     def note(self, reason: str, times: Array) -> None:
@@ -190,7 +190,7 @@ class Intake:
         self._index = 0
         self.epoch = 0
         self._ready: list[WindowTask] = []
-        self._bins: BinStore | None = None
+        self._bins: Bins | None = None
         self._restart()
         self.admission.at_break = self.begin_anew
 
@@ -238,7 +238,7 @@ class Intake:
             first, last = times
             self._newest = max(self._newest, last)
             if self._bins is None:
-                self._bins = BinStore(self.rig, self._settings.bin, first - EDGE_LEAD)
+                self._bins = Bins(self.rig, self._settings.bin, first - EDGE_LEAD)
                 self.next_end = first - EDGE_LEAD + self._settings.window
         heard = {name: (c.t, c.value) for name, c in decoded.columns.items() if len(c.t)}
         self.last_seen |= {name: float(t[-1]) for name, (t, _) in heard.items()}
@@ -291,7 +291,7 @@ class Intake:
         self._restart()
         return window
 
-    def _task(self, bins: BinStore, end: float) -> WindowTask:
+    def _task(self, bins: Bins, end: float) -> WindowTask:
         start = end - self._settings.window
         window, self._lying = self._plausibility.screened(forward(bins.window(start, end)))
         self.refusals.note_wild(bins.new_wild())

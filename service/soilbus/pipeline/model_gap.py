@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from soilbus.estimation.observation_model import Linearised
+from soilbus.estimation.observation_model import Linearisation
 
 SPAN = 120.0
 """Seconds over which chi-square is averaged."""
@@ -33,7 +33,7 @@ class Square(NamedTuple):
     rows: int
 
 
-def squares(at: Linearised, n_wheels: int) -> dict[str, Square]:
+def squares(at: Linearisation, n_wheels: int) -> dict[str, Square]:
     """Those of torque, draft and, where it is measured, sinkage in one fitted window."""
     per_instant = at.by_latents.shape[1]
     square = (at.rows[:, 0] * at.weighed[:, 0]).reshape(-1, per_instant)

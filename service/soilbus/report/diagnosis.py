@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.diagnosis.fitted_model import Completion
+from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.verdict import PAYS, PAYS_BESIDE
 from soilbus.diagnosis.where import channels
 from soilbus.offline.diagnose import Findings
@@ -111,7 +111,7 @@ def _pictures(findings: Findings) -> Iterator[str]:
         yield picture(_residuals(completed, f"after: gap {after.value:.3f}"), "residuals after")
 
 
-def _residuals(completion: Completion, title: str) -> Any:
+def _residuals(completion: FittedModel, title: str) -> Any:
     """Standardised residuals by channel (rows) over slip, load and time (columns); a colour for each wheel."""
     from matplotlib.figure import Figure
 
@@ -141,7 +141,7 @@ def _cloud(axis: Any, x: Array, z: Array, label: str) -> None:
     axis.axhline(0.0, color="grey", lw=0.5)
 
 
-def _clouds(completion: Completion) -> dict[str, dict[str, Array]]:
+def _clouds(completion: FittedModel) -> dict[str, dict[str, Array]]:
     """Columns slip, load [kN], time [s], residual (M, 4) of the held-out blocks by channel and wheel."""
     found: dict[str, dict[str, list[Array]]] = {}
     for check, fit in zip(completion.checks, completion.fits, strict=True):

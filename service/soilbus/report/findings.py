@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from soilbus.config.model import Config
-from soilbus.diagnosis.fitted_model import Completion
+from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.residual_terms import WARNING, Correction
 from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.verdict import gap_limit
@@ -93,7 +93,7 @@ def _place(place: Disagreement) -> dict[str, Any]:
     return {name: getattr(place, name) for name in names}
 
 
-def _effect(addition: Addition, completed: Completion) -> dict[str, Any]:
+def _effect(addition: Addition, completed: FittedModel) -> dict[str, Any]:
     effect = addition.effect
     return {
         "name": effect.name,
@@ -197,7 +197,7 @@ def size_text(place: Disagreement) -> str:
     return f"reading less model {place.size:+.3g} {UNITS.get(place.channel, '')}".rstrip()
 
 
-def effect_lines(number: int, addition: Addition, completed: Completion) -> list[str]:
+def effect_lines(number: int, addition: Addition, completed: FittedModel) -> list[str]:
     """One effect: its parameters, what it is, what else it may be, what would tell."""
     effect = addition.effect
     lines = [f"{number}. {effect.name}, probability {addition.probability:.2f}", f"   {effect.physics}"]

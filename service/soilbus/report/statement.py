@@ -13,7 +13,7 @@ import numpy as np
 from soilbus.config.model import Config
 from soilbus.diagnosis.detectable import Detectable
 from soilbus.diagnosis.diagnose import Diagnosis
-from soilbus.diagnosis.fitted_model import Completion
+from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.verdict import AT_TIMES, Verdict, gap_limit
 from soilbus.estimation.posterior import Posterior, bearing_pressure
@@ -85,7 +85,7 @@ def doubt(diagnosis: Diagnosis) -> str | None:
     return text
 
 
-def same_push(addition: Addition, completed: Completion) -> str | None:
+def same_push(addition: Addition, completed: FittedModel) -> str | None:
     """The error of the pitch sensor that would do the same as an offset of the hitch; None where none may."""
     problem = completed.checks[-1].problem
     chassis = problem.rig.chassis

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.window import NoiseTable, Rig, Window, made_window
-from soilbus.sensors.outliers import SIDE, Samples, joined, judge
+from soilbus.sensors.outliers import SIDE, Samples, joined, outlier_test
 
 Array = NDArray[np.float64]
 
@@ -19,7 +19,7 @@ GLIMPSE_BACK = 1.0
 """Samples of so many seconds before a glimpse help to judge those in it."""
 
 
-class BinStore:
+class Bins:
     """Sums and counts of samples by bin and channel, over a sliding span of time.
 
     Bins are counted from `origin`; each sample is added once, however many windows it
@@ -51,7 +51,7 @@ class BinStore:
     def window(self, start: float, end: float) -> Window:
         """The bins from start to end [s], both rounded to whole bins."""
         low, high = self._span(start, end)
-        samples, wild, later = judge(self._taken(high), self._noise.sd)
+        samples, wild, later = outlier_test(self._taken(high), self._noise.sd)
         new = ~samples.settled
         self._totals = self._with(self._totals, samples.pick(new & ~wild), high)
         again = new & wild & (later < SIDE)
@@ -68,14 +68,14 @@ class BinStore:
         samples = self._taken(high)
         self._recent = recent
         near = self._bins(samples) >= low - round(GLIMPSE_BACK / self.bin_length)
-        samples, wild, _ = judge(samples.pick(near), self._noise.sd)
+        samples, wild, _ = outlier_test(samples.pick(near), self._noise.sd)
         totals = self._with(self._totals.copy(), samples.pick(~(samples.settled | wild)), high)
         return self._made(totals, low, high)
 
     def screened(self, end: float) -> Samples:
         """The samples before `end` [s] that are not wild, their times [s] counted from `origin`; nothing is decided."""
         recent = list(self._recent)
-        samples, wild, _ = judge(self._taken(round((end - self.origin) / self.bin_length)), self._noise.sd)
+        samples, wild, _ = outlier_test(self._taken(round((end - self.origin) / self.bin_length)), self._noise.sd)
         self._recent = recent
         return samples.pick(~wild)
 

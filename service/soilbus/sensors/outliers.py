@@ -21,7 +21,7 @@ Sd = Callable[[NDArray[np.intp], Array, Array], Array]
 """Sd (N,) of samples, channel after channel, from each channel's number of them (C,), their expected
 magnitudes (N,) and the channels' mean magnitudes (C,)."""
 
-WILD = "wild"
+OUTLIER = "wild"
 """Reason under which wild samples are counted."""
 SIDE = 4
 """Samples on each side that a sample is compared with."""
@@ -77,7 +77,7 @@ class Judged(NamedTuple):
     later: NDArray[np.intp]
 
 
-def judge(samples: Samples, sd: Sd) -> Judged:
+def outlier_test(samples: Samples, sd: Sd) -> Judged:
     """Find the wild ones among samples in any order.
 
     A channel with fewer than nine samples is not judged; the first and last four of the

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from soilbus.estimation.local_cubics import PARTS, Curve, Series, curve_of, faithful, variance_of_one
 from soilbus.estimation.window import NoiseTable, Window, made_window
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.sensors.outliers import Samples
 
 Array = NDArray[np.float64]
@@ -56,7 +56,7 @@ class _Binned(NamedTuple):
     worth: Array
 
 
-def resolved_window(store: BinStore, end: float) -> Window:
+def resolved_window(store: Bins, end: float) -> Window:
     """All samples of a store from its origin to `end` [s]; its own window where longer bins lose nothing."""
     samples = store.screened(end)
     whole = store.window(store.origin, end)  # which decides what is wild
@@ -79,7 +79,7 @@ def resolved_window(store: BinStore, end: float) -> Window:
     return replace(made_window(noise, centre, mean, worth, count), curves=curves)
 
 
-def _channels(samples: Samples, store: BinStore, noise: NoiseTable) -> Iterator[_Channel]:
+def _channels(samples: Samples, store: Bins, noise: NoiseTable) -> Iterator[_Channel]:
     for column in np.unique(samples.column).tolist():
         own = samples.column == column
         t, value = samples.t[own], samples.value[own]

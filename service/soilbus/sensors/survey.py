@@ -35,7 +35,7 @@ from soilbus.can.units import SI, unit_of
 from soilbus.config.model import Config, ConfigError, Signal
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.window import Rig, Window, forward, pairs, pull_given, turning
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.sensors.consistency import change, implausible, median, resolution_of, without
 from soilbus.terra.vehicle import GRAVITY, axle_loads, slip_ratio
 
@@ -292,7 +292,7 @@ def _facts(config: Config, mapped: Iterable[str], heard: Columns) -> Facts | Non
         return None
     start = min(float(t[0]) for t, _ in known.values())
     end = max(float(t[-1]) for t, _ in known.values())
-    store = BinStore(rig, bin_length, start)
+    store = Bins(rig, bin_length, start)
     store.add(known)
     raw = store.window(start, end)
     if not len(raw.t):

@@ -17,7 +17,7 @@ from soilbus.decision.immobilisation import Alert, Moment, Watch, moments, watch
 from soilbus.decision.traversability import Status
 from soilbus.estimation.assembly import rig_of
 from soilbus.pipeline.estimator import WindowEstimator
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import drive
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Swing
@@ -190,7 +190,7 @@ def _looks(recording: Recording, config: Config, end: float) -> tuple[list[Momen
     """The moments until the end [s], and from their times on the curves of windows that the service calls valid."""
     rig, settings = rig_of(config), config.estimator
     estimator, no_limit = WindowEstimator(config), np.full(len(rig.radius), np.nan)
-    store = BinStore(rig, LOOK, 0.0)
+    store = Bins(rig, LOOK, 0.0)
     store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
     curves = []
     for due in np.arange(settings.window, end, settings.hop).tolist():

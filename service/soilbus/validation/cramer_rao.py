@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.terra.wheel import Soil
 
@@ -25,7 +25,7 @@ _ROUNDS = 3
 """Linearisations that bring the latents from their first guess to their values at the truth."""
 
 
-def cramer_rao(noiseless: WindowProblem, prior: SoilPrior, soil: Soil) -> Posterior:
+def cramer_rao(noiseless: ObservationModel, prior: SoilPrior, soil: Soil) -> Posterior:
     """The true soil with the least covariance of the logarithms that an unbiased estimate can have.
 
     `noiseless` holds what perfect sensors would have read in the window, with the variances

@@ -19,9 +19,9 @@ from soilbus.config.model import Config
 from soilbus.decision.capability import assess
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.laplace import cold_fit
-from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.window import Rig
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.equilibrium import Mechanics, Situation, solve
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -98,10 +98,10 @@ def trial(task: Task) -> DraftTrial:
     duration = config.estimator.window
     recording = simulate(config, Scenario(duration, (Patch(0.0, name, soil),), slip=slip), seed)
     rig, model, settings = rig_of(config), model_of(config), config.traversability
-    store = BinStore(rig, config.estimator.bin, 0.0)
+    store = Bins(rig, config.estimator.bin, 0.0)
     store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
     prior = missed(prior_of(config), soil, np.random.default_rng([seed, 1]))
-    fit = cold_fit(WindowProblem(store.window(0.0, duration), rig, model, config.estimator.min_speed), prior)
+    fit = cold_fit(ObservationModel(store.window(0.0, duration), rig, model, config.estimator.min_speed), prior)
     limit = np.array([wheel.max_torque or np.nan for wheel in config.wheel])
     truth = true_largest_draft(soil, rig, limit, settings.max_slip, WheelModel(shear_law=config.model.shear_law))
     if fit is None or not fit.converged:

@@ -15,13 +15,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.estimation.gaussian import Belief
-from soilbus.estimation.laplace import FINE, Node, density, ridge
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.laplace import FINE, Node, density, profile_over_n
 from soilbus.estimation.multistart import Fit
-from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.parametrization import MAX_PHI, Coordinates
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-from soilbus.estimation.solver import Fitting, Place, Point
+from soilbus.estimation.solver import Iterate, Objective, QuadraticModel
 from soilbus.terra.wheel import Soil
 
 Array = NDArray[np.float64]
@@ -54,18 +54,18 @@ class Samples(NamedTuple):
 
 
 def samples(
-    problem: WindowProblem, prior: SoilPrior, before: Belief, found: Fit, count: int, rng: np.random.Generator
+    problem: ObservationModel, prior: SoilPrior, before: Gaussian, found: Fit, count: int, rng: np.random.Generator
 ) -> Samples | None:
     """So many soils of the posterior; None where k_c, k_phi and n are not all free and told apart by the tyres."""
     with np.errstate(all="ignore"):
-        along = ridge(problem, prior, before, found)
+        along = profile_over_n(problem, prior, before, found)
         if along is None or len(along.nodes) < 3:
             return None
         coordinates = Coordinates(prior, float(problem.rig.width.mean()))
         drawn = _drawn(along.nodes, coordinates, count, rng)
         position = drawn.position
         u, nodes = np.array([node.u for node in along.nodes]), along.nodes
-        fitting = Fitting(along.problem, prior, before)
+        fitting = Objective(along.problem, prior, before)
         log_share = np.full(count, -np.inf)
         logs = np.empty((count, len(PARAMETERS)))
         bound = np.zeros((count, len(PARAMETERS), len(PARAMETERS)))
@@ -123,13 +123,13 @@ def _normal(node: Node, coordinates: Coordinates, others: NDArray[np.intp]) -> t
     By the fit's moments, or by its curvature where they leave k_c's share no deviation.
     """
     free = coordinates.free
-    for belief in (node.fit.belief, node.fit.mode):
-        back = np.linalg.inv(coordinates.log_directions(belief.soil)[free])
-        covariance = (back @ belief.covariance[np.ix_(free, free)] @ back.T)[np.ix_(others, others)]
+    for gaussian in (node.fit.gaussian, node.fit.mode):
+        back = np.linalg.inv(coordinates.log_directions(gaussian.soil)[free])
+        covariance = (back @ gaussian.covariance[np.ix_(free, free)] @ back.T)[np.ix_(others, others)]
         std = np.sqrt(covariance.diagonal())
         if np.linalg.eigvalsh(covariance / std / std[:, None])[0] > SINGULAR:
             break
-    return coordinates.position(belief.soil)[others], np.asarray(np.linalg.cholesky(WIDER * covariance))
+    return coordinates.position(gaussian.soil)[others], np.asarray(np.linalg.cholesky(WIDER * covariance))
 
 
 def _soil_at(position: Array, coordinates: Coordinates) -> Array:
@@ -142,20 +142,20 @@ def _soil_at(position: Array, coordinates: Coordinates) -> Array:
     return soil if inside else np.where(np.arange(len(soil)) == _K_PHI, 0.0, soil)
 
 
-def _point_at(fitting: Fitting, soil: Array, near: Node) -> tuple[Place, Point | None]:
+def _point_at(fitting: Objective, soil: Array, near: Node) -> tuple[Iterate, QuadraticModel | None]:
     """The window at a soil (6,), with the latents that are likeliest there."""
     problem, optimum = fitting.problem, near.fit.optimum
     latents = problem.carried(optimum.latents, Soil(*soil.tolist()), optimum.gains)
-    place = Place(soil, optimum.gains, latents, np.inf, 1)
+    place = Iterate(soil, optimum.gains, latents, np.inf, 1)
     at = problem.linearise(place.as_soil(), place.gains, latents)
     latents = problem.updated(at, latents, np.zeros(len(PARAMETERS)), np.zeros(len(place.gains)))
     place = replace(place, latents=latents)
     return place, fitting.point(place)
 
 
-def _unlikelihood(fitting: Fitting, point: Point) -> float:
+def _unlikelihood(fitting: Objective, point: QuadraticModel) -> float:
     """-2 log posterior density of a soil's logarithms up to a constant, whatever the gains (Laplace, all but exact)."""
     gains = slice(len(fitting.free), None)
     information, gradient = point.information[gains, gains], point.gradient[gains]
     fall = float(gradient @ np.linalg.solve(information, gradient))
-    return point.cost - fall + float(np.linalg.slogdet(information)[1])
+    return point.neg2_log_posterior - fall + float(np.linalg.slogdet(information)[1])

@@ -31,12 +31,12 @@ from numpy.typing import NDArray
 from soilbus.allocator import keep_freed_memory
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import completion_of, model_of, prior_of, rig_of
-from soilbus.estimation.gaussian import Belief
-from soilbus.estimation.laplace import with_whole
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.laplace import with_nested_laplace
 from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.observation_model import CompletedProblem, WindowProblem
+from soilbus.estimation.observation_model import ObservationModel, ObservationModelWithEffects
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -245,8 +245,8 @@ def _trial(recording: Recording, task: Task, prior: SoilPrior, soil: Soil, sinka
     noisy, noiseless = (_problem(recording, config, duration, names, of_truth) for of_truth in (False, True))
     bound = cramer_rao(noiseless, prior, soil)
     begin = time.thread_time()
-    found, before = fit_window(noisy, prior), Belief.of(prior, noisy.gain_std)
-    fit = with_whole(noisy, prior, before, found) if found is not None and found.converged else found
+    found, before = fit_window(noisy, prior), Gaussian.of(prior, noisy.gain_std)
+    fit = with_nested_laplace(noisy, prior, before, found) if found is not None and found.converged else found
     seconds = time.thread_time() - begin
     if fit is None or found is None:
         nothing = np.full(len(PARAMETERS) + 1, np.nan)
@@ -266,17 +266,17 @@ def _trial(recording: Recording, task: Task, prior: SoilPrior, soil: Soil, sinka
 
 def _problem(
     recording: Recording, config: Config, duration: float, names: Iterable[str], of_truth: bool
-) -> WindowProblem:
+) -> ObservationModel:
     """The window of these channels as measured, or as it truly was at the times of the samples."""
     rig, truth = rig_of(config), recording.truth
     columns = {name: recording.channels[name] for name in names}
-    store = BinStore(rig, config.estimator.bin, 0.0)
+    store = Bins(rig, config.estimator.bin, 0.0)
     store.add({
         name: (column.t, np.interp(column.t, truth["t"], truth[name]) if of_truth else column.value)
         for name, column in columns.items()
     })  # fmt: skip
     window, settings = store.window(0.0, duration), config.estimator
-    return CompletedProblem(
+    return ObservationModelWithEffects(
         window, rig, model_of(config), settings.min_speed, settings.max_turn, *completion_of(config)
     )
 

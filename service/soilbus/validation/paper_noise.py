@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.window import Rig, SensorNoise, window_of_samples
 from soilbus.terra.entry_angle import entry_angle_for_load
@@ -116,7 +116,7 @@ def windows_of(trial: Trial, depth: float, noise: Noise, windows: int, seed: int
             "speed.wheel": np.full(instants, RIM_SPEED / trial.radius),
         }  # fmt: skip
         window = window_of_samples(rig, np.arange(instants, dtype=np.float64), samples)
-        fit = fit_window(WindowProblem(window, rig, model, 0.1), prior)
+        fit = fit_window(ObservationModel(window, rig, model, 0.1), prior)
         if fit is not None and fit.converged:
             soil = fit.posterior.soil
             found.append((lumped_modulus(soil.k_c, soil.k_phi, trial.width), soil.phi, soil.n))

@@ -33,7 +33,7 @@ from soilbus.estimation.assembly import prior_of, rig_of
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.window import Rig, Window
 from soilbus.pipeline.estimator import WindowEstimator
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -215,7 +215,7 @@ def _window(recording: Recording, config: Config, rig: Rig, of_truth: bool) -> W
     """The window as measured, or as it truly was at the times of the samples."""
     truth, duration = recording.truth, config.estimator.window
     columns = {n: c for n in rig.channels if (c := recording.channels.get(n)) is not None}
-    store = BinStore(rig, config.estimator.bin, 0.0)
+    store = Bins(rig, config.estimator.bin, 0.0)
     store.add({n: (c.t, np.interp(c.t, truth["t"], truth[n]) if of_truth else c.value) for n, c in columns.items()})
     return store.window(0.0, duration)
 

@@ -13,7 +13,7 @@ from soilbus.diagnosis.diagnose import NotFitted, diagnose
 from soilbus.diagnosis.records import Record, record_of
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.posterior import Estimate, Posterior
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Effect
 
@@ -62,7 +62,7 @@ def record_of_case(case: Case) -> Record:
     """What the diagnosis is given."""
     config, recording = case.config, case.recording
     rig, settings = rig_of(config), case.config.estimator
-    store = BinStore(rig, settings.bin, 0.0)
+    store = Bins(rig, settings.bin, 0.0)
     columns = {n: (c.t, c.value) for n, c in recording.channels.items() if n in rig.channels}
     store.add(columns)
     end = max(float(t[-1]) for t, _ in columns.values())

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.estimation.gaussian import Belief
+from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.observation_model import WindowProblem
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import SoilPrior
-from soilbus.estimation.solver import Fitting, Place
-from soilbus.sensors.bins import BinStore
+from soilbus.estimation.solver import Iterate, Objective
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
@@ -76,11 +76,11 @@ def line(size: Array, times: Array) -> tuple[float, float]:
     return float(fixed), float(each)
 
 
-def _steps(problem: WindowProblem, prior: SoilPrior, soil: Array) -> Callable[[], Any]:
+def _steps(problem: ObservationModel, prior: SoilPrior, soil: Array) -> Callable[[], Any]:
     """Some Gauss-Newton steps at the optimum."""
-    fitting = Fitting(problem, prior, Belief.of(prior, problem.gain_std))
+    fitting = Objective(problem, prior, Gaussian.of(prior, problem.gain_std))
 
-    def moved(place: Place) -> Place:
+    def moved(place: Iterate) -> Iterate:
         point = fitting.point(place)
         step = None if point is None else point.step()
         if point is None or step is None:
@@ -97,7 +97,7 @@ def _steps(problem: WindowProblem, prior: SoilPrior, soil: Array) -> Callable[[]
     return work
 
 
-def _problems(wheels: int) -> Iterator[tuple[WindowProblem, SoilPrior]]:
+def _problems(wheels: int) -> Iterator[tuple[ObservationModel, SoilPrior]]:
     """Windows of all lengths of a tractor with so many wheels, half of them on each axle; one: a test rig."""
     config = _configuration(max(wheels, 2))
     recording = simulate(config, excited("loam", max(LENGTHS)), seed=1)
@@ -108,10 +108,10 @@ def _problems(wheels: int) -> Iterator[tuple[WindowProblem, SoilPrior]]:
         noise = config.noise.draft.absolute * np.random.default_rng(1).standard_normal(len(pull))
         samples["draft"] = recording.truth["t"], pull + noise
     rig, settings = rig_of(config), config.estimator
-    store = BinStore(rig, settings.bin, 0.0)
+    store = Bins(rig, settings.bin, 0.0)
     store.add({name: samples[name] for name in rig.channels if name in samples})
     for length in LENGTHS:
-        yield WindowProblem(store.window(0.0, length), rig, model_of(config), settings.min_speed), prior_of(config)
+        yield ObservationModel(store.window(0.0, length), rig, model_of(config), settings.min_speed), prior_of(config)
 
 
 def _configuration(wheels: int) -> Config:

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.estimation.multistart import Fit, descend, fit_window
-from soilbus.estimation.observation_model import Latents, Linearised, WindowProblem, diagonals
+from soilbus.estimation.multistart import Fit, fit_from_soil, fit_window
+from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModel, diagonals
 from soilbus.estimation.posterior import SoilPrior
-from soilbus.sensors.bins import BinStore
+from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
@@ -48,7 +48,7 @@ DIFFERENCE = 1e-5
 class Window(NamedTuple):
     """A window to fit, and what is known beforehand."""
 
-    problem: WindowProblem
+    problem: ObservationModel
     prior: SoilPrior
 
     @property
@@ -129,7 +129,7 @@ def by_finite_differences(window: Window, least_squares: Any) -> Soil:
     return soil_at(x)
 
 
-def _whitened(problem: WindowProblem, at: Linearised, latents: Latents) -> Callable[[Soil], Array]:
+def _whitened(problem: ObservationModel, at: Linearisation, latents: Latents) -> Callable[[Soil], Array]:
     """Readings less model of torques, draft balance and sinkages, whitened, by soil.
 
     Loads and speeds are eliminated as in ours: they are measured with noise that travels
@@ -160,7 +160,7 @@ def _works(window: Window, least_squares: Any) -> tuple[Callable[[], object], ..
     """Ours, ours from one start, and the peer."""
     return (
         lambda: fit_window(*window),
-        lambda: descend(*window, window.start),
+        lambda: fit_from_soil(*window, window.start),
         lambda: by_finite_differences(window, least_squares),
     )
 
@@ -176,7 +176,7 @@ def _window(name: str, exact: str, rough: str) -> Window:
     ])  # fmt: skip
     rig, settings = rig_of(config), config.estimator
     channels = simulate(config, excited(name, LENGTH), seed=1).channels
-    store = BinStore(rig, settings.bin, 0.0)
+    store = Bins(rig, settings.bin, 0.0)
     store.add({n: (channels[n].t, channels[n].value) for n in rig.channels if n in channels})
-    problem = WindowProblem(store.window(0.0, LENGTH), rig, model_of(config), settings.min_speed)
+    problem = ObservationModel(store.window(0.0, LENGTH), rig, model_of(config), settings.min_speed)
     return Window(problem, prior_of(config))
