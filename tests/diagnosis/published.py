@@ -122,7 +122,7 @@ def lugs_beside_a_shifted_peak(errors: float, points: Path = POINTS) -> dict[str
 
 def strain(completion: FittedModel) -> float:
     """How far a fit has gone from what was known of the soil before, as chi-square per parameter."""
-    before, after = completion.before[-1], completion.fits[-1].gaussian
+    before, after = completion.joint_prior[-1], completion.fits[-1].gaussian
     free = np.flatnonzero(np.diag(before.covariance)[:6] > 0.0)
     off = np.log(after.soil[free] / before.soil[free])
     return float(off @ np.linalg.solve(before.covariance[np.ix_(free, free)], off)) / len(free)

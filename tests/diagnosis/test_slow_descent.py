@@ -119,7 +119,7 @@ def test_what_a_slow_descent_tells_is_the_cost_with_the_latents_at_their_best():
     slow = descended(fitting, fast, DescentOptions())
     here = Iterate(slow.optimum.soil, slow.optimum.gains, slow.optimum.latents, slow.neg2_log_posterior, 0)
     for _ in range(3):
-        here = fitting.moved(here, fitting.point(here), np.zeros(len(point.gradient)))
+        here = fitting.stepped(here, fitting.point(here), np.zeros(len(point.gradient)))
     assert slow.converged
     assert slow.neg2_log_posterior == pytest.approx(fitting.point(here).neg2_log_posterior, abs=NOTHING)
     assert slow.neg2_log_posterior == pytest.approx(known.neg2_log_posterior, abs=2.0 * NOTHING)

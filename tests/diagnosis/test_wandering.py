@@ -44,7 +44,7 @@ def test_what_each_recording_has_of_its_own_is_as_unknown_in_the_next_one_as_in_
     found = fit_model(records, prior_of(reference_configuration()), [CATALOGUE["draft_offset"]])
     n = found.checks[0].problem.n_sensors
     place = {f.parameter.name: 6 + n + i for i, f in enumerate(found.free)}
-    before = found.before[1]
+    before = found.joint_prior[1]
     row = before.covariance[place["drift"]]
     assert row[place["drift"]] == abs(row).sum() == 1.0
     assert before.gains[place["drift"] - 6] == 0.0

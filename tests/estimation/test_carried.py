@@ -44,10 +44,10 @@ def test_what_data_told_and_the_prior_are_together_what_they_were(simulated):
     one = simulated(SOILS["loam"], 1)
     problem, prior = one.problem(), one.prior
     mode = fit_window(problem, prior).mode
-    told = mode.apart_from(prior)
+    told = mode.likelihood_factor(prior)
     assert told.covariance[K_C, K_C] > mode.covariance[K_C, K_C]
     fitting = Objective(problem, prior, told)
-    known = fitting.before_at(Iterate(mode.soil, mode.gains, None, np.inf, 0))
+    known = fitting.prior_at(Iterate(mode.soil, mode.gains, None, np.inf, 0))
     scale = np.sqrt(np.diag(known.information))
     assert known.gradient / scale == pytest.approx(0.0, abs=1e-6)
     directions = fitting.directions(Iterate(mode.soil, mode.gains, None, np.inf, 0))[1:]
@@ -61,7 +61,7 @@ def test_two_that_tell_k_c_badly_tell_it_as_their_product_does(simulated):
     one = simulated(SOILS["loam"], 1)
     prior = one.prior
     mode = fit_window(one.problem(), prior).mode
-    told = replace(mode.apart_from(prior), k_c_off=-2.0)  # a k_c below zero would fit best
+    told = replace(mode.likelihood_factor(prior), k_c_offset=-2.0)  # a k_c below zero would fit best
     fitting = Objective(one.problem(), prior, told)
     k_c = mode.soil[K_C] * np.exp(np.linspace(-3.0, 1.0, 41))
     along = told.covariance[:, K_C] / told.covariance[K_C, K_C]
@@ -70,7 +70,7 @@ def test_two_that_tell_k_c_badly_tell_it_as_their_product_does(simulated):
     for k, off in zip(k_c, shift, strict=True):
         soil, gains = told.soil * np.exp(along[:6] * off), told.gains + along[6:] * off
         soil[K_C] = k
-        costs.append(fitting.before_at(Iterate(soil, gains, None, np.inf, 0)).neg2_log_prior)
+        costs.append(fitting.prior_at(Iterate(soil, gains, None, np.inf, 0)).neg2_log_prior)
     of_data = shift**2 / told.covariance[K_C, K_C]
     of_prior = (np.log(k_c / prior.median[K_C]) / prior.log_std[K_C]) ** 2
     expected = of_data + of_prior
@@ -80,26 +80,26 @@ def test_two_that_tell_k_c_badly_tell_it_as_their_product_does(simulated):
 
 def test_what_is_given_or_moved_stays_told_by_data(simulated):
     one = simulated(SOILS["loam"], 1)
-    told = fit_window(one.problem(), one.prior).mode.apart_from(one.prior)
+    told = fit_window(one.problem(), one.prior).mode.likelihood_factor(one.prior)
     n = PARAMETERS.index("n")
     held = told.given(n, float(np.log(told.soil[n])) + 0.02)
     along = told.covariance[:, n] / told.covariance[n, n]
     assert held.soil[K_C] == told.soil[K_C]
-    assert held.k_c_off == pytest.approx(told.k_c_off + 0.02 * along[K_C])
+    assert held.k_c_offset == pytest.approx(told.k_c_offset + 0.02 * along[K_C])
     assert held.soil[n] == pytest.approx(told.soil[n] * np.exp(0.02))
 
 
 def test_a_prior_without_doubt_about_k_c_has_nothing_apart():
     prior = prior_of(reference_configuration(["soil.k_c.std=0"]))
     gaussian = Gaussian.of(prior, np.zeros(0))
-    assert gaussian.apart_from(prior) is gaussian
+    assert gaussian.likelihood_factor(prior) is gaussian
 
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_windows_in_a_row_tell_k_c_as_one_long_window_does(seed):
     """In logarithms six windows of 10 s had told k_c of this clay to a third, and a factor of 2.5 too small."""
     row, whole = fits(CLAY, seed, 10.0), fits(CLAY, seed, 60.0)
-    (log, std), (at_once, std_at_once) = of_k_c(row[-1].whole.posterior), of_k_c(whole[-1].whole.posterior)
+    (log, std), (at_once, std_at_once) = of_k_c(row[-1].reported.posterior), of_k_c(whole[-1].reported.posterior)
     assert abs(log - at_once) < std_at_once
     assert 0.7 < std / std_at_once < 1.6
     assert abs(log - np.log(SOILS[CLAY].k_c)) < 2.5 * std

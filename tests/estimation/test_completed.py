@@ -44,7 +44,7 @@ def at(request, problems):
     free = parameters_of(effect, plain.n_wheels)
     problem = plain.completed([effect], free)
     gains = np.concatenate([np.zeros(problem.n_sensors), np.full(len(free), PULL)])
-    latents = problem.carried(problem.start(SOIL), SOIL, gains)
+    latents = problem.with_entry_angles(problem.start(SOIL), SOIL, gains)
     for _ in range(4):
         there = problem._response(SOIL, gains, latents)
         latents = replace(latents, entry_angle=latents.entry_angle + there.off / there.load_slope)

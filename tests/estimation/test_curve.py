@@ -66,7 +66,7 @@ def test_straight_ahead_no_curve_is_seen():
     config = reference_configuration()
     tracker, scenario = tracker_of(config), Scenario(16.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))
     for window, end in windows(config, simulate(config, scenario, 2)):
-        assert not tracker.estimate(window, end).fit.bend
+        assert not tracker.estimate(window, end).fit.curved_path
 
 
 def test_only_differences_between_the_sides_are_freed_and_by_as_much_as_the_rims_differ(simulated):

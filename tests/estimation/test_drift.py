@@ -47,12 +47,12 @@ def after(pause: float, told, little: Window) -> Fit:
 
 def spreads(fit: Fit) -> tuple[float, float]:
     """Relative std of bearing pressure and tan phi."""
-    found = fit.whole.posterior.bearing_pressure(Z_REF, B_REF), fit.whole.posterior.tan_phi()
+    found = fit.reported.posterior.bearing_pressure(Z_REF, B_REF), fit.reported.posterior.tan_phi()
     return found[0].std / found[0].value, found[1].std / found[1].value
 
 
 def gain_stds(fit: Fit) -> list[float]:
-    return [fit.whole.gain(i).std for i in range(N_GAINS)]
+    return [fit.reported.gain(i).std for i in range(N_GAINS)]
 
 
 def test_the_soil_of_an_hour_ago_is_no_more_than_another_soil(told, little):

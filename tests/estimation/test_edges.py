@@ -109,5 +109,5 @@ def test_angles_solved_anew_carry_the_loads_with_the_effects_as_they_are(simulat
     fitting = Objective(problem, case.prior, Gaussian.of(case.prior, problem.gain_std))
     place = fitting.start(np.asarray(SOILS["loam"]), gains=gains)
     place.latents.entry_angle *= 1.1
-    point = fitting.point(fitting.carried(place))
+    point = fitting.point(fitting.with_entry_angles(place))
     assert np.abs(point.at.off).max() < 1e-3 * problem.load.mean()

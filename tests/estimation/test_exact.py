@@ -38,7 +38,7 @@ def test_the_average_along_n_has_the_moments_of_the_exact_posterior(ill_told):
     found = samples(problem, prior, before, fit, 500, np.random.default_rng(1))
     assert found.share.sum() == pytest.approx(1.0)
     assert found.effective > 60.0
-    whole = with_nested_laplace(problem, prior, before, fit).whole
+    whole = with_nested_laplace(problem, prior, before, fit).reported
     along = profile_over_n(problem, prior, before, fit)
     nodes = attainable_variance(along, prior, before)
     u = [node.u for node in along.nodes]

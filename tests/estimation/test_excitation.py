@@ -45,7 +45,9 @@ def of_drive(soil, sinkage, seed):
     config = rough(soil)
     problem = minima.window(config, soil, 10.0, minima.constant(SLIPS[seed % 4]), sinkage, 100 + seed, STILL)
     prior = missed(prior_of(config), SOILS[soil], np.random.default_rng([seed, 9]))
-    whole = with_nested_laplace(problem, prior, Gaussian.of(prior, problem.gain_std), fit_window(problem, prior)).whole
+    whole = with_nested_laplace(
+        problem, prior, Gaussian.of(prior, problem.gain_std), fit_window(problem, prior)
+    ).reported
     return deviations(whole.posterior, soil)
 
 

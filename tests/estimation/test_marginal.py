@@ -31,7 +31,7 @@ def test_without_noise_a_window_that_tells_k_c_says_the_truth(seed):
     times = {name: drive.channels[name].t for name in fitted}
     store.add({name: (t, np.interp(t, drive.truth["t"], drive.truth[name])) for name, t in times.items()})
     problem = ObservationModel(store.window(0.0, DURATION), rig, model_of(config), config.estimator.min_speed)
-    told = cold_fit(problem, truth).whole.posterior
+    told = cold_fit(problem, truth).reported.posterior
     bound = cramer_rao(problem, truth, soil)
     std = np.sqrt(np.diag(bound.log_covariance))
     off = np.log(np.asarray(told.soil) / np.asarray(soil)) / std

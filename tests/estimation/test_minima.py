@@ -67,7 +67,7 @@ def test_two_optima_as_likely_are_a_fit_with_a_rival(torn):
 
 def test_what_is_passed_on_covers_both_optima(torn):
     fit = fit_window(*torn)
-    one, other, whole = fit.gaussian, fit.second_mode.gaussian, fit.whole
+    one, other, whole = fit.gaussian, fit.second_mode.gaussian, fit.reported
     off = np.log(other.soil / one.soil)
     share = fit.second_mode.share
     for k in range(6):
@@ -147,13 +147,13 @@ def test_whatever_the_data_every_fit_is_physical(harms, rows, seed, short):
     assert fit.posterior.soil.phi <= MAX_PHI < 0.5 * math.pi
     away = np.abs(np.log(soil / prior.median)) / prior.log_std
     assert away.max() < BOUND * (1.0 + 1e-9)
-    for gaussian in (fit.mode, fit.gaussian, fit.whole):
+    for gaussian in (fit.mode, fit.gaussian, fit.reported):
         assert np.isfinite(gaussian.gains).all()
         spread = np.sqrt(np.diag(gaussian.covariance))
         assert np.isfinite(spread).all()
         scaled = gaussian.covariance[spread > 0.0][:, spread > 0.0] / np.outer(*[spread[spread > 0.0]] * 2)
         assert np.linalg.eigvalsh(scaled).min() > -1e-9
         known = prior.log_std * np.where(K_C & (gaussian is not fit.mode), LESS_SURE, 1.0 + 1e-6)
-        assert (spread[:6] <= known).all() or (fit.second_mode is not None and gaussian is fit.whole)
+        assert (spread[:6] <= known).all() or (fit.second_mode is not None and gaussian is fit.reported)
     assert math.isfinite(fit.neg2_log_posterior) or not fit.converged
     assert math.isfinite(fit.neg2_log_evidence) or not fit.converged

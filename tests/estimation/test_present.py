@@ -95,7 +95,7 @@ def test_the_filter_is_the_joint_solution_for_the_soils_of_all_pieces(drift, sim
     place = Iterate(fit.optimum.soil, fit.optimum.gains, fit.optimum.latents, 0.0, 0)
     at, directions = fit.optimum.at, fitting.directions(place)
     free, kept = len(fitting.free), directions.shape[1]
-    known = fitting.before_at(place)
+    known = fitting.prior_at(place)
     m = at.by_latents.shape[1]
     ago = (fit.optimum.t - fit.optimum.t[-1]) / 10.0
     steps, covariances, evidences = [], [], []
@@ -165,7 +165,7 @@ def test_all_that_a_fit_says_moves_as_its_mode_does_and_is_less_sure(overrides, 
     problem, prior = minima.window(config, "wet_clay", seed=3), minima.prior_of(config)
     before = Gaussian.of(prior, problem.gain_std)
     fit = fit_window(problem, prior, before)
-    fit = replace(fit, marginalised=fit.mode.mixed(fit.mode, 0.5))
+    fit = replace(fit, marginalised=fit.mode.mixture(fit.mode, 0.5))
     fitting = Objective(problem, prior, before)
     now = at_window_end(fitting, fit, 10.0, 0.03)
     assert (fit.second_mode is None) == (wheels == 4)

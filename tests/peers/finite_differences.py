@@ -54,7 +54,7 @@ def fit(case: Case) -> Posterior | None:
     for turn in range(PASSES):
         at = problem.linearise(soil, gains, latents)
         if turn:
-            latents = problem.carried(problem.updated(at, latents, np.zeros(6), np.zeros(len(gains))), soil)
+            latents = problem.with_entry_angles(problem.updated(at, latents, np.zeros(6), np.zeros(len(gains))), soil)
             at = problem.linearise(soil, gains, latents)
         residuals = _whitened(problem, at, latents, gains)
         try:

@@ -97,7 +97,7 @@ def of_soft_ground(tracked: TrackerOutput) -> TrackerOutput:
     """The same, as sure of it, of a ground that holds nothing."""
     soft = np.array(SOILS["wet_clay"]) * [0.05, 0.05, 1.0, 0.3, 0.2, 1.0]
     fit = dataclasses.replace(
-        tracked.fit, gaussian=dataclasses.replace(tracked.fit.whole, soil=soft), marginalised=None
+        tracked.fit, gaussian=dataclasses.replace(tracked.fit.reported, soil=soft), marginalised=None
     )
     return dataclasses.replace(tracked, fit=dataclasses.replace(fit, second_mode=None))
 
@@ -373,7 +373,7 @@ class Drive:
                 raise ZeroDivisionError
             tracked = self.of_soft if known.soft else self.tracked
             assert tracked is not None
-            estimator.tracker._newest = tracked.fit.whole
+            estimator.tracker._newest = tracked.fit.reported
             return tracked_at(tracked, window, since=end - self.config.estimator.window, mismatch=known.blind)
 
         if self.tracked is not None:

@@ -61,7 +61,7 @@ def descended(fitting: Objective, fast: Fit, effort: DescentOptions) -> Fit | No
     ground, end = _Ground(fitting), fast.optimum
     with np.errstate(all="ignore"):
         ended = Iterate(end.soil, fitting.problem.allowed(end.gains), end.latents, fast.neg2_log_posterior, 0)
-        point = fitting.with_before(ended, end.at)
+        point = fitting.with_prior(ended, end.at)
         if point is None or _foreseen(point, point.step()) > effort.give_up_above:
             return None
         here = ground.at(ended, end.at)
@@ -99,7 +99,7 @@ class _Ground:
 
     def at(self, place: Iterate, at: Linearisation | None = None) -> _Here | None:
         """A place, which may be linearised already, with its latents at their best, and the normal equations there."""
-        point = self.fitting.point(place) if at is None else self.fitting.with_before(place, at)
+        point = self.fitting.point(place) if at is None else self.fitting.with_prior(place, at)
         if point is None:
             return None
         here = _Here(place, point)
@@ -115,7 +115,7 @@ class _Ground:
     def damped(self, here: _Here, damping: float) -> _Here | None:
         """The place after a damped step, where it costs less."""
         step = here.point.step(damping)
-        there = None if step is None else self.at(self.fitting.moved(*here, step))
+        there = None if step is None else self.at(self.fitting.stepped(*here, step))
         return there if there is not None and there.point.neg2_log_posterior < here.point.neg2_log_posterior else None
 
     def honest(self, here: _Here, enough: float) -> _Here | None:
@@ -143,7 +143,7 @@ class _Valley:
 
     fitting: Objective
     share: float = 1.0
-    bend: Array | None = None
+    second_derivative: Array | None = None
 
     def along(self, here: _Here, full: Array) -> tuple[_Here | None, int]:
         """The place after a part of a full step (F + A,), None where none lowers the cost, and how many were tried."""
@@ -151,29 +151,33 @@ class _Valley:
         length, least = point.length(full), None
         for tried in range(1, MAX_TRIED + 1):
             share = self.share
-            step = share * full if self.bend is None else self.fitting.turned(place, point, share, self.bend)
+            step = (
+                share * full
+                if self.second_derivative is None
+                else self.fitting.geodesic_step(place, point, share, self.second_derivative)
+            )
             if step is not None:
-                reach = self.fitting.reach(place, step)
+                reach = self.fitting.step_share(place, step)
                 share, step = reach * share, reach * step
             there = None
             if step is not None and share > LEAST:
-                there = _at(self.fitting, self.fitting.moved(place, point, step))
+                there = _at(self.fitting, self.fitting.stepped(place, point, step))
             if step is None or there is None:
-                self.share, self.bend = SHORTER * self.share, None
+                self.share, self.second_derivative = SHORTER * self.share, None
                 continue
             foretold, fall = share * (2.0 - share) * length, point.neg2_log_posterior - there.point.neg2_log_posterior
-            bend = self.fitting.bend(place, point, step, there.point) / share**2
+            second_derivative = self.fitting.second_derivative(place, point, step, there.point) / share**2
             if fall > GOOD * foretold:
                 left = 1.0 - share
                 further = LONGER if share < SHORT and fall > AS_FORETOLD * foretold else 1.0
                 self.share = min(further * share / left, 1.0) if left > 0.0 else 1.0
-                self.bend = bend * left**2 if left > 0.0 else None
+                self.second_derivative = second_derivative * left**2 if left > 0.0 else None
                 return there, tried
             if fall > 0.0 and (least is None or there.point.neg2_log_posterior < least.point.neg2_log_posterior):
                 least = there
             straight = share * (length * share / (foretold - fall)) ** (1.0 / 3.0)  # the bend costs share^4
-            self.share = min(share, BENT * straight) if self.bend is None else SHORTER * share
-            self.bend = bend
+            self.share = min(share, BENT * straight) if self.second_derivative is None else SHORTER * share
+            self.second_derivative = second_derivative
         return least, MAX_TRIED
 
 
@@ -189,7 +193,7 @@ def _at(fitting: Objective, place: Iterate) -> _Here | None:
 
 def _followed(fitting: Objective, here: _Here) -> _Here | None:
     """The place with its latents where the linear model there says that they fit best."""
-    return _at(fitting, fitting.moved(*here, np.zeros(len(here.point.gradient))))
+    return _at(fitting, fitting.stepped(*here, np.zeros(len(here.point.gradient))))
 
 
 def _enough(fitting: Objective, point: QuadraticModel, nothing: float) -> float:
@@ -198,7 +202,7 @@ def _enough(fitting: Objective, point: QuadraticModel, nothing: float) -> float:
 
 
 def _fit(fitting: Objective, place: Iterate, point: QuadraticModel, steps: int, converged: bool) -> Fit | None:
-    gaussians = fitting.gaussians(place, point, place.soil)
+    gaussians = fitting.gaussians_at(place, point, place.soil)
     if gaussians is None:
         return None
     return Fit(

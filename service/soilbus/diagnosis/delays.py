@@ -202,8 +202,8 @@ def _downhill(
     low, high = bounds[0] + STEP, bounds[1] - STEP
     for _ in range(ROUNDS):
         total = min(max(total, low), high)
-        before, here, after = (cost(s - tau, tau) for s in (total - STEP, total, total + STEP))
-        curved, slope = (before + after - 2.0 * here) / STEP**2, (after - before) / (2.0 * STEP)
+        earlier, here, later = (cost(s - tau, tau) for s in (total - STEP, total, total + STEP))
+        curved, slope = (earlier + later - 2.0 * here) / STEP**2, (later - earlier) / (2.0 * STEP)
         move = -slope / curved if curved > 0.0 else -np.sign(slope) * np.inf
         if abs(move) <= STEP or not low < min(max(total + move, low), high) < high:
             break
@@ -221,12 +221,12 @@ class _Part:
         self.problem = record.learned.completed(fitted.effects, free)
         self.columns = [self.problem.n_sensors + k for k in at]
         self.free = [free[k] for k in at]
-        before = _without(fitted.before[i], self.columns)
+        joint_prior = _without(fitted.joint_prior[i], self.columns)
         self.gains = self.fit.optimum.gains.copy()
         for f, k, column in zip(self.free, at, self.columns, strict=True):
             self.gains[column] = f.pull_at(fitted.free[k].at(float(self.gains[column])))
         optimum = self.fit.optimum
-        fitting = Objective(self.problem, prior, before)
+        fitting = Objective(self.problem, prior, joint_prior)
         place = Iterate(optimum.soil, self.gains, optimum.latents, np.inf, 0)
         point = fitting.point(place)
         if point is None:
@@ -266,12 +266,12 @@ def _alone(free: Sequence[Free], at: tuple[int, int]) -> list[Free]:
     return [free[i] if i in at else replace(free[i], value=0.0, std=0.0) for i in own]
 
 
-def _without(before: Gaussian, columns: Sequence[int]) -> Gaussian:
+def _without(joint_prior: Gaussian, columns: Sequence[int]) -> Gaussian:
     """What was known before of all but these gains, which are held."""
-    covariance = before.covariance.copy()
+    covariance = joint_prior.covariance.copy()
     held = [_SOIL + c for c in columns]
     covariance[held] = covariance[:, held] = 0.0
-    return Gaussian(before.soil, before.gains, covariance)
+    return Gaussian(joint_prior.soil, joint_prior.gains, covariance)
 
 
 def _pull(fitted: FittedModel, i: int) -> float:

@@ -70,7 +70,7 @@ class FittedModel:
     effects: tuple[Effect, ...]
     free: tuple[Free, ...]
     beforehand: tuple[Free, ...]
-    before: tuple[Gaussian, ...]
+    joint_prior: tuple[Gaussian, ...]
     fits: tuple[Fit, ...]
     checks: tuple[Checked, ...]
     sizes: float = 0.0
@@ -203,14 +203,14 @@ def fit_model(
         fitted = _fits(records, prior, effects, free, starts, effort)
     if fitted is None:
         return None
-    befores, fits = fitted
+    joint_priors, fits = fitted
     checks = [
         check(record.checked.completed(effects, free), prior, fit, None if near is None else near[i])
         for i, (record, fit) in enumerate(zip(records, fits, strict=True))
     ]
     added = [effect for effect in effects if effect not in present.effects]
     sizes = sum(_sizes(effect, free, fits, checks) for effect in added)
-    return FittedModel(tuple(effects), free, beforehand, tuple(befores), tuple(fits), tuple(checks), sizes)
+    return FittedModel(tuple(effects), free, beforehand, tuple(joint_priors), tuple(fits), tuple(checks), sizes)
 
 
 def _fits(
@@ -222,17 +222,17 @@ def _fits(
     effort: DescentOptions,
 ) -> tuple[list[Gaussian], list[Fit]] | None:
     """What was known before each recording, and its fit."""
-    befores: list[Gaussian] = []
+    joint_priors: list[Gaussian] = []
     fits: list[Fit] = []
     for i, record in enumerate(records):
         problem = record.learned.completed(effects, free)
-        before = _of_next(fits[-1].mode, prior, problem, effects) if fits else _of_first(record, prior, problem)
-        fit = _fitted(problem, prior, before, None if starts is None else starts[i], effort)
+        joint_prior = _of_next(fits[-1].mode, prior, problem, effects) if fits else _of_first(record, prior, problem)
+        fit = _fitted(problem, prior, joint_prior, None if starts is None else starts[i], effort)
         if fit is None:
             return None
-        befores.append(before)
+        joint_priors.append(joint_prior)
         fits.append(fit)
-    return befores, fits
+    return joint_priors, fits
 
 
 def _held_at_edges(
@@ -283,10 +283,10 @@ def _of_parameters(fit: Fit, n_sensors: int, members: Sequence[int]) -> tuple[Ar
 
 def _of_first(record: Record, prior: SoilPrior, problem: ObservationModelWithEffects) -> Gaussian:
     """What is known before the first recording; nothing yet of effects that its model had not."""
-    before = Gaussian.of(prior, problem.gain_std)
+    joint_prior = Gaussian.of(prior, problem.gain_std)
     if record.known is None:
-        return before
-    gains, covariance = before.gains.copy(), before.covariance.copy()
+        return joint_prior
+    gains, covariance = joint_prior.gains.copy(), joint_prior.covariance.copy()
     n = len(record.known.gains)
     gains[:n], covariance[: _SOIL + n, : _SOIL + n] = record.known.gains, record.known.covariance
     return Gaussian(record.known.soil, gains, covariance)
@@ -295,20 +295,20 @@ def _of_first(record: Record, prior: SoilPrior, problem: ObservationModelWithEff
 def _fitted(
     problem: ObservationModelWithEffects,
     prior: SoilPrior,
-    before: Gaussian,
+    joint_prior: Gaussian,
     start: Start | None,
     effort: DescentOptions,
 ) -> Fit | None:
     """From the given start, or from anywhere; a fit that has not converged goes on from where it is, slowly."""
     if start is None:
-        fit = fit_window(problem, prior, before)
+        fit = fit_window(problem, prior, joint_prior)
         if fit is None or fit.converged:
             return fit
         start = Start(fit.mode.soil, fit.mode.gains)
-    fit = fit_from(problem, prior, before, start, problem.n_sensors, effort)
+    fit = fit_from(problem, prior, joint_prior, start, problem.n_sensors, effort)
     if fit is None or fit.converged:
         return fit
-    slow = descended(Objective(problem, prior, before), fit, effort)
+    slow = descended(Objective(problem, prior, joint_prior), fit, effort)
     return None if (slow or fit).neg2_log_posterior > effort.give_up_above else slow or fit
 
 
@@ -338,12 +338,12 @@ def check(problem: ObservationModelWithEffects, prior: SoilPrior, fit: Fit, near
     rounds = CHECK_ROUNDS if near is None or len(near.load) != problem.n else CHECK_AGAIN
     with np.errstate(all="ignore"):
         latents = fitting.near(fit.mode.soil, gains, near).latents
-        latents = problem.carried(latents, soil, gains)
+        latents = problem.with_entry_angles(latents, soil, gains)
         at = problem.linearise(soil, gains, latents)
         for _ in range(rounds - 1):
             latents = problem.updated(at, latents, np.zeros(_SOIL), np.zeros(len(gains)))
             at = problem.linearise(soil, gains, latents)
-        point = fitting.with_before(Iterate(fit.mode.soil, gains, latents, np.inf, 0), at)
+        point = fitting.with_prior(Iterate(fit.mode.soil, gains, latents, np.inf, 0), at)
         step = None if point is None else point.step()
     if point is None or step is None:
         return Checked(problem, latents, at, np.inf, np.inf)

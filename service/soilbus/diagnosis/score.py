@@ -146,10 +146,10 @@ def _normal(
     free: Sequence[Free],
 ) -> Normal:
     problem = record.learned.completed((*present.effects, *candidates), (*present.free, *free))
-    fit, before, P = present.fits[i], present.before[i], len(free)
-    covariance = np.zeros((len(before.covariance) + P,) * 2)
-    covariance[:-P, :-P], covariance[-P:, -P:] = before.covariance, np.eye(P)
-    extended = Gaussian(before.soil, np.concatenate([before.gains, np.zeros(P)]), covariance)
+    fit, joint_prior, P = present.fits[i], present.joint_prior[i], len(free)
+    covariance = np.zeros((len(joint_prior.covariance) + P,) * 2)
+    covariance[:-P, :-P], covariance[-P:, -P:] = joint_prior.covariance, np.eye(P)
+    extended = Gaussian(joint_prior.soil, np.concatenate([joint_prior.gains, np.zeros(P)]), covariance)
     gains = np.concatenate([fit.optimum.gains, np.zeros(P)])
     place = Iterate(fit.optimum.soil, gains, fit.optimum.latents, np.inf, 0)
     fitting = Objective(problem, prior, extended)

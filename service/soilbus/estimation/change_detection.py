@@ -30,11 +30,11 @@ class ChangeStatistic(NamedTuple):
 
 
 def change_statistic(
-    fitting: Objective, before: Gaussian, place: Iterate, at: Linearisation, first: int, enough: float
+    fitting: Objective, joint_prior: Gaussian, place: Iterate, at: Linearisation, first: int, enough: float
 ) -> ChangeStatistic:
     """The likeliest beginning of another soil among the instants from `first` on.
 
-    The residuals are linearised at a place that earlier data told (`at`); `before` is what
+    The residuals are linearised at a place that earlier data told (`at`); `joint_prior` is what
     they told.  Below `enough` the ratio is only an upper bound.
     """
     n, m = at.by_latents.shape[:2]
@@ -46,11 +46,11 @@ def change_statistic(
     ratio = _ratio(misfit, count)
     if ratio.max() <= enough:
         return ChangeStatistic(first + int(np.argmax(ratio)), float(ratio.max()))
-    known = fitting.given(before)
+    known = fitting.given(joint_prior)
     by_known = known.directions(place)
     gradient = np.einsum("imk,im->ik", weighed, rows[:, :, 0]) @ by_known
     information = by_known.T @ np.einsum("imk,iml->ikl", rows, weighed) @ by_known
-    told = known.before_at(place).information
+    told = known.prior_at(place).information
     begin = int(np.argmax(_ratio(misfit - _explained(gradient, information + told), count)))
     # From there on together: another point within what is known must not pass for another soil.
     left = misfit[begin:].sum() - _explained(gradient[begin:].sum(0), information[begin:].sum(0) + told)

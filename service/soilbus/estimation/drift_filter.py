@@ -61,9 +61,9 @@ def at_window_end(fitting: Objective, fit: Fit, window: float, drift: float) -> 
     The same fit where nothing wanders or the numbers stop being finite.  Cost and evidence
     stay those of a constant soil: a wandering one would explain too much that is no soil.
     """
-    if not (drift or fit.bend):
+    if not (drift or fit.curved_path):
         return fit
-    optimum, still = fit.optimum, fitting.around(fit.optimum)
+    optimum, still = fit.optimum, fitting.approximation_at(fit.optimum)
     if still is None:
         return fit
     place, free = Iterate(optimum.soil, optimum.gains, optimum.latents, fit.neg2_log_posterior, 0), len(fitting.free)
@@ -75,13 +75,13 @@ def at_window_end(fitting: Objective, fit: Fit, window: float, drift: float) -> 
     gains = place.gains.copy()
     gains[fitting.active] -= step[free:]
     now = replace(place, soil=fitting.coordinates.moved(place.soil, -step[:free]), gains=gains)
-    mode = fitting.believed(now, covariance)
+    mode = fitting.gaussian_with(now, covariance)
 
     def moved(gaussian: Gaussian) -> Gaussian:
         return (
             mode
             if gaussian is fit.mode
-            else fitting.changed(gaussian, still.step - step, covariance - still.covariance)
+            else fitting.shifted(gaussian, still.step - step, covariance - still.covariance)
         )
 
     return replace(
@@ -111,7 +111,7 @@ def _joint(fitting: Objective, fit: Fit, still: GaussianApproximation, window: f
 
     The last, of the coordinates in the time of a window, as if nothing were known of it beforehand.
     """
-    at, t, directions, before = fit.optimum.at, fit.optimum.t, still.directions, still.known
+    at, t, directions, prior = fit.optimum.at, fit.optimum.t, still.directions, still.prior
     free, told, m = len(fitting.free), directions.shape[1], at.by_latents.shape[1]
     ago = (t - t[-1]) / window
     soil, steady = slice(1, 1 + free), slice(-free, None)
@@ -123,9 +123,9 @@ def _joint(fitting: Objective, fit: Fit, still: GaussianApproximation, window: f
     then = np.eye(told, rows.shape[1] - 1)  # what was known before is of the soil then
     then[:free, steady] = ago[0] * np.eye(free)
     joint = np.zeros((rows.shape[1],) * 2)
-    joint[0, 0] = before.neg2_log_prior
-    joint[1:, 1:] = then.T @ before.information @ then
-    joint[0, 1:] = joint[1:, 0] = then.T @ before.gradient
+    joint[0, 0] = prior.neg2_log_prior
+    joint[1:, 1:] = then.T @ prior.information @ then
+    joint[0, 1:] = joint[1:, 0] = then.T @ prior.gradient
     of_bends = np.arange(1 + told, len(joint) - free)
     joint[of_bends, of_bends] += 1.0
     steps = _ENDS if drift else _ENDS[-1:]
@@ -148,10 +148,10 @@ def _joint(fitting: Objective, fit: Fit, still: GaussianApproximation, window: f
 def _by_bends(fitting: Objective, fit: Fit) -> tuple[Array, Array]:
     """Derivatives (N m, K) of the residuals by bends in their standard deviations, and these weighed."""
     m = fit.optimum.at.by_latents.shape[1]
-    if not fit.bend:
+    if not fit.curved_path:
         none = np.zeros((len(fit.optimum.t) * m, 0))
         return none, none
-    of_bends = np.repeat(fit.bend.bends, m, axis=0)
+    of_bends = np.repeat(fit.curved_path.basis, m, axis=0)
     by_curve, weighed = by_curvature(fitting, fit)
     return of_bends * by_curve.reshape(-1, 1), of_bends * weighed.reshape(-1, 1)
 

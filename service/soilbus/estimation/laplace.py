@@ -84,7 +84,7 @@ class ProfileOverN(NamedTuple):
     nodes: list[Node]
 
 
-def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, before: Gaussian, found: Fit) -> Fit:
+def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, found: Fit) -> Fit:
     """The fit with mean and covariance of the whole posterior, where its top may not tell them.
 
     That is where n is badly known or there is a rival.  There the noise of loads and speeds
@@ -97,12 +97,12 @@ def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, before: Gau
     if spread < WELL_KNOWN and found.second_mode is None:
         return found
     with np.errstate(all="ignore"):
-        along = profile_over_n(problem, prior, before, found)
+        along = profile_over_n(problem, prior, joint_prior, found)
         if along is None:
             return found
         coordinates = Coordinates(prior, float(problem.rig.width.mean()))
-        told = attainable_variance(along, prior, before) if len(along.nodes) > 2 else None
-        whole = along.top.gaussian if told is None else _averaged(along.nodes, told, coordinates, before)
+        told = attainable_variance(along, prior, joint_prior) if len(along.nodes) > 2 else None
+        whole = along.top.gaussian if told is None else _averaged(along.nodes, told, coordinates, joint_prior)
     finite = np.isfinite(whole.soil).all() and np.isfinite(whole.covariance).all()
     if not finite or found.second_mode is not None:  # beside its rival an optimum is told as it was found
         return replace(found, marginalised=whole) if finite else found
@@ -117,25 +117,27 @@ def cold_fit(problem: ObservationModel, prior: SoilPrior) -> Fit | None:
     return with_nested_laplace(problem, prior, Gaussian.of(prior, problem.gain_std), fit)
 
 
-def profile_over_n(problem: ObservationModel, prior: SoilPrior, before: Gaussian, found: Fit) -> ProfileOverN | None:
+def profile_over_n(
+    problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, found: Fit
+) -> ProfileOverN | None:
     """The ridge through an optimum; without nodes where k_c, k_phi and n are not all free and the tyres unlike.
 
     None where the descent finds no optimum of the denoised problem.
     """
     optimum = found.optimum
     calm = DenoisedObservationModel(problem, optimum)
-    top = _converged(Objective(calm, prior, before), Iterate(optimum.soil, optimum.gains, calm.latents, np.inf, 1))
+    top = _converged(Objective(calm, prior, joint_prior), Iterate(optimum.soil, optimum.gains, calm.latents, np.inf, 1))
     if top is None:
         return None
     if not prior.log_std[[_K_C, _K_PHI, _N]].all() or np.ptp(problem.rig.width) == 0.0:
         return ProfileOverN(calm, top, [])
-    first = _held(calm, prior, before, top, math.log(top.mode.soil[_N]), None)
+    first = _held(calm, prior, joint_prior, top, math.log(top.mode.soil[_N]), None)
     if first is None:
         return ProfileOverN(calm, top, [])
     step = min(math.sqrt(top.mode.covariance[_N, _N]), LONGEST)
     covariance = top.mode.covariance
     slope = covariance[:, _N] / covariance[_N, _N]
-    down, up = (_along(calm, prior, before, first, slope, way, step) for way in (-1.0, 1.0))
+    down, up = (_along(calm, prior, joint_prior, first, slope, way, step) for way in (-1.0, 1.0))
     return ProfileOverN(calm, top, [*reversed(down), first, *up])
 
 
@@ -150,13 +152,13 @@ def _converged(fitting: Objective, near: Iterate) -> Fit | None:
 
 
 def _along(
-    problem: ObservationModel, prior: SoilPrior, before: Gaussian, top: Node, slope: Array, way: float, step: float
+    problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, top: Node, slope: Array, way: float, step: float
 ) -> list[Node]:
     """Nodes to one side; slope (6 + G,) is how logarithms of the soil and gains change with that of n at the top."""
     nodes: list[Node] = []
     last, least = top, top.unlikelihood
     for _ in range(MAX_STEPS):
-        node = _held(problem, prior, before, last.fit, last.u + way * step, slope)
+        node = _held(problem, prior, joint_prior, last.fit, last.u + way * step, slope)
         if node is None:
             break
         nodes.append(node)
@@ -173,7 +175,7 @@ def _place(fit: Fit) -> Array:
 
 
 def _held(
-    problem: ObservationModel, prior: SoilPrior, before: Gaussian, near: Fit, u: float, slope: Array | None
+    problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, near: Fit, u: float, slope: Array | None
 ) -> Node | None:
     """A fit with n held, from the optimum of one nearby, moved along the slope (6 + G,) of the ridge there."""
     soil, gains, n = near.optimum.soil.copy(), near.optimum.gains, math.exp(u)
@@ -185,26 +187,26 @@ def _held(
         soil[free] = Coordinates(prior, float(problem.rig.width.mean())).within(np.exp(moved[:_SOIL]))[free]
         gains = problem.allowed(moved[_SOIL:])
     soil[_N] = n
-    deviation = (u - math.log(before.soil[_N])) / math.sqrt(before.covariance[_N, _N])
+    deviation = (u - math.log(joint_prior.soil[_N])) / math.sqrt(joint_prior.covariance[_N, _N])
     median, log_std = prior.median.copy(), prior.log_std.copy()
     median[_N], log_std[_N] = n, 0.0
-    fitting = Objective(problem, SoilPrior(median, log_std), before.given(_N, u))
-    latents = problem.carried(near.optimum.latents, Soil(*soil.tolist()), gains)
+    fitting = Objective(problem, SoilPrior(median, log_std), joint_prior.conditioned_on(_N, u))
+    latents = problem.with_entry_angles(near.optimum.latents, Soil(*soil.tolist()), gains)
     fit = _converged(fitting, Iterate(soil, gains, latents, np.inf, 1))
-    return None if fit is None else Node(u, fit, deviation**2 + fitting.earlier.surplus)
+    return None if fit is None else Node(u, fit, deviation**2 + fitting.prior_factor.surplus)
 
 
-def attainable_variance(along: ProfileOverN, prior: SoilPrior, before: Gaussian) -> Array | None:
+def attainable_variance(along: ProfileOverN, prior: SoilPrior, joint_prior: Gaussian) -> Array | None:
     """Variance (nodes, 2) of log k_c and log n that a window on the soil of each node could leave at best.
 
     None where it is not to be told.
     """
-    fitting = Objective(along.problem, prior, before)
+    fitting = Objective(along.problem, prior, joint_prior)
     columns = np.searchsorted(fitting.free, [_K_C, _N])
     variance = []
     for node in along.nodes:
         place = Iterate(node.fit.optimum.soil, node.fit.optimum.gains, node.fit.optimum.latents, np.inf, 1)
-        point = fitting.with_before(place, node.fit.optimum.at)
+        point = fitting.with_prior(place, node.fit.optimum.at)
         inverse = None if point is None else solve_with_inverse(point.information, point.gradient)
         if inverse is None:
             return None
@@ -223,14 +225,14 @@ def counted(centre: Array, told: Array) -> tuple[Array, Array]:
     return of_all / of_all.sum(), of_k_c / of_k_c.sum()
 
 
-def _averaged(nodes: list[Node], told: Array, coordinates: Coordinates, before: Gaussian) -> Gaussian:
+def _averaged(nodes: list[Node], told: Array, coordinates: Coordinates, joint_prior: Gaussian) -> Gaussian:
     """Mean of all nodes and of what lies between them, by straight lines, and its spread about that.
 
     Soils of the ridge let a window tell its soil as unlike as by a factor of ten: the mean is where the mean
     square error is least if each counts by what is left there at best (`counted`), `told` (nodes, 2).
     """
     n, free = len(PARAMETERS), coordinates.free
-    active = n + np.flatnonzero(np.diag(before.covariance)[n:] > 0.0)
+    active = n + np.flatnonzero(np.diag(joint_prior.covariance)[n:] > 0.0)
     gaussians = [node.fit.gaussian for node in nodes]
     u = np.array([node.u for node in nodes])
     fine = np.linspace(u[0], u[-1], FINE)
@@ -238,9 +240,9 @@ def _averaged(nodes: list[Node], told: Array, coordinates: Coordinates, before: 
     weight = confidence(u, np.array([node.misfit for node in nodes]), fine)
     share = np.array([np.interp(fine, u, one) for one in np.eye(len(u))])
     left = _next(fine, probable, told[:, 0] @ share)
-    known = 1.0 - left / before.variance_of_k_c(coordinates.prior)
+    known = 1.0 - left / joint_prior.variance_of_k_c(coordinates.prior)
     place = np.array([[*coordinates.position(b.soil), *b.gains[active - n]] for b in gaussians])
-    unbiased = np.array([_unbiased_k_c(node, before, coordinates.prior) for node in nodes])
+    unbiased = np.array([_unbiased_k_c(node, joint_prior, coordinates.prior) for node in nodes])
     place[:, _K_C] += known * (unbiased - place[:, _K_C])
     along = place.T @ share
     own = np.array([_in_coordinates(b.covariance, coordinates.log_directions(b.soil), free, active) for b in gaussians])
@@ -274,7 +276,7 @@ def _next(fine: Array, probable: Array, value: Array) -> float:
     return float(np.interp(mean + math.sqrt((fine - mean) ** 2 @ probable), fine, value))
 
 
-def _unbiased_k_c(node: Node, before: Gaussian, prior: SoilPrior) -> float:
+def _unbiased_k_c(node: Node, joint_prior: Gaussian, prior: SoilPrior) -> float:
     """Logarithm of k_c given n of which the mean over windows on one soil is that soil's, to second order.
 
     The model is all but linear in k_c, and so the mean of the posterior of its logarithm is biased down, and
@@ -282,7 +284,7 @@ def _unbiased_k_c(node: Node, before: Gaussian, prior: SoilPrior) -> float:
     Math. Stat. 36:1137): that is half a variance above the mode, as far as it is the window that tells k_c.
     """
     variance = node.fit.mode.covariance[_K_C, _K_C]
-    of_window = 1.0 - variance / before.given(_N, node.u).variance_of_k_c(prior)
+    of_window = 1.0 - variance / joint_prior.conditioned_on(_N, node.u).variance_of_k_c(prior)
     return float(np.log(node.fit.mode.soil[_K_C]) + 0.5 * variance * of_window)
 
 

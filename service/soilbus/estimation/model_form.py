@@ -87,29 +87,31 @@ def formed(model: WheelModel, step: Array) -> WheelModel:
     )
 
 
-def form_left(fitting: Objective, fit: Fit, before: FormLeft) -> FormLeft:
+def form_left(fitting: Objective, fit: Fit, joint_prior: FormLeft) -> FormLeft:
     """What a window's fit leaves open, given what was left before it; that where the window tells nothing."""
     problem, optimum = fitting.problem, fit.optimum
-    around = fitting.around(optimum)
-    open_ = np.flatnonzero(np.diag(before.covariance) > 0.0)
-    if around is None or not len(open_):
-        return before
+    approximation = fitting.approximation_at(optimum)
+    open_ = np.flatnonzero(np.diag(joint_prior.covariance) > 0.0)
+    if approximation is None or not len(open_):
+        return joint_prior
     rows, weighed = problem.by_form(optimum)
     rows, weighed = rows[:, open_], weighed[:, open_]
-    by_prior, precision, off = fitting.earlier.by_mean(optimum.soil, optimum.gains, before.by_form[:, open_])
-    slopes = fitting.earlier_slopes(optimum)
+    by_prior, precision, off = fitting.prior_factor.jacobian_by_mean(
+        optimum.soil, optimum.gains, joint_prior.by_form[:, open_]
+    )
+    slopes = fitting.prior_jacobian(optimum)
     columns = weighed.T @ optimum.at.rows
-    mixed = (columns @ around.directions) + by_prior.T @ precision @ slopes
+    mixed = (columns @ approximation.directions) + by_prior.T @ precision @ slopes
     gradient = columns[:, 0] + by_prior.T @ (precision @ off)
     information = rows.T @ weighed + by_prior.T @ precision @ by_prior
-    own = solve_with_inverse(before.covariance[np.ix_(open_, open_)], before.mean[open_])
+    own = solve_with_inverse(joint_prior.covariance[np.ix_(open_, open_)], joint_prior.mean[open_])
     if own is None:
-        return before
-    of_gradient, of_information = around.explained(mixed)
+        return joint_prior
+    of_gradient, of_information = approximation.explained(mixed)
     told = solve_with_inverse(information - of_information + own[1], own[0] - gradient + of_gradient)
     if told is None:
-        return before
-    by_form, mean, covariance = np.zeros_like(before.by_form), np.zeros(len(FORM)), np.zeros((len(FORM),) * 2)
-    by_form[:, open_] = -fitting.spread(optimum) @ around.covariance @ mixed.T
+        return joint_prior
+    by_form, mean, covariance = np.zeros_like(joint_prior.by_form), np.zeros(len(FORM)), np.zeros((len(FORM),) * 2)
+    by_form[:, open_] = -fitting.parameter_jacobian(optimum) @ approximation.covariance @ mixed.T
     mean[open_], covariance[np.ix_(open_, open_)] = told
     return FormLeft(by_form, mean, covariance)

@@ -148,7 +148,7 @@ class Fit:
     converged: bool
     second_mode: SecondMode | None = None
     marginalised: Gaussian | None = None
-    bend: CurvedPathFit | None = None
+    curved_path: CurvedPathFit | None = None
     off_scale: bool = False
     form: FormLeft | None = None
 
@@ -158,14 +158,14 @@ class Fit:
         return self.gaussian.posterior
 
     @property
-    def whole(self) -> Gaussian:
+    def reported(self) -> Gaussian:
         """Soil and gains to be reported and passed on: the average where there is one, else both optima, or belief."""
         if self.marginalised is not None:
             return self.marginalised
         return (
             self.gaussian
             if self.second_mode is None
-            else self.gaussian.mixed(self.second_mode.gaussian, self.second_mode.share)
+            else self.gaussian.mixture(self.second_mode.gaussian, self.second_mode.share)
         )
 
     @property
@@ -189,15 +189,15 @@ class Fit:
         return self.neg2_log_posterior / max(self.rows, 1)
 
 
-def fit_window(problem: ObservationModel, prior: SoilPrior, before: Gaussian | None = None) -> Fit | None:
+def fit_window(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian | None = None) -> Fit | None:
     """Posterior of a window of which nothing is known: descents from several soils, of which the best counts.
 
-    `before` is what earlier windows told, in place of the prior.  None if no descent ends
+    `joint_prior` is what earlier windows told, in place of the prior.  None if no descent ends
     at a finite optimum.
     """
-    before = Gaussian.of(prior, problem.gain_std) if before is None else before
-    fitting = Objective(problem, prior, before)
-    thin = Objective(problem.thinned(THINNED), prior, before, with_gains=False)
+    joint_prior = Gaussian.of(prior, problem.gain_std) if joint_prior is None else joint_prior
+    fitting = Objective(problem, prior, joint_prior)
+    thin = Objective(problem.thinned(THINNED), prior, joint_prior, with_gains=False)
     with np.errstate(all="ignore"):
         ends = _ends(thin)
         best, led = _best(fitting, ends)
@@ -205,7 +205,7 @@ def fit_window(problem: ObservationModel, prior: SoilPrior, before: Gaussian | N
             return best
         if not best.converged:
             near = descend_soil(
-                Objective(problem, prior, before, with_gains=False), best.mode.soil, MAX_ITERATIONS, 0.0
+                Objective(problem, prior, joint_prior, with_gains=False), best.mode.soil, MAX_ITERATIONS, 0.0
             )
             best = best if near is None else _fit_at(fitting, descend_jointly(fitting, near, MAX_ITERATIONS)) or best
         if not best.converged:
@@ -291,7 +291,7 @@ def _ends(thin: Objective) -> list[Iterate]:
     every start is tried.
     """
     ends: list[Iterate] = []
-    for start in starting_soils(thin.problem, thin.coordinates.prior, thin.before):
+    for start in starting_soils(thin.problem, thin.coordinates.prior, thin.joint_prior):
         end = descend_soil(thin, np.asarray(start), MAX_APPROACH, known=ends)
         if end is None:
             continue
@@ -305,9 +305,9 @@ def _ends(thin: Objective) -> list[Iterate]:
     return sorted(ends, key=lambda end: end.neg2_log_posterior)
 
 
-def starting_soils(problem: ObservationModel, prior: SoilPrior, before: Gaussian | None = None) -> Iterator[Soil]:
+def starting_soils(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian | None = None) -> Iterator[Soil]:
     """What is believed (else the prior median), loam, and the known soils that foretell the window best."""
-    yield Soil(*(prior.median if before is None else before.soil).tolist())
+    yield Soil(*(prior.median if joint_prior is None else joint_prior.soil).tolist())
     likeliest, *others = ranked_by_likelihood(problem, [near(prior, SOILS[kind]) for kind in KINDS])
     yield likeliest
     yield near(prior, SOILS["loam"])
@@ -321,7 +321,7 @@ def near(prior: SoilPrior, soil: Soil) -> Soil:
 
 
 def fit_from_soil(
-    problem: ObservationModel, prior: SoilPrior, start: Soil, before: Gaussian | None = None
+    problem: ObservationModel, prior: SoilPrior, start: Soil, joint_prior: Gaussian | None = None
 ) -> Fit | None:
     """Gauss-Newton from one start; None where the numbers stop being finite.
 
@@ -329,18 +329,18 @@ def fit_from_soil(
     latents and gains would take up whatever a wrong soil leaves.  Near it everything is
     relinearised together.
     """
-    before = Gaussian.of(prior, problem.gain_std) if before is None else before
+    joint_prior = Gaussian.of(prior, problem.gain_std) if joint_prior is None else joint_prior
     soil = np.where(prior.log_std > 0.0, np.asarray(start, float), prior.median)
     with np.errstate(all="ignore"):
-        near = descend_soil(Objective(problem, prior, before, with_gains=False), soil, MAX_ITERATIONS)
-        fitting = Objective(problem, prior, before)
+        near = descend_soil(Objective(problem, prior, joint_prior, with_gains=False), soil, MAX_ITERATIONS)
+        fitting = Objective(problem, prior, joint_prior)
         return None if near is None else _fit_at(fitting, descend_jointly(fitting, near, MAX_ITERATIONS))
 
 
 def fit_from(
     problem: ObservationModel,
     prior: SoilPrior,
-    before: Gaussian,
+    joint_prior: Gaussian,
     start: Start,
     first: int,
     effort: DescentOptions = DEFAULT_OPTIONS,
@@ -350,7 +350,7 @@ def fit_from(
     Where a fit of the same model ended is near the optimum: everything moves from there,
     unless the numbers stop being finite.  The first step that makes things worse ends it: a slower descent is better.
     """
-    fitting, (most, give_up_above, enough, little) = Objective(problem, prior, before), effort
+    fitting, (most, give_up_above, enough, little) = Objective(problem, prior, joint_prior), effort
     compared = partial(
         descend_jointly,
         fitting,
@@ -367,7 +367,7 @@ def fit_from(
             fit = _fit_at(fitting, compared(place, MAX_RESUMED))
             if fit is not None:
                 return fit
-        moving = Objective(problem, prior, before, first=first)
+        moving = Objective(problem, prior, joint_prior, first=first)
         near = descend_soil(moving, start.soil, most // 2, little, gains, give_up_above=AS_MEASURED * give_up_above)
         if near is None:
             return None
@@ -383,9 +383,11 @@ class WarmStart:
     at: Linearisation
 
 
-def warm_start(problem: ObservationModel, prior: SoilPrior, last: Fit, before: Gaussian | None = None) -> WarmStart:
+def warm_start(
+    problem: ObservationModel, prior: SoilPrior, last: Fit, joint_prior: Gaussian | None = None
+) -> WarmStart:
     """A window at the optimum of the one just before, where what both share is linearised already."""
-    fitting = Objective(problem, prior, Gaussian.of(prior, problem.gain_std) if before is None else before)
+    fitting = Objective(problem, prior, Gaussian.of(prior, problem.gain_std) if joint_prior is None else joint_prior)
     with np.errstate(all="ignore"):
         latents, at = problem.after(last.optimum)
     soil = np.where(prior.log_std > 0.0, last.optimum.soil, prior.median)
@@ -396,10 +398,10 @@ def fit_warm(ahead: WarmStart) -> Fit | None:
     """Descent from the optimum of the window just before; the first step costs nothing more."""
     fitting, near = ahead.fitting, ahead.place
     with np.errstate(all="ignore"):
-        point = fitting.with_before(near, ahead.at)
+        point = fitting.with_prior(near, ahead.at)
         step = None if point is None else point.step()
         if point is not None and step is not None:
-            near = fitting.moved(near, point, step)
+            near = fitting.stepped(near, point, step)
         first = 0.0 if point is None or step is None else point.length(step)
         end = descend_jointly(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED, first, enough=CONVERGED_RESUMED)
         return _fit_at(fitting, end)
@@ -417,14 +419,14 @@ def refit_denoised(fitting: Objective, fit: Fit) -> Fit:
     optimum = fit.optimum
     with np.errstate(all="ignore"):
         calm = DenoisedObservationModel(fitting.problem, optimum)
-        again = Objective(calm, fitting.coordinates.prior, fitting.before)
+        again = Objective(calm, fitting.coordinates.prior, fitting.joint_prior)
         calm_place = Iterate(optimum.soil, optimum.gains, calm.latents, np.inf, 1)
         found = _fit_at(again, descend_jointly(again, calm_place, MAX_ITERATIONS, enough=CONVERGED_RESUMED))
         if found is None or not found.converged:
             return fit
         near = fitting.start(found.optimum.soil, optimum.latents.entry_angle, found.optimum.gains)
         first = fitting.point(near)
-        place = near if first is None else fitting.moved(near, first, np.zeros(len(first.gradient)))
+        place = near if first is None else fitting.stepped(near, first, np.zeros(len(first.gradient)))
         point = fitting.point(place)
     if first is None or point is None:
         return fit
@@ -448,7 +450,7 @@ def refine(fitting: Objective, near: Iterate) -> Fit | None:
 
 def _fit_at(fitting: Objective, end: Descent | None) -> Fit | None:
     """The end of a descent, with what is known there; None where the numbers stopped being finite."""
-    gaussians = None if end is None else fitting.gaussians(end.place, end.point, end.last.soil)
+    gaussians = None if end is None else fitting.gaussians_at(end.place, end.point, end.last.soil)
     if end is None or gaussians is None:
         return None
     fallen = end.length if end.converged else 0.0

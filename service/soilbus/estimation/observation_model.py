@@ -180,7 +180,7 @@ class CurvedPathFit(NamedTuple):
     """Optimum of a window before its data were freed of a bending way, and how large bends (N, K) may be beforehand."""
 
     optimum: Optimum
-    bends: Array
+    basis: Array
 
 
 def inverse_covariance(A: Array, latent_var: Array, row_var: Array, n_wheels: int) -> Array:
@@ -322,9 +322,11 @@ class ObservationModel(Measurements):
     def start(self, soil: Soil, guess: Array | None = None, gains: Array | None = None) -> Latents:
         """Latents at the measured values, entry angles solved for this soil (and gains) from a guess (N, W)."""
         angle = np.full((self.n, self.n_wheels), np.nan) if guess is None else guess
-        return self.carried(Latents(self.load.copy(), self.speed.copy(), self.ground_speed.copy(), angle), soil, gains)
+        return self.with_entry_angles(
+            Latents(self.load.copy(), self.speed.copy(), self.ground_speed.copy(), angle), soil, gains
+        )
 
-    def carried(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
+    def with_entry_angles(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
         """The same latents with the entry angles at which this soil carries their loads; gains (G,) as linearise()."""
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
         state = self._state(soil, latents.entry_angle, slip)
@@ -343,21 +345,21 @@ class ObservationModel(Measurements):
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(np.where(self.usable, self.sinkages(soil, gains, latents), 0.0).sum(0) / known)
 
-    def after(self, before: Optimum) -> tuple[Latents, Linearisation]:
+    def after(self, previous: Optimum) -> tuple[Latents, Linearisation]:
         """Latents and model of this window at the optimum of one that ends a little earlier.
 
         Instants that both share are taken over; the others are linearised at the measured
         values, with entry angles as loads and slips had them in the other window.
         """
-        shared = self._shared(before.t)
-        if before.at.by_latents.shape[1] != self._n_residuals:
+        shared = self._shared(previous.t)
+        if previous.at.by_latents.shape[1] != self._n_residuals:
             shared = 0
         new = self.part(slice(shared, None))
-        start = new._measured_on(self._angle_curve(before.latents))
-        at = new.linearise(Soil(*before.soil.tolist()), before.gains, start)
+        start = new._measured_on(self._angle_curve(previous.latents))
+        at = new.linearise(Soil(*previous.soil.tolist()), previous.gains, start)
         if not shared:
             return start, at
-        return before.latents.followed_by(shared, start), before.at.followed_by(shared, at)
+        return previous.latents.followed_by(shared, start), previous.at.followed_by(shared, at)
 
     def _shared(self, t: Array) -> int:
         """How many of the first instants are the last of those at t (M,)."""
@@ -607,9 +609,11 @@ class ObservationModel(Measurements):
         load, speed, ground = new[:, :W], new[:, W : 2 * W], new[:, 2 * W]
         slip_change = (latents.ground_speed[:, None] / latents.speed - ground[:, None] / speed) / self.rig.radius
         more = load - latents.load - at.load_by_slip * slip_change
-        return Latents(load, speed, ground, self.turned(at, latents.entry_angle, soil_step, gain_step, more))
+        return Latents(
+            load, speed, ground, self.stepped_entry_angle(at, latents.entry_angle, soil_step, gain_step, more)
+        )
 
-    def turned(
+    def stepped_entry_angle(
         self, at: Linearisation, angle: Array, soil_step: Array, gain_step: Array, more_load: Any = 0.0
     ) -> Array:
         """Entry angles (N, W) after a step (6,) of the soil and (G,) of the gains, by the linear model.
@@ -645,7 +649,9 @@ class DenoisedObservationModel(ObservationModel):
         self._expected = expected(latents, optimum.at.variance)
         load, speed, ground_speed = self._expected[:, :W], self._expected[:, W : 2 * W], self._expected[:, 2 * W]
         soil = Soil(*optimum.soil.tolist())
-        self.latents = self.carried(Latents(load, speed, ground_speed, fitted.entry_angle), soil, optimum.gains)
+        self.latents = self.with_entry_angles(
+            Latents(load, speed, ground_speed, fitted.entry_angle), soil, optimum.gains
+        )
         self._by_noise = problem.linearise(soil, optimum.gains, self.latents).by_latents
         *_, variance, row_var = self._corrected(optimum.gains)
         self._inverse = inverse_covariance(self._by_noise, variance, row_var, W)
@@ -658,9 +664,9 @@ class DenoisedObservationModel(ObservationModel):
         """Least and greatest value that each of the gains may have, (G,) each."""
         return self._problem.gain_bounds()
 
-    def carried(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
+    def with_entry_angles(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
         """The same latents with the entry angles at which this soil carries their loads."""
-        return self._problem.carried(latents, soil, gains)
+        return self._problem.with_entry_angles(latents, soil, gains)
 
     def sinkages(self, soil: Soil, gains: Array, latents: Latents) -> Array:
         """Sinkage [m] of each wheel at each instant (N, W)."""
@@ -783,10 +789,10 @@ class ObservationModelWithEffects(ObservationModel):
                 low[i], high[i] = (f.parameter.low - f.value) / f.std, (f.parameter.high - f.value) / f.std
         return low, high
 
-    def carried(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
+    def with_entry_angles(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
         """As WindowProblem; without gains the effects' parameters are at their prior values."""
         solved = np.isfinite(latents.entry_angle).all() and bool(self.effects)
-        base = latents if solved else super().carried(latents, soil, gains)
+        base = latents if solved else super().with_entry_angles(latents, soil, gains)
         if not self.effects:
             return base
         active = self.active(np.zeros(len(self.free)) if gains is None else gains[self.n_sensors :])

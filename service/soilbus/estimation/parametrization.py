@@ -135,7 +135,7 @@ class Coordinates:
                 directions[_K_PHI, column[_N]] = -K_L / k_phi * n * _LOG_DEPTH
         return directions
 
-    def bend(self, gradient: Array) -> Array:
+    def curvature(self, gradient: Array) -> Array:
         """Curvature (F, F) that the coordinates themselves add to chi-square, by its gradient (F,).
 
         The model is all but linear in k_c, and so curved in its logarithm; of that, what
@@ -186,13 +186,13 @@ class Coordinates:
         soil[self.free] = np.minimum(np.maximum(soil[self.free], low), high)
         return soil
 
-    def reach(self, soil: Array, step: Array) -> float:
+    def step_share(self, soil: Array, step: Array) -> float:
         """Share of a step (F,) from a soil (6,) that is no longer than steps may be and stays within the bounds."""
         low, high = self._log_bounds
         change = self.log_directions(soil)[self.free] @ step
         room = np.where(change > 0.0, high, low) - np.log(soil[self.free])
         longest = MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-12)
-        return min(longest, share_of_step(room, change))
+        return min(longest, step_share_within(room, change))
 
     def edges(self, soil: Array) -> Array:
         """Directions (E, F) in which no step can go, since a parameter is at a bound."""
@@ -233,7 +233,7 @@ def at_edges(place: Array, low: Array, high: Array) -> Array:
     return np.subtract(place >= high - EDGE, place <= low + EDGE, dtype=float)
 
 
-def share_of_step(room: Array, step: Array) -> float:
+def step_share_within(room: Array, step: Array) -> float:
     """Share of a step (M,), 1 at most, that leaves everything within the room (M,) there is; inf: no end of it."""
     cramped = np.abs(step) > np.abs(room) + EDGE
     if not cramped.any():

@@ -103,7 +103,7 @@ def without_curve(gaussian: Gaussian, curve: Curve) -> Gaussian:
     if not spread > 0.0:
         return gaussian
     step = -mean_along / spread * float(side[_SOIL:] @ gaussian.gains) / count
-    return gaussian.moved(step, covariance - np.outer(mean_along, mean_along) / spread)
+    return gaussian.shifted(step, covariance - np.outer(mean_along, mean_along) / spread)
 
 
 APART = 1.0
@@ -160,14 +160,14 @@ def detected_curvature(fitting: Objective, fit: Fit | None) -> CurvedPath | None
     if fit is None or not fit.converged or not sides(problem.rig).any():
         return None
     optimum = fit.optimum
-    around = fitting.around(optimum)
-    if around is None:
+    approximation = fitting.approximation_at(optimum)
+    if approximation is None:
         return None
     std, by_bends = curvature_basis(fitting.problem)
     by_curve, weighed = by_curvature(fitting, fit)
     rows = optimum.at.rows.reshape(*weighed.shape, -1)
     across = by_bends.T @ (weighed[:, None] @ rows)[:, 0]
-    of_gradient, of_information = around.explained(across @ around.directions)
+    of_gradient, of_information = approximation.explained(across @ approximation.directions)
     gradient = across[:, 0] - of_gradient
     own = (by_curve * weighed).sum(axis=1)
     information = by_bends.T @ (own[:, None] * by_bends) - of_information + np.eye(len(std))
@@ -191,14 +191,14 @@ def fit_on_curved_path(
 
     Bends may have led that far astray, so it is no more than a place to begin.
     """
-    prior, before, optimum = fitting.coordinates.prior, fitting.before, fit.optimum
+    prior, joint_prior, optimum = fitting.coordinates.prior, fitting.joint_prior, fit.optimum
     if straight.n != fitting.problem.n:
         return fitting, fit
-    again = Objective(straight, prior, before)
+    again = Objective(straight, prior, joint_prior)
     with np.errstate(all="ignore"):
         new = refine(again, again.start(optimum.soil, optimum.latents.entry_angle, optimum.gains))
     if new is None or not new.converged:
-        new = fit_window(straight, prior, before)
+        new = fit_window(straight, prior, joint_prior)
     if new is None or not new.converged or new.neg2_log_posterior + way.neg2_log_prior > fit.neg2_log_posterior:
         return fitting, fit
     cost, neg2_log_evidence = (
@@ -207,5 +207,5 @@ def fit_on_curved_path(
     )
     bend = CurvedPathFit(optimum, curvature_basis(fitting.problem)[1])
     return again, replace(
-        new, neg2_log_posterior=cost, neg2_log_evidence=min(fit.neg2_log_evidence, neg2_log_evidence), bend=bend
+        new, neg2_log_posterior=cost, neg2_log_evidence=min(fit.neg2_log_evidence, neg2_log_evidence), curved_path=bend
     )

@@ -22,7 +22,7 @@ from soilbus.estimation.parametrization import (
     Moments,
     at_edges,
     moments_along_share,
-    share_of_step,
+    step_share_within,
 )
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.terra.wheel import Soil
@@ -59,15 +59,15 @@ class Iterate:
 class QuadraticModel:
     """Normal equations by the free coordinates (F) and active gains (A) at one place.
 
-    information (F + A, F + A) is Gauss-Newton's, of which `known` is what was known
+    information (F + A, F + A) is Gauss-Newton's, of which `prior_information` is what was known
     before; bend, which comes on top for a step, is the curvature of the coordinates.
     cost is -2 log posterior up to a constant.  edges (E, F + A) are the directions in which
     no step can go.
     """
 
     information: Array
-    known: Array
-    bend: Array
+    prior_information: Array
+    curvature: Array
     gradient: Array
     neg2_log_posterior: float
     edges: Array
@@ -80,7 +80,7 @@ class QuadraticModel:
         With another gradient it is that of the parabola with that slope here.
         """
         gradient = self.gradient if gradient is None else gradient
-        curved = self.information + self.bend
+        curved = self.information + self.curvature
         curved.flat[:: len(curved) + 1] *= 1.0 + damping
         solution = _solution(curved, np.concatenate([gradient[None], self.edges]).T)
         if solution is None:
@@ -99,7 +99,7 @@ class QuadraticModel:
     def neg2_log_evidence(self) -> float:
         """-2 log of the data's likelihood whatever the soil may be (Laplace), up to the same constant."""
         return self.neg2_log_posterior + float(
-            np.linalg.slogdet(self.information)[1] - np.linalg.slogdet(self.known)[1]
+            np.linalg.slogdet(self.information)[1] - np.linalg.slogdet(self.prior_information)[1]
         )
 
     def length(self, step: Array) -> float:
@@ -115,7 +115,7 @@ class GaussianApproximation(NamedTuple):
     """
 
     directions: Array
-    known: PriorQuadratic
+    prior: PriorQuadratic
     step: Array
     covariance: Array
 
@@ -125,35 +125,40 @@ class GaussianApproximation(NamedTuple):
 
 
 class Objective:
-    """A window's residuals together with what was known before (`earlier`): free coordinates (F), active gains (A)."""
+    """A window's residuals and those of its prior (`prior_factor`): free coordinates (F), active gains (A)."""
 
     def __init__(
-        self, problem: ObservationModel, prior: SoilPrior, before: Gaussian, with_gains: bool = True, first: int = 0
+        self,
+        problem: ObservationModel,
+        prior: SoilPrior,
+        joint_prior: Gaussian,
+        with_gains: bool = True,
+        first: int = 0,
     ) -> None:
-        """Raises ValueError where `before` has no proper covariance; gains before the `first` one are held."""
-        self.problem, self.before = problem, before
+        """Raises ValueError where `joint_prior` has no proper covariance; gains before the `first` one are held."""
+        self.problem, self.joint_prior = problem, joint_prior
         self.coordinates = Coordinates(prior, float(problem.rig.width.mean()))
-        known = np.diag(before.covariance)[_SOIL:] > 0.0 if with_gains else np.zeros(len(before.gains), bool)
+        known = np.diag(joint_prior.covariance)[_SOIL:] > 0.0 if with_gains else np.zeros(len(joint_prior.gains), bool)
         known[:first] = False
         self.active = np.flatnonzero(known)
         self._gain_bounds = tuple(bound[self.active] for bound in problem.gain_bounds())
         self._has_bounds = bool(np.isfinite(self._gain_bounds).any())
         self.free = self.coordinates.free
         self._identity = np.eye(len(self.free) + len(self.active))
-        self._of_gains = np.zeros((7 + len(before.gains), len(self._identity)))
+        self._of_gains = np.zeros((7 + len(joint_prior.gains), len(self._identity)))
         self._of_gains[7 + self.active] = self._identity[len(self.free) :]
         self._by_sensors = with_gains and first == 0
-        self.earlier = PriorFactor(before, prior, self.active)
+        self.prior_factor = PriorFactor(joint_prior, prior, self.active)
         self._last: tuple[Array, Array, PriorQuadratic] | None = None
-        self._around: tuple[Optimum, GaussianApproximation | None] | None = None
+        self._approximation: tuple[Optimum, GaussianApproximation | None] | None = None
 
-    def given(self, before: Gaussian) -> Objective:
+    def given(self, joint_prior: Gaussian) -> Objective:
         """The same with something else known before."""
-        return Objective(self.problem, self.coordinates.prior, before)
+        return Objective(self.problem, self.coordinates.prior, joint_prior)
 
     def start(self, soil: Array, guess: Array | None = None, gains: Array | None = None) -> Iterate:
         """A soil with gains as believed, or these (G,), and latents as measured; angles solved from a guess (N, W)."""
-        gains = self.before.gains if gains is None else gains
+        gains = self.joint_prior.gains if gains is None else gains
         return Iterate(soil, gains, self.problem.start(Soil(*soil.tolist()), guess, gains), np.inf, 0)
 
     def near(self, soil: Array, gains: Array, latents: Latents | None) -> Iterate:
@@ -162,73 +167,78 @@ class Objective:
             return self.start(soil, gains=gains)
         return Iterate(soil, gains, latents, np.inf, 0)
 
-    def restarted(self, place: Iterate, point: QuadraticModel, step: Array) -> Iterate:
+    def stepped_with_measured_latents(self, place: Iterate, point: QuadraticModel, step: Array) -> Iterate:
         """The place after a step (F + A,) with latents as measured, as they are at this place already."""
         free, gains = len(self.free), place.gains.copy()
-        step = self.reach(place, step) * step
+        step = self.step_share(place, step) * step
         gains[self.active] += step[free:]
         soil, gains = self.coordinates.moved(place.soil, step[:free]), self.problem.allowed(gains)
-        angle = self.problem.turned(point.at, place.latents.entry_angle, soil - place.soil, gains - place.gains)
+        angle = self.problem.stepped_entry_angle(
+            point.at, place.latents.entry_angle, soil - place.soil, gains - place.gains
+        )
         return self._reached(place, point, soil, gains, replace(place.latents, entry_angle=angle))
 
     def point(self, place: Iterate) -> QuadraticModel | None:
         """The normal equations at a place; None where the model is not finite."""
         at = self.problem.linearise(place.as_soil(), place.gains, place.latents, self._by_sensors)
-        return self.with_before(place, at)
+        return self.with_prior(place, at)
 
-    def with_before(self, place: Iterate, at: Linearisation) -> QuadraticModel | None:
+    def with_prior(self, place: Iterate, at: Linearisation) -> QuadraticModel | None:
         """Those of residuals linearised already."""
         free = len(self.free)
         directions = self.directions(place)
         if not self._by_sensors:
             directions = np.delete(directions, slice(7, 7 + self.problem.n_sensors), axis=0)
         gradient = directions.T @ at.normal[:, 0]
-        known = self.before_at(place)
+        known = self.prior_at(place)
         cost = at.chi2 + known.neg2_log_prior
         if not math.isfinite(cost):
             return None
-        bend = np.zeros_like(self._identity)
-        bend[:free, :free] = self.coordinates.bend((gradient + known.of_data)[:free])
+        curvature = np.zeros_like(self._identity)
+        curvature[:free, :free] = self.coordinates.curvature((gradient + known.of_data)[:free])
         return QuadraticModel(
             information=directions.T @ at.normal @ directions + known.information,
-            known=known.information,
-            bend=bend,
+            prior_information=known.information,
+            curvature=curvature,
             gradient=gradient + known.gradient,
             neg2_log_posterior=cost,
             edges=self._edges(place),
             at=at,
         )
 
-    def before_at(self, place: Iterate) -> PriorQuadratic:
+    def prior_at(self, place: Iterate) -> PriorQuadratic:
         """What was known before, seen from a place; asked again from the last one's soil and gains, it is at hand."""
         if self._last is None or self._last[0] is not place.soil or self._last[1] is not place.gains:
             by_logs = self._identity.copy()
             by_logs[: len(self.free), : len(self.free)] = self._log_directions(place.soil)[self.free]
-            self._last = place.soil, place.gains, self.earlier.seen_from(place.soil, place.gains, by_logs)
+            self._last = place.soil, place.gains, self.prior_factor.quadratic_at(place.soil, place.gains, by_logs)
         return self._last[2]
 
-    def around(self, optimum: Optimum) -> GaussianApproximation | None:
+    def approximation_at(self, optimum: Optimum) -> GaussianApproximation | None:
         """The linear window about an optimum, at hand when asked for it again; None where it tells nothing."""
-        if self._around is None or self._around[0] is not optimum:
+        if self._approximation is None or self._approximation[0] is not optimum:
             place = Iterate(optimum.soil, optimum.gains, optimum.latents, math.nan, 0)
-            directions, known = self.directions(place), self.before_at(place)
+            directions, known = self.directions(place), self.prior_at(place)
             by_unknowns = directions.T @ optimum.at.normal
             solution = solve_with_inverse(
                 by_unknowns @ directions + known.information, by_unknowns[:, 0] + known.gradient
             )
-            self._around = optimum, None if solution is None else GaussianApproximation(directions, known, *solution)
-        return self._around[1]
+            self._approximation = (
+                optimum,
+                None if solution is None else GaussianApproximation(directions, known, *solution),
+            )
+        return self._approximation[1]
 
-    def spread(self, optimum: Optimum) -> Array:
+    def parameter_jacobian(self, optimum: Optimum) -> Array:
         """Derivatives (6 + G, F + A) of the soil's logarithms and the gains by coordinates and active gains there."""
         spread = self._of_gains[1:].copy()
         spread[:_SOIL, : len(self.free)] = self._log_directions(optimum.soil)
         return spread
 
-    def earlier_slopes(self, optimum: Optimum) -> Array:
+    def prior_jacobian(self, optimum: Optimum) -> Array:
         """Derivatives (R, F + A) of the residuals of what was known before."""
         kept = np.concatenate([self.free, _SOIL + self.active])
-        return self.earlier.slopes(optimum.soil, self.spread(optimum)[kept])
+        return self.prior_factor.jacobian(optimum.soil, self.parameter_jacobian(optimum)[kept])
 
     def directions(self, place: Iterate) -> Array:
         """What a column of Linearised.rows (1 + 6 + G) has of each coordinate and active gain (F + A)."""
@@ -236,22 +246,22 @@ class Objective:
         directions[1:7, : len(self.free)] = place.soil[:, None] * self._log_directions(place.soil)
         return directions
 
-    def moved(self, place: Iterate, point: QuadraticModel, step: Array) -> Iterate:
+    def stepped(self, place: Iterate, point: QuadraticModel, step: Array) -> Iterate:
         """The place after a step (F + A,), with the latents that the linear model foresees."""
         free = len(self.free)
-        step = self.reach(place, step) * step
+        step = self.step_share(place, step) * step
         soil = self.coordinates.moved(place.soil, step[:free])
         gain_step = np.zeros(len(place.gains))
         gain_step[self.active] = step[free:]
         latents = self.problem.updated(point.at, place.latents, soil - place.soil, gain_step)
         return self._reached(place, point, soil, place.gains + gain_step, latents)
 
-    def bend(self, place: Iterate, point: QuadraticModel, step: Array, there: QuadraticModel) -> Array:
+    def second_derivative(self, place: Iterate, point: QuadraticModel, step: Array, there: QuadraticModel) -> Array:
         """Second derivative of the residuals (R,) along a step (F + A,) that led from the place to `there`."""
         straight = point.at.rows @ (self.directions(place) @ step)
         return np.asarray(2.0 * (there.at.rows[:, 0] - point.at.rows[:, 0] - straight))
 
-    def turned(self, place: Iterate, point: QuadraticModel, share: float, bend: Array) -> Array | None:
+    def geodesic_step(self, place: Iterate, point: QuadraticModel, share: float, bend: Array) -> Array | None:
         """A share of the full step that bends (R,) as the valley does (F + A,); None where there is no step.
 
         Geodesic acceleration: Transtrum & Sethna 2012, arXiv:1201.5885.
@@ -271,28 +281,28 @@ class Objective:
         edges[len(of_soil) + np.arange(len(own)), len(self.free) + own] = at[own]
         return edges
 
-    def reach(self, place: Iterate, step: Array) -> float:
+    def step_share(self, place: Iterate, step: Array) -> float:
         """Share of a step (F + A,) that can be taken."""
         free = len(self.free)
-        of_soil = self.coordinates.reach(place.soil, step[:free])
+        of_soil = self.coordinates.step_share(place.soil, step[:free])
         if not self._has_bounds:
             return of_soil
         low, high = self._gain_bounds
         room = np.where(step[free:] > 0.0, high, low) - place.gains[self.active]
-        return min(of_soil, share_of_step(room, step[free:]))
+        return min(of_soil, step_share_within(room, step[free:]))
 
     def _reached(self, place: Iterate, point: QuadraticModel, soil: Array, gains: Array, latents: Latents) -> Iterate:
         """Soil (6,), gains (G,) and foreseen latents as a place, with the entry angles solved where they turn far."""
         turn = np.abs(latents.entry_angle / place.latents.entry_angle - 1.0).max(initial=0.0)
         if turn > (LONG_TURN_WITH_EFFECTS if len(point.at.load_by_effects) else LONG_TURN):
-            latents = self.problem.carried(latents, Soil(*soil.tolist()), gains)
+            latents = self.problem.with_entry_angles(latents, Soil(*soil.tolist()), gains)
         return Iterate(soil, gains, latents, point.neg2_log_posterior, place.trials)
 
-    def carried(self, place: Iterate) -> Iterate:
+    def with_entry_angles(self, place: Iterate) -> Iterate:
         """The same place with the entry angles solved anew: linear models in a row may have lost them."""
-        return replace(place, latents=self.problem.carried(place.latents, place.as_soil(), place.gains))
+        return replace(place, latents=self.problem.with_entry_angles(place.latents, place.as_soil(), place.gains))
 
-    def gaussians(self, place: Iterate, point: QuadraticModel, at: Array) -> tuple[Gaussian, Gaussian] | None:
+    def gaussians_at(self, place: Iterate, point: QuadraticModel, at: Array) -> tuple[Gaussian, Gaussian] | None:
         """What this optimum tells, by its moments and by its curvature; None where the information is singular.
 
         The point is of a soil (6,) one step away, `at`.  Without moments that are finite both are the curvature's.
@@ -324,13 +334,13 @@ class Objective:
         by_changes[[_K_C, _K_PHI], [1, 2]] = 1.0
         by_k_c = by_changes[_K_C].copy()
         by_k_c[[0, 1]] = 1.0, 0.0
-        slopes = self.earlier.slopes(place.soil, by_changes, by_k_c)
-        quadratic = slopes.T @ self.earlier.precision @ slopes
+        slopes = self.prior_factor.jacobian(place.soil, by_changes, by_k_c)
+        quadratic = slopes.T @ self.prior_factor.precision @ slopes
         of_data = np.concatenate([[0], others + 2])
-        quadratic[of_data[:, None], of_data] += by_share.T @ (point.information - point.known) @ by_share
+        quadratic[of_data[:, None], of_data] += by_share.T @ (point.information - point.prior_information) @ by_share
         k_c, k_phi = place.soil[[_K_C, _K_PHI]]
         share = k_c / (k_c + k_phi * self.coordinates.width)
-        pull = slopes.T @ self.earlier.precision @ self.earlier.off(place.soil, place.gains)
+        pull = slopes.T @ self.prior_factor.precision @ self.prior_factor.residuals(place.soil, place.gains)
         gradient = np.zeros(len(quadratic))
         gradient[:3] = pull[2] * share / (1.0 - share) - pull[1], *pull[1:3]  # the data pull as much the other way
         return moments_along_share(quadratic, gradient, share)
@@ -349,11 +359,11 @@ class Objective:
         spread[:_SOIL, :free] = self._log_directions(soil if at is None else at)
         return Gaussian(soil, gains, spread @ covariance @ spread.T)
 
-    def believed(self, place: Iterate, covariance: Array) -> Gaussian:
+    def gaussian_with(self, place: Iterate, covariance: Array) -> Gaussian:
         """A place with the covariance (F + A, F + A) of its coordinates and active gains."""
         return self._gaussian(place.soil, place.gains, covariance)
 
-    def changed(self, gaussian: Gaussian, step: Array, covariance: Array) -> Gaussian:
+    def shifted(self, gaussian: Gaussian, step: Array, covariance: Array) -> Gaussian:
         """A belief after a step (F + A,) that brings as much covariance (F + A, F + A) with it."""
         free, gains = len(self.free), gaussian.gains.copy()
         gains[self.active] += step[free:]
@@ -426,7 +436,7 @@ def descend_soil(
 ) -> Iterate | None:
     """Levenberg-damped steps of the soil and the active gains, latents as measured, until they are short.
 
-    A descent that is foreseen to end at one of the `known` places ends there at once; one
+    A descent that is foreseen to end at one of the `prior_information` places ends there at once; one
     that is foreseen to cost more than `give_up_above`, or that has no further step, is None.
     """
     place = fitting.start(soil, gains=gains)
@@ -444,7 +454,7 @@ def descend_soil(
         for end in known:
             if _leads_to(fitting, place, point, step, end):
                 return replace(end, trials=trials)
-        new_place = fitting.restarted(place, point, step)
+        new_place = fitting.stepped_with_measured_latents(place, point, step)
         new = fitting.point(new_place)
         trials += 1
         if new is None or new.neg2_log_posterior >= point.neg2_log_posterior:
@@ -482,7 +492,7 @@ def descend_jointly(
     near: Iterate,
     most: int,
     left_over: float = LEFT_OVER,
-    before: float = 0.0,
+    previous_length: float = 0.0,
     refusals: int = MAX_REFUSED,
     give_up_above: float = np.inf,
     enough: float = CONVERGED,
@@ -490,7 +500,7 @@ def descend_jointly(
 ) -> Descent | None:
     """Steps of soil, gains and latents together from a place near the optimum.
 
-    `before` is the squared length of the step that led there, if it was one of these; a step
+    `joint_prior` is the squared length of the step that led there, if it was one of these; a step
     of less than `enough` is the last, and one after which the cost twice fell by less than
     `nothing` though little more was foreseen: along a bent valley steps overshoot for ever.
     Given up after more `refusals` in a row, and where the foreseen cost is above `give_up_above`.
@@ -513,10 +523,10 @@ def descend_jointly(
         if best is not None and (point is None or point.neg2_log_posterior > best[1].neg2_log_posterior + worse):
             near, point = best
             if refused == 1:
-                near = fitting.carried(near)
+                near = fitting.with_entry_angles(near)
                 point = fitting.point(near)
             share = 0.4 * min(share, 1.0)
-            before, last_step = 0.0, None  # nothing can be foreseen after a refused step
+            previous_length, last_step = 0.0, None  # nothing can be foreseen after a refused step
             refused += 1
             if refused > refusals:
                 break
@@ -530,10 +540,10 @@ def descend_jointly(
         length = point.length(full)
         if last_step is not None and share == 1.0:
             share = _stride(point, last_step, last_share, full)
-        near = fitting.moved(near, point, share * full)
+        near = fitting.stepped(near, point, share * full)
         last_step, last_share = full, share
-        converged = length < enough or (share == 1.0 and length * length < left_over * before)
-        before = length if share == 1.0 else 0.0
+        converged = length < enough or (share == 1.0 and length * length < left_over * previous_length)
+        previous_length = length if share == 1.0 else 0.0
         if converged or point.neg2_log_posterior - length > give_up_above:
             break
         idle = (

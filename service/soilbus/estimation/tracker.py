@@ -161,15 +161,15 @@ def sinkages_off_scale(fitting: Objective, fit: Fit) -> bool:
     large, as if there were none: the fall of the cost is a little underestimated.
     """
     problem, optimum = fitting.problem, fit.optimum
-    around = fitting.around(optimum)
-    if not problem.with_sinkage or around is None:
+    approximation = fitting.approximation_at(optimum)
+    if not problem.with_sinkage or approximation is None:
         return False
     at, soil = optimum.at, Soil(*optimum.soil.tolist())
     (n, m), wheels = at.by_latents.shape[:2], problem.n_wheels
     sinkage = np.where(problem.has_sinkage, problem.sinkages(soil, optimum.gains, optimum.latents), 0.0)
     weighed = at.weighed.reshape(n, m, -1)[:, m - wheels :]
     of_wheels = np.einsum("iw,iwk->wk", sinkage, weighed)
-    of_gradient, of_information = around.explained(of_wheels @ around.directions)
+    of_gradient, of_information = approximation.explained(of_wheels @ approximation.directions)
     gradient = of_wheels[:, 0] - of_gradient
     square = np.divide(sinkage**2, problem.sinkage_var, where=problem.has_sinkage, out=np.zeros((n, wheels)))
     information = np.diag(square.sum(axis=0)) - of_information
@@ -313,28 +313,28 @@ class Tracker:
             self._fit = None
             return TrackerOutput(None, False, Ground.SAME, since, *left_out)
         self._forget_before(start)
-        before = self._known_at(since, problem)
+        joint_prior = self._known_at(since, problem)
         if self._alarm is not None and self._alarm.t <= end - RECENT * self.settings.window:
             self._alarm = None  # another soil would have been found by now
         last = self._fit
         changed = None
         if last is None or (last.second_mode is not None and self._budget.allows()):
-            fitting, fit = self._afresh(window, problem, before)
+            fitting, fit = self._afresh(window, problem, joint_prior)
             if self.mismatch(fit) and self._alarm is not None:
-                changed = self._another_soil(window, self._alarm, fit, before, None)
+                changed = self._another_soil(window, self._alarm, fit, joint_prior, None)
         else:
-            ahead = warm_start(problem, self._here, last, before)
+            ahead = warm_start(problem, self._here, last, joint_prior)
             fitting, fit = ahead.fitting, fit_warm(ahead)
             if fit is not None and not fit.converged and fit.chi2 <= self.chi2_limit(fit):
                 fit = refit_denoised(fitting, fit)  # a long valley is no sign of another soil
             if fit is None or not fit.converged:
-                fit = self._searched(problem, self._here, before) or fit
+                fit = self._searched(problem, self._here, joint_prior) or fit
             fitting, fit = self._on_the_way(window, fitting, fit)
             self._alarm = self._alarm_in(window, ahead, last, fit, end - since)
             if self._alarm is not None:
-                changed = self._another_soil(window, self._alarm, fit, before, last)
+                changed = self._another_soil(window, self._alarm, fit, joint_prior, last)
             if changed is None and self.mismatch(fit) and self._budget.allows():
-                fitting, fit = self._afresh(window, problem, before)
+                fitting, fit = self._afresh(window, problem, joint_prior)
         if changed is not None:
             return self._remembered(replace(changed, standstill=left_out[0], turning=left_out[1]), end, problem)
         new = new or self._crossing is not crossing
@@ -359,11 +359,11 @@ class Tracker:
             return self._alarm
         if self._good_until <= end - length or filled <= GRACE * length:
             return None
-        if fit is not None and fit.bend and not self._unsettled(fit):
+        if fit is not None and fit.curved_path and not self._unsettled(fit):
             return None  # a curve is why
         t = ahead.fitting.problem.t
         first = int(np.searchsorted(t, float(last.optimum.t[-1]) - LOOK_BACK * length))
-        place = replace(last.whole, soil=last.optimum.soil, gains=last.optimum.gains)
+        place = replace(last.reported, soil=last.optimum.soil, gains=last.optimum.gains)
         known = place.drifted(self._drift(place, SINCE_THE_MIDDLE), np.zeros(len(place.gains)))
         doubt = change_statistic(ahead.fitting, known, ahead.place, ahead.at, first, ALARM)
         if doubt.ratio <= ALARM and fit is not None and fit.chi2 <= self.chi2_limit(fit):
@@ -372,12 +372,12 @@ class Tracker:
         near = window.ground_speed[(window.t >= begin - 1.0) & (window.t <= begin)]
         return ChangePoint(begin, max(float(np.nanmean(near)), self.settings.min_speed))
 
-    def _afresh(self, window: Window, problem: ObservationModel, before: Gaussian) -> tuple[Objective, Fit | None]:
+    def _afresh(self, window: Window, problem: ObservationModel, joint_prior: Gaussian) -> tuple[Objective, Fit | None]:
         """A fit that starts anywhere; what was known of the soil counts only where it agrees with the data."""
-        fitting, fit = self._as_one(window, problem, before)
+        fitting, fit = self._as_one(window, problem, joint_prior)
         if self.mismatch(fit) and self._gaussians:
             there = elsewhere(self.prior)
-            known = before.of_another_soil(there)
+            known = joint_prior.of_another_soil(there)
             other = self._searched(problem, there, known)
             if not self.mismatch(other):
                 begin = float(problem.t[0])
@@ -391,7 +391,7 @@ class Tracker:
             return fit
         if not self.mismatch(fit):
             off_scale = sinkages_off_scale(fitting, fit)
-            fit = with_nested_laplace(fitting.problem, fitting.coordinates.prior, fitting.before, fit)
+            fit = with_nested_laplace(fitting.problem, fitting.coordinates.prior, fitting.joint_prior, fit)
             fit = replace(fit, off_scale=off_scale)
         fit = replace(fit, form=self._form_left(fitting, fit))
         return at_window_end(fitting, fit, self.settings.window, self.settings.drift)
@@ -400,9 +400,9 @@ class Tracker:
         """What the form of the model leaves open of a fit."""
         if not any(self.settings.form):
             return None
-        before = fitting.before.form or FormLeft.of(np.array(self.settings.form), len(fit.gains))
+        joint_prior = fitting.joint_prior.form or FormLeft.of(np.array(self.settings.form), len(fit.gains))
         with np.errstate(all="ignore"):
-            return form_left(fitting, fit, before)
+            return form_left(fitting, fit, joint_prior)
 
     def mismatch(self, fit: Fit | None) -> bool:
         """Whether a fit failed or leaves more than noise."""
@@ -418,7 +418,9 @@ class Tracker:
         fit = tracked.fit
         self._fit = None
         if fit is not None and fit.converged:  # the next window has all its bends again
-            self._fit = fit if fit.bend is None else replace(fit, optimum=fit.bend.optimum, bend=None)
+            self._fit = (
+                fit if fit.curved_path is None else replace(fit, optimum=fit.curved_path.optimum, curved_path=None)
+            )
         if fit is not None:
             self._distrusted = tracked.mismatch
             self._in_border = tracked.mismatch and tracked.ground is Ground.SETTLING
@@ -427,9 +429,9 @@ class Tracker:
             learned = end - tracked.since >= LEARNED * self.settings.window and fit.is_gaussian
             if learned and tracked.ground in (Ground.SAME, Ground.NEW):
                 curve = curve_of(problem)
-                told = without_curve(fit.mode.apart_from(self._here), curve)
+                told = without_curve(fit.mode.likelihood_factor(self._here), curve)
                 self._gaussians.append((end, replace(told, form=fit.form)))
-                self._newest = without_curve(fit.whole, curve)
+                self._newest = without_curve(fit.reported, curve)
         return tracked
 
     def _known_at(self, t: float, problem: ObservationModel) -> Gaussian:
@@ -470,7 +472,7 @@ class Tracker:
         return np.asarray(self.settings.drift**2 * elapsed * (directions @ directions.T))
 
     def _another_soil(
-        self, window: Window, alarm: ChangePoint, one: Fit | None, before: Gaussian, last: Fit | None
+        self, window: Window, alarm: ChangePoint, one: Fit | None, joint_prior: Gaussian, last: Fit | None
     ) -> TrackerOutput | None:
         """The window as two soils, the second from the alarm on, if that is much likelier than `one`; else None.
 
@@ -479,7 +481,7 @@ class Tracker:
         first = self._problem(window.rows(np.flatnonzero(window.t < alarm.t - _SAME_TIME)))
         ahead = None
         if last is not None and first.n_rows >= MIN_NEW_ROWS:
-            ahead = warm_start(first, self._here, last, before)
+            ahead = warm_start(first, self._here, last, joint_prior)
         old = None if ahead is None else fit_warm(ahead)
         if self.mismatch(old):
             old = None
@@ -498,7 +500,9 @@ class Tracker:
             new = self._searched(second, there, known)
             if new is None or self.mismatch(new):
                 continue
-            if old is not None and not self._likelier(old, new, self._as_one(apart, self._problem(apart), before)[1]):
+            if old is not None and not self._likelier(
+                old, new, self._as_one(apart, self._problem(apart), joint_prior)[1]
+            ):
                 return None
             self._crossing, self._here = crossing, there
             told = self._told(Objective(second, there, known), new)
@@ -530,7 +534,7 @@ class Tracker:
             problem = self._problem(apart.rows(np.flatnonzero(apart.t >= longer.end)))
             if problem.n_rows < 2 * MIN_NEW_ROWS:
                 break
-            known = fitting.before
+            known = fitting.joint_prior
             later = self._searched(problem, self._here, known)
             if later is None or self._unsettled(later):
                 continue
@@ -549,10 +553,10 @@ class Tracker:
         apart = 0.0 if chassis is None else lag
         return [Transition(alarm.t - _SAME_TIME, end, apart) for end in ends[max(over - 1, 0) :]]
 
-    def _as_one(self, window: Window, problem: ObservationModel, before: Gaussian) -> tuple[Objective, Fit | None]:
+    def _as_one(self, window: Window, problem: ObservationModel, joint_prior: Gaussian) -> tuple[Objective, Fit | None]:
         """A window as one soil, this one, from any start."""
-        fit = self._searched(problem, self._here, before)
-        return self._on_the_way(window, Objective(problem, self._here, before), fit)
+        fit = self._searched(problem, self._here, joint_prior)
+        return self._on_the_way(window, Objective(problem, self._here, joint_prior), fit)
 
     def _on_the_way(self, window: Window, fitting: Objective, fit: Fit | None) -> tuple[Objective, Fit | None]:
         """A fit of a window freed of the bends of its way, where it has any; just after a border that would hide it."""
@@ -563,12 +567,12 @@ class Tracker:
             return fitting, fit
         return fit_on_curved_path(fitting, fit, way, self._problem(straightened(window, self.rig, way)))
 
-    def _searched(self, problem: ObservationModel, prior: SoilPrior, before: Gaussian) -> Fit | None:
+    def _searched(self, problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian) -> Fit | None:
         """A fit from any start; None also where the budget allows no further search."""
         if not self._budget.allows():
             return None
         begun = self._budget.work.instants
-        fit = fit_window(problem, prior, before)
+        fit = fit_window(problem, prior, joint_prior)
         self._budget.spend(begun)
         return fit
 

@@ -215,18 +215,18 @@ class WindowEstimator:
             return UncertainModel.over(CompletedModel.of(self.model, effects, speed))
         widening = _widening(tracked, fit)
         return UncertainModel.of(
-            self.model, *self._completion, fit.whole, len(self.rig.wheels), speed, widening, fit.form
+            self.model, *self._completion, fit.reported, len(self.rig.wheels), speed, widening, fit.form
         )
 
     def _honest(self, tracked: TrackerOutput, fit: Fit) -> Posterior:
         """Posterior, of both optima where there are two, widened where the residuals are larger than the noise."""
-        return fit.whole.posterior.widened(_widening(tracked, fit), self.prior)
+        return fit.reported.posterior.widened(_widening(tracked, fit), self.prior)
 
     def _draft_gain(self, tracked: TrackerOutput) -> Estimate:
         """Gain error of the load cell at the hitch: as fitted, else what is known of it beforehand."""
         if tracked.fit is None or tracked.mismatch:
             return Estimate(0.0, self.rig.noise["draft"].gain)
-        return tracked.fit.whole.gain(gain_names(self.rig).index("draft"))
+        return tracked.fit.reported.gain(gain_names(self.rig).index("draft"))
 
     def _bearing(self, posterior: Posterior) -> Estimate:
         return posterior.bearing_pressure(self._settings.z_ref, self._settings.b_ref)
@@ -292,7 +292,7 @@ class WindowEstimator:
             return Status.DEGRADED, "model_mismatch"
         if self._ambiguous(fit):
             return Status.NOT_EXCITED, "ambiguous"
-        posterior = fit.whole.posterior
+        posterior = fit.reported.posterior
         bearing, tan_phi = self._bearing(posterior), posterior.tan_phi()
         lacking = {
             "load_range": bearing.std > self._settings.max_bearing_std * bearing.value,

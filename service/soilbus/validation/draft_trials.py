@@ -106,7 +106,7 @@ def trial(task: Task) -> DraftTrial:
     truth = true_largest_draft(soil, rig, limit, settings.max_slip, WheelModel(shear_law=config.model.shear_law))
     if fit is None or not fit.converged:
         return DraftTrial(name, np.nan, np.nan, truth)
-    able, _ = assess(fit.whole.posterior, rig, model, None, limit, settings.max_slip, settings.max_sinkage)
+    able, _ = assess(fit.reported.posterior, rig, model, None, limit, settings.max_slip, settings.max_sinkage)
     if able is None:
         return DraftTrial(name, np.nan, np.nan, truth)
     return DraftTrial(name, able.max_draft.value, able.max_draft.std, truth)

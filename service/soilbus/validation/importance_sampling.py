@@ -54,18 +54,18 @@ class Samples(NamedTuple):
 
 
 def samples(
-    problem: ObservationModel, prior: SoilPrior, before: Gaussian, found: Fit, count: int, rng: np.random.Generator
+    problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, found: Fit, count: int, rng: np.random.Generator
 ) -> Samples | None:
     """So many soils of the posterior; None where k_c, k_phi and n are not all free and told apart by the tyres."""
     with np.errstate(all="ignore"):
-        along = profile_over_n(problem, prior, before, found)
+        along = profile_over_n(problem, prior, joint_prior, found)
         if along is None or len(along.nodes) < 3:
             return None
         coordinates = Coordinates(prior, float(problem.rig.width.mean()))
         drawn = _drawn(along.nodes, coordinates, count, rng)
         position = drawn.position
         u, nodes = np.array([node.u for node in along.nodes]), along.nodes
-        fitting = Objective(along.problem, prior, before)
+        fitting = Objective(along.problem, prior, joint_prior)
         log_share = np.full(count, -np.inf)
         logs = np.empty((count, len(PARAMETERS)))
         bound = np.zeros((count, len(PARAMETERS), len(PARAMETERS)))
@@ -80,7 +80,7 @@ def samples(
                 jacobian = np.linalg.slogdet(coordinates.log_directions(soil)[coordinates.free])[1]
                 log_share[i] = jacobian - 0.5 * _unlikelihood(fitting, point) - drawn.log_density[i]
                 covariance = np.asarray(np.linalg.inv(point.information))
-                bound[i] = fitting.believed(place, covariance).posterior.log_covariance
+                bound[i] = fitting.gaussian_with(place, covariance).posterior.log_covariance
     share = np.exp(np.where(np.isfinite(log_share), log_share, -np.inf) - np.nanmax(log_share))
     kept = share > 0.0
     return Samples(logs[kept], share[kept] / share[kept].sum(), bound[kept])
@@ -145,7 +145,7 @@ def _soil_at(position: Array, coordinates: Coordinates) -> Array:
 def _point_at(fitting: Objective, soil: Array, near: Node) -> tuple[Iterate, QuadraticModel | None]:
     """The window at a soil (6,), with the latents that are likeliest there."""
     problem, optimum = fitting.problem, near.fit.optimum
-    latents = problem.carried(optimum.latents, Soil(*soil.tolist()), optimum.gains)
+    latents = problem.with_entry_angles(optimum.latents, Soil(*soil.tolist()), optimum.gains)
     place = Iterate(soil, optimum.gains, latents, np.inf, 1)
     at = problem.linearise(place.as_soil(), place.gains, latents)
     latents = problem.updated(at, latents, np.zeros(len(PARAMETERS)), np.zeros(len(place.gains)))

@@ -245,17 +245,17 @@ def _trial(recording: Recording, task: Task, prior: SoilPrior, soil: Soil, sinka
     noisy, noiseless = (_problem(recording, config, duration, names, of_truth) for of_truth in (False, True))
     bound = cramer_rao(noiseless, prior, soil)
     begin = time.thread_time()
-    found, before = fit_window(noisy, prior), Gaussian.of(prior, noisy.gain_std)
-    fit = with_nested_laplace(noisy, prior, before, found) if found is not None and found.converged else found
+    found, joint_prior = fit_window(noisy, prior), Gaussian.of(prior, noisy.gain_std)
+    fit = with_nested_laplace(noisy, prior, joint_prior, found) if found is not None and found.converged else found
     seconds = time.thread_time() - begin
     if fit is None or found is None:
         nothing = np.full(len(PARAMETERS) + 1, np.nan)
         return Trial(nothing, nothing, nothing, np.nan, False, seconds)
-    (value, std), (truth, least) = (_logarithms(p, config) for p in (fit.whole.posterior, bound))
+    (value, std), (truth, least) = (_logarithms(p, config) for p in (fit.reported.posterior, bound))
     trial = Trial(value - truth, std, least, fit.chi2, fit.converged, seconds)
     if not drawn or not fit.converged:
         return trial
-    posterior = samples(noisy, prior, before, found, drawn, np.random.default_rng([seed, 2]))
+    posterior = samples(noisy, prior, joint_prior, found, drawn, np.random.default_rng([seed, 2]))
     if posterior is None:
         return trial
     soils = zip(np.exp(posterior.logs).tolist(), posterior.bound, strict=True)

@@ -85,7 +85,7 @@ def _steps(problem: ObservationModel, prior: SoilPrior, soil: Array) -> Callable
         step = None if point is None else point.step()
         if point is None or step is None:
             raise AssertionError("a Gauss-Newton step failed at the optimum")
-        return fitting.moved(place, point, step)
+        return fitting.stepped(place, point, step)
 
     start = moved(moved(fitting.start(soil)))
 

@@ -119,7 +119,7 @@ def by_finite_differences(window: Window, least_squares: Any) -> Soil:
         if turn:
             soil = soil_at(x)
             at = problem.linearise(soil, gains, latents)
-            latents = problem.carried(problem.updated(at, latents, np.zeros(len(prior.median)), gains), soil)
+            latents = problem.with_entry_angles(problem.updated(at, latents, np.zeros(len(prior.median)), gains), soil)
             at = problem.linearise(soil, gains, latents)
         residuals = _whitened(problem, at, latents)
         x = least_squares(
