@@ -20,9 +20,9 @@ from typing import Annotated, Any
 
 import numpy as np
 from cantools.database.can import Database
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, NonNegativeInt, PositiveInt, ValidationError
 
+from soilbus.arrays import Array
 from soilbus.can.channels import Channel
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import completion_of, model_of, prior_of, rig_of
@@ -30,8 +30,6 @@ from soilbus.estimation.gaussian import Belief
 from soilbus.estimation.parametrization import MAX_PHI
 from soilbus.estimation.posterior import PARAMETERS
 from soilbus.estimation.tracker import elsewhere, gain_errors
-
-Array = NDArray[np.float64]
 
 FORMAT, VERSION = "soilbus state", 1
 LARGEST = 1 << 20

@@ -25,10 +25,9 @@ import numpy as np
 from numpy.polynomial.hermite_e import hermeval
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.terra.wheel import Soil
-
-Array = NDArray[np.float64]
 
 DRAWS = 256
 SEED = 12

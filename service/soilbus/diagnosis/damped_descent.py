@@ -15,13 +15,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.multistart import Effort, Fit
 from soilbus.estimation.observation_model import Linearised, Optimum
 from soilbus.estimation.solver import Fitting, Place, Point
-
-Array = NDArray[np.float64]
 
 MAX_STEPS = 15
 ENOUGH_FAR = 2e-3

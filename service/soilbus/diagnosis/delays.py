@@ -17,8 +17,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import Completion, complete
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.verdict import temperature
@@ -30,7 +30,6 @@ from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
 from soilbus.estimation.solver import Fitting, Place
 from soilbus.terra.effects.effect import Effect, Late
 
-Array = NDArray[np.float64]
 Cost = Callable[[float, float], float]
 
 _SOIL = len(PARAMETERS)

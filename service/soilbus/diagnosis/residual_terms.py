@@ -14,15 +14,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import Checked, Completion
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.where import channels
 from soilbus.estimation.observation_model import CompletedProblem, Latents, Linearised
 from soilbus.terra.wheel import sinkage
-
-Array = NDArray[np.float64]
 
 MAX_TERMS = 3
 HARMONICS = (1, 2)

@@ -16,10 +16,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import Checked, Completion
 from soilbus.estimation.posterior import PARAMETERS
-
-Array = NDArray[np.float64]
 
 FEWEST = 20
 """Residuals that a region must have."""

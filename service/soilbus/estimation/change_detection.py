@@ -14,12 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Belief
 from soilbus.estimation.observation_model import Linearised
 from soilbus.estimation.solver import Fitting, Place
 from soilbus.estimation.window import Window
-
-Array = NDArray[np.float64]
 
 
 class Suspicion(NamedTuple):

@@ -27,14 +27,12 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Belief, solved
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.path_curvature import along_bends
 from soilbus.estimation.solver import Around, Fitting, Place
-
-Array = NDArray[np.float64]
 
 PIECES = 5
 """Pieces of a whole window."""

@@ -24,8 +24,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array, Indices
 from soilbus.estimation.gaussian import Belief, solved
 from soilbus.estimation.multistart import Fit, fit_window, settled
 from soilbus.estimation.observation_model import DenoisedProblem, WindowProblem
@@ -33,9 +33,6 @@ from soilbus.estimation.parametrization import BOUND, Coordinates
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Fitting, Place
 from soilbus.terra.wheel import Soil
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 WELL_KNOWN = 0.05
 """Sd of the logarithm of n below which a posterior with one top counts as Gaussian."""

@@ -23,8 +23,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Belief
 from soilbus.estimation.measurements import Readings
 from soilbus.estimation.multistart import Fit, fit_window, settled
@@ -32,8 +32,6 @@ from soilbus.estimation.observation_model import Bend, WindowProblem
 from soilbus.estimation.posterior import PARAMETERS
 from soilbus.estimation.solver import Fitting
 from soilbus.estimation.window import Rig, Window, pairs
-
-Array = NDArray[np.float64]
 
 _SOIL = len(PARAMETERS)
 

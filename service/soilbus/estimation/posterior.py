@@ -13,10 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.wheel import Soil
-
-Array = NDArray[np.float64]
 
 PARAMETERS = Soil._fields
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Belief, Earlier, Known, solved
 from soilbus.estimation.observation_model import Latents, Linearised, Optimum, WindowProblem
 from soilbus.estimation.parametrization import (
@@ -26,9 +26,6 @@ from soilbus.estimation.parametrization import (
 )
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.terra.wheel import Soil
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 LONG_TURN = 0.2
 """Relative change of an entry angle from which the angles are solved again, not extrapolated."""

@@ -29,8 +29,8 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.change_detection import Crossing, suspicion, without_crossing
 from soilbus.estimation.drift_filter import at_present
 from soilbus.estimation.gaussian import Belief
@@ -101,8 +101,6 @@ class Tracked:
     turning: int = 0
     search_ended: bool = False
 
-
-Array = NDArray[np.float64]
 
 PERSISTENCE = 86400.0
 """Time [s] in which a gain error forgets all but 1/e of what it was: amplifiers drift, tyres wear."""

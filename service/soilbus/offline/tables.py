@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.can.log_lines import LogLines
 from soilbus.config.model import Column, Config, Table
 from soilbus.diagnosis.records import Record, TooLittle, record_of_rows
@@ -35,7 +35,6 @@ from soilbus.terra.effects.effect import Effect
 from soilbus.terra.effects.size import for_wheel
 from soilbus.terra.vehicle import slip_ratio
 
-Array = NDArray[np.float64]
 Columns = Mapping[str, Sequence[Any]]
 
 ROW = 1.0

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.decision.capability import assess
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
@@ -29,8 +29,6 @@ from soilbus.terra.soils import soil_named
 from soilbus.terra.vehicle import axle_loads
 from soilbus.terra.wheel import Soil, WheelModel, sinkage
 from soilbus.validation.monte_carlo import NORMAL_95, Each, missed
-
-Array = NDArray[np.float64]
 
 SOILS = ("rubicon_sandy_loam_43", "north_gower_clayey_loam_46", "upland_sandy_loam_51")
 SPREAD = 0.1

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Belief
 from soilbus.estimation.laplace import FINE, Node, density, ridge
 from soilbus.estimation.multistart import Fit
@@ -23,8 +24,6 @@ from soilbus.estimation.parametrization import MAX_PHI, Coordinates
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Fitting, Place, Point
 from soilbus.terra.wheel import Soil
-
-Array = NDArray[np.float64]
 
 TAILS = 5.0
 """Degrees of freedom of Student's t that the draws follow given n."""

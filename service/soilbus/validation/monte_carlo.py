@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.allocator import keep_freed_memory
+from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import completion_of, model_of, prior_of, rig_of
 from soilbus.estimation.gaussian import Belief
@@ -46,8 +47,6 @@ from soilbus.validation.bayes_risk_bound import Attainable, attainable
 from soilbus.validation.cramer_rao import cramer_rao
 from soilbus.validation.importance_sampling import samples
 from soilbus.workers import workers
-
-Array = NDArray[np.float64]
 
 SOILS = ("loam", "wet_clay", "dry_sand")
 DURATIONS = (2.0, 10.0, 60.0)

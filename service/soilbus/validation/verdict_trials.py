@@ -21,8 +21,8 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.config.model import Config, Prior
 from soilbus.config.model import Traversability as Settings
 from soilbus.decision.capability import Demand
@@ -42,8 +42,6 @@ from soilbus.terra.wheel import Soil, WheelModel
 from soilbus.validation.draft_trials import true_largest_draft
 from soilbus.validation.monte_carlo import MAX_PHI, NORMAL_95, Each, missed
 from soilbus.validation.windows import task_of
-
-Array = NDArray[np.float64]
 
 SPREAD = 0.2
 """Sd of the logarithms by which a drive's soil parameters leave those of the table's soil."""
