@@ -30,6 +30,7 @@ from soilbus.estimation.gaussian import Belief
 from soilbus.estimation.parametrization import MAX_PHI
 from soilbus.estimation.posterior import PARAMETERS
 from soilbus.estimation.tracker import elsewhere, gain_errors
+from soilbus.words import one_line
 
 FORMAT, VERSION = "soilbus state", 1
 LARGEST = 1 << 20
@@ -186,7 +187,7 @@ def loaded(content: bytes, owner: Owner) -> State:
             raise StateError("it belongs to another configuration")
         state = State.model_validate(file.state)
     except (ValidationError, ValueError, RecursionError, OverflowError) as error:
-        raise StateError(f"it is damaged: {_one_line(error)}") from None
+        raise StateError(f"it is damaged: {_damage(error)}") from None
     if state.belief is not None:
         belief_of(state.belief, owner)
     return state
@@ -249,8 +250,8 @@ def _wiring(channel: Channel, database: Database) -> list[Any]:
     ]  # fmt: skip
 
 
-def _one_line(error: Exception) -> str:
+def _damage(error: Exception) -> str:
     if isinstance(error, ValidationError):
         first = error.errors()[0]
         return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:200]
-    return " ".join(str(error).split())[:200]
+    return one_line(error, 200)
