@@ -18,6 +18,8 @@ from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.wheel import Soil
 
 PARAMETERS = Soil._fields
+NORMAL_95 = 1.959964
+"""Standard deviations on either side of the mean that hold 95 % of a normal distribution."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,7 +36,8 @@ from soilbus.estimation.gaussian import Belief
 from soilbus.estimation.laplace import with_whole
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import CompletedProblem, WindowProblem
-from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
+from soilbus.estimation.parametrization import MAX_PHI
+from soilbus.estimation.posterior import NORMAL_95, PARAMETERS, Posterior, SoilPrior
 from soilbus.sensors.bins import BinStore
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import Recording, simulate
@@ -53,11 +54,8 @@ DURATIONS = (2.0, 10.0, 60.0)
 SLIP = Swing(0.05, 0.40)
 ROUGHLY_KNOWN = ("soil.c.value=3000", "soil.c.std=750", "soil.K.value=0.02", "soil.K.std=0.005")
 """Settings with which cohesion and shear modulus are known to 25 %."""
-MAX_PHI = 1.2
-"""A prior that is off by more than this friction angle [rad] is drawn again: the model ends at a right angle."""
 MAX_DRAWN = 20
 """Soils around a named one that are tried until the tractor gets on."""
-NORMAL_95 = 1.959964
 _PHI = PARAMETERS.index("phi")
 
 

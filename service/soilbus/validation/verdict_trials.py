@@ -30,7 +30,8 @@ from soilbus.decision.demand import present_demand
 from soilbus.decision.judgement import judge
 from soilbus.decision.traversability import State, Traversability
 from soilbus.estimation.assembly import prior_of, rig_of
-from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+from soilbus.estimation.parametrization import MAX_PHI
+from soilbus.estimation.posterior import NORMAL_95, PARAMETERS, SoilPrior
 from soilbus.estimation.window import Rig, Window
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.sensors.bins import BinStore
@@ -40,7 +41,7 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import KINDS, soil_named
 from soilbus.terra.wheel import Soil, WheelModel
 from soilbus.validation.draft_trials import true_largest_draft
-from soilbus.validation.monte_carlo import MAX_PHI, NORMAL_95, Each, missed
+from soilbus.validation.monte_carlo import Each, missed
 from soilbus.validation.windows import task_of
 
 SPREAD = 0.2
