@@ -8,7 +8,9 @@ from scipy.stats import binom, chi2
 
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.observation_model import ObservationModel
-from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+from soilbus.estimation.posterior import NORMAL_95
+from soilbus.estimation.posterior import PARAMETERS
+from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.window import window_of_samples
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.entry_angle import entry_angle_for_load
@@ -16,7 +18,7 @@ from soilbus.terra.soils import SOILS as KNOWN
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import Soil, WheelModel, sinkage, state_on, wheel_forces
 from soilbus.validation.cramer_rao import cramer_rao
-from soilbus.validation.monte_carlo import NORMAL_95, ROUGHLY_KNOWN, SOILS, tasks_of, trials
+from soilbus.validation.monte_carlo import ROUGHLY_KNOWN, SOILS, tasks_of, trials
 
 MODEL = WheelModel()
 LOAD = np.array([5200.0, 4800.0, 6000.0, 5500.0])

@@ -13,11 +13,12 @@ from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.laplace import with_nested_laplace
 from soilbus.estimation.multistart import fit_window
+from soilbus.estimation.posterior import NORMAL_95
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
-from soilbus.validation.monte_carlo import NORMAL_95, missed
+from soilbus.validation.monte_carlo import missed
 
 STILL, LEANING = Swing(0.0, 1e-9), Swing(-0.3, 0.3)
 SLIPS = (0.05, 0.1, 0.2, 0.35)

@@ -16,13 +16,16 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import least_squares
 
-from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModel
+from soilbus.arrays import Array
+from soilbus.estimation.observation_model import Latents
+from soilbus.estimation.observation_model import Linearisation
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import Posterior
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.wheel import Soil, WheelState, sinkage, wheel_forces
 
-from .windows import B_REF, Z_REF, Answer, Array, Case, fit_model, reading_covariance
+from .windows import B_REF, Z_REF, Answer, Case, fit_model, reading_covariance
 
 PASSES = 4
 REACH = 4.0

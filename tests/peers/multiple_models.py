@@ -13,12 +13,13 @@ from collections.abc import Collection
 
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import PARAMETERS, Estimate
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
 
-from .windows import B_REF, Z_REF, Answer, Array, Case, at_measured, reading_covariance
+from .windows import B_REF, Z_REF, Answer, Case, at_measured, reading_covariance
 
 DOUBLE = 0.05
 """Relative difference below which two soils of the table count as one."""

@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import Estimate
 from soilbus.terra.wheel import Soil, WheelState, wheel_forces_and_derivatives
 
-from .windows import B_REF, Answer, Array, Case, bearing_pressure, entry_angles, fit_model
+from .windows import B_REF, Answer, Case, bearing_pressure, entry_angles, fit_model
 
 MAX_STEPS = 50
 CONVERGED = 1e-8

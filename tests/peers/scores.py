@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import binomtest
 
+from soilbus.arrays import Array
 from soilbus.terra.wheel import Soil
 
-from .windows import B_REF, Z_REF, Answer, Array
+from .windows import B_REF, Z_REF, Answer
 
 QUANTITIES = ("bearing", "phi", "n", "c", "K")
 HIGHEST = {"phi": np.pi / 2.0}

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.assembly import model_of, rig_of
 from soilbus.estimation.observation_model import Linearisation, ObservationModel, diagonals
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
@@ -19,7 +19,6 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.wheel import Soil, WheelModel
 
-Array = NDArray[np.float64]
 Answer = dict[str, Estimate]
 """Estimates by name: parameters of Soil, and "bearing"; std is nan where the method has none."""
 Method = Callable[["Case"], Answer | None]

@@ -12,13 +12,13 @@ import pytest
 import soilbus.validation.monte_carlo as of_room
 from soilbus.cli.main import main
 from soilbus.estimation.assembly import prior_of
+from soilbus.estimation.parametrization import MAX_PHI
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import SOILS
 from soilbus.validation.bayes_risk_bound import Attainable
 from soilbus.validation.monte_carlo import (
-    MAX_PHI,
     ROUGHLY_KNOWN,
     Trial,
     as_json,

@@ -14,12 +14,12 @@ from cantools.database import Database
 from cantools.database.can import Message, Signal
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.can.checksum import column_checksums
 from soilbus.can.decode import ColumnDecoder
 from soilbus.can.inbox import checksum_byte_of
 from soilbus.can.publish import value_codes
 
-Array = NDArray[np.float64]
 Frame = tuple[float, int, bool, bytes]
 Since = NDArray[np.bool_]
 

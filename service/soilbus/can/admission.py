@@ -16,6 +16,7 @@ import numpy as np
 from cantools.database.can import Database, Message
 from numpy.typing import NDArray
 
+from soilbus.arrays import Mask
 from soilbus.can.channels import Channel, Column, Decoded, Reason
 from soilbus.can.decode import SignalColumn
 from soilbus.can.inbox import (
@@ -23,7 +24,6 @@ from soilbus.can.inbox import (
     Data,
     Frame,
     Inbox,
-    Mask,
     checksum_right,
     counter_moved,
     inbox_of,

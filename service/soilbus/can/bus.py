@@ -19,6 +19,7 @@ from soilbus.can.bus_state import BusState, state_told, tells_overflow
 from soilbus.can.outbox import Outbox
 from soilbus.can.publish import Frame
 from soilbus.can.wire import Received, Wire, error_number, wire_of
+from soilbus.words import one_line
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +70,7 @@ def bus_fault(settings: Mapping[str, Any], error: Exception) -> BusError:
     if number in _KERNEL_WITHOUT_CAN:
         return BusError(f"bus {name}: this kernel has no SocketCAN", may_come=False)
     is_there = isinstance(error, (OSError, can.CanError)) and not isinstance(error, can.CanInterfaceNotImplementedError)
-    return BusError(f"bus {name}: {_one_line(error)}", may_come=is_there)
+    return BusError(f"bus {name}: {one_line(error)}", may_come=is_there)
 
 
 def heard_for(settings: Mapping[str, Any], seconds: float) -> Iterator[tuple[float, int, bool, bytes, bool, bool]]:
@@ -85,7 +86,7 @@ def heard_for(settings: Mapping[str, Any], seconds: float) -> Iterator[tuple[flo
                 message = bus.recv(left)
             except (OSError, can.CanError) as error:
                 name = f"{settings.get('interface')}:{settings.get('channel')}"
-                raise BusError(f"bus {name}: {_one_line(error)}", may_come=True) from None
+                raise BusError(f"bus {name}: {one_line(error)}", may_come=True) from None
             if message is not None:
                 yield (
                     message.timestamp, message.arbitration_id, message.is_extended_id, bytes(message.data),
@@ -114,10 +115,6 @@ def ask_for_buffer(own: socket.socket) -> None:
     own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
     with suppress(OSError):  # it takes CAP_NET_ADMIN
         own.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER)
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 @dataclass(slots=True)
@@ -195,7 +192,7 @@ class LiveBus:
             self._wire = wire_of(bus)
         except OSError as error:
             bus.shutdown()
-            raise BusError(f"bus: {_one_line(error)}", may_come=True) from None
+            raise BusError(f"bus: {one_line(error)}", may_come=True) from None
         self.state, self.fault = BusState.UNKNOWN, ""
 
     def _reopen(self) -> bool:
@@ -215,8 +212,8 @@ class LiveBus:
         return True
 
     def _lost(self, error: Exception) -> None:
-        log.warning("bus lost: %s", _one_line(error))
-        self.fault = _one_line(error)
+        log.warning("bus lost: %s", one_line(error))
+        self.fault = one_line(error)
         self._counts.lost += 1
         self.close()
         self._wait()
@@ -319,7 +316,7 @@ class LiveBus:
                 if error_number(error) not in _NO_ROOM:
                     self._lost(error)
                 else:
-                    self._say(f"send queue full: {_one_line(error)}")
+                    self._say(f"send queue full: {one_line(error)}")
                 return False
             self._outbox.done(frame)
             self._counts.sent += 1

@@ -17,7 +17,7 @@ from soilbus.can.j1939 import STANDARD_PGNS, pgn_of
 from soilbus.config.file import DBC_FOLDERS, located, shipped_dbc
 from soilbus.config.model import Config, ConfigError
 from soilbus.files import read_bounded
-from soilbus.words import did_you_mean
+from soilbus.words import did_you_mean, one_line
 
 LARGEST = 32 * 2**20
 """Bytes of a DBC file: five times those of one with 10 000 messages."""
@@ -50,7 +50,7 @@ def load_databases(config: Config, mapped_only: bool = False) -> Database:
         except OSError as error:
             faults.append(f"dbc.input: {name}: {error.strerror or error}")
         except Exception as error:  # the parser raises all kinds on a text that is no DBC
-            faults.append(f"dbc.input: {name}: not a DBC file: {_one_line(error)}")
+            faults.append(f"dbc.input: {name}: not a DBC file: {one_line(error)}")
     if faults:
         raise ConfigError(faults)
     if names is not None and not names <= messages.keys():
@@ -109,7 +109,7 @@ def output_database(config: Config) -> Database:
     except OSError as error:
         raise ConfigError([f"output.dbc: {name}: {error.strerror or error}"]) from None
     except Exception as error:
-        raise ConfigError([f"output.dbc: {name}: not a DBC file: {_one_line(error)}"]) from None
+        raise ConfigError([f"output.dbc: {name}: not a DBC file: {one_line(error)}"]) from None
     missing = sorted(ours - {m.name for m in database.messages})
     if missing:
         raise ConfigError([f"output.dbc: {name}: no message {', '.join(missing)}"])
@@ -178,7 +178,3 @@ def _layout(message: Message) -> tuple[object, ...]:
         for s in message.signals
     )
     return message.frame_id, message.is_extended_frame, message.length, tuple(signals)
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

@@ -13,6 +13,7 @@ import numpy as np
 from cantools.database.can import Message, Signal
 from numpy.typing import NDArray
 
+from soilbus.arrays import Mask
 from soilbus.can.channels import Channel
 from soilbus.can.checksum import CHECKSUM, COUNTER, column_checksums
 from soilbus.can.decode import Block, ColumnDecoder
@@ -27,7 +28,6 @@ _NO_FRAME = (-math.inf, -1, b"")
 
 Data = bytes | bytearray
 Frame = tuple[float, int, Data]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(slots=True)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 from soilbus.daemon.state_store import Owner, State, StateError, dumped, gaussian_of, read, stored_gaussian, write_whole
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.tracker import PERSISTENCE
+from soilbus.words import one_line
 
 log = logging.getLogger(__name__)
 
@@ -97,7 +98,7 @@ class StatePersistence:
             write_whole(self._path, content)
         except Exception as error:  # whatever it is, a thread's error would be told to nobody
             if not self._fails:
-                why = " ".join(str(getattr(error, "strerror", None) or error).split())
+                why = getattr(error, "strerror", None) or one_line(error)
                 log.warning("state cannot be stored in %s: %s", self._path.parent, why)
             self._fails = True
             return

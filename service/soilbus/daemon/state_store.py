@@ -20,9 +20,9 @@ from typing import Annotated, Any
 
 import numpy as np
 from cantools.database.can import Database
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, NonNegativeInt, PositiveInt, ValidationError
 
+from soilbus.arrays import Array
 from soilbus.can.channels import Channel
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import completion_of, model_of, prior_of, rig_of
@@ -30,8 +30,7 @@ from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.parametrization import MAX_PHI
 from soilbus.estimation.posterior import PARAMETERS
 from soilbus.estimation.tracker import elsewhere, gain_errors
-
-Array = NDArray[np.float64]
+from soilbus.words import one_line
 
 FORMAT, VERSION = "soilbus state", 1
 LARGEST = 1 << 20
@@ -188,7 +187,7 @@ def loaded(content: bytes, owner: Owner) -> State:
             raise StateError("it belongs to another configuration")
         state = State.model_validate(file.state)
     except (ValidationError, ValueError, RecursionError, OverflowError) as error:
-        raise StateError(f"it is damaged: {_one_line(error)}") from None
+        raise StateError(f"it is damaged: {_damage(error)}") from None
     if state.gaussian is not None:
         gaussian_of(state.gaussian, owner)
     return state
@@ -251,8 +250,8 @@ def _wiring(channel: Channel, database: Database) -> list[Any]:
     ]  # fmt: skip
 
 
-def _one_line(error: Exception) -> str:
+def _damage(error: Exception) -> str:
     if isinstance(error, ValidationError):
         first = error.errors()[0]
         return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:200]
-    return " ".join(str(error).split())[:200]
+    return one_line(error, 200)

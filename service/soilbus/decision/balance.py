@@ -13,12 +13,11 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.decision.sigma_points import SigmaPoints
 from soilbus.decision.uncertain_model import ModelOfRows
 from soilbus.decision.wheels import Axles, WheelTable
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE
-
-Array = NDArray[np.float64]
 
 PARTS = 5
 """Points into which each step of the slip grid is divided."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.decision.balance import (
     PARTS,
     Balance,
@@ -31,8 +31,6 @@ from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.estimation.window import Rig
 from soilbus.terra.effects.steady import CompletedModel, Wheel
 from soilbus.terra.wheel import WheelModel
-
-Array = NDArray[np.float64]
 
 MIN_SLIP = 0.02
 GRID = 9

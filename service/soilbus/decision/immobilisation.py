@@ -27,8 +27,8 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.decision.traction_loss import TractionLoss
 from soilbus.estimation.window import Rig, Window, inertia_of, pull_given
 from soilbus.terra.vehicle import slip_ratio
@@ -36,8 +36,6 @@ from soilbus.terra.vehicle import slip_ratio
 if TYPE_CHECKING:
     from soilbus.decision.capability import OverSlip
 
-
-Array = NDArray[np.float64]
 
 LONG, SHORT = 2.5, 0.8
 """Time constants [s] of forgetting a capacity: of ground that softens over many metres, and of a soft patch's edge."""

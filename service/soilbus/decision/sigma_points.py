@@ -25,10 +25,10 @@ import numpy as np
 from numpy.polynomial.hermite_e import hermeval
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
+from soilbus.estimation.parametrization import MAX_PHI
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.terra.wheel import Soil
-
-Array = NDArray[np.float64]
 
 DRAWS = 256
 SEED = 12
@@ -133,8 +133,6 @@ LEADING = 3
 AXIS = (1.2, 3.2)
 """Of the first direction's own points, in standard deviations on both sides of the mode."""
 AXIS_DEGREE = 6
-MAX_PHI = 1.2
-"""Friction angle [rad] at which points are held back: the model ends at a right angle."""
 _LEAST = 1e-14
 """Variance of a direction, over the largest, below which it counts as held."""
 _PHI = Soil._fields.index("phi")

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.model_form import FormLeft, formed
 from soilbus.estimation.nuisance_parameters import Free, active_at
@@ -24,7 +25,6 @@ from soilbus.terra.effects.effect import Effect
 from soilbus.terra.effects.steady import CompletedModel, Slopes, Wheel
 from soilbus.terra.wheel import WheelModel, WheelState
 
-Array = NDArray[np.float64]
 _Rows = slice | NDArray[np.intp]
 
 _SOIL = len(PARAMETERS)

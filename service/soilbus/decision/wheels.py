@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.decision.uncertain_model import ModelOfRows, UncertainModel
 from soilbus.estimation.window import Rig
 from soilbus.terra.effects.steady import CompletedModel, Wheel
@@ -21,8 +22,6 @@ from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE, WheelModel, WheelState
-
-Array = NDArray[np.float64]
 
 TOLERANCE = 1e-3
 """Newton step of pull and load, over the weight, that is the last: it leaves some 1e-6 of the weight."""

@@ -17,9 +17,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from soilbus.diagnosis.fitted_model import FittedModel, fit_model
+from soilbus.arrays import Array
+from soilbus.diagnosis.fitted_model import FittedModel
+from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.verdict import temperature
 from soilbus.estimation.gaussian import Gaussian
@@ -30,7 +31,6 @@ from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective
 from soilbus.terra.effects.effect import Effect, Late
 
-Array = NDArray[np.float64]
 Cost = Callable[[float, float], float]
 
 _SOIL = len(PARAMETERS)

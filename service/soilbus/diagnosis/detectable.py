@@ -17,8 +17,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.diagnosis.evidence import evidence_of_any_size
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.records import Record
@@ -27,8 +27,6 @@ from soilbus.diagnosis.verdict import price
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect, Parameter
-
-Array = NDArray[np.float64]
 
 PLAUSIBLE = 2.0
 """Prior standard deviations up to which an effect may well be there: a normal one goes beyond in a twentieth of all."""

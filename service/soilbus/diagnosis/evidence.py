@@ -19,11 +19,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.nuisance_parameters import Free
 from soilbus.terra.effects.along import splines
 from soilbus.terra.effects.effect import Knot
-
-Array = NDArray[np.float64]
 
 SCALES = tuple(2.0**k for k in range(-4, 3))
 """Times the prior std, all as likely."""

@@ -13,8 +13,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.diagnosis.damped_descent import descended
 from soilbus.diagnosis.evidence import OwnParameters, correction, own_parameters
 from soilbus.diagnosis.records import Record
@@ -27,8 +27,6 @@ from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.wheel import Soil
-
-Array = NDArray[np.float64]
 
 _SOIL = len(PARAMETERS)
 CHECK_ROUNDS, CHECK_AGAIN = 3, 2

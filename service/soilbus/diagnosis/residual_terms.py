@@ -14,15 +14,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from soilbus.diagnosis.fitted_model import Checked, FittedModel
+from soilbus.arrays import Array
+from soilbus.diagnosis.fitted_model import Checked
+from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.where import channels
 from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModelWithEffects
 from soilbus.terra.wheel import sinkage
-
-Array = NDArray[np.float64]
 
 MAX_TERMS = 3
 HARMONICS = (1, 2)

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.diagnosis.evidence import evidence_of_any_size
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.records import Record
@@ -25,8 +26,6 @@ from soilbus.estimation.observation_model import Latents, Linearisation
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.solver import Iterate, Objective
 from soilbus.terra.effects.effect import Effect
-
-Array = NDArray[np.float64]
 
 MAX_STEP = 2.0
 """Prior standard deviations to which a foreseen parameter is confined: linear is not for ever."""

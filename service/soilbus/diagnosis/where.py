@@ -16,10 +16,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.diagnosis.fitted_model import Checked, FittedModel
+from soilbus.arrays import Array
+from soilbus.diagnosis.fitted_model import Checked
+from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.estimation.posterior import PARAMETERS
-
-Array = NDArray[np.float64]
 
 FEWEST = 20
 """Residuals that a region must have."""

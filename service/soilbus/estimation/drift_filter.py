@@ -27,14 +27,13 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
+from soilbus.arrays import Array
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.gaussian import solve_with_inverse
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.path_curvature import by_curvature
 from soilbus.estimation.solver import GaussianApproximation, Iterate, Objective
-
-Array = NDArray[np.float64]
 
 PIECES = 5
 """Pieces of a whole window."""

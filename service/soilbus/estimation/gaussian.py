@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.posterior import PARAMETERS, Estimate, Posterior, SoilPrior
 from soilbus.terra.wheel import Soil
 
 if TYPE_CHECKING:
     from soilbus.estimation.model_form import FormLeft
 
-
-Array = NDArray[np.float64]
 
 _SOIL = len(PARAMETERS)
 _K_C = PARAMETERS.index("k_c")

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from soilbus.arrays import Array
 
 HALF_WIDTHS = (2, 3, 4, 6, 9, 13, 19, 28)
 """Samples on each side that are tried; two are the fewest that leave a cubic anything to average."""

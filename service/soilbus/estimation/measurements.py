@@ -10,11 +10,11 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.local_cubics import Series
 from soilbus.estimation.window import Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
 
-Array = NDArray[np.float64]
 Reading = tuple[Array, Array, NDArray[np.bool_]]
 """Values, variances of them, and which of them are known; zero where not."""
 

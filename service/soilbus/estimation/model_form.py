@@ -21,8 +21,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.gaussian import solve_with_inverse
 from soilbus.estimation.posterior import PARAMETERS
 from soilbus.terra.wheel import WheelModel
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from soilbus.estimation.multistart import Fit
     from soilbus.estimation.solver import Objective
 
-Array = NDArray[np.float64]
 
 FORM = ("peak", "peak_by_slip", "exit", "shear")
 """Form parameters: of the angle of greatest stress over the entry angle, of its change with slip, of the exit angle

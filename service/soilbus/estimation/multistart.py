@@ -9,8 +9,8 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.model_form import FormLeft
 from soilbus.estimation.observation_model import (
@@ -36,8 +36,6 @@ from soilbus.estimation.solver import (
 )
 from soilbus.terra.soils import KINDS, SOILS
 from soilbus.terra.wheel import Soil
-
-Array = NDArray[np.float64]
 
 _K_C = PARAMETERS.index("k_c")
 

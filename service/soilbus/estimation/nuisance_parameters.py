@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.terra.dual import Dual
 from soilbus.terra.effects.effect import Active, Effect, Parameter
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

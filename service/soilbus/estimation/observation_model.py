@@ -56,6 +56,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.measurements import Measurements
 from soilbus.estimation.nuisance_parameters import Free, active_at, varied_at
 from soilbus.estimation.window import Rig, Window
@@ -83,9 +84,6 @@ class Work:
     """Instants at which the model was evaluated."""
 
     instants: int = 0
-
-
-Array = NDArray[np.float64]
 
 
 @dataclass(slots=True)

@@ -25,9 +25,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-
-Array = NDArray[np.float64]
 
 NODES = 81
 REACH = 6.0

@@ -13,12 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.wheel import Soil
 
-Array = NDArray[np.float64]
-
 PARAMETERS = Soil._fields
+NORMAL_95 = 1.959964
+"""Standard deviations on either side of the mean that hold 95 % of a normal distribution."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,14 +23,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import KINDS, SOILS, UNKNOWN
 from soilbus.terra.wheel import Soil, sinkage, state_on, wheel_forces
-
-Array = NDArray[np.float64]
 
 PRIOR_UNKNOWN = 0.5
 """Probability of `unknown` before any window; the kinds of the table share the rest evenly."""

@@ -11,10 +11,16 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from soilbus.estimation.gaussian import Gaussian, PriorFactor, PriorQuadratic, solve_with_inverse
-from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModel, Optimum
+from soilbus.arrays import Array
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.gaussian import PriorFactor
+from soilbus.estimation.gaussian import PriorQuadratic
+from soilbus.estimation.gaussian import solve_with_inverse
+from soilbus.estimation.observation_model import Latents
+from soilbus.estimation.observation_model import Linearisation
+from soilbus.estimation.observation_model import ObservationModel
+from soilbus.estimation.observation_model import Optimum
 from soilbus.estimation.parametrization import (
     MAX_STEP,
     TYPICAL_DEPTH,
@@ -26,9 +32,6 @@ from soilbus.estimation.parametrization import (
 )
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.terra.wheel import Soil
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 LONG_TURN = 0.2
 """Relative change of an entry angle from which the angles are solved again, not extrapolated."""

@@ -29,9 +29,11 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from soilbus.estimation.change_detection import Transition, change_statistic, without_transition
+from soilbus.arrays import Array
+from soilbus.estimation.change_detection import Transition
+from soilbus.estimation.change_detection import change_statistic
+from soilbus.estimation.change_detection import without_transition
 from soilbus.estimation.drift_filter import at_window_end
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.laplace import with_nested_laplace
@@ -108,8 +110,6 @@ class TrackerOutput:
     turning: int = 0
     search_ended: bool = False
 
-
-Array = NDArray[np.float64]
 
 PERSISTENCE = 86400.0
 """Time [s] in which a gain error forgets all but 1/e of what it was: amplifiers drift, tyres wear."""

@@ -15,10 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.local_cubics import Series
 from soilbus.terra.vehicle import Chassis, pull_required
-
-Array = NDArray[np.float64]
 
 WHEEL_QUANTITIES = ("torque", "load", "speed", "sinkage")
 VEHICLE_QUANTITIES = ("ground_speed", "draft", "pitch", "acceleration", "yaw_rate")

@@ -27,6 +27,7 @@ from soilbus.pipeline.estimator import Undecided, WindowEstimator
 from soilbus.pipeline.intake import Intake, WindowTask
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
+from soilbus.words import one_line
 from soilbus.workers import workers
 
 _T = TypeVar("_T")
@@ -79,7 +80,7 @@ def _read(path: Path, batches: Callable[[Any], Iterator[list[_T]]]) -> Iterator[
         raise LogError(f"{path}: this format needs soilbus[mf4]") from None
     except Exception as error:  # python-can's readers raise all kinds on a damaged file
         what = "not a CAN log that can be read" if n == 0 else f"cut off or damaged after {n} frames"
-        raise LogError(f"{path}: {what} ({_one_line(error)})") from None
+        raise LogError(f"{path}: {what} ({one_line(error, 100)})") from None
     if n == 0:
         raise LogError(f"{path}: no frame in it")
 
@@ -89,10 +90,6 @@ def _reader(path: Path) -> Any:
     if path.suffixes[-2:] == [".log", ".gz"]:
         return can.CanutilsLogReader(gzip.open(path, "rt"))
     return can.LogReader(path)
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:100] or type(error).__name__
 
 
 def log_names(logs: Sequence[Path]) -> list[str]:

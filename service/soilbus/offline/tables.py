@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.can.log_lines import LogLines
 from soilbus.config.model import Column, Config, Table
 from soilbus.diagnosis.records import Record, TooLittle, record_of_rows
@@ -34,8 +34,8 @@ from soilbus.pipeline.result import WindowResult
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.effects.size import for_wheel
 from soilbus.terra.vehicle import slip_ratio
+from soilbus.words import one_line
 
-Array = NDArray[np.float64]
 Columns = Mapping[str, Sequence[Any]]
 
 ROW = 1.0
@@ -210,7 +210,7 @@ def _columns(path: Path, needed: Sequence[str]) -> Columns:
     try:
         return reader(path, needed)
     except OSError as error:
-        raise TableError(f"{path}: {error.strerror or _one_line(error)}") from None
+        raise TableError(f"{path}: {error.strerror or one_line(error, 100)}") from None
 
 
 def _csv(path: Path, needed: Sequence[str]) -> Columns:
@@ -218,7 +218,7 @@ def _csv(path: Path, needed: Sequence[str]) -> Columns:
         with path.open(newline="", encoding="utf-8-sig") as lines:
             rows = [row for row in csv.reader(LogLines(lines), strict=True) if row]
     except (ValueError, csv.Error) as error:
-        raise TableError(f"{path}: not CSV text ({_one_line(error)})") from None
+        raise TableError(f"{path}: not CSV text ({one_line(error, 100)})") from None
     header = [name.strip() for name in rows[0]] if rows else []
     _check_columns(path, header, needed)
     for i, row in enumerate(rows[1:], 1):
@@ -238,7 +238,7 @@ def _parquet(path: Path, needed: Sequence[str]) -> Columns:
         _check_columns(path, parquet.read_schema(path).names, needed)
         table = parquet.read_table(path, columns=list(needed))
     except arrow.ArrowException as error:
-        raise TableError(f"{path}: not a Parquet file that can be read ({_one_line(error)})") from None
+        raise TableError(f"{path}: not a Parquet file that can be read ({one_line(error, 100)})") from None
     return {name: table.column(name).to_pylist() for name in needed}
 
 
@@ -280,7 +280,3 @@ def _number(path: Path, column: str, row: int, cell: Any) -> float:
     if not math.isfinite(value):
         raise TableError(f"{path}: row {row + 1}, column {column}: {cell!r} is not a number")
     return value
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:100] or type(error).__name__

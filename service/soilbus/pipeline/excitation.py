@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.vehicle import slip_ratio
-
-Array = NDArray[np.float64]
 
 
 class Excitation(NamedTuple):

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 from cantools.database.can import Database
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.can.admission import LONGEST_GAP, Admission
 from soilbus.can.channels import Channel, Decoded
 from soilbus.can.dbc_files import checked_messages
@@ -30,8 +30,6 @@ from soilbus.sensors.consistency import Plausibility, without
 from soilbus.sensors.outliers import OUTLIER
 from soilbus.sensors.rates import resolved_window
 from soilbus.terra.vehicle import slip_ratio
-
-Array = NDArray[np.float64]
 
 DEFAULT_TIMEOUT = 1.0
 LIMIT_SAMPLES = 3

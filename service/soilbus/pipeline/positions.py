@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.terra.earth import wrapped
-
-Array = NDArray[np.float64]
 
 SMOOTHING = 1.0
 """Fixes up to so many seconds before and after share in a position: receivers are noisy."""

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.verdict import PAYS, PAYS_BESIDE
 from soilbus.diagnosis.where import channels
@@ -25,8 +25,6 @@ from soilbus.report.findings import (
 )
 from soilbus.report.page import html_table, page, picture
 from soilbus.report.statement import doubt, shown_lines, statement, why_probabilities
-
-Array = NDArray[np.float64]
 
 REGRESSORS = ("slip", "load of a wheel, kN", "time, s")
 MOST_POINTS = 3000

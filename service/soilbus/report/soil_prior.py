@@ -7,11 +7,10 @@ from collections.abc import Iterator
 
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import prior_of
-from soilbus.estimation.posterior import PARAMETERS
+from soilbus.estimation.posterior import NORMAL_95, PARAMETERS
 from soilbus.report.table import table
 from soilbus.terra.soils import KINDS, SOILS
 
-NORMAL_95 = 1.96
 SHOWN = {
     # unit, and its value in SI
     "k_c": ("kN/m^(n+1)", 1e3), "k_phi": ("kN/m^(n+2)", 1e3), "n": ("", 1.0), "phi": ("deg", math.pi / 180.0),

@@ -10,10 +10,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.window import NoiseTable, Rig, Window, made_window
 from soilbus.sensors.outliers import SIDE, Samples, joined, outlier_test
-
-Array = NDArray[np.float64]
 
 GLIMPSE_BACK = 1.0
 """Samples of so many seconds before a glimpse help to judge those in it."""

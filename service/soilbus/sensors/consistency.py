@@ -27,6 +27,7 @@ import numpy as np
 from cantools.database.can import Database
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array, Mask
 from soilbus.can.channels import Channel
 from soilbus.config.model import Estimator
 from soilbus.estimation.window import (
@@ -40,9 +41,6 @@ from soilbus.estimation.window import (
     zero_if_unknown,
 )
 from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads, slip_ratio
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 def running_sum(values: NDArray[Any], n: int) -> Array:

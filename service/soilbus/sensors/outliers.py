@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from soilbus.arrays import Array, Mask
+
 Sd = Callable[[NDArray[np.intp], Array, Array], Array]
 """Sd (N,) of samples, channel after channel, from each channel's number of them (C,), their expected
 magnitudes (N,) and the channels' mean magnitudes (C,)."""

@@ -21,12 +21,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.local_cubics import PARTS, Curve, Series, curve_of, faithful, variance_of_one
 from soilbus.estimation.window import NoiseTable, Window, made_window
 from soilbus.sensors.bins import Bins
 from soilbus.sensors.outliers import Samples
-
-Array = NDArray[np.float64]
 
 MOST_LOST = 0.1
 """Share of a bin's samples that its value at one instant may cost: less than the noise itself is known to."""

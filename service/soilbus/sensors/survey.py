@@ -25,8 +25,8 @@ from typing import NamedTuple
 
 import numpy as np
 from cantools.database.can import Database
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array, Mask
 from soilbus.can.admission import Admission
 from soilbus.can.channels import Channel, Reason
 from soilbus.can.dbc_files import checked_messages
@@ -39,8 +39,6 @@ from soilbus.sensors.bins import Bins
 from soilbus.sensors.consistency import change, implausible, median, resolution_of, without
 from soilbus.terra.vehicle import GRAVITY, axle_loads, slip_ratio
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Frame = tuple[float, int, bool, bytes | bytearray, bool, bool]
 
 BATCH = 5000

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.terra.earth import moved
-from soilbus.terra.soil_laws import Array
 
 
 @dataclass(frozen=True, slots=True)

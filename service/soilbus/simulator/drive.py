@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.config.model import Config, Wheel
 from soilbus.estimation.assembly import chassis_of, effects_of
 from soilbus.simulator.course import positions
 from soilbus.simulator.equilibrium import Equilibrium, Mechanics, Situation, sinkages, solve, surroundings
 from soilbus.simulator.scenario import SAMPLE_RATE, Scenario, Swing, realise, soil_along, soil_names
 from soilbus.terra.effects.effect import Active, Surroundings
-from soilbus.terra.soil_laws import Array
 from soilbus.terra.vehicle import Chassis, axle_loads, pull_required
 from soilbus.terra.wheel import WheelModel
 

@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.terra.effects.effect import Active, Surroundings, forces_with, wheel_with
 from soilbus.terra.entry_angle import entry_angle_for_load
-from soilbus.terra.soil_laws import Array
 from soilbus.terra.wheel import (
     MAX_ENTRY_ANGLE,
     MIN_ENTRY_ANGLE,

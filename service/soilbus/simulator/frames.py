@@ -16,6 +16,7 @@ from cantools.database import Database
 from cantools.database.can import Message, Signal
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.can.channels import Channel
 from soilbus.can.checksum import COUNTER, column_checksums
 from soilbus.can.mapping import channels_of, load_databases
@@ -24,7 +25,6 @@ from soilbus.config.model import Config, Wheel
 from soilbus.files import placed
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.sensors import channel_rng
-from soilbus.terra.soil_laws import Array
 
 START = 1_700_000_000.0
 """Time stamp [s] of a recording's first instant: logs hold wall clock time."""

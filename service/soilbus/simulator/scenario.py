@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.simulator.course import NORTHWARD, Course
-from soilbus.terra.soil_laws import Array
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import Soil
 

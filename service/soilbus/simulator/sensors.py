@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.can.channels import Column
 from soilbus.config.model import Config, Noise
 from soilbus.simulator.drive import Drive
 from soilbus.simulator.scenario import SAMPLE_RATE
 from soilbus.terra.earth import SEMI_MAJOR_AXIS, wrapped
 from soilbus.terra.effects.sensors import read_late
-from soilbus.terra.soil_laws import Array
 
 _DIVIDERS = {"ground_speed": 2, "latitude": 5, "longitude": 5}
 """Radars give 25 Hz, receivers of positions 10 Hz; all other sensors every sample of the truth."""

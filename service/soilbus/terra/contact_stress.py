@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.terra.rim import (
     Rim,
     fixed_shares,
@@ -19,7 +20,7 @@ from soilbus.terra.rim import (
     rim_of_fixed_shares,
     split_nodes,
 )
-from soilbus.terra.soil_laws import SHEAR_LAWS, Array
+from soilbus.terra.soil_laws import SHEAR_LAWS
 from soilbus.terra.wheel_state import LONGEST, PEAK, WheelModel, WheelState
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from soilbus.arrays import Array
 
 SEMI_MAJOR_AXIS = 6378137.0
 """[m]"""

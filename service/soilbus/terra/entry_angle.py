@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from soilbus.terra.soil_laws import Array
+from soilbus.arrays import Array
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE, MIN_ENTRY_ANGLE, WheelModel, WheelState, in_chunks, load_and_slope
 
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.terra.contact_stress import Stress, integrals, mobilised
 from soilbus.terra.rim import gauss, on_branches, place_of_depth, place_of_turn, rim_at, split_nodes
-from soilbus.terra.soil_laws import Array
 from soilbus.terra.wheel_state import WheelModel, WheelState
 
 POWER, FEWER = 2, 2

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from soilbus.terra.soil_laws import Array
+from soilbus.arrays import Array
 
 SERIES_TERMS = 10
 """Terms of the sine and cosine series: exact to rounding up to entry angles of pi/2."""

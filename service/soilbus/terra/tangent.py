@@ -6,8 +6,8 @@ from dataclasses import fields, replace
 
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.terra.dual import Dual, value_of
-from soilbus.terra.soil_laws import Array
 from soilbus.terra.wheel import INPUTS, wheel_forces_and_derivatives
 from soilbus.terra.wheel_state import WheelModel, WheelState
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.terra.contact_stress import (
     Stress,
     by_exponential_share,
@@ -29,7 +30,7 @@ from soilbus.terra.contact_stress import (
     unit_of,
 )
 from soilbus.terra.hardpan import by_pan, pan_stresses, reaching
-from soilbus.terra.soil_laws import Array, lumped_modulus
+from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.wheel_state import EXACT_NODES as EXACT_NODES
 from soilbus.terra.wheel_state import FAST_NODES as FAST_NODES
 from soilbus.terra.wheel_state import WheelModel as WheelModel

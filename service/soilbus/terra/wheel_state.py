@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.terra.rim import Quadrature
-from soilbus.terra.soil_laws import Array
 
 EXACT_NODES = 12
 """Gauss-Legendre nodes a branch: errors below 1e-6 of W (of T: W r) for n in 0.1..1.6, K

@@ -13,9 +13,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from soilbus.arrays import Array
 
 TILTS = (-1.0, 0.0, 1.0, 2.0)
 """Powers of the bound that soils are weighed down by: the greater, the more those count that are told well."""

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.decision.capability import OverSlip
 from soilbus.decision.immobilisation import Alert, Moment, Watch, moments, watched
@@ -25,8 +26,6 @@ from soilbus.validation.boggings import KINDS, Trouble, bogging
 from soilbus.validation.firm_drives import EASY, FIRM_DRIVE, FIRM_KINDS, HARD, firm_ground
 from soilbus.validation.monte_carlo import Each
 from soilbus.validation.windows import task_of
-
-Array = NDArray[np.float64]
 
 HALVES = ("report", "tune")
 LOOK = 0.1

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
+from soilbus.estimation.posterior import NORMAL_95
 from soilbus.report.table import table
 from soilbus.validation.bogging_trials import ENOUGH_TIME, ENOUGH_WAY, FELT, REACTION, WarningFigures
 from soilbus.validation.draft_trials import SPREAD, DraftFigures
@@ -16,8 +17,6 @@ SHARED = """The drives are simulated with the estimator's own wheel-soil model, 
 the figures show that numbers and intervals follow from the model, not that the model is the field's."""
 MAX_ERROR = 0.05
 COVERAGE = (0.90, 0.98)
-TWO_SIDED = 1.96
-"""Standard deviations either side of the mean that hold 95 % of a normal distribution."""
 
 
 def decisions_report(drafts: Sequence[DraftFigures], calls: Reliability, warnings: Sequence[WarningFigures]) -> str:
@@ -101,7 +100,7 @@ def poisson_interval(count: int) -> tuple[float, float]:
     def bound(n: int, z: float) -> float:
         return n * (1.0 - 1.0 / (9.0 * n) + z / (3.0 * math.sqrt(n))) ** 3 if n else 0.0
 
-    return bound(count, -TWO_SIDED), bound(count + 1, TWO_SIDED)
+    return bound(count, -NORMAL_95), bound(count + 1, NORMAL_95)
 
 
 def _bogging_row(found: WarningFigures) -> tuple[str, ...]:

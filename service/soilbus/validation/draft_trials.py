@@ -13,13 +13,14 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.decision.capability import assess
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.laplace import cold_fit
 from soilbus.estimation.observation_model import ObservationModel
+from soilbus.estimation.posterior import NORMAL_95
 from soilbus.estimation.window import Rig
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.equilibrium import Mechanics, Situation, solve
@@ -28,9 +29,7 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import soil_named
 from soilbus.terra.vehicle import axle_loads
 from soilbus.terra.wheel import Soil, WheelModel, sinkage
-from soilbus.validation.monte_carlo import NORMAL_95, Each, missed
-
-Array = NDArray[np.float64]
+from soilbus.validation.monte_carlo import Each, missed
 
 SOILS = ("rubicon_sandy_loam_43", "north_gower_clayey_loam_46", "upland_sandy_loam_51")
 SPREAD = 0.1

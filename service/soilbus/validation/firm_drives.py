@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.simulator.scenario import Patch, Profile, Scenario, Swing, realise
-from soilbus.terra.soil_laws import Array
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.validation.boggings import FAST, FIRM, NO_LIFT, SOFT, largest_draft
 

@@ -15,16 +15,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.laplace import FINE, Node, density, profile_over_n
+from soilbus.estimation.laplace import FINE
+from soilbus.estimation.laplace import Node
+from soilbus.estimation.laplace import density
+from soilbus.estimation.laplace import profile_over_n
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.parametrization import MAX_PHI, Coordinates
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective, QuadraticModel
 from soilbus.terra.wheel import Soil
-
-Array = NDArray[np.float64]
 
 TAILS = 5.0
 """Degrees of freedom of Student's t that the draws follow given n."""

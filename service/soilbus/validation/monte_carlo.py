@@ -29,13 +29,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.allocator import keep_freed_memory
+from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import completion_of, model_of, prior_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.laplace import with_nested_laplace
 from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.observation_model import ObservationModel, ObservationModelWithEffects
-from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
+from soilbus.estimation.observation_model import ObservationModel
+from soilbus.estimation.observation_model import ObservationModelWithEffects
+from soilbus.estimation.parametrization import MAX_PHI
+from soilbus.estimation.posterior import NORMAL_95
+from soilbus.estimation.posterior import PARAMETERS
+from soilbus.estimation.posterior import Posterior
+from soilbus.estimation.posterior import SoilPrior
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import Recording, simulate
@@ -47,18 +53,13 @@ from soilbus.validation.cramer_rao import cramer_rao
 from soilbus.validation.importance_sampling import samples
 from soilbus.workers import workers
 
-Array = NDArray[np.float64]
-
 SOILS = ("loam", "wet_clay", "dry_sand")
 DURATIONS = (2.0, 10.0, 60.0)
 SLIP = Swing(0.05, 0.40)
 ROUGHLY_KNOWN = ("soil.c.value=3000", "soil.c.std=750", "soil.K.value=0.02", "soil.K.std=0.005")
 """Settings with which cohesion and shear modulus are known to 25 %."""
-MAX_PHI = 1.2
-"""A prior that is off by more than this friction angle [rad] is drawn again: the model ends at a right angle."""
 MAX_DRAWN = 20
 """Soils around a named one that are tried until the tractor gets on."""
-NORMAL_95 = 1.959964
 _PHI = PARAMETERS.index("phi")
 
 

@@ -18,8 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.terra.rim import Quadrature, fixed_shares
-from soilbus.terra.soil_laws import SHEAR_LAWS, Array
+from soilbus.terra.soil_laws import SHEAR_LAWS
 from soilbus.terra.wheel import EXACT_NODES
 
 Three = tuple[float, float, float]

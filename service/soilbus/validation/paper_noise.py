@@ -11,12 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.window import Rig, SensorNoise, window_of_samples
 from soilbus.terra.entry_angle import entry_angle_for_load
-from soilbus.terra.soil_laws import Array, lumped_modulus
+from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.wheel import WheelModel, WheelState, sinkage, wheel_forces
 from soilbus.validation.paper import EXACT, Equations, Forces, OperatingPoint, Unknowns, WheelEquations
 from soilbus.validation.paper_tables import Trial

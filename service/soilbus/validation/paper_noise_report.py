@@ -6,8 +6,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.report.table import table
-from soilbus.terra.soil_laws import Array
 from soilbus.validation.paper import EXACT, SIMPSON, Equations
 from soilbus.validation.paper_noise import (
     LEVELS,

@@ -21,8 +21,8 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.config.model import Config, Prior
 from soilbus.config.model import Traversability as Settings
 from soilbus.decision.capability import Demand
@@ -30,7 +30,8 @@ from soilbus.decision.demand import present_demand
 from soilbus.decision.judgement import judge
 from soilbus.decision.traversability import State, Traversability
 from soilbus.estimation.assembly import prior_of, rig_of
-from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+from soilbus.estimation.parametrization import MAX_PHI
+from soilbus.estimation.posterior import NORMAL_95, PARAMETERS, SoilPrior
 from soilbus.estimation.window import Rig, Window
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.sensors.bins import Bins
@@ -40,10 +41,8 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import KINDS, soil_named
 from soilbus.terra.wheel import Soil, WheelModel
 from soilbus.validation.draft_trials import true_largest_draft
-from soilbus.validation.monte_carlo import MAX_PHI, NORMAL_95, Each, missed
+from soilbus.validation.monte_carlo import Each, missed
 from soilbus.validation.windows import task_of
-
-Array = NDArray[np.float64]
 
 SPREAD = 0.2
 """Sd of the logarithms by which a drive's soil parameters leave those of the table's soil."""

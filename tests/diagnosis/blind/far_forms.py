@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.simulator.scenario import SAMPLE_RATE
-from soilbus.terra.soil_laws import Array
 from soilbus.terra.wheel import WheelState
 
 from .contact_forms import SOIL_WEIGHT, less_pull

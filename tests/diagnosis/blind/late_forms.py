@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.can.channels import Column
 from soilbus.simulator.recording import Recording
-from soilbus.terra.soil_laws import Array
 
 from .form import Form, Hidden, Setting, by_hooks
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import SAMPLE_RATE
-from soilbus.terra.soil_laws import Array
 
 from .form import Form, Hidden, Setting, by_hooks
 

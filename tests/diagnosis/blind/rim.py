@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from soilbus.terra.soil_laws import Array
+from soilbus.arrays import Array
 from soilbus.terra.wheel import WheelState
 
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(12)

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.simulator.scenario import Patch, Scenario
-from soilbus.terra.soil_laws import Array
 from soilbus.terra.wheel import Soil, WheelState
 
 from .form import Form, Hidden, Setting, by_hooks

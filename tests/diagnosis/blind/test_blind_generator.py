@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from soilbus.arrays import Array
 from soilbus.simulator.drive import Drive, drive
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.reference import reference_configuration
@@ -16,7 +17,6 @@ from soilbus.terra.effects.along import instants
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active, Surroundings, forces_with
 from soilbus.terra.effects.sensors import read_late
-from soilbus.terra.soil_laws import Array
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import WheelModel, WheelState, state_on, wheel_forces
 

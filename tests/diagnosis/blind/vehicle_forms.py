@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import Scenario
-from soilbus.terra.soil_laws import Array
 
 from .form import Form, Hidden, Setting, by_hooks
 

@@ -20,10 +20,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import SAMPLE_RATE
-from soilbus.terra.soil_laws import Array
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import Soil, state_on
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.terra.dual import Dual, weighed_sum
 from soilbus.terra.effects.effect import Knot, Parameter, Surroundings
-from soilbus.terra.soil_laws import Array
 
 _GAP = 3.0  # times the median step
 _FORGOTTEN = 1e-15  # share of what was, that a low pass keeps

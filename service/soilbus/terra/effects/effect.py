@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from soilbus.terra.soil_laws import Array
+from soilbus.arrays import Array
 from soilbus.terra.wheel import WheelModel, WheelState, wheel_forces
 
 DRAFT_ROUNDS = 3

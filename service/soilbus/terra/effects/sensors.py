@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.terra.effects.along import earlier, instants, through_low_pass
 from soilbus.terra.effects.effect import Active, Effect, Late, Parameter, Surroundings, Values
-from soilbus.terra.soil_laws import Array
 
 _LOAD_CELLS = (
     "zero and span of load cells: OIML R 60 (2021); draft cells 6.5 to 7.2 % off in the field: Cogent Eng. 2024"

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.terra.effects.effect import Active, Surroundings, forces_with, wheel_with
-from soilbus.terra.soil_laws import Array
 from soilbus.terra.wheel import WheelModel, WheelState, sinkage, wheel_forces, wheel_forces_and_slopes
 
 STEP = 1e-6

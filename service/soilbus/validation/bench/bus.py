@@ -20,15 +20,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.can.bus import open_bus
 from soilbus.simulator.reference import TRACTOR
 from soilbus.validation.bench.bus_ear import Ear
 from soilbus.validation.bench.bus_load import FULL, Traffic, others
 from soilbus.validation.bench.figure import Figure
-
-Array = NDArray[np.float64]
 
 STARTS, CALLS = 3, 1000
 """How often a start and a system call are timed."""

@@ -7,8 +7,8 @@ import time
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.can.bus import RECEIVE_BUFFER, open_bus
 from soilbus.can.dbc_files import filters_of, load_databases, output_database
 from soilbus.can.wire import wire_of
@@ -16,8 +16,6 @@ from soilbus.daemon.bus_health import RECEIVED_MODULUS
 from soilbus.pipeline.intake import EDGE_LEAD, Intake
 from soilbus.pipeline.outputs import WINDOW_MODULUS
 from soilbus.simulator.reference import reference_configuration
-
-Array = NDArray[np.float64]
 
 LITTLE_ROOM = 0.05
 """Longest time [s] between two looks where the kernel does not keep the frames of seconds for us."""

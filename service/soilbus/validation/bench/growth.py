@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
@@ -20,8 +20,6 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.validation.bench.figure import Figure, in_turn
-
-Array = NDArray[np.float64]
 
 WHEELS = (1, 2, 4, 8)
 LENGTHS = (5.0, 10.0, 20.0, 40.0)

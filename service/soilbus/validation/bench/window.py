@@ -11,8 +11,8 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import Fit, fit_from_soil, fit_window
 from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModel, diagonals
@@ -25,8 +25,6 @@ from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import Soil, sinkage, state_on, wheel_forces
 from soilbus.validation.bench.figure import Figure, in_turn
-
-Array = NDArray[np.float64]
 
 SOILS = ("loam", "wet_clay", "dry_sand")
 KNOWN = (("c", "K"), ("K", "c"))
