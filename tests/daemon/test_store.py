@@ -61,7 +61,7 @@ def belief_with(seed: int) -> Gaussian:
 def state_with(gaussian: Gaussian | None, **changed) -> State:
     stored = None if gaussian is None else stored_gaussian(gaussian, 1.7e9, OWNER)
     return State(
-        **{"at": 1.7e9, "starts": 3, "belief": stored, "totals": {"windows": 5, "failed.internal": 2}} | changed
+        **{"at": 1.7e9, "starts": 3, "gaussian": stored, "totals": {"windows": 5, "failed.internal": 2}} | changed
     )
 
 
@@ -142,15 +142,15 @@ def test_nothing_that_is_sealed_well_is_a_traceback(edits):
 
 def _scaled(state, row, factor):
     for i in range(N):
-        state["belief"]["covariance"][row][i] *= factor
+        state["gaussian"]["covariance"][row][i] *= factor
 
 
 def _covariance(state, i, j, value):
-    state["belief"]["covariance"][i][j] = value
+    state["gaussian"]["covariance"][i][j] = value
 
 
 def _indefinite(state):
-    c = state["belief"]["covariance"]
+    c = state["gaussian"]["covariance"]
     c[7][8] = c[8][7] = 1.1 * (c[7][7] * c[8][8]) ** 0.5
 
 
@@ -162,8 +162,8 @@ def _indefinite(state):
         (b"[" * 100_000, "not JSON"),
         (b'{"at": ' + b"9" * 5000 + b"}", "not JSON"),
         (b'"soilbus state"', "not a state of soilbus"),
-        (b'{"format": "openpilot", "version": 1}', "not a state of soilbus"),
-        (CONTENT.replace(b'"version": 1', b'"version": 2'), "version 2, this is 1"),
+        (b'{"format": "openpilot", "version": 2}', "not a state of soilbus"),
+        (CONTENT.replace(b'"version": 2', b'"version": 1'), "version 1, this is 2"),
         (CONTENT.replace(b'"starts": 3', b'"starts": 4'), "wrong checksum"),
         (CONTENT.replace(OWNER.key.encode(), b"0" * 64), "another configuration"),
         (sealed(lambda s: s.update(more=1)), "more"),
@@ -173,17 +173,17 @@ def _indefinite(state):
         (sealed(lambda s: s.update(at=float("nan"))), "at"),
         (sealed(lambda s: s["totals"].update(windows=-1)), "windows"),
         (sealed(lambda s: s["totals"].update({f"x{i}": 1 for i in range(2000)})), "totals"),
-        (sealed(lambda s: s["belief"]["soil"].pop("phi")), "other parameters"),
-        (sealed(lambda s: s["belief"]["gains"].update({"torque.XX": 0.0})), "other parameters"),
-        (sealed(lambda s: s["belief"]["covariance"].pop()), "another shape"),
-        (sealed(lambda s: s["belief"]["covariance"][3].pop()), "another shape"),
-        (sealed(lambda s: s["belief"]["soil"].update(phi=1.5)), "physical bounds"),
-        (sealed(lambda s: s["belief"]["soil"].update(n=0.0)), "physical bounds"),
-        (sealed(lambda s: s["belief"]["soil"].update(k_phi=1e30)), "physical bounds"),
-        (sealed(lambda s: s["belief"]["soil"].update(k_phi=1e-30)), "physical bounds"),
-        (sealed(lambda s: s["belief"]["gains"].update({"torque.FL": 0.5})), "physical bounds"),
-        (sealed(lambda s: s["belief"]["gains"].update({"torque.FL": -0.5})), "physical bounds"),
-        (sealed(lambda s: s["belief"]["gains"].update({"torque.FL": float("inf")})), "torque.FL"),
+        (sealed(lambda s: s["gaussian"]["soil"].pop("phi")), "other parameters"),
+        (sealed(lambda s: s["gaussian"]["gains"].update({"torque.XX": 0.0})), "other parameters"),
+        (sealed(lambda s: s["gaussian"]["covariance"].pop()), "another shape"),
+        (sealed(lambda s: s["gaussian"]["covariance"][3].pop()), "another shape"),
+        (sealed(lambda s: s["gaussian"]["soil"].update(phi=1.5)), "physical bounds"),
+        (sealed(lambda s: s["gaussian"]["soil"].update(n=0.0)), "physical bounds"),
+        (sealed(lambda s: s["gaussian"]["soil"].update(k_phi=1e30)), "physical bounds"),
+        (sealed(lambda s: s["gaussian"]["soil"].update(k_phi=1e-30)), "physical bounds"),
+        (sealed(lambda s: s["gaussian"]["gains"].update({"torque.FL": 0.5})), "physical bounds"),
+        (sealed(lambda s: s["gaussian"]["gains"].update({"torque.FL": -0.5})), "physical bounds"),
+        (sealed(lambda s: s["gaussian"]["gains"].update({"torque.FL": float("inf")})), "torque.FL"),
         (sealed(lambda s: _covariance(s, 2, 2, 0.0)), "positive definite"),
         (sealed(lambda s: _covariance(s, 2, 2, -1.0)), "positive definite"),
         (sealed(lambda s: _covariance(s, 2, 2, 5e-324)), "positive definite"),

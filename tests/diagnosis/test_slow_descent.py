@@ -32,7 +32,7 @@ class Banana:
     """Rosenbrock's valley (1960, Comput. J. 3:175) as residuals 10 STEEP (y - x^2) and 1 - x."""
 
     STEEP = 10.0
-    bend, turned = Objective.bend, Objective.turned
+    second_derivative, geodesic_step = Objective.second_derivative, Objective.geodesic_step
 
     def __init__(self) -> None:
         self.asked = 0
@@ -40,10 +40,10 @@ class Banana:
     def directions(self, place):
         return np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 
-    def reach(self, place, step):
+    def step_share(self, place, step):
         return 1.0
 
-    def moved(self, place, point, step):
+    def stepped(self, place, point, step):
         return replace(place, soil=place.soil + step)
 
     def point(self, place):
@@ -69,7 +69,7 @@ def test_steps_that_bend_follow_a_valley_that_does():
     damped, damping = Banana(), DAMPING
     there = begun(damped)
     while there.point.neg2_log_posterior > 1e-6 and damped.asked < 1000:
-        place = damped.moved(*there, there.point.step(damping))
+        place = damped.stepped(*there, there.point.step(damping))
         point = damped.point(place)
         falls = point.neg2_log_posterior < there.point.neg2_log_posterior
         damping *= EASED if falls else HELD_BACK
@@ -82,8 +82,8 @@ def test_the_second_derivative_along_a_step_is_that_of_the_residuals():
     banana = Banana()
     place, point = begun(banana)
     step = np.array([0.3, -0.2])
-    there = banana.point(banana.moved(place, point, step))
-    assert banana.bend(place, point, step, there) == pytest.approx([-20.0 * banana.STEEP * 0.3**2, 0.0], abs=1e-9)
+    there = banana.point(banana.stepped(place, point, step))
+    assert banana.second_derivative(place, point, step, there) == pytest.approx([-20.0 * banana.STEEP * 0.3**2, 0.0], abs=1e-9)
 
 
 def test_a_parabola_has_the_step_of_the_slope_that_it_is_given():
@@ -167,7 +167,7 @@ class Flat:
             neg2_log_posterior=cost, step=lambda: np.ones(1), length=lambda step: 0.5, information=np.eye(1)
         )
 
-    def moved(self, place, point, step):
+    def stepped(self, place, point, step):
         return place + 1
 
 

@@ -8,9 +8,7 @@ from scipy.stats import binom, chi2
 
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.observation_model import ObservationModel
-from soilbus.estimation.posterior import NORMAL_95
-from soilbus.estimation.posterior import PARAMETERS
-from soilbus.estimation.posterior import SoilPrior
+from soilbus.estimation.posterior import NORMAL_95, PARAMETERS, SoilPrior
 from soilbus.estimation.window import window_of_samples
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.entry_angle import entry_angle_for_load

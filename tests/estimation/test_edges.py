@@ -14,7 +14,7 @@ from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import DEFAULT_OPTIONS, Start, fit_from, fit_from_soil, fit_window
 from soilbus.estimation.nuisance_parameters import parameters_of
 from soilbus.estimation.observation_model import ObservationModelWithEffects
-from soilbus.estimation.parametrization import BOUND, Coordinates, at_edges, share_of_step
+from soilbus.estimation.parametrization import BOUND, Coordinates, at_edges, step_share_within
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Objective, QuadraticModel
 from soilbus.terra.effects.catalogue import CATALOGUE
@@ -44,17 +44,17 @@ def test_a_step_never_leaves_the_edges_and_with_one_it_is_the_best_there_is(seed
 
 
 def test_steps_end_at_the_bounds():
-    assert share_of_step(np.array([0.5, np.inf, -0.2]), np.array([1.0, 9.0, -0.1])) == 0.5
-    assert share_of_step(np.array([np.inf]), np.array([3.0])) == 1.0
+    assert step_share_within(np.array([0.5, np.inf, -0.2]), np.array([1.0, 9.0, -0.1])) == 0.5
+    assert step_share_within(np.array([np.inf]), np.array([3.0])) == 1.0
     assert at_edges(np.array([1.0, 2.0, 3.0]), np.ones(3), np.full(3, 3.0)).tolist() == [-1.0, 0.0, 1.0]
     prior = SoilPrior.from_value_std(dict(zip(PARAMETERS, [(v, 0.25 * v) for v in WET_CLAY], strict=True)))
     coordinates = Coordinates(prior, 0.3)
     soil = np.asarray(WET_CLAY, float)
     step = np.zeros(6)
     step[C] = 0.6
-    soil = coordinates.moved(soil, coordinates.reach(soil, step) * step)
+    soil = coordinates.moved(soil, coordinates.step_share(soil, step) * step)
     assert not len(coordinates.edges(soil))
-    soil = coordinates.moved(soil, coordinates.reach(soil, step) * step)
+    soil = coordinates.moved(soil, coordinates.step_share(soil, step) * step)
     assert coordinates.edges(soil).tolist() == [np.eye(6)[C].tolist()]
     assert soil[C] == pytest.approx(WET_CLAY.c * np.exp(BOUND * prior.log_std[C]))
 

@@ -17,9 +17,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from soilbus.arrays import Array
-from soilbus.estimation.observation_model import Latents
-from soilbus.estimation.observation_model import Linearisation
-from soilbus.estimation.observation_model import ObservationModel
+from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModel
 from soilbus.estimation.posterior import Posterior
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soil_laws import lumped_modulus

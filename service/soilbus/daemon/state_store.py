@@ -32,7 +32,7 @@ from soilbus.estimation.posterior import PARAMETERS
 from soilbus.estimation.tracker import elsewhere, gain_errors
 from soilbus.words import one_line
 
-FORMAT, VERSION = "soilbus state", 1
+FORMAT, VERSION = "soilbus state", 2
 LARGEST = 1 << 20
 """Bytes of a file beyond which it is not ours."""
 FAR = 8.0

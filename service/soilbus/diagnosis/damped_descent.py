@@ -17,13 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.estimation.multistart import DescentOptions
-from soilbus.estimation.multistart import Fit
-from soilbus.estimation.observation_model import Linearisation
-from soilbus.estimation.observation_model import Optimum
-from soilbus.estimation.solver import Iterate
-from soilbus.estimation.solver import Objective
-from soilbus.estimation.solver import QuadraticModel
+from soilbus.estimation.multistart import DescentOptions, Fit
+from soilbus.estimation.observation_model import Linearisation, Optimum
+from soilbus.estimation.solver import Iterate, Objective, QuadraticModel
 
 MAX_STEPS = 15
 ENOUGH_FAR = 2e-3

@@ -19,8 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.diagnosis.fitted_model import FittedModel
-from soilbus.diagnosis.fitted_model import fit_model
+from soilbus.diagnosis.fitted_model import FittedModel, fit_model
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.verdict import temperature
 from soilbus.estimation.gaussian import Gaussian

@@ -16,8 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.diagnosis.fitted_model import Checked
-from soilbus.diagnosis.fitted_model import FittedModel
+from soilbus.diagnosis.fitted_model import Checked, FittedModel
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.where import channels
 from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModelWithEffects

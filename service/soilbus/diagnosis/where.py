@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.diagnosis.fitted_model import Checked
-from soilbus.diagnosis.fitted_model import FittedModel
+from soilbus.diagnosis.fitted_model import Checked, FittedModel
 from soilbus.estimation.posterior import PARAMETERS
 
 FEWEST = 20

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.observation_model import Linearisation
-from soilbus.estimation.solver import Iterate
-from soilbus.estimation.solver import Objective
+from soilbus.estimation.solver import Iterate, Objective
 from soilbus.estimation.window import Window
 
 

@@ -29,8 +29,7 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.gaussian import solve_with_inverse
+from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.path_curvature import by_curvature
 from soilbus.estimation.solver import GaussianApproximation, Iterate, Objective

@@ -25,15 +25,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from soilbus.arrays import Array
-from soilbus.arrays import Indices
-from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.gaussian import solve_with_inverse
-from soilbus.estimation.multistart import Fit
-from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.multistart import refine
-from soilbus.estimation.observation_model import DenoisedObservationModel
-from soilbus.estimation.observation_model import ObservationModel
+from soilbus.arrays import Array, Indices
+from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
+from soilbus.estimation.multistart import Fit, fit_window, refine
+from soilbus.estimation.observation_model import DenoisedObservationModel, ObservationModel
 from soilbus.estimation.parametrization import BOUND, Coordinates
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective

@@ -27,11 +27,8 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.measurements import Measurements
-from soilbus.estimation.multistart import Fit
-from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.multistart import refine
-from soilbus.estimation.observation_model import CurvedPathFit
-from soilbus.estimation.observation_model import ObservationModel
+from soilbus.estimation.multistart import Fit, fit_window, refine
+from soilbus.estimation.observation_model import CurvedPathFit, ObservationModel
 from soilbus.estimation.posterior import PARAMETERS
 from soilbus.estimation.solver import Objective
 from soilbus.estimation.window import Rig, Window, pairs

@@ -13,14 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.gaussian import PriorFactor
-from soilbus.estimation.gaussian import PriorQuadratic
-from soilbus.estimation.gaussian import solve_with_inverse
-from soilbus.estimation.observation_model import Latents
-from soilbus.estimation.observation_model import Linearisation
-from soilbus.estimation.observation_model import ObservationModel
-from soilbus.estimation.observation_model import Optimum
+from soilbus.estimation.gaussian import Gaussian, PriorFactor, PriorQuadratic, solve_with_inverse
+from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModel, Optimum
 from soilbus.estimation.parametrization import (
     MAX_STEP,
     TYPICAL_DEPTH,

@@ -31,9 +31,7 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.estimation.change_detection import Transition
-from soilbus.estimation.change_detection import change_statistic
-from soilbus.estimation.change_detection import without_transition
+from soilbus.estimation.change_detection import Transition, change_statistic, without_transition
 from soilbus.estimation.drift_filter import at_window_end
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.laplace import with_nested_laplace

@@ -17,10 +17,7 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.laplace import FINE
-from soilbus.estimation.laplace import Node
-from soilbus.estimation.laplace import density
-from soilbus.estimation.laplace import profile_over_n
+from soilbus.estimation.laplace import FINE, Node, density, profile_over_n
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.parametrization import MAX_PHI, Coordinates

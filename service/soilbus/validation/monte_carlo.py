@@ -35,13 +35,9 @@ from soilbus.estimation.assembly import completion_of, model_of, prior_of, rig_o
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.laplace import with_nested_laplace
 from soilbus.estimation.multistart import fit_window
-from soilbus.estimation.observation_model import ObservationModel
-from soilbus.estimation.observation_model import ObservationModelWithEffects
+from soilbus.estimation.observation_model import ObservationModel, ObservationModelWithEffects
 from soilbus.estimation.parametrization import MAX_PHI
-from soilbus.estimation.posterior import NORMAL_95
-from soilbus.estimation.posterior import PARAMETERS
-from soilbus.estimation.posterior import Posterior
-from soilbus.estimation.posterior import SoilPrior
+from soilbus.estimation.posterior import NORMAL_95, PARAMETERS, Posterior, SoilPrior
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import Recording, simulate
