@@ -212,6 +212,6 @@ def first_verdict(wire: ScriptedBus) -> float:
 def test_the_file_can_be_read_by_people(tmp_path: Path):
     keeper_in(tmp_path, FakeClock()).close(BELIEF, {"windows": 3})
     state = json.loads((tmp_path / FILE).read_text())["state"]
-    assert list(state["belief"]["soil"]) == ["k_c", "k_phi", "n", "phi", "c", "K"]
-    assert state["belief"]["gains"]["torque.FL"] == 0.0
+    assert list(state["gaussian"]["soil"]) == ["k_c", "k_phi", "n", "phi", "c", "K"]
+    assert state["gaussian"]["gains"]["torque.FL"] == 0.0
     assert state["totals"] == {"windows": 3}

@@ -82,7 +82,7 @@ def test_what_is_given_or_moved_stays_told_by_data(simulated):
     one = simulated(SOILS["loam"], 1)
     told = fit_window(one.problem(), one.prior).mode.likelihood_factor(one.prior)
     n = PARAMETERS.index("n")
-    held = told.given(n, float(np.log(told.soil[n])) + 0.02)
+    held = told.conditioned_on(n, float(np.log(told.soil[n])) + 0.02)
     along = told.covariance[:, n] / told.covariance[n, n]
     assert held.soil[K_C] == told.soil[K_C]
     assert held.k_c_offset == pytest.approx(told.k_c_offset + 0.02 * along[K_C])
