@@ -9,7 +9,7 @@ import pytest
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import fit_window, refine
-from soilbus.estimation.observation_model import DenoisedObservationModel, expected
+from soilbus.estimation.observation_model import DenoisedObservationModel, shrunk_latents
 from soilbus.estimation.solver import Iterate, Objective
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Swing
@@ -24,12 +24,12 @@ def test_noise_alone_is_the_mean_and_signals_stay():
     noise = sd * rng.standard_normal(signal.shape)
     variance = np.broadcast_to(sd**2, signal.shape)
     level = 5.0 + noise
-    assert expected(level, variance) == pytest.approx(np.broadcast_to(level.mean(0), level.shape))
-    calm = expected(signal + noise, variance)
+    assert shrunk_latents(level, variance) == pytest.approx(np.broadcast_to(level.mean(0), level.shape))
+    calm = shrunk_latents(signal + noise, variance)
     left, before = (((x - signal) / sd).std() for x in (calm, signal + noise))
     assert left < 0.6 * before  # one direction of four
     exact = variance * np.array([1.0, 1.0, 1.0, 0.0])
-    assert expected(signal + noise, exact)[:, 3] == pytest.approx((signal + noise)[:, 3])
+    assert shrunk_latents(signal + noise, exact)[:, 3] == pytest.approx((signal + noise)[:, 3])
 
 
 def test_a_window_without_variation_tells_no_more_than_the_bound():

@@ -244,8 +244,8 @@ class _Part:
         """What this channel alone is off where it is so late (delay, time constant)."""
         pulls = iter(f.pull_at(v) for f, v in zip(self.free, values, strict=True))
         gains = np.concatenate([self.sensors, [next(pulls) if f.std else 0.0 for f in self.alone.free]])
-        late = self.alone.lateness(gains, self.fit.optimum.latents, self.torque)
-        return self.alone.late_residuals(late, self.point.at.by_latents, gains)
+        late = self.alone.delay_terms(gains, self.fit.optimum.latents, self.torque)
+        return self.alone.delay_residuals(late, self.point.at.by_latents, gains)
 
     def cost(self, delay: float, tau: float) -> float:
         """-2 log posterior of this recording, least over all the rest."""
