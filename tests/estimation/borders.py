@@ -23,7 +23,7 @@ from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.change_detection import Transition, without_transition
 from soilbus.estimation.observation_model import ObservationModelWithEffects
 from soilbus.estimation.posterior import Posterior
-from soilbus.estimation.tracker import elsewhere
+from soilbus.estimation.tracker import new_soil_prior
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import Recording, simulate
@@ -144,7 +144,7 @@ def least_sd(config: Config, driven: Drive, t: float) -> float:
     window = without_transition(store.window(driven.on, end), border, rig.front)
     settings = config.estimator
     problem = ObservationModelWithEffects(window, rig, model_of(config), settings.min_speed, settings.max_turn)
-    bound = cramer_rao(problem, elsewhere(prior_of(config)), driven.soils[1].parameters())
+    bound = cramer_rao(problem, new_soil_prior(prior_of(config)), driven.soils[1].parameters())
     bearing = bound.bearing_pressure(settings.z_ref, settings.b_ref)
     return bearing.std / bearing.value
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from drives import errors, tracker_of, windows
 
-from soilbus.estimation.tracker import Ground
+from soilbus.estimation.tracker import TrackerState
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -40,7 +40,7 @@ def hour(soil: str, minutes: float, seed: int) -> Hour:
     good = [r.fit for r in results if r.fit is not None and not r.mismatch]
     return Hour(
         len(results),
-        sum(r.ground is not Ground.SAME for r in results),
+        sum(r.state is not TrackerState.STEADY for r in results),
         len(results) - len(good),
         np.array([errors(fit.posterior, SOILS[soil]) for fit in good]),
         np.array([fit.chi2 for fit in good]),

@@ -11,7 +11,7 @@ from drives import errors, tracker_of, windows
 
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.path_curvature import curve_of, rim_difference, sides, with_curve
+from soilbus.estimation.path_curvature import curvature_of, rim_difference, sides, with_curvature
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -39,8 +39,8 @@ def _names(tracker, window):
 
 
 def test_without_that_unknown_a_curve_is_a_mismatch(monkeypatch):
-    monkeypatch.setattr("soilbus.estimation.tracker.with_curve", lambda gaussian, curve: gaussian)
-    monkeypatch.setattr("soilbus.estimation.path_curvature.BENT", np.inf)
+    monkeypatch.setattr("soilbus.estimation.tracker.with_curvature", lambda gaussian, curve: gaussian)
+    monkeypatch.setattr("soilbus.estimation.path_curvature.MIN_CURVATURE_GAIN", np.inf)
     config = reference_configuration()
     scenario = Scenario(11.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))
     window, end = next(windows(config, simulate(config, scenario, 1)))
@@ -58,7 +58,7 @@ def test_a_curve_that_begins_within_a_window_is_no_soil(seed, monkeypatch):
         return np.array([w.away for w in told])
 
     assert np.abs(away()).max() < 3.0
-    monkeypatch.setattr("soilbus.estimation.path_curvature.BENT", np.inf)
+    monkeypatch.setattr("soilbus.estimation.path_curvature.MIN_CURVATURE_GAIN", np.inf)
     assert np.abs(away()[:, 1]).max() > 3.0
 
 
@@ -74,7 +74,7 @@ def test_only_differences_between_the_sides_are_freed_and_by_as_much_as_the_rims
     problem = case.problem(curved(case.window, case.rig, 1.0 / 50.0))
     assert rim_difference(problem) == pytest.approx(TRACK / 100.0, abs=0.007)
     before = Gaussian.of(case.prior, problem.gain_std)
-    added = with_curve(before, curve_of(problem)).covariance - before.covariance
+    added = with_curvature(before, curvature_of(problem)).covariance - before.covariance
     speeds = [6 + problem.gain_names.index(f"speed.{wheel}") for wheel in case.rig.wheels]
     assert np.flatnonzero(added.any(axis=0)).tolist() == speeds
     of_speeds = added[np.ix_(speeds, speeds)]

@@ -158,5 +158,5 @@ def test_no_belief_grows_from_one_of_two_optima():
         result = estimator.solve(task)
         if result.reason == "ambiguous":
             told += 1
-            assert not estimator._tracker._gaussians
+            assert not estimator._tracker._posteriors
     assert told > 0

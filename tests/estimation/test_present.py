@@ -11,7 +11,7 @@ from drives import errors, task_of, tracker_of, windows
 from scipy.special import expit
 
 from soilbus.decision.traversability import Status
-from soilbus.estimation.drift_filter import PIECES, STEADY, at_window_end
+from soilbus.estimation.drift_filter import PIECES, STEADY_DRIFT_SD, at_window_end
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.solver import Iterate, Objective
@@ -125,13 +125,13 @@ def test_the_filter_is_the_joint_solution_for_the_soils_of_all_pieces(drift, sim
             else:
                 link = (of(piece, 0.0) - of(piece - 1, 0.0))[:free]
                 information += link.T @ link * PIECES / drift**2
-        information[n - steady :, n - steady :] += np.eye(steady) / (STEADY * drift) ** 2
+        information[n - steady :, n - steady :] += np.eye(steady) / (STEADY_DRIFT_SD * drift) ** 2
         last = np.concatenate([np.arange(free) + free * (PIECES - 1), np.arange(free * PIECES, n - steady)])
         covariance = np.linalg.inv(information)
         steps.append(-(covariance @ gradient)[last])
         covariances.append(covariance[np.ix_(last, last)])
         cost -= gradient @ covariance @ gradient
-        evidences.append(cost + np.linalg.slogdet(information)[1] + 2.0 * steady * np.log(STEADY * drift))
+        evidences.append(cost + np.linalg.slogdet(information)[1] + 2.0 * steady * np.log(STEADY_DRIFT_SD * drift))
     probable = expit((evidences[0] - evidences[1]) / 2.0)  # the steady change
     off = steps[1] - steps[0]
     step = steps[0] + probable * off

@@ -11,7 +11,7 @@ from drives import errors, tracker_of, windows
 
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.tracker import PERSISTENCE, gain_errors, prior_from_last_run
+from soilbus.estimation.tracker import GAIN_CORRELATION_TIME, gain_errors, prior_from_last_run
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -37,16 +37,16 @@ def learned(before) -> Gaussian:
     tracker = tracker_of(CONFIG)
     for window, end in before:
         tracker.estimate(window, end)
-    assert tracker.newest is not None
-    return tracker.newest
+    assert tracker.newest_posterior is not None
+    return tracker.newest_posterior
 
 
 def first_fit(window, gaussian: Gaussian | None, elapsed: float = NIGHT):
     """Of a run that knew this beforehand."""
     tracker = tracker_of(CONFIG)
     if gaussian is not None:
-        tracker.recall(gaussian, elapsed)
-    tracker.forget()  # as the first window of every run asks
+        tracker.start_from_last_run(gaussian, elapsed)
+    tracker.reset()  # as the first window of every run asks
     tracked = tracker.estimate(*window)
     assert not tracked.mismatch
     return tracked.fit
@@ -62,10 +62,10 @@ def test_gains_wander_about_their_prior_as_long_as_nobody_looks():
     rng = np.random.default_rng(1)
     root = 0.1 * rng.standard_normal((20, 20)) * np.concatenate([np.ones(6), GAIN_STD])[:, None]
     gaussian = Gaussian(PRIOR.median * 2.0, GAIN_STD * rng.standard_normal(14), root @ root.T)
-    for elapsed in (0.0, 60.0, PERSISTENCE, 30 * PERSISTENCE):
+    for elapsed in (0.0, 60.0, GAIN_CORRELATION_TIME, 30 * GAIN_CORRELATION_TIME):
         left = prior_from_last_run(gaussian, PRIOR, GAIN_STD, elapsed)
         # simulated: dg = -g dt / T + sqrt(2 / T) std dW, whose steps over any time are known exactly
-        still = math.exp(-elapsed / PERSISTENCE)
+        still = math.exp(-elapsed / GAIN_CORRELATION_TIME)
         at_first = rng.multivariate_normal(gaussian.gains, gaussian.covariance[6:, 6:], 200_000, method="cholesky")
         wandered = still * at_first + math.sqrt(1 - still**2) * GAIN_STD * rng.standard_normal(at_first.shape)
         assert left.gains == pytest.approx(wandered.mean(0), abs=0.02 * GAIN_STD.max())

@@ -29,7 +29,7 @@ from soilbus.estimation.assembly import completion_of, model_of, prior_of, rig_o
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.parametrization import MAX_PHI
 from soilbus.estimation.posterior import PARAMETERS
-from soilbus.estimation.tracker import elsewhere, gain_errors
+from soilbus.estimation.tracker import gain_errors, new_soil_prior
 from soilbus.words import one_line
 
 FORMAT, VERSION = "soilbus state", 2
@@ -99,7 +99,7 @@ class Owner:
             _digest([config.model_dump(mode="json", include=SECTIONS), [_wiring(c, database) for c in channels]]),
             tuple(names),
             np.concatenate([prior.median, np.zeros(len(names))]),
-            np.concatenate([elsewhere(prior).log_std, gain_std]),
+            np.concatenate([new_soil_prior(prior).log_std, gain_std]),
         )
 
 

@@ -25,7 +25,7 @@ from soilbus.estimation.multistart import Fit
 from soilbus.estimation.nuisance_parameters import active_at
 from soilbus.estimation.posterior import Estimate, Posterior, SoilPrior
 from soilbus.estimation.soil_classes import SoilClasses, guessed
-from soilbus.estimation.tracker import MIN_ROWS, Ground, Settings, Tracker, TrackerOutput
+from soilbus.estimation.tracker import MIN_ROWS, Settings, Tracker, TrackerOutput, TrackerState
 from soilbus.estimation.window import Rig, Window
 from soilbus.pipeline.excitation import excitation_of
 from soilbus.pipeline.intake import WindowTask
@@ -104,7 +104,7 @@ class WindowEstimator:
     def estimate(self, task: WindowTask) -> Undecided:
         """Soil and status of one window."""
         if task.fresh:
-            self._tracker.forget()
+            self._tracker.reset()
         tracked = self._tracker.estimate(task.window, task.end)
         fit = tracked.fit
         status, reason = self._status(task, tracked)
@@ -140,7 +140,7 @@ class WindowEstimator:
         model = self._present_model(task.window, tracked, effects)
         window = _with_true_draft(task.window, effects, self.rig)
         demand = present_demand(window, self.rig.chassis, self._settings.hop, self._draft_gain(tracked))
-        here = tracked.ground not in (Ground.CHANGING, Ground.SETTLING)
+        here = tracked.state not in (TrackerState.SUSPECT, TrackerState.TRANSITION)
         if task.fresh:
             self._idle = np.zeros(len(self.rig.wheels), bool)
         self._idle = idle(task.window, self.rig, task.end - self._settings.hop, self._idle)
@@ -243,7 +243,7 @@ class WindowEstimator:
     def _soil_class(self, posterior: Posterior | None) -> dict[str, float] | None:
         if posterior is None or self._classes is None:
             return None
-        here = self._tracker.here
+        here = self._tracker.soil_prior
         return self._classes.probabilities(posterior, self._guess if here is self.prior else here)
 
     def _sinkage(self, fit: Fit | None) -> dict[str, float | None]:
@@ -304,7 +304,7 @@ class WindowEstimator:
 
     def _hardly_new(self, tracked: TrackerOutput, end: float) -> bool:
         """Whether the window has too little of the soil that has just begun."""
-        if tracked.ground in (Ground.CHANGING, Ground.SETTLING):
+        if tracked.state in (TrackerState.SUSPECT, TrackerState.TRANSITION):
             return True
         return tracked.since > end - self.config.traversability.min_share * self._settings.window
 
