@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soilbus.estimation.local_cubics import PARTS, Series, curve_of, variance_of_one
+from soilbus.estimation.local_cubics import PHASE_PARTS, Series, curve_of, variance_of_one
 from soilbus.estimation.window import Rig, SensorNoise
 from soilbus.sensors.bins import Bins
 from soilbus.sensors.rates import resolved_window
@@ -66,7 +66,7 @@ def test_the_variance_of_a_value_at_one_instant_is_what_noise_makes_of_it(half, 
     there = smooth[:, i] + u * (left + u * (3 * rise - 2 * left - right + u * (left + right - 2 * rise)))
     own = slice(reach, reach + n)
     told = noise[:, own].mean(1) - smooth[:, own].mean(1) + there
-    assert variance_of_one(half, n, round(phase * PARTS)) == pytest.approx(told.var(), rel=0.04)
+    assert variance_of_one(half, n, round(phase * PHASE_PARTS)) == pytest.approx(told.var(), rel=0.04)
 
 
 def store_of(shake: float, step: float = 0.02) -> Bins:

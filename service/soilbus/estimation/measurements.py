@@ -27,11 +27,15 @@ Masked = tuple[Array, Array, NDArray[np.bool_]]
 """Values, their variances, and a mask of which are known; zero where not."""
 
 MAX_SLIP = 0.98
-"""Slip from which a wheel is unusable: the model divides by 1 - slip; no evidence recorded."""
+"""Slip from which a wheel is unusable; no evidence recorded."""
 MIN_SLIP = -1.0
 """Slip (braking) up to which a wheel is unusable; no evidence recorded."""
 CUBIC_SELECTION_SD = 6.0
 """Sd of the noise by which cubics must differ from lines to be used; no evidence recorded."""
+SUBSTITUTE_LOAD = 1e3
+"""Load [N] of unusable wheel-instants; their rows are zero, so it only has to be positive."""
+SUBSTITUTE_SPEED_RATIO = 0.8
+"""Ground speed over rim speed of unusable wheel-instants; their rows are zero, so it only has to be positive."""
 GAIN_QUANTITIES = ("torque", "load", "speed", "ground_speed", "draft")
 """Quantities with a gain error, in the order of `gain_names`."""
 
@@ -100,9 +104,8 @@ class Measurements:
         load, load_var, _ = take("load")
         speed, speed_var, _ = take("speed")
         self.ground_speed, self.ground_speed_var, _ = take("ground_speed")
-        # Unusable wheel-instants get a finite substitute; their rows are zero.
-        self.load = np.where(usable, load, 1e3)
-        self.speed = np.where(usable, speed, self.ground_speed[:, None] / (0.8 * rig.radius))
+        self.load = np.where(usable, load, SUBSTITUTE_LOAD)
+        self.speed = np.where(usable, speed, self.ground_speed[:, None] / (SUBSTITUTE_SPEED_RATIO * rig.radius))
         self.load_var, self.speed_var = np.where(usable, load_var, 0.0), np.where(usable, speed_var, 0.0)
         self.since, self.distance = travelled(self.t, self.ground_speed, window.t)
         self.duration = float(window.t[-1] - window.t[0]) if len(window.t) else 0.0

@@ -33,8 +33,8 @@ MAX_RIM_DIFFERENCE = 1.0
 """Relative difference of rim speeds of a turn about a centre one track from the vehicle's middle: B/R = 1.
 Steered tractors turn about centres at least 1.5 tracks away; one side that spins while the other stands is at 2."""
 MAX_AXLE_RATIO = 2.0
-"""Ratio of the axles' relative differences in one turn.  The front axle's is less by the square of the cosine of the
-steering angle (1/2 at 45 degrees), the slower inner wheels of both slip about alike."""
+"""Greatest ratio of the axles' relative differences in one turn.  The front axle's is less by the square of the
+cosine of the steering angle (1/2 at 45 degrees); the inner wheels of both axles slip about alike."""
 TRACK_RANGE = (0.3, 8.0)
 """Tracks [m] of wheeled vehicles, from small rovers to 3.2 m, the latter over 1 - slip for slips up to 0.6."""
 
@@ -113,16 +113,27 @@ class Window:
 def forward(window: Window) -> Window:
     """The window with every instant of reversing turned into the same drive forward.
 
-    A smooth wheel is its own mirror image: backwards, all that points along the ground
-    changes its sign and nothing else does.  So wheel speed, torque, draft, pitch,
-    acceleration and yaw rate are negated and the ground speed becomes its magnitude (a radar's has no
-    sign anyway), while loads and sinkages stay.  The load transfer is in the measured
-    loads, which stay with their wheels.  Not mirrored is what tells front from rear: which
-    axle runs in the other's ruts, and lugs with a direction.
+    Parameters
+    ----------
+    window : Window
+        With signed wheel speeds.
 
-    A vehicle reverses where more of its wheels turn backward than forward; the speed of a
-    wheel against most of the others is nan, and that of every wheel where neither side is
-    in the majority.
+    Returns
+    -------
+    Window
+        With wheel speeds >= 0.
+
+    Notes
+    -----
+    A smooth wheel is its own mirror image: in reverse all quantities along the ground change
+    their sign and no others do.  So wheel speed, torque, draft, pitch, acceleration and yaw
+    rate are negated and the ground speed becomes its magnitude (a radar's has no sign);
+    loads and sinkages stay.  The load transfer is in the measured loads, which stay with their
+    wheels.  Not mirrored is what distinguishes front from rear: which axle runs in the other's
+    ruts, and lugs with a direction.
+
+    A vehicle reverses where more of its wheels turn backward than forward.  The speed of a
+    wheel that turns against the majority is nan, and so are all speeds without a majority.
     """
     if not (window.speed < 0.0).any():
         return window
@@ -146,23 +157,33 @@ def forward(window: Window) -> Window:
 
 
 def turning(window: Window, rig: Rig, max_turn: float) -> NDArray[np.bool_]:
-    """At which instants (N,) of a forward window the vehicle turns too sharply for one ground speed.
+    """Whether the vehicle turns too sharply for one ground speed, at each instant (N,) of a forward window.
 
+    Parameters
+    ----------
+    window : Window
+        From `forward`.
+    rig : Rig
+        Its track [m] is used where known.
+    max_turn : float
+        Relative difference of the rim speeds of an axle above which an instant is in a turn.
+
+    Notes
+    -----
     On a turn of radius R with track B and yaw rate r = V/R, the ground speeds of the two
     wheels of an axle differ by B r, that is by B/R of their mean V, and each wheel's slip,
-    taken from the speed of the vehicle's middle, is wrong by B/(2 R) (1 - slip).  An instant
-    is in a turn where that relative difference exceeds `max_turn`.
+    taken from the speed of the vehicle's middle, is wrong by B/(2 R) (1 - slip).
 
     Where the yaw rate is known it decides: rim speeds that differ without it are wheel spin.
-    With a track the difference is B r.  Without one the rim speeds must show a turn (below)
-    to the side of the yaw rate, by a difference that a track could make of it.
+    With a known track the difference is B r.  Without one the rim speeds must show a turn (see
+    below) to the side of the yaw rate, by a difference that a track in `TRACK_RANGE` explains.
 
-    Without a yaw rate the rim speeds alone tell.  A turn makes the wheels of the same side the
-    faster ones on every axle, by the same relative difference but for what steering angle and
-    tracks make of it, and by no more than a turn about a centre one track away.  All else is
-    slip: of one wheel, of one on each axle crosswise (open differentials), of all on one side
-    while the others stand, or of one axle on a side slope.  An axle with an unknown speed, or
-    not with two wheels, does not count; without any no instant is in a turn.
+    Without a yaw rate the rim speeds decide.  In a turn the wheels of the same side are the
+    faster ones on every axle, by relative differences that are equal up to the influence of
+    steering angle and tracks, and no greater than in a turn about a centre one track away.  All
+    other patterns are slip: of one wheel, of one on each axle crosswise (open differentials), of
+    all on one side while the others stand, or of one axle on a side slope.  An axle with an
+    unknown speed or without two wheels is ignored; without any axle no instant is in a turn.
     """
     relative, difference = _rim_differences(window, rig)
     size = np.abs(relative)
@@ -177,7 +198,7 @@ def turning(window: Window, rig: Rig, max_turn: float) -> NDArray[np.bool_]:
         if rig.track is not None:
             by_yaw = rig.track * np.abs(yaw) > max_turn * np.abs(window.ground_speed)
         else:
-            track = difference / yaw[:, None]  # of the axle, were nothing but the turn in it
+            track = difference / yaw[:, None]  # of the axle, if the difference is the turn's alone
             low, high = TRACK_RANGE
             by_yaw = by_rims & (np.isnan(track) | ((track > low) & (track < high))).all(axis=1)
     return np.asarray(np.where(np.isfinite(yaw), by_yaw, by_rims))
