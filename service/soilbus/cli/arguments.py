@@ -59,6 +59,7 @@ def command_line() -> argparse.ArgumentParser:
 
     sub = command("demo", "simulated tractor, service and dashboard; needs no hardware, ends by itself", "")
     sub.add_argument("--duration", type=float, default=42.0, metavar="S", help="simulated seconds (default 42)")
+    sub.add_argument("--picture", type=Path, metavar="OUT.svg", help="keep the last state of the dashboard")
 
     sub = command("run", "the service on a live bus")
     sub.add_argument("--wait", action="store_true", help="wait for an interface that is not there yet")
