@@ -157,9 +157,9 @@ class Signal(_Section):
 
     `sign` flips a sensor mounted the other way round.  `valid` names a signal (or a
     signal of the same message) that must hold one of `valid_values` for the value to
-    count.  `at` tells on which side of the gear a torque or speed is measured.
+    count.  `at` is the side of the gear on which a torque or speed is measured.
     `timeout` [s] is the age from which the channel counts as stale.  `delay` [s] is how much
-    earlier what a sample tells was true: a radar's filter, a receiver's solution, a queue.
+    earlier what a sample reports was true: a radar's filter, a receiver's solution, a queue.
     """
 
     signal: SignalName
@@ -186,7 +186,7 @@ class Signal(_Section):
 class Wheel(_Section):
     """One wheel and its sensors; radius is the rolling radius [m], width the tyre's [m].
 
-    `max_torque` [N m] is the motor's limit at the wheel where no signal tells it.  Only the
+    `max_torque` [N m] is the motor's limit at the wheel where no signal reports it.  Only the
     wheel of a test rig has no axle.  A rigid wheel has no tyre that could flatten or wear.
     """
 
@@ -243,7 +243,7 @@ class Signals(_Section):
     acceleration: Signal | None = None
     """Along the vehicle [m/s^2], dv/dt."""
     yaw_rate: Signal | None = None
-    """Positive to the left [rad/s]; tells turns from wheels that spin on one side."""
+    """Positive to the left [rad/s]; distinguishes turns from wheels that spin on one side."""
     latitude: Signal | None = None
     """WGS84, positive north; only for the map."""
     longitude: Signal | None = None
@@ -298,7 +298,7 @@ class Table(_Section):
     t: Column | None = None
     """[s]."""
     run: Annotated[str, Field(min_length=1)] | None = None
-    """Column that tells soil beds apart."""
+    """Column by which soil beds differ."""
     where: dict[str, Any] = Field(default_factory=dict)
     """Only rows that equal these values count."""
 
@@ -368,7 +368,7 @@ class NoiseOfChannels(_Section):
     yaw_rate: Noise = Noise(absolute=0.01)
     """[rad/s]."""
     slip: Noise = Noise(absolute=0.005)
-    """Of a table that tells slip itself; its gain is the relative error of 1 - slip."""
+    """Of a table that holds slip itself; its gain is the relative error of 1 - slip."""
 
     @field_validator("sinkage", "pitch", "acceleration", "yaw_rate")
     @classmethod

@@ -160,7 +160,7 @@ class Intake:
 
     Channels that are late by their `delay` and by `delays` [s] by quantity (those of the
     configuration's effects where none are given) are put beside what was true with them: all
-    others wait for the latest one.  So each window is whole, and tells of as long before its
+    others wait for the latest one.  So each window is whole, and is of as long before its
     end; whether a channel is fresh goes by the stamps of its frames.  Raises ConfigError where
     configuration and database do not fit.
     """
@@ -190,7 +190,7 @@ class Intake:
         self._ready: list[WindowTask] = []
         self._bins: Bins | None = None
         self._restart()
-        self.admission.at_break = self.begin_anew
+        self.admission.at_break = self.begin_recording
 
     def of_another_recording(self) -> Intake:
         """An intake that knows nothing of what this one heard; both count windows, frames and refusals together."""
@@ -204,7 +204,7 @@ class Intake:
             return channel.wheel in self.rig.wheels and channel.quantity in ("torque", "speed", "load")
         return channel.quantity not in OPTIONAL_ROLES
 
-    def begin_anew(self) -> None:
+    def begin_recording(self) -> None:
         """What comes next is a recording of its own: its clock was set, or the bus was silent for long."""
         ready = self.finish(self.admission.newest)
         self._restart()
@@ -275,7 +275,7 @@ class Intake:
         return tasks
 
     def taken_whole(self) -> Window | None:
-        """All that was ingested since the clock was last set, as one window; what comes later begins anew.
+        """All that was ingested since the clock was last set, as one window; what comes later is another recording.
 
         Its bins are as short as the recording's spectrum asks for (see `resolution`); the one
         that has just begun is left out.  None where there is no sample.
