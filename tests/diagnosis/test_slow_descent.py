@@ -83,7 +83,9 @@ def test_the_second_derivative_along_a_step_is_that_of_the_residuals():
     place, point = begun(banana)
     step = np.array([0.3, -0.2])
     there = banana.point(banana.stepped(place, point, step))
-    assert banana.second_derivative(place, point, step, there) == pytest.approx([-20.0 * banana.STEEP * 0.3**2, 0.0], abs=1e-9)
+    assert banana.second_derivative(place, point, step, there) == pytest.approx(
+        [-20.0 * banana.STEEP * 0.3**2, 0.0], abs=1e-9
+    )
 
 
 def test_a_parabola_has_the_step_of_the_slope_that_it_is_given():

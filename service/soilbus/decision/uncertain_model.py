@@ -1,6 +1,6 @@
 """A wheel-soil model whose effects are known to within a covariance, beside that of the soil.
 
-What a window tells of the soil and of the effects belongs together: a soil that looks
+What a window determines of the soil and of the effects belongs together: a soil that looks
 stronger goes with lugs that look shorter.  So each principal direction of the effects'
 covariance, one standard deviation long, is a model of its own, and brings the soil along by
 its regression on the effects; what is left of the soil's covariance is independent of them.
