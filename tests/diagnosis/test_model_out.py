@@ -16,7 +16,7 @@ from soilbus.config.model import ConfigError
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.model_out import effect_tables
 from soilbus.diagnosis.records import record_of
-from soilbus.estimation.assembly import completion_of, model_of, prior_of, rig_of
+from soilbus.estimation.assembly import effects_and_parameters_of, model_of, prior_of, rig_of
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import TRACTOR, reference_configuration
@@ -44,7 +44,7 @@ def test_what_is_written_is_the_model_that_was_fitted(record, tmp_path):
     fitted = fit_model([record], prior_of(reference_configuration()), effects)
     tables, notes = effect_tables(fitted)
     config = load_config(written(tmp_path, tables, notes=notes))
-    kept, free = completion_of(config)
+    kept, free = effects_and_parameters_of(config)
     assert [effect.name for effect in kept] == ["draft_offset", "wheel_load_offset"]
     told = fitted.parameters()
     of_wheels = [told["wheel_load_offset"][f"offset_{w}"] for w in rig_of(config).wheels]
@@ -68,7 +68,7 @@ def test_values_and_stds_read_back(tmp_path_factory, value, std, wheels):
         {"name": "wheel_load_offset", "offset": {w: {"value": value, "std": std} for w in wheels}},
     ]
     config = load_config(written(tmp_path_factory.mktemp("x"), tables))
-    _, free = completion_of(config)
+    _, free = effects_and_parameters_of(config)
     by_name = {f.name: (f.value, f.std) for f in free}
     assert by_name["slip_sinkage.exponent"] == (value, std)
     for i, wheel in enumerate(rig_of(config).wheels):

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.observation_model import Linearisation
+from soilbus.estimation.observation_model import RESIDUAL, Linearisation
 from soilbus.estimation.solver import Iterate, Objective
 from soilbus.estimation.window import Window
 
@@ -59,14 +59,14 @@ def change_statistic(
     if first >= n:
         return ChangeStatistic(max(n - 1, 0), 0.0)
     rows, weighed = (a.reshape(n, m, -1)[first:] for a in (at.rows, at.weighed))
-    misfit = np.einsum("im,im->i", rows[:, :, 0], weighed[:, :, 0])
+    misfit = np.einsum("im,im->i", rows[:, :, RESIDUAL], weighed[:, :, RESIDUAL])
     count = np.count_nonzero(rows.any(axis=2), axis=1).astype(float)
     ratio = _log_likelihood_ratio(misfit, count)
     if ratio.max() <= threshold:
         return ChangeStatistic(first + int(np.argmax(ratio)), float(ratio.max()))
     with_prior = objective.given(joint_prior)
     directions = with_prior.directions(iterate)
-    gradient = np.einsum("imk,im->ik", weighed, rows[:, :, 0]) @ directions
+    gradient = np.einsum("imk,im->ik", weighed, rows[:, :, RESIDUAL]) @ directions
     information = directions.T @ np.einsum("imk,iml->ikl", rows, weighed) @ directions
     prior_information = with_prior.prior_at(iterate).information
     begin = int(np.argmax(_log_likelihood_ratio(misfit - _explained(gradient, information + prior_information), count)))

@@ -25,7 +25,7 @@ from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.measurements import Measurements
 from soilbus.estimation.multistart import Fit, fit_window, refine
-from soilbus.estimation.observation_model import FIRST_GAIN, CurvedPathFit, ObservationModel
+from soilbus.estimation.observation_model import FIRST_GAIN, RESIDUAL, CurvedPathFit, ObservationModel
 from soilbus.estimation.posterior import PARAMETERS
 from soilbus.estimation.solver import Objective
 from soilbus.estimation.window import Rig, Window, pairs
@@ -120,7 +120,7 @@ def detected_curvature(objective: Objective, fit: Fit | None) -> CurvedPath | No
     rows = optimum.at.rows.reshape(*weighed.shape, -1)
     cross = basis.T @ (weighed[:, None] @ rows)[:, 0]
     of_gradient, of_information = approximation.explained(cross @ approximation.directions)
-    gradient = cross[:, 0] - of_gradient
+    gradient = cross[:, RESIDUAL] - of_gradient
     own = (by_curve * weighed).sum(axis=1)
     information = basis.T @ (own[:, None] * basis) - of_information + np.eye(len(std))
     amplitude = -np.linalg.solve(information, gradient)

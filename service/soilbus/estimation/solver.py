@@ -14,7 +14,7 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian, PriorFactor, PriorQuadratic, solve_with_inverse
-from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModel, Optimum
+from soilbus.estimation.observation_model import FIRST_GAIN, SOIL, Latents, Linearisation, ObservationModel, Optimum
 from soilbus.estimation.parametrization import (
     MAX_STEP,
     TYPICAL_DEPTH,
@@ -142,8 +142,8 @@ class Objective:
         self._has_bounds = bool(np.isfinite(self._gain_bounds).any())
         self.free = self.coordinates.free
         self._identity = np.eye(len(self.free) + len(self.active))
-        self._of_gains = np.zeros((7 + len(joint_prior.gains), len(self._identity)))
-        self._of_gains[7 + self.active] = self._identity[len(self.free) :]
+        self._of_gains = np.zeros((FIRST_GAIN + len(joint_prior.gains), len(self._identity)))
+        self._of_gains[FIRST_GAIN + self.active] = self._identity[len(self.free) :]
         self._by_sensors = with_gains and first == 0
         self.prior_factor = PriorFactor(joint_prior, prior, self.active)
         self._last: tuple[Array, Array, PriorQuadratic] | None = None
@@ -185,7 +185,7 @@ class Objective:
         free = len(self.free)
         directions = self.directions(place)
         if not self._by_sensors:
-            directions = np.delete(directions, slice(7, 7 + self.problem.n_sensors), axis=0)
+            directions = np.delete(directions, self.problem.layout.sensor_columns, axis=0)
         gradient = directions.T @ at.normal[:, 0]
         known = self.prior_at(place)
         cost = at.chi2 + known.neg2_log_prior
@@ -240,7 +240,7 @@ class Objective:
     def directions(self, place: Iterate) -> Array:
         """What a column of Linearised.rows (1 + 6 + G) has of each coordinate and active gain (F + A)."""
         directions = self._of_gains.copy()
-        directions[1:7, : len(self.free)] = place.soil[:, None] * self._log_directions(place.soil)
+        directions[SOIL, : len(self.free)] = place.soil[:, None] * self._log_directions(place.soil)
         return directions
 
     def stepped(self, place: Iterate, point: QuadraticModel, step: Array) -> Iterate:

@@ -40,7 +40,7 @@ from soilbus.estimation.laplace import with_nested_laplace
 from soilbus.estimation.model_form import FormLeft, form_left
 from soilbus.estimation.multistart import Fit, WarmStart, fit_warm, fit_window, refit_denoised, warm_start
 from soilbus.estimation.nuisance_parameters import Free
-from soilbus.estimation.observation_model import ObservationModel, ObservationModelWithEffects, Work
+from soilbus.estimation.observation_model import RESIDUAL, ObservationModel, ObservationModelWithEffects, Work
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.path_curvature import (
     curvature_of,
@@ -722,10 +722,10 @@ def sinkages_off_scale(objective: Objective, fit: Fit) -> bool:
     at, soil = optimum.at, Soil(*optimum.soil.tolist())
     (n, m), wheels = at.by_latents.shape[:2], problem.n_wheels
     sinkage = np.where(problem.has_sinkage, problem.sinkages(soil, optimum.gains, optimum.latents), 0.0)
-    weighed = at.weighed.reshape(n, m, -1)[:, m - wheels :]
+    weighed = at.weighed.reshape(n, m, -1)[:, problem.layout.sinkages]
     of_wheels = np.einsum("iw,iwk->wk", sinkage, weighed)
     of_gradient, of_information = approximation.explained(of_wheels @ approximation.directions)
-    gradient = of_wheels[:, 0] - of_gradient
+    gradient = of_wheels[:, RESIDUAL] - of_gradient
     square = np.divide(sinkage**2, problem.sinkage_var, where=problem.has_sinkage, out=np.zeros((n, wheels)))
     information = np.diag(square.sum(axis=0)) - of_information
     scales = np.vstack([np.ones(wheels), np.eye(wheels)[sinkage.any(axis=0)]])

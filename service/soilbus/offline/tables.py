@@ -22,7 +22,7 @@ from soilbus.arrays import Array
 from soilbus.can.log_lines import LogLines
 from soilbus.config.model import Column, Config, Table
 from soilbus.diagnosis.records import Record, TooLittle, record_of_rows
-from soilbus.estimation.assembly import completion_of, model_of, possible_effects, rig_of
+from soilbus.estimation.assembly import effects_and_parameters_of, model_of, possible_effects, rig_of
 from soilbus.estimation.measurements import MAX_SLIP, MIN_SLIP
 from soilbus.estimation.window import Rig, Window, window_of_samples
 from soilbus.offline.recordings import Recordings
@@ -120,7 +120,7 @@ def _task(index: int, run: Run, rig: Rig) -> WindowTask:
 def recordings_of_tables(config: Config, paths: Sequence[Path]) -> Recordings:
     """The runs of tables as the diagnosis wants them; TableError as runs_of(), TooLittle for a table of short runs."""
     rig, model = rig_of(config), model_of(config)
-    effects, free = completion_of(config)
+    effects, free = effects_and_parameters_of(config)
     records: list[Record] = []
     first, too_short, rejected, samples = [], [], Counter[str](), 0
     for path in paths:

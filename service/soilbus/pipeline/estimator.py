@@ -19,7 +19,7 @@ from soilbus.decision.traction_loss import NO_LOSS, idle, motion_of, observed
 from soilbus.decision.traversability import Status, Traversability
 from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.wheels import WheelTable
-from soilbus.estimation.assembly import completion_of, form_of, model_of, prior_of, rig_of
+from soilbus.estimation.assembly import effects_and_parameters_of, form_of, model_of, prior_of, rig_of
 from soilbus.estimation.measurements import gain_names
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.nuisance_parameters import active_at
@@ -65,7 +65,7 @@ class WindowEstimator:
     def __init__(self, config: Config) -> None:
         self.config = config
         self.rig, self.prior, self.model = rig_of(config), prior_of(config), model_of(config)
-        self._completion = completion_of(config)
+        self._completion = effects_and_parameters_of(config)
         self._settings = config.estimator
         self._wheels: WheelTable | None = None
         self._gap = GapWatch(config.estimator.window, config.estimator.hop)
