@@ -87,7 +87,7 @@ def records_of(config: Config, points: Path, told: FittedModel | None = None) ->
     records = recordings_of_tables(config, [points]).records
     if told is None:
         return records
-    return tuple(r.completed(told.effects, told.free, told.fits[-1].gaussian) for r in records)
+    return tuple(r.with_effects(told.effects, told.free, told.fits[-1].gaussian) for r in records)
 
 
 class Beside(NamedTuple):

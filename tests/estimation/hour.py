@@ -57,10 +57,10 @@ def main() -> None:
     print("soil          windows  false  mis-        chi2   rms error / sd       within 1.96 sd")
     print("                     changes  matches  (mean)  bearing  tan phi     bearing  tan phi")
     for soil in args.soils:
-        told = hour(soil, args.minutes, args.seed)
-        rms, within = np.sqrt(np.mean(told.errors**2, axis=0)), np.mean(np.abs(told.errors) < 1.96, axis=0)
+        result = hour(soil, args.minutes, args.seed)
+        rms, within = np.sqrt(np.mean(result.errors**2, axis=0)), np.mean(np.abs(result.errors) < 1.96, axis=0)
         print(
-            f"{soil:<12}  {told.windows:7d}  {told.changes:5d}  {told.mismatches:7d}  {told.chi2.mean():6.3f}"
+            f"{soil:<12}  {result.windows:7d}  {result.changes:5d}  {result.mismatches:7d}  {result.chi2.mean():6.3f}"
             f"  {rms[0]:7.2f}  {rms[1]:7.2f}     {within[0]:7.1%}  {within[1]:7.1%}"
         )
 

@@ -150,7 +150,7 @@ def test_one_soil_for_minutes_stays_one_soil_and_the_errors_as_said():
     # Gains are fixed over the drive and windows overlap: this is not many independent errors.
     assert np.sqrt(np.mean(away**2)) < 1.6
     assert np.abs(away).max() < 3.5
-    # What windows before told is worth something: the last estimates are surer than the first.
+    # The windows before add information: the last estimates have smaller sd than the first.
     std = [r.fit.posterior.bearing_pressure(Z_REF, B_REF).std for r in results]
     assert np.median(std[-20:]) < 0.9 * np.median(std[:5])
 
@@ -164,8 +164,8 @@ def test_a_window_that_fails_leaves_what_is_known_alone():
     for i, (window, end) in enumerate(drive):
         undisturbed.estimate(window, end)
         if i == 3:
-            wild = window.torque * nonsense.choice([-3.0, 3.0], window.torque.shape)
-            bad = disturbed.estimate(replace(window, torque=wild), end)
+            outliers = window.torque * nonsense.choice([-3.0, 3.0], window.torque.shape)
+            bad = disturbed.estimate(replace(window, torque=outliers), end)
             assert bad.mismatch
             assert all(at != end for at, _ in disturbed._posteriors)
         else:

@@ -217,7 +217,7 @@ class _Part:
     def __init__(self, record: Record, prior: SoilPrior, fitted: FittedModel, i: int, at: tuple[int, int]) -> None:
         self.fit: Fit = fitted.fits[i]
         free = tuple(fitted.beforehand[k] if k in at else f for k, f in enumerate(fitted.free))
-        self.problem = record.learned.completed(fitted.effects, free)
+        self.problem = record.learned.with_effects(fitted.effects, free)
         self.columns = [self.problem.n_sensors + k for k in at]
         self.free = [free[k] for k in at]
         joint_prior = _without(fitted.joint_prior[i], self.columns)
@@ -234,7 +234,7 @@ class _Part:
         variance, row_var = self.problem.variances(self.gains)
         self.inverse = inverse_covariance(point.at.by_latents, variance, row_var, self.problem.n_wheels)
         self.torque = self.problem.torques(optimum.soil, self.gains, optimum.latents)
-        self.alone = self.problem.completed(
+        self.alone = self.problem.with_effects(
             [e for e in fitted.effects if e.name == self.free[0].effect], _alone(free, at)
         )
         self.sensors = self.gains[: self.problem.n_sensors]

@@ -193,7 +193,7 @@ def fit_model(
     fitted = _fits(records, prior, effects, free, starts, effort)
     for _ in range(len(free)):
         inside = (
-            None if fitted is None else _held_at_edges(records[0].learned.completed(effects, free), fitted[1], free)
+            None if fitted is None else _held_at_edges(records[0].learned.with_effects(effects, free), fitted[1], free)
         )
         if fitted is None or inside is None:
             break
@@ -203,7 +203,7 @@ def fit_model(
         return None
     joint_priors, fits = fitted
     checks = [
-        check(record.checked.completed(effects, free), prior, fit, None if near is None else near[i])
+        check(record.checked.with_effects(effects, free), prior, fit, None if near is None else near[i])
         for i, (record, fit) in enumerate(zip(records, fits, strict=True))
     ]
     added = [effect for effect in effects if effect not in present.effects]
@@ -223,7 +223,7 @@ def _fits(
     joint_priors: list[Gaussian] = []
     fits: list[Fit] = []
     for i, record in enumerate(records):
-        problem = record.learned.completed(effects, free)
+        problem = record.learned.with_effects(effects, free)
         joint_prior = _of_next(fits[-1].mode, prior, problem, effects) if fits else _of_first(record, prior, problem)
         fit = _fitted(problem, prior, joint_prior, None if starts is None else starts[i], effort)
         if fit is None:

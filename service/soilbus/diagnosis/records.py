@@ -50,8 +50,8 @@ class Record:
 
     def completed(self, effects: Sequence[Effect], free: Sequence[Free], known: Gaussian | None = None) -> Record:
         """The same under a model with these effects and parameters, of which so much is known."""
-        learned, checked = (part.completed(effects, free) for part in (self.learned, self.checked))
-        whole = None if self.whole is None else self.whole.completed(effects, free)
+        learned, checked = (part.with_effects(effects, free) for part in (self.learned, self.checked))
+        whole = None if self.whole is None else self.whole.with_effects(effects, free)
         return Record(self.name, learned, checked, known, whole, self.fold)
 
     def with_held_out(self, fold: int) -> Record | None:

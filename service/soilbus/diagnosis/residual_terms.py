@@ -81,7 +81,7 @@ def corrections(records: list[Record], completion: FittedModel) -> list[Correcti
 
 def _samples(records: list[Record], completion: FittedModel, place: int) -> Iterator[tuple[_Sample, _Sample]]:
     for record, fit, check in zip(records, completion.fits, completion.checks, strict=True):
-        learned = record.learned.completed(completion.effects, completion.free)
+        learned = record.learned.with_effects(completion.effects, completion.free)
         of_fit = _sample(learned, fit.optimum.at, fit.optimum.latents, fit.optimum.gains, place)
         yield of_fit, _of_check(check, fit.mode.gains, place)
 

@@ -144,7 +144,7 @@ def _normal(
     candidates: Sequence[Effect],
     free: Sequence[Free],
 ) -> Normal:
-    problem = record.learned.completed((*present.effects, *candidates), (*present.free, *free))
+    problem = record.learned.with_effects((*present.effects, *candidates), (*present.free, *free))
     fit, joint_prior, P = present.fits[i], present.joint_prior[i], len(free)
     covariance = np.zeros((len(joint_prior.covariance) + P,) * 2)
     covariance[:-P, :-P], covariance[-P:, -P:] = joint_prior.covariance, np.eye(P)

@@ -759,7 +759,7 @@ class ObservationModelWithEffects(ObservationModel):
         super().__init__(window, rig, model, min_speed, max_turn)
         self._set_effects(effects, free)
 
-    def completed(self, effects: Sequence[Effect], free: Sequence[Free]) -> Self:
+    def with_effects(self, effects: Sequence[Effect], free: Sequence[Free]) -> Self:
         """The same measurements under a model with these effects alone and their free parameters."""
         other = copy(self)
         other._set_effects(effects, free)

@@ -57,7 +57,7 @@ def recordings_of(
                 fault = fault or error
                 too_short.append(name)
                 continue
-            records.append(record.completed(effects, free))
+            records.append(record.with_effects(effects, free))
         rejected += intake.refusals.total
         if len(records) == first[-1]:
             raise TooLittle(_why(log, intake, fault))

@@ -134,7 +134,7 @@ def recordings_of_tables(config: Config, paths: Sequence[Path]) -> Recordings:
                 too_short.append(run.name)
                 fault = error
                 continue
-            records.append(record.completed(effects, free))
+            records.append(record.with_effects(effects, free))
         if len(records) == first[-1]:
             raise fault
     return Recordings(tuple(records), tuple(first), samples, dict(rejected.most_common()), tuple(too_short))
