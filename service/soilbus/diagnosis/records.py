@@ -48,7 +48,7 @@ class Record:
     whole: ObservationModelWithEffects | None = None
     fold: NDArray[np.intp] | None = None
 
-    def completed(self, effects: Sequence[Effect], free: Sequence[Free], known: Gaussian | None = None) -> Record:
+    def with_effects(self, effects: Sequence[Effect], free: Sequence[Free], known: Gaussian | None = None) -> Record:
         """The same under a model with these effects and parameters, of which so much is known."""
         learned, checked = (part.with_effects(effects, free) for part in (self.learned, self.checked))
         whole = None if self.whole is None else self.whole.with_effects(effects, free)
