@@ -30,7 +30,7 @@ class Settings:
     drift: sd of the logarithm of each soil coordinate after one window; it grows with the
     square root of time.  min_rows: residuals below which a window is not fitted.
     search_rate, search_burst: evaluations of the model that searches may take, see SearchBudget.
-    form: root mean squares by which form.FORM may differ from the configured model's; () leaves none of it open.
+    form: how far each of form.FORM may be from the configured model's; () leaves none of it open.
     """
 
     window: float

@@ -239,7 +239,7 @@ class Tracker:
         """What the form of the model leaves open of a fit."""
         if not any(self.settings.form):
             return None
-        before = fitting.before.form or FormLeft.of(np.array(self.settings.form), len(fit.gains))
+        before = fitting.before.form or FormLeft.of(self.settings.form, len(fit.gains))
         with np.errstate(all="ignore"):
             return form_left(fitting, fit, before)
 
