@@ -90,7 +90,8 @@ def test_on_the_configured_form_the_data_narrow_it_and_values_stay():
 
 
 @pytest.mark.parametrize(
-    "kind, sinkage, wider", [("loam", True, 2.0), ("wet_clay", True, 1.2), ("loam", False, 8.0), ("wet_clay", False, 4.0)]
+    ("kind", "sinkage", "wider"),
+    [("loam", True, 2.0), ("wet_clay", True, 1.2), ("loam", False, 8.0), ("wet_clay", False, 4.0)],
 )
 def test_what_cancels_at_driven_loads_stays_cancelled_in_the_decision(kind, sinkage, wider):
     one, other = WindowEstimator(CONFIG), WindowEstimator(FORMLESS)
