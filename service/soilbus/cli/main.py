@@ -94,6 +94,8 @@ def _demo(args: argparse.Namespace) -> None:
 
 
 def _run(args: argparse.Namespace) -> None:
+    # python-can loads asammdf where it is installed: 2 s and 97 MB for files that the service never reads.
+    sys.modules.setdefault("asammdf", None)  # type: ignore[arg-type]
     with loading():
         from soilbus.can.bus import BusError
         from soilbus.daemon.start import start_service
