@@ -15,7 +15,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from soilbus.allocator import keep_freed_memory, loading
+from soilbus.allocator import loading
 from soilbus.cli.arguments import command_line
 from soilbus.files import NotWritten, whole_file
 from soilbus.process import output_fault, say
@@ -39,7 +39,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[_Told()])
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # what it does for itself is no news
     logging.getLogger("can").setLevel(logging.CRITICAL)  # a bus that is away is ours to tell of, once
-    keep_freed_memory()
     with loading():
         from soilbus.config.model import ConfigError
     try:
