@@ -116,34 +116,6 @@ def test_what_one_thread_has_freed_another_takes_without_asking_the_kernel(of_un
     assert least <= faults <= most
 
 
-SIZES = """
-import ctypes, sys
-import numpy as np
-from soilbus.allocator import SMALL, take_small_blocks
-
-class Mallinfo(ctypes.Structure):
-    _fields_ = [(f"of{i}", ctypes.c_size_t) for i in range(7)] + [("used", ctypes.c_size_t)] + [
-        (f"too{i}", ctypes.c_size_t) for i in range(2)
-    ]
-
-mallinfo = ctypes.CDLL(None).mallinfo2
-mallinfo.restype = Mallinfo
-if sys.argv[1] == "ahead":
-    take_small_blocks()
-before = mallinfo().used
-arrays = [np.zeros(size, np.uint8) for _ in range(20) for size in range(1, SMALL)]
-del arrays
-print(mallinfo().used - before)
-"""
-
-
-@pytest.mark.parametrize(("when", "least", "most"), [("never", 3.0e6, 4.5e6), ("ahead", -1e5, 3e5)])
-def test_small_blocks_that_numpy_keeps_are_taken_at_the_start(when, least, most):
-    # The C library keeps freed blocks of its own for each thread, 0.24 MB, and counts them as used.
-    done = subprocess.run([sys.executable, "-c", SIZES, when], capture_output=True, text=True, check=True, timeout=60.0)
-    assert least < int(done.stdout) < most
-
-
 THREADS = """
 import sys
 from soilbus.cli.main import main

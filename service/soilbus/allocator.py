@@ -13,8 +13,6 @@ from contextlib import contextmanager
 _C = ctypes.CDLL(None)
 _C.malloc.restype, _C.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]
 _C.free.restype, _C.free.argtypes = None, [ctypes.c_void_p]
-SMALL, OF_EACH = 1024, 7
-"""Bytes from which numpy keeps no freed blocks, and how many it keeps of each size below (NBUCKETS, NCACHE)."""
 
 
 def keep_freed_memory() -> None:
@@ -32,23 +30,11 @@ def give_back_freed_memory() -> None:
     """Hand what is free in glibc's heaps to the kernel (malloc_trim(3)); elsewhere this does nothing.
 
     What a rare hard window took lies between blocks in use and would stay with the process.  In 590 windows
-    on changing ground 79 MB stay with it once a minute and 86 MB without, for 18 page faults a window.
+    on changing ground 76 MB stay with it once a minute and 82 MB without, for 20 page faults a window.
     """
     trim = getattr(_C, "malloc_trim", None)
     if trim is not None:
         trim(0)
-
-
-def take_small_blocks() -> None:
-    """Let numpy have now all the small blocks that it will ever keep: 3.5 MB.
-
-    Of each size below a kilobyte it keeps as many freed ones as OF_EACH, for good.  Taken one by one, as arrays of
-    one size after another come by, they would make the process grow for a day, and lie scattered between other blocks.
-    """
-    import numpy as np
-
-    blocks = [np.empty(size, np.uint8) for size in range(1, SMALL) for _ in range(OF_EACH)]
-    del blocks
 
 
 @contextmanager

@@ -14,7 +14,6 @@ import numpy as np
 from cantools.database.can import Database
 from numpy.typing import NDArray
 
-from soilbus.allocator import take_small_blocks
 from soilbus.can.channels import Channel, Column, Decoded
 from soilbus.can.publish import Publisher
 from soilbus.config.model import Config
@@ -70,7 +69,6 @@ def warm_up(config: Config, database: Database, ours: Database) -> list[WindowRe
     for result in results:
         for message, values in hop_frames(result):
             publisher.frame(message, values)
-    take_small_blocks()
     return results
 
 
