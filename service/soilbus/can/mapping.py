@@ -25,7 +25,7 @@ OPTIONAL_ROLES = ("yaw_rate", *POSITION_ROLES)
 
 MAX_SPEED = 25.0  # m/s, faster than any field tractor
 LEAST_GAP, GAP_CYCLES = 2.0, 1.5
-"""A position is stale after these seconds, and where the DBC says that it is sent seldom, after this number of cycles."""
+"""A position is stale after these seconds, or, where the DBC says that it is sent seldom, after these cycles."""
 _HEAVY = 5.0e4  # kg, stands for the mass when there is no [vehicle]
 
 _DIMENSIONS: dict[str, tuple[str, ...]] = {

@@ -532,21 +532,21 @@ class Effect(BaseModel):
 
 
 class Form(_Section):
-    """How far the contact of wheel and soil may differ in form from the model, as root mean squares; 0: not at all.
+    """How far the contact of wheel and soil may differ in form from the model, at most; 0: not at all.
 
     The greatest stress sits at (c1 + c2 s) of the entry angle, where the model has 0.5: c1 is 0.18 in loose and
-    0.43 in compact sand, c2 0.32 in both (Wong & Reece 1967, J. Terramechanics 4:81); an even
-    spread from those to the model's gives 0.32 / sqrt(3) for each.
+    0.43 in compact sand, c2 0.32 in both (Wong & Reece 1967, J. Terramechanics 4:81).  Every form from the model's to
+    the farthest is as likely as any other before a window's data.
     """
 
-    peak: NonNegativeFloat = 0.18
-    """Of c1."""
-    peak_by_slip: NonNegativeFloat = 0.18
-    """Of c2."""
-    exit: NonNegativeFloat = 0.1
-    """Of the exit angle behind the axle over the entry angle: a rut that springs back by the square of it."""
-    shear: NonNegativeFloat = 0.7
-    """Of the share of the strength that the other shear law mobilises: either law as likely as the other."""
+    peak: NonNegativeFloat = 0.32
+    """How much less c1 may be than 0.5."""
+    peak_by_slip: NonNegativeFloat = 0.32
+    """How large c2 may be."""
+    exit: NonNegativeFloat = 0.17
+    """How large the exit angle behind the axle may be, over the entry angle: a rut that springs back by 3 %."""
+    shear: NonNegativeFloat = 1.0
+    """Share of the strength that the other shear law may mobilise: all of it or none, one as likely as the other."""
 
 
 class Model(_Section):

@@ -101,7 +101,7 @@ def _starts(fitted: FittedModel, found: Mapping[tuple[str, Late], DelayPosterior
             for (name, late), posterior in found.items():
                 if free.effect == name and free.parameter.name in (late.delay, late.time_constant):
                     best = posterior.best[free.parameter.name == late.time_constant]
-                    gains[n_sensors + i] = free.pull_at(best)
+                    gains[n_sensors + i] = free.standardised(best)
         starts.append(start._replace(gains=gains))
     return starts
 
@@ -146,7 +146,7 @@ def _posterior(
     parts = [_Part(record, prior, fitted, i, at) for i, record in enumerate(records)]
 
     def cost(delay: float, tau: float) -> float:
-        of_prior = first.pull_at(delay) ** 2 + second.pull_at(tau) ** 2
+        of_prior = first.standardised(delay) ** 2 + second.standardised(tau) ** 2
         return of_prior + sum(part.cost(delay, tau) for part in parts) / heat
 
     low, high = first.parameter.low, first.parameter.high
@@ -223,7 +223,7 @@ class _Part:
         joint_prior = _without(fitted.joint_prior[i], self.columns)
         self.gains = self.fit.optimum.gains.copy()
         for f, k, column in zip(self.free, at, self.columns, strict=True):
-            self.gains[column] = f.pull_at(fitted.free[k].at(float(self.gains[column])))
+            self.gains[column] = f.standardised(fitted.free[k].at(float(self.gains[column])))
         optimum = self.fit.optimum
         fitting = Objective(self.problem, prior, joint_prior)
         place = Iterate(optimum.soil, self.gains, optimum.latents, np.inf, 0)
@@ -242,7 +242,7 @@ class _Part:
 
     def _residuals(self, *values: float) -> Array:
         """What this channel alone is off where it is so late (delay, time constant)."""
-        pulls = iter(f.pull_at(v) for f, v in zip(self.free, values, strict=True))
+        pulls = iter(f.standardised(v) for f, v in zip(self.free, values, strict=True))
         gains = np.concatenate([self.sensors, [next(pulls) if f.std else 0.0 for f in self.alone.free]])
         late = self.alone.delay_terms(gains, self.fit.optimum.latents, self.torque)
         return self.alone.delay_residuals(late, self.point.at.by_latents, gains)

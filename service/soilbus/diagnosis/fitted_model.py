@@ -134,7 +134,7 @@ class FittedModel:
         """Gains (G,) of these fits by the prior deviations that the parameters have beforehand."""
         n_sensors = len(gains) - len(self.free)
         pulls = [
-            first.pull_at(f.at(u)) if f.std < first.std else u
+            first.standardised(f.at(u)) if f.std < first.std else u
             for f, first, u in zip(self.free, self.beforehand, gains[n_sensors:].tolist(), strict=True)
         ]
         return np.concatenate([gains[:n_sensors], pulls])

@@ -96,7 +96,7 @@ def model_of(config: Config) -> WheelModel:
 
 
 def form_of(config: Config) -> tuple[float, ...]:
-    """Prior root mean squares of `model_form.FORM`; 0 where an effect of the model has that parameter."""
+    """How far each of `model_form.FORM` may be from the model; 0 where an effect of the model has that parameter."""
     named, form = {effect.name for effect in config.model.effects}, config.model.form
     peak = 0.0 if "stress_peak_shift" in named else 1.0
     leave, shear = float("rut_recovery" not in named), float("exponential_shear" not in named)

@@ -34,21 +34,21 @@ class Free:
         """effect.parameter, with the wheel's number where it has one."""
         return f"{self.effect}.{self.parameter.name}" + ("" if self.wheel is None else f".{self.wheel}")
 
-    def within(self, standardised: float) -> bool:
-        """Whether a standardised value is inside the parameter's range."""
-        return self.parameter.low <= self.value + self.std * standardised <= self.parameter.high
+    def within(self, u: float) -> bool:
+        """Whether the value at a standardised u is inside the parameter's range."""
+        return self.parameter.low <= self.value + self.std * u <= self.parameter.high
 
-    def allowed(self, standardised: float) -> float:
-        """A standardised value clipped to the parameter's range."""
-        return standardised if self.within(standardised) or self.std == 0.0 else self.pull_at(self.at(standardised))
+    def allowed(self, u: float) -> float:
+        """A standardised u clipped to the parameter's range."""
+        return u if self.within(u) or self.std == 0.0 else self.standardised(self.at(u))
 
-    def pull_at(self, value: float) -> float:
-        """The standardised value of a value; the inverse of `at`, for a parameter with prior sd > 0."""
+    def standardised(self, value: float) -> float:
+        """The standardised u of a value; the inverse of `at`, for a parameter with prior sd > 0."""
         return (value - self.value) / self.std
 
-    def at(self, standardised: float) -> float:
-        """The value at a standardised value, clipped to the parameter's range."""
-        return min(max(self.value + self.std * standardised, self.parameter.low), self.parameter.high)
+    def at(self, u: float) -> float:
+        """The value at a standardised u, clipped to the parameter's range."""
+        return min(max(self.value + self.std * u, self.parameter.low), self.parameter.high)
 
 
 def parameters_of(effect: Effect, n_wheels: int) -> list[Free]:

@@ -137,7 +137,7 @@ class Settings:
     min_rows : int
         Residuals below which a window is not fitted.
     form : tuple of float
-        Prior root mean squares of `model_form.FORM` about the configured model; () holds the form.
+        How far each of `model_form.FORM` may be from the configured model; () holds the form.
     search_rate, search_burst : float
         Evaluations of the model that searches may take, see `SearchBudget`.
     """
@@ -266,6 +266,7 @@ class Tracker:
         return replace(self._estimate(window, end), search_ended=self._budget.ended)
 
     def _estimate(self, window: Window, end: float) -> TrackerOutput:
+        """One step of the recursion: warm start, change detection, states, report."""
         start = end - self.settings.window
         transition = self._transition
         new_soil = transition is not None and (self._in_transition or start < transition.end)
@@ -538,7 +539,7 @@ class Tracker:
         """Part of a fit that the form of the model leaves open; None where the form is held."""
         if not any(self.settings.form):
             return None
-        joint_prior = objective.joint_prior.form or FormLeft.of(np.array(self.settings.form), len(fit.gains))
+        joint_prior = objective.joint_prior.form or FormLeft.of(self.settings.form, len(fit.gains))
         with np.errstate(all="ignore"):
             return form_left(objective, fit, joint_prior)
 
