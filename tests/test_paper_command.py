@@ -9,7 +9,7 @@ from contextlib import redirect_stdout
 import pytest
 
 from soilbus.cli.main import main
-from soilbus.report import paper
+from soilbus.validation import paper_report
 from soilbus.validation.paper import EXACT, SIMPSON, WheelEquations
 from soilbus.validation.paper_tables import RUNS, SANDY_LOAM, WET_CLAY
 
@@ -107,7 +107,7 @@ def test_the_verdicts_follow_from_the_figures(output, monkeypatch):
         ("SOLVED", 0.0), ("EXACT", SIMPSON),
     ):  # fmt: skip
         monkeypatch.setattr(paper, name, value)
-    said = " ".join(paper.what_holds(0.05))
+    said = " ".join(paper_report.what_holds(0.05))
     for verdict in (
         "Convergence does not hold", "The accuracy holds", "(conclusion 3) holds", "fit one sinkage",
         "Real time does not hold",
