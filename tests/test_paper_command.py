@@ -106,7 +106,7 @@ def test_the_verdicts_follow_from_the_figures(output, monkeypatch):
         ("K_L_bound", lambda *_: 1e-4), ("TORQUE_ON_CLAY", clay), ("TORQUE_ON_LOAM", loam), ("RUNS", slow),
         ("SOLVED", 0.0), ("EXACT", SIMPSON),
     ):  # fmt: skip
-        monkeypatch.setattr(paper, name, value)
+        monkeypatch.setattr(paper_report, name, value)
     said = " ".join(paper_report.what_holds(0.05))
     for verdict in (
         "Convergence does not hold", "The accuracy holds", "(conclusion 3) holds", "fit one sinkage",
