@@ -30,6 +30,8 @@ from soilbus.estimation.solver import (
 from soilbus.terra.soils import KINDS, SOILS
 from soilbus.terra.wheel import Soil
 
+__all__ = ["THOROUGH", "Effort", "Fit", "Rival", "Start", "continued", "descend", "fit_window"]
+
 _K_C = PARAMETERS.index("k_c")
 
 MAX_ITERATIONS = 30
@@ -101,6 +103,7 @@ class Effort(NamedTuple):
 
 
 THOROUGH = Effort()
+"""As much as a fit can be worth."""
 
 
 class Rival(NamedTuple):
