@@ -6,14 +6,41 @@ import shutil
 import subprocess
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
+from xdist.scheduler import LoadFileScheduling
 
 import guest
 import soilbus  # noqa: F401  # before numpy, which it keeps to one thread
 from availability import unavailable
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
+REAL_BUS = tuple(f"tests/{folder}/" for folder in ("bus", "guest", "systemd"))
+"""Folders of the tests that need vcan0 or a guest kernel."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begins with the tests on a real bus: they mostly wait, and the other worker runs the rest meanwhile."""
+    items.sort(key=lambda item: not item.nodeid.startswith(REAL_BUS))
+    strays = {item.nodeid for item in items if item.get_closest_marker("vcan") or item.get_closest_marker("systemd")}
+    if strays := [name for name in sorted(strays) if not name.startswith(REAL_BUS)]:
+        raise pytest.UsageError(f"only tests in {', '.join(REAL_BUS)} have a real bus for themselves: {strays[0]}")
+
+
+class _OneRealBus(LoadFileScheduling):
+    """One worker runs the tests of a file, for they share fixtures, and one those that need a real bus.
+
+    There is one vcan0, and beside a second guest kernel times measured in the first are another machine's.
+    """
+
+    def _split_scope(self, nodeid: str) -> str:
+        return "real bus" if nodeid.startswith(REAL_BUS) else super()._split_scope(nodeid)
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadFileScheduling:
+    """The scheduler of pytest-xdist."""
+    return _OneRealBus(config, log)
 
 
 @pytest.fixture(scope="session")
