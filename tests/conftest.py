@@ -16,31 +16,35 @@ import soilbus  # noqa: F401  # before numpy, which it keeps to one thread
 from availability import unavailable
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
-REAL_BUS = tuple(f"tests/{folder}/" for folder in ("bus", "guest", "systemd"))
-"""Folders of the tests that need vcan0 or a guest kernel."""
+IN_REAL_TIME = ("tests/bus/", "tests/guest/", "tests/systemd/", "tests/test_demo.py")
+"""What waits for a bus, a guest kernel or a service most of the time."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begins with the tests on a real bus: they mostly wait, and the other worker runs the rest meanwhile."""
-    items.sort(key=lambda item: not item.nodeid.startswith(REAL_BUS))
-    strays = {item.nodeid for item in items if item.get_closest_marker("vcan") or item.get_closest_marker("systemd")}
-    if strays := [name for name in sorted(strays) if not name.startswith(REAL_BUS)]:
-        raise pytest.UsageError(f"only tests in {', '.join(REAL_BUS)} have a real bus for themselves: {strays[0]}")
+    """Begin with the tests in real time: one worker waits with them while the others compute."""
+    items.sort(key=lambda item: not _in_real_time(item.nodeid))
+    for item in items:
+        if (item.get_closest_marker("vcan") or item.get_closest_marker("systemd")) and not _in_real_time(item.nodeid):
+            raise pytest.UsageError(f"{item.nodeid} needs a real bus, and only tests in {IN_REAL_TIME} take turns")
 
 
-class _OneRealBus(LoadFileScheduling):
-    """One worker runs the tests of a file, for they share fixtures, and one those that need a real bus.
+def _in_real_time(nodeid: str) -> bool:
+    return nodeid.startswith(IN_REAL_TIME)
 
-    There is one vcan0, and beside a second guest kernel times measured in the first are another machine's.
+
+class _TakingTurns(LoadFileScheduling):
+    """Give the tests of a file to one worker, for they share fixtures, and those in real time all to one.
+
+    There is one vcan0, and a second guest kernel beside the first would spoil what is timed in both.
     """
 
     def _split_scope(self, nodeid: str) -> str:
-        return "real bus" if nodeid.startswith(REAL_BUS) else super()._split_scope(nodeid)
+        return "in real time" if _in_real_time(nodeid) else super()._split_scope(nodeid)
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadFileScheduling:
-    """The scheduler of pytest-xdist."""
-    return _OneRealBus(config, log)
+    """Return the scheduler of pytest-xdist."""
+    return _TakingTurns(config, log)
 
 
 @pytest.fixture(scope="session")
