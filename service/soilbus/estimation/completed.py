@@ -353,7 +353,7 @@ class CompletedProblem(WindowProblem):
 
     def _nothing_late(self, quantity: str, n_effects: int) -> tuple[Array, Array]:
         """Nothing (N, columns), with no derivatives (P, N, columns)."""
-        columns = len(self._curves.of(quantity))
+        columns = self._curves.number_of(quantity)
         return np.zeros((self.n, columns)), np.zeros((n_effects, self.n, columns))
 
     def _surroundings(self, latents: Latents) -> Surroundings:
