@@ -6,9 +6,9 @@ not.  Nor does it follow the wheel's load N there.  Over one span of bins, with 
     follows      T - T' = b (Q - Q') + T' (N / N' - 1) + noise     b = T' / sum(T' / r): its share of the thrust
     saturated    T - T' =                                noise     chi-square within noise, less than of `follows`
 
-Q is draft, slope and what speeds the vehicle up; what slows it down is not asked of the motors: a vehicle that loses
-speed under a draft that rises while its torques stand has an unmet demand.  A ceiling is never exceeded, so only the
-highest torque measured so far can be one.
+A wheel follows where it does so with its load or without.  Q is draft, slope and what speeds the vehicle up; what slows
+it down is not asked of the motors: a vehicle that loses speed under a draft that rises while its torques stand has an
+unmet demand.  A ceiling is never exceeded, so only the highest torque measured so far can be one.
 
 A constant command below the ceiling, a pedal that is held, looks the same while it lasts.  So one plateau counts while
 the vehicle loses speed on it; a second one at the same level, with less torque between them, makes it a ceiling until
@@ -98,11 +98,11 @@ class TorqueCeiling:
             saturated &= self.highest - torque <= deviations * np.sqrt(2.0 * var)
         known = np.isfinite(self.level) & ~exceeded
         same = saturated & known & ~below
-        weight = np.where(
-            same, self.weight + 1.0 / var, np.where(saturated, 1.0 / var, np.where(known, self.weight, 0.0))
-        )
-        level = np.where(known, self.level, np.nan)
-        level = np.where(same, level + (torque - level) / (var * weight), np.where(saturated, torque, level))
+        new = np.divide(1.0, var, out=np.zeros_like(var), where=saturated)
+        weight = np.where(known & (same | ~saturated), self.weight, 0.0) + new
+        share = np.divide(new, weight, out=np.zeros_like(weight), where=saturated)
+        level = np.where(known & (same | ~saturated), self.level, np.where(saturated, torque, np.nan))
+        level = np.where(saturated, level + share * (torque - level), level)
         gain, of_noise = _speed_gained(window, deviations)
         lasts = saturated | (self.lasts & known & ~below)
         return replace(
@@ -129,10 +129,13 @@ def _saturated(window: Window, rig: Rig, deviations: float) -> Mask:
         load = window.load.mean(axis=0)
         of_load = (mean / load) ** 2 * window.variance["load"]
         weighed = np.isfinite(load) & np.isfinite(of_load).all(axis=0)
-        change = (pull - pull.mean())[:, None] * share + np.where(weighed, mean * (window.load / load - 1.0), 0.0)
-        of_change = share**2 * of_pull[:, None] + np.where(weighed, of_load, 0.0)
+        rest = window.torque - mean - (pull - pull.mean())[:, None] * share
+        of_rest = variance + share**2 * of_pull[:, None]
+        unweighed = (rest**2 / of_rest).sum(axis=0)
+        rest = rest - np.where(weighed, mean * (window.load / load - 1.0), 0.0)
+        of_rest = of_rest + np.where(weighed, of_load, 0.0)
         stands = ((window.torque - mean) ** 2 / variance).sum(axis=0)
-        follows = ((window.torque - mean - change) ** 2 / (variance + of_change)).sum(axis=0)
+        follows = np.minimum(unweighed, (rest**2 / of_rest).sum(axis=0))
         flat = stands <= n - 1.0 + deviations * math.sqrt(2.0 * (n - 1.0))
         return np.asarray((share > 0.0) & flat & (follows - stands > deviations**2))
 
