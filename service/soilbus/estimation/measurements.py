@@ -203,6 +203,11 @@ class Curves:
             self._cache[quantity] = [self._curve(v, var) for v, var in zip(*(c.T for c in columns), strict=True)]
         return self._cache[quantity]
 
+    def number_of(self, quantity: str) -> int:
+        """Number of curves that `of` returns, without computing them."""
+        values = getattr(self.window, quantity)
+        return 1 if values.ndim == 1 else int(values.shape[1])
+
     def _curve(self, values: Array, variance: Array) -> Series:
         known = np.isfinite(values) & np.isfinite(variance)
         return Series.of(self.window.t[known], values[known], variance[known])

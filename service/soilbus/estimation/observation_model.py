@@ -1014,7 +1014,7 @@ class ObservationModelWithEffects(ObservationModel):
 
     def _no_delay(self, quantity: str, n_effects: int) -> tuple[Array, Array]:
         """Zero corrections (N, columns) and derivatives (P, N, columns)."""
-        columns = len(self._curves.of(quantity))
+        columns = self._curves.number_of(quantity)
         return np.zeros((self.n, columns)), np.zeros((n_effects, self.n, columns))
 
     def with_entry_angles(self, latents: Latents, soil: Soil, gains: Array | None = None) -> Latents:
@@ -1094,8 +1094,11 @@ def _gathered(predicted: Sequence[Any], n_effects: int, shape: tuple[int, int]) 
 
 
 def _monomials(states: Array) -> Array:
-    """Products (N, len(_POWERS)) of powers of load and slip (2, N)."""
-    return np.stack([states[0] ** i * states[1] ** j for i, j in _TORQUE_POWERS], axis=1)
+    """Products (N, len(_TORQUE_POWERS)) of powers of load and slip (2, N)."""
+    load, slip = (
+        [value**i for i in range(highest + 1)] for value, highest in zip(states, _TORQUE_POWERS[-1], strict=True)
+    )
+    return np.stack([load[i] * slip[j] for i, j in _TORQUE_POWERS], axis=1)
 
 
 def _varied(soil: Soil) -> Soil:

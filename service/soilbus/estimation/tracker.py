@@ -57,6 +57,17 @@ from soilbus.terra.effects.effect import Effect
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil, WheelModel
 
+__all__ = [
+    "ChangePoint",
+    "SearchBudget",
+    "Settings",
+    "Tracker",
+    "TrackerOutput",
+    "TrackerState",
+    "gain_errors",
+    "new_soil_prior",
+]
+
 MIN_ROWS = 60
 """Residuals that a window needs; no evidence recorded."""
 MIN_RESIDUALS_PER_SOIL = 30
