@@ -137,3 +137,6 @@ def test_what_is_considered_besides_adds_up_and_never_exceeds_the_prior():
     assert np.all(np.diag(huge) <= prior.log_std**2 * (1.0 + 1e-9))
     assert np.all(np.linalg.eigvalsh(huge - small) > -1e-6)
     assert posterior.beside(np.zeros((6, 6)), prior).log_covariance == pytest.approx(own, rel=1e-6, abs=1e-12)
+    shift = 5.0 * prior.log_std
+    about = posterior.beside(1e6 * by @ by.T, prior, shift).log_covariance
+    assert about == pytest.approx(huge + np.outer(shift, shift))

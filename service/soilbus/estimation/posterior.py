@@ -120,10 +120,12 @@ class Posterior:
         covariance[np.ix_(free, free)] = (axes * wide) @ axes.T * np.outer(unit, unit)
         return Posterior(self.soil, covariance)
 
-    def beside(self, more: Array, prior: SoilPrior) -> Posterior:
+    def beside(self, more: Array, prior: SoilPrior, shift: Array | None = None) -> Posterior:
         """The same with `more` left open besides, a covariance (6, 6) of the logarithms, as by considered parameters.
 
-        C + more, of which no principal variance in units of the prior's exceeds 1, or what it was before.
+        C + more, of which no principal variance in units of the prior's exceeds 1, or what it was before.  With a
+        shift (6,) of the logarithms, from this soil to the mean, it is the second moment about this soil: its square
+        comes on top, and is not bounded by the prior's variance, which is about another soil.
         """
         free = prior.free
         if not len(free):
@@ -134,6 +136,8 @@ class Posterior:
         most = max(1.0, float(np.linalg.eigvalsh(own)[-1]))
         covariance = np.zeros_like(self.log_covariance)
         covariance[at] = (axes * np.clip(variance, 0.0, most)) @ axes.T * unit
+        if shift is not None:
+            covariance[at] += np.outer(shift[free], shift[free])
         return Posterior(self.soil, covariance)
 
     def distance(self, soil: Soil) -> float:
