@@ -21,6 +21,7 @@ from soilbus.estimation.multistart import DescentOptions, Fit
 from soilbus.estimation.observation_model import Linearisation, Optimum
 from soilbus.estimation.solver import Iterate, Objective, QuadraticModel
 
+# A value whose docstring states no source has no evidence recorded.
 MAX_STEPS = 15
 """Steps after which a descent ends unconverged."""
 FAR_STOP_SHARE = 2e-3

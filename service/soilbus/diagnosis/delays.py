@@ -36,6 +36,7 @@ Cost = Callable[[float, float], float]
 """-2 log posterior, tempered, of dead time [s] and time constant [s]."""
 
 _SOIL = len(PARAMETERS)
+# A value whose docstring states no source has no evidence recorded.
 NODES = 11
 """Time constants of the quadrature: over the whole range, and again over where the posterior is."""
 SUM_STEP = 0.005

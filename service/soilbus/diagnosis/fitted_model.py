@@ -31,6 +31,7 @@ from soilbus.terra.effects.effect import Effect
 from soilbus.terra.wheel import Soil
 
 _SOIL = len(PARAMETERS)
+# A value whose docstring states no source has no evidence recorded.
 CHECK_ROUNDS, CHECK_ROUNDS_NEAR = 3, 2
 """Linearisations that bring the latents of held-out blocks to their optimum: from the measurements, and from latents
 under a model much like it."""

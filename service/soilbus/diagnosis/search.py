@@ -41,6 +41,7 @@ from soilbus.estimation.multistart import DEFAULT_OPTIONS, DescentOptions, Start
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect
 
+# A value whose docstring states no source has no evidence recorded.
 SCORE_THRESHOLD = -2.0
 """Predicted change of -2 log evidence above which a candidate is dropped."""
 MAX_TRIALS_BY_SCORE, MAX_TRIALS_BY_FURTHER_SCORE = 4, 4

@@ -22,6 +22,7 @@ from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import FittedModel, HeldOutCheck
 from soilbus.estimation.posterior import PARAMETERS
 
+# A value whose docstring states no source has no evidence recorded.
 MIN_RESIDUALS = 20
 """Residuals that a region must have."""
 SIGNIFICANCE_LEVEL = 0.01
