@@ -18,6 +18,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import brentq
 
 from soilbus.arrays import Array
 from soilbus.diagnosis.evidence import mixture_neg2_log_evidence
@@ -31,8 +32,6 @@ from soilbus.terra.effects.effect import Effect, Parameter
 
 MAX_PLAUSIBLE_SD = 2.0
 """Prior standard deviations up to which an effect is plausible: a normal variable exceeds them in one of twenty."""
-BISECTIONS = 24
-"""Halvings of the range in which a size is looked for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,16 +133,13 @@ def _least_size(information: Array, index: int, free: Sequence[Free], required: 
     """Size of one parameter from which the expected fall of -2 log evidence reaches the required one; else infinite."""
     direction = np.eye(len(free))[index]
     parameter = free[index].parameter
-    low, high = 0.0, _max_size(parameter) / parameter.std
-    if -_expected_change(information, high * direction, free) < required:
-        return np.inf
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        if -_expected_change(information, middle * direction, free) < required:
-            low = middle
-        else:
-            high = middle
-    return high * parameter.std
+
+    def excess(size: float) -> float:
+        """Change of -2 log evidence above the negative of the required fall."""
+        return _expected_change(information, size * direction, free) + required
+
+    most = _max_size(parameter) / parameter.std
+    return float(brentq(excess, 0.0, most)) * parameter.std if excess(most) <= 0.0 else np.inf
 
 
 def _expected_change(information: Array, u: Array, free: Sequence[Free]) -> float:

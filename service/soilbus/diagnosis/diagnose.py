@@ -37,6 +37,8 @@ from soilbus.estimation.posterior import Posterior, SoilPrior
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.effects.vehicle import GRADE, GRADE_BESIDE_PITCH
 
+__all__ = ["Diagnosis", "NotFitted", "diagnose"]
+
 MAX_EFFECTS = 3
 """Effects that are added at most."""
 MAX_OVERLAP = 0.25

@@ -17,6 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.optimize import lsq_linear
 
 from soilbus.arrays import Array
 from soilbus.diagnosis.evidence import mixture_neg2_log_evidence
@@ -208,24 +210,16 @@ class _Minimum(NamedTuple):
 
 
 def _bounded_minimum(information: Array, gradient: Array, free: Sequence[Free]) -> _Minimum:
-    """Minimum of the quadratic model with the parameters inside their ranges: those that would leave stay at the edge.
+    """Minimum of the quadratic model with the parameters (P,) inside their ranges.
 
-    information (P, P) includes the prior's, the identity.
+    information (P, P) includes the prior's, the identity.  With information = L L' the minimum is that of the bounded
+    least squares problem |L' u + L^-1 gradient|^2, solved by an active set method (Stark & Parker 1995, Comput. Stat.
+    10:129).
     """
     low, high = (np.array([(getattr(f.parameter, edge) - f.value) / f.std for f in free]) for edge in ("low", "high"))
-    step = np.zeros(len(free))
-    inside = np.ones(len(free), bool)
-    for _ in range(len(free) + 1):
-        at_edge = np.where(inside, 0.0, step)
-        rest = gradient + information @ at_edge
-        step = at_edge.copy()
-        if inside.any():
-            step[inside] = -np.linalg.solve(information[np.ix_(inside, inside)], rest[inside])
-        leaving = inside & ((step < low) | (step > high))
-        if not leaving.any():
-            break
-        step = np.clip(step, low, high)
-        inside &= ~leaving
+    root = np.linalg.cholesky(information)
+    found = lsq_linear(root.T, -solve_triangular(root, gradient, lower=True), (low, high), method="bvls")
+    step, inside = found.x, found.active_mask == 0
     fall = float(-2.0 * gradient @ step - step @ information @ step)
     if not inside.any():
         return _Minimum(step, fall, -fall)

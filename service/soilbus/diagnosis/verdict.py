@@ -19,6 +19,9 @@ from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from types import MappingProxyType
 
+import numpy as np
+from scipy.special import expit, softmax
+
 from soilbus.diagnosis.evidence import OwnParameters
 
 FALL_REQUIRED_ALONE, FALL_REQUIRED_BESIDE = 12.0, 30.0
@@ -150,7 +153,7 @@ def probabilities(
     """
     most = max(falls.values())
     usual, large = (_tempered_shares(falls, t, further) for t in temperatures(explained + most))
-    something = 1.0 / (1.0 + math.exp(-most / (2.0 * temperature(explained, FORMULA_ERROR_OF_EXISTENCE))))
+    something = float(expit(most / (2.0 * temperature(explained, FORMULA_ERROR_OF_EXISTENCE))))
     chances = {
         n: something * ((1.0 - P_LARGE_FORMULA_ERROR) * usual[n] + P_LARGE_FORMULA_ERROR * large[n]) for n in falls
     }
@@ -188,14 +191,11 @@ def _tempered_shares(
     falls: Mapping[str, float], temperature: float, further: Mapping[str, Sequence[OwnParameters]]
 ) -> dict[str, float]:
     """Softmax of the tempered falls, halved."""
-    tempered = {
-        name: fall / temperature - sum(own.surcharge(temperature) for own in further.get(name, ()))
+    tempered = [
+        fall / temperature - sum(own.surcharge(temperature) for own in further.get(name, ()))
         for name, fall in falls.items()
-    }
-    most = max(tempered.values())
-    weights = {name: math.exp((fall - most) / 2.0) for name, fall in tempered.items()}
-    total = sum(weights.values())
-    return {name: weight / total for name, weight in weights.items()}
+    ]
+    return dict(zip(falls, softmax(np.array(tempered) / 2.0).tolist(), strict=True))
 
 
 def soil_error_share(name: str) -> float:
