@@ -119,8 +119,8 @@ def test_the_demand_is_the_draft_without_the_error_of_its_load_cell(tmp_path):
         pipeline = Pipeline(known, load_databases(known))
         for now in fed(pipeline.intake, log):
             needs += [pipeline.estimator.estimate(task).demand.pull for task in pipeline.intake.due(now)]
-    told, true = needs
-    assert told - true == pytest.approx(300.0 + 0.05 * true, rel=0.02)
+    draft, true = needs
+    assert draft - true == pytest.approx(300.0 + 0.05 * true, rel=0.02)
 
 
 def test_values_in_the_decision_are_those_of_the_window():

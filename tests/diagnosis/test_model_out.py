@@ -1,4 +1,4 @@
-"""The completed model as a configuration file: what is written reads back as the same model, whatever the vehicle."""
+"""The completed model as a configuration file: what is written reads back as the same model."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ def test_what_is_written_is_the_model_that_was_fitted(record, tmp_path):
     config = load_config(written(tmp_path, tables, notes=notes))
     kept, free = effects_and_parameters_of(config)
     assert [effect.name for effect in kept] == ["draft_offset", "wheel_load_offset"]
-    told = fitted.parameters()
-    of_wheels = [told["wheel_load_offset"][f"offset_{w}"] for w in rig_of(config).wheels]
-    expected = [told["draft_offset"]["offset"], *of_wheels]
+    reported = fitted.parameters()
+    of_wheels = [reported["wheel_load_offset"][f"offset_{w}"] for w in rig_of(config).wheels]
+    expected = [reported["draft_offset"]["offset"], *of_wheels]
     found = [f for f in free if f.parameter.name == "offset"]
     np.testing.assert_allclose([(f.value, f.std) for f in found], [(e.value, e.std) for e in expected], rtol=1e-5)
     assert all((f.value, f.std) == (f.parameter.neutral, 0.0) for f in free if f not in found)  # of that record

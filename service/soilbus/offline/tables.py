@@ -149,7 +149,7 @@ def candidates(config: Config, records: Sequence[Record]) -> list[Effect]:
     unknown = OF_TRUE_SPEED | OF_SEVERAL_WHEELS
     if config.table is None or config.table.t is None:
         unknown |= OF_TIME
-    load = float(np.mean(np.concatenate([record.learned.load[:, 0] for record in records])))
+    load = float(np.mean(np.concatenate([record.training.load[:, 0] for record in records])))
     radius = config.wheel[0].radius
     return [for_wheel(effect, load, radius) for effect in possible_effects(config) if effect.name not in unknown]
 

@@ -1,4 +1,4 @@
-"""Fits that do not converge fast: along valleys that bend, at costs that only seem low, at the edge of a range."""
+"""The damped descent: along curved valleys, where -2 log posterior is underestimated, at the edge of a range."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from soilbus.diagnosis.damped_descent import DAMPING, EASED, HELD_BACK, MAX_STEPS, _Here, _Valley, descended
+from soilbus.diagnosis.damped_descent import Expansion, GeodesicSteps, descend_damped
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.score import scores
@@ -58,23 +58,23 @@ class Banana:
 
 def begun(banana):
     place = Iterate(np.array([-1.0, 1.0]), np.zeros(0), None, np.inf, 0)
-    return _Here(place, banana.point(place))
+    return Expansion(place, banana.point(place))
 
 
-def test_steps_that_bend_follow_a_valley_that_does():
+def test_curved_steps_follow_a_curved_valley_in_half_the_steps_of_damped_ones():
     banana = Banana()
-    here, valley = begun(banana), _Valley(banana)
-    while here.point.neg2_log_posterior > 1e-6 and banana.asked < 100:
-        here, _ = valley.along(here, here.point.step())
-    damped, damping = Banana(), DAMPING
+    here, geodesic = begun(banana), GeodesicSteps(banana)
+    while here.quadratic.neg2_log_posterior > 1e-6 and banana.asked < 100:
+        here, _ = geodesic.along(here, here.quadratic.step())
+    damped, damping = Banana(), 1e-2
     there = begun(damped)
-    while there.point.neg2_log_posterior > 1e-6 and damped.asked < 1000:
-        place = damped.stepped(*there, there.point.step(damping))
+    while there.quadratic.neg2_log_posterior > 1e-6 and damped.asked < 1000:
+        place = damped.stepped(*there, there.quadratic.step(damping))
         point = damped.point(place)
-        falls = point.neg2_log_posterior < there.point.neg2_log_posterior
-        damping *= EASED if falls else HELD_BACK
-        there = _Here(place, point) if falls else there
-    assert banana.asked <= MAX_STEPS
+        falls = point.neg2_log_posterior < there.quadratic.neg2_log_posterior
+        damping *= 0.3 if falls else 10.0
+        there = Expansion(place, point) if falls else there
+    assert banana.asked <= 15
     assert damped.asked > 2 * banana.asked
 
 
@@ -88,7 +88,7 @@ def test_the_second_derivative_along_a_step_is_that_of_the_residuals():
     )
 
 
-def test_a_parabola_has_the_step_of_the_slope_that_it_is_given():
+def test_a_quadratic_model_steps_by_the_gradient_that_it_is_given():
     _, point = begun(Banana())
     gradient = np.array([3.0, -1.0])
     assert point.information @ point.step(gradient=gradient) == pytest.approx(-gradient)
@@ -108,17 +108,17 @@ def recorded(soil="loam", hidden=()):
     return record_of("x", store.window(0.0, 60.0), rig, model_of(CONFIG), 0.2, 0.15)
 
 
-def test_what_a_slow_descent_tells_is_the_cost_with_the_latents_at_their_best():
+def test_a_damped_descent_ends_at_the_posterior_with_the_latents_at_their_optimum():
     """With latents as measured it seems too low, and then no step lowers it."""
     record = recorded("wet_clay")
     known = fit_model([record], PRIOR, ())
-    problem, optimum = record.learned, known.fits[0].mode
+    problem, optimum = record.training, known.fits[0].mode
     fitting = Objective(problem, PRIOR, Gaussian.of(PRIOR, problem.gain_std))
     place = fitting.start(optimum.soil, gains=optimum.gains)
     point = fitting.point(place)
     assert point.neg2_log_posterior < known.neg2_log_posterior - 5.0
     fast = _fit_at(fitting, Descent(place, place, point, np.inf, 1, converged=False))
-    slow = descended(fitting, fast, DescentOptions())
+    slow = descend_damped(fitting, fast, DescentOptions())
     here = Iterate(slow.optimum.soil, slow.optimum.gains, slow.optimum.latents, slow.neg2_log_posterior, 0)
     for _ in range(3):
         here = fitting.stepped(here, fitting.point(here), np.zeros(len(point.gradient)))
@@ -137,27 +137,27 @@ def test_fits_go_on_from_where_a_parameter_was_held_at_the_edge_of_its_range():
     i = [f.parameter.name for f in held.free].index("exponent")
     assert (held.free[i].std, held.free[i].value) == (0.0, 0.05)
     (start,) = held.as_starts()
-    assert held.beforehand[i].std > 0.0
-    assert held.beforehand[i].at(start.gains[record.learned.n_sensors + i]) == pytest.approx(0.05)
+    assert held.free_unheld[i].std > 0.0
+    assert held.free_unheld[i].at(start.gains[record.training.n_sensors + i]) == pytest.approx(0.05)
     again = fit_model([record], PRIOR, [narrow], [start])
     assert again.fits[0].iterations == 1
     assert again.neg2_log_evidence == pytest.approx(held.neg2_log_evidence, abs=0.1)
     (score,) = scores([record], PRIOR, held, [CATALOGUE["lugs"]])
-    assert held.beforehand[i].at(score.starts[0].gains[record.learned.n_sensors + i]) == pytest.approx(0.05, abs=1e-3)
+    assert held.free_unheld[i].at(score.starts[0].gains[record.training.n_sensors + i]) == pytest.approx(0.05, abs=1e-3)
 
 
 def test_a_start_with_other_effects_has_those_that_are_new_absent(record):
     slip, lugs = CATALOGUE["slip_sinkage"], CATALOGUE["lugs"]
     one = fit_model([record], PRIOR, [slip])
     (own,), (both,), (none,) = one.as_starts(), one.as_starts([lugs, slip]), one.as_starts([])
-    n_sensors, n_lugs = record.learned.n_sensors, len(lugs.parameters)
+    n_sensors, n_lugs = record.training.n_sensors, len(lugs.parameters)
     assert both.gains[n_sensors : n_sensors + n_lugs].tolist() == [0.0] * n_lugs
     assert both.gains[n_sensors + n_lugs :].tolist() == own.gains[n_sensors:].tolist()
     assert none.gains.tolist() == own.gains[:n_sensors].tolist()
 
 
 class Flat:
-    """Places whose costs go up and down by less than is foreseen at each."""
+    """Iterates whose -2 log posterior goes up and down by less than is predicted at each."""
 
     def __init__(self, costs):
         self.costs, self.asked = costs, 0
@@ -186,7 +186,7 @@ def test_a_fit_whose_cost_no_longer_falls_ends_where_it_was_least():
 
 
 class Trial(int):
-    """A place by its number."""
+    """An iterate by its number."""
 
     trials = 0
 
