@@ -18,7 +18,7 @@ from soilbus.config.model import Config
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import Fit, fit_from_soil, fit_window
 from soilbus.estimation.observation_model import ObservationModel
-from soilbus.estimation.parametrization import BOUND, Coordinates
+from soilbus.estimation.parametrization import BOUND_SD, Coordinates
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
@@ -109,7 +109,7 @@ def cases() -> Iterator[Case]:
 def starts(prior: SoilPrior, width: float, count: int, seed: int) -> Iterator[Soil]:
     """Soils of the prior, kept as near to it as a fit keeps its own; width [m] is the mean tyre's."""
     coordinates = Coordinates(prior, width)
-    for deviation in np.random.default_rng(seed).standard_normal((count, len(prior.median))).clip(-BOUND, BOUND):
+    for deviation in np.random.default_rng(seed).standard_normal((count, len(prior.median))).clip(-BOUND_SD, BOUND_SD):
         yield Soil(*coordinates.within(prior.median * np.exp(prior.log_std * deviation)).tolist())
 
 

@@ -14,7 +14,7 @@ from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import DEFAULT_OPTIONS, Start, fit_from, fit_from_soil, fit_window
 from soilbus.estimation.nuisance_parameters import parameters_of
 from soilbus.estimation.observation_model import ObservationModelWithEffects
-from soilbus.estimation.parametrization import BOUND, Coordinates, at_edges, step_share_within
+from soilbus.estimation.parametrization import BOUND_SD, Coordinates, at_bounds, step_fraction_within
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Objective, QuadraticModel
 from soilbus.terra.effects.catalogue import CATALOGUE
@@ -44,25 +44,25 @@ def test_a_step_never_leaves_the_edges_and_with_one_it_is_the_best_there_is(seed
 
 
 def test_steps_end_at_the_bounds():
-    assert step_share_within(np.array([0.5, np.inf, -0.2]), np.array([1.0, 9.0, -0.1])) == 0.5
-    assert step_share_within(np.array([np.inf]), np.array([3.0])) == 1.0
-    assert at_edges(np.array([1.0, 2.0, 3.0]), np.ones(3), np.full(3, 3.0)).tolist() == [-1.0, 0.0, 1.0]
+    assert step_fraction_within(np.array([0.5, np.inf, -0.2]), np.array([1.0, 9.0, -0.1])) == 0.5
+    assert step_fraction_within(np.array([np.inf]), np.array([3.0])) == 1.0
+    assert at_bounds(np.array([1.0, 2.0, 3.0]), np.ones(3), np.full(3, 3.0)).tolist() == [-1.0, 0.0, 1.0]
     prior = SoilPrior.from_value_std(dict(zip(PARAMETERS, [(v, 0.25 * v) for v in WET_CLAY], strict=True)))
     coordinates = Coordinates(prior, 0.3)
     soil = np.asarray(WET_CLAY, float)
     step = np.zeros(6)
     step[C] = 0.6
-    soil = coordinates.moved(soil, coordinates.step_share(soil, step) * step)
+    soil = coordinates.stepped(soil, coordinates.step_fraction(soil, step) * step)
     assert not len(coordinates.edges(soil))
-    soil = coordinates.moved(soil, coordinates.step_share(soil, step) * step)
+    soil = coordinates.stepped(soil, coordinates.step_fraction(soil, step) * step)
     assert coordinates.edges(soil).tolist() == [np.eye(6)[C].tolist()]
-    assert soil[C] == pytest.approx(WET_CLAY.c * np.exp(BOUND * prior.log_std[C]))
+    assert soil[C] == pytest.approx(WET_CLAY.c * np.exp(BOUND_SD * prior.log_std[C]))
 
 
 def test_a_fit_converges_with_a_parameter_at_its_bound(simulated):
     case = simulated(WET_CLAY, 5, overrides=[f"soil.c.value={0.2 * WET_CLAY.c}", f"soil.c.std={0.02 * WET_CLAY.c}"])
     fit = fit_window(case.problem(), case.prior)
-    bound = case.prior.median[C] * np.exp(BOUND * case.prior.log_std[C])
+    bound = case.prior.median[C] * np.exp(BOUND_SD * case.prior.log_std[C])
     assert bound < 0.5 * WET_CLAY.c
     assert fit.converged
     assert fit.mode.soil[C] == pytest.approx(bound)
@@ -109,5 +109,5 @@ def test_angles_solved_anew_carry_the_loads_with_the_effects_as_they_are(simulat
     fitting = Objective(problem, case.prior, Gaussian.of(case.prior, problem.gain_std))
     place = fitting.start(np.asarray(SOILS["loam"]), gains=gains)
     place.latents.entry_angle *= 1.1
-    point = fitting.point(fitting.with_entry_angles(place))
-    assert np.abs(point.at.off).max() < 1e-3 * problem.load.mean()
+    point = fitting.quadratic_model(fitting.with_entry_angles(place))
+    assert np.abs(point.linearisation.off).max() < 1e-3 * problem.load.mean()

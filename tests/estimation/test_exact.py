@@ -10,7 +10,7 @@ import pytest
 
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.laplace import attainable_variance, counted, profile_over_n, with_nested_laplace
+from soilbus.estimation.laplace import attainable_variance, error_weights, profile_over_n, with_nested_laplace
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import SoilPrior
@@ -47,7 +47,7 @@ def test_the_average_along_n_has_the_moments_of_the_exact_posterior(ill_told):
     # Where errors count alike and spread evenly: k_phi is what the bearing capacity and the others leave.
     coordinates = Coordinates(prior, float(problem.rig.width.mean()))
     position = np.array([coordinates.position(soil) for soil in np.exp(found.logs)])
-    of_all, of_k_c = counted(found.share, told)
+    of_all, of_k_c = error_weights(found.share, told)
     mean = of_all @ position
     mean[0] = of_k_c @ position[:, 0]
     std = np.sqrt(found.share @ (position - mean) ** 2)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from soilbus.estimation.gaussian import solve_with_inverse
-from soilbus.estimation.multistart import fit_from_soil, fit_warm, fit_window, near, starting_soils, warm_start
-from soilbus.estimation.parametrization import BOUND, Coordinates
+from soilbus.estimation.multistart import clip_to_prior, fit_from_soil, fit_warm, fit_window, starting_soils, warm_start
+from soilbus.estimation.parametrization import BOUND_SD, Coordinates
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.soils import SOILS
@@ -77,7 +77,7 @@ def test_errors_are_as_large_as_the_posterior_says(simulated):
 def test_the_same_optimum_from_all_starts(wet_clay, wet_clay_fit):
     problem, prior = wet_clay.problem(), wet_clay.prior
     unlike = ("loam", "clayey_soil_38", "dry_sand", "heavy_clay_40", "wet_clay")
-    for start in (Soil(*prior.median), *(near(prior, SOILS[name]) for name in unlike)):
+    for start in (Soil(*prior.median), *(clip_to_prior(prior, SOILS[name]) for name in unlike)):
         fit = fit_from_soil(problem, prior, start)
         assert fit.converged
         assert fit.neg2_log_posterior == pytest.approx(wet_clay_fit.neg2_log_posterior, abs=0.01)
@@ -287,11 +287,11 @@ def test_coordinates_and_back(wet_clay):
         h = 1e-6 * np.eye(6)[k]
         up, down = (coordinates.soil_at(coordinates.position(soil) + s * h) for s in (1, -1))
         assert np.log(up / down) / 2e-6 == pytest.approx(directions[:, k], abs=1e-8)
-    far = coordinates.moved(soil, np.full(6, 1e6))
+    far = coordinates.stepped(soil, np.full(6, 1e6))
     for _ in range(50):
-        far = coordinates.moved(far, np.full(6, 1e6))
+        far = coordinates.stepped(far, np.full(6, 1e6))
     away = np.abs(np.log(far / wet_clay.prior.median)) / wet_clay.prior.log_std
-    assert away.max() < BOUND * (1.0 + 1e-9)
+    assert away.max() < BOUND_SD * (1.0 + 1e-9)
 
 
 def test_starts_stay_near_the_prior_and_hold_what_is_held(wet_clay):

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.multistart import fit_from_soil, fit_window
-from soilbus.estimation.parametrization import BOUND, MAX_PHI
+from soilbus.estimation.parametrization import BOUND_SD, MAX_PHI
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import SOILS
@@ -146,7 +146,7 @@ def test_whatever_the_data_every_fit_is_physical(harms, rows, seed, short):
     assert (soil > 0.0).all()
     assert fit.posterior.soil.phi <= MAX_PHI < 0.5 * math.pi
     away = np.abs(np.log(soil / prior.median)) / prior.log_std
-    assert away.max() < BOUND * (1.0 + 1e-9)
+    assert away.max() < BOUND_SD * (1.0 + 1e-9)
     for gaussian in (fit.mode, fit.gaussian, fit.reported):
         assert np.isfinite(gaussian.gains).all()
         spread = np.sqrt(np.diag(gaussian.covariance))

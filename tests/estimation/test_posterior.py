@@ -130,10 +130,11 @@ def test_what_is_considered_besides_adds_up_and_never_exceeds_the_prior():
     own[np.ix_(free, free)] = np.linalg.inv(told @ told.T + np.diag(prior.log_std[free] ** -2))
     by = rng.standard_normal((6, 2)) * 1e-2
     posterior = Posterior(Soil(*np.ones(6)), own)
-    small = posterior.beside(by @ by.T, prior).log_covariance
+    small = posterior.with_added_covariance(by @ by.T, prior).log_covariance
     expected = own + (by @ by.T) * np.outer(prior.log_std > 0.0, prior.log_std > 0.0)
     assert small == pytest.approx(expected, rel=0.02, abs=1e-7)  # what data tell by far outweighs the prior
-    huge = posterior.beside(1e6 * by @ by.T, prior).log_covariance
+    huge = posterior.with_added_covariance(1e6 * by @ by.T, prior).log_covariance
     assert np.all(np.diag(huge) <= prior.log_std**2 * (1.0 + 1e-9))
     assert np.all(np.linalg.eigvalsh(huge - small) > -1e-6)
-    assert posterior.beside(np.zeros((6, 6)), prior).log_covariance == pytest.approx(own, rel=1e-6, abs=1e-12)
+    unchanged = posterior.with_added_covariance(np.zeros((6, 6)), prior).log_covariance
+    assert unchanged == pytest.approx(own, rel=1e-6, abs=1e-12)

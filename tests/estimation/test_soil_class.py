@@ -9,10 +9,10 @@ import pytest
 from reliability import WIDE_COHESION, Said, driven, shortfall, windows
 
 from soilbus.estimation.assembly import prior_of
-from soilbus.estimation.multistart import fit_window, near
+from soilbus.estimation.multistart import clip_to_prior, fit_window
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
-from soilbus.estimation.soil_classes import PRIOR_UNKNOWN, WITHIN, SoilClasses, guessed, ranked_by_likelihood
+from soilbus.estimation.soil_classes import PRIOR_UNKNOWN, WITHIN_CLASS_SD, SoilClasses, guessed, ranked_by_likelihood
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import KINDS, SOILS, UNKNOWN
 from soilbus.terra.wheel import Soil
@@ -179,8 +179,8 @@ def test_the_classes_are_those_of_the_table_with_a_spread_below_that_of_the_tabl
     assert len({tuple(SOILS[name]) for name in KINDS}) == len(KINDS)
     assert {tuple(SOILS[name][:2]) for name in SOILS} - {tuple(SOILS[name][:2]) for name in KINDS} == {(5300.0, 1515e3)}
     within, among = CLASSES.spread[0], CLASSES.spread[-1]
-    assert within == pytest.approx([*WITHIN.values()])
-    assert np.all(among > 1.5 * within - (within == WITHIN["K"]))  # K in the table is a planning figure
+    assert within == pytest.approx([*WITHIN_CLASS_SD.values()])
+    assert np.all(among > 1.5 * within - (within == WITHIN_CLASS_SD["K"]))  # K in the table is a planning figure
     depth = soil_at(CLASSES.centre[KINDS.index("dry_sand")])
     assert depth == pytest.approx(SOILS["dry_sand"])
 
@@ -189,7 +189,7 @@ def test_the_classes_are_those_of_the_table_with_a_spread_below_that_of_the_tabl
 def test_start_values_are_the_soils_that_foretell_the_window(simulated, sensors):
     without = {"all": (), "no sinkage": ("sinkage",), "no draft": ("draft",), "only torque": ("sinkage", "draft")}
     problem = simulated(SOILS["upland_sandy_loam_51"], 6, without=without[sensors]).problem()
-    soils = [near(PRIOR, SOILS[name]) for name in KINDS]
+    soils = [clip_to_prior(PRIOR, SOILS[name]) for name in KINDS]
     order = [KINDS[soils.index(soil)] for soil in ranked_by_likelihood(problem, soils)]
     assert order[0] == "upland_sandy_loam_51"
     assert sorted(order) == sorted(KINDS)

@@ -67,8 +67,8 @@ def descended(fitting: Objective, fast: Fit, effort: DescentOptions) -> Fit | No
             return None
         valley, damping, falling, steps = _Valley(fitting), DAMPING, np.inf, 0
         while damping < MOST_DAMPING and steps < MAX_STEPS:
-            enough, full = _enough(fitting, here.point, effort.nothing), here.point.step()
-            worth = min(here.point.neg2_log_posterior - effort.nothing, effort.give_up_above)
+            enough, full = _enough(fitting, here.point, effort.stall_tolerance), here.point.step()
+            worth = min(here.point.neg2_log_posterior - effort.stall_tolerance, effort.give_up_above)
             if full is None or falling < enough or _foreseen(here.point, full) > worth:
                 break
             there, tried = valley.along(here, full) if ground.is_even(here.point) else (None, 0)
@@ -97,7 +97,7 @@ class _Ground:
 
     def at(self, place: Iterate, at: Linearisation | None = None) -> _Here | None:
         """A place, which may be linearised already, with its latents at their best, and the normal equations there."""
-        point = self.fitting.point(place) if at is None else self.fitting.with_prior(place, at)
+        point = self.fitting.quadratic_model(place) if at is None else self.fitting.with_prior(place, at)
         if point is None:
             return None
         here = _Here(place, point)
@@ -146,7 +146,7 @@ class _Valley:
     def along(self, here: _Here, full: Array) -> tuple[_Here | None, int]:
         """The place after a part of a full step (F + A,), None where none lowers the cost, and how many were tried."""
         place, point = here
-        length, least = point.length(full), None
+        length, least = point.squared_length(full), None
         for tried in range(1, MAX_TRIED + 1):
             share = self.share
             step = (
@@ -155,7 +155,7 @@ class _Valley:
                 else self.fitting.geodesic_step(place, point, share, self.second_derivative)
             )
             if step is not None:
-                reach = self.fitting.step_share(place, step)
+                reach = self.fitting.step_fraction(place, step)
                 share, step = reach * share, reach * step
             there = None
             if step is not None and share > LEAST:
@@ -181,11 +181,11 @@ class _Valley:
 
 def _foreseen(point: QuadraticModel, full: Array | None) -> float:
     """The cost after a full step (F + A,), if all were linear; infinite where there is none."""
-    return np.inf if full is None else point.neg2_log_posterior - point.length(full)
+    return np.inf if full is None else point.neg2_log_posterior - point.squared_length(full)
 
 
 def _at(fitting: Objective, place: Iterate) -> _Here | None:
-    point = fitting.point(place)
+    point = fitting.quadratic_model(place)
     return None if point is None else _Here(place, point)
 
 
@@ -207,7 +207,7 @@ def _fit(fitting: Objective, place: Iterate, point: QuadraticModel, steps: int, 
         gaussian=gaussians[1],
         mode=gaussians[1],
         sinkage=fitting.problem.mean_sinkage(place.as_soil(), place.gains, place.latents),
-        optimum=Optimum(fitting.problem.t, place.soil, place.gains, place.latents, point.at),
+        optimum=Optimum(fitting.problem.t, place.soil, place.gains, place.latents, point.linearisation),
         neg2_log_posterior=point.neg2_log_posterior,
         neg2_log_evidence=point.neg2_log_evidence,
         rows=fitting.problem.n_rows,

@@ -227,12 +227,12 @@ class _Part:
         optimum = self.fit.optimum
         fitting = Objective(self.problem, prior, joint_prior)
         place = Iterate(optimum.soil, self.gains, optimum.latents, np.inf, 0)
-        point = fitting.point(place)
+        point = fitting.quadratic_model(place)
         if point is None:
             raise np.linalg.LinAlgError("the model is not finite where it was fitted")
         self.point, self.directions = point, fitting.directions(place)
         variance, row_var = self.problem.variances(self.gains)
-        self.inverse = inverse_covariance(point.at.by_latents, variance, row_var, self.problem.n_wheels)
+        self.inverse = inverse_covariance(point.linearisation.by_latents, variance, row_var, self.problem.n_wheels)
         self.torque = self.problem.torques(optimum.soil, self.gains, optimum.latents)
         self.alone = self.problem.completed(
             [e for e in fitted.effects if e.name == self.free[0].effect], _alone(free, at)
@@ -245,13 +245,13 @@ class _Part:
         pulls = iter(f.pull_at(v) for f, v in zip(self.free, values, strict=True))
         gains = np.concatenate([self.sensors, [next(pulls) if f.std else 0.0 for f in self.alone.free]])
         late = self.alone.lateness(gains, self.fit.optimum.latents, self.torque)
-        return self.alone.late_residuals(late, self.point.at.by_latents, gains)
+        return self.alone.late_residuals(late, self.point.linearisation.by_latents, gains)
 
     def cost(self, delay: float, tau: float) -> float:
         """-2 log posterior of this recording, least over all the rest."""
         off = self._residuals(delay, tau) - self.here
         weighed = (self.inverse @ off[:, :, None])[:, :, 0]
-        at = self.point.at
+        at = self.point.linearisation
         gradient = self.point.gradient + self.directions.T @ (at.rows.T @ weighed.ravel())
         fall = gradient @ np.linalg.solve(self.point.information, gradient)
         return float(

@@ -22,7 +22,7 @@ from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import DEFAULT_OPTIONS, DescentOptions, Fit, Start, fit_from, fit_window
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModelWithEffects
-from soilbus.estimation.parametrization import at_edges
+from soilbus.estimation.parametrization import at_bounds
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective
 from soilbus.terra.effects.effect import Effect
@@ -238,7 +238,7 @@ def _held_at_edges(
 ) -> tuple[Free, ...] | None:
     """The parameters with those held that would leave their range; None where none would, or fits did not converge."""
     gains = fits[-1].mode.gains
-    edges = at_edges(gains, *problem.gain_bounds())[problem.n_sensors :].tolist()
+    edges = at_bounds(gains, *problem.gain_bounds())[problem.n_sensors :].tolist()
     leaves = [f.std > 0.0 and edge != 0.0 for f, edge in zip(free, edges, strict=True)]
     if not any(leaves) or not all(fit.converged for fit in fits):
         return None
@@ -314,7 +314,7 @@ def _of_next(
     known: Gaussian, prior: SoilPrior, problem: ObservationModelWithEffects, effects: Sequence[Effect]
 ) -> Gaussian:
     """What one recording tells of the next: all but the soil and what belongs to one recording only."""
-    after = known.of_another_soil(prior)
+    after = known.with_prior_soil(prior)
     by_name = {effect.name: effect for effect in effects}
     gone = [
         problem.n_sensors + i
@@ -335,7 +335,7 @@ def check(problem: ObservationModelWithEffects, prior: SoilPrior, fit: Fit, near
     fitting = Objective(problem, prior, fit.mode)
     rounds = CHECK_ROUNDS if near is None or len(near.load) != problem.n else CHECK_AGAIN
     with np.errstate(all="ignore"):
-        latents = fitting.near(fit.mode.soil, gains, near).latents
+        latents = fitting.start_near(fit.mode.soil, gains, near).latents
         latents = problem.with_entry_angles(latents, soil, gains)
         at = problem.linearise(soil, gains, latents)
         for _ in range(rounds - 1):
@@ -345,5 +345,5 @@ def check(problem: ObservationModelWithEffects, prior: SoilPrior, fit: Fit, near
         step = None if point is None else point.step()
     if point is None or step is None:
         return Checked(problem, latents, at, np.inf, np.inf)
-    length = point.length(step)
+    length = point.squared_length(step)
     return Checked(problem, latents, at, point.neg2_log_evidence - length, point.neg2_log_posterior - length)

@@ -153,7 +153,7 @@ def _normal(
     place = Iterate(fit.optimum.soil, gains, fit.optimum.latents, np.inf, 0)
     fitting = Objective(problem, prior, extended)
     with np.errstate(all="ignore"):
-        point = fitting.point(place)
+        point = fitting.quadratic_model(place)
     if point is None:
         raise np.linalg.LinAlgError("the model is not finite where it was fitted")
     base, new = slice(None, -P), slice(-P, None)
@@ -164,7 +164,7 @@ def _normal(
     answer = inverse[1] @ information[base, new]
     left = information[new, new] - np.eye(P) - information[new, base] @ answer
     by_effects = point.gradient[new] - answer.T @ point.gradient[base]
-    return Normal(fitting, place, point.at, by_effects, left, answer, present.checks[i].latents, present)
+    return Normal(fitting, place, point.linearisation, by_effects, left, answer, present.checks[i].latents, present)
 
 
 def _score(effect: Effect, columns: NDArray[np.intp], free: Sequence[Free], normals: Sequence[Normal]) -> Score:
@@ -222,7 +222,7 @@ def _start(normal: Normal, columns: NDArray[np.intp], step: Array) -> Start:
     follow = -normal.answer[:, columns] @ step
     fitting, place = normal.fitting, normal.place
     n_free, n_known = len(fitting.free), len(place.gains) - len(normal.left)
-    soil = fitting.coordinates.moved(place.soil, follow[:n_free])
+    soil = fitting.coordinates.stepped(place.soil, follow[:n_free])
     gains = place.gains[:n_known].copy()
     gains[fitting.active[fitting.active < n_known]] += follow[n_free:]
     start = Start(soil, np.concatenate([normal.present.unheld(gains), step]), checked=normal.checked)
@@ -231,4 +231,4 @@ def _start(normal: Normal, columns: NDArray[np.intp], step: Array) -> Start:
     change = np.zeros(len(place.gains))
     change[:n_known], change[n_known + columns] = gains - place.gains[:n_known], step
     latents = fitting.problem.updated(normal.at, place.latents, soil - place.soil, change)
-    return start._replace(near=True, latents=latents)
+    return start._replace(near_optimum=True, latents=latents)

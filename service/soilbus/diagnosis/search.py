@@ -120,7 +120,7 @@ def _better(one: FittedModel | None, other: FittedModel | None) -> FittedModel |
 
 def _key(starts: Sequence[Start] | None) -> Hashable:
     """Where a fit begins, as a key."""
-    return starts and tuple((start.soil.tobytes(), start.gains.tobytes(), start.near) for start in starts)
+    return starts and tuple((start.soil.tobytes(), start.gains.tobytes(), start.near_optimum) for start in starts)
 
 
 TRIED, FURTHER = 4, 4
@@ -144,7 +144,7 @@ BEHIND_UNSETTLED = 250.0
 """Cost on a few instants above the least one's from which a candidate is given up, converged or not."""
 STEPS = 12
 """Steps of the soil, and then of everything, in which a candidate that explains much is fitted."""
-ROUGH = DescentOptions(STEPS, enough=0.1, little=5e-3)
+ROUGH = DescentOptions(STEPS, step_tolerance=0.1, relative_tolerance=5e-3)
 """The same where few instants tell which candidates to fit to all."""
 WORTH_TRYING = -2.0
 """Foreseen change of -2 log evidence above which a candidate does not count."""
@@ -526,5 +526,5 @@ def _others(addition: Addition, present: FittedModel) -> frozenset[str]:
 def _without(fits: Fits, present: FittedModel, effect: Effect, effort: DescentOptions) -> FittedModel | None:
     """The present model less one effect, fitted from where it stands but for the latents: they followed the effect."""
     left = [e for e in present.effects if e.name != effect.name]
-    starts = [start._replace(near=False) for start in present.as_starts(left)]
+    starts = [start._replace(near_optimum=False) for start in present.as_starts(left)]
     return fits.of(left, [starts], effort)

@@ -45,7 +45,7 @@ def change_statistic(
     ratio = _ratio(misfit, count)
     if ratio.max() <= enough:
         return ChangeStatistic(first + int(np.argmax(ratio)), float(ratio.max()))
-    known = fitting.given(joint_prior)
+    known = fitting.with_joint_prior(joint_prior)
     by_known = known.directions(place)
     gradient = np.einsum("imk,im->ik", weighed, rows[:, :, 0]) @ by_known
     information = by_known.T @ np.einsum("imk,iml->ikl", rows, weighed) @ by_known

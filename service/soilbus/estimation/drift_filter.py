@@ -72,7 +72,7 @@ def at_window_end(fitting: Objective, fit: Fit, window: float, drift: float) -> 
     covariance[:free, :free] += np.eye(free) * drift**2 / (3.0 * PIECES)  # the end of the last piece is not its mean
     gains = place.gains.copy()
     gains[fitting.active] -= step[free:]
-    now = replace(place, soil=fitting.coordinates.moved(place.soil, -step[:free]), gains=gains)
+    now = replace(place, soil=fitting.coordinates.stepped(place.soil, -step[:free]), gains=gains)
     mode = fitting.gaussian_with(now, covariance)
 
     def moved(gaussian: Gaussian) -> Gaussian:

@@ -322,7 +322,7 @@ class Tracker:
                 changed = self._another_soil(window, self._alarm, fit, joint_prior, None)
         else:
             ahead = warm_start(problem, self._here, last, joint_prior)
-            fitting, fit = ahead.fitting, fit_warm(ahead)
+            fitting, fit = ahead.objective, fit_warm(ahead)
             if fit is not None and not fit.converged and fit.chi2 <= self.chi2_limit(fit):
                 fit = refit_denoised(fitting, fit)  # a long valley is no sign of another soil
             if fit is None or not fit.converged:
@@ -359,11 +359,11 @@ class Tracker:
             return None
         if fit is not None and fit.curved_path and not self._unsettled(fit):
             return None  # a curve is why
-        t = ahead.fitting.problem.t
+        t = ahead.objective.problem.t
         first = int(np.searchsorted(t, float(last.optimum.t[-1]) - LOOK_BACK * length))
         place = replace(last.reported, soil=last.optimum.soil, gains=last.optimum.gains)
         known = place.drifted(self._drift(place, SINCE_THE_MIDDLE), np.zeros(len(place.gains)))
-        doubt = change_statistic(ahead.fitting, known, ahead.place, ahead.at, first, ALARM)
+        doubt = change_statistic(ahead.objective, known, ahead.iterate, ahead.linearisation, first, ALARM)
         if doubt.ratio <= ALARM and fit is not None and fit.chi2 <= self.chi2_limit(fit):
             return None
         begin = float(t[doubt.instant])
@@ -375,7 +375,7 @@ class Tracker:
         fitting, fit = self._as_one(window, problem, joint_prior)
         if self.mismatch(fit) and self._gaussians:
             there = elsewhere(self.prior)
-            known = joint_prior.of_another_soil(there)
+            known = joint_prior.with_prior_soil(there)
             other = self._searched(problem, there, known)
             if not self.mismatch(other):
                 begin = float(problem.t[0])
@@ -444,7 +444,7 @@ class Tracker:
         elapsed = (t - end) / self.settings.window
         gains = problem.gain_std**2 * min((elapsed + 1.0) / GAIN_MEMORY, 1.0)
         if self._crossing is not None and end <= self._crossing.end:
-            return gaussian.of_another_soil(self._here).drifted(np.zeros((_SOIL, _SOIL)), gains)
+            return gaussian.with_prior_soil(self._here).drifted(np.zeros((_SOIL, _SOIL)), gains)
         form = None if gaussian.form is None else gaussian.form.drifted(self.settings.form, elapsed / GAIN_MEMORY)
         return replace(gaussian.drifted(self._drift(gaussian, elapsed), gains), form=form)
 
@@ -494,7 +494,7 @@ class Tracker:
             if second.n_rows < MIN_NEW_ROWS or window.t[-1] < arrived:
                 break  # after a mismatch the wheels of both axles must agree, and agree with the draft
             waits = self.mismatch(one) and window.t[-1] < alarm.t + PATIENCE * self.settings.window
-            known = self._known_at(alarm.t, second).of_another_soil(there)
+            known = self._known_at(alarm.t, second).with_prior_soil(there)
             new = self._searched(second, there, known)
             if new is None or self.mismatch(new):
                 continue
@@ -507,7 +507,7 @@ class Tracker:
             return TrackerOutput(told, False, self._new_ground(crossing, told, float(window.t[-1])), crossing.end)
         if ahead is None or old is None or not waits:
             return None
-        return TrackerOutput(self._told(ahead.fitting, old), False, Ground.CHANGING, float(window.t[0]))
+        return TrackerOutput(self._told(ahead.objective, old), False, Ground.CHANGING, float(window.t[0]))
 
     def _new_ground(self, crossing: Transition, fit: Fit | None, end: float) -> Ground:
         """Whether the border before a window that ends at `end` [s] is over: a long one may go on."""
