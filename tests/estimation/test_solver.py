@@ -1,4 +1,4 @@
-"""What is at a bound stays there, and the others are where they then fit best."""
+"""Steps and fits at bounds: no step leaves them, and the other parameters are where they then fit best."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ C = PARAMETERS.index("c")
 
 @given(st.integers(0, 10_000), st.lists(st.sampled_from([-1.0, 0.0, 1.0]), min_size=4, max_size=4))
 @settings(max_examples=60, deadline=None)
-def test_a_step_never_leaves_the_edges_and_with_one_it_is_the_best_there_is(seed, edges):
+def test_a_step_never_crosses_active_bounds_and_with_one_it_is_the_constrained_optimum(seed, sides):
     rng = np.random.default_rng(seed)
     root, target = np.tril(rng.normal(size=(4, 4)), -1) + np.eye(4), rng.normal(size=4)
     none = np.zeros((4, 4))
-    point = QuadraticModel(
-        root.T @ root, none, none, root.T @ target, 0.0, np.diag(edges)[np.array(edges) != 0.0], None
+    model = QuadraticModel(
+        root.T @ root, none, none, root.T @ target, 0.0, np.diag(sides)[np.array(sides) != 0.0], None
     )
-    step = point.step()
-    assert np.all(step * np.array(edges) <= 1e-12)
+    step = model.step()
+    assert np.all(step * np.array(sides) <= 1e-12)
     cost = float(np.sum((root @ step + target) ** 2))
     assert cost <= float(target @ target) + 1e-9
-    if np.count_nonzero(edges) < 2:
-        low, high = (np.where(np.array(edges) == way, 0.0, way * np.inf) for way in (-1.0, 1.0))
+    if np.count_nonzero(sides) < 2:
+        low, high = (np.where(np.array(sides) == side, 0.0, side * np.inf) for side in (-1.0, 1.0))
         best = lsq_linear(root, -target, (low, high), method="bvls").x
         assert step == pytest.approx(best, abs=1e-9)
 
@@ -53,9 +53,9 @@ def test_steps_end_at_the_bounds():
     step = np.zeros(6)
     step[C] = 0.6
     soil = coordinates.stepped(soil, coordinates.step_fraction(soil, step) * step)
-    assert not len(coordinates.edges(soil))
+    assert not len(coordinates.active_bounds(soil))
     soil = coordinates.stepped(soil, coordinates.step_fraction(soil, step) * step)
-    assert coordinates.edges(soil).tolist() == [np.eye(6)[C].tolist()]
+    assert coordinates.active_bounds(soil).tolist() == [np.eye(6)[C].tolist()]
     assert soil[C] == pytest.approx(WET_CLAY.c * np.exp(BOUND_SD * prior.log_std[C]))
 
 
@@ -77,7 +77,7 @@ def test_a_fit_converges_with_a_parameter_at_its_bound(simulated):
 
 @pytest.fixture(scope="module")
 def bulldozed(simulated):
-    """A drive under a model with bulldozing that it has not: as likely less than none as more."""
+    """A drive without bulldozing, fitted with it: the best value is as likely below its range as in it."""
     case = simulated(SOILS["loam"], 11)
     rig, config = rig_of(case.config), case.config
     plain = ObservationModelWithEffects(case.window, rig, model_of(config), config.estimator.min_speed)
@@ -87,10 +87,10 @@ def bulldozed(simulated):
 
 def test_parameters_of_effects_stay_inside_their_ranges(bulldozed):
     problem, prior = bulldozed
-    before = Gaussian.of(prior, problem.gain_std)
+    joint_prior = Gaussian.of(prior, problem.gain_std)
     gains = np.concatenate([np.zeros(problem.n_sensors), np.ones(len(problem.free))])
-    fast = fit_from(problem, prior, before, Start(np.asarray(SOILS["loam"]), gains), problem.n_sensors)
-    fit = descended(Objective(problem, prior, before), fast, DEFAULT_OPTIONS)
+    fast = fit_from(problem, prior, joint_prior, Start(np.asarray(SOILS["loam"]), gains), problem.n_sensors)
+    fit = descended(Objective(problem, prior, joint_prior), fast, DEFAULT_OPTIONS)
     assert fit.converged
     low, high = problem.gain_bounds()
     for found in (fast, fit):
@@ -100,14 +100,14 @@ def test_parameters_of_effects_stay_inside_their_ranges(bulldozed):
     assert np.isinf(low[: problem.n_sensors]).all()
 
 
-def test_angles_solved_anew_carry_the_loads_with_the_effects_as_they_are(simulated):
+def test_solved_entry_angles_carry_the_loads_with_effects(simulated):
     case = simulated(SOILS["loam"], 12)
     plain = ObservationModelWithEffects(case.window, rig_of(case.config), model_of(case.config), 0.2)
     effect = CATALOGUE["multipass"]
     problem = plain.completed([effect], parameters_of(effect, plain.n_wheels))
     gains = np.concatenate([np.zeros(problem.n_sensors), [1.0, 0.5, 0.3, -0.8]])
-    fitting = Objective(problem, case.prior, Gaussian.of(case.prior, problem.gain_std))
-    place = fitting.start(np.asarray(SOILS["loam"]), gains=gains)
-    place.latents.entry_angle *= 1.1
-    point = fitting.quadratic_model(fitting.with_entry_angles(place))
-    assert np.abs(point.linearisation.off).max() < 1e-3 * problem.load.mean()
+    objective = Objective(problem, case.prior, Gaussian.of(case.prior, problem.gain_std))
+    iterate = objective.start(np.asarray(SOILS["loam"]), gains=gains)
+    iterate.latents.entry_angle *= 1.1
+    model = objective.quadratic_model(objective.with_entry_angles(iterate))
+    assert np.abs(model.linearisation.off).max() < 1e-3 * problem.load.mean()
