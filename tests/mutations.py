@@ -128,8 +128,8 @@ MUTATIONS = (
     ),
     Mutation(
         "the soil never drifts", "estimation/tracker.py",
-        "belief.drifted(self._drift(belief, elapsed), gains)",
-        "belief.drifted(0.0 * self._drift(belief, elapsed), gains)",
+        "gaussian.drifted(self._drift(gaussian, elapsed), gains)",
+        "gaussian.drifted(0.0 * self._drift(gaussian, elapsed), gains)",
         ("tests/estimation/test_drift.py::test_the_soil_of_an_hour_ago_is_no_more_than_another_soil",),
     ),
     Mutation(

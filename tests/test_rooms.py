@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "service" / "soilbus"
-MAY_IMPORT = {
-    "terra": set(),
-    "config": set(),
-    "can": {"config"},
-    "estimation": {"config", "terra"},
-    "sensors": {"config", "can", "estimation", "terra"},
-    "decision": {"config", "sensors", "estimation", "terra"},
-    "pipeline": {"config", "can", "decision", "sensors", "estimation", "terra"},
-    "daemon": {"pipeline", "config", "can", "decision", "sensors", "estimation", "terra"},
-    "diagnosis": {"estimation", "terra"},
-    "offline": {"pipeline", "diagnosis", "config", "can", "sensors", "estimation", "terra"},
-    "simulator": {"config", "can", "estimation", "terra"},
-    "report": {"offline", "pipeline", "diagnosis", "config", "can", "decision", "sensors", "estimation", "terra"},
-}
-"""Rooms that a room may import from; `cli` and `validation` may import from all, and nothing from them."""
+PICTURE = PACKAGE.parent / "docs" / "rooms.dot"
+ARROWS = re.findall(r"(\w+) -> (\w+);", PICTURE.read_text())
+
+
+def below(room: str) -> set[str]:
+    """Rooms that arrows of the picture lead to from a room, by way of others too."""
+    found: set[str] = set()
+    left = [room]
+    while left:
+        here = left.pop()
+        found |= {here}
+        left += [lower for upper, lower in ARROWS if upper == here and lower not in found]
+    return found - {room}
+
+
+ROOMS = {room for arrow in ARROWS for room in arrow}
 
 
 def imports() -> list[tuple[str, str, str]]:
@@ -39,31 +41,34 @@ def imports() -> list[tuple[str, str, str]]:
 
 
 IMPORTS = imports()
-ROOMS = {room for room, _, _ in IMPORTS if room}
 
 
-def test_each_room_has_its_arrows() -> None:
-    folders = {path.name for path in PACKAGE.iterdir() if path.is_dir() and any(path.glob("*.py"))}
-    assert folders == {*MAY_IMPORT, "cli", "validation"}
+def test_the_picture_has_every_room() -> None:
+    assert {path.name for path in PACKAGE.iterdir() if path.is_dir() and any(path.glob("*.py"))} == ROOMS
 
 
-@pytest.mark.parametrize("room", sorted(MAY_IMPORT))
+@pytest.mark.parametrize("room", sorted(ROOMS))
 def test_a_room_imports_only_from_those_below_it(room: str) -> None:
-    allowed = MAY_IMPORT[room] | {room}
     wrong = [
         f"{file}: {module}"
         for importer, file, module in IMPORTS
-        if importer == room and (part := module.split(".")[1]) in ROOMS and part not in allowed
+        if importer == room and (part := module.split(".")[1]) in ROOMS and part not in below(room) | {room}
     ]
     assert wrong == []
 
 
 def test_the_arrows_make_no_circle() -> None:
-    left = dict(MAY_IMPORT)
+    left = {room: below(room) for room in ROOMS}
     while left:
-        lowest = {room for room, below in left.items() if not below & left.keys()}
+        lowest = {room for room, lower in left.items() if not lower & left.keys()}
         assert lowest, f"a circle among {sorted(left)}"
-        left = {room: below for room, below in left.items() if room not in lowest}
+        left = {room: lower for room, lower in left.items() if room not in lowest}
+
+
+def test_the_daemon_knows_neither_simulator_nor_validation() -> None:
+    assert below("daemon").isdisjoint({"simulator", "validation", "report", "diagnosis"})
+    assert "can" not in below("estimation") | below("diagnosis")
+    assert below("terra") == below("config") == set()
 
 
 def test_modules_outside_of_the_rooms_know_no_room_but_the_command_line() -> None:

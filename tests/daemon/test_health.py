@@ -254,7 +254,7 @@ def test_a_defect_in_every_window_is_a_fault_until_an_estimator_that_knows_nothi
 
 def test_a_fault_that_stays_is_not_logged_window_by_window(drive, caplog):
     bench = Bench(drive)
-    bench.service._solver._anew = lambda: bench.estimator
+    bench.service._solver._again = lambda: bench.estimator
     broken(bench.estimator, range(100))
     bench.run(16.0)
     assert bench.service.failures["internal"] > 2 * REPEATED

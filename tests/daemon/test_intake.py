@@ -70,11 +70,11 @@ def test_wild_samples_are_left_out_and_counted(loam):
     clean, _ = windows(loam)
     tasks, intake = windows(frames_)
     assert len(tasks) == len(clean) == 5
-    assert intake.refusals.total["wild"] == np.count_nonzero(times < tasks[-1].end)
+    assert intake.refusals.total["outlier"] == np.count_nonzero(times < tasks[-1].end)
     for task, other in zip(tasks, clean, strict=True):
         n = np.count_nonzero((times >= task.start) & (times < task.end))
         assert n > 0
-        assert task.rejected == {"wild": n}
+        assert task.rejected == {"outlier": n}
         assert other.rejected == {}
         assert task.window.samples == other.window.samples - n
         assert task.window.speed[:, 0] == pytest.approx(other.window.speed[:, 0], rel=5e-3)  # 5 sd of a bin's mean
@@ -92,7 +92,7 @@ def test_live_and_replay_give_the_same_windows(every, glimpse, loam):
     for a, b in zip(got, expected, strict=True):
         assert (a.rejected, a.slip, a.window.samples) == (b.rejected, b.slip, b.window.samples)
         assert all(np.array_equal(getattr(a.window, q), getattr(b.window, q), equal_nan=True) for q in QUANTITIES)
-    assert intake.refusals.total["wild"] > 10
+    assert intake.refusals.total["outlier"] > 10
 
 
 def test_slip_in_reverse_is_that_of_the_same_drive_forward():

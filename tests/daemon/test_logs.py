@@ -316,5 +316,5 @@ def test_a_wild_sample_after_the_last_window_is_counted(lines, tmp_path):
     windows = windows_of([tmp_path / "a.log"], pipeline)
     assert windows[-1]["t"] < float(some[place][1:18])
     assert [w["rejected"] for w in windows] == [{}] * len(windows)
-    assert pipeline.intake.refusals.total == {"wild": 1}
+    assert pipeline.intake.refusals.total == {"outlier": 1}
     assert pipeline.intake.refusals.used == samples_in(some) - 1

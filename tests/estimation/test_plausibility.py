@@ -15,7 +15,7 @@ from soilbus.can.mapping import channels_of
 from soilbus.estimation.assembly import rig_of, with_effects
 from soilbus.estimation.window import Window, forward
 from soilbus.sensors.bins import Bins
-from soilbus.sensors.consistency import Plausibility, Resolution, implausible, lasts, runs
+from soilbus.sensors.consistency import Resolution, SensorConsistency, implausible, lasts, runs
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, demo, excited
@@ -252,7 +252,7 @@ def test_motor_speeds_are_binned_as_the_window_is(good):
     """Against plain means of the samples of each bin."""
     recording = simulate(CONFIG, excited("loam", 12.0), seed=3)
     database = load_databases(CONFIG)
-    ear = Plausibility(RIG, channels_of(CONFIG, database), database, CONFIG.estimator)
+    ear = SensorConsistency(RIG, channels_of(CONFIG, database), database, CONFIG.estimator)
     heard = {n: (c.t + 5.0, c.value) for n, c in recording.channels.items() if n.startswith("motor_speed")}
     for part in (slice(0, 170), slice(170, 171), slice(171, None)):
         ear.add({n: (t[part], v[part]) for n, (t, v) in heard.items()})

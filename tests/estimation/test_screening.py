@@ -88,7 +88,7 @@ def test_one_wild_sample_in_a_hundred_costs_little(monkeypatch):
         windows = {"clean": drive.window(), "screened": drive.window(wild)}
         if number % 2 == 0:
             with monkeypatch.context() as without:
-                without.setattr(screening, "FAR", np.inf)
+                without.setattr(screening, "OUTLIER_SD", np.inf)
                 windows["unscreened"] = drive.window(wild)
         lost += drive.n_samples - windows["clean"].samples
         taken += drive.n_samples - windows["screened"].samples
@@ -142,7 +142,7 @@ TIMES = 0.02 * np.arange(N)
 
 def found(value: np.ndarray, t: np.ndarray = TIMES) -> np.ndarray:
     samples = Samples(np.zeros(len(t), np.int16), t, np.asarray(value, float), np.zeros(len(t), bool))
-    return np.flatnonzero(outlier_test(samples, lambda count, size, level: np.ones(len(size))).wild)
+    return np.flatnonzero(outlier_test(samples, lambda count, size, level: np.ones(len(size))).outlier)
 
 
 def noise(seed: int) -> np.ndarray:
@@ -234,7 +234,7 @@ def test_channels_do_not_mix():
     mixed = np.random.default_rng(6).permutation(347)
     samples = Samples(column[mixed], t[mixed], value[mixed], np.zeros(347, bool))
     judged = outlier_test(samples, lambda count, size, level: np.ones(len(size)))
-    assert np.sort(judged.samples.value[judged.wild]) == pytest.approx(np.sort(value[[7, 46, 47, 346]]))
+    assert np.sort(judged.samples.value[judged.outlier]) == pytest.approx(np.sort(value[[7, 46, 47, 346]]))
     last = [6, 46, 346]
     assert judged.later[last].tolist() == [0, 0, 0]
     assert judged.later[[0, 7, 47]].tolist() == [6, 39, 299]
@@ -280,7 +280,7 @@ def slid(columns, cuts, rng=None, origin: float = 0.0):
             store.glimpse(origin + cut - 0.3, origin + cut)
         if cut in hops:
             windows.append(store.window(origin + cut - 3.0, origin + cut))
-            wild.append(store.new_wild())
+            wild.append(store.new_outliers())
             store.drop_before(origin + cut - 2.0)
     return windows, np.concatenate(wild)
 
@@ -325,10 +325,10 @@ def test_a_doubtful_last_sample_is_asked_again():
     first = store.window(0.0, 3.0)
     assert first.samples == 300 - 2
     assert max(abs(first.draft[-1]), abs(first.pitch[-1])) < 3.0
-    assert not len(store.new_wild())
+    assert not len(store.new_outliers())
     later = store.window(1.0, 4.0)
     assert later.samples == 300 - 1  # the step was real
-    assert store.new_wild() == pytest.approx([t[149]])
+    assert store.new_outliers() == pytest.approx([t[149]])
     assert later.draft[19] > 10.0
     assert abs(later.pitch[19]) < 3.0
 
@@ -344,7 +344,7 @@ def test_windows_of_the_past_change_nothing():
         store.window(0.0, end)
     other.window(0.0, 5.0)
     assert same(store.window(2.0, 7.0), other.window(2.0, 7.0))
-    assert np.array_equal(store.new_wild(), other.new_wild())
+    assert np.array_equal(store.new_outliers(), other.new_outliers())
 
 
 def test_a_glimpse_is_screened_and_sees_what_came_last():
@@ -358,7 +358,7 @@ def test_a_glimpse_is_screened_and_sees_what_came_last():
         seen = store.glimpse(1.7, 2.0)
         assert seen.samples == 14
         assert np.abs(seen.draft).max() < 3.0
-    assert not len(store.new_wild())
+    assert not len(store.new_outliers())
 
 
 def test_late_samples_are_judged_when_they_come():
@@ -371,7 +371,7 @@ def test_late_samples_are_judged_when_they_come():
     assert store.window(0.0, 3.0).samples == 147
     store.add({"draft": (t[late], value[late])})
     assert store.window(0.0, 4.0).samples == 199
-    assert store.new_wild() == pytest.approx([t[91]])
+    assert store.new_outliers() == pytest.approx([t[91]])
 
 
 def test_relative_noise_at_rest_has_a_floor():
@@ -385,4 +385,4 @@ def test_relative_noise_at_rest_has_a_floor():
     value[[30, 100, 101, 180]] = 0.001
     store.add({"speed.A": (t, value)})
     assert store.window(0.0, 5.0).samples == 250
-    assert not len(store.new_wild())
+    assert not len(store.new_outliers())

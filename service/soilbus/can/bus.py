@@ -160,7 +160,7 @@ class LiveBus:
         self._counts = BusCounts()
         self._wire: Wire | None = None
         self._outbox = Outbox()
-        self._overruns_before = 0  # of wires that are closed, and what the controller told
+        self._overruns_before = 0  # of wires that are closed, and what the controller reported
         self._refused_while_away = 0
         self._next_try = -1.0
         self._back_off = FIRST_BACK_OFF

@@ -38,7 +38,7 @@ class Channel:
     `value in SI = factor * physical value of the DBC + offset`; values outside
     low..high (SI) are implausible.  `valid_signal` (same message) must hold one of
     `valid_values` (raw codes).  `quantity` is the role, e.g. "torque"; `wheel` the
-    wheel's name or "" for the vehicle.  What a sample tells was true `delay` [s] before its stamp.
+    wheel's name or "" for the vehicle.  What a sample reports was true `delay` [s] before its stamp.
     """
 
     quantity: str

@@ -52,7 +52,7 @@ class SourceLock:
 
     @classmethod
     def at_cycle(cls, own: int, cycle_time: float) -> SourceLock:
-        """With patience for a message that comes every `cycle_time` [s] (0: not told)."""
+        """With patience for a message that comes every `cycle_time` [s] (0: unknown)."""
         return cls(own, max(LOCK_RELEASE, LOCK_CYCLES * cycle_time))
 
     def admits(self, t: float, source: int) -> bool:

@@ -25,7 +25,7 @@ OPTIONAL_ROLES = ("yaw_rate", *POSITION_ROLES)
 
 MAX_SPEED = 25.0  # m/s, faster than any field tractor
 LEAST_GAP, GAP_CYCLES = 2.0, 1.5
-"""A position is stale after so many seconds, and where the DBC says that it is sent seldom, after so many cycles."""
+"""A position is stale after these seconds, or, where the DBC says that it is sent seldom, after these cycles."""
 _HEAVY = 5.0e4  # kg, stands for the mass when there is no [vehicle]
 
 _DIMENSIONS: dict[str, tuple[str, ...]] = {
@@ -84,7 +84,7 @@ def channels_of(config: Config, database: Database) -> list[Channel]:
 
 
 def without_unit(channels: Iterable[Channel], database: Database) -> list[Channel]:
-    """Channels whose signal tells no unit, so that SI was assumed."""
+    """Channels whose signal has no unit, so that SI was assumed."""
     return [c for c in channels if unit_of(_signal(c, database).unit) is None]
 
 

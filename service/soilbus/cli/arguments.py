@@ -40,7 +40,7 @@ def counted(text: str) -> int:
 
 def command_line() -> argparse.ArgumentParser:
     """Parser of the whole command line; `command` names the one to do."""
-    parser = argparse.ArgumentParser(prog="soilbus", description="Tells a tractor what soil it is driving on.")
+    parser = argparse.ArgumentParser(prog="soilbus", description="What soil a tractor is driving on, from its CAN bus.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def command(name: str, text: str, config: str = "required") -> argparse.ArgumentParser:
@@ -59,6 +59,7 @@ def command_line() -> argparse.ArgumentParser:
 
     sub = command("demo", "simulated tractor, service and dashboard; needs no hardware, ends by itself", "")
     sub.add_argument("--duration", type=float, default=42.0, metavar="S", help="simulated seconds (default 42)")
+    sub.add_argument("--picture", type=Path, metavar="OUT.svg", help="keep the last state of the dashboard")
 
     sub = command("run", "the service on a live bus")
     sub.add_argument("--wait", action="store_true", help="wait for an interface that is not there yet")
@@ -118,7 +119,7 @@ def command_line() -> argparse.ArgumentParser:
     sub.add_argument("--around", type=between(0.0, 1.0), default=0.0, metavar="S", help="std of soils' log (default 0)")
     figures(sub, "drives, noise and priors")
 
-    sub = command("decisions", "what soilbus foretells, beside what simulated drives then do", "optional")
+    sub = command("decisions", "what soilbus predicts, beside what simulated drives then do", "optional")
     sub.add_argument("--drives", type=counted, default=150, metavar="N", help="on each soil (default 150)")
     sub.add_argument("--calls", type=counted, default=600, metavar="N", help="of go, caution, no-go (default 600)")
     sub.add_argument("--boggings", type=counted, default=40, metavar="N", help="drives into trouble (default 40)")

@@ -8,22 +8,27 @@ faster, so the service's times are shortened by the same factor.
 
 from __future__ import annotations
 
+import io
+import re
 import subprocess
 import threading
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
+from pathlib import Path
 
 import can
 from rich.console import Console
+from rich.panel import Panel
 
 from soilbus.can.bus import BusError, LiveBus, open_bus
 from soilbus.can.dbc_files import filters_of, output_database
 from soilbus.config.model import Config
 from soilbus.daemon.start import start_service
+from soilbus.files import whole_file
 from soilbus.pipeline.result import WindowResult
-from soilbus.report.dashboard import show
+from soilbus.report.dashboard import WIDTH, panel, show
 from soilbus.report.received_frames import Readings
 from soilbus.report.table import table
 from soilbus.simulator.frames import frames
@@ -37,8 +42,11 @@ SEED = 1
 SHOWN_EVERY = 4.0
 
 
-def run_demo(duration: float) -> None:
-    """Drive `duration` simulated seconds from loam onto wet clay and show what the service says."""
+def run_demo(duration: float, picture: Path | None = None) -> None:
+    """Drive `duration` simulated seconds from loam onto wet clay and show what the service says.
+
+    `picture` is where the last state of the dashboard is kept as SVG.
+    """
     console = Console()
     real = reference_configuration()
     recording = simulate(real, demo_scenario(duration), SEED)
@@ -58,9 +66,14 @@ def run_demo(duration: float) -> None:
             worker = threading.Thread(target=service.run, daemon=True)
             worker.start()
             sender.start()
-            show(Readings(ours), ear, console, done=lambda: not sender.is_alive())
+            known = Readings(ours)
+            show(known, ear, console, done=lambda: not sender.is_alive())
+            shown = panel(known)
             service.stop()
             worker.join(timeout=2.0)
+    if picture is not None:
+        with whole_file(picture) as out:
+            out.write(_svg(shown))
     console.print("\n" + _story(results), highlight=False, end="")
 
 
@@ -121,6 +134,13 @@ def _ip(*words: str) -> bool:
         return subprocess.run(["ip", *words], capture_output=True, check=False).returncode == 0
     except OSError:
         return False
+
+
+def _svg(shown: Panel) -> str:
+    """A dashboard as SVG that asks for no font from elsewhere."""
+    paper = Console(record=True, file=io.StringIO(), width=WIDTH, force_terminal=True)
+    paper.print(shown)
+    return re.sub(r"@font-face \{.*?\}\s*", "", paper.export_svg(title="soilbus watch"), flags=re.DOTALL)
 
 
 def _story(results: list[WindowResult]) -> str:

@@ -22,7 +22,7 @@ def demo(args: argparse.Namespace) -> None:
     """`soilbus demo`: simulated tractor, service and dashboard."""
     from soilbus.cli.demo import run_demo
 
-    run_demo(args.duration)
+    run_demo(args.duration, args.picture)
 
 
 def run(args: argparse.Namespace) -> None:

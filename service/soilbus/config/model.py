@@ -108,7 +108,9 @@ class Bus(BaseModel):
 
     model_config = ConfigDict(extra="allow", frozen=True)
     interface: str = "socketcan"
+    """Backend of python-can."""
     channel: str = "can0"
+    """Name of the interface."""
 
     @model_validator(mode="after")
     def _no_typing_error(self) -> Bus:
@@ -122,6 +124,7 @@ class Dbc(_Section):
     """DBC files that describe the vehicle's frames, beside the configuration or ours by name."""
 
     input: list[str] = Field(default_factory=list)
+    """Files that hold the mapped messages."""
     checked: list[str] = Field(default_factory=list)
     """Messages of the vehicle's own DBC that are believed only with a right Counter and Checksum (dbc/README.md)."""
 
@@ -130,10 +133,15 @@ class Vehicle(_Section):
     """Longitudinal vehicle; lengths m, mass kg, heights above the ground."""
 
     mass: Annotated[PositiveFloat, AfterValidator(MASS)]
+    """Of the whole vehicle [kg], ballast included."""
     wheelbase: Annotated[PositiveFloat, AfterValidator(WHEELBASE)]
+    """Front to rear axle [m]."""
     cg_ahead_of_rear_axle: Annotated[PositiveFloat, AfterValidator(CG_AHEAD)]
+    """Centre of gravity ahead of the rear axle [m]."""
     cg_height: Annotated[PositiveFloat, AfterValidator(HEIGHT)]
+    """Centre of gravity above the ground [m]."""
     hitch_height: Annotated[NonNegativeFloat, AfterValidator(HITCH_HEIGHT)] = 0.5
+    """Line of draft above the ground at the hitch [m]."""
     track: Annotated[PositiveFloat, AfterValidator(TRACK)] | None = None
     """Distance between the middles of the left and the right wheels; turns a yaw rate into a difference of speeds."""
 
@@ -149,18 +157,25 @@ class Signal(_Section):
 
     `sign` flips a sensor mounted the other way round.  `valid` names a signal (or a
     signal of the same message) that must hold one of `valid_values` for the value to
-    count.  `at` tells on which side of the gear a torque or speed is measured.
+    count.  `at` is the side of the gear on which a torque or speed is measured.
     `timeout` [s] is the age from which the channel counts as stale.  `delay` [s] is how much
-    earlier what a sample tells was true: a radar's filter, a receiver's solution, a queue.
+    earlier what a sample reports was true: a radar's filter, a receiver's solution, a queue.
     """
 
     signal: SignalName
+    """`Message.Signal` of the DBC."""
     sign: Literal[1, -1] = 1
+    """-1 for a sensor mounted the other way round."""
     at: Literal["wheel", "shaft"] | None = None
+    """Side of the gear on which it is measured."""
     valid: str | None = None
+    """Signal that must hold one of `valid_values` for the value to count."""
     valid_values: list[int] = Field(default_factory=lambda: [1])
+    """See `valid`."""
     timeout: PositiveFloat | None = None
+    """Age from which the channel is stale [s]."""
     delay: Annotated[float, Field(ge=-1.0, le=2.0)] = 0.0
+    """How much earlier what a sample reports was true [s]: a filter, a receiver, a queue."""
 
     @model_validator(mode="before")
     @classmethod
@@ -171,22 +186,34 @@ class Signal(_Section):
 class Wheel(_Section):
     """One wheel and its sensors; radius is the rolling radius [m], width the tyre's [m].
 
-    `max_torque` [N m] is the motor's limit at the wheel where no signal tells it.  Only the
+    `max_torque` [N m] is the motor's limit at the wheel where no signal reports it.  Only the
     wheel of a test rig has no axle.  A rigid wheel has no tyre that could flatten or wear.
     """
 
     name: Name
+    """For messages, JSON and frames: FL, FR, RL, RR on a tractor."""
     axle: Literal["front", "rear"] | None = None
+    """Axle that carries it."""
     radius: Annotated[PositiveFloat, AfterValidator(RADIUS)]
+    """Rolling radius [m]."""
     width: Annotated[PositiveFloat, AfterValidator(WIDTH)]
+    """Of the tyre [m]."""
     tyre: Literal["flexible", "rigid"] = "flexible"
+    """A rigid wheel has no tyre that could flatten or wear."""
     gear_ratio: Annotated[PositiveFloat, AfterValidator(GEAR_RATIO)] = 1.0
+    """Turns of the motor shaft for one of the wheel."""
     max_torque: Annotated[PositiveFloat, AfterValidator(WHEEL_TORQUE)] | None = None
+    """The motor's limit at the wheel [N m], where no signal reports it."""
     torque: Signal | None = None
+    """Motor torque [N m], at the wheel or the shaft."""
     speed: Signal | None = None
+    """Rotation [rad/s], at the wheel or the shaft."""
     load: Signal | None = None
+    """Load cell [N]."""
     sinkage: Signal | None = None
+    """Depth of the rut below the wheel [m]; optional."""
     torque_limit: Signal | None = None
+    """Greatest torque that the motor reports it can give [N m]; optional."""
     motor_speed: Signal | None = None
     """Only to find out a speed sensor that lies."""
 
@@ -208,11 +235,15 @@ class Signals(_Section):
     """Signals of the whole vehicle."""
 
     ground_speed: Signal | None = None
+    """True speed over ground [m/s]: radar, GNSS or ISO 11783 ground-based speed."""
     draft: Signal | None = None
+    """Pull at the hitch [N], positive backward."""
     pitch: Signal | None = None
+    """Nose-up angle [rad]."""
     acceleration: Signal | None = None
+    """Along the vehicle [m/s^2], dv/dt."""
     yaw_rate: Signal | None = None
-    """Positive to the left [rad/s]; tells turns from wheels that spin on one side."""
+    """Positive to the left [rad/s]; distinguishes turns from wheels that spin on one side."""
     latitude: Signal | None = None
     """WGS84, positive north; only for the map."""
     longitude: Signal | None = None
@@ -229,7 +260,9 @@ class Column(_Section):
     """A column of a table: its name, or a table with the factor that brings it to SI."""
 
     column: Annotated[str, Field(min_length=1)]
+    """Name in the head of the table."""
     factor: float = 1.0
+    """From its unit to SI."""
 
     @model_validator(mode="before")
     @classmethod
@@ -253,13 +286,21 @@ class Table(_Section):
     """
 
     wheel_load: Column
+    """[N]."""
     slip: Column
+    """1 - V/(r omega)."""
     drawbar_pull: Column | None = None
+    """[N], positive forward."""
     torque: Column | None = None
+    """[N m] about the axle."""
     sinkage: Column | None = None
+    """[m]."""
     t: Column | None = None
+    """[s]."""
     run: Annotated[str, Field(min_length=1)] | None = None
+    """Column by which soil beds differ."""
     where: dict[str, Any] = Field(default_factory=dict)
+    """Only rows that equal these values count."""
 
     @field_validator("where")
     @classmethod
@@ -290,9 +331,13 @@ class Noise(_Section):
     """
 
     absolute: NonNegativeFloat = 0.0
+    """Sd of a sample in the channel's SI unit."""
     relative: Annotated[NonNegativeFloat, AfterValidator(SHARE)] = 0.0
+    """Sd of a sample over its reading."""
     of_mean: Annotated[NonNegativeFloat, AfterValidator(SHARE)] = 0.0
+    """Sd of a sample over the window's mean magnitude."""
     gain: Annotated[NonNegativeFloat, AfterValidator(SHARE)] = 0.0
+    """Sd of the gain error that is fixed over a recording."""
 
     @model_validator(mode="after")
     def _not_perfect(self) -> Noise:
@@ -305,16 +350,25 @@ class NoiseOfChannels(_Section):
     """Noise of each channel; the defaults are those of a well-instrumented tractor."""
 
     torque: Noise = Noise(of_mean=0.02, gain=0.01)
+    """[N m]."""
     load: Noise = Noise(relative=0.02, gain=0.01)
+    """[N]."""
     speed: Noise = Noise(relative=0.003, gain=0.002)
+    """[rad/s]."""
     ground_speed: Noise = Noise(relative=0.01, gain=0.003)
+    """[m/s]."""
     draft: Noise = Noise(absolute=60.0, gain=0.01)
+    """[N]."""
     sinkage: Noise = Noise(absolute=0.005)
+    """[m]."""
     pitch: Noise = Noise(absolute=0.003)
+    """[rad]."""
     acceleration: Noise = Noise(absolute=0.02)
+    """[m/s^2]."""
     yaw_rate: Noise = Noise(absolute=0.01)
+    """[rad/s]."""
     slip: Noise = Noise(absolute=0.005)
-    """Of a table that tells slip itself; its gain is the relative error of 1 - slip."""
+    """Of a table that holds slip itself; its gain is the relative error of 1 - slip."""
 
     @field_validator("sinkage", "pitch", "acceleration", "yaw_rate")
     @classmethod
@@ -328,7 +382,9 @@ class Prior(_Section):
     """What is known of a soil parameter beforehand; std = 0 holds it at value."""
 
     value: NonNegativeFloat
+    """Median of the prior."""
     std: NonNegativeFloat
+    """Standard deviation; 0 holds the parameter."""
 
     @model_validator(mode="after")
     def _free_is_positive(self) -> Prior:
@@ -361,11 +417,17 @@ class SoilPrior(_Section):
     """
 
     k_c: Annotated[Prior, _prior(MODULUS_C)] = Prior(value=6.0e3, std=1.2e4)
+    """Cohesive modulus [N/m^(n+1)]."""
     k_phi: Annotated[Prior, _prior(MODULUS_PHI)] = Prior(value=8.0e5, std=1.4e6)
+    """Frictional modulus [N/m^(n+2)]."""
     n: Annotated[Prior, _prior(EXPONENT)] = Prior(value=0.6, std=0.4)
+    """Sinkage exponent."""
     phi: Annotated[Prior, _prior(ANGLE)] = Prior(value=0.40, std=0.20)
+    """Angle of internal friction [rad]."""
     c: Annotated[Prior, _prior(COHESION)] = Prior(value=3.0e3, std=2.0e3)
+    """Cohesion [Pa]."""
     K: Annotated[Prior, _prior(SHEAR_LENGTH)] = Prior(value=0.02, std=0.01)
+    """Shear deformation modulus [m]."""
 
     @model_validator(mode="before")
     @classmethod
@@ -384,7 +446,9 @@ class Estimator(_Section):
     """Window estimation; times s, speeds m/s, lengths m."""
 
     window: Annotated[PositiveFloat, AfterValidator(WINDOW)] = 10.0
+    """Length of a window [s]."""
     hop: PositiveFloat = 1.0
+    """From the end of one window to the next [s]."""
     soil_drift: NonNegativeFloat = 0.015
     """How far the soil may wander in the time of one window, as sd of a relative change."""
     bin: PositiveFloat = 0.1
@@ -394,7 +458,9 @@ class Estimator(_Section):
     max_turn: PositiveFloat = 0.15
     """Relative difference of speeds left and right in a turn above which slip is not judged (turn gate)."""
     z_ref: PositiveFloat = 0.02
+    """Depth of the reported bearing pressure [m]."""
     b_ref: PositiveFloat = 0.3
+    """Plate width of the reported bearing pressure [m]."""
     max_bearing_std: PositiveFloat = 0.10
     """Relative std of the bearing pressure up to which a window counts as excited."""
     max_tan_phi_std: PositiveFloat = 0.15
@@ -418,6 +484,7 @@ class Traversability(_Section):
     """When soilbus says go; draft N, slopes rad."""
 
     max_slip: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.6
+    """Slip that no driven wheel may pass; the largest draft is sought up to it."""
     max_sinkage: PositiveFloat = 0.25
     """Sinkage [m] that no wheel may pass: ground clearance."""
     margin: NonNegativeFloat = 0.15
@@ -461,31 +528,34 @@ class Effect(BaseModel):
 
     model_config = ConfigDict(extra="allow", frozen=True)
     name: str
+    """As in the catalogue (effects.md); further keys are its parameters, each a number or `{ value, std }`."""
 
 
 class Form(_Section):
-    """How far the contact of wheel and soil may differ in form from the model, as root mean squares; 0: not at all.
+    """How far the contact of wheel and soil may differ in form from the model, at most; 0: not at all.
 
     The greatest stress sits at (c1 + c2 s) of the entry angle, where the model has 0.5: c1 is 0.18 in loose and
-    0.43 in compact sand, c2 0.32 in both (Wong & Reece 1967, J. Terramechanics 4:81); an even
-    spread from those to the model's gives 0.32 / sqrt(3) for each.
+    0.43 in compact sand, c2 0.32 in both (Wong & Reece 1967, J. Terramechanics 4:81).  Every form from the model's to
+    the farthest is as likely as any other before a window's data.
     """
 
-    peak: NonNegativeFloat = 0.18
-    """Of c1."""
-    peak_by_slip: NonNegativeFloat = 0.18
-    """Of c2."""
-    exit: NonNegativeFloat = 0.1
-    """Of the exit angle behind the axle over the entry angle: a rut that springs back by the square of it."""
-    shear: NonNegativeFloat = 0.7
-    """Of the share of the strength that the other shear law mobilises: either law as likely as the other."""
+    peak: NonNegativeFloat = 0.32
+    """How much less c1 may be than 0.5."""
+    peak_by_slip: NonNegativeFloat = 0.32
+    """How large c2 may be."""
+    exit: NonNegativeFloat = 0.17
+    """How large the exit angle behind the axle may be, over the entry angle: a rut that springs back by 3 %."""
+    shear: NonNegativeFloat = 1.0
+    """Share of the strength that the other shear law may mobilise: all of it or none, one as likely as the other."""
 
 
 class Model(_Section):
     """The wheel-soil model: base choices and added effects."""
 
     shear_law: Literal["exponential", "rational"] = "exponential"
+    """Janosi-Hanamoto, or the rational law of Xi et al. 2024."""
     effects: list[Effect] = Field(default_factory=list)
+    """Of the catalogue, as `diagnose --model-out` writes them."""
     form: Form = Form()
 
 
@@ -493,6 +563,7 @@ class Output(_Section):
     """What soilbus sends."""
 
     dbc: str = "soilbus.dbc"
+    """Layout of our own frames."""
 
 
 class Config(_Section):

@@ -25,11 +25,11 @@ REPEATED = 3
 class GuardedEstimator:
     """Solves windows with an estimator.
 
-    `first` makes it, in the worker, when it is first needed; `anew` makes another one, that knows nothing.
+    `first` makes it, in the worker, when it is first needed; `again` makes another one, that knows nothing.
     """
 
-    def __init__(self, first: Callable[[], WindowEstimator], anew: Callable[[], WindowEstimator]) -> None:
-        self._first, self._anew = first, anew
+    def __init__(self, first: Callable[[], WindowEstimator], again: Callable[[], WindowEstimator]) -> None:
+        self._first, self._again = first, again
         self._estimator: WindowEstimator | None = None
         self._in_a_row = 0
 
@@ -63,7 +63,7 @@ class GuardedEstimator:
             if self._in_a_row <= REPEATED:
                 log.error("window %d failed: %s", task.index, _where(error))
             if self._in_a_row % REPEATED == 0:
-                self._estimator = self._anew()
+                self._estimator = self._again()
             return _failed(task)
         self._in_a_row = 0
         return result

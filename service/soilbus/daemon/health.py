@@ -1,4 +1,4 @@
-"""Whether the service does its work: systemd is told that it lives only while it does.
+"""Whether the service does its work: systemd hears that it lives only while it does.
 
 A silent bus, or none, is no fault of the service: starting it again would heal nothing.
 """

@@ -1,4 +1,4 @@
-"""What systemd is told: ready, state in the STATUS line, alive, stopping (sd_notify(3))."""
+"""Messages to systemd: ready, state in the STATUS line, alive, stopping (sd_notify(3))."""
 
 from __future__ import annotations
 

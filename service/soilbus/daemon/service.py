@@ -53,7 +53,7 @@ frame taken halts the worker.  No longer where the kernel has its default's room
 LONGEST_CURVE = 60.0
 """Age [s] up to which a valid window's pull over slip serves to watch for immobilisation."""
 FOREIGN_HOLD = 3.0
-"""Seconds for which another sender under our identifiers is told of: until every reader has seen it."""
+"""Seconds for which another sender under our identifiers is reported: until every reader has seen it."""
 INTERRUPTIONS = frozenset(("bus_down", "no_frames", "input_missing", "input_stale", "foreign_sender"))
 """Reasons, beside a bus-off and a fault, for which no window that ended before is believed any more."""
 
@@ -170,7 +170,7 @@ class Service:
                 return
             now = self.clock()
             if self._time.set_ahead(message.timestamp, now):
-                self.intake.begin_anew()
+                self.intake.begin_recording()
             feed(
                 message.timestamp,
                 message.arbitration_id,
@@ -210,10 +210,10 @@ class Service:
 
     def _take(self, result: WindowResult, ended: float) -> None:
         if result.gaps and not (self.result is not None and self.result.gaps):
-            told = ", ".join(f"{channel} {chi2:.2f}" for channel, chi2 in result.gaps.items())
+            shown = ", ".join(f"{channel} {chi2:.2f}" for channel, chi2 in result.gaps.items())
             log.warning(
                 "model_gap: for minutes the model has not described %s (chi-square; 1 is noise); "
-                "record a drive with candump -l and run: soilbus diagnose --config F LOG", told,
+                "record a drive with candump -l and run: soilbus diagnose --config F LOG", shown,
             )  # fmt: skip
         if _kind(result.reason) == "implausible" and (self.result is None or self.result.reason != result.reason):
             log.warning("%s: contradicts the other sensors, not used in this window", result.reason)
@@ -248,7 +248,7 @@ class Service:
         hears = self.bus.is_open and now - self._time.last_frame <= SILENCE
         fault = self._health.fault(now, self._backlog.solving_since, hears, self.bus.counts.sent) or ""
         if fault and fault != self._fault:
-            log.error("fault: %s; systemd is not told any more that all is well", fault)
+            log.error("fault: %s; systemd no longer hears that all is well", fault)
         self._fault = fault
 
     def _totals(self) -> dict[str, int]:

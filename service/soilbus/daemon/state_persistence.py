@@ -25,7 +25,7 @@ FILE = "state.json"
 
 
 class Recalled(NamedTuple):
-    """What another run knew, so many seconds ago."""
+    """What another run knew, and how many seconds ago."""
 
     gaussian: Gaussian
     elapsed: float
@@ -34,7 +34,7 @@ class Recalled(NamedTuple):
 class StatePersistence:
     """Keeps one vehicle's state in a folder; `writer` is a thread of its own, `wall` the time of day [s, Unix].
 
-    A state that cannot be used is one warning, and everything begins anew.  So is a folder
+    A state that cannot be used is one warning, and everything begins afresh.  So is a folder
     that cannot be written: one warning, until it can be again.
     """
 
@@ -74,7 +74,7 @@ class StatePersistence:
         try:
             return read(self._path, self._owner)
         except StateError as error:
-            log.warning("stored state %s is not used, everything begins anew: %s", self._path, error)
+            log.warning("stored state %s is not used, the estimate begins afresh: %s", self._path, error)
             return None
 
     def _write(self, gaussian: Gaussian | None, counts: Mapping[str, int]) -> None:
@@ -96,7 +96,7 @@ class StatePersistence:
         try:
             content = dumped(State(at=at, starts=starts, gaussian=self._stored, totals=dict(totals)), self._owner)
             write_whole(self._path, content)
-        except Exception as error:  # whatever it is, a thread's error would be told to nobody
+        except Exception as error:  # whatever it is, a thread's error would reach nobody
             if not self._fails:
                 why = getattr(error, "strerror", None) or one_line(error)
                 log.warning("state cannot be stored in %s: %s", self._path.parent, why)

@@ -14,7 +14,7 @@ from soilbus.pipeline.result import WindowResult
 MAX_PENDING = 3
 """Windows that may wait for the worker."""
 TIDIED, NEEDED, SPARE = 60, 4_000_000, 2_500_000
-"""After each so many windows memory that is free is given back, but for the bytes that the next window needs, and
+"""Windows after which memory that is free is given back, but for the bytes that the next window needs, and
 those that a day's scattered rests will take."""
 
 
@@ -34,7 +34,7 @@ def wait_for(future: Future[WindowResult], longest: float) -> None:
 class WorkQueue:
     """What `workers` (one thread) has to solve; it works beside the loop, which never waits for it for long.
 
-    `waiting` waits for a future, so many seconds at most.
+    `waiting` waits for a future, for at most the seconds given.
     """
 
     def __init__(

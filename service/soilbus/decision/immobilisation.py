@@ -103,7 +103,7 @@ def _trends(x: Array, series: Sequence[Array], memories: Sequence[float]) -> lis
 
 
 def _estimated(squares: Trend, alike: float) -> float:
-    """Mean of squares of which so many say the same, widened as poorly known of few (as Student's t); inf of none."""
+    """Mean of squares of which this number agree, widened as poorly known of few (as Student's t); inf of none."""
     return squares.mean * (1.0 + 2.0 * alike / squares.n) if squares.n > 0.0 else math.inf
 
 
@@ -210,7 +210,7 @@ CREEP = 4.0
 HOLD = 300.0
 """A peak of the demand is remembered this long [s] at least, and at most twice as long."""
 LONGEST_GAP = 1.0
-"""Silence [s] after which the trends start anew."""
+"""Silence [s] after which the trends start afresh."""
 REMEMBERED = 10.0
 """Age [s] up to which moments are kept for the next curve."""
 SETTLED = 2.0
@@ -294,14 +294,14 @@ def watched(
 
     inertia [N] is the share of the pull that speeds the vehicle up.  None is what is not known.
     Moments may come at any rate.  After LONGEST_GAP without slip, pull or curve the trends start
-    anew, and when time goes back the peaks are forgotten too.  Unknown until the trends have settled.
+    afresh, and when time goes back the peaks are forgotten too.  Unknown until the trends have settled.
     """
     slips = [s for s in slip if s is not None and math.isfinite(s)]
     if not slips or pull is None or not math.isfinite(pull) or curve is None:
-        return before if 0.0 <= t - before.t <= LONGEST_GAP else _anew(before, t)
+        return before if 0.0 <= t - before.t <= LONGEST_GAP else _restarted(before, t)
     step = t - before.t
     if not 0.0 <= step <= LONGEST_GAP:
-        before, step = replace(_anew(before, t), since=t), 0.0
+        before, step = replace(_restarted(before, t), since=t), 0.0
     look = Look(t, sum(slips) / len(slips), pull, pull - inertia)
     reserve = _reserve(curve, look.slip)
     kept = before.recent[bool(before.recent and t - before.recent[0].t > REMEMBERED) :]
@@ -357,7 +357,7 @@ def _ago(recent: Sequence[Look], t: float) -> Look | None:
     return recent[place] if place < len(recent) and recent[place].t - t < LAG else None
 
 
-def _anew(before: Watch, t: float) -> Watch:
+def _restarted(before: Watch, t: float) -> Watch:
     """Nothing remembered but the peaks."""
     return Watch(peaks=before.peaks, asked=before.asked) if t >= before.peaks.since else Watch()
 

@@ -1,8 +1,8 @@
 """Draws of standard normals, and what quantities that are found draw by draw amount to.
 
-A posterior as a few soils, and what its draws have, as foretold from what these soils have.
+A posterior as a few soils, and what its draws have, as predicted from what these soils have.
 
-A polynomial through what the soils have tells each draw's (response surface, Box & Wilson
+A polynomial through what the soils have predicts each draw's (response surface, Box & Wilson
 1951), along the leading principal directions of the logarithms' covariance.  The first of these
 is the ridge on which k_c, k_phi and n replace each other, sd 0.3 to 1.6: along it forces bend
 to and fro, so it has points of its own and a higher degree.  What the leading directions
@@ -186,7 +186,7 @@ class SigmaPoints:
 
 @cache
 def _shares(leading: int, linear: int) -> tuple[Array, NDArray[np.intp]]:
-    """share and mirror of SigmaPoints with so many directions under the polynomial and beside it."""
+    """share and mirror of SigmaPoints with this number of directions under the polynomial and beside it."""
     points = design(leading)
     z = normals(leading + linear, leading)
     fit = np.linalg.pinv(_polynomials(points))

@@ -126,7 +126,7 @@ def observed(before: TractionLoss, motion: Motion, min_speed: float, settings: S
 def missing_pull(loss: TractionLoss, curve: OverSlip, noise: NoiseOfChannels, deviations: float) -> float:
     """Pull [N] that the estimate predicts at the present slip and the wheels surely do not give; 0 where nothing is.
 
-    The innovation P(s) - P, less so many of its standard deviations: of the curve, of the slip by the gain errors of
+    The innovation P(s) - P, less these standard deviations of it: of the curve, of the slip by the gain errors of
     both speeds, and of the draft's gain error.
     """
     known = np.isfinite(curve.pull)

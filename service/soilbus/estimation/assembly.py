@@ -78,7 +78,7 @@ def model_of(config: Config) -> WheelModel:
 
 
 def form_of(config: Config) -> tuple[float, ...]:
-    """How far the form of the contact may be from the model's, as form.FORM: no farther where an effect names it."""
+    """How far the form of the contact may be from the model's, as form.FORM: not at all where an effect names it."""
     named, form = {effect.name for effect in config.model.effects}, config.model.form
     peak = 0.0 if "stress_peak_shift" in named else 1.0
     leave, shear = float("rut_recovery" not in named), float("exponential_shear" not in named)

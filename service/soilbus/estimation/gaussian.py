@@ -195,13 +195,13 @@ class PriorFactor:
 
     def __init__(self, gaussian_prior: Gaussian, prior: SoilPrior, active: NDArray[np.intp]) -> None:
         self._gaussian_prior, self._prior, self._free, self._active = gaussian_prior, prior, prior.free, active
-        kept = np.concatenate([self._free, _SOIL + active])
-        inverse = solve_with_inverse(gaussian_prior.covariance[kept[:, None], kept], np.zeros(len(kept)))
+        unknowns = np.concatenate([self._free, _SOIL + active])
+        inverse = solve_with_inverse(gaussian_prior.covariance[unknowns[:, None], unknowns], np.zeros(len(unknowns)))
         if inverse is None:
             raise ValueError("the prior has no proper covariance")
         self.precision = inverse[1]
         self._mean = np.concatenate([np.log(gaussian_prior.soil[self._free]), gaussian_prior.gains[active]])
-        self._zero_gradient = np.zeros(len(kept))
+        self._zero_gradient = np.zeros(len(unknowns))
         self.least_value = 0.0
         self._is_likelihood_factor = gaussian_prior.k_c_offset is not None and _K_C in self._free
         if self._is_likelihood_factor:

@@ -361,10 +361,10 @@ def _averaged(nodes: list[Node], attainable: Array, coordinates: Coordinates, jo
 
 def _in_coordinates(covariance: Array, directions: Array, free: Indices, active: Indices) -> Array:
     """Covariance (F + A, F + A) of coordinates and active gains, from that of logarithms and all gains."""
-    kept = np.concatenate([free, active])
-    back = np.eye(len(kept))
+    unknowns = np.concatenate([free, active])
+    back = np.eye(len(unknowns))
     back[: len(free), : len(free)] = np.linalg.inv(directions[free])
-    return np.asarray(back @ covariance[np.ix_(kept, kept)] @ back.T)
+    return np.asarray(back @ covariance[np.ix_(unknowns, unknowns)] @ back.T)
 
 
 def _one_sd_above(fine: Array, probability: Array, value: Array) -> float:

@@ -1,17 +1,22 @@
 """What the form of the wheel-soil model leaves open of a window's estimate.
 
 No soil's contact has exactly the configured form: the greatest stress may sit elsewhere than the model has
-it, the rut may come up again behind the axle, the shear strength may be mobilised by the other law.  Along
-a few form parameters f (prior: `Spread`) the window is linear about its optimum,
+it, the rut may come up again behind the axle, the shear strength may be mobilised by the other law.  The forms of
+the literature all lie on one side of the configured one, f = 0, so the prior of the form parameters f
+(`form_prior`) has a mean besides its covariance.  Along f the window is linear about its optimum,
 
     residuals = r + J theta + B f,    prior factor: theta - S_0 f,
 
 with theta the soil's coordinates and the active gains.  The estimate stays that of the configured form, f = 0:
 theta(f) = S f with S = -H^-1 (J' W B - H_0 S_0), H = J' W J + H_0, is what another form would have made of the same
 data (a considered parameter: Schmidt 1966; Tapley, Schutz & Born, Statistical Orbit Determination, 2004,
-ch. 6).  What the residuals tell of f has a mean and a covariance; their second moment M about f = 0
-is how far the estimate may be off by its form, and S M S' adds to its covariance: less than by the prior
-alone where the data speak for the configured form, as much where they cannot tell.
+ch. 6).  The posterior of f, from this prior and the residuals, has a mean and a covariance; their second moment M
+about f = 0 is how far the estimate may be off by its form, and S M S' adds to its covariance: less than by the prior
+alone where the data favour the configured form, as much where they cannot tell.
+
+A reported std is therefore a root mean square about the reported value, and no std about the posterior's mean: where
+the data cannot tell the form, most of the probability lies on one side of the value.  M has the product of the means
+of any two form parameters: a peak before the middle and an exit behind the axle both raise the estimated pressure.
 """
 
 from __future__ import annotations
@@ -35,7 +40,23 @@ if TYPE_CHECKING:
 FORM = ("peak", "peak_by_slip", "exit", "shear")
 """Form parameters: of the angle of greatest stress over the entry angle, of its change with slip, of the exit angle
 behind the axle over the entry angle, and the share of the shear strength that the other law mobilises."""
+SIDE = np.array([-1.0, 1.0, 1.0, 1.0])
+"""Which way the literature's forms lie from the configured one: the peak nearer to the axle, the exit behind it."""
+OF_SQUARE = np.array([1.0 / 12.0, 1.0 / 12.0, 1.0 / 12.0, 1.0 / 4.0])
+"""Variance over the square of the range: even between its ends (1/12), or either end as likely (1/4: a shear law)."""
 _SOIL = len(PARAMETERS)
+
+
+def form_prior(farthest: Sequence[float]) -> tuple[Array, Array]:
+    """Mean (4,) and covariance (4, 4) of the form parameters before any data.
+
+    Parameters
+    ----------
+    farthest
+        How far each of FORM may be from the configured form, whose value is 0; none is negative.
+    """
+    reach = np.asarray(farthest)
+    return SIDE * reach / 2.0, np.diag(OF_SQUARE * reach**2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,13 +72,13 @@ class FormLeft:
     covariance: Array
 
     @classmethod
-    def of(cls, spread: Array, n_gains: int) -> FormLeft:
-        """Before any data: the prior, root mean squares (4,) about the configured form."""
-        return cls(np.zeros((_SOIL + n_gains, len(FORM))), np.zeros(len(FORM)), np.diag(np.asarray(spread) ** 2))
+    def of(cls, farthest: Sequence[float], n_gains: int) -> FormLeft:
+        """Before any data: the prior, see `form_prior`."""
+        return cls(np.zeros((_SOIL + n_gains, len(FORM))), *form_prior(farthest))
 
-    def drifted(self, spread: Sequence[float], share: float) -> FormLeft:
+    def drifted(self, farthest: Sequence[float], share: float) -> FormLeft:
         """Later: the form may have changed by this share of the prior variance, up to all of it."""
-        return replace(self, covariance=self.covariance + min(share, 1.0) * np.diag(np.asarray(spread) ** 2))
+        return replace(self, covariance=self.covariance + min(share, 1.0) * form_prior(farthest)[1])
 
     @property
     def moment(self) -> Array:
@@ -66,9 +87,14 @@ class FormLeft:
 
     @property
     def log_covariance(self) -> Array:
-        """What the form adds to the covariance (6, 6) of the soil's logarithms."""
+        """What the form adds to the covariance (6, 6) of the soil's logarithms about their mean."""
         of_soil = self.by_form[:_SOIL]
-        return np.asarray(of_soil @ self.moment @ of_soil.T)
+        return np.asarray(of_soil @ self.covariance @ of_soil.T)
+
+    @property
+    def log_shift(self) -> Array:
+        """From the soil's logarithms on the configured form to their mean over all forms (6,)."""
+        return np.asarray(self.by_form[:_SOIL] @ self.mean)
 
 
 def formed(model: WheelModel, step: Array) -> WheelModel:

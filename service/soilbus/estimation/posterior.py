@@ -160,11 +160,19 @@ class Posterior:
         covariance[np.ix_(free, free)] = (axes * wide) @ axes.T * np.outer(unit, unit)
         return Posterior(self.soil, covariance)
 
-    def with_added_covariance(self, more: Array, prior: SoilPrior) -> Posterior:
-        """The posterior with a covariance `more` (6, 6) of the logarithms added, as by considered parameters.
+    def with_added_covariance(self, more: Array, prior: SoilPrior, shift: Array | None = None) -> Posterior:
+        """The posterior with a covariance of the logarithms added, as by considered parameters.
 
-        Principal variances of the sum, in units of the prior's, are clipped to 1, or to the greatest that the
-        posterior has itself.
+        Parameters
+        ----------
+        more : (6, 6)
+            Added.  Principal variances of the sum, in units of the prior's, are clipped to 1, or to the greatest
+            that the posterior has itself.
+        prior
+            Of the soil.
+        shift : (6,), optional
+            Of the logarithms, from this soil to the mean.  Then the result is the second moment about this soil: the
+            square of the shift is added, and not clipped, because the prior's variance is about another soil.
         """
         free = prior.free
         if not len(free):
@@ -175,6 +183,8 @@ class Posterior:
         most = max(1.0, float(np.linalg.eigvalsh(own)[-1]))
         covariance = np.zeros_like(self.log_covariance)
         covariance[at] = (axes * np.clip(variance, 0.0, most)) @ axes.T * unit
+        if shift is not None:
+            covariance[at] += np.outer(shift[free], shift[free])
         return Posterior(self.soil, covariance)
 
     def distance(self, soil: Soil) -> float:

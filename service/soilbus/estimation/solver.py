@@ -410,8 +410,8 @@ class Objective:
 
     def prior_jacobian(self, optimum: Optimum) -> Array:
         """Derivatives (R, F + A) of the prior's residuals by coordinates and active gains."""
-        kept = np.concatenate([self.free, _SOIL + self.active])
-        return self.prior_factor.jacobian(optimum.soil, self.parameter_jacobian(optimum)[kept])
+        unknowns = np.concatenate([self.free, _SOIL + self.active])
+        return self.prior_factor.jacobian(optimum.soil, self.parameter_jacobian(optimum)[unknowns])
 
     def second_derivative(self, iterate: Iterate, model: QuadraticModel, step: Array, there: QuadraticModel) -> Array:
         """Second derivative of the residuals (R,) along a step (F + A,), from the models at both of its ends."""

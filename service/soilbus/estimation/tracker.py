@@ -78,7 +78,7 @@ class Settings:
     drift: sd of the logarithm of each soil coordinate after one window; it grows with the
     square root of time.  min_rows: residuals below which a window is not fitted.
     search_rate, search_burst: evaluations of the model that searches may take, see SearchBudget.
-    form: root mean squares by which form.FORM may differ from the configured model's; () leaves none of it open.
+    form: how far each of model_form.FORM may be from the configured model's; () leaves none of it open.
     """
 
     window: float
@@ -398,7 +398,7 @@ class Tracker:
         """What the form of the model leaves open of a fit."""
         if not any(self.settings.form):
             return None
-        joint_prior = fitting.joint_prior.form or FormLeft.of(np.array(self.settings.form), len(fit.gains))
+        joint_prior = fitting.joint_prior.form or FormLeft.of(self.settings.form, len(fit.gains))
         with np.errstate(all="ignore"):
             return form_left(fitting, fit, joint_prior)
 

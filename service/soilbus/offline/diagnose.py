@@ -34,7 +34,7 @@ class Findings:
 
 
 def diagnose_logs(config: Config, logs: Sequence[Path], say: Callable[[str], None] | None = None) -> Findings:
-    """Reads the logs and diagnoses them together; `say` is told what is being done.  With [table] logs are tables.
+    """Reads the logs and diagnoses them together; `say` gets each phase.  With [table] logs are tables.
 
     Raises LogError and TooLittle as recordings_of(), NotFitted where the present model
     cannot be fitted, ConfigError where configuration and database do not fit.

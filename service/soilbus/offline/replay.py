@@ -93,7 +93,7 @@ def _reader(path: Path) -> Any:
 
 
 def log_names(logs: Sequence[Path]) -> list[str]:
-    """What to call each of the logs: as much of the end of its path as tells it from the others.
+    """What to call each of the logs: as much of the end of its path as distinguishes it.
 
     A log that is given twice has its number besides.
     """

@@ -1,8 +1,8 @@
 """Tables of a test rig: rows of steady states, read as what the estimator and the diagnosis work with.
 
-A table tells slip, not speeds.  So the wheel turns at a rim speed of our own choice and the
+A table holds slip, not speeds.  So the wheel turns at a rim speed of our own choice and the
 ground speed follows from the slip: all of the slip's error is in the ground speed.  Nothing
-that depends on the true speed can be told then; see `candidates`.
+that depends on the true speed can be identified then; see `candidates`.
 """
 
 from __future__ import annotations

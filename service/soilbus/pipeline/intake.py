@@ -26,14 +26,14 @@ from soilbus.estimation.assembly import delays_of, rig_of
 from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, Window, forward, inertia_of, pull_given
 from soilbus.pipeline.positions import PositionTrack
 from soilbus.sensors.bins import Bins
-from soilbus.sensors.consistency import Plausibility, without
+from soilbus.sensors.consistency import SensorConsistency, without
 from soilbus.sensors.outliers import OUTLIER
 from soilbus.sensors.rates import resolved_window
 from soilbus.terra.vehicle import slip_ratio
 
 DEFAULT_TIMEOUT = 1.0
 LIMIT_SAMPLES = 3
-"""Reported torque limits of which the median is in force: one wild sample moves nothing."""
+"""Reported torque limits of which the median is in force: one outlier moves nothing."""
 COVERAGE_BLOCK = 0.5
 MIN_COVERAGE = 0.95
 SLIP_SPAN = 0.3
@@ -98,8 +98,8 @@ class Refusals:
         for reason, n in decoded.untimed.items():
             self.total[str(reason)] += n
 
-    def note_wild(self, times: Array) -> None:
-        """Take note of samples that were used until they were found wild."""
+    def note_outliers(self, times: Array) -> None:
+        """Take note of samples that were used until they were found to be outliers."""
         self.note(OUTLIER, times)
         self.used -= len(times)
 
@@ -122,7 +122,7 @@ class ReportedLimits:
     """Greatest torque [N m] that each motor has reported, else the configured one (W,), nan where neither is known.
 
     What a motor has reported holds until it reports another limit, however long it is silent and whatever becomes of
-    the clock.  The median of the last few samples is not moved by a wild one.
+    the clock.  The median of the last few samples is not moved by an outlier.
     """
 
     def __init__(self, wheels: Sequence[str], configured: Sequence[float]) -> None:
@@ -160,7 +160,7 @@ class Intake:
 
     Channels that are late by their `delay` and by `delays` [s] by quantity (those of the
     configuration's effects where none are given) are put beside what was true with them: all
-    others wait for the latest one.  So each window is whole, and tells of as long before its
+    others wait for the latest one.  So each window is whole, and is of as long before its
     end; whether a channel is fresh goes by the stamps of its frames.  Raises ConfigError where
     configuration and database do not fit.
     """
@@ -175,7 +175,7 @@ class Intake:
         self._positions = PositionTrack(
             {c.name: c.timeout or DEFAULT_TIMEOUT for c in self.channels if c.quantity in POSITION_ROLES}
         )
-        self._plausibility = Plausibility(self.rig, self.channels, database, config.estimator)
+        self._consistency = SensorConsistency(self.rig, self.channels, database, config.estimator)
         of_effects = delays_of(config) if delays is None else delays
         late = {c.name: c.delay + of_effects.get(c.quantity, 0.0) for c in self.channels}
         self._latest = max([0.0, *late.values()])
@@ -190,7 +190,7 @@ class Intake:
         self._ready: list[WindowTask] = []
         self._bins: Bins | None = None
         self._restart()
-        self.admission.at_break = self.begin_anew
+        self.admission.at_break = self.begin_recording
 
     def of_another_recording(self) -> Intake:
         """An intake that knows nothing of what this one heard; both count windows, frames and refusals together."""
@@ -204,7 +204,7 @@ class Intake:
             return channel.wheel in self.rig.wheels and channel.quantity in ("torque", "speed", "load")
         return channel.quantity not in OPTIONAL_ROLES
 
-    def begin_anew(self) -> None:
+    def begin_recording(self) -> None:
         """What comes next is a recording of its own: its clock was set, or the bus was silent for long."""
         ready = self.finish(self.admission.newest)
         self._restart()
@@ -215,7 +215,7 @@ class Intake:
         self._bins = None
         self._fresh = True
         self._positions.forget()
-        self._plausibility.forget()
+        self._consistency.forget()
         self._limits.forget_times()
         self._lying: tuple[str, ...] = ()
         self.next_end = math.inf
@@ -223,10 +223,10 @@ class Intake:
         self._newest = -math.inf  # stamp of the latest sample, admitted or refused
 
     def _screen_the_rest(self) -> None:
-        """Count the wild samples that came after the last window too."""
+        """Count the outliers that came after the last window too."""
         if self._bins is not None:
             self._bins.window(self._newest, self._newest + self._bins.bin_length)
-            self.refusals.note_wild(self._bins.new_wild())
+            self.refusals.note_outliers(self._bins.new_outliers())
 
     def ingest(self, until: float = math.inf) -> None:
         """Decode the frames filed so far that are older than `until` [s] and put them into bins."""
@@ -247,7 +247,7 @@ class Intake:
         for name in heard.keys() & self._waits.keys():
             t, value = heard[name]
             heard[name] = t + self._waits[name], value
-        self._plausibility.add(heard)
+        self._consistency.add(heard)
         if self._bins is not None:
             self._bins.add({name: samples for name, samples in heard.items() if name in self._binned})
 
@@ -275,7 +275,7 @@ class Intake:
         return tasks
 
     def taken_whole(self) -> Window | None:
-        """All that was ingested since the clock was last set, as one window; what comes later begins anew.
+        """All that was ingested since the clock was last set, as one window; what comes later is another recording.
 
         Its bins are as short as the recording's spectrum asks for (see `resolution`); the one
         that has just begun is left out.  None where there is no sample.
@@ -285,14 +285,14 @@ class Intake:
         if bins is not None and end - bins.origin >= bins.bin_length:
             end = bins.origin + math.floor((end - bins.origin) / bins.bin_length) * bins.bin_length
             window = forward(resolved_window(bins, end))
-            self.refusals.note_wild(bins.new_wild())
+            self.refusals.note_outliers(bins.new_outliers())
         self._restart()
         return window
 
     def _task(self, bins: Bins, end: float) -> WindowTask:
         start = end - self._settings.window
-        window, self._lying = self._plausibility.screened(forward(bins.window(start, end)))
-        self.refusals.note_wild(bins.new_wild())
+        window, self._lying = self._consistency.checked(forward(bins.window(start, end)))
+        self.refusals.note_outliers(bins.new_outliers())
         missing = tuple(c.name for c in self.needed if c.name not in self.last_seen)
         covered = dict(zip(self.rig.channels, coverage(window).tolist(), strict=True))
         badly_covered = [c.name for c in self.needed if covered[c.name] < MIN_COVERAGE]
@@ -317,7 +317,7 @@ class Intake:
         self._index += 1
         bins.drop_before(start + self._settings.hop)
         self._positions.drop_before((start + end) / 2.0 + self._settings.hop)
-        self._plausibility.drop_before(start + self._settings.hop)
+        self._consistency.drop_before(start + self._settings.hop)
         self._limits.drop_before(end)
         return task
 

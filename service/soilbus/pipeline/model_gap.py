@@ -21,7 +21,7 @@ SPAN = 120.0
 LEAST_SPAN = 60.0
 """Seconds of windows that there must be."""
 LIMIT = 1.15
-"""Reduced chi-square of a channel from which a gap is told."""
+"""Reduced chi-square of a channel from which a gap is reported."""
 DEVIATIONS = 5.0
 """Standard deviations of it beyond 1 that it must be besides."""
 
@@ -51,7 +51,7 @@ class GapWatch:
         self._seen: deque[tuple[float, Mapping[str, Square]]] = deque()
 
     def forget(self) -> None:
-        """Begin anew."""
+        """Begin afresh."""
         self._seen.clear()
 
     def take(self, end: float, found: Mapping[str, Square]) -> None:

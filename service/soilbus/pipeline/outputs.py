@@ -51,16 +51,16 @@ HOP_FRAMES = (
 
 
 def check_cycle_times(config: Config, database: Database) -> None:
-    """Raises ConfigError where frames would come less often than the DBC tells their readers (GenMsgCycleTime).
+    """Raises ConfigError where frames would come less often than the DBC promises their readers (GenMsgCycleTime).
 
     Readers judge silence by it, and would take each pause for the end of soilbus.
     """
-    told = {m.name: (m.cycle_time or math.inf) / 1e3 for m in database.messages}
+    promised = {m.name: (m.cycle_time or math.inf) / 1e3 for m in database.messages}
     faults = []
     for frames, every in ((FAST_FRAMES, TICK), (HOP_FRAMES, config.estimator.hop)):
-        if late := [name for name in frames if told[name] < every * (1.0 - 1e-9)]:
+        if late := [name for name in frames if promised[name] < every * (1.0 - 1e-9)]:
             faults.append(
-                f"output.dbc: {config.output.dbc} promises {', '.join(late)} every {1e3 * told[late[0]]:g} ms, but"
+                f"output.dbc: {config.output.dbc} promises {', '.join(late)} every {1e3 * promised[late[0]]:g} ms, but"
                 f" soilbus sends every {1e3 * every:g} ms: set GenMsgCycleTime in a copy of the DBC that both sides use"
                 + (", or a shorter estimator.hop" if frames is HOP_FRAMES else "")
             )

@@ -31,7 +31,7 @@ class Pipeline:
     def __init__(self, config: Config, database: Database) -> None:
         self.config, self.database = config, database
         self._hear_with(Intake(config, database))
-        completion_of(config)  # its faults are told now, and not when the estimator is made
+        completion_of(config)  # its faults are raised now, and not when the estimator is made
 
     def _hear_with(self, intake: Intake) -> None:
         self.intake, self.admission, self.feed = intake, intake.admission, intake.admission.feed

@@ -11,7 +11,7 @@ from soilbus.arrays import Array
 from soilbus.terra.earth import wrapped
 
 SMOOTHING = 1.0
-"""Fixes up to so many seconds before and after share in a position: receivers are noisy."""
+"""Fixes up to this number of seconds before and after share in a position: receivers are noisy."""
 NO_FIX = 1e-9
 """Angle [rad] below which a coordinate is zero: what receivers send before they have a fix."""
 
@@ -35,7 +35,7 @@ class PositionTrack:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew."""
+        """Begin afresh."""
         self._fixes: dict[str, tuple[Array, Array]] = dict.fromkeys(self._timeout, (np.zeros(0), np.zeros(0)))
 
     def copy(self) -> PositionTrack:

@@ -144,14 +144,14 @@ def effect_lines(config: Config) -> list[str]:
 def _row(channel: Channel, database: Database, unit_assumed: bool, checked: bool) -> tuple[str, ...]:
     message = database.get_message_by_name(channel.message)
     signal = message.get_signal_by_name(channel.signal)
-    status = "SI assumed: the DBC tells no unit" if unit_assumed else "ok"
+    status = "SI assumed: the DBC gives no unit" if unit_assumed else "ok"
     if channel.valid_signal:
         status += f", valid while {channel.valid_signal} is {'/'.join(map(str, channel.valid_values))}"
     if channel.delay:
         status += f", late by {channel.delay:g} s"
     if checked:
         status += ", counter and CRC required"
-    every = f"{message.cycle_time} ms" if message.cycle_time else "not told"
+    every = f"{message.cycle_time} ms" if message.cycle_time else "not given"
     return (
         channel.name,
         f"{channel.message}.{channel.signal}",
@@ -164,7 +164,7 @@ def _row(channel: Channel, database: Database, unit_assumed: bool, checked: bool
 
 
 def identifiable(config: Config) -> list[tuple[str, str]]:
-    """(parameter, verdict) for each soil parameter: told by which sensors, or why not."""
+    """(parameter, verdict) for each soil parameter: determined by which sensors, or why not."""
     rig = rig_of(config)
     held = {name for name, prior in config.soil_prior.items() if prior.std == 0.0}
     if config.table is not None:

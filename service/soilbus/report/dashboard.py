@@ -53,8 +53,8 @@ def panel(known: Readings, fault: str = "") -> Panel:
     ground, task = (Table.grid(padding=(0, 4)) for _ in range(2))
     ground.add_row(_soil(known), _wheels(known))
     task.add_row(_limits(known), _advice(known))
-    told = (Text("  ".join(words)) for words in (_detail(known), _demand(known)))
-    parts = (head, _warning(known), *told, Text(" ".join(_kind(known))), Text(""))
+    lines = (Text("  ".join(words)) for words in (_detail(known), _demand(known)))
+    parts = (head, _warning(known), *lines, Text(" ".join(_kind(known))), Text(""))
     service, bus = (Text("  ".join(words)) for words in (_service(known), _bus(known)))
     last = (Text(""), task, Text(""), service, Text(f"bus: away ({fault})") if fault else bus)
     return Panel(Group(*parts, ground, *last), title="soilbus", width=WIDTH)
@@ -173,8 +173,8 @@ def _one(known: Readings, message: str, signal: str, form: str) -> Text:
 
 def _pair(known: Readings, message: str, signal: str, std: str | None = None) -> Text:
     value, spread = known.number(message, signal), known.number(message, std or f"{signal}Std")
-    told = "-" if value is None or spread is None else f"{_figures(value, spread)}"
-    return Text(told, style="" if known.is_valid(message) else "dim")
+    figure = "-" if value is None or spread is None else f"{_figures(value, spread)}"
+    return Text(figure, style="" if known.is_valid(message) else "dim")
 
 
 def _figures(value: float, spread: float) -> str:

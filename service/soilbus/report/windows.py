@@ -92,7 +92,7 @@ def _by_log(results: Sequence[WindowResult]) -> list[str]:
 
 
 def counted(counts: Counter[str]) -> str:
-    """As in "wild 3, stale 1", the most frequent first; "none" without any."""
+    """As in "outlier 3, stale 1", the most frequent first; "none" without any."""
     return ", ".join(f"{name} {n}" for name, n in counts.most_common()) or "none"
 
 

@@ -15,15 +15,15 @@ from soilbus.estimation.window import NoiseTable, Rig, Window, made_window
 from soilbus.sensors.outliers import SIDE, Samples, joined, outlier_test
 
 GLIMPSE_BACK = 1.0
-"""Samples of so many seconds before a glimpse help to judge those in it."""
+"""Seconds before a glimpse whose samples help to judge those in it."""
 
 
 class Bins:
     """Sums and counts of samples by bin and channel, over a sliding span of time.
 
     Bins are counted from `origin`; each sample is added once, however many windows it
-    ends up in.  Wild samples (see `screening`) are left out; one that looks wild among the
-    last four of its channel is judged anew when more is known.
+    ends up in.  Outliers (see `outliers`) are left out; one that looks like an outlier among the
+    last four of its channel is judged again when more is known.
     """
 
     def __init__(self, rig: Rig, bin_length: float, origin: float) -> None:
@@ -35,7 +35,7 @@ class Bins:
         self._first = 0
         self._totals = np.zeros((3, 0, len(self._index)))  # count, sum of values, sum of times
         self._recent: list[Samples] = []
-        self._wild: list[Array] = []
+        self._outliers: list[Array] = []
 
     def add(self, samples: Mapping[str, tuple[Array, Array]]) -> None:
         """Add samples (t [s], value in SI; both (N,)) by channel; those before the span are dropped."""
@@ -50,12 +50,12 @@ class Bins:
     def window(self, start: float, end: float) -> Window:
         """The bins from start to end [s], both rounded to whole bins."""
         low, high = self._span(start, end)
-        samples, wild, later = outlier_test(self._taken(high), self._noise.sd)
+        samples, outlier, later = outlier_test(self._taken(high), self._noise.sd)
         new = ~samples.settled
-        self._totals = self._with(self._totals, samples.pick(new & ~wild), high)
-        again = new & wild & (later < SIDE)
-        if wild.any():
-            self._wild.append(samples.t[new & wild & ~again] + self.origin)
+        self._totals = self._with(self._totals, samples.pick(new & ~outlier), high)
+        again = new & outlier & (later < SIDE)
+        if outlier.any():
+            self._outliers.append(samples.t[new & outlier & ~again] + self.origin)
         settled = samples._replace(settled=~again)
         self._recent.append(settled.pick(later < 2 * SIDE))
         return self._made(self._totals, low, high)
@@ -67,21 +67,21 @@ class Bins:
         samples = self._taken(high)
         self._recent = recent
         near = self._bins(samples) >= low - round(GLIMPSE_BACK / self.bin_length)
-        samples, wild, _ = outlier_test(samples.pick(near), self._noise.sd)
-        totals = self._with(self._totals.copy(), samples.pick(~(samples.settled | wild)), high)
+        samples, outlier, _ = outlier_test(samples.pick(near), self._noise.sd)
+        totals = self._with(self._totals.copy(), samples.pick(~(samples.settled | outlier)), high)
         return self._made(totals, low, high)
 
     def screened(self, end: float) -> Samples:
-        """The samples before `end` [s] that are not wild, their times [s] counted from `origin`; nothing is decided."""
+        """The samples before `end` [s] but outliers, their times [s] counted from `origin`; nothing is decided."""
         recent = list(self._recent)
-        samples, wild, _ = outlier_test(self._taken(round((end - self.origin) / self.bin_length)), self._noise.sd)
+        samples, outlier, _ = outlier_test(self._taken(round((end - self.origin) / self.bin_length)), self._noise.sd)
         self._recent = recent
-        return samples.pick(~wild)
+        return samples.pick(~outlier)
 
-    def new_wild(self) -> Array:
-        """Times [s] of the samples found wild for good since the last call, ascending."""
-        found = np.sort(np.concatenate([np.zeros(0), *self._wild]))
-        self._wild.clear()
+    def new_outliers(self) -> Array:
+        """Times [s] of the samples found to be outliers for good since the last call, ascending."""
+        found = np.sort(np.concatenate([np.zeros(0), *self._outliers]))
+        self._outliers.clear()
         return found
 
     def drop_before(self, t: float) -> None:

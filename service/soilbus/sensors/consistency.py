@@ -1,18 +1,12 @@
-"""Series of a window's bins: sums, changes, and what lasts.
+"""Which sensor contradicts the others, though each of its readings is plausible by itself.
 
-One window as the checks of plausibility see it.
+    slip s = 1 - V/(r omega), traction mu = T/(r W), weight: sum of W = m g cos(pitch) + draft's part,
+    acceleration: dV/dt = a, balance: sum of T/r rises where draft + slope + inertia rises.
 
-Sensors that lie about how what they measure changes: against each other, or by another measure.
-
-Which sensor lies: readings plausible each by itself, but not beside the others.
-
-A window of bins is judged as a whole, on the instants at which the vehicle drives straight
-on, and only what is sustained counts.  Thresholds lie beyond what any soil, slope, driver or
-effect of `terra.effects` makes of good sensors; a lie that a soil could tell (a draft somewhat
-off, one wheel that slips more) is left to the model, which then does not fit.  Each check sees
-the window without the channels that an earlier one has named.
-
-The intake's own ear for sensors that lie: what `estimation.plausibility` must know besides the window.
+A window of bins is checked as a whole, on the instants at which the vehicle drives straight on, and only what lasts
+counts.  Thresholds lie beyond what any soil, slope, driver or effect of `terra.effects` makes of good sensors; a fault
+that a soil could imitate (a draft somewhat off, one wheel that slips more) is left to the model, which then does not
+fit.  Each check sees the window without the channels that an earlier one has named.
 """
 
 from __future__ import annotations
@@ -42,6 +36,486 @@ from soilbus.estimation.window import (
 )
 from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads, slip_ratio
 
+SUSTAINED = 1.0
+"""Seconds for which a contradiction must last."""
+DEVIATIONS = 5.0
+"""Standard deviations by which a change must stand out of the noise to count as one."""
+FALSE_SLIP = 0.12
+"""Slip that a wrong rolling radius may feign: four of its standard deviations in `terra.effects`."""
+LAG = 1.0
+"""Seconds over which changes are compared."""
+OPPOSITE = 0.85
+"""Share of significant changes that go the wrong way."""
+CORRELATION = -0.9
+"""Their correlation, at most."""
+LEAST_SLOWING, LEAST_PULLING = 2.0, 4.0
+"""Seconds of significant changes, one after the other, that there must be of speed and of pull: at the border of a
+soft soil a driver who lifts the implement may pull less and drive more for a moment."""
+LEAST_FORCE, LEAST_SPEED = 0.01, 0.05
+"""Changes of force, as a share of the weight, and of speed [m/s] below which none is significant."""
+COMPARED, CHANGING = 3.0, 0.06
+"""Seconds over which speed and acceleration are compared, and rms of the changes of speed [m/s] that there must be."""
+TOGETHER, MAY_BE, KNOWN = 0.985, 0.9, 0.9
+"""Their correlation at the best delay, at least, and at another one that may be theirs; share of bins with both."""
+OTHER_SCALE = math.log(1.35)
+"""Logarithm of the ratio of their changes from which they contradict each other."""
+AT_ONCE, ABOUT, JUMP, UNEXPLAINED = 0.3, 0.6, 0.25, 0.25
+"""A jump: at least JUMP [m/s] in AT_ONCE [s], of which the acceleration within ABOUT [s] of it explains less than
+the share UNEXPLAINED."""
+SAME = 1e-12
+"""Relative difference of means of equal readings: rounding."""
+CHANCE = 1e-12
+"""Chance, by the noise that the sensor is said to have, below which a run of equal readings is a frozen sensor."""
+COARSE = 0.1
+"""Share of repeated readings elsewhere in the window by which a sensor is coarser than its signal, not frozen."""
+STILL_SHARE = 0.1
+"""Rim speed, as a share of the ground speed, below which a wheel does not turn."""
+BRAKED = 0.2
+"""Braking torque over load and radius from which a wheel may be locked."""
+GEAR_SLACK = 0.03
+"""Relative difference of motor and wheel speed that gear and radius of the wheel's sensor may have."""
+LEAST_TURN = 0.02
+"""Difference [rad/s] of the two that resolution and phase may make besides."""
+NO_TRACTION, TRACTION = 0.01, 0.15
+"""Torque over load and radius of a wheel that drives nothing (any soil resists more), and of one that surely drives."""
+ODD_SLIP = 0.2
+"""Distance from the other wheels' slip that speaks against the wheel's speed rather than its torque."""
+LOAD_SUM = 0.15
+"""Share of the weight by which the loads' sum must be wrong; lost zeros and what is carried stay below it."""
+LOAD_AXLE = 0.05
+"""Share of the weight by which the load transfer of an axle without fault may be wrong."""
+LOAD_SIDE = 0.10
+"""Share of an axle's load by which its left and right must differ more than the other axle's for one to be named."""
+ANY_LOAD = 0.6
+"""Wrong share of the weight that nothing carried explains, so that all load cells are wrong."""
+MOTOR_SPEED = "motor_speed"
+
+
+class Resolution(NamedTuple):
+    """Step [SI] between two readings of a channel (0: none), and whether it reads 0 at rest or without load."""
+
+    step: float
+    rests_at_zero: bool
+
+
+class ConsistencyInput(NamedTuple):
+    """One window as the checks see it: bins of length `bin` [s]; driving (N,), slip and traction (N, W).
+
+    traction is torque over load and radius; both are nan where unknown, slip also where the vehicle
+    does not drive straight on.  motor_speed [rad/s] (N, W) is at the wheel's side of the gear.
+    """
+
+    window: Window
+    rig: Rig
+    bin: float
+    driving: Mask
+    slip: Array
+    traction: Array
+    motor_speed: Array
+    resolution: Mapping[str, Resolution]
+
+    @property
+    def sustained(self) -> int:
+        """Bins for which a contradiction must last."""
+        return max(round(SUSTAINED / self.bin), 1)
+
+
+class Checked(NamedTuple):
+    """A window without the channels that lie in it, and which these are."""
+
+    window: Window
+    implausible: tuple[str, ...]
+
+
+class SensorConsistency:
+    """Judges windows; the speeds of the motors, which no estimate needs, are kept here."""
+
+    def __init__(self, rig: Rig, channels: Iterable[Channel], database: Database, settings: Estimator) -> None:
+        self._rig, self._settings = rig, settings
+        listed = tuple(channels)
+        self._resolution = {c.name: resolution_of(c, database) for c in listed}
+        self._motors = [w for w in rig.wheels if any(c.name == f"{MOTOR_SPEED}.{w}" for c in listed)]
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget what was heard."""
+        self._heard: dict[str, list[tuple[Array, Array]]] = {wheel: [] for wheel in self._motors}
+
+    def add(self, samples: Mapping[str, tuple[Array, Array]]) -> None:
+        """Samples (t [s], value in SI; both (N,)) by channel; only the motors' speeds are kept."""
+        for wheel, heard in self._heard.items():
+            if found := samples.get(f"{MOTOR_SPEED}.{wheel}"):
+                heard.append(found)
+
+    def checked(self, window: Window) -> Checked:
+        """A forward window (`window.forward`) without what lies in it."""
+        s = self._settings
+        names = implausible(
+            window, self._rig, s.min_speed, s.max_turn, s.bin, self._resolution, self._motor_speed(window)
+        )  # fmt: skip
+        return Checked(without(window, self._rig, set(names)), names)
+
+    def drop_before(self, t: float) -> None:
+        """Forget what was heard before t [s]."""
+        for wheel, heard in self._heard.items():
+            self._heard[wheel] = [part for part in heard if part[0][-1] >= t]
+
+    def _motor_speed(self, window: Window) -> Array | None:
+        """Mean speeds [rad/s] of the motors in the window's bins (N, W), forward; nan where unknown."""
+        if not self._motors or not len(window.t):
+            return None
+        n = len(window.t)
+        speed = np.full((n, len(self._rig.wheels)), np.nan)
+        begin = window.t[0] - self._settings.bin / 2.0
+        for wheel, heard in self._heard.items():
+            if not heard:
+                continue
+            t, value = (np.concatenate(parts) for parts in zip(*heard, strict=True))
+            bins = np.floor((t - begin) / self._settings.bin + 1e-6).astype(np.intp)
+            inside = (bins >= 0) & (bins < n)
+            count = np.bincount(bins[inside], minlength=n)
+            total = np.bincount(bins[inside], np.abs(value[inside]), minlength=n)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                speed[:, self._rig.wheels.index(wheel)] = total / count
+        return speed
+
+
+def resolution_of(channel: Channel, database: Database) -> Resolution:
+    """The step of a channel's signal in SI, and whether zero is the end of its range."""
+    signal = database.get_message_by_name(channel.message).get_signal_by_name(channel.signal)
+    step = 0.0 if signal.conversion.is_float else abs(channel.factor * float(signal.scale))
+    ends = (signal.minimum, signal.maximum)
+    unsigned = not signal.is_signed and float(signal.offset) == 0.0
+    return Resolution(step, unsigned or any(end is not None and float(end) == 0.0 for end in ends))
+
+
+def implausible(
+    window: Window,
+    rig: Rig,
+    min_speed: float,
+    max_turn: float,
+    bin_length: float,
+    resolution: Mapping[str, Resolution],
+    motor_speed: Array | None = None,
+) -> tuple[str, ...]:
+    """Channels of a forward window (see `window.forward`) that lie in it, in the order of rig.channels.
+
+    min_speed [m/s] and max_turn as the estimator's gates; resolution by channel name;
+    motor_speed [rad/s] (N, W), nan where unknown, may be named as "motor_speed.FL".
+    """
+    motor = np.full(window.speed.shape, np.nan) if motor_speed is None else motor_speed
+    data = consistency_input(window, rig, min_speed, max_turn, bin_length, resolution, motor)
+    if not data.driving.any():
+        return ()
+    named: set[str] = set()
+    for check in CHECKS:
+        if found := set(check(data)):
+            named |= found
+            window = without(window, rig, found)
+            motor = np.where([f"motor_speed.{w}" in found for w in rig.wheels], np.nan, motor)
+            data = consistency_input(window, rig, min_speed, max_turn, bin_length, resolution, motor)
+    order = (*rig.channels, *(f"motor_speed.{w}" for w in rig.wheels))
+    return tuple(name for name in order if name in named)
+
+
+def without(window: Window, rig: Rig, channels: set[str]) -> Window:
+    """The window without any reading of these channels."""
+    values: dict[str, Array] = {}
+    for name in channels & set(rig.channels):
+        quantity, _, wheel = name.partition(".")
+        values.setdefault(quantity, getattr(window, quantity).copy())
+        values[quantity][..., rig.wheels.index(wheel) if wheel else slice(None)] = np.nan
+    changed: dict[str, Any] = values
+    return replace(window, **changed) if changed else window
+
+
+def consistency_input(
+    window: Window,
+    rig: Rig,
+    min_speed: float,
+    max_turn: float,
+    bin_length: float,
+    resolution: Mapping[str, Resolution],
+    motor_speed: Array,
+) -> ConsistencyInput:
+    """What the checks need of a window."""
+    driving = (window.ground_speed > min_speed) & ~turning(window, rig, max_turn)
+    ground = np.where(driving, window.ground_speed, np.nan)[:, None]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        traction = np.where(window.load > 0.0, window.torque / (rig.radius * window.load), np.nan)
+    slip = slip_ratio(rig.radius, window.speed, ground)
+    return ConsistencyInput(window, rig, bin_length, driving, slip, traction, motor_speed, resolution)
+
+
+def frozen(data: ConsistencyInput) -> Iterator[str]:
+    """Channels that read the very same for longer than their noise allows, while the vehicle drives."""
+    window, rig = data.window, data.rig
+    quantities = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
+    value = np.column_stack([getattr(window, q) for q in quantities])
+    with np.errstate(invalid="ignore"):
+        same = np.abs(np.diff(value, axis=0)) <= SAME * np.abs(value[1:])
+    same &= data.driving[1:, None]
+    often = np.flatnonzero(same.sum(axis=0) >= data.sustained).tolist()
+    if not often:
+        return
+    variance = np.column_stack([window.variance[q] for q in quantities])
+    for i in often:
+        name = rig.channels[i]
+        noise, resolution = rig.noise[name.partition(".")[0]], data.resolution.get(name, Resolution(0.0, False))
+        stretches = [(first, last) for first, last in runs(same[:, i]) if last - first >= data.sustained]
+        within = sum(last - first for first, last in stretches)
+        if same[:, i].sum() - within > COARSE * (np.isfinite(value[:, i]).sum() - within):
+            continue
+        if any(_stuck(float(value[a, i]), variance[a : b + 1, i], noise, resolution) for a, b in stretches):
+            yield name
+
+
+def _stuck(value: float, variance: Array, noise: SensorNoise, resolution: Resolution) -> bool:
+    """Whether noise would have moved a reading that is the same in bins of these variances (N,).
+
+    At most, where the truth is in the middle of the reading's step, noise leaves one sample
+    in it with the chance erf(step / (2 sqrt(2) sd)).
+    """
+    of_sample = noise.absolute**2 + (noise.relative**2 + noise.of_mean**2) * value**2
+    if of_sample == 0.0 or (resolution.rests_at_zero and abs(value) <= resolution.step):
+        return False
+    samples = float((of_sample / variance).sum())
+    same = math.erf(resolution.step / (2.0 * math.sqrt(2.0 * of_sample)))
+    return (samples - 1.0) * math.log(max(same, CHANCE)) < math.log(CHANCE)
+
+
+def standing_wheels(data: ConsistencyInput) -> Iterator[str]:
+    """Speeds of wheels that stand, unbraked, while the vehicle drives; the ground speed where all of them rest."""
+    window, rig = data.window, data.rig
+    ground = window.ground_speed[:, None]
+    with np.errstate(invalid="ignore"):
+        still = data.driving[:, None] & (rig.radius * window.speed < STILL_SHARE * ground)
+        braked = data.traction < -BRAKED
+        idle = np.abs(data.traction) < NO_TRACTION
+    if lasts(np.logical_and.reduce(still & idle, axis=1), data.sustained):
+        yield "ground_speed"
+        return
+    for i, wheel in enumerate(rig.wheels):
+        if lasts(still[:, i] & ~braked[:, i], data.sustained):
+            yield f"speed.{wheel}"
+
+
+def gear_ratio(data: ConsistencyInput) -> Iterator[str]:
+    """Of a wheel and its motor, whose speeds do not go together, the one farther from the other wheels'.
+
+    Both, where this is so of most wheels: the gear ratio may be wrong, and the torques with it.
+    """
+    window, rig, motor = data.window, data.rig, data.motor_speed
+    with np.errstate(invalid="ignore"):
+        noise = np.sqrt(2.0 * window.variance["speed"])
+        apart = np.abs(motor - window.speed) > GEAR_SLACK * np.abs(window.speed) + DEVIATIONS * noise + LEAST_TURN
+    apart &= data.driving[:, None]
+    wrong = [i for i in range(len(rig.wheels)) if lasts(apart[:, i], data.sustained)]
+    good = [i for i in range(len(rig.wheels)) if i not in wrong]
+    for i in wrong:
+        if len(wrong) > len(good):
+            yield f"speed.{rig.wheels[i]}"
+            yield f"motor_speed.{rig.wheels[i]}"
+            continue
+        where = apart[:, i]
+        usual = median((rig.radius * window.speed)[where][:, good])
+        of_motor, of_wheel = (abs(median(rig.radius[i] * s[where, i]) - usual) for s in (motor, window.speed))
+        yield f"{'motor_speed' if of_motor > of_wheel else 'speed'}.{rig.wheels[i]}"
+
+
+def load_sum(data: ConsistencyInput) -> Iterator[str]:
+    """The load that alone explains why the loads do not add up to the weight; all of them where nothing else can."""
+    window, rig, chassis = data.window, data.rig, data.rig.chassis
+    if chassis is None or set(rig.front.tolist()) != {True, False}:
+        return
+    weight = chassis.mass * GRAVITY
+    excess = _axle_excess(window, rig, chassis) / weight
+    total = excess.sum(axis=1)
+    with np.errstate(invalid="ignore"):
+        wrong = data.driving & (np.abs(total) > LOAD_SUM)
+    if not lasts(wrong, data.sustained):
+        return
+    front, rear = np.median(excess[wrong], axis=0)
+    if not -ANY_LOAD < front + rear < ANY_LOAD:
+        yield from (f"load.{wheel}" for wheel in rig.wheels)
+        return
+    if min(abs(front), abs(rear)) > LOAD_AXLE:
+        return  # something is carried
+    of_axle = [np.flatnonzero(rig.front), np.flatnonzero(~rig.front)]
+    bad, sound = of_axle if abs(front) > abs(rear) else of_axle[::-1]
+    if len(bad) == len(sound) == 2:
+        left, other = (
+            median(window.load[wrong][:, axle[0]] / window.load[wrong][:, axle].sum(axis=1)) for axle in (bad, sound)
+        )
+        if abs(left - other) > LOAD_SIDE:
+            heavier = 0 if left > other else 1
+            yield f"load.{rig.wheels[bad[heavier if front + rear > 0.0 else 1 - heavier]]}"
+
+
+def _axle_excess(window: Window, rig: Rig, chassis: Chassis) -> Array:
+    """By how much [N] the loads on front and rear axle exceed those of mass, draft, slope and inertia, (N, 2)."""
+    draft, pitch, acceleration = (zero_if_unknown(a) for a in (window.draft, window.pitch, window.acceleration))
+    due = np.stack(axle_loads(chassis, draft, pitch, acceleration), axis=1)
+    reported = np.stack([window.load[:, rig.front].sum(axis=1), window.load[:, ~rig.front].sum(axis=1)], axis=1)
+    return np.asarray(reported - due)
+
+
+def acceleration_sign(data: ConsistencyInput) -> Iterator[str]:
+    """The acceleration, where it says that the vehicle slows down whenever it speeds up."""
+    window = data.window
+    lag = max(round(LAG / data.bin), 1)
+    gained = change(smooth(window.ground_speed), lag)
+    reported = data.bin * moving_sum(window.acceleration, lag)
+    noise = np.sqrt(change_variance(window.variance["ground_speed"], lag) / 3.0)
+    reported_noise = data.bin * np.sqrt(moving_sum(window.variance["acceleration"], lag))
+    if _opposite(data, gained, noise, LEAST_SPEED, reported, reported_noise, LEAST_SPEED, LEAST_SLOWING):
+        yield "acceleration"
+
+
+def slip_without_traction(data: ConsistencyInput) -> Iterator[str]:
+    """Torques, speeds or the ground speed of wheels that slip without driving, or drive without slipping."""
+    rig, slip, grip = data.rig, data.slip, data.traction
+    with np.errstate(invalid="ignore"):
+        idle = (slip > FALSE_SLIP) & (grip < NO_TRACTION)
+        dragged = (slip < -FALSE_SLIP) & (grip > TRACTION)
+    idles = [i for i in range(len(rig.wheels)) if lasts(idle[:, i], data.sustained)]
+    drags = [i for i in range(len(rig.wheels)) if lasts(dragged[:, i], data.sustained)]
+    if 2 * len(drags) > len(rig.wheels):
+        yield "ground_speed"
+        return
+    if len(idles) == len(rig.wheels) and not _pulls(data, np.logical_and.reduce(idle, axis=1)):
+        yield "ground_speed"  # or the torques: coasting at a ground speed that is reported too low looks the same
+    yield from (f"torque.{rig.wheels[i]}" for i in idles)
+    others = [i for i in range(len(rig.wheels)) if i not in {*idles, *drags}]
+    for i in drags:
+        where = dragged[:, i]
+        usual = median(slip[where][:, others])
+        odd = math.isfinite(usual) and abs(median(slip[where, i]) - usual) > ODD_SLIP
+        yield f"{'speed' if odd else 'torque'}.{rig.wheels[i]}"
+
+
+def _pulls(data: ConsistencyInput, where: Mask) -> bool:
+    """Whether draft, slope and inertia ask the wheels to pull at these instants."""
+    chassis = data.rig.chassis
+    if chassis is None:
+        return bool(median(data.window.draft[where]) > 0.0)
+    return median(pull_given(data.window, chassis)[where]) > TRACTION / 3.0 * chassis.mass * GRAVITY
+
+
+def speed_scale(data: ConsistencyInput) -> Iterator[str]:
+    """Ground speed or acceleration, where the one changes several tenths more or less than the other says.
+
+    Where the ground speed jumps it is the one; where the slip would be impossible with the
+    one false it is the other; else it may be either, and both are named.
+    """
+    window = data.window
+    lag, n = max(round(LAG / data.bin), 1), max(round(COMPARED / data.bin), 1)
+    gained = change(smooth(window.ground_speed), lag)
+    reported = data.bin * moving_sum(window.acceleration, lag)
+    if len(reported) < n:
+        return
+    scale = _scales(np.where(data.driving[lag:], gained, np.nan), reported, n, round(ABOUT / data.bin))
+    wrong = np.abs(np.log(scale)) > OTHER_SCALE  # nor nan
+    if not wrong.any():
+        return
+    factor, seen = median(scale[wrong]), _usual_slip(data.slip[lag:], wrong, n)
+    if _jumps(data):
+        yield "ground_speed"
+        return
+    if not 1.0 - (1.0 - seen) / factor < -FALSE_SLIP:
+        yield "ground_speed"
+    if not seen < -FALSE_SLIP:
+        yield "acceleration"
+
+
+def _scales(gained: Array, reported: Array, n: int, late: int) -> Array:
+    """Ratios of speed gained to acceleration reported (both (M,)) in each n neighbours, (M - n + 1,); nan where unsure.
+
+    Either may be late by up to `late` bins; of the delays with which the two may go together the
+    one counts with which they are most alike.
+    """
+    nothing = np.full(late, np.nan)
+    moved = neighbours(np.concatenate([nothing, reported, nothing]), len(reported))
+    known = np.isfinite(gained) & np.isfinite(moved)
+    one, other = np.where(known, gained, 0.0), np.where(known, moved, 0.0)
+    both, of_one, of_other, count = np.stack([one * other, one * one, other * other, known]) @ _stretches(
+        len(reported), n
+    )
+    enough = (count >= KNOWN * n) & (of_one > n * CHANGING**2) & (of_other > 0.0)
+    together = np.divide(both, np.sqrt(of_one * of_other), where=enough, out=np.zeros(both.shape))
+    scale = np.divide(both, of_other, where=together > MAY_BE, out=np.full(both.shape, np.inf))
+    best = np.argmin(np.abs(np.log(scale)), axis=0)
+    chosen = np.take_along_axis(scale, best[None], axis=0)[0]
+    return np.where(together.max(axis=0) > TOGETHER, chosen, np.nan)
+
+
+@lru_cache(maxsize=8)
+def _stretches(length: int, n: int) -> Array:
+    """Matrix (length, length - n + 1) of ones and zeros that sums each n neighbours."""
+    first = np.arange(length - n + 1)
+    place = np.arange(length)[:, None]
+    return np.asarray((place >= first) & (place < first + n), float)
+
+
+def _usual_slip(slip: Array, begins: Mask, n: int) -> float:
+    """Median slip in the stretches of n of these instants (N, W) that begin where the mask (N - n + 1,) says."""
+    within = np.convolve(begins, np.ones(n)) > 0.0
+    return median(slip[within])
+
+
+def _jumps(data: ConsistencyInput) -> bool:
+    """Whether the ground speed changes at once by what no acceleration about that time explains."""
+    window = data.window
+    at_once, about = (max(round(span / data.bin), 1) for span in (AT_ONCE, ABOUT))
+    jump = np.abs(change(window.ground_speed, at_once))
+    reported = np.abs(data.bin * moving_sum(zero_if_unknown(window.acceleration), at_once))
+    most = neighbours(np.pad(reported, about), 2 * about + 1).max(axis=1)
+    with np.errstate(invalid="ignore"):
+        return bool((data.driving[at_once:] & (jump > JUMP) & (most < UNEXPLAINED * jump)).any())
+
+
+def draft_sign(data: ConsistencyInput) -> Iterator[str]:
+    """The draft, where the vehicle pulls less whenever its wheels drive more; needs slope and inertia."""
+    window, rig, chassis = data.window, data.rig, data.rig.chassis
+    if chassis is None:
+        return
+    lag, weight, variance = max(round(LAG / data.bin), 1), chassis.mass * GRAVITY, window.variance
+    driven = change((window.torque / rig.radius).sum(axis=1), lag)
+    noise = np.sqrt(change_variance((variance["torque"] / rig.radius**2).sum(axis=1), lag))
+    known = np.isfinite(window.pitch) & np.isfinite(window.acceleration)
+    pull = change(np.where(known, pull_given(window, chassis), np.nan), lag)
+    of_pull = variance["draft"] + weight**2 * variance["pitch"] + chassis.mass**2 * variance["acceleration"]
+    pull_noise = np.sqrt(change_variance(of_pull, lag))
+    least = LEAST_FORCE * weight
+    if _opposite(data, driven, noise, least, pull, pull_noise, least, LEAST_PULLING):
+        yield "draft"
+
+
+def _opposite(
+    data: ConsistencyInput,
+    one: Array,
+    one_noise: Array,
+    one_least: float,
+    other: Array,
+    other_noise: Array,
+    other_least: float,
+    seconds: float,
+) -> bool:
+    """Whether changes (M,) of two quantities that go together go against each other for so long.
+
+    Only changes count that are significant, of both: beyond their noise and at least so great.
+    """
+    with np.errstate(invalid="ignore"):
+        both = np.abs(one) > np.maximum(DEVIATIONS * one_noise, one_least)
+        both &= np.abs(other) > np.maximum(DEVIATIONS * other_noise, other_least)
+    both &= data.driving[len(data.driving) - len(both) :]
+    a, b = one[both], other[both]
+    product, n = a * b, max(round(seconds / data.bin), 1)
+    if np.count_nonzero(product < 0.0) < OPPOSITE * n:
+        return False
+    opposite, of_both, of_one, of_other = (running_sum(x, n) for x in (product < 0.0, product, a * a, b * b))
+    return bool(((opposite >= OPPOSITE * n) & (of_both < CORRELATION * np.sqrt(of_one * of_other))).any())
+
 
 def running_sum(values: NDArray[Any], n: int) -> Array:
     """Sums of each n neighbours of (N,), (N - n + 1,); none where there are fewer."""
@@ -49,7 +523,7 @@ def running_sum(values: NDArray[Any], n: int) -> Array:
 
 
 def change(values: Array, lag: int) -> Array:
-    """Changes (N - lag,) over so many bins of values (N,), in their unit."""
+    """Changes (N - lag,) over `lag` bins of values (N,), in their unit."""
     return values[lag:] - values[:-lag]
 
 
@@ -84,7 +558,7 @@ def median(values: Array) -> float:
 
 
 def lasts(holds: Mask, bins: int) -> bool:
-    """Whether something holds in so many bins in a row."""
+    """Whether something holds in this number of bins in a row."""
     if np.count_nonzero(holds) < bins:
         return False
     return any(last - first >= bins for first, last in runs(holds))
@@ -96,491 +570,7 @@ def runs(holds: Mask) -> list[tuple[int, int]]:
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
-SUSTAINED = 1.0
-"""Seconds for which a contradiction must last."""
-DEVIATIONS = 5.0
-"""Standard deviations by which a change must stand out of the noise to count as one."""
-FALSE_SLIP = 0.12
-"""Slip that a wrong rolling radius may feign: four of its standard deviations in `terra.effects`."""
-
-
-class Resolution(NamedTuple):
-    """Step [SI] between two readings of a channel (0: none), and whether it reads 0 at rest or without load."""
-
-    step: float
-    rests_at_zero: bool
-
-
-class Scene(NamedTuple):
-    """One window as the checks see it: bins of length `bin` [s]; driving (N,), slip and traction (N, W).
-
-    traction is torque over load and radius; both are nan where unknown, slip also where the vehicle
-    does not drive straight on.  motor_speed [rad/s] (N, W) is at the wheel's side of the gear.
-    """
-
-    window: Window
-    rig: Rig
-    bin: float
-    driving: Mask
-    slip: Array
-    traction: Array
-    motor_speed: Array
-    resolution: Mapping[str, Resolution]
-
-    @property
-    def sustained(self) -> int:
-        """Bins for which a contradiction must last."""
-        return max(round(SUSTAINED / self.bin), 1)
-
-
-def scene_of(
-    window: Window,
-    rig: Rig,
-    min_speed: float,
-    max_turn: float,
-    bin_length: float,
-    resolution: Mapping[str, Resolution],
-    motor_speed: Array,
-) -> Scene:
-    """What the checks need of a window."""
-    driving = (window.ground_speed > min_speed) & ~turning(window, rig, max_turn)
-    ground = np.where(driving, window.ground_speed, np.nan)[:, None]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        traction = np.where(window.load > 0.0, window.torque / (rig.radius * window.load), np.nan)
-    slip = slip_ratio(rig.radius, window.speed, ground)
-    return Scene(window, rig, bin_length, driving, slip, traction, motor_speed, resolution)
-
-
-LAG = 1.0
-"""Seconds over which changes are compared."""
-OPPOSITE = 0.85
-"""Share of significant changes that go the wrong way."""
-CORRELATION = -0.9
-"""Their correlation, at most."""
-LEAST_SLOWING, LEAST_PULLING = 2.0, 4.0
-"""Seconds of significant changes, one after the other, that there must be of speed and of pull: at the border of a
-soft soil a driver who lifts the implement may pull less and drive more for a moment."""
-LEAST_FORCE, LEAST_SPEED = 0.01, 0.05
-"""Changes of force, as a share of the weight, and of speed [m/s] below which none is significant."""
-COMPARED, CHANGING = 3.0, 0.06
-"""Seconds over which speed and acceleration are compared, and rms of the changes of speed [m/s] that there must be."""
-TOGETHER, MAY_BE, KNOWN = 0.985, 0.9, 0.9
-"""Their correlation at the best delay, at least, and at another one that may be theirs; share of bins with both."""
-OTHER_SCALE = math.log(1.35)
-"""Logarithm of the ratio of their changes from which they contradict each other."""
-AT_ONCE, ABOUT, JUMP, UNEXPLAINED = 0.3, 0.6, 0.25, 0.25
-"""A jump: at least so much [m/s] in AT_ONCE [s], of which not this share is told within ABOUT [s] of it."""
-
-
-def accelerated(scene: Scene) -> Iterator[str]:
-    """The acceleration, where it says that the vehicle slows down whenever it speeds up."""
-    window = scene.window
-    lag = max(round(LAG / scene.bin), 1)
-    gained = change(smooth(window.ground_speed), lag)
-    told = scene.bin * moving_sum(window.acceleration, lag)
-    noise = np.sqrt(change_variance(window.variance["ground_speed"], lag) / 3.0)
-    told_noise = scene.bin * np.sqrt(moving_sum(window.variance["acceleration"], lag))
-    if _opposite(scene, gained, noise, LEAST_SPEED, told, told_noise, LEAST_SPEED, LEAST_SLOWING):
-        yield "acceleration"
-
-
-def scaled(scene: Scene) -> Iterator[str]:
-    """Ground speed or acceleration, where the one changes several tenths more or less than the other says.
-
-    Where the ground speed jumps it is the one; where the slip would be impossible with the
-    one false it is the other; else it may be either, and both are named.
-    """
-    window = scene.window
-    lag, n = max(round(LAG / scene.bin), 1), max(round(COMPARED / scene.bin), 1)
-    gained = change(smooth(window.ground_speed), lag)
-    told = scene.bin * moving_sum(window.acceleration, lag)
-    if len(told) < n:
-        return
-    scale = _scales(np.where(scene.driving[lag:], gained, np.nan), told, n, round(ABOUT / scene.bin))
-    wrong = np.abs(np.log(scale)) > OTHER_SCALE  # nor nan
-    if not wrong.any():
-        return
-    factor, seen = median(scale[wrong]), _usual_slip(scene.slip[lag:], wrong, n)
-    if _jumps(scene):
-        yield "ground_speed"
-        return
-    if not 1.0 - (1.0 - seen) / factor < -FALSE_SLIP:
-        yield "ground_speed"
-    if not seen < -FALSE_SLIP:
-        yield "acceleration"
-
-
-def _scales(gained: Array, told: Array, n: int, late: int) -> Array:
-    """Ratios of what is gained to what is told (both (M,)) in each n neighbours, (M - n + 1,); nan where none is sure.
-
-    Either may be late by so many bins; of the delays with which the two may go together the
-    one counts with which they are most alike.
-    """
-    nothing = np.full(late, np.nan)
-    moved = neighbours(np.concatenate([nothing, told, nothing]), len(told))
-    known = np.isfinite(gained) & np.isfinite(moved)
-    one, other = np.where(known, gained, 0.0), np.where(known, moved, 0.0)
-    both, of_one, of_other, count = np.stack([one * other, one * one, other * other, known]) @ _stretches(len(told), n)
-    enough = (count >= KNOWN * n) & (of_one > n * CHANGING**2) & (of_other > 0.0)
-    together = np.divide(both, np.sqrt(of_one * of_other), where=enough, out=np.zeros(both.shape))
-    scale = np.divide(both, of_other, where=together > MAY_BE, out=np.full(both.shape, np.inf))
-    best = np.argmin(np.abs(np.log(scale)), axis=0)
-    chosen = np.take_along_axis(scale, best[None], axis=0)[0]
-    return np.where(together.max(axis=0) > TOGETHER, chosen, np.nan)
-
-
-@lru_cache(maxsize=8)
-def _stretches(length: int, n: int) -> Array:
-    """What sums each n neighbours of so many values: (length, length - n + 1) of ones and zeros."""
-    first = np.arange(length - n + 1)
-    place = np.arange(length)[:, None]
-    return np.asarray((place >= first) & (place < first + n), float)
-
-
-def _usual_slip(slip: Array, begins: Mask, n: int) -> float:
-    """Median slip in the stretches of n of these instants (N, W) that begin where the mask (N - n + 1,) says."""
-    within = np.convolve(begins, np.ones(n)) > 0.0
-    return median(slip[within])
-
-
-def _jumps(scene: Scene) -> bool:
-    """Whether the ground speed changes at once by what no acceleration about that time explains."""
-    window = scene.window
-    at_once, about = (max(round(span / scene.bin), 1) for span in (AT_ONCE, ABOUT))
-    jump = np.abs(change(window.ground_speed, at_once))
-    told = np.abs(scene.bin * moving_sum(zero_if_unknown(window.acceleration), at_once))
-    most = neighbours(np.pad(told, about), 2 * about + 1).max(axis=1)
-    with np.errstate(invalid="ignore"):
-        return bool((scene.driving[at_once:] & (jump > JUMP) & (most < UNEXPLAINED * jump)).any())
-
-
-def pulling(scene: Scene) -> Iterator[str]:
-    """The draft, where the vehicle pulls less whenever its wheels drive more; told only with slope and inertia."""
-    window, rig, chassis = scene.window, scene.rig, scene.rig.chassis
-    if chassis is None:
-        return
-    lag, weight, variance = max(round(LAG / scene.bin), 1), chassis.mass * GRAVITY, window.variance
-    driven = change((window.torque / rig.radius).sum(axis=1), lag)
-    noise = np.sqrt(change_variance((variance["torque"] / rig.radius**2).sum(axis=1), lag))
-    known = np.isfinite(window.pitch) & np.isfinite(window.acceleration)
-    pull = change(np.where(known, pull_given(window, chassis), np.nan), lag)
-    of_pull = variance["draft"] + weight**2 * variance["pitch"] + chassis.mass**2 * variance["acceleration"]
-    pull_noise = np.sqrt(change_variance(of_pull, lag))
-    least = LEAST_FORCE * weight
-    if _opposite(scene, driven, noise, least, pull, pull_noise, least, LEAST_PULLING):
-        yield "draft"
-
-
-def _opposite(
-    scene: Scene,
-    one: Array,
-    one_noise: Array,
-    one_least: float,
-    other: Array,
-    other_noise: Array,
-    other_least: float,
-    seconds: float,
-) -> bool:
-    """Whether changes (M,) of two quantities that go together go against each other for so long.
-
-    Only changes count that are significant, of both: beyond their noise and at least so great.
-    """
-    with np.errstate(invalid="ignore"):
-        both = np.abs(one) > np.maximum(DEVIATIONS * one_noise, one_least)
-        both &= np.abs(other) > np.maximum(DEVIATIONS * other_noise, other_least)
-    both &= scene.driving[len(scene.driving) - len(both) :]
-    a, b = one[both], other[both]
-    product, n = a * b, max(round(seconds / scene.bin), 1)
-    if np.count_nonzero(product < 0.0) < OPPOSITE * n:
-        return False
-    opposite, of_both, of_one, of_other = (running_sum(x, n) for x in (product < 0.0, product, a * a, b * b))
-    return bool(((opposite >= OPPOSITE * n) & (of_both < CORRELATION * np.sqrt(of_one * of_other))).any())
-
-
-SAME = 1e-12
-"""Relative difference of means of equal readings: rounding."""
-CHANCE = 1e-12
-"""Chance, by the noise that the sensor is said to have, below which a run of equal readings is a frozen sensor."""
-COARSE = 0.1
-"""Share of repeated readings elsewhere in the window by which a sensor is coarser than its signal, not frozen."""
-STILL_SHARE = 0.1
-"""Rim speed, as a share of the ground speed, below which a wheel does not turn."""
-BRAKED = 0.2
-"""Braking torque over load and radius from which a wheel may be locked."""
-GEAR_SLACK = 0.03
-"""Relative difference of motor and wheel speed that gear and radius of the wheel's sensor may have."""
-LEAST_TURN = 0.02
-"""Difference [rad/s] of the two that resolution and phase may make besides."""
-NO_TRACTION, TRACTION = 0.01, 0.15
-"""Torque over load and radius of a wheel that drives nothing (any soil resists more), and of one that surely drives."""
-ODD_SLIP = 0.2
-"""Distance from the other wheels' slip that speaks against the wheel's speed rather than its torque."""
-LOAD_SUM = 0.15
-"""Share of the weight by which the loads' sum must be wrong; lost zeros and what is carried stay below it."""
-LOAD_AXLE = 0.05
-"""Share of the weight by which the load transfer of an axle without fault may be wrong."""
-LOAD_SIDE = 0.10
-"""Share of an axle's load by which its left and right must differ more than the other axle's for one to be named."""
-ANY_LOAD = 0.6
-"""Wrong share of the weight that nothing carried explains, so that all load cells are wrong."""
-
-
-def implausible(
-    window: Window,
-    rig: Rig,
-    min_speed: float,
-    max_turn: float,
-    bin_length: float,
-    resolution: Mapping[str, Resolution],
-    motor_speed: Array | None = None,
-) -> tuple[str, ...]:
-    """Channels of a forward window (see `window.forward`) that lie in it, in the order of rig.channels.
-
-    min_speed [m/s] and max_turn as the estimator's gates; resolution by channel name;
-    motor_speed [rad/s] (N, W), nan where unknown, may be named as "motor_speed.FL".
-    """
-    motor = np.full(window.speed.shape, np.nan) if motor_speed is None else motor_speed
-    scene = scene_of(window, rig, min_speed, max_turn, bin_length, resolution, motor)
-    if not scene.driving.any():
-        return ()
-    named: set[str] = set()
-    for check in CHECKS:
-        if found := set(check(scene)):
-            named |= found
-            window = without(window, rig, found)
-            motor = np.where([f"motor_speed.{w}" in found for w in rig.wheels], np.nan, motor)
-            scene = scene_of(window, rig, min_speed, max_turn, bin_length, resolution, motor)
-    order = (*rig.channels, *(f"motor_speed.{w}" for w in rig.wheels))
-    return tuple(name for name in order if name in named)
-
-
-def without(window: Window, rig: Rig, channels: set[str]) -> Window:
-    """The window without any reading of these channels."""
-    values: dict[str, Array] = {}
-    for name in channels & set(rig.channels):
-        quantity, _, wheel = name.partition(".")
-        values.setdefault(quantity, getattr(window, quantity).copy())
-        values[quantity][..., rig.wheels.index(wheel) if wheel else slice(None)] = np.nan
-    changed: dict[str, Any] = values
-    return replace(window, **changed) if changed else window
-
-
-def frozen(scene: Scene) -> Iterator[str]:
-    """Channels that read the very same for longer than their noise allows, while the vehicle drives."""
-    window, rig = scene.window, scene.rig
-    quantities = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
-    value = np.column_stack([getattr(window, q) for q in quantities])
-    with np.errstate(invalid="ignore"):
-        same = np.abs(np.diff(value, axis=0)) <= SAME * np.abs(value[1:])
-    same &= scene.driving[1:, None]
-    often = np.flatnonzero(same.sum(axis=0) >= scene.sustained).tolist()
-    if not often:
-        return
-    variance = np.column_stack([window.variance[q] for q in quantities])
-    for i in often:
-        name = rig.channels[i]
-        noise, resolution = rig.noise[name.partition(".")[0]], scene.resolution.get(name, Resolution(0.0, False))
-        stretches = [(first, last) for first, last in runs(same[:, i]) if last - first >= scene.sustained]
-        within = sum(last - first for first, last in stretches)
-        if same[:, i].sum() - within > COARSE * (np.isfinite(value[:, i]).sum() - within):
-            continue
-        if any(_stuck(float(value[a, i]), variance[a : b + 1, i], noise, resolution) for a, b in stretches):
-            yield name
-
-
-def _stuck(value: float, variance: Array, noise: SensorNoise, resolution: Resolution) -> bool:
-    """Whether noise would have moved a reading that is the same in bins of these variances (N,).
-
-    At most, where the truth is in the middle of the reading's step, noise leaves one sample
-    in it with the chance erf(step / (2 sqrt(2) sd)).
-    """
-    of_sample = noise.absolute**2 + (noise.relative**2 + noise.of_mean**2) * value**2
-    if of_sample == 0.0 or (resolution.rests_at_zero and abs(value) <= resolution.step):
-        return False
-    samples = float((of_sample / variance).sum())
-    same = math.erf(resolution.step / (2.0 * math.sqrt(2.0 * of_sample)))
-    return (samples - 1.0) * math.log(max(same, CHANCE)) < math.log(CHANCE)
-
-
-def not_turning(scene: Scene) -> Iterator[str]:
-    """Speeds of wheels that stand, unbraked, while the vehicle drives; the ground speed where all of them rest."""
-    window, rig = scene.window, scene.rig
-    ground = window.ground_speed[:, None]
-    with np.errstate(invalid="ignore"):
-        still = scene.driving[:, None] & (rig.radius * window.speed < STILL_SHARE * ground)
-        braked = scene.traction < -BRAKED
-        idle = np.abs(scene.traction) < NO_TRACTION
-    if lasts(np.logical_and.reduce(still & idle, axis=1), scene.sustained):
-        yield "ground_speed"
-        return
-    for i, wheel in enumerate(rig.wheels):
-        if lasts(still[:, i] & ~braked[:, i], scene.sustained):
-            yield f"speed.{wheel}"
-
-
-def geared(scene: Scene) -> Iterator[str]:
-    """Of a wheel and its motor, whose speeds do not go together, the one farther from the other wheels'.
-
-    Both, where this is so of most wheels: the gear ratio may be wrong, and the torques with it.
-    """
-    window, rig, motor = scene.window, scene.rig, scene.motor_speed
-    with np.errstate(invalid="ignore"):
-        noise = np.sqrt(2.0 * window.variance["speed"])
-        apart = np.abs(motor - window.speed) > GEAR_SLACK * np.abs(window.speed) + DEVIATIONS * noise + LEAST_TURN
-    apart &= scene.driving[:, None]
-    wrong = [i for i in range(len(rig.wheels)) if lasts(apart[:, i], scene.sustained)]
-    good = [i for i in range(len(rig.wheels)) if i not in wrong]
-    for i in wrong:
-        if len(wrong) > len(good):
-            yield f"speed.{rig.wheels[i]}"
-            yield f"motor_speed.{rig.wheels[i]}"
-            continue
-        where = apart[:, i]
-        usual = median((rig.radius * window.speed)[where][:, good])
-        of_motor, of_wheel = (abs(median(rig.radius[i] * s[where, i]) - usual) for s in (motor, window.speed))
-        yield f"{'motor_speed' if of_motor > of_wheel else 'speed'}.{rig.wheels[i]}"
-
-
-def loads(scene: Scene) -> Iterator[str]:
-    """The load that alone explains why the loads do not add up to the weight; all of them where nothing else can."""
-    window, rig, chassis = scene.window, scene.rig, scene.rig.chassis
-    if chassis is None or set(rig.front.tolist()) != {True, False}:
-        return
-    weight = chassis.mass * GRAVITY
-    excess = _axle_excess(window, rig, chassis) / weight
-    total = excess.sum(axis=1)
-    with np.errstate(invalid="ignore"):
-        wrong = scene.driving & (np.abs(total) > LOAD_SUM)
-    if not lasts(wrong, scene.sustained):
-        return
-    front, rear = np.median(excess[wrong], axis=0)
-    if not -ANY_LOAD < front + rear < ANY_LOAD:
-        yield from (f"load.{wheel}" for wheel in rig.wheels)
-        return
-    if min(abs(front), abs(rear)) > LOAD_AXLE:
-        return  # something is carried
-    of_axle = [np.flatnonzero(rig.front), np.flatnonzero(~rig.front)]
-    bad, sound = of_axle if abs(front) > abs(rear) else of_axle[::-1]
-    if len(bad) == len(sound) == 2:
-        left, other = (
-            median(window.load[wrong][:, axle[0]] / window.load[wrong][:, axle].sum(axis=1)) for axle in (bad, sound)
-        )
-        if abs(left - other) > LOAD_SIDE:
-            heavier = 0 if left > other else 1
-            yield f"load.{rig.wheels[bad[heavier if front + rear > 0.0 else 1 - heavier]]}"
-
-
-def _axle_excess(window: Window, rig: Rig, chassis: Chassis) -> Array:
-    """By how much [N] the loads on front and rear axle exceed those of mass, draft, slope and inertia, (N, 2)."""
-    draft, pitch, acceleration = (zero_if_unknown(a) for a in (window.draft, window.pitch, window.acceleration))
-    due = np.stack(axle_loads(chassis, draft, pitch, acceleration), axis=1)
-    told = np.stack([window.load[:, rig.front].sum(axis=1), window.load[:, ~rig.front].sum(axis=1)], axis=1)
-    return np.asarray(told - due)
-
-
-def traction(scene: Scene) -> Iterator[str]:
-    """Torques, speeds or the ground speed of wheels that slip without driving, or drive without slipping."""
-    rig, slip, grip = scene.rig, scene.slip, scene.traction
-    with np.errstate(invalid="ignore"):
-        idle = (slip > FALSE_SLIP) & (grip < NO_TRACTION)
-        dragged = (slip < -FALSE_SLIP) & (grip > TRACTION)
-    idles = [i for i in range(len(rig.wheels)) if lasts(idle[:, i], scene.sustained)]
-    drags = [i for i in range(len(rig.wheels)) if lasts(dragged[:, i], scene.sustained)]
-    if 2 * len(drags) > len(rig.wheels):
-        yield "ground_speed"
-        return
-    if len(idles) == len(rig.wheels) and not _pulls(scene, np.logical_and.reduce(idle, axis=1)):
-        yield "ground_speed"  # or the torques: coasting at a ground speed that is told too low looks the same
-    yield from (f"torque.{rig.wheels[i]}" for i in idles)
-    others = [i for i in range(len(rig.wheels)) if i not in {*idles, *drags}]
-    for i in drags:
-        where = dragged[:, i]
-        usual = median(slip[where][:, others])
-        odd = math.isfinite(usual) and abs(median(slip[where, i]) - usual) > ODD_SLIP
-        yield f"{'speed' if odd else 'torque'}.{rig.wheels[i]}"
-
-
-def _pulls(scene: Scene, where: Mask) -> bool:
-    """Whether draft, slope and inertia ask the wheels to pull at these instants."""
-    chassis = scene.rig.chassis
-    if chassis is None:
-        return bool(median(scene.window.draft[where]) > 0.0)
-    return median(pull_given(scene.window, chassis)[where]) > TRACTION / 3.0 * chassis.mass * GRAVITY
-
-
-CHECKS: Sequence[Callable[[Scene], Iterator[str]]] = (
-    frozen, not_turning, geared, loads, accelerated, traction, scaled, pulling,
+CHECKS: Sequence[Callable[[ConsistencyInput], Iterator[str]]] = (
+    frozen, standing_wheels, gear_ratio, load_sum, acceleration_sign, slip_without_traction, speed_scale, draft_sign,
 )  # fmt: skip
 """In their order: what one names the next ones do not see."""
-
-
-MOTOR_SPEED = "motor_speed"
-
-
-class Screened(NamedTuple):
-    """A window without the channels that lie in it, and which these are."""
-
-    window: Window
-    implausible: tuple[str, ...]
-
-
-class Plausibility:
-    """Judges windows; the speeds of the motors, which no estimate needs, are kept here."""
-
-    def __init__(self, rig: Rig, channels: Iterable[Channel], database: Database, settings: Estimator) -> None:
-        self._rig, self._settings = rig, settings
-        listed = tuple(channels)
-        self._resolution = {c.name: resolution_of(c, database) for c in listed}
-        self._motors = [w for w in rig.wheels if any(c.name == f"{MOTOR_SPEED}.{w}" for c in listed)]
-        self.forget()
-
-    def forget(self) -> None:
-        """Begin anew."""
-        self._heard: dict[str, list[tuple[Array, Array]]] = {wheel: [] for wheel in self._motors}
-
-    def add(self, samples: Mapping[str, tuple[Array, Array]]) -> None:
-        """Samples (t [s], value in SI; both (N,)) by channel; only the motors' speeds are kept."""
-        for wheel, heard in self._heard.items():
-            if found := samples.get(f"{MOTOR_SPEED}.{wheel}"):
-                heard.append(found)
-
-    def screened(self, window: Window) -> Screened:
-        """A forward window (`window.forward`) without what lies in it."""
-        s = self._settings
-        names = implausible(
-            window, self._rig, s.min_speed, s.max_turn, s.bin, self._resolution, self._motor_speed(window)
-        )  # fmt: skip
-        return Screened(without(window, self._rig, set(names)), names)
-
-    def drop_before(self, t: float) -> None:
-        """Forget what was heard before t [s]."""
-        for wheel, heard in self._heard.items():
-            self._heard[wheel] = [part for part in heard if part[0][-1] >= t]
-
-    def _motor_speed(self, window: Window) -> Array | None:
-        """Mean speeds [rad/s] of the motors in the window's bins (N, W), forward; nan where unknown."""
-        if not self._motors or not len(window.t):
-            return None
-        n = len(window.t)
-        speed = np.full((n, len(self._rig.wheels)), np.nan)
-        begin = window.t[0] - self._settings.bin / 2.0
-        for wheel, heard in self._heard.items():
-            if not heard:
-                continue
-            t, value = (np.concatenate(parts) for parts in zip(*heard, strict=True))
-            bins = np.floor((t - begin) / self._settings.bin + 1e-6).astype(np.intp)
-            inside = (bins >= 0) & (bins < n)
-            count = np.bincount(bins[inside], minlength=n)
-            total = np.bincount(bins[inside], np.abs(value[inside]), minlength=n)
-            with np.errstate(invalid="ignore", divide="ignore"):
-                speed[:, self._rig.wheels.index(wheel)] = total / count
-        return speed
-
-
-def resolution_of(channel: Channel, database: Database) -> Resolution:
-    """The step of a channel's signal in SI, and whether zero is the end of its range."""
-    signal = database.get_message_by_name(channel.message).get_signal_by_name(channel.signal)
-    step = 0.0 if signal.conversion.is_float else abs(channel.factor * float(signal.scale))
-    ends = (signal.minimum, signal.maximum)
-    unsigned = not signal.is_signed and float(signal.offset) == 0.0
-    return Resolution(step, unsigned or any(end is not None and float(end) == 0.0 for end in ends))

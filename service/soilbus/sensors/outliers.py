@@ -1,9 +1,9 @@
-"""Single wild samples: readings that fit neither their noise nor the readings around them.
+"""Single outliers: readings that fit neither their noise nor the readings around them.
 
 Each sample is compared with a robust straight line through the four before and the four
 after it (a Hampel identifier with the trend taken out; cf. Davies & Gather, J. Am. Stat.
 Assoc. 88, 1993, 782-792).  Steps, bends and vibration widen the limit, so that only one or
-two samples standing out by themselves are called wild: longer runs, frozen or offset
+two samples standing out by themselves are called outliers: longer runs, frozen or offset
 sensors are the model's to notice.
 """
 
@@ -20,22 +20,21 @@ from soilbus.arrays import Array, Mask
 Sd = Callable[[NDArray[np.intp], Array, Array], Array]
 """Sd (N,) of samples, channel after channel, from each channel's number of them (C,), their expected
 magnitudes (N,) and the channels' mean magnitudes (C,)."""
-
-OUTLIER = "wild"
-"""Reason under which wild samples are counted."""
+OUTLIER = "outlier"
+"""Reason under which outliers are counted."""
 SIDE = 4
 """Samples on each side that a sample is compared with."""
 SPAN = 2 * SIDE + 1
-FAR = 6.5
-"""Distance from the line, in standard deviations of the sensor, from which a sample may be wild."""
-ROOM = 3.0
+OUTLIER_SD = 6.5
+"""Distance from the line, in standard deviations of the sensor, from which a sample may be an outlier."""
+QUARTILE_DISTANCES = 3.0
 """Distances of the quartiles around a sample that it may always lie off: in steps and bumps real signals do."""
-LIVELY = 1.5
-"""A channel that scatters so many times as much as its sensor (it vibrates, or its noise is set too low) is
-judged by its own scatter."""
-VERY_FAR = 8.0
-"""Distance from the line, in standard deviations of that scatter, from which a sample of such a channel is wild."""
-BEND = 1.65
+VIBRATING_SD = 1.5
+"""A channel that scatters by more than this multiple of its sensor's noise (it vibrates, or its noise is set too low)
+is judged by its own scatter."""
+VIBRATING_OUTLIER_SD = 8.0
+"""Distance from the line, in standard deviations of that scatter, from which a sample of such a channel is one."""
+MEDIAN_SECOND_DIFFERENCE = 1.65
 """Median second difference of normal samples, in their standard deviation."""
 
 
@@ -60,25 +59,16 @@ class Samples(NamedTuple):
         return ordered
 
 
-def joined(parts: Sequence[Samples]) -> Samples:
-    """All samples of the parts."""
-    columns, t, value, settled = zip(*(parts or (NO_SAMPLES,)), strict=True)
-    return Samples(np.concatenate(columns), np.concatenate(t), np.concatenate(value), np.concatenate(settled))
-
-
-NO_SAMPLES = Samples(np.zeros(0, np.int16), np.zeros(0), np.zeros(0), np.zeros(0, bool))
-
-
-class Judged(NamedTuple):
-    """Samples in order, which are wild, and how many of its channel follow each one; each (N,)."""
+class Tested(NamedTuple):
+    """Samples in order, which are outliers, and how many of its channel follow each one; each (N,)."""
 
     samples: Samples
-    wild: Mask
+    outlier: Mask
     later: NDArray[np.intp]
 
 
-def outlier_test(samples: Samples, sd: Sd) -> Judged:
-    """Find the wild ones among samples in any order.
+def outlier_test(samples: Samples, sd: Sd) -> Tested:
+    """Find the outliers among samples in any order.
 
     A channel with fewer than nine samples is not judged; the first and last four of the
     others are judged by the line nearest to them.
@@ -91,9 +81,9 @@ def outlier_test(samples: Samples, sd: Sd) -> Judged:
     here = np.arange(n)
     later = np.repeat(end, count)
     later -= here + 1
-    wild = np.zeros(n, bool)
+    outlier = np.zeros(n, bool)
     if n < SPAN:
-        return Judged(samples, wild, later)
+        return Tested(samples, outlier, later)
     line = np.maximum(here - SIDE, np.repeat(end - count, count))
     np.minimum(line, np.repeat(np.maximum(end - SPAN, 0), count), out=line)
     slope, level, when = _lines(t, value).take(line, axis=1)
@@ -101,14 +91,16 @@ def outlier_test(samples: Samples, sd: Sd) -> Judged:
     off = np.abs(value - expected)
     size = np.abs(expected)
     noise = sd(count, size, np.bincount(column, size) / np.maximum(count, 1))
-    far = np.flatnonzero(off > FAR * noise)
+    far = np.flatnonzero(off > OUTLIER_SD * noise)
     far = far[count[column[far]] >= SPAN]
     if len(far):
-        limit = ROOM * _spread(t, value, line[far], slope[far])
-        lively = _liveliness(value, noise, end - count, end, column[far])
-        np.maximum(limit, np.where(lively > LIVELY, VERY_FAR * lively, 0.0) * noise[far], out=limit)
-        wild[far] = off[far] > limit
-    return Judged(samples, wild, later)
+        limit = QUARTILE_DISTANCES * _spread(t, value, line[far], slope[far])
+        vibration = _vibration(value, noise, end - count, end, column[far])
+        np.maximum(
+            limit, np.where(vibration > VIBRATING_SD, VIBRATING_OUTLIER_SD * vibration, 0.0) * noise[far], out=limit
+        )
+        outlier[far] = off[far] > limit
+    return Tested(samples, outlier, later)
 
 
 def _lines(t: Array, value: Array) -> Array:
@@ -143,15 +135,24 @@ def _spread(t: Array, value: Array, first: NDArray[np.intp], slope: Array) -> Ar
     return np.asarray(level[:, SIDE + 2] - level[:, SIDE - 2])
 
 
-def _liveliness(
+def _vibration(
     value: Array, noise: Array, begin: NDArray[np.intp], end: NDArray[np.intp], column: NDArray[np.int16]
 ) -> Array:
     """How many sd of the noise the second differences of these columns (M,) show.
 
     value[begin:end], of (C,), are the samples of one column.
     """
-    lively = np.zeros(len(begin))
+    vibration = np.zeros(len(begin))
     for c in np.unique(column):
-        bend = np.diff(value[begin[c] : end[c]], 2) / noise[begin[c] + 1 : end[c] - 1]
-        lively[c] = np.median(np.abs(bend)) / BEND
-    return lively[column]
+        second_difference = np.diff(value[begin[c] : end[c]], 2) / noise[begin[c] + 1 : end[c] - 1]
+        vibration[c] = np.median(np.abs(second_difference)) / MEDIAN_SECOND_DIFFERENCE
+    return vibration[column]
+
+
+def joined(parts: Sequence[Samples]) -> Samples:
+    """All samples of the parts."""
+    columns, t, value, settled = zip(*(parts or (NO_SAMPLES,)), strict=True)
+    return Samples(np.concatenate(columns), np.concatenate(t), np.concatenate(value), np.concatenate(settled))
+
+
+NO_SAMPLES = Samples(np.zeros(0, np.int16), np.zeros(0), np.zeros(0), np.zeros(0, bool))

@@ -58,7 +58,7 @@ class _Binned(NamedTuple):
 def resolved_window(store: Bins, end: float) -> Window:
     """All samples of a store from its origin to `end` [s]; its own window where longer bins lose nothing."""
     samples = store.screened(end)
-    whole = store.window(store.origin, end)  # which decides what is wild
+    whole = store.window(store.origin, end)  # which decides what is an outlier
     noise = NoiseTable.of(store.rig)
     channels = list(_channels(samples, store, noise))
     span = end - store.origin

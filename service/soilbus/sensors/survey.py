@@ -44,7 +44,7 @@ Frame = tuple[float, int, bool, bytes | bytearray, bool, bool]
 BATCH = 5000
 """Frames that are decoded at a time."""
 SILENCE = 60.0
-"""Seconds without a frame, or set back, after which a recording begins anew; the longest part is compared."""
+"""Seconds without a frame, or set back, after which another recording begins; the longest part is compared."""
 
 
 @dataclass(frozen=True, slots=True)
