@@ -1,6 +1,10 @@
-"""Steps and fits at bounds: no step leaves them, and the other parameters are where they then fit best."""
+"""The stopping rule of the joint descent, and steps and fits at bounds."""
 
 from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -16,12 +20,88 @@ from soilbus.estimation.nuisance_parameters import parameters_of
 from soilbus.estimation.observation_model import ObservationModelWithEffects
 from soilbus.estimation.parametrization import BOUND_SD, Coordinates, at_bounds, step_fraction_within
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-from soilbus.estimation.solver import Objective, QuadraticModel
+from soilbus.estimation.solver import Iterate, Objective, QuadraticModel, StoppingRule, descend_jointly
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.soils import SOILS
 
 WET_CLAY = SOILS["wet_clay"]
 C = PARAMETERS.index("c")
+
+
+class OneResidual:
+    """An objective r(x)^2 of one unknown, which counts its evaluations."""
+
+    def __init__(self, residual, derivative):
+        self.residual, self.derivative = residual, derivative
+        self.tried, self.n_solved_angles = [], 0
+
+    def quadratic_model(self, iterate):
+        (x,) = iterate.soil
+        self.tried.append(x)
+        r, slope = self.residual(x), self.derivative(x)
+        if not math.isfinite(r):
+            return None
+        none = np.zeros((1, 1))
+        return QuadraticModel(np.array([[slope**2]]), none, none, np.array([slope * r]), r**2, np.zeros((0, 1)), None)
+
+    def stepped(self, iterate, model, step):
+        return replace(iterate, soil=iterate.soil + step)
+
+    def with_entry_angles(self, iterate):
+        self.n_solved_angles += 1
+        return iterate
+
+
+def begin(x):
+    return Iterate(np.array([x]), np.zeros(0), None, math.inf, 0)
+
+
+def exponential():
+    """Least at log 3."""
+    return OneResidual(lambda x: math.exp(x) - 3.0, math.exp)
+
+
+def test_a_descent_converges_where_the_step_is_shorter_than_its_tolerance():
+    end = descend_jointly(exponential(), begin(0.5), StoppingRule(30, step_tolerance=1e-12, next_step_tolerance=0.0))
+    assert end.converged
+    assert end.predicted_decrease < 1e-12 < (math.exp(0.5) - 3.0) ** 2
+    assert end.iterate.soil[0] == pytest.approx(math.log(3.0), abs=1e-9)
+
+
+def test_a_descent_converges_one_step_earlier_where_the_next_one_will_be_short():
+    early = descend_jointly(exponential(), begin(0.5), StoppingRule(30, step_tolerance=1e-12, next_step_tolerance=1e-3))
+    late = descend_jointly(exponential(), begin(0.5), StoppingRule(30, step_tolerance=1e-12, next_step_tolerance=0.0))
+    assert early.converged
+    assert early.iterations < late.iterations
+    assert early.predicted_decrease > 1e-12
+    assert early.iterate.soil[0] == pytest.approx(math.log(3.0), abs=1e-2)
+
+
+def test_a_descent_whose_predicted_value_stays_too_high_is_given_up():
+    curve = OneResidual(lambda x: 100.0 + 0.0 * x, lambda x: 1e-9)
+    rule = StoppingRule(30, step_tolerance=0.0, next_step_tolerance=0.0, give_up_above=-1.0)
+    end = descend_jointly(curve, begin(0.0), rule)
+    assert not end.converged
+    assert end.iterations == len(curve.tried) == 1
+
+
+def test_rejected_steps_are_shortened_and_end_a_descent_that_finds_none():
+    """Every step leads up a cliff."""
+    cliff = OneResidual(lambda x: 10.0 if x == 0.0 else 1e3, lambda x: -1.0)
+    end = descend_jointly(cliff, begin(0.0), StoppingRule(30, max_rejected=3))
+    assert not end.converged
+    assert end.previous.soil[0] == 0.0
+    steps = [x for x in cliff.tried if x != 0.0]
+    assert len(steps) == 4
+    assert all(later < 0.5 * step for step, later in pairwise(steps))
+    assert cliff.n_solved_angles == 1
+
+
+def test_a_descent_ends_with_its_evaluations_or_where_the_numbers_are_not_finite():
+    end = descend_jointly(exponential(), begin(0.5), StoppingRule(2, step_tolerance=1e-12, next_step_tolerance=0.0))
+    assert end.iterations == 2
+    assert not end.converged
+    assert descend_jointly(OneResidual(lambda x: math.nan, lambda x: 1.0), begin(0.0), StoppingRule(30)) is None
 
 
 @given(st.integers(0, 10_000), st.lists(st.sampled_from([-1.0, 0.0, 1.0]), min_size=4, max_size=4))
@@ -35,8 +115,8 @@ def test_a_step_never_crosses_active_bounds_and_with_one_it_is_the_constrained_o
     )
     step = model.step()
     assert np.all(step * np.array(sides) <= 1e-12)
-    cost = float(np.sum((root @ step + target) ** 2))
-    assert cost <= float(target @ target) + 1e-9
+    value = float(np.sum((root @ step + target) ** 2))
+    assert value <= float(target @ target) + 1e-9
     if np.count_nonzero(sides) < 2:
         low, high = (np.where(np.array(sides) == side, 0.0, side * np.inf) for side in (-1.0, 1.0))
         best = lsq_linear(root, -target, (low, high), method="bvls").x
