@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from soilbus.allocator import keep_freed_memory
 from soilbus.can.dbc_files import load_databases
 from soilbus.config.model import Config
 from soilbus.config.model import Effect as Setting
@@ -80,5 +79,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    keep_freed_memory()
     sys.exit(main())

@@ -89,7 +89,7 @@ def test_a_real_result_ends_the_wait():
 
 def test_free_memory_is_given_back_once_in_a_while_and_after_the_result_is_out(monkeypatch):
     done: list[str] = []
-    monkeypatch.setattr("soilbus.daemon.work_queue.Tidying", lambda needed, spare: partial(done.append, "tidy"))
+    monkeypatch.setattr("soilbus.daemon.work_queue.give_back_freed_memory", partial(done.append, "tidy"))
     backlog = WorkQueue(InlineExecutor(), lambda task: task, 0.0)
     for task in range(2 * TIDIED + 1):
         backlog.add(task, 0.0, 0, 0.0)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gc
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -81,6 +83,36 @@ def test_a_vehicle_that_cannot_be_simulated_starts_all_the_same(started):
     assert rehearsals == []
     service.step()
     assert service.bus.is_open
+
+
+DAEMON = """
+import os, signal, sys, threading
+from soilbus.cli.main import main
+
+def noted(frame, event, value):
+    if event == "return" and frame.f_code.co_name == "warm_up":
+        print(*(result.status for result in value))
+        os.kill(os.getpid(), signal.SIGTERM)
+
+threading.setprofile(noted)
+status = main(["run", *sys.argv[1:]])
+print(*(name for name, module in sys.modules.items() if module))
+sys.exit(status)
+"""
+EXTRAS = {"scipy", "matplotlib", "pandas", "dask", "asammdf", "rich"}
+"""Packages that only other commands need."""
+
+
+def test_a_daemon_that_has_rehearsed_has_loaded_nothing_of_other_commands():
+    options = [word for setting in VIRTUAL for word in ("--set", setting)]
+    command = [sys.executable, "-c", DAEMON, "--config", str(FIELD / "field.toml"), *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60.0)
+    statuses, modules = (line.split() for line in done.stdout.splitlines())
+    assert statuses == [Status.VALID] * WINDOWS
+    assert "soilbus.estimation.tracker" in modules
+    rooms = {module.split(".")[1] for module in modules if module.startswith("soilbus.")}
+    assert not rooms & {"simulator", "validation", "diagnosis", "offline", "report"}
+    assert not {module.partition(".")[0] for module in modules} & EXTRAS
 
 
 def test_nothing_is_collected_while_loading_and_what_is_loaded_is_left_alone():

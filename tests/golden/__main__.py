@@ -9,8 +9,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from soilbus.allocator import keep_freed_memory
-
 from .compare import EXACT, Move, Tolerances, moves, summary
 from .drives import drive_again
 from .outputs import HERE, Source, diagnoses, replays
@@ -55,5 +53,4 @@ def _compared(source: Source, limits: Tolerances, renew: bool) -> Iterator[Move]
 
 
 if __name__ == "__main__":
-    keep_freed_memory()
     sys.exit(main())

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from soilbus.allocator import keep_freed_memory, loading
+from soilbus.allocator import loading
 from soilbus.cli.arguments import command_line
 from soilbus.cli.common import WorkError
 from soilbus.files import NotWritten
@@ -32,7 +32,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[_StandardError()])
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # what it does for itself is no news
     logging.getLogger("can").setLevel(logging.CRITICAL)  # a bus that is away is ours to tell of, once
-    keep_freed_memory()
     with loading():
         from soilbus.config.model import ConfigError
     try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING
 
@@ -27,6 +28,8 @@ def demo(args: argparse.Namespace) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """`soilbus run`: the daemon on a live bus."""
+    # python-can loads asammdf where it is installed: 2 s and 97 MB for files that the service never reads.
+    sys.modules.setdefault("asammdf", None)  # type: ignore[arg-type]
     with loading():
         from soilbus.can.bus import BusError
         from soilbus.daemon.start import start_service

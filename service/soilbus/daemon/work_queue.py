@@ -7,15 +7,14 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, wait
 from typing import NamedTuple
 
-from soilbus.allocator import Tidying
+from soilbus.allocator import give_back_freed_memory
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.result import WindowResult
 
 MAX_PENDING = 3
 """Windows that may wait for the worker."""
-TIDIED, NEEDED, SPARE = 60, 4_000_000, 2_500_000
-"""Windows after which memory that is free is given back, but for the bytes that the next window needs, and
-those that a day's scattered rests will take."""
+TIDIED = 60
+"""Windows after which memory that is free is given back, and after as many again."""
 
 
 class Pending(NamedTuple):
@@ -47,7 +46,6 @@ class WorkQueue:
         self._workers, self._solve, self._waiting = workers, solve, waiting
         self._pending: deque[Pending] = deque()
         self._busy_since = now
-        self._tidy = Tidying(NEEDED, SPARE)
         self.solved = 0
         """Windows solved since the start."""
 
@@ -81,14 +79,14 @@ class WorkQueue:
             self._waiting(self._pending[0].future, longest)
 
     def results(self, now: float) -> Iterator[tuple[WindowResult, Pending]]:
-        """The windows that are solved, in their order; once in a while the worker then tidies up."""
+        """The windows that are solved, in their order; after every TIDIED the worker then gives back free memory."""
         while self.has_result:
             pending = self._pending.popleft()
             self._busy_since = now
             self.solved += 1
             yield pending.future.result(), pending
             if self.solved % TIDIED == 0:
-                self._workers.submit(self._tidy)
+                self._workers.submit(give_back_freed_memory)
 
     def close(self) -> None:
         """Solve no more."""

@@ -230,7 +230,10 @@ class Intake:
 
     def ingest(self, until: float = math.inf) -> None:
         """Decode the frames filed so far that are older than `until` [s] and put them into bins."""
-        decoded = self.admission.take(until)
+        self.add(self.admission.take(until))
+
+    def add(self, decoded: Decoded) -> None:
+        """Put decoded samples into bins; `ingest` does so with the frames that were filed."""
         self.refusals.add(decoded)
         if (times := _times(decoded)) is not None:
             first, last = times

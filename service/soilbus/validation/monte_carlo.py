@@ -183,6 +183,7 @@ def monte_carlo(
 def processes(count: int) -> Iterator[Each]:
     """A map over so many processes, each with one thread; the built-in one for less than two."""
     if count < 2:
+        keep_freed_memory()
         yield map
         return
     with workers(count, "spawn", keep_freed_memory) as pool:
