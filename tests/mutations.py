@@ -254,6 +254,7 @@ def _code(copy: Path, tests: Sequence[str]) -> int:
         "pytest",
         "-q",
         "-x",
+        "-n0",
         "-p",
         "no:cacheprovider",
         "-o",

@@ -178,6 +178,11 @@ class Curves:
             self._made[quantity] = [self._curve(v, var) for v, var in zip(*(c.T for c in columns), strict=True)]
         return self._made[quantity]
 
+    def number_of(self, quantity: str) -> int:
+        """How many curves `of` returns; it makes none."""
+        values = getattr(self.window, quantity)
+        return 1 if values.ndim == 1 else int(values.shape[1])
+
     def _curve(self, values: Array, variance: Array) -> Series:
         known = np.isfinite(values) & np.isfinite(variance)
         return Series.of(self.window.t[known], values[known], variance[known])

@@ -1022,7 +1022,7 @@ class ObservationModelWithEffects(ObservationModel):
 
     def _nothing_late(self, quantity: str, n_effects: int) -> tuple[Array, Array]:
         """Nothing (N, columns), with no derivatives (P, N, columns)."""
-        columns = len(self._curves.of(quantity))
+        columns = self._curves.number_of(quantity)
         return np.zeros((self.n, columns)), np.zeros((n_effects, self.n, columns))
 
     def _surroundings(self, latents: Latents) -> Surroundings:
@@ -1060,7 +1060,8 @@ def _gathered(told: Sequence[Any], n_effects: int, shape: tuple[int, int]) -> tu
 
 def _monomials(states: Array) -> Array:
     """Products (N, len(_POWERS)) of powers of load and slip (2, N)."""
-    return np.stack([states[0] ** i * states[1] ** j for i, j in _POWERS], axis=1)
+    load, slip = ([value**i for i in range(most + 1)] for value, most in zip(states, _POWERS[-1], strict=True))
+    return np.stack([load[i] * slip[j] for i, j in _POWERS], axis=1)
 
 
 def _varied(soil: Soil) -> Soil:

@@ -15,6 +15,7 @@ from soilbus.decision.demand import present_demand
 from soilbus.decision.hysteresis import Held, doubted, settled
 from soilbus.decision.immobilisation import SPAN, Watch, moments, watched, with_loss
 from soilbus.decision.judgement import Basis, judge
+from soilbus.decision.torque_ceiling import TorqueCeiling
 from soilbus.decision.traction_loss import NO_LOSS, idle, motion_of, observed
 from soilbus.decision.traversability import Status, Traversability
 from soilbus.decision.uncertain_model import UncertainModel
@@ -75,6 +76,7 @@ class WindowEstimator:
         self._curve: OverSlip | None = None
         self._loss = NO_LOSS
         self._idle = np.zeros(len(self.rig.wheels), bool)
+        self._ceiling = TorqueCeiling.unknown(len(self.rig.wheels))
         self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
         self._guess = guessed(self.prior, prior_of(Config()))
         settings = config.estimator
@@ -141,10 +143,7 @@ class WindowEstimator:
         window = _with_true_draft(task.window, effects, self.rig)
         demand = present_demand(window, self.rig.chassis, self._settings.hop, self._draft_gain(tracked))
         here = tracked.ground not in (Ground.CHANGING, Ground.SETTLING)
-        if task.fresh:
-            self._idle = np.zeros(len(self.rig.wheels), bool)
-        self._idle = idle(task.window, self.rig, task.end - self._settings.hop, self._idle)
-        limit = np.where(self._idle, 0.0, task.torque_limit)
+        limit = self._torque_limit(task, window)
         known = None if own is None else Posterior(own.soil, model.with_form(own.log_covariance))
         return Undecided(result, known, demand, limit, window, task.fresh, model, here)
 
@@ -180,6 +179,21 @@ class WindowEstimator:
         return replace(
             way, state=self._held.state, since_valid=None if self._valid_at is None else result.t - self._valid_at
         )
+
+    def _torque_limit(self, task: WindowTask, window: Window) -> NDArray[np.float64]:
+        """Greatest torque (W,) [N m] that may be counted on: none of an idle wheel, no more than a ceiling that shows.
+
+        window: the task's, with the true draft.
+        """
+        hop, deviations = self._settings.hop, self.config.traversability.contradiction
+        if task.fresh:
+            self._idle, self._ceiling = (
+                np.zeros(len(self.rig.wheels), bool),
+                TorqueCeiling.unknown(len(self.rig.wheels)),
+            )
+        self._idle = idle(task.window, self.rig, task.end - hop, self._idle)
+        self._ceiling = self._ceiling.after(window, self.rig, hop, deviations)
+        return np.where(self._idle, 0.0, np.fmin(task.torque_limit, self._ceiling.limit))
 
     def _watched_gaps(self, task: WindowTask, fit: Fit | None) -> Mapping[str, float]:
         """The channels that have not fitted for minutes; windows with poor inputs have no say."""
