@@ -137,7 +137,7 @@ def test_the_filter_is_the_joint_solution_for_the_soils_of_all_pieces(drift, sim
     step = steps[0] + probable * off
     covariance = (1.0 - probable) * covariances[0] + probable * covariances[1]
     covariance += probable * (1.0 - probable) * np.outer(off, off)
-    soil = objective.coordinates.moved(place.soil, step[:free])
+    soil = objective.coordinates.stepped(place.soil, step[:free])
     np.testing.assert_allclose(now.soil, soil, rtol=1e-6)
     np.testing.assert_allclose(
         now.gains[objective.active], fit.optimum.gains[objective.active] + step[free:], atol=1e-7

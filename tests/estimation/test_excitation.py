@@ -31,7 +31,9 @@ CHANCE = 1e-3
 def rough(soil, *more):
     """Settings by which c and K are known to 25 % and k_c to 50 %."""
     k_c = SOILS[soil].k_c
-    return reference_configuration([*minima.told(soil), f"soil.k_c.value={k_c}", f"soil.k_c.std={0.5 * k_c}", *more])
+    return reference_configuration(
+        [*minima.c_and_K_known(soil), f"soil.k_c.value={k_c}", f"soil.k_c.std={0.5 * k_c}", *more]
+    )
 
 
 def deviations(posterior, soil):

@@ -82,8 +82,11 @@ def descend_damped(objective: Objective, fast: Fit, options: DescentOptions) -> 
             return None
         geodesic, damping, fall, steps = GeodesicSteps(objective), INITIAL_DAMPING, np.inf, 0
         while damping < MAX_DAMPING and steps < MAX_STEPS:
-            negligible, full = _negligible_fall(objective, here.quadratic, options.nothing), here.quadratic.step()
-            target = min(here.quadratic.neg2_log_posterior - options.nothing, options.give_up_above)
+            negligible, full = (
+                _negligible_fall(objective, here.quadratic, options.stall_tolerance),
+                here.quadratic.step(),
+            )
+            target = min(here.quadratic.neg2_log_posterior - options.stall_tolerance, options.give_up_above)
             if full is None or fall < negligible or _predicted(here.quadratic, full) > target:
                 break
             there, tried = geodesic.along(here, full) if levenberg.one_step_suffices(here.quadratic) else (None, 0)
@@ -116,7 +119,7 @@ class _LevenbergSteps:
 
     def expanded(self, iterate: Iterate, at: Linearisation | None = None) -> Expansion | None:
         """The iterate with its latents at their optimum; `at` is its linearisation where that is at hand."""
-        quadratic = self.objective.point(iterate) if at is None else self.objective.with_prior(iterate, at)
+        quadratic = self.objective.quadratic_model(iterate) if at is None else self.objective.with_prior(iterate, at)
         if quadratic is None:
             return None
         here = Expansion(iterate, quadratic)
@@ -169,7 +172,7 @@ class GeodesicSteps:
         None where none lowers -2 log posterior.
         """
         iterate, quadratic = here
-        length, least = quadratic.length(full), None
+        length, least = quadratic.squared_length(full), None
         for tried in range(1, MAX_CURVED_TRIALS + 1):
             share = self.share
             step = (
@@ -178,7 +181,7 @@ class GeodesicSteps:
                 else self.objective.geodesic_step(iterate, quadratic, share, self.second_derivative)
             )
             if step is not None:
-                within = self.objective.step_share(iterate, step)
+                within = self.objective.step_fraction(iterate, step)
                 share, step = within * share, within * step
             there = None
             if step is not None and share > MIN_SHARE:
@@ -208,7 +211,7 @@ class GeodesicSteps:
 
 def _predicted(quadratic: QuadraticModel, full: Array | None) -> float:
     """-2 log posterior after a full step (F + A,) by the quadratic model; infinite where there is no step."""
-    return np.inf if full is None else quadratic.neg2_log_posterior - quadratic.length(full)
+    return np.inf if full is None else quadratic.neg2_log_posterior - quadratic.squared_length(full)
 
 
 def _negligible_fall(objective: Objective, quadratic: QuadraticModel, nothing: float) -> float:
@@ -218,7 +221,7 @@ def _negligible_fall(objective: Objective, quadratic: QuadraticModel, nothing: f
 
 
 def _expand(objective: Objective, iterate: Iterate) -> Expansion | None:
-    quadratic = objective.point(iterate)
+    quadratic = objective.quadratic_model(iterate)
     return None if quadratic is None else Expansion(iterate, quadratic)
 
 
@@ -235,7 +238,7 @@ def _fit(objective: Objective, iterate: Iterate, quadratic: QuadraticModel, step
         gaussian=gaussians[1],
         mode=gaussians[1],
         sinkage=objective.problem.mean_sinkage(iterate.as_soil(), iterate.gains, iterate.latents),
-        optimum=Optimum(objective.problem.t, iterate.soil, iterate.gains, iterate.latents, quadratic.at),
+        optimum=Optimum(objective.problem.t, iterate.soil, iterate.gains, iterate.latents, quadratic.linearisation),
         neg2_log_posterior=quadratic.neg2_log_posterior,
         neg2_log_evidence=quadratic.neg2_log_evidence,
         rows=objective.problem.n_rows,

@@ -252,12 +252,12 @@ class _RecordProfile:
         optimum = self.fit.optimum
         objective = Objective(self.problem, prior, joint_prior)
         iterate = Iterate(optimum.soil, self.gains, optimum.latents, np.inf, 0)
-        quadratic = objective.point(iterate)
+        quadratic = objective.quadratic_model(iterate)
         if quadratic is None:
             raise np.linalg.LinAlgError("the model is not finite where it was fitted")
         self.quadratic, self.directions = quadratic, objective.directions(iterate)
         variance, row_var = self.problem.variances(self.gains)
-        self.inverse = inverse_covariance(quadratic.at.by_latents, variance, row_var, self.problem.n_wheels)
+        self.inverse = inverse_covariance(quadratic.linearisation.by_latents, variance, row_var, self.problem.n_wheels)
         self.torque = self.problem.torques(optimum.soil, self.gains, optimum.latents)
         self.alone = self.problem.with_effects(
             [e for e in fitted.effects if e.name == self.free[0].effect], _alone(free, at)
@@ -270,13 +270,13 @@ class _RecordProfile:
         standardised = iter(f.standardised(v) for f, v in zip(self.free, values, strict=True))
         gains = np.concatenate([self.sensors, [next(standardised) if f.std else 0.0 for f in self.alone.free]])
         late = self.alone.delay_terms(gains, self.fit.optimum.latents, self.torque)
-        return self.alone.delay_residuals(late, self.quadratic.at.by_latents, gains)
+        return self.alone.delay_residuals(late, self.quadratic.linearisation.by_latents, gains)
 
     def cost(self, delay: float, tau: float) -> float:
         """-2 log posterior of this recording at a delay and a time constant [s], minimised over all else."""
         change = self._residuals(delay, tau) - self.here
         weighed = (self.inverse @ change[:, :, None])[:, :, 0]
-        at = self.quadratic.at
+        at = self.quadratic.linearisation
         gradient = self.quadratic.gradient + self.directions.T @ (at.rows.T @ weighed.ravel())
         fall = gradient @ np.linalg.solve(self.quadratic.information, gradient)
         return float(

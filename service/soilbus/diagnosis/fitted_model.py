@@ -24,7 +24,7 @@ from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import DEFAULT_OPTIONS, DescentOptions, Fit, Start, fit_from, fit_window
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModelWithEffects
-from soilbus.estimation.parametrization import at_edges
+from soilbus.estimation.parametrization import at_bounds
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective
 from soilbus.terra.effects.effect import Effect
@@ -258,7 +258,7 @@ def check(
     objective = Objective(problem, prior, fit.mode)
     rounds = CHECK_ROUNDS if near is None or len(near.load) != problem.n else CHECK_ROUNDS_NEAR
     with np.errstate(all="ignore"):
-        latents = objective.near(fit.mode.soil, gains, near).latents
+        latents = objective.start_near(fit.mode.soil, gains, near).latents
         latents = problem.with_entry_angles(latents, soil, gains)
         at = problem.linearise(soil, gains, latents)
         for _ in range(rounds - 1):
@@ -268,7 +268,7 @@ def check(
         step = None if quadratic is None else quadratic.step()
     if quadratic is None or step is None:
         return HeldOutCheck(problem, latents, at, np.inf, np.inf)
-    length = quadratic.length(step)
+    length = quadratic.squared_length(step)
     return HeldOutCheck(
         problem, latents, at, quadratic.neg2_log_evidence - length, quadratic.neg2_log_posterior - length
     )
@@ -313,7 +313,7 @@ def _prior_of_next(
     posterior: Gaussian, prior: SoilPrior, problem: ObservationModelWithEffects, effects: Sequence[Effect]
 ) -> Gaussian:
     """Joint prior of the next recording: the posterior, with the prior of what is each recording's own."""
-    after = posterior.of_another_soil(prior)
+    after = posterior.with_prior_soil(prior)
     by_name = {effect.name: effect for effect in effects}
     own = [
         problem.n_sensors + i
@@ -353,7 +353,7 @@ def _held_at_edges(
 ) -> tuple[Free, ...] | None:
     """The parameters with those held that would leave their range; None where none would, or fits did not converge."""
     gains = fits[-1].mode.gains
-    edges = at_edges(gains, *problem.gain_bounds())[problem.n_sensors :].tolist()
+    edges = at_bounds(gains, *problem.gain_bounds())[problem.n_sensors :].tolist()
     leaves = [f.std > 0.0 and edge != 0.0 for f, edge in zip(free, edges, strict=True)]
     if not any(leaves) or not all(fit.converged for fit in fits):
         return None

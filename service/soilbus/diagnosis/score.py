@@ -168,7 +168,7 @@ def _reduced(
     iterate = Iterate(fit.optimum.soil, gains, fit.optimum.latents, np.inf, 0)
     objective = Objective(problem, prior, extended)
     with np.errstate(all="ignore"):
-        quadratic = objective.point(iterate)
+        quadratic = objective.quadratic_model(iterate)
     if quadratic is None:
         raise np.linalg.LinAlgError("the model is not finite where it was fitted")
     present_columns, new = slice(None, -P), slice(-P, None)
@@ -180,7 +180,7 @@ def _reduced(
     reduced = information[new, new] - np.eye(P) - information[new, present_columns] @ response
     gradient = quadratic.gradient[new] - response.T @ quadratic.gradient[present_columns]
     held_out = present.checks[i].latents
-    return NormalEquations(objective, iterate, quadratic.at, gradient, reduced, response, held_out, present)
+    return NormalEquations(objective, iterate, quadratic.linearisation, gradient, reduced, response, held_out, present)
 
 
 def _score(
@@ -238,7 +238,7 @@ def _start(equations: NormalEquations, columns: NDArray[np.intp], step: Array) -
     follow = -equations.response[:, columns] @ step
     objective, iterate = equations.objective, equations.iterate
     n_free, n_present = len(objective.free), len(iterate.gains) - len(equations.information)
-    soil = objective.coordinates.moved(iterate.soil, follow[:n_free])
+    soil = objective.coordinates.stepped(iterate.soil, follow[:n_free])
     gains = iterate.gains[:n_present].copy()
     gains[objective.active[objective.active < n_present]] += follow[n_free:]
     standardised = np.concatenate([equations.fitted.unheld(gains), step])
@@ -248,4 +248,4 @@ def _start(equations: NormalEquations, columns: NDArray[np.intp], step: Array) -
     change = np.zeros(len(iterate.gains))
     change[:n_present], change[n_present + columns] = gains - iterate.gains[:n_present], step
     latents = objective.problem.updated(equations.at, iterate.latents, soil - iterate.soil, change)
-    return start._replace(near=True, latents=latents)
+    return start._replace(near_optimum=True, latents=latents)

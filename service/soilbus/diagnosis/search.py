@@ -69,7 +69,7 @@ predicted falls are small: below it the score is as good."""
 
 MAX_STEPS = 12
 """Descent steps of the soil, and then of all parameters, of a full fit that is compared with others."""
-TRIAL_OPTIONS = DescentOptions(MAX_STEPS, enough=0.1, little=5e-3)
+TRIAL_OPTIONS = DescentOptions(MAX_STEPS, step_tolerance=0.1, relative_tolerance=5e-3)
 """Stopping rule of trial fits: looser, as they only choose the candidates for full fits."""
 GIVE_UP_SHARE = 0.3
 """Share of the required fall that the training blocks must show, for a full fit after one that fell short of it."""
@@ -422,7 +422,7 @@ def _has_competitor(
 def _fit_without(cache: FitCache, present: FittedModel, effect: Effect, options: DescentOptions) -> FittedModel | None:
     """The present model less one effect, fitted from its optimum but for the latents, which followed that effect."""
     kept = [e for e in present.effects if e.name != effect.name]
-    starts = [start._replace(near=False) for start in present.as_starts(kept)]
+    starts = [start._replace(near_optimum=False) for start in present.as_starts(kept)]
     return cache.fit(kept, [starts], options)
 
 
@@ -637,4 +637,4 @@ def _better(one: FittedModel | None, other: FittedModel | None) -> FittedModel |
 
 def start_key(starts: Sequence[Start] | None) -> Hashable:
     """A start as a hashable key."""
-    return starts and tuple((start.soil.tobytes(), start.gains.tobytes(), start.near) for start in starts)
+    return starts and tuple((start.soil.tobytes(), start.gains.tobytes(), start.near_optimum) for start in starts)

@@ -64,7 +64,7 @@ def change_statistic(
     ratio = _log_likelihood_ratio(misfit, count)
     if ratio.max() <= threshold:
         return ChangeStatistic(first + int(np.argmax(ratio)), float(ratio.max()))
-    with_prior = objective.given(joint_prior)
+    with_prior = objective.with_joint_prior(joint_prior)
     directions = with_prior.directions(iterate)
     gradient = np.einsum("imk,im->ik", weighed, rows[:, :, RESIDUAL]) @ directions
     information = directions.T @ np.einsum("imk,iml->ikl", rows, weighed) @ directions

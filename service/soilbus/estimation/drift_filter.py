@@ -84,7 +84,7 @@ def at_window_end(objective: Objective, fit: Fit, window: float, drift: float) -
     covariance[:free, :free] += np.eye(free) * drift**2 / (3.0 * PIECES)  # the end of the last piece is not its mean
     gains = iterate.gains.copy()
     gains[objective.active] -= step[free:]
-    at_end = replace(iterate, soil=objective.coordinates.moved(iterate.soil, -step[:free]), gains=gains)
+    at_end = replace(iterate, soil=objective.coordinates.stepped(iterate.soil, -step[:free]), gains=gains)
     mode = objective.gaussian_with(at_end, covariance)
 
     def shifted(gaussian: Gaussian) -> Gaussian:

@@ -300,7 +300,7 @@ class Tracker:
                 two_soils = self._fit_two_soils(window, self._change_point, fit, joint_prior, None)
         else:
             warm = warm_start(problem, self._soil_prior, last, joint_prior)
-            objective, fit = warm.fitting, fit_warm(warm)
+            objective, fit = warm.objective, fit_warm(warm)
             if fit is not None and not fit.converged and fit.chi2 <= self.chi2_limit(fit):
                 fit = refit_denoised(objective, fit)  # slow convergence in a valley is no sign of a new soil
             if fit is None or not fit.converged:
@@ -336,7 +336,7 @@ class Tracker:
         elapsed = (t - end) / self.settings.window
         gains = problem.gain_std**2 * min((elapsed + 1.0) / GAIN_MEMORY_WINDOWS, 1.0)
         if self._transition is not None and end <= self._transition.end:
-            return gaussian.of_another_soil(self._soil_prior).drifted(np.zeros((_SOIL, _SOIL)), gains)
+            return gaussian.with_prior_soil(self._soil_prior).drifted(np.zeros((_SOIL, _SOIL)), gains)
         form = (
             None if gaussian.form is None else gaussian.form.drifted(self.settings.form, elapsed / GAIN_MEMORY_WINDOWS)
         )
@@ -387,11 +387,13 @@ class Tracker:
             return None
         if fit is not None and fit.curved_path and not self._is_unsettled(fit):
             return None  # path curvature explains the disagreement
-        t = warm.fitting.problem.t
+        t = warm.objective.problem.t
         first = int(np.searchsorted(t, float(last.optimum.t[-1]) - LOOK_BACK_WINDOWS * length))
         centred = replace(last.reported, soil=last.optimum.soil, gains=last.optimum.gains)
         predicted = centred.drifted(self._drift(centred, DRIFT_SINCE_MIDDLE_WINDOWS), np.zeros(len(centred.gains)))
-        statistic = change_statistic(warm.fitting, predicted, warm.place, warm.at, first, SUSPECT_LOG_LIKELIHOOD_RATIO)
+        statistic = change_statistic(
+            warm.objective, predicted, warm.iterate, warm.linearisation, first, SUSPECT_LOG_LIKELIHOOD_RATIO
+        )
         if statistic.ratio <= SUSPECT_LOG_LIKELIHOOD_RATIO and fit is not None and fit.chi2 <= self.chi2_limit(fit):
             return None
         begin = float(t[statistic.instant])
@@ -424,7 +426,7 @@ class Tracker:
             if second.n_rows < MIN_RESIDUALS_PER_SOIL or window.t[-1] < arrived:
                 break  # after a mismatch both axles and the draft must agree on the new soil
             waits = self.mismatch(one) and window.t[-1] < change.t + UNEXPLAINED_WINDOWS * self.settings.window
-            new_joint_prior = self._prior_at(change.t, second).of_another_soil(new_prior)
+            new_joint_prior = self._prior_at(change.t, second).with_prior_soil(new_prior)
             new = self._search(second, new_prior, new_joint_prior)
             if new is None or self.mismatch(new):
                 continue
@@ -439,7 +441,7 @@ class Tracker:
             )
         if warm is None or old is None or not waits:
             return None
-        return TrackerOutput(self._reported(warm.fitting, old), False, TrackerState.SUSPECT, float(window.t[0]))
+        return TrackerOutput(self._reported(warm.objective, old), False, TrackerState.SUSPECT, float(window.t[0]))
 
     def _candidate_transitions(self, change: ChangePoint, start: float) -> list[Transition]:
         """Transitions of growing length from the change point on; of those over before `start` [s] only the last."""
@@ -500,7 +502,7 @@ class Tracker:
         objective, fit = self._search_one_soil(window, problem, joint_prior)
         if self.mismatch(fit) and self._posteriors:
             new_prior = new_soil_prior(self.prior)
-            new_joint_prior = joint_prior.of_another_soil(new_prior)
+            new_joint_prior = joint_prior.with_prior_soil(new_prior)
             other = self._search(problem, new_prior, new_joint_prior)
             if not self.mismatch(other):
                 begin = float(problem.t[0])

@@ -352,7 +352,7 @@ def _widening(tracked: TrackerOutput, fit: Fit) -> float:
 
 def _with_form(own: Posterior, fit: Fit, prior: SoilPrior) -> Posterior:
     """A posterior with what the form of the model leaves open besides: second moments about the same soil."""
-    return own if fit.form is None else own.beside(fit.form.log_covariance, prior, fit.form.log_shift)
+    return own if fit.form is None else own.with_added_covariance(fit.form.log_covariance, prior, fit.form.log_shift)
 
 
 def _with_true_draft(window: Window, effects: Sequence[Active], rig: Rig) -> Window:
