@@ -99,8 +99,6 @@ def test_a_missed_target_says_so(value, at_most, aim, met):
 @pytest.mark.parametrize("known", window.KNOWN)
 def test_least_squares_has_the_same_problem_and_our_fit_its_optimum(name, known):
     """The peer's residuals are written out on their own; here with scipy's exact end instead of a quick one."""
-    from scipy.optimize import least_squares
-
     problem = window._window(name, *known)
     exact, rough = known
     assert [*np.array(["k_c", "k_phi", "n", "phi", "c", "K"])[problem.prior.free]] == [
@@ -108,7 +106,7 @@ def test_least_squares_has_the_same_problem_and_our_fit_its_optimum(name, known)
     ]
     assert problem.start._asdict()[rough] == pytest.approx(1.25 * window.soil_named(name)._asdict()[rough])
     ours = window.fit_window(*problem)
-    peer = window.by_finite_differences(problem, least_squares)
+    peer = window.by_finite_differences(problem)
     assert window.distance(problem, ours, peer) < 0.02
 
 
@@ -136,11 +134,8 @@ def test_unlike_solutions_of_the_papers_problem_are_no_figure(monkeypatch):
         paper.paper_solve_speedup()
 
 
-@pytest.mark.parametrize("gone", ["scipy", "scipy.optimize"])
-@pytest.mark.parametrize("measure", [paper.paper_solve_speedup, window.window_solve_speedup])
-def test_without_scipy_one_line_says_what_to_install(gone, measure, small, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, gone, None)
-    monkeypatch.setattr(bench, "MEASUREMENTS", (lambda _: {"w": measure()},))
+def test_without_the_extra_one_line_says_what_to_install(small, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "threadpoolctl", None)
     assert main(["bench"]) == 1
     printed, err = capsys.readouterr()
     assert printed == ""

@@ -37,20 +37,24 @@ def test_one_package_has_the_same_bounds_wherever_it_is_named() -> None:
     assert len(names) == len(set(names))
 
 
-def imported(module: str, seen: set[str]) -> set[str]:
-    """Top-level packages, ours aside, that a module of ours and what it imports at its head import."""
+def imported(module: str, seen: set[str], everywhere: bool = False) -> set[str]:
+    """Top-level packages, ours aside, that a module of ours and what it imports at its head import.
+
+    `everywhere`: also what they import inside functions and for type checking alone.
+    """
     path = REPO / "service" / Path(*module.split("."))
     path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
     if module in seen or not path.is_file():
         return set()
     seen.add(module)
     found: set[str] = set()
-    for node in ast.parse(path.read_text()).body:
+    tree = ast.parse(path.read_text())
+    for node in ast.walk(tree) if everywhere else tree.body:
         names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
         if isinstance(node, ast.ImportFrom):
             names = [node.module or "", *(f"{node.module}.{a.name}" for a in node.names)]
         for name in names:
-            found |= imported(name, seen) if name.startswith("soilbus") else {name.partition(".")[0]}
+            found |= imported(name, seen, everywhere) if name.startswith("soilbus") else {name.partition(".")[0]}
     return found
 
 
@@ -58,6 +62,14 @@ def test_the_daemon_imports_no_more_than_it_may() -> None:
     modules = ("soilbus.daemon.start", *LOADED_BY_THE_WORKER)
     foreign = set().union(*(imported(module, set()) for module in modules)) - sys.stdlib_module_names
     assert foreign <= OF_THE_DAEMON
+
+
+def test_no_module_that_the_daemon_can_load_imports_scipy_even_inside_a_function() -> None:
+    seen: set[str] = set()
+    foreign = set().union(*(imported(module, seen, True) for module in ("soilbus.daemon.start", *LOADED_BY_THE_WORKER)))
+    assert {"soilbus.estimation.tracker", "soilbus.decision.capability", "soilbus.can.bus"} <= seen
+    assert "numpy" in foreign
+    assert "scipy" not in foreign
 
 
 def test_what_only_the_worker_needs_is_in_nobody_elses_way() -> None:

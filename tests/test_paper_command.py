@@ -9,7 +9,7 @@ from contextlib import redirect_stdout
 import pytest
 
 from soilbus.cli.main import main
-from soilbus.validation import paper_report as paper
+from soilbus.validation import paper_report
 from soilbus.validation.paper import EXACT, SIMPSON, WheelEquations
 from soilbus.validation.paper_tables import RUNS, SANDY_LOAM, WET_CLAY
 
@@ -106,8 +106,8 @@ def test_the_verdicts_follow_from_the_figures(output, monkeypatch):
         ("K_L_bound", lambda *_: 1e-4), ("TORQUE_ON_CLAY", clay), ("TORQUE_ON_LOAM", loam), ("RUNS", slow),
         ("SOLVED", 0.0), ("EXACT", SIMPSON),
     ):  # fmt: skip
-        monkeypatch.setattr(paper, name, value)
-    said = " ".join(paper.what_holds(0.05))
+        monkeypatch.setattr(paper_report, name, value)
+    said = " ".join(paper_report.what_holds(0.05))
     for verdict in (
         "Convergence does not hold", "The accuracy holds", "(conclusion 3) holds", "fit one sinkage",
         "Real time does not hold",

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
-from itertools import islice
+from itertools import islice, product
 
+import numpy as np
 import pytest
 
 from soilbus.diagnosis import search as fits_module
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import record_of
-from soilbus.diagnosis.score import further_scores, scores
+from soilbus.diagnosis.score import further_scores, normals_of, scores
 from soilbus.diagnosis.search import THINNED, Fits
 from soilbus.estimation import multistart as gauss_newton
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import DescentOptions, fit_window
+from soilbus.estimation.nuisance_parameters import parameters_of
 from soilbus.estimation.solver import descend_jointly
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
@@ -66,6 +68,40 @@ def test_a_few_instants_foretell_what_an_effect_explains_of_all(record):
 
 def test_what_is_foreseen_for_the_rows_there_are_is_the_evidence(base):
     assert base.foreseen(base.rows) == pytest.approx(base.neg2_log_evidence)
+
+
+def fall_on_any_face(information, gradient, low, high):
+    """Greatest fall of a parabola in a box: the best of the stationary points of all its faces that are inside."""
+    best = 0.0
+    for face in product((None, 0, 1), repeat=len(gradient)):
+        free = np.array([edge is None for edge in face])
+        u = np.array([0.0 if edge is None else (low, high)[edge][i] for i, edge in enumerate(face)])
+        if free.any():
+            u[free] = -np.linalg.solve(information[np.ix_(free, free)], (gradient + information @ u)[free])
+        if np.all((u >= low) & (u <= high)):
+            best = max(best, float(-2.0 * gradient @ u - u @ information @ u))
+    return best
+
+
+def test_the_predicted_fall_is_the_greatest_that_the_ranges_of_the_parameters_allow(record, base):
+    candidates = [effect for effect in CATALOGUE.values() if not effect.of_record]
+    at_edge = 0
+    for effect in candidates:
+        free = parameters_of(effect, len(record.learned.rig.wheels))
+        if len(free) > 4:  # three to this power are the faces
+            continue
+        (normal,) = normals_of([record], PRIOR, base, [effect], free)
+        information = normal.left + np.eye(len(free))
+        low, high = (
+            np.array([(getattr(f.parameter, edge) - f.value) / f.std for f in free]) for edge in ("low", "high")
+        )
+        (score,) = scores([record], PRIOR, base, [effect])
+        assert score.fall == pytest.approx(
+            fall_on_any_face(information, normal.by_effects, low, high), rel=1e-6, abs=1e-9
+        )
+        inside = -np.linalg.solve(information, normal.by_effects)
+        at_edge += bool(np.any((inside < low) | (inside > high)))
+    assert at_edge >= 3
 
 
 def test_scores_from_further_starts_are_the_same_together_as_alone(record, base):

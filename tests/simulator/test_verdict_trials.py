@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 import pytest
-from scipy.stats import binomtest
 
 from soilbus.decision.traversability import State
 from soilbus.estimation.assembly import rig_of
+from soilbus.estimation.posterior import NORMAL_95
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS
@@ -30,8 +30,10 @@ def calls_of(p, true):
 
 @pytest.mark.parametrize(("hits", "n"), [(0, 1), (3, 3), (5, 17), (40, 100)])
 def test_the_interval_is_wilson_s(hits, n):
-    found = binomtest(hits, n).proportion_ci(0.95, method="wilson")
-    assert wilson(hits, n) == pytest.approx((found.low, found.high), abs=1e-6)
+    """Both ends p are NORMAL_95 standard deviations of a frequency with this p from what was found (Wilson 1927)."""
+    for p in wilson(hits, n):
+        assert (hits / n - p) ** 2 == pytest.approx(NORMAL_95**2 * p * (1.0 - p) / n, rel=1e-6, abs=1e-12)
+    assert wilson(hits, n)[0] <= hits / n <= wilson(hits, n)[1]
     assert wilson(0, 0) == (0.0, 1.0)
 
 

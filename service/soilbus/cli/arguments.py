@@ -7,6 +7,8 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
+from soilbus import __version__
+
 
 def between(low: float, high: float) -> Callable[[str], float]:
     """Parser of a number in a range, for argparse."""
@@ -41,6 +43,7 @@ def counted(text: str) -> int:
 def command_line() -> argparse.ArgumentParser:
     """Parser of the whole command line; `command` names the one to do."""
     parser = argparse.ArgumentParser(prog="soilbus", description="What soil a tractor is driving on, from its CAN bus.")
+    parser.add_argument("--version", action="version", version=f"soilbus {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def command(name: str, text: str, config: str = "required") -> argparse.ArgumentParser:

@@ -13,6 +13,8 @@ from soilbus.config.faults import fault_lines
 from soilbus.config.model import Config, ConfigError
 from soilbus.files import read_bounded
 
+__all__ = ["load_config", "located", "overridden", "parse_config", "shipped_dbc"]
+
 LARGEST = 2**20
 """Bytes of a configuration: a thousand times those of a tractor's."""
 _SHOWN = 60

@@ -26,6 +26,29 @@ from pydantic import (
 
 from soilbus.words import did_you_mean
 
+__all__ = [
+    "Bus",
+    "Column",
+    "Config",
+    "ConfigError",
+    "Dbc",
+    "Effect",
+    "Estimator",
+    "Form",
+    "Model",
+    "Noise",
+    "NoiseOfChannels",
+    "Output",
+    "Prior",
+    "Signal",
+    "Signals",
+    "SoilPrior",
+    "Table",
+    "Traversability",
+    "Vehicle",
+    "Wheel",
+]
+
 CONTROL_FREE_NAME = r"^[A-Za-z0-9_-]{1,16}$"
 Name = Annotated[str, Field(pattern=CONTROL_FREE_NAME)]
 SignalName = Annotated[str, Field(pattern=r"^[^.\s]+\.[^.\s]+$")]

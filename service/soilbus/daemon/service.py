@@ -9,9 +9,9 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from dataclasses import replace
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
+from soilbus import __version__
 from soilbus.can.bus import LiveBus
 from soilbus.can.bus_state import BusState
 from soilbus.can.publish import Publisher
@@ -404,10 +404,6 @@ def _kind(reason: str) -> str:
 
 
 def software_version() -> tuple[int, int, int]:
-    """Version of the installed package; zeros in a checkout that is not installed."""
-    try:
-        parts = [int(p) for p in version("soilbus").split(".")[:3] if p.isdigit()]
-    except PackageNotFoundError:
-        parts = []
-    major, minor, patch = (parts + [0, 0, 0])[:3]
+    """The three numbers of the package's version."""
+    major, minor, patch = (int(part) for part in __version__.split("."))
     return major, minor, patch

@@ -32,6 +32,8 @@ from soilbus.estimation.window import Rig
 from soilbus.terra.effects.steady import CompletedModel, Wheel
 from soilbus.terra.wheel import WheelModel
 
+__all__ = ["Capability", "Demand", "Forecast", "OverSlip", "SetPoint", "assess", "slip_grid"]
+
 MIN_SLIP = 0.02
 GRID = 9
 MAX_SKID = 0.3

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from soilbus.decision.capability import Capability
     from soilbus.estimation.posterior import Estimate
 
+__all__ = ["State", "Status", "Traversability", "state_of"]
+
 
 class State(StrEnum):
     """May the vehicle go on?"""

@@ -17,6 +17,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import softmax
 
 from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
@@ -65,10 +66,8 @@ class _Ridge(NamedTuple):
 
     def weights(self) -> Array:
         """Shares (K,) of the posterior's mass."""
-        log = -0.5 * (self.cost - self.cost.min()) + np.log(self.sd)
         edges = np.concatenate([self.tau[:1], (self.tau[1:] + self.tau[:-1]) / 2.0, self.tau[-1:]])
-        mass = np.exp(log - log.max()) * np.diff(edges)
-        return np.asarray(mass / mass.sum())
+        return np.asarray(softmax(np.log(self.sd * np.diff(edges)) - 0.5 * self.cost))
 
 
 def with_delays(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, explained: float) -> FittedModel:

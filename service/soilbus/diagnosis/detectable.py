@@ -17,6 +17,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import brentq
 
 from soilbus.arrays import Array
 from soilbus.diagnosis.evidence import evidence_of_any_size
@@ -30,8 +31,6 @@ from soilbus.terra.effects.effect import Effect, Parameter
 
 PLAUSIBLE = 2.0
 """Prior standard deviations up to which an effect may well be there: a normal one goes beyond in a twentieth of all."""
-HALVINGS = 24
-"""Of the range in which a size is looked for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,16 +123,12 @@ def _least_size(information: Array, place: int, free: Sequence[Free], asked: flo
     """Size of one parameter from which the evidence is expected to fall by what is asked; infinite where none does."""
     direction = np.eye(len(free))[place]
     parameter = free[place].parameter
-    low, high = 0.0, _most(parameter) / parameter.std
-    if -_expected(information, high * direction, free) < asked:
-        return np.inf
-    for _ in range(HALVINGS):
-        middle = 0.5 * (low + high)
-        if -_expected(information, middle * direction, free) < asked:
-            low = middle
-        else:
-            high = middle
-    return high * parameter.std
+
+    def short_of(size: float) -> float:
+        return _expected(information, size * direction, free) + asked
+
+    most = _most(parameter) / parameter.std
+    return float(brentq(short_of, 0.0, most)) * parameter.std if short_of(most) <= 0.0 else np.inf
 
 
 def _expected(information: Array, u: Array, free: Sequence[Free]) -> float:

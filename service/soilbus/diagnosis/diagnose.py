@@ -20,6 +20,8 @@ from soilbus.estimation.posterior import Posterior, SoilPrior
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.effects.vehicle import GRADE, GRADE_BESIDE_PITCH
 
+__all__ = ["Diagnosis", "NotFitted", "diagnose"]
+
 MAX_EFFECTS = 3
 OVERLAP = 0.25
 """Share by which the sum of what effects explain alone may differ from what they explain together: of 9 blind pairs

@@ -15,6 +15,8 @@ from soilbus.estimation.window import Rig, Window
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.wheel import WheelModel
 
+__all__ = ["Record", "TooLittle", "record_of", "record_of_rows"]
+
 BLOCK = 4.0
 """Length of a time block [s]: long beside a sensor's lag, short beside a sweep of slip."""
 CHECKED = 3

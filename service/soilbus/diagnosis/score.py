@@ -14,6 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.optimize import lsq_linear
 
 from soilbus.arrays import Array
 from soilbus.diagnosis.evidence import evidence_of_any_size
@@ -192,21 +194,15 @@ class _Solution(NamedTuple):
 
 
 def _within(information: Array, gradient: Array, free: Sequence[Free]) -> _Solution:
-    """Least cost of the parabola with the parameters inside their ranges: those that would leave stay at the edge."""
+    """Least cost of the parabola with the parameters (P,) inside their ranges.
+
+    With information = L L' that is the bounded least squares problem |L' u + L^-1 gradient|^2, of an active set method
+    (Stark & Parker 1995, Comput. Stat. 10:129).
+    """
     low, high = (np.array([(getattr(f.parameter, edge) - f.value) / f.std for f in free]) for edge in ("low", "high"))
-    step = np.zeros(len(free))
-    inside = np.ones(len(free), bool)
-    for _ in range(len(free) + 1):
-        at_edge = np.where(inside, 0.0, step)
-        rest = gradient + information @ at_edge
-        step = at_edge.copy()
-        if inside.any():
-            step[inside] = -np.linalg.solve(information[np.ix_(inside, inside)], rest[inside])
-        leaving = inside & ((step < low) | (step > high))
-        if not leaving.any():
-            break
-        step = np.clip(step, low, high)
-        inside &= ~leaving
+    root = np.linalg.cholesky(information)
+    found = lsq_linear(root.T, -solve_triangular(root, gradient, lower=True), (low, high), method="bvls")
+    step, inside = found.x, found.active_mask == 0
     fall = float(-2.0 * gradient @ step - step @ information @ step)
     if not inside.any():
         return _Solution(step, fall, -fall)

@@ -12,6 +12,9 @@ from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from types import MappingProxyType
 
+import numpy as np
+from scipy.special import expit, softmax
+
 from soilbus.diagnosis.evidence import OwnParameters
 
 
@@ -71,7 +74,7 @@ def probabilities(
     """
     most = max(falls.values())
     usual, great = (_shares(falls, t, further) for t in temperatures(explained + most))
-    something = 1.0 / (1.0 + math.exp(-most / (2.0 * temperature(explained, FORM_LEFT))))
+    something = float(expit(most / (2.0 * temperature(explained, FORM_LEFT))))
     chances = {n: something * ((1.0 - AT_TIMES) * usual[n] + AT_TIMES * great[n]) for n in falls}
     return dict(sorted(chances.items(), key=lambda item: -item[1]))
 
@@ -106,14 +109,11 @@ def _great_temperature(explained: float) -> float:
 def _shares(
     falls: Mapping[str, float], temperature: float, further: Mapping[str, Sequence[OwnParameters]]
 ) -> dict[str, float]:
-    tempered = {
-        name: fall / temperature - sum(own.surcharge(temperature) for own in further.get(name, ()))
+    tempered = [
+        fall / temperature - sum(own.surcharge(temperature) for own in further.get(name, ()))
         for name, fall in falls.items()
-    }
-    most = max(tempered.values())
-    weights = {name: math.exp((fall - most) / 2.0) for name, fall in tempered.items()}
-    total = sum(weights.values())
-    return {name: weight / total for name, weight in weights.items()}
+    ]
+    return dict(zip(falls, softmax(np.array(tempered) / 2.0).tolist(), strict=True))
 
 
 def gap_limit(rows: int) -> float:

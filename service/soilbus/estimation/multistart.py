@@ -37,6 +37,8 @@ from soilbus.estimation.solver import (
 from soilbus.terra.soils import KINDS, SOILS
 from soilbus.terra.wheel import Soil
 
+__all__ = ["DEFAULT_OPTIONS", "DescentOptions", "Fit", "SecondMode", "Start", "fit_from", "fit_from_soil", "fit_window"]
+
 _K_C = PARAMETERS.index("k_c")
 
 MAX_ITERATIONS = 30
@@ -108,6 +110,7 @@ class DescentOptions(NamedTuple):
 
 
 DEFAULT_OPTIONS = DescentOptions()
+"""The full budget of a fit."""
 
 
 class SecondMode(NamedTuple):

@@ -17,7 +17,21 @@ from soilbus.arrays import Array
 from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.wheel import Soil
 
+__all__ = [
+    "NORMAL_95",
+    "PARAMETERS",
+    "Derived",
+    "Estimate",
+    "Posterior",
+    "Scalar",
+    "SoilPrior",
+    "bearing_pressure",
+    "tan_phi",
+    "tyre_modulus",
+]
+
 PARAMETERS = Soil._fields
+"""Names of the soil parameters, in the order of every vector of them."""
 NORMAL_95 = 1.959964
 """Standard deviations on either side of the mean that hold 95 % of a normal distribution."""
 

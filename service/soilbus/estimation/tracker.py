@@ -55,6 +55,8 @@ from soilbus.terra.effects.effect import Effect
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil, WheelModel
 
+__all__ = ["ChangePoint", "Ground", "SearchBudget", "Settings", "Tracker", "TrackerOutput", "elsewhere", "gain_errors"]
+
 MIN_ROWS = 60
 """Residuals that a window needs."""
 

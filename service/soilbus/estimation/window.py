@@ -19,8 +19,23 @@ from soilbus.arrays import Array
 from soilbus.estimation.local_cubics import Series
 from soilbus.terra.vehicle import Chassis, pull_required
 
+__all__ = [
+    "VEHICLE_QUANTITIES",
+    "WHEEL_QUANTITIES",
+    "NoiseTable",
+    "Rig",
+    "SensorNoise",
+    "Window",
+    "forward",
+    "made_window",
+    "turning",
+    "window_of_samples",
+]
+
 WHEEL_QUANTITIES = ("torque", "load", "speed", "sinkage")
+"""Quantities that each wheel has a channel of."""
 VEHICLE_QUANTITIES = ("ground_speed", "draft", "pitch", "acceleration", "yaw_rate")
+"""Quantities that the vehicle has one channel of."""
 LEAST_LEVEL = {
     "torque": 50.0, "load": 500.0, "speed": 0.4, "sinkage": 0.01,
     "ground_speed": 0.2, "draft": 500.0, "pitch": 0.01, "acceleration": 0.1, "yaw_rate": 0.02,

@@ -17,6 +17,8 @@ from soilbus.estimation.posterior import Posterior
 from soilbus.offline.recordings import Recordings, recordings_of
 from soilbus.offline.tables import candidates, recordings_of_tables
 
+__all__ = ["Findings", "diagnose_logs"]
+
 
 @dataclass(frozen=True, slots=True)
 class Findings:

@@ -30,6 +30,8 @@ from soilbus.pipeline.result import WindowResult
 from soilbus.words import one_line
 from soilbus.workers import workers
 
+__all__ = ["LogError", "estimator_beside", "fed", "log_names", "read_frames", "read_log", "replay"]
+
 _T = TypeVar("_T")
 
 SWITCH_INTERVAL = 0.0002

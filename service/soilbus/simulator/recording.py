@@ -15,6 +15,8 @@ from soilbus.simulator.scenario import Scenario
 from soilbus.simulator.sensors import measure
 from soilbus.terra.effects.effect import Active
 
+__all__ = ["Recording", "simulate"]
+
 
 @dataclass(frozen=True, slots=True)
 class Recording:

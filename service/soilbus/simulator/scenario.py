@@ -16,6 +16,20 @@ from soilbus.simulator.course import NORTHWARD, Course
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import Soil
 
+__all__ = [
+    "SAMPLE_RATE",
+    "Patch",
+    "Profile",
+    "Scenario",
+    "Swing",
+    "Wave",
+    "demo",
+    "excited",
+    "realise",
+    "soil_along",
+    "soil_names",
+]
+
 SAMPLE_RATE = 50.0
 """Samples of the truth a second [Hz]."""
 _N_SINES = 4

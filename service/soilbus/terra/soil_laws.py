@@ -12,7 +12,18 @@ from typing import Any
 
 import numpy as np
 
+__all__ = [
+    "SHEAR_LAWS",
+    "ShearLaw",
+    "exponential_shear",
+    "lumped_modulus",
+    "normal_stress",
+    "rational_shear",
+    "shear_displacement",
+]
+
 ShearLaw = Callable[[Any], tuple[Any, Any]]
+"""Shear displacement over K -> mobilised share of the strength, and its derivative."""
 
 
 def normal_stress(K_L: Any, n: Any, sinkage: Any) -> Any:
@@ -61,3 +72,4 @@ SHEAR_LAWS: dict[str, ShearLaw] = {
     "exponential": exponential_shear,
     "rational": rational_shear,
 }
+"""Shear laws by the name that the configuration has for them."""

@@ -10,6 +10,8 @@ import math
 
 from soilbus.terra.wheel import Soil
 
+__all__ = ["KINDS", "SOILS", "UNKNOWN", "soil_named"]
+
 _WONG = {
     # name: (n, k_c [kN/m^(n+1)], k_phi [kN/m^(n+2)], c [kPa], phi [deg], K [m])
     "dry_sand": (1.10, 0.99, 1528.43, 1.04, 28.0, 0.020),
@@ -40,6 +42,7 @@ def _soil(n: float, k_c: float, k_phi: float, c: float, phi_deg: float, K: float
 
 
 SOILS: dict[str, Soil] = {name: _soil(*row) for name, row in _WONG.items()}
+"""The known soils by name."""
 SOILS |= {
     # Table 2 of Xi et al. 2024.
     "xi_wet_clay": _soil(0.85, 43.68, 499.3, 7.58, 14.0, 0.025),

@@ -11,7 +11,10 @@ from typing import Any
 
 import numpy as np
 
+__all__ = ["GRAVITY", "Chassis", "axle_loads", "pull_required", "slip_ratio"]
+
 GRAVITY = 9.80665
+"""Standard acceleration of free fall [m/s^2]."""
 
 
 @dataclass(frozen=True, slots=True)

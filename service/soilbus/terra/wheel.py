@@ -31,10 +31,23 @@ from soilbus.terra.contact_stress import (
 )
 from soilbus.terra.hardpan import by_pan, pan_stresses, reaching
 from soilbus.terra.soil_laws import lumped_modulus
-from soilbus.terra.wheel_state import EXACT_NODES as EXACT_NODES
-from soilbus.terra.wheel_state import FAST_NODES as FAST_NODES
-from soilbus.terra.wheel_state import WheelModel as WheelModel
-from soilbus.terra.wheel_state import WheelState as WheelState
+from soilbus.terra.wheel_state import EXACT_NODES, FAST_NODES, WheelModel, WheelState
+
+__all__ = [
+    "EXACT_NODES",
+    "FAST_NODES",
+    "FORCES",
+    "INPUTS",
+    "SHAPE",
+    "Soil",
+    "WheelModel",
+    "WheelState",
+    "sinkage",
+    "state_on",
+    "wheel_forces",
+    "wheel_forces_and_derivatives",
+    "wheel_forces_and_slopes",
+]
 
 MIN_ENTRY_ANGLE = 1e-4
 MAX_ENTRY_ANGLE = 1.4
@@ -44,7 +57,9 @@ of it small chunks cost twice as much, given that the allocator keeps its memory
 
 
 FORCES = ("load", "drawbar_pull", "torque")
+"""What wheel_forces() returns: W [N], DP [N], T [N m]."""
 INPUTS = ("entry_angle", "slip", "K_L", "n", "tan_phi", "c", "K")
+"""What the forces are differentiated by, as fields of WheelState."""
 SHAPE = ("peak", "leave", "exponential_share", "pan_stiffness", "pan_depth")
 """What the shape of the contact depends on: the angles of greatest stress and of exit over the entry angle, and
 the fields of WheelModel by name."""

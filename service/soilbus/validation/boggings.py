@@ -6,7 +6,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter
 
+from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import rig_of
 from soilbus.simulator.drive import SimulationError, drive
@@ -120,12 +122,9 @@ def _digging(config: Config, firm: str, most: float, start: float, rng: np.rando
     return Trouble(replace(first, speed=Profile(even.tolist(), smooth.tolist())), effects)
 
 
-def _smoothed(values: np.ndarray, gain: float) -> np.ndarray:
+def _smoothed(values: Array, gain: float) -> Array:
     """Two lags of first order, as mass and driveline make of a change."""
+    memory = 1.0 - gain
     for _ in range(2):
-        out, last = np.empty_like(values), values[0]
-        for i, value in enumerate(values):
-            last += gain * (value - last)
-            out[i] = last
-        values = out
+        values, _ = lfilter([gain], [1.0, -memory], values, zi=[memory * values[0]])
     return values

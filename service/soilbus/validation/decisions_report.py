@@ -6,7 +6,8 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from soilbus.estimation.posterior import NORMAL_95
+from scipy.special import gammaincinv
+
 from soilbus.report.table import table
 from soilbus.validation.bogging_trials import ENOUGH_TIME, ENOUGH_WAY, FELT, REACTION, WarningFigures
 from soilbus.validation.draft_trials import SPREAD, DraftFigures
@@ -95,12 +96,9 @@ def _pooled(firm: Sequence[WarningFigures]) -> dict[str, _Pooled]:
 
 
 def poisson_interval(count: int) -> tuple[float, float]:
-    """95 % interval of what a count is expected to be (Byar's approximation: Breslow and Day 1987, eq. 2.9)."""
-
-    def bound(n: int, z: float) -> float:
-        return n * (1.0 - 1.0 / (9.0 * n) + z / (3.0 * math.sqrt(n))) ** 3 if n else 0.0
-
-    return bound(count, -NORMAL_95), bound(count + 1, NORMAL_95)
+    """Exact 95 % interval of the expectation of a Poisson count (Garwood 1936, Biometrika 28:437)."""
+    least = float(gammaincinv(count, 0.025)) if count else 0.0
+    return least, float(gammaincinv(count + 1, 0.975))
 
 
 def _bogging_row(found: WarningFigures) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import softmax
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
@@ -80,9 +81,9 @@ def samples(
                 log_share[i] = jacobian - 0.5 * _unlikelihood(fitting, point) - drawn.log_density[i]
                 covariance = np.asarray(np.linalg.inv(point.information))
                 bound[i] = fitting.gaussian_with(place, covariance).posterior.log_covariance
-    share = np.exp(np.where(np.isfinite(log_share), log_share, -np.inf) - np.nanmax(log_share))
+    share = softmax(np.where(np.isfinite(log_share), log_share, -np.inf))
     kept = share > 0.0
-    return Samples(logs[kept], share[kept] / share[kept].sum(), bound[kept])
+    return Samples(logs[kept], share[kept], bound[kept])
 
 
 class _Drawn(NamedTuple):

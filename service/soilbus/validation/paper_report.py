@@ -8,6 +8,8 @@ import time
 from collections.abc import Callable
 from functools import partial
 
+from scipy.optimize import brentq
+
 from soilbus.report.table import table
 from soilbus.validation.paper import (
     AS_PRINTED,
@@ -44,6 +46,8 @@ WIDTH = 118
 PARAMETERS = ("phi [deg]", "K_L", "n")
 DECIMALS = (4, 3, 5)
 REPEATS = 20
+MICROMETRE = 1e-6
+"""[m] How near to none, and to the radius, a sinkage is looked for."""
 
 
 def paper_report(sinkage: float, seed: int) -> str:
@@ -321,13 +325,12 @@ def _where_the_torques_are() -> str:
 
 
 def _sinkage_where(force: str, value: float, trial: Trial, equations: Equations) -> float:
-    """Sinkage [m] at which W or T, both of which grow with it, has a value; by bisection."""
-    low, high = 0.0, trial.radius
-    for _ in range(50):
-        z = (low + high) / 2.0
-        below = getattr(WheelEquations(trial.at(z), equations).forces(trial.truth), force) < value
-        low, high = (z, high) if below else (low, z)
-    return z
+    """Sinkage [m] at which W or T, both of which grow with it, has a value."""
+
+    def beyond(z: float) -> float:
+        return float(getattr(WheelEquations(trial.at(z), equations).forces(trial.truth), force)) - value
+
+    return float(brentq(beyond, MICROMETRE, trial.radius - MICROMETRE))
 
 
 def _corrected(sinkage: float) -> str:

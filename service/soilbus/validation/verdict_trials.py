@@ -17,10 +17,11 @@ import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import ndtri
+from scipy.stats import binomtest
 
 from soilbus.arrays import Array
 from soilbus.config.model import Config, Prior
@@ -31,7 +32,7 @@ from soilbus.decision.judgement import judge
 from soilbus.decision.traversability import State, Traversability
 from soilbus.estimation.assembly import prior_of, rig_of
 from soilbus.estimation.parametrization import MAX_PHI
-from soilbus.estimation.posterior import NORMAL_95, PARAMETERS, SoilPrior
+from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.window import Rig, Window
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.sensors.bins import Bins
@@ -167,7 +168,7 @@ def _margin(way: Traversability, demand: Demand, rng: np.random.Generator) -> fl
     """A margin with which the pull suffices with a probability drawn from all; None where no pull does."""
     if way.capability is None or (most := way.capability.likely_pull) is None or demand.pull <= 0.0:
         return None
-    sure = NormalDist().inv_cdf(rng.uniform(LEAST, 1.0 - LEAST))
+    sure = float(ndtri(rng.uniform(LEAST, 1.0 - LEAST)))
     return (most.value - sure * math.hypot(most.std, demand.std)) / demand.pull - 1.0
 
 
@@ -243,17 +244,15 @@ def reliability(calls: Sequence[Call]) -> Reliability:
 
 def _bin(i: int, p: Array, true: Array) -> Bin:
     inside = np.minimum((p * BINS).astype(int), BINS - 1) == i
-    n, hits = int(inside.sum()), float(true[inside].sum())
+    n, hits = int(inside.sum()), int(true[inside].sum())
     least, most = wilson(hits, n)
     mean, share = (float(p[inside].mean()), hits / n) if n else (math.nan, math.nan)
     return Bin(i / BINS, (i + 1) / BINS, n, mean, share, least, most)
 
 
-def wilson(hits: float, n: int) -> tuple[float, float]:
+def wilson(hits: int, n: int) -> tuple[float, float]:
     """95 % interval of a binomial frequency (Wilson 1927); 0 to 1 for no trials."""
     if n == 0:
         return 0.0, 1.0
-    z2 = NORMAL_95**2
-    centre = (hits + z2 / 2.0) / (n + z2)
-    half = NORMAL_95 * math.sqrt(hits * (n - hits) / n + z2 / 4.0) / (n + z2)
-    return max(centre - half, 0.0), min(centre + half, 1.0)
+    interval = binomtest(hits, n).proportion_ci(0.95, method="wilson")
+    return float(interval.low), float(interval.high)

@@ -42,7 +42,7 @@ def run_bench() -> dict[str, Any]:
 
     With one thread for linear algebra, as the service has by its unit: with two, both wait for each other
     all the time, and both are counted.  ModuleNotFoundError, with a line for the user, where
-    scipy or threadpoolctl is not installed; AssertionError where ours and a peer come to different results.
+    threadpoolctl is not installed; AssertionError where ours and a peer come to different results.
     """
     try:
         from threadpoolctl import threadpool_limits

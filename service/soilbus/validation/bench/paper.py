@@ -8,6 +8,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from scipy.integrate import quad
+from scipy.optimize import fsolve
 
 from soilbus.validation.bench.figure import Figure
 from soilbus.validation.paper import EXACT, Forces, OperatingPoint, Unknowns, WheelEquations, entry_angle
@@ -23,15 +25,7 @@ Problem = tuple[OperatingPoint, Forces, Unknowns]
 
 
 def paper_solve_speedup() -> Figure:
-    """The paper's three wheels from 20 % and 50 % off, rational shear and exact integrals, one solve at a time.
-
-    ModuleNotFoundError, with a line for the user, where scipy is not installed.
-    """
-    try:
-        from scipy.integrate import quad
-        from scipy.optimize import fsolve
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError("the paper's bench needs the extra soilbus[peers]") from None
+    """The paper's three wheels from 20 % and 50 % off, rational shear and exact integrals, one solve at a time."""
     problems = paper_problems()
 
     def ours(problem: Problem) -> Unknowns:
@@ -40,7 +34,7 @@ def paper_solve_speedup() -> Figure:
 
     def peer(problem: Problem) -> Any:
         point, measured, start = problem
-        return fsolve(balance(point, measured, quad), start)
+        return fsolve(balance(point, measured), start)
 
     apart = max(float(np.max(np.abs(np.array(ours(p)) / peer(p) - 1.0))) for p in problems)
     if not apart < AGREEMENT:
@@ -65,7 +59,7 @@ def paper_problems() -> list[Problem]:
     return problems
 
 
-def balance(point: OperatingPoint, measured: Forces, quad: Any) -> Callable[[Any], list[float]]:
+def balance(point: OperatingPoint, measured: Forces) -> Callable[[Any], list[float]]:
     """Eqs. 20-22 less the measured forces, for fsolve: the paper's ten integrals, each by quad."""
     r, area = point.radius, point.radius * point.width
     c, K, advance = point.c, point.K, 1.0 - point.slip

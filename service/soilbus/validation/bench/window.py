@@ -8,9 +8,10 @@ at the prior's median; ours then also tries other soils, least_squares does not.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from soilbus.arrays import Array
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
@@ -56,21 +57,14 @@ class Window(NamedTuple):
 
 
 def window_solve_speedup() -> Figure:
-    """10 s, four wheels, five free parameters, cold; AssertionError where the two come to different ends.
-
-    ModuleNotFoundError, with a line for the user, where scipy is not installed.
-    """
-    try:
-        from scipy.optimize import least_squares
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError("the bench of a window needs the extra soilbus[peers]") from None
+    """10 s, four wheels, five free parameters, cold; AssertionError where the two come to different ends."""
     windows = [_window(soil, *known) for known in KNOWN for soil in SOILS]
     apart, times = [], []
     for window in windows:
-        apart.append(distance(window, fit_window(*window), by_finite_differences(window, least_squares)))
+        apart.append(distance(window, fit_window(*window), by_finite_differences(window)))
         if not apart[-1] < AGREEMENT:
             raise AssertionError(f"ours and least_squares end {apart[-1]:.2g} standard deviations apart")
-        times.append(in_turn(_works(window, least_squares), ROUNDS))
+        times.append(in_turn(_works(window), ROUNDS))
     ours, alone, peer = np.array(times).T
     singly = ", ".join(f"{ratio:.1f}" for ratio in peer / ours)
     return Figure(
@@ -95,7 +89,7 @@ def distance(window: Window, ours: Fit | None, peer: Soil) -> float:
     return float(np.max(np.abs(np.log(np.asarray(peer) / ours.mode.soil)[free]) / std))
 
 
-def by_finite_differences(window: Window, least_squares: Any) -> Soil:
+def by_finite_differences(window: Window) -> Soil:
     """The most probable soil by scipy's least_squares.
 
     Unknowns are the logarithms' distances from the prior's median in its standard
@@ -154,12 +148,12 @@ def _whitened(problem: ObservationModel, at: Linearisation, latents: Latents) ->
     return residuals
 
 
-def _works(window: Window, least_squares: Any) -> tuple[Callable[[], object], ...]:
+def _works(window: Window) -> tuple[Callable[[], object], ...]:
     """Ours, ours from one start, and the peer."""
     return (
         lambda: fit_window(*window),
         lambda: fit_from_soil(*window, window.start),
-        lambda: by_finite_differences(window, least_squares),
+        lambda: by_finite_differences(window),
     )
 
 
