@@ -144,7 +144,7 @@ MUTATIONS = (
     ),
     Mutation(
         "gains may be as negative as they like", "daemon/state_store.py",
-        "(np.abs(off) <= FAR * std).all()", "(off <= FAR * std).all()",
+        "(np.abs(off) <= STORED_RANGE_SD * std).all()", "(off <= STORED_RANGE_SD * std).all()",
         ("tests/daemon/test_store.py::test_each_fault_is_told_in_one_line",),
     ),
     Mutation(

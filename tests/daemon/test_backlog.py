@@ -9,7 +9,7 @@ from time import perf_counter, sleep
 import pytest
 
 from fakes import FakeClock, InlineExecutor
-from soilbus.daemon.work_queue import MAX_PENDING, TIDIED, WorkQueue
+from soilbus.daemon.work_queue import MAX_PENDING_WINDOWS, WINDOWS_PER_MEMORY_RELEASE, WorkQueue
 
 
 class Later(Executor):
@@ -52,7 +52,7 @@ def test_what_the_worker_cannot_keep_up_with_is_dropped_but_for_the_newest_and_t
     worker_has = backlog.add(0, 0.0, 0, 0.0)
     worker.jobs[0][0].set_running_or_notify_cancel()
     dropped = [backlog.add(task, 0.0, 0, 0.0) for task in range(1, 6)]
-    assert [worker_has, *dropped] == [0] * MAX_PENDING + [1] * (6 - MAX_PENDING)
+    assert [worker_has, *dropped] == [0] * MAX_PENDING_WINDOWS + [1] * (6 - MAX_PENDING_WINDOWS)
     worker.jobs[0][0].set_result(0)
     del worker.jobs[0]
     while worker.jobs:
@@ -91,9 +91,12 @@ def test_free_memory_is_given_back_once_in_a_while_and_after_the_result_is_out(m
     done: list[str] = []
     monkeypatch.setattr("soilbus.daemon.work_queue.give_back_freed_memory", partial(done.append, "tidy"))
     backlog = WorkQueue(InlineExecutor(), lambda task: task, 0.0)
-    for task in range(2 * TIDIED + 1):
+    for task in range(2 * WINDOWS_PER_MEMORY_RELEASE + 1):
         backlog.add(task, 0.0, 0, 0.0)
         for result, _ in backlog.results(0.0):
             done.append(f"window {result} out")
     tidied = [i for i, what in enumerate(done) if what == "tidy"]
-    assert [done[i - 1] for i in tidied] == [f"window {TIDIED - 1} out", f"window {2 * TIDIED - 1} out"]
+    assert [done[i - 1] for i in tidied] == [
+        f"window {WINDOWS_PER_MEMORY_RELEASE - 1} out",
+        f"window {2 * WINDOWS_PER_MEMORY_RELEASE - 1} out",
+    ]

@@ -19,7 +19,7 @@ from soilbus.simulator.scenario import Swing
 from soilbus.terra.wheel import Soil
 from soilbus.validation import importance_sampling as exact
 from soilbus.validation.cramer_rao import cramer_rao
-from soilbus.validation.importance_sampling import samples
+from soilbus.validation.importance_sampling import sample_posterior
 
 STILL = Swing(0.0, 1e-9)
 
@@ -35,7 +35,7 @@ def ill_told():
 
 def test_the_average_along_n_has_the_moments_of_the_exact_posterior(ill_told):
     problem, prior, before, fit = ill_told
-    found = samples(problem, prior, before, fit, 500, np.random.default_rng(1))
+    found = sample_posterior(problem, prior, before, fit, 500, np.random.default_rng(1))
     assert found.share.sum() == pytest.approx(1.0)
     assert found.effective > 60.0
     whole = with_nested_laplace(problem, prior, before, fit).reported
@@ -72,9 +72,9 @@ def test_where_moments_leave_the_share_of_k_c_no_deviation_the_draws_are_by_the_
         return node._replace(fit=replace(node.fit, gaussian=replace(node.fit.gaussian, covariance=covariance)))
 
     flat = along._replace(nodes=[without_deviation(node) for node in along.nodes])
-    told = samples(problem, prior, before, fit, 500, np.random.default_rng(1))
+    told = sample_posterior(problem, prior, before, fit, 500, np.random.default_rng(1))
     monkeypatch.setattr(exact, "ridge", lambda *_: flat)
-    again = samples(problem, prior, before, fit, 500, np.random.default_rng(2))
+    again = sample_posterior(problem, prior, before, fit, 500, np.random.default_rng(2))
     (mean, std), (other, _) = (moments(found) for found in (told, again))
     chance = 3.5 * np.sqrt(1.0 / told.effective + 1.0 / again.effective)
     assert again.effective > 30.0
@@ -88,7 +88,7 @@ def moments(found):
 
 def test_each_soil_has_the_bound_of_a_window_on_it(ill_told):
     problem, prior, before, fit = ill_told
-    found = samples(problem, prior, before, fit, 300, np.random.default_rng(1))
+    found = sample_posterior(problem, prior, before, fit, 300, np.random.default_rng(1))
     calm = profile_over_n(problem, prior, before, fit).problem
     for i in np.argsort(found.share)[-20:]:
         bound = cramer_rao(calm, prior, Soil(*np.exp(found.logs[i]).tolist())).log_covariance
@@ -101,4 +101,4 @@ def test_without_a_ridge_there_are_no_samples(ill_told):
     problem, prior, _, _ = ill_told
     held = SoilPrior(prior.median, np.where(np.arange(6) == 0, 0.0, prior.log_std))
     before, fit = Gaussian.of(held, problem.gain_std), fit_window(problem, held)
-    assert samples(problem, held, before, fit, 10, np.random.default_rng(1)) is None
+    assert sample_posterior(problem, held, before, fit, 10, np.random.default_rng(1)) is None

@@ -17,13 +17,13 @@ from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import SOILS
-from soilbus.validation.bayes_risk_bound import Attainable
+from soilbus.validation.bayes_risk_bound import BayesRisk
 from soilbus.validation.monte_carlo import (
     ROUGHLY_KNOWN,
     Trial,
     as_json,
-    missed,
     monte_carlo,
+    prior_about,
     summary,
     tasks_of,
     trials,
@@ -53,7 +53,7 @@ def test_what_is_attainable_is_told_beside_what_is_attained():
     for i, window in enumerate(made):
         weight = rng.uniform(0.1, 2.0) * np.ones((3, 7))
         risk = weight * least**2 * rng.exponential(1.0, 7)
-        shown.append(replace(window, exact=Attainable(window.error / 1.3, risk, weight, float(i))))
+        shown.append(replace(window, exact=BayesRisk(window.error / 1.3, risk, weight, float(i))))
     cell = summary("loam", 2.0, True, [*shown, *made_up(3, spread=50.0)])
     assert cell.exact.windows == 400
     # the mean of n exponential numbers scatters by 1 / sqrt(n); unlike weights leave fewer of them, uniform ones 3/4
@@ -148,14 +148,14 @@ def test_a_prior_misses_by_as_much_as_it_says():
     prior = prior_of(CONFIG)
     held = SoilPrior(prior.median, np.where(np.arange(6) == 4, 0.0, prior.log_std))
     soil, rng = SOILS["wet_clay"], np.random.default_rng(1)
-    drawn = [missed(held, soil, rng) for _ in range(4000)]
+    drawn = [prior_about(held, soil, rng) for _ in range(4000)]
     assert all((p.log_std == held.log_std).all() for p in drawn)
     miss = np.log(np.array([p.median for p in drawn]) / np.asarray(soil))
     assert miss.std(axis=0) == pytest.approx(held.log_std, rel=0.05)
     assert np.abs(miss.mean(axis=0)).max() < 0.08
     assert not miss[:, 4].any()
     phi = PARAMETERS.index("phi")
-    steep = [missed(prior, soil._replace(phi=1.1), rng).median[phi] for _ in range(200)]
+    steep = [prior_about(prior, soil._replace(phi=1.1), rng).median[phi] for _ in range(200)]
     assert max(steep) < MAX_PHI
 
 

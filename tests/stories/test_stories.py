@@ -63,7 +63,7 @@ def with_the_verdict_of_the_run_before(monkeypatch):
     usual = Service.present_way
 
     def present_way(self, now):
-        knows = self.result is None and self._keeper.recalled is not None
+        knows = self.result is None and self._persistence.stored_prior is not None
         return Traversability(Way.GO) if knows and self._state[0] is ServiceState.ESTIMATING else usual(self, now)
 
     monkeypatch.setattr(Service, "present_way", present_way)

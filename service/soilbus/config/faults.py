@@ -16,7 +16,7 @@ from pydantic import BaseModel, ValidationError
 from soilbus.config.model import Config
 from soilbus.words import did_you_mean
 
-LONGEST_SHOWN = 40
+MAX_SHOWN_CHARACTERS = 40
 """Characters of a wrong value that a line repeats."""
 
 
@@ -114,7 +114,7 @@ def _shown(given: Any) -> str:
     if isinstance(given, bool):
         return str(given).lower()
     text = f'"{given}"' if isinstance(given, str) else str(given)
-    return text if len(text) <= LONGEST_SHOWN else text[: LONGEST_SHOWN - 3] + "..."
+    return text if len(text) <= MAX_SHOWN_CHARACTERS else text[: MAX_SHOWN_CHARACTERS - 3] + "..."
 
 
 def _named(raw: Any, location: Sequence[Any]) -> list[str]:

@@ -8,9 +8,9 @@ from soilbus.can.admission import CLOCK_STEP, LAST_TIME
 from soilbus.can.bus import LiveBus
 from soilbus.can.wire import STAMPED
 
-GRACE = 0.2
+CLOSE_DELAY = 0.2
 """A window that no later frame has closed is closed this long after its end [s], where the bus cannot tell before."""
-LATE = 0.01
+TAKING_DELAY = 0.01
 """Seconds by which a frame may be taken later than it was stamped."""
 
 
@@ -47,14 +47,14 @@ class BusTime:
 
     def heard(self, end: float, now: float) -> float:
         """The bus's own time of which all is heard; asks the bus itself where a window may just have ended at `end`."""
-        heard, latest = max(self._stamp, self.at(self._nothing_left) - GRACE), self.at(now) + LATE
+        heard, latest = max(self._stamp, self.at(self._nothing_left) - CLOSE_DELAY), self.at(now) + TAKING_DELAY
         if heard < end <= latest:
             return max(heard, min(self._bus.heard_until(), latest))  # its clock may just have been set
         return heard
 
     def wait(self, end: float, now: float, longest: float) -> float:
         """How long to wait for a frame, `longest` at most: not past the moment when a window's end is heard."""
-        if self.at(now) + longest + LATE < end:
+        if self.at(now) + longest + TAKING_DELAY < end:
             return longest
         left = end + STAMPED - self._bus.stamping_time()
         return longest if math.isnan(left) else min(longest, max(left, 0.0))

@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 
 INTERNAL = "internal"
 """Reason and kind of failure of a window at which the estimator raised."""
-REPEATED = 3
+FAILURES_TO_FAULT = 3
 """Such windows in a row from which the service is in fault."""
 
 
@@ -48,7 +48,7 @@ class GuardedEstimator:
     @property
     def in_fault(self) -> bool:
         """Whether windows have failed by a defect so often in a row that the next will too."""
-        return self._in_a_row >= REPEATED
+        return self._in_a_row >= FAILURES_TO_FAULT
 
     def solve(self, task: WindowTask) -> WindowResult:
         """The window's result, unwatched: the loop watches; an invalid one where the estimator raised.
@@ -60,9 +60,9 @@ class GuardedEstimator:
             result = self.estimator.solve_unwatched(task)
         except Exception as error:
             self._in_a_row += 1
-            if self._in_a_row <= REPEATED:
-                log.error("window %d failed: %s", task.index, _where(error))
-            if self._in_a_row % REPEATED == 0:
+            if self._in_a_row <= FAILURES_TO_FAULT:
+                log.error("window %d failed: %s", task.index, _error_with_place(error))
+            if self._in_a_row % FAILURES_TO_FAULT == 0:
                 self._estimator = self._again()
             return _failed(task)
         self._in_a_row = 0
@@ -87,7 +87,7 @@ def _failed(task: WindowTask) -> WindowResult:
     )
 
 
-def _where(error: Exception) -> str:
+def _error_with_place(error: Exception) -> str:
     """The error in one line, with the place in our code that raised it."""
     trace, place = error.__traceback__, ""
     while trace is not None:

@@ -5,9 +5,9 @@ A silent bus, or none, is no fault of the service: starting it again would heal 
 
 from __future__ import annotations
 
-LONGEST_SOLVE = 20.0
+MAX_SOLVE_TIME = 20.0
 """A window that takes longer [s] is an estimator that hangs."""
-LONGEST_MUTE = 30.0
+MAX_TIME_WITHOUT_SEND = 30.0
 """Seconds of frames heard without one sent, after which it is the sender that hangs and not the bus that is full."""
 
 
@@ -25,8 +25,8 @@ class Health:
         """
         if sent != self._sent or not hears:
             self._sent, self._able = sent, now
-        if solving_since is not None and now - solving_since > LONGEST_SOLVE:
+        if solving_since is not None and now - solving_since > MAX_SOLVE_TIME:
             return "overload the estimator hangs"
-        if now - self._able > LONGEST_MUTE:
+        if now - self._able > MAX_TIME_WITHOUT_SEND:
             return "internal nothing can be sent"
         return None

@@ -64,7 +64,7 @@ def start_service(
         _load()
     service = Service(
         config, pipeline, bus, publisher, Notifier.from_environment(), workers, on_window=on_window,
-        opened_keeper=partial(_keeper, pipeline, os.environ),
+        open_persistence=partial(_state_persistence, pipeline, os.environ),
     )  # fmt: skip
     if rehearse:
         workers.submit(_rehearse, config, pipeline.database, ours)  # where it raises, the first window is late, no more
@@ -88,7 +88,7 @@ def _rehearse(config: Config, database: Database, ours: Database) -> None:
     warm_up(config, database, ours)
 
 
-def _keeper(pipeline: Pipeline, environ: Mapping[str, str]) -> StatePersistence | None:
+def _state_persistence(pipeline: Pipeline, environ: Mapping[str, str]) -> StatePersistence | None:
     """In the worker: keeps the state in the folder that systemd made for it; None where there is none."""
     folder = environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if not folder:

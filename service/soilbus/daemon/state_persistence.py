@@ -17,14 +17,14 @@ from soilbus.words import one_line
 
 log = logging.getLogger(__name__)
 
-PERIOD = 60.0
+STORE_PERIOD = 60.0
 """Seconds between two writings, so what a power cut takes at most."""
-LONGEST_LAST = 3.0
+MAX_LAST_WRITE_TIME = 3.0
 """Seconds that the end waits for the last writing."""
 FILE = "state.json"
 
 
-class Recalled(NamedTuple):
+class StoredPrior(NamedTuple):
     """What another run knew, and how many seconds ago."""
 
     gaussian: Gaussian
@@ -40,26 +40,28 @@ class StatePersistence:
 
     def __init__(self, folder: Path, owner: Owner, writer: Executor, wall: Callable[[], float] = time.time) -> None:
         self._path, self._owner, self._writer, self._wall = folder / FILE, owner, writer, wall
-        self._before = self._read()
-        self._stored = None if self._before is None else self._before.gaussian
+        self._previous = self._read()
+        self._stored = None if self._previous is None else self._previous.gaussian
         self._seen: Gaussian | None = None
         self._writing: Future[None] | None = None
         self._fails = False
         self._next = float("-inf")
 
     @property
-    def recalled(self) -> Recalled | None:
+    def stored_prior(self) -> StoredPrior | None:
         """What the run before knew; of unknown age, and then taken for old, where the clock was set back since."""
-        if self._before is None or self._before.gaussian is None:
+        if self._previous is None or self._previous.gaussian is None:
             return None
-        elapsed = self._wall() - self._before.gaussian.at
-        return Recalled(gaussian_of(self._before.gaussian, self._owner), elapsed if elapsed >= 0.0 else PERSISTENCE)
+        elapsed = self._wall() - self._previous.gaussian.at
+        return StoredPrior(
+            gaussian_of(self._previous.gaussian, self._owner), elapsed if elapsed >= 0.0 else PERSISTENCE
+        )
 
     def tick(self, now: float, gaussian: Gaussian | None, counts: Callable[[], Mapping[str, int]]) -> None:
         """Have the state written if that is due at the monotonic time `now` [s]; returns at once."""
         if now < self._next:
             return
-        self._next = now + PERIOD
+        self._next = now + STORE_PERIOD
         if self._writing is None or self._writing.done():
             self._write(gaussian, counts())
 
@@ -67,7 +69,7 @@ class StatePersistence:
         """Have the last state written; waits for it, but not long."""
         self._write(gaussian, counts)
         if self._writing is not None:
-            wait([self._writing], LONGEST_LAST)
+            wait([self._writing], MAX_LAST_WRITE_TIME)
         self._writer.shutdown(wait=False)
 
     def _read(self) -> State | None:
@@ -90,7 +92,7 @@ class StatePersistence:
                 self._stored = stored_gaussian(gaussian, at, self._owner)
             except StateError as error:
                 log.info("the present belief is not stored: %s", error)
-        before = self._before
+        before = self._previous
         totals = Counter(counts) + Counter({} if before is None else before.totals)
         starts = 1 if before is None else before.starts + 1
         try:

@@ -33,9 +33,9 @@ from soilbus.estimation.tracker import elsewhere, gain_errors
 from soilbus.words import one_line
 
 FORMAT, VERSION = "soilbus state", 2
-LARGEST = 1 << 20
+MAX_FILE_BYTES = 1 << 20
 """Bytes of a file beyond which it is not ours."""
-FAR = 8.0
+STORED_RANGE_SD = 8.0
 """Prior standard deviations beyond which no belief of ours lies, and by which its own may be wider."""
 SECTIONS = {"vehicle", "wheel", "signals", "noise", "soil", "estimator", "model"}
 """Sections of the configuration that a belief depends on."""
@@ -136,7 +136,7 @@ def _check(gaussian: Gaussian, owner: Owner) -> None:
     if physical:
         off = np.concatenate([np.log(gaussian.soil[free]) - np.log(median[free]), gaussian.gains])
         std = np.concatenate([owner.std[:n_soil][free], owner.std[n_soil:]])
-        physical = (np.abs(off) <= FAR * std).all() and np.allclose(gaussian.soil[~free], median[~free])
+        physical = (np.abs(off) <= STORED_RANGE_SD * std).all() and np.allclose(gaussian.soil[~free], median[~free])
     if not physical:
         raise StateError("the belief is out of physical bounds")
     _check_covariance(gaussian.covariance, owner.std)
@@ -147,7 +147,7 @@ def _check_covariance(covariance: Array, std: Array) -> None:
     held, variance = std == 0.0, np.diag(covariance)
     if covariance[held].any() or covariance[:, held].any() or not (variance[~held] > 0.0).all():
         raise StateError("the belief's covariance is not positive definite")
-    if (variance > (FAR * std) ** 2).any():
+    if (variance > (STORED_RANGE_SD * std) ** 2).any():
         raise StateError("the belief's covariance is out of bounds")
     scale = np.sqrt(variance[~held])
     with np.errstate(over="ignore"):
@@ -200,12 +200,12 @@ def read(path: Path, owner: Owner) -> State | None:
         with open(descriptor, "rb") as file:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
                 raise StateError("it is no file")
-            content = file.read(LARGEST + 1)
+            content = file.read(MAX_FILE_BYTES + 1)
     except FileNotFoundError:
         return None
     except OSError as error:
         raise StateError(error.strerror or str(error)) from None
-    if len(content) > LARGEST:
+    if len(content) > MAX_FILE_BYTES:
         raise StateError("it is too large to be a state of soilbus")
     return loaded(content, owner)
 

@@ -11,9 +11,9 @@ from soilbus.allocator import give_back_freed_memory
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.result import WindowResult
 
-MAX_PENDING = 3
+MAX_PENDING_WINDOWS = 3
 """Windows that may wait for the worker."""
-TIDIED = 60
+WINDOWS_PER_MEMORY_RELEASE = 60
 """Windows after which memory that is free is given back, and after as many again."""
 
 
@@ -68,7 +68,7 @@ class WorkQueue:
             self._busy_since = now
         self._pending.append(Pending(self._workers.submit(self._solve, task), ended, epoch))
         dropped = 0
-        while len(self._pending) > MAX_PENDING and self._pending[1].future.cancel():
+        while len(self._pending) > MAX_PENDING_WINDOWS and self._pending[1].future.cancel():
             del self._pending[1]
             dropped += 1
         return dropped
@@ -85,7 +85,7 @@ class WorkQueue:
             self._busy_since = now
             self.solved += 1
             yield pending.future.result(), pending
-            if self.solved % TIDIED == 0:
+            if self.solved % WINDOWS_PER_MEMORY_RELEASE == 0:
                 self._workers.submit(give_back_freed_memory)
 
     def close(self) -> None:

@@ -35,9 +35,9 @@ __all__ = ["LogError", "estimator_beside", "fed", "log_names", "read_frames", "r
 _T = TypeVar("_T")
 
 SWITCH_INTERVAL = 0.0002
-FIRST_LINES = 2000
+CHANNEL_SCAN_LINES = 2000
 """Lines of a log in which its channels are looked for: several seconds of a bus."""
-MAX_AHEAD = 30
+MAX_PENDING_WINDOWS = 30
 """Windows that may wait for the estimator."""
 
 
@@ -145,7 +145,7 @@ def replay(
     try:
         for name, task in tasks:
             pending.append((name, workers.submit(_estimate, task)))
-            while pending and (pending[0][1].done() or len(pending) > MAX_AHEAD):
+            while pending and (pending[0][1].done() or len(pending) > MAX_PENDING_WINDOWS):
                 yield decided()
     except LogError as error:
         fault = error
@@ -210,13 +210,13 @@ def fed(intake: Intake, log: Path, progress: Callable[[int, float], None] | None
             continue
         feed(t, identifier, extended, data, remote)
         if not due - 2.0 <= t < due:
-            yield _believed(admission, t)
+            yield _plausible_time(admission, t)
             due = min(intake.next_end, t + 1.0) if intake.next_end > t else t + 1.0
             if progress is not None:
                 first = t if math.isnan(first) else first
                 progress(n, t - first)
     t, identifier, extended, data, remote, error = frame
-    yield _believed(admission, t)
+    yield _plausible_time(admission, t)
     if counts.unknown + counts.error_frames == unheard + n:
         raise LogError(f"{log}: none of its {n} frames is in the DBC: a log of another bus?")
     message = None if remote or error else admission.cut_short(identifier, extended, data)
@@ -224,7 +224,7 @@ def fed(intake: Intake, log: Path, progress: Callable[[int, float], None] | None
         raise LogError(f"{log}: cut off in its last frame ({len(data)} of {message.length} bytes of {message.name})")
 
 
-def _believed(admission: Admission, t: float) -> float:
+def _plausible_time(admission: Admission, t: float) -> float:
     """A frame's stamp [s]; that of the latest mapped frame where it is far from it, for then it is no time."""
     newest = admission.newest
     return t if newest <= t <= newest + LONGEST_GAP else newest
@@ -281,7 +281,7 @@ def _channels(path: Path) -> set[str]:
         return set()
     try:
         with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as text:
-            words = [line.split(maxsplit=2) for line in islice(text, FIRST_LINES)]
+            words = [line.split(maxsplit=2) for line in islice(text, CHANNEL_SCAN_LINES)]
     except (OSError, EOFError, ValueError):
         return set()
     return {word[1] for word in words if len(word) == 3 and word[0].startswith("(")}

@@ -38,11 +38,11 @@ from soilbus.words import one_line
 
 Columns = Mapping[str, Sequence[Any]]
 
-ROW = 1.0
+ROW_PERIOD = 1.0
 """Time [s] from one row to the next where the table has none."""
-RIM_SPEED = 100.0
+RIM_SPEED_RATIO = 100.0
 """Rim speed of the stand-in, in units of the least speed at which slip is judged: no slip is a standstill."""
-MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
+MISSING_CELLS = frozenset({"", "nan", "na", "n/a", "null", "none"})
 """Texts, in small letters, of a cell without a value."""
 OF_TRUE_SPEED = frozenset({"rate_stiffening", "inertia"})
 OF_TIME = frozenset({"torque_lag", "channel_lag", "soil_drift", "grade"})
@@ -156,7 +156,7 @@ def candidates(config: Config, records: Sequence[Record]) -> list[Effect]:
 
 def _run(name: str, values: Mapping[str, Array], rig: Rig, config: Config) -> Run:
     n = len(values["slip"])
-    t = np.asarray(values.get("t", np.arange(n) * ROW), np.float64)
+    t = np.asarray(values.get("t", np.arange(n) * ROW_PERIOD), np.float64)
     load, slip = values["wheel_load"], values["slip"]
     with np.errstate(invalid="ignore"):
         faults = {
@@ -170,7 +170,7 @@ def _run(name: str, values: Mapping[str, Array], rig: Rig, config: Config) -> Ru
     kept = np.flatnonzero([not reason for reason in reasons])
     kept = kept[np.argsort(t[kept], kind="stable")]
     rejected = Counter(reason for reason in reasons if reason)
-    rim_speed = RIM_SPEED * config.estimator.min_speed
+    rim_speed = RIM_SPEED_RATIO * config.estimator.min_speed
     window = window_of_rows(rig, t[kept], {role: v[kept] for role, v in values.items()}, rim_speed)
     return Run(name, window, dict(sorted(rejected.items())))
 
@@ -271,7 +271,7 @@ def _numbers(path: Path, columns: Columns, column: Column, rows: Sequence[int]) 
 
 
 def _number(path: Path, column: str, row: int, cell: Any) -> float:
-    if cell is None or str(cell).strip().lower() in MISSING:
+    if cell is None or str(cell).strip().lower() in MISSING_CELLS:
         return math.nan
     try:
         value = math.inf if isinstance(cell, bool) else float(cell)

@@ -51,12 +51,12 @@ def configuration_warnings(config: Config) -> list[str]:
     elif config.table is None and config.signals.ground_speed is None:
         lines.append("signals.ground_speed is not mapped: without slip nothing can be estimated")
     c = config.soil.c
-    if 0.0 < c.value < LEAST_COHESION and c.std > 0.0:
+    if 0.0 < c.value < MIN_COHESION and c.std > 0.0:
         lines.append(f"soil.c.value = {c.value:g} Pa is next to nothing; is it in kPa?")
     return lines
 
 
-LEAST_COHESION = 70.0
+MIN_COHESION = 70.0
 """Pa: the stiffest clay of Wong's table has 69 kPa, the loosest sand 1 kPa."""
 
 
@@ -168,7 +168,7 @@ def identifiable(config: Config) -> list[tuple[str, str]]:
     rig = rig_of(config)
     held = {name for name, prior in config.soil_prior.items() if prior.std == 0.0}
     if config.table is not None:
-        verdicts = _told_by(config.table)
+        verdicts = _verdicts_of_table(config.table)
     elif not rig.wheels or config.signals.ground_speed is None:
         verdicts = dict.fromkeys(config.soil_prior, "no: needs torque, speed and load of a wheel and a ground speed")
     else:
@@ -188,7 +188,7 @@ def identifiable(config: Config) -> list[tuple[str, str]]:
     return [(name, "held by the configuration" if name in held else text) for name, text in verdicts.items()]
 
 
-def _told_by(columns: Table) -> dict[str, str]:
+def _verdicts_of_table(columns: Table) -> dict[str, str]:
     """What the columns of a test rig tell of each soil parameter."""
     forces = " and ".join(role.replace("_", " ") for role in ("torque", "drawbar_pull") if role in columns.columns)
     depth = "yes: sinkage over varied load" if columns.sinkage else f"weakly: {forces} alone; sinkage would tell more"

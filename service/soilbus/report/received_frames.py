@@ -17,11 +17,11 @@ from soilbus.can.inbox import checksum_byte_of
 from soilbus.can.wire import Received
 
 CYCLES_UNTIL_STALE = 3
-GRACE = 0.2
+BUS_DELAY = 0.2
 """Time [s] beyond these cycles that a bus may take."""
 
 
-class Readings:
+class ReceivedFrames:
     """The last good frame of each message, by the rules of dbc/README.md."""
 
     def __init__(self, database: Database, clock: Callable[[], float] = time.monotonic) -> None:
@@ -57,7 +57,7 @@ class Readings:
     def value(self, message: str, signal: str) -> float | str | None:
         """A signal's value or name; None where the frame is stale, or the value not available or reserved."""
         age = self._clock() - self._seen.get(message, -1e9)
-        if age > CYCLES_UNTIL_STALE * self._cycle[message] + GRACE:
+        if age > CYCLES_UNTIL_STALE * self._cycle[message] + BUS_DELAY:
             return None
         value = self._values[message].get(signal)
         if isinstance(value, NamedSignalValue):

@@ -17,7 +17,7 @@ from soilbus.estimation.posterior import Estimate
 from soilbus.pipeline.outputs import known
 from soilbus.pipeline.result import WindowResult
 
-DECIMALS = 7
+DEGREE_DECIMALS = 7
 """Of a degree: a centimetre."""
 
 
@@ -42,7 +42,7 @@ def soil_map(results: Iterable[WindowResult]) -> tuple[str, int]:
 
 def _feature(result: WindowResult) -> dict[str, Any]:
     assert result.position is not None
-    latitude, longitude = (round(math.degrees(angle), DECIMALS) for angle in result.position)
+    latitude, longitude = (round(math.degrees(angle), DEGREE_DECIMALS) for angle in result.position)
     return {
         "type": "Feature",
         "id": result.index,

@@ -16,7 +16,7 @@ SHOWN = {
     "k_c": ("kN/m^(n+1)", 1e3), "k_phi": ("kN/m^(n+2)", 1e3), "n": ("", 1.0), "phi": ("deg", math.pi / 180.0),
     "c": ("kPa", 1e3), "K": ("mm", 1e-3),
 }  # fmt: skip
-MOST_NAMED = 3
+MAX_SOILS_NAMED = 3
 
 
 def prior_text(config: Config) -> str:
@@ -39,6 +39,6 @@ def _rows(config: Config) -> Iterator[tuple[str, ...]]:
             continue
         values = {kind: getattr(SOILS[kind], name) for kind in KINDS}
         outside = sorted((kind for kind, v in values.items() if not low <= v <= high), key=lambda kind: -values[kind])
-        named = ", ".join(f"{kind} ({values[kind] / size:.3g})" for kind in outside[:MOST_NAMED])
-        more = f" and {len(outside) - MOST_NAMED} more" if len(outside) > MOST_NAMED else ""
+        named = ", ".join(f"{kind} ({values[kind] / size:.3g})" for kind in outside[:MAX_SOILS_NAMED])
+        more = f" and {len(outside) - MAX_SOILS_NAMED} more" if len(outside) > MAX_SOILS_NAMED else ""
         yield name, f"{median / size:.3g}", f"{low / size:.3g}", f"{high / size:.3g}", unit, named + more or "none"

@@ -18,7 +18,7 @@ from soilbus.pipeline.result import WindowResult
 from soilbus.report.advice import advice, of_use
 from soilbus.report.page import html_table, page, picture
 
-SEAM = 5.0
+RECORDING_GAP = 5.0
 """Room [s] between two recordings in a plot."""
 
 
@@ -134,7 +134,7 @@ def _plots(results: Sequence[WindowResult]) -> Any:
                 axis.axvline(begin, color="0.8", linewidth=0.8)
         if several:
             axes[0].annotate(stretch[0].log, (begin, 1.0), xycoords=("data", "axes fraction"), fontsize=7, rotation=20)
-        begin = stretch[-1].t + shift + SEAM
+        begin = stretch[-1].t + shift + RECORDING_GAP
     labels = ("bearing pressure, kPa", "friction angle, °", "max. draft, kN", "slip")
     for axis, label in zip(axes, labels, strict=True):
         axis.set_ylabel(label)

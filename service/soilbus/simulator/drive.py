@@ -76,7 +76,7 @@ def drive(config: Config, scenario: Scenario, seed: int, effects: Sequence[Activ
     rear = np.array([wheel.axle == "rear" for wheel in config.wheel])
     model = WheelModel(shear_law=config.model.shear_law)
     mechanics = Mechanics(model, rear, chassis.mass, scenario.duration, float(motion.distance[-1]), present)
-    result = solve(_held_back(situation, mechanics), mechanics)
+    result = solve(_with_resisting_effects(situation, mechanics), mechanics)
     stuck = np.flatnonzero(~result.found)
     end = int(stuck[0]) if len(stuck) else len(t)
     if end < 2:
@@ -92,7 +92,7 @@ def drive(config: Config, scenario: Scenario, seed: int, effects: Sequence[Activ
     )
 
 
-def _held_back(situation: Situation, mechanics: Mechanics) -> Situation:
+def _with_resisting_effects(situation: Situation, mechanics: Mechanics) -> Situation:
     """The situation with the forces of effects that hold the vehicle back, as if it pulled no draft."""
     resistance, nothing = situation.resistance, np.zeros(len(situation.t))
     around = surroundings(situation, mechanics, nothing, nothing)

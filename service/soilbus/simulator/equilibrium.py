@@ -36,10 +36,10 @@ from soilbus.terra.wheel import (
 MAX_SLIP = 0.95
 """Beyond this common slip the tractor counts as bogged down."""
 _MIN_SLIP = -0.5
-_TOLERANCE = 1e-10
-_MAX_STEPS = 60
-_DIFFERENCE = 1e-6  # relative; Newton's steps need not be exact
-_STRIDE = 10  # every tenth instant first: its neighbours then start next to their solution
+_RESIDUAL_TOLERANCE = 1e-10
+_MAX_NEWTON_STEPS = 60
+_RELATIVE_DIFFERENCE = 1e-6  # relative; Newton's steps need not be exact
+_COARSE_STRIDE = 10  # every tenth instant first: its neighbours then start next to their solution
 
 
 class Situation(NamedTuple):
@@ -116,7 +116,7 @@ class Equilibrium(NamedTuple):
 def solve(situation: Situation, mechanics: Mechanics) -> Equilibrium:
     """The equilibrium at each instant, residuals below 1e-10 of the weight where found."""
     n_instants = len(situation.demand)
-    coarse = np.unique(np.append(np.arange(0, n_instants, _STRIDE), n_instants - 1))
+    coarse = np.unique(np.append(np.arange(0, n_instants, _COARSE_STRIDE), n_instants - 1))
     knots = _from_scratch(_at(situation, coarse), mechanics)
     good = coarse[knots.found]
     if not len(good):
@@ -217,11 +217,11 @@ def _by_differences(mechanics: Mechanics) -> _Forces:
 
     def slopes(situation: Situation, slip: Array, draft: Array, angle: Array) -> _Slopes:
         here = forces(situation, slip, draft, angle)
-        turn, pull = _DIFFERENCE * angle, _DIFFERENCE * situation.level_load.sum(axis=0)
+        turn, pull = _RELATIVE_DIFFERENCE * angle, _RELATIVE_DIFFERENCE * situation.level_load.sum(axis=0)
         return _Slopes(
             here,
             (forces(situation, slip, draft, angle + turn) - here) / turn,
-            (forces(situation, slip + _DIFFERENCE, draft, angle) - here) / _DIFFERENCE,
+            (forces(situation, slip + _RELATIVE_DIFFERENCE, draft, angle) - here) / _RELATIVE_DIFFERENCE,
             (forces(situation, slip, draft + pull, angle) - here) / pull,
         )
 
@@ -233,12 +233,12 @@ def _newton(situation: Situation, guess: tuple[Array, Array, Array], slopes: _Fo
     forces = np.empty((3, *angle.shape))
     found = np.zeros(len(slip), bool)
     todo = np.arange(len(slip))
-    for _ in range(_MAX_STEPS):
+    for _ in range(_MAX_NEWTON_STEPS):
         part = _at(situation, todo)
         at = slopes(part, slip[todo], draft[todo], angle[..., todo])
         step, miss = _step(part, slip[todo], draft[todo], at)
         forces[..., todo] = at.forces
-        at_rest = miss + np.abs(step[0]) < _TOLERANCE
+        at_rest = miss + np.abs(step[0]) < _RESIDUAL_TOLERANCE
         found[todo] = at_rest
         todo, d_slip, d_draft, d_angle = todo[~at_rest], *(a[..., ~at_rest] for a in step)
         if not len(todo):

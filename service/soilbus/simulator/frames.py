@@ -26,10 +26,10 @@ from soilbus.files import placed
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.sensors import channel_rng
 
-START = 1_700_000_000.0
+START_TIME = 1_700_000_000.0
 """Time stamp [s] of a recording's first instant: logs hold wall clock time."""
-_JITTER = 1e-3
-_PHASE = 0.9e-3
+_MAX_JITTER = 1e-3
+_PHASE_STEP = 0.9e-3
 _PHASES = 12
 
 _WRITERS: dict[str, Callable[[Any], Any]] = {
@@ -44,14 +44,14 @@ Payload = NDArray[np.uint8]
 
 
 def frames(
-    recording: Recording, config: Config, database: Database | None = None, start: float = START
+    recording: Recording, config: Config, database: Database | None = None, start: float = START_TIME
 ) -> Iterator[can.Message]:
     """The recording's frames in the order of their time stamps.
 
     Every message that carries a mapped channel is sent at the rate of its fastest channel,
     each with a phase of its own and up to 1 ms of jitter; a slower channel repeats its last
     value.  `database` defaults to the configured DBC files.  Signals that nothing is mapped
-    to are not available, save those that follow from the drive (see `_beside`).  Raises
+    to are not available, save those that follow from the drive (see `_unmapped_signals`).  Raises
     ConfigError as `channels_of`, ValueError for a mapped message that cannot be encoded.
     """
     database = database if database is not None else load_databases(config)
@@ -61,9 +61,9 @@ def frames(
     for number, (name, channels) in enumerate(_by_message(channels_of(config, database)).items()):
         message = database.get_message_by_name(name)
         t, values = _sampled(recording, channels)
-        values |= _beside(recording, config.wheel, message, channels, t)
-        jitter = channel_rng(recording.seed, name).uniform(0.0, _JITTER, len(t))
-        times.append(start + t + _PHASE * (number % _PHASES) + jitter)
+        values |= _unmapped_signals(recording, config.wheel, message, channels, t)
+        jitter = channel_rng(recording.seed, name).uniform(0.0, _MAX_JITTER, len(t))
+        times.append(start + t + _PHASE_STEP * (number % _PHASES) + jitter)
         payloads.append(encoded(message, _raw_codes(message, channels, values, len(t))))
         messages.append(message)
     if times:
@@ -149,7 +149,7 @@ def _sampled(recording: Recording, channels: list[Channel]) -> tuple[Array, dict
     return t, values
 
 
-def _beside(
+def _unmapped_signals(
     recording: Recording, wheels: list[Wheel], message: Message, channels: list[Channel], t: Array
 ) -> dict[str, Array]:
     """What a real vehicle sends beside the mapped signals, where the signal's name tells it."""

@@ -17,7 +17,7 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.words import did_you_mean
 
-_MEAN_SPEED = 1.4
+_ASSUMED_SPEED = 1.4
 
 
 def scenario_over(soils: Sequence[str], duration: float, course: Course = NORTHWARD) -> Scenario:
@@ -28,7 +28,7 @@ def scenario_over(soils: Sequence[str], duration: float, course: Course = NORTHW
     for name in soils:
         if name not in SOILS:
             raise KeyError(f"no soil is named {name}{did_you_mean(name, SOILS)}; known: {', '.join(SOILS)}")
-    length = duration * _MEAN_SPEED / len(soils)
+    length = duration * _ASSUMED_SPEED / len(soils)
     patches = tuple(Patch(i * length, name) for i, name in enumerate(soils))
     return Scenario(duration, patches, slip=Swing(0.05, 0.40), course=course)
 

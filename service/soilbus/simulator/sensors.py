@@ -17,13 +17,13 @@ from soilbus.simulator.scenario import SAMPLE_RATE
 from soilbus.terra.earth import SEMI_MAJOR_AXIS, wrapped
 from soilbus.terra.effects.sensors import read_late
 
-_DIVIDERS = {"ground_speed": 2, "latitude": 5, "longitude": 5}
+_RATE_DIVIDERS = {"ground_speed": 2, "latitude": 5, "longitude": 5}
 """Radars give 25 Hz, receivers of positions 10 Hz; all other sensors every sample of the truth."""
-POSITION_NOISE = 0.02
+POSITION_SD = 0.02
 """Sd of a fix, north and east [m]: a receiver with real-time corrections."""
-_SAME_TRUTH = {"motor_speed": "speed"}
+_MEASURED_QUANTITY = {"motor_speed": "speed"}
 """Quantities that another sensor tells too; its noise is theirs."""
-_EXACT = frozenset({"torque_limit"})  # told by the motor controller, not measured
+_NOISELESS = frozenset({"torque_limit"})  # told by the motor controller, not measured
 
 
 def channel_rng(seed: int, name: str) -> np.random.Generator:
@@ -51,25 +51,25 @@ def measure(drive: Drive, config: Config, seed: int) -> dict[str, Column]:
     """
     columns: dict[str, Column] = {}
     wheels = {wheel.name: wheel for wheel in config.wheel}
-    t, told = drive.columns["t"], drive.columns | _changed(drive, [wheel.name for wheel in config.wheel])
+    t, told = drive.columns["t"], drive.columns | _with_sensor_effects(drive, [wheel.name for wheel in config.wheel])
     told = told | {"yaw_rate": np.zeros(len(t))}  # the drives are straight
     for quantity, wheel in fitted(config):
         name = f"{quantity}.{wheel}" if wheel else quantity
-        every = slice(None, None, _DIVIDERS.get(quantity, 1))
-        measured = _SAME_TRUTH.get(quantity, quantity)
+        every = slice(None, None, _RATE_DIVIDERS.get(quantity, 1))
+        measured = _MEASURED_QUANTITY.get(quantity, quantity)
         truth, rng = told[f"{measured}.{wheel}" if wheel else measured], channel_rng(seed, name)
         if (delay := getattr(wheels[wheel] if wheel else config.signals, quantity).delay) != 0.0:
             truth = np.interp(t - delay, t, truth)
         if quantity in ("latitude", "longitude"):
             parallel = 1.0 if quantity == "latitude" else np.cos(drive.columns["latitude"])
-            truth = wrapped(truth + POSITION_NOISE / (SEMI_MAJOR_AXIS * parallel) * rng.standard_normal(len(t)))
-        elif quantity not in _EXACT:
+            truth = wrapped(truth + POSITION_SD / (SEMI_MAJOR_AXIS * parallel) * rng.standard_normal(len(t)))
+        elif quantity not in _NOISELESS:
             truth = disturbed(truth, getattr(config.noise, measured), config.estimator.window, rng)
         columns[name] = Column(t[every].copy(), truth[every].copy())
     return columns
 
 
-def _changed(drive: Drive, wheels: list[str]) -> dict[str, NDArray[Any]]:
+def _with_sensor_effects(drive: Drive, wheels: list[str]) -> dict[str, NDArray[Any]]:
     """Columns (N,) as sensors without noise tell them, of what effects change."""
     around = drive.surroundings
     torque, load = (np.stack([drive.columns[f"{q}.{wheel}"] for wheel in wheels], axis=1) for q in ("torque", "load"))

@@ -16,14 +16,14 @@ import numpy as np
 
 from soilbus.arrays import Array
 
-TILTS = (-1.0, 0.0, 1.0, 2.0)
+WEIGHT_POWERS = (-1.0, 0.0, 1.0, 2.0)
 """Powers of the bound that soils are weighed down by: the greater, the more those count that are told well."""
-ALIKE = TILTS.index(0.0)
-FEW = 0.5
+UNWEIGHTED = WEIGHT_POWERS.index(0.0)
+MAX_SUM_OF_SQUARED_SHARES = 0.5
 """Greatest weight that a few samples may have, squared and summed, for the error about their mean to be known."""
 
 
-class Attainable(NamedTuple):
+class BayesRisk(NamedTuple):
     """What a posterior's samples say of quantities (Q,), of which `effective` many are independent.
 
     error (Q,): of the estimate with the least mean square error in units of the bounds; risk and weight
@@ -37,14 +37,14 @@ class Attainable(NamedTuple):
     effective: float
 
 
-def attainable(value: Array, share: Array, bound: Array, truth: Array) -> Attainable:
+def bayes_risk(value: Array, share: Array, bound: Array, truth: Array) -> BayesRisk:
     """From samples' logarithms (M, Q), their shares (M,) of the probability and bounds (M, Q), and the truth (Q,)."""
     bound = np.where(bound > 0.0, bound, 1.0)  # of what is held
-    tilt = np.array(TILTS)[:, None, None]
+    tilt = np.array(WEIGHT_POWERS)[:, None, None]
     weight = share[:, None] * bound**-tilt
     counted = weight / bound**2
     part = counted / counted.sum(axis=1, keepdims=True)
     best = (part * value).sum(axis=1)
-    own = np.minimum((part**2).sum(axis=1), FEW)  # the mean is theirs, too
+    own = np.minimum((part**2).sum(axis=1), MAX_SUM_OF_SQUARED_SHARES)  # the mean is theirs, too
     risk = (counted * (value - best[:, None]) ** 2).sum(axis=1) / (1.0 - own)
-    return Attainable(best[ALIKE] - truth, risk, weight.sum(axis=1), float(1.0 / (share @ share)))
+    return BayesRisk(best[UNWEIGHTED] - truth, risk, weight.sum(axis=1), float(1.0 / (share @ share)))

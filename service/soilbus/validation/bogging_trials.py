@@ -22,21 +22,21 @@ from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import drive
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Swing
-from soilbus.validation.boggings import KINDS, Trouble, bogging
-from soilbus.validation.firm_drives import EASY, FIRM_DRIVE, FIRM_KINDS, HARD, firm_ground
+from soilbus.validation.boggings import KINDS, BoggingDrive, bogging
+from soilbus.validation.firm_drives import DRIVE_TIME, EASY, FIRM_KINDS, HARD, firm_ground
 from soilbus.validation.monte_carlo import Each
 from soilbus.validation.windows import task_of
 
 HALVES = ("report", "tune")
-LOOK = 0.1
+LOOK_PERIOD = 0.1
 """Time [s] between two looks, as in the service."""
-ENOUGH_TIME, ENOUGH_WAY = 3.0, 3.0
+MIN_LEAD_TIME, MIN_LEAD_DISTANCE = 3.0, 3.0
 """Warning ahead that is enough: [s] or [m]."""
-REACTION = 1.0
+REACTION_TIME = 1.0
 """Time [s] without which no change is told from noise."""
-FELT = 0.05
+PERCEPTIBLE_DRAFT_LOSS = 0.05
 """Loss, as a share of the largest draft, that slip and pull can tell from their noise."""
-EARLIEST = 5.0
+MIN_DRIVE_TIME = 5.0
 """Slip that passes within this time [s] of the first window cannot be foreseen: no drive to judge by."""
 
 
@@ -68,13 +68,16 @@ class WarningTrial:
     @property
     def in_time(self) -> bool:
         """Whether the warning was early enough."""
-        return self.lead >= ENOUGH_TIME or self.way >= ENOUGH_WAY
+        return self.lead >= MIN_LEAD_TIME or self.way >= MIN_LEAD_DISTANCE
 
     @property
     def sudden(self) -> bool:
         """Whether slip passed too soon after the first sign for any warning to be early enough."""
         speed = self.possible_way / self.possible if 0.0 < self.possible < np.inf else 0.0
-        return self.possible < ENOUGH_TIME + REACTION and self.possible_way < ENOUGH_WAY + REACTION * speed
+        return (
+            self.possible < MIN_LEAD_TIME + REACTION_TIME
+            and self.possible_way < MIN_LEAD_DISTANCE + REACTION_TIME * speed
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +127,7 @@ def observed(task: Task) -> Observation:
     config, rig = task.config, rig_of(task.config)
     rng = np.random.default_rng([task.seed, 3])
     if task.kind in FIRM_KINDS:
-        trouble = Trouble(firm_ground(config, task.kind, rng))
+        trouble = BoggingDrive(firm_ground(config, task.kind, rng))
     else:
         trouble = bogging(config, task.kind, rng)
     recording = simulate(config, trouble.scenario, task.seed, trouble.effects)
@@ -133,14 +136,14 @@ def observed(task: Task) -> Observation:
     start = config.estimator.window
     passed = truth["t"][(slip > config.traversability.max_slip) & (truth["t"] > start)]
     end = float(passed[0]) if len(passed) else float(truth["t"][-1])
-    looks, curves = _looks(recording, config, end)
-    felt = _felt(task, trouble, end) if len(passed) else end
+    looks, curves = _moments_and_curves(recording, config, end)
+    felt = _first_perceptible(task, trouble, end) if len(passed) else end
     return Observation(
         looks, curves, start, end, len(passed) > 0, truth["t"], truth["distance"], felt
     )  # fmt: skip
 
 
-def _felt(task: Task, trouble: Trouble, end: float) -> float:
+def _first_perceptible(task: Task, trouble: BoggingDrive, end: float) -> float:
     """From when on, until the end [s], the largest draft that the way truly holds is less by FELT than at the start.
 
     0 where it is not: then the demand is what grows.
@@ -150,7 +153,7 @@ def _felt(task: Task, trouble: Trouble, end: float) -> float:
     truth = drive(task.config, even, task.seed, trouble.effects).columns
     mass = task.config.vehicle.mass if task.config.vehicle else 0.0
     held, t = truth["draft"] + mass * truth["acceleration"], truth["t"]
-    firm = t[(held >= (1.0 - FELT) * held[0]) & (t <= end)]
+    firm = t[(held >= (1.0 - PERCEPTIBLE_DRAFT_LOSS) * held[0]) & (t <= end)]
     return float(firm[-1]) if len(firm) and firm[-1] < t[t <= end][-1] else 0.0
 
 
@@ -159,15 +162,15 @@ def judged(kind: str, seen: Observation) -> WarningTrial:
     t, warned = watch(seen)
     begins = t[1:][warned[1:] & ~warned[:-1]]
     seconds = seen.end - seen.start
-    if not seen.passed or seconds <= EARLIEST:
+    if not seen.passed or seconds <= MIN_DRIVE_TIME:
         return WarningTrial(kind, seconds, len(begins), np.nan, np.nan)
     lead = seen.end - float(begins[-1]) if len(begins) and warned[-1] else 0.0
     possible = seen.end - min(max(seen.felt, seen.start), seen.end)
-    way, possible_way = (_way(seen, seen.end - s) for s in (lead, possible))
+    way, possible_way = (_distance_since(seen, seen.end - s) for s in (lead, possible))
     return WarningTrial(kind, seconds, len(begins), lead, way, possible, possible_way)
 
 
-def _way(seen: Observation, since: float) -> float:
+def _distance_since(seen: Observation, since: float) -> float:
     """Distance [m] driven from a time [s] until the end."""
     return float(np.interp(seen.end, seen.t, seen.way) - np.interp(since, seen.t, seen.way))
 
@@ -185,11 +188,13 @@ def watch(seen: Observation) -> tuple[Array, NDArray[np.bool_]]:
     return t, warned > 0.5
 
 
-def _looks(recording: Recording, config: Config, end: float) -> tuple[list[Moment], list[tuple[float, OverSlip]]]:
+def _moments_and_curves(
+    recording: Recording, config: Config, end: float
+) -> tuple[list[Moment], list[tuple[float, OverSlip]]]:
     """The moments until the end [s], and from their times on the curves of windows that the service calls valid."""
     rig, settings = rig_of(config), config.estimator
     estimator, no_limit = WindowEstimator(config), np.full(len(rig.radius), np.nan)
-    store = Bins(rig, LOOK, 0.0)
+    store = Bins(rig, LOOK_PERIOD, 0.0)
     store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
     curves = []
     for due in np.arange(settings.window, end, settings.hop).tolist():
@@ -216,7 +221,7 @@ def warning_trials(
     """
     if half not in HALVES:
         raise ValueError(f"no half of the drives is called {half}; known: {', '.join(HALVES)}")
-    firm = math.ceil(3600.0 * hours / (FIRM_DRIVE - config.estimator.window))
+    firm = math.ceil(3600.0 * hours / (DRIVE_TIME - config.estimator.window))
     kinds = [KINDS[i % len(KINDS)] for i in range(boggings)] + [
         HARD[i // 2 % len(HARD)] if i % 2 else EASY for i in range(firm)
     ]

@@ -29,14 +29,14 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import soil_named
 from soilbus.terra.vehicle import axle_loads
 from soilbus.terra.wheel import Soil, WheelModel, sinkage
-from soilbus.validation.monte_carlo import Each, missed
+from soilbus.validation.monte_carlo import Each, prior_about
 
 SOILS = ("rubicon_sandy_loam_43", "north_gower_clayey_loam_46", "upland_sandy_loam_51")
-SPREAD = 0.1
+SOIL_LOG_SD = 0.1
 """Sd of the logarithms by which a drive's soil parameters leave those of the named soil."""
 LOW_SLIP, HIGH_SLIP = (0.04, 0.10), (0.20, 0.40)
 """Between which the lowest and the highest slip of a drive lie."""
-SLIPS = np.linspace(0.02, 1.0, 50)
+SLIP_SHARES = np.linspace(0.02, 1.0, 50)
 """At which the truth is solved, in units of the greatest slip allowed."""
 
 
@@ -92,14 +92,14 @@ def trial(task: Task) -> DraftTrial:
     """Simulate, estimate, foretell, and solve for the truth."""
     config, name, seed = task
     rng = np.random.default_rng([seed, 2])
-    soil = Soil(*(np.asarray(soil_named(name)) * np.exp(SPREAD * rng.standard_normal(6))).tolist())
+    soil = Soil(*(np.asarray(soil_named(name)) * np.exp(SOIL_LOG_SD * rng.standard_normal(6))).tolist())
     slip = Swing(rng.uniform(*LOW_SLIP), rng.uniform(*HIGH_SLIP))
     duration = config.estimator.window
     recording = simulate(config, Scenario(duration, (Patch(0.0, name, soil),), slip=slip), seed)
     rig, model, settings = rig_of(config), model_of(config), config.traversability
     store = Bins(rig, config.estimator.bin, 0.0)
     store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
-    prior = missed(prior_of(config), soil, np.random.default_rng([seed, 1]))
+    prior = prior_about(prior_of(config), soil, np.random.default_rng([seed, 1]))
     fit = cold_fit(ObservationModel(store.window(0.0, duration), rig, model, config.estimator.min_speed), prior)
     limit = np.array([wheel.max_torque or np.nan for wheel in config.wheel])
     truth = true_largest_draft(soil, rig, limit, settings.max_slip, WheelModel(shear_law=config.model.shear_law))
@@ -121,7 +121,7 @@ def true_largest_draft(
     """
     if rig.chassis is None:
         raise ValueError("a draft needs the vehicle's mass and geometry")
-    slips = max_slip * SLIPS
+    slips = max_slip * SLIP_SHARES
     shape = (len(rig.radius), len(slips))
     share = 1.0 / np.where(rig.front, rig.front.sum(), (~rig.front).sum())
     free, drawn = (np.where(rig.front, *axle_loads(rig.chassis, draft, 0.0, 0.0)) * share for draft in (0.0, 1.0))

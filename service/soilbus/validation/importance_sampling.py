@@ -26,18 +26,18 @@ from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective, QuadraticModel
 from soilbus.terra.wheel import Soil
 
-TAILS = 5.0
+PROPOSAL_DOF = 5.0
 """Degrees of freedom of Student's t that the draws follow given n."""
-WIDER = 1.2
+COVARIANCE_RATIO = 1.2
 """Their covariance over that of the fit with this n."""
-SINGULAR = 1e-9
+MIN_EIGENVALUE = 1e-9
 """Least eigenvalue of a matrix of correlations up to which it is singular."""
-FLATTER = 0.5
+PROPOSAL_DENSITY_POWER = 0.5
 """Power of the density of n that n is drawn from."""
 _K_C, _K_PHI, _N, _PHI = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "phi"))
 
 
-class Samples(NamedTuple):
+class PosteriorSamples(NamedTuple):
     """Logarithms (M, 6) of soils and their shares (M,) of the posterior probability.
 
     bound (M, 6, 6) is the Cramér-Rao bound of the logarithms where the window is of that soil.
@@ -53,16 +53,16 @@ class Samples(NamedTuple):
         return float(1.0 / (self.share @ self.share))
 
 
-def samples(
+def sample_posterior(
     problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, found: Fit, count: int, rng: np.random.Generator
-) -> Samples | None:
+) -> PosteriorSamples | None:
     """So many soils of the posterior; None where k_c, k_phi and n are not all free and told apart by the tyres."""
     with np.errstate(all="ignore"):
         along = profile_over_n(problem, prior, joint_prior, found)
         if along is None or len(along.nodes) < 3:
             return None
         coordinates = Coordinates(prior, float(problem.rig.width.mean()))
-        drawn = _drawn(along.nodes, coordinates, count, rng)
+        drawn = _draws(along.nodes, coordinates, count, rng)
         position = drawn.position
         u, nodes = np.array([node.u for node in along.nodes]), along.nodes
         fitting = Objective(along.problem, prior, joint_prior)
@@ -74,33 +74,33 @@ def samples(
             logs[i] = np.log(soil)
             if soil[_K_PHI] > 0.0 and soil[_PHI] < MAX_PHI:
                 near = nodes[int(np.argmin(np.abs(u - logs[i, _N])))]
-                place, point = _point_at(fitting, soil, near)
+                place, point = _quadratic_at(fitting, soil, near)
                 if point is None:
                     continue
                 jacobian = np.linalg.slogdet(coordinates.log_directions(soil)[coordinates.free])[1]
-                log_share[i] = jacobian - 0.5 * _unlikelihood(fitting, point) - drawn.log_density[i]
+                log_share[i] = jacobian - 0.5 * _neg2_log_density(fitting, point) - drawn.log_density[i]
                 covariance = np.asarray(np.linalg.inv(point.information))
                 bound[i] = fitting.gaussian_with(place, covariance).posterior.log_covariance
     share = softmax(np.where(np.isfinite(log_share), log_share, -np.inf))
     kept = share > 0.0
-    return Samples(logs[kept], share[kept], bound[kept])
+    return PosteriorSamples(logs[kept], share[kept], bound[kept])
 
 
-class _Drawn(NamedTuple):
+class _Draws(NamedTuple):
     """Positions (M, F) and the logarithms (M,) of the densities that they were drawn from."""
 
     position: Array
     log_density: Array
 
 
-def _drawn(nodes: list[Node], coordinates: Coordinates, count: int, rng: np.random.Generator) -> _Drawn:
+def _draws(nodes: list[Node], coordinates: Coordinates, count: int, rng: np.random.Generator) -> _Draws:
     """Positions about the nodes and what lies between them."""
     free = coordinates.free
     i = int(np.searchsorted(free, _N))
     others = np.delete(np.arange(len(free)), i)
     u = np.array([node.u for node in nodes])
     fine = np.linspace(u[0], u[-1], FINE)
-    weight = density(u, FLATTER * np.array([node.unlikelihood for node in nodes]), fine)
+    weight = density(u, PROPOSAL_DENSITY_POWER * np.array([node.unlikelihood for node in nodes]), fine)
     normals = [_normal(node, coordinates, others) for node in nodes]
     centre, roots = np.array([normal[0] for normal in normals]), np.array([normal[1] for normal in normals])
     cell = rng.choice(FINE, count, p=weight)
@@ -108,13 +108,15 @@ def _drawn(nodes: list[Node], coordinates: Coordinates, count: int, rng: np.rand
     below = np.clip(np.searchsorted(u, log_n) - 1, 0, len(u) - 2)
     share = (log_n - u[below]) / (u[below + 1] - u[below])
     roots = roots[below] * (1.0 - share)[:, None, None] + roots[below + 1] * share[:, None, None]
-    normal = rng.standard_normal((count, len(others))) * np.sqrt(TAILS / rng.chisquare(TAILS, count))[:, None]
+    normal = (
+        rng.standard_normal((count, len(others))) * np.sqrt(PROPOSAL_DOF / rng.chisquare(PROPOSAL_DOF, count))[:, None]
+    )
     position = np.empty((count, len(free)))
     position[:, i] = log_n
     position[:, others] = centre[below] * (1.0 - share)[:, None] + centre[below + 1] * share[:, None]
     position[:, others] += np.einsum("mij,mj->mi", roots, normal)
-    tails = -0.5 * (TAILS + len(others)) * np.log1p((normal**2).sum(1) / TAILS)
-    return _Drawn(position, np.log(weight[cell]) + tails - np.log(np.einsum("mii->mi", roots)).sum(1))
+    tails = -0.5 * (PROPOSAL_DOF + len(others)) * np.log1p((normal**2).sum(1) / PROPOSAL_DOF)
+    return _Draws(position, np.log(weight[cell]) + tails - np.log(np.einsum("mii->mi", roots)).sum(1))
 
 
 def _normal(node: Node, coordinates: Coordinates, others: NDArray[np.intp]) -> tuple[Array, Array]:
@@ -127,9 +129,9 @@ def _normal(node: Node, coordinates: Coordinates, others: NDArray[np.intp]) -> t
         back = np.linalg.inv(coordinates.log_directions(gaussian.soil)[free])
         covariance = (back @ gaussian.covariance[np.ix_(free, free)] @ back.T)[np.ix_(others, others)]
         std = np.sqrt(covariance.diagonal())
-        if np.linalg.eigvalsh(covariance / std / std[:, None])[0] > SINGULAR:
+        if np.linalg.eigvalsh(covariance / std / std[:, None])[0] > MIN_EIGENVALUE:
             break
-    return coordinates.position(gaussian.soil)[others], np.asarray(np.linalg.cholesky(WIDER * covariance))
+    return coordinates.position(gaussian.soil)[others], np.asarray(np.linalg.cholesky(COVARIANCE_RATIO * covariance))
 
 
 def _soil_at(position: Array, coordinates: Coordinates) -> Array:
@@ -142,7 +144,7 @@ def _soil_at(position: Array, coordinates: Coordinates) -> Array:
     return soil if inside else np.where(np.arange(len(soil)) == _K_PHI, 0.0, soil)
 
 
-def _point_at(fitting: Objective, soil: Array, near: Node) -> tuple[Iterate, QuadraticModel | None]:
+def _quadratic_at(fitting: Objective, soil: Array, near: Node) -> tuple[Iterate, QuadraticModel | None]:
     """The window at a soil (6,), with the latents that are likeliest there."""
     problem, optimum = fitting.problem, near.fit.optimum
     latents = problem.with_entry_angles(optimum.latents, Soil(*soil.tolist()), optimum.gains)
@@ -153,7 +155,7 @@ def _point_at(fitting: Objective, soil: Array, near: Node) -> tuple[Iterate, Qua
     return place, fitting.point(place)
 
 
-def _unlikelihood(fitting: Objective, point: QuadraticModel) -> float:
+def _neg2_log_density(fitting: Objective, point: QuadraticModel) -> float:
     """-2 log posterior density of a soil's logarithms up to a constant, whatever the gains (Laplace, all but exact)."""
     gains = slice(len(fitting.free), None)
     information, gradient = point.information[gains, gains], point.gradient[gains]

@@ -8,7 +8,7 @@ deviations and bounds are those of logarithms.
 
 The bound is local: it knows how the window would change with a soil next to the true one.
 Where the soils that the window allows are not next to it, an estimate may miss it: what is at least
-missed follows from the bounds of all these soils and how probable they are (`exact`, see `attainable`).
+missed follows from the bounds of all these soils and how probable they are (`exact`, see `bayes_risk`).
 For the same reason no interval holds each single soil 95 times in 100, but soils
 that lie about it as they may (`around`).
 """
@@ -44,17 +44,17 @@ from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import Soil
-from soilbus.validation.bayes_risk_bound import Attainable, attainable
+from soilbus.validation.bayes_risk_bound import BayesRisk, bayes_risk
 from soilbus.validation.cramer_rao import cramer_rao
-from soilbus.validation.importance_sampling import samples
+from soilbus.validation.importance_sampling import sample_posterior
 from soilbus.workers import workers
 
 SOILS = ("loam", "wet_clay", "dry_sand")
-DURATIONS = (2.0, 10.0, 60.0)
-SLIP = Swing(0.05, 0.40)
+WINDOW_LENGTHS = (2.0, 10.0, 60.0)
+SLIP_RANGE = Swing(0.05, 0.40)
 ROUGHLY_KNOWN = ("soil.c.value=3000", "soil.c.std=750", "soil.K.value=0.02", "soil.K.std=0.005")
 """Settings with which cohesion and shear modulus are known to 25 %."""
-MAX_DRAWN = 20
+MAX_SOIL_DRAWS = 20
 """Soils around a named one that are tried until the tractor gets on."""
 _PHI = PARAMETERS.index("phi")
 
@@ -88,7 +88,7 @@ class Trial:
     chi2: float
     converged: bool
     seconds: float
-    exact: Attainable | None = None
+    exact: BayesRisk | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,11 +116,11 @@ class Cell:
     bound: Array
     chi2: float
     seconds: float
-    exact: Exact | None = None
+    exact: BayesRiskFigures | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Exact:
+class BayesRiskFigures:
     """What could be attained in some windows, in units of the bounds, of each quantity (Q,).
 
     least: no estimate has a root mean square error below this on all soils that the windows allow, and
@@ -156,7 +156,7 @@ def monte_carlo(
     windows: int,
     seed: int,
     soils: Sequence[str] = SOILS,
-    durations: Sequence[float] = DURATIONS,
+    durations: Sequence[float] = WINDOW_LENGTHS,
     each: Each = map,
     exact: int = 0,
     around: float = 0.0,
@@ -209,7 +209,7 @@ def trials(task: Task) -> tuple[Trial, Trial]:
     Raises SimulationError where the tractor cannot drive on, KeyError for an unknown soil.
     """
     recording, soil = _driven(task)
-    prior = missed(prior_of(task.config), soil, np.random.default_rng([task.seed, 1]))
+    prior = prior_about(prior_of(task.config), soil, np.random.default_rng([task.seed, 1]))
     with_sinkage, without = (_trial(recording, task, prior, soil, fitted) for fitted in (True, False))
     return with_sinkage, without
 
@@ -219,17 +219,17 @@ def _driven(task: Task) -> tuple[Recording, Soil]:
     config, name, duration, seed, _, around = task
     rng, named = np.random.default_rng([seed, 3]), soil_named(name)
     spread = np.where(prior_of(config).log_std > 0.0, around, 0.0)
-    for _ in range(MAX_DRAWN if around else 1):
-        soil = missed(SoilPrior(np.asarray(named), spread), named, rng).median if around else np.asarray(named)
+    for _ in range(MAX_SOIL_DRAWS if around else 1):
+        soil = prior_about(SoilPrior(np.asarray(named), spread), named, rng).median if around else np.asarray(named)
         of_drive = Soil(*soil.tolist())
         with suppress(SimulationError) if around else nullcontext():
-            recording = simulate(config, Scenario(duration, (Patch(0.0, name, of_drive),), slip=SLIP), seed)
+            recording = simulate(config, Scenario(duration, (Patch(0.0, name, of_drive),), slip=SLIP_RANGE), seed)
             if recording.bogged_at is None:
                 return recording, of_drive
     raise SimulationError(f"the tractor gets stuck on {name}")
 
 
-def missed(prior: SoilPrior, soil: Soil, rng: np.random.Generator) -> SoilPrior:
+def prior_about(prior: SoilPrior, soil: Soil, rng: np.random.Generator) -> SoilPrior:
     """A prior of the same spread that was told of this soil: medians log-normal about it, held ones right."""
     while True:
         median = np.asarray(soil) * np.exp(prior.log_std * rng.standard_normal(len(soil)))
@@ -253,13 +253,13 @@ def _trial(recording: Recording, task: Task, prior: SoilPrior, soil: Soil, sinka
     trial = Trial(value - truth, std, least, fit.chi2, fit.converged, seconds)
     if not drawn or not fit.converged:
         return trial
-    posterior = samples(noisy, prior, joint_prior, found, drawn, np.random.default_rng([seed, 2]))
+    posterior = sample_posterior(noisy, prior, joint_prior, found, drawn, np.random.default_rng([seed, 2]))
     if posterior is None:
         return trial
     soils = zip(np.exp(posterior.logs).tolist(), posterior.bound, strict=True)
     told = [_logarithms(Posterior(Soil(*soil), covariance), config) for soil, covariance in soils]
     value, bound_of_each = (np.array(column) for column in zip(*told, strict=True))
-    return replace(trial, exact=attainable(value, posterior.share, bound_of_each, truth))
+    return replace(trial, exact=bayes_risk(value, posterior.share, bound_of_each, truth))
 
 
 def _problem(
@@ -312,11 +312,11 @@ def summary(soil: str, duration: float, sinkage: bool, windows: Sequence[Trial])
             bound=np.sqrt((bound**2).sum(axis=0) / count),
             chi2=float(sum(trial.chi2 for trial in good) / count),
             seconds=float(np.median([trial.seconds for trial in windows])),
-            exact=_exact([trial for trial in good if trial.exact is not None], np.asarray(free)),
+            exact=_bayes_risk_figures([trial for trial in good if trial.exact is not None], np.asarray(free)),
         )
 
 
-def _exact(windows: Sequence[Trial], free: NDArray[np.bool_]) -> Exact | None:
+def _bayes_risk_figures(windows: Sequence[Trial], free: NDArray[np.bool_]) -> BayesRiskFigures | None:
     """The figures of windows whose exact posteriors are known; None without any."""
     known = [(trial, trial.exact) for trial in windows if trial.exact is not None]
     if not known:
@@ -328,7 +328,7 @@ def _exact(windows: Sequence[Trial], free: NDArray[np.bool_]) -> Exact | None:
     off = np.sqrt(((risk - average * weight) ** 2).sum(axis=0)) / weight.sum(axis=0)
     tilt = average.argmax(axis=0), np.arange(average.shape[1])
     square = ours.sum(0) / best.sum(0)
-    return Exact(
+    return BayesRiskFigures(
         windows=len(known),
         least=np.sqrt(average[tilt]),
         least_scatter=0.5 * off[tilt] / np.sqrt(average[tilt]),

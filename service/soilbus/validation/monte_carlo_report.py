@@ -7,19 +7,19 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 
 from soilbus.report.table import table
-from soilbus.validation.monte_carlo import DURATIONS, SOILS, Cell, Exact
+from soilbus.validation.monte_carlo import SOILS, WINDOW_LENGTHS, BayesRiskFigures, Cell
 
-MAX_RMS = 1.15
+MAX_RMS_RATIO = 1.15
 COVERAGE = (0.93, 0.97)
 MAX_CHI2_OFF = 0.03
-ATTAINABLE = """Each quantity, in root mean square errors over the bound: what any estimate must allow on some of the
+BAYES_RISK_NOTE = """Each quantity, in root mean square errors over the bound: what any estimate must allow on some of the
 soils that the windows and what was known allow, by the information that a window would hold on each of these; what
 the estimate that has the least on average over them attains here; and ours over that.  Where the first is
 above {most}, none can be within the target on all of them.  samples: median number of effective ones.
 """
 SHARED = """Windows are simulated with the estimator's own wheel-soil model, noise and priors: the figures show how much
 of what such a window holds the estimate gets out, and that its intervals are right if the model is."""
-_TOLD = "{:.2f}+-{:.2f} {:.2f} {:.2f}+-{:.2f}"
+_BAYES_RISK_CELL = "{:.2f}+-{:.2f} {:.2f} {:.2f}+-{:.2f}"
 
 
 def with_progress(cells: Iterable[Cell]) -> Iterator[Cell]:
@@ -30,7 +30,7 @@ def with_progress(cells: Iterable[Cell]) -> Iterator[Cell]:
     from rich.console import Console
     from rich.progress import track
 
-    n_cells = 2 * len(SOILS) * len(DURATIONS)
+    n_cells = 2 * len(SOILS) * len(WINDOW_LENGTHS)
     yield from track(cells, "montecarlo", n_cells, console=Console(stderr=True), transient=True)
 
 
@@ -43,14 +43,14 @@ def monte_carlo_report(cells: Sequence[Cell]) -> str:
     if not exact:
         return text
     head = ("soil", "window", "sinkage", *names, "windows", "samples")
-    rows = [_attainable(*pair, names) for pair in exact]
-    return text + "\n" + table(head, rows) + "\n" + ATTAINABLE.format(most=MAX_RMS)
+    rows = [_bayes_risk_row(*pair, names) for pair in exact]
+    return text + "\n" + table(head, rows) + "\n" + BAYES_RISK_NOTE.format(most=MAX_RMS_RATIO)
 
 
-def _attainable(cell: Cell, exact: Exact, names: Sequence[str]) -> tuple[str, ...]:
+def _bayes_risk_row(cell: Cell, exact: BayesRiskFigures, names: Sequence[str]) -> tuple[str, ...]:
     told_of = exact.least, exact.least_scatter, exact.best, exact.share, exact.scatter
     figures = dict(zip(cell.quantities, zip(*(column.tolist() for column in told_of), strict=True), strict=True))
-    told = [_TOLD.format(*figures[name]) if name in figures else "held" for name in names]
+    told = [_BAYES_RISK_CELL.format(*figures[name]) if name in figures else "held" for name in names]
     fitted = "measured" if cell.sinkage else "none"
     return (cell.soil, f"{cell.duration:g} s", fitted, *told, str(exact.windows), f"{exact.effective:.0f}")
 
@@ -68,7 +68,7 @@ def _row(cell: Cell, names: Sequence[str]) -> tuple[str, ...]:
 def _figure(rms: float, coverage: float, n: int) -> str:
     """Such as "1.02 95.0" of n windows."""
     low, high = COVERAGE
-    too_large = _mark(rms - MAX_RMS, _rms_scatter(n))
+    too_large = _mark(rms - MAX_RMS_RATIO, _rms_scatter(n))
     astray = _mark(max(low - coverage, coverage - high), _coverage_scatter(n))
     return f"{rms:.2f}{too_large} {100.0 * coverage:.1f}{astray}"
 
@@ -94,7 +94,7 @@ def _notes(cells: Sequence[Cell]) -> Iterator[str]:
     n = min(cell.windows for cell in cells)
     low, high = (100.0 * share for share in COVERAGE)
     yield "Each quantity: RMS error over the Cramér-Rao bound, and share of 95 % intervals that hold the truth [%]."
-    yield f"Targets: at most {MAX_RMS}; {low:.0f} to {high:.0f} %; chi2 1 +- {MAX_CHI2_OFF}."
+    yield f"Targets: at most {MAX_RMS_RATIO}; {low:.0f} to {high:.0f} %; chi2 1 +- {MAX_CHI2_OFF}."
     scatter = f"{_rms_scatter(n):.3f} and the other by {100.0 * _coverage_scatter(n):.1f} points"
     yield f"{n} windows scatter the one by {scatter}"
     yield "by chance: ~ marks a target missed by less than twice that, * one missed by more."

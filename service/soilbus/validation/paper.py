@@ -26,13 +26,13 @@ from soilbus.terra.wheel import EXACT_NODES
 Three = tuple[float, float, float]
 
 MAX_ITERATIONS = 50
-TOLERANCE = 1e-8
+RELATIVE_STEP_TOLERANCE = 1e-8
 """Relative step of every unknown that ends the iteration; the paper does not print its own."""
-LAST_STEP = 1e-4
+N_STEP_TOLERANCE = 1e-4
 """Step of n that ends the elimination: Newton squares it, so n is then right to 1e-9 and K_L to 1e-7 of itself."""
-STRAIGHTENED = 1.5
+N_OFFSET = 1.5
 """The forces under small angles go as 1/(n + 3/2), so in that variable they are nearly straight."""
-LARGEST_N = 20.0
+MAX_N = 20.0
 """Beyond this Newton has gone astray, and powers of the sinkage would overflow."""
 
 
@@ -178,10 +178,10 @@ class WheelEquations:
                 return Solution(x, done, False)
             step = _triple(miss, v, w) / volume, _triple(u, miss, w) / volume, _triple(u, v, miss) / volume
             new = Unknowns(x.K_L - step[0], x.phi - step[1], x.n - step[2])
-            if not (math.isfinite(new.K_L) and math.isfinite(new.phi) and abs(new.n) < LARGEST_N):
+            if not (math.isfinite(new.K_L) and math.isfinite(new.phi) and abs(new.n) < MAX_N):
                 return Solution(x, done, False)
             x = new
-            if all(abs(s) <= TOLERANCE * abs(value) for s, value in zip(step, x, strict=True)):
+            if all(abs(s) <= RELATIVE_STEP_TOLERANCE * abs(value) for s, value in zip(step, x, strict=True)):
                 return Solution(x, done + 1, True)
         return Solution(x, most, False)
 
@@ -193,7 +193,7 @@ class WheelEquations:
         """
         W, DP, T = self._from_normal_stress(measured)
         done, converged, K_L, s = 0, False, math.nan, math.nan
-        while done < MAX_ITERATIONS and not converged and abs(n) < LARGEST_N:
+        while done < MAX_ITERATIONS and not converged and abs(n) < MAX_N:
             b, a, w, d, t, b_n, a_n, w_n, d_n, t_n = (self._rows @ self._z**n).tolist()
             try:
                 s = T / t
@@ -201,12 +201,12 @@ class WheelEquations:
                 K_L = (W - s * w) / a
                 K_L_n = -(s_n * w + s * w_n + K_L * a_n) / a
                 step = (K_L * b + s * d - DP) / (K_L_n * b + K_L * b_n + s_n * d + s * d_n)
-                from_pole = n + STRAIGHTENED
+                from_pole = n + N_OFFSET
                 change = from_pole / max(1.0 + step / from_pole, 0.1) - from_pole
             except ZeroDivisionError:  # no shear at all, or forces of cohesion alone: n does not matter
                 break
             K_L, s, n = K_L + K_L_n * change, s + s_n * change, n + change
-            done, converged = done + 1, abs(change) <= LAST_STEP
+            done, converged = done + 1, abs(change) <= N_STEP_TOLERANCE
         return Solution(Unknowns(K_L, math.atan2(s, K_L), n), done, converged)
 
     def all_solutions(self, measured: Forces, largest_n: float = 3.0, steps: int = 100) -> list[Unknowns]:

@@ -46,7 +46,7 @@ WIDTH = 118
 PARAMETERS = ("phi [deg]", "K_L", "n")
 DECIMALS = (4, 3, 5)
 REPEATS = 20
-MICROMETRE = 1e-6
+SINKAGE_MARGIN = 1e-6
 """[m] How near to none, and to the radius, a sinkage is looked for."""
 
 
@@ -102,8 +102,8 @@ def what_holds(sinkage: float) -> list[str]:
     seconds = max(_seconds(partial(_newton, run, sinkage)) for run in RUNS)
     fastest = min(run.seconds for run in RUNS)
     return [
-        f"Convergence {_verdict(len(steps) == len(RUNS) and max(errors) < SOLVED)} for its start values: eq. 41 ends "
-        f"at a soil from {len(steps)} of the {len(RUNS)}, after "
+        f"Convergence {_verdict(len(steps) == len(RUNS) and max(errors) < MAX_SOLUTION_ERROR)} for its start values: "
+        f"eq. 41 ends at a soil from {len(steps)} of the {len(RUNS)}, after "
         f"at most {max(steps, default=0)} steps and within {max(errors, default=0.0):.0e} % of the true one (the "
         f"paper: six steps from 20 % off). From 50 % above the truth, which it does not try, eq. 41 gets there for "
         f"{sum(newton for newton, _ in above)} of {len(above)} wheels; eliminating K_L and phi first (ours) for "
@@ -121,9 +121,9 @@ def what_holds(sinkage: float) -> list[str]:
     ]
 
 
-SOLVED = 1e-3
+MAX_SOLUTION_ERROR = 1e-3
 """Error [%] up to which a solution is the true soil."""
-ALIKE = 0.05
+READING_TOLERANCE = 0.05
 """Share by which loads, or sinkages, may differ and still be read off a figure as one."""
 
 
@@ -134,7 +134,11 @@ def _verdict(it_is: bool) -> str:
 def _what_fits() -> str:
     """What both torques of figure 13 may share."""
     clay, loam = _place(TORQUE_ON_CLAY, WET_CLAY), _place(TORQUE_ON_LOAM, SANDY_LOAM)
-    one = [f"one {name}" for name, a, b in zip(("sinkage", "load"), clay, loam, strict=True) if abs(a / b - 1) < ALIKE]
+    one = [
+        f"one {name}"
+        for name, a, b in zip(("sinkage", "load"), clay, loam, strict=True)
+        if abs(a / b - 1) < READING_TOLERANCE
+    ]
     return " and ".join(one) or "neither one load nor one sinkage"
 
 
@@ -330,7 +334,7 @@ def _sinkage_where(force: str, value: float, trial: Trial, equations: Equations)
     def beyond(z: float) -> float:
         return float(getattr(WheelEquations(trial.at(z), equations).forces(trial.truth), force)) - value
 
-    return float(brentq(beyond, MICROMETRE, trial.radius - MICROMETRE))
+    return float(brentq(beyond, SINKAGE_MARGIN, trial.radius - SINKAGE_MARGIN))
 
 
 def _corrected(sinkage: float) -> str:

@@ -42,16 +42,16 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import KINDS, soil_named
 from soilbus.terra.wheel import Soil, WheelModel
 from soilbus.validation.draft_trials import true_largest_draft
-from soilbus.validation.monte_carlo import Each, missed
+from soilbus.validation.monte_carlo import Each, prior_about
 from soilbus.validation.windows import task_of
 
-SPREAD = 0.2
+SOIL_LOG_SD = 0.2
 """Sd of the logarithms by which a drive's soil parameters leave those of the table's soil."""
 LOW_SLIP, HIGH_SLIP = (0.03, 0.12), (0.15, 0.55)
 """Between which the lowest and the highest slip of a drive lie."""
-TORQUE, SINKAGE = (400.0, 1600.0), (0.02, 0.15)
+TORQUE_LIMIT_RANGE, SINKAGE_LIMIT_RANGE = (400.0, 1600.0), (0.02, 0.15)
 """Between which a motor's torque limit at the wheel [N m] and a sinkage limit [m] are drawn."""
-NEAR = 0.75
+NEAR_LIMIT_SHARE = 0.75
 """Share of drives that ask for a margin near the limit."""
 LEAST = 1e-3
 BINS = 10
@@ -137,7 +137,7 @@ def trial(task: Task) -> Call:
     ground, recording = _driven(config, seed, rng)
     settings = config.traversability.model_copy(update={"max_sinkage": ground.max_sinkage})
     measured, exact = (_window(recording, config, rig, of_truth) for of_truth in (False, True))
-    told = _told(config, missed(prior_of(config), ground.soil, np.random.default_rng([seed, 1])))
+    told = _with_prior(config, prior_about(prior_of(config), ground.soil, np.random.default_rng([seed, 1])))
     task_of_window = task_of(measured, config.estimator.window, told, ground.torque_limit, fresh=True)
     estimate = WindowEstimator(told).estimate(task_of_window)
     posterior, status, demand = estimate.result.posterior, estimate.result.status, estimate.demand
@@ -149,14 +149,14 @@ def trial(task: Task) -> Call:
         return judge(posterior, status, demand, rig, estimate.model, ground.torque_limit, by)[0]
 
     way = judged(settings)
-    if rng.random() < NEAR and (margin := _margin(way, demand, rng)) is not None:
+    if rng.random() < NEAR_LIMIT_SHARE and (margin := _margin(way, demand, rng)) is not None:
         settings = settings.model_copy(update={"margin": margin})
         way = judged(settings)
     probability = math.nan if way.probability is None else way.probability
     return Call(ground.name, probability, way.state, way.limit, _can(config, ground, settings, asked.pull))
 
 
-def _told(config: Config, prior: SoilPrior) -> Config:
+def _with_prior(config: Config, prior: SoilPrior) -> Config:
     """The configuration with another prior of the soil."""
     std = prior.median * np.sqrt(np.expm1(prior.log_std**2))
     pairs = zip(PARAMETERS, prior.median.tolist(), std.tolist(), strict=True)
@@ -199,15 +199,15 @@ def _driven(config: Config, seed: int, rng: np.random.Generator) -> tuple[Ground
 def _ground(config: Config, rng: np.random.Generator) -> Ground:
     name = str(rng.choice(KINDS))
     while True:
-        soil = Soil(*(np.asarray(soil_named(name)) * np.exp(SPREAD * rng.standard_normal(6))).tolist())
+        soil = Soil(*(np.asarray(soil_named(name)) * np.exp(SOIL_LOG_SD * rng.standard_normal(6))).tolist())
         if soil.phi < MAX_PHI:
             break
     torque_limit = np.array([wheel.max_torque or np.nan for wheel in config.wheel])
     max_sinkage, kind = config.traversability.max_sinkage, rng.integers(3)
     if kind == 1:
-        torque_limit = np.full(len(torque_limit), rng.uniform(*TORQUE))
+        torque_limit = np.full(len(torque_limit), rng.uniform(*TORQUE_LIMIT_RANGE))
     if kind == 2:
-        max_sinkage = rng.uniform(*SINKAGE)
+        max_sinkage = rng.uniform(*SINKAGE_LIMIT_RANGE)
     return Ground(name, soil, torque_limit, max_sinkage)
 
 

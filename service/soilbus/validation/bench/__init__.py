@@ -21,7 +21,7 @@ from soilbus.simulator.scenario import excited
 from soilbus.validation.bench import decode, growth, paper, replay, service, window
 from soilbus.validation.bench.figure import Figure
 
-RECORDING = 120.0
+RECORDING_TIME = 120.0
 THREADS = 1
 
 Measurement = Callable[[Path], Mapping[str, Figure]]
@@ -29,7 +29,7 @@ Measurement = Callable[[Path], Mapping[str, Figure]]
 
 MEASUREMENTS: tuple[Measurement, ...] = (
     lambda log: {"decode_speedup": decode.decode_speedup(log)},
-    lambda log: {"replay_realtime_factor": replay.replay_realtime_factor(log, RECORDING)},
+    lambda log: {"replay_realtime_factor": replay.replay_realtime_factor(log, RECORDING_TIME)},
     lambda _: {"paper_solve_speedup": paper.paper_solve_speedup()},
     lambda _: {"window_solve_speedup": window.window_solve_speedup()},
     service.window_times,
@@ -58,7 +58,9 @@ def _figures() -> dict[str, Figure]:
     figures: dict[str, Figure] = {}
     with TemporaryDirectory() as folder:
         log = Path(folder) / "bench.log"
-        write_log(frames(simulate(config, excited("loam", RECORDING), seed=1), config, load_databases(config)), log)
+        write_log(
+            frames(simulate(config, excited("loam", RECORDING_TIME), seed=1), config, load_databases(config)), log
+        )
         for measure in _with_progress(MEASUREMENTS):
             figures |= measure(log)
     return figures

@@ -25,13 +25,13 @@ from soilbus.arrays import Array
 from soilbus.can.bus import open_bus
 from soilbus.simulator.reference import TRACTOR
 from soilbus.validation.bench.bus_ear import Ear
-from soilbus.validation.bench.bus_load import FULL, Traffic, others
+from soilbus.validation.bench.bus_load import FULL_BUS_RATE, Traffic, others
 from soilbus.validation.bench.figure import Figure
 
-STARTS, CALLS = 3, 1000
+N_STARTS, N_SYSTEM_CALLS = 3, 1000
 """How often a start and a system call are timed."""
-QUIET = 1.0
-SETTLED = 2.5
+QUIET_TIME = 1.0
+COUNT_TIME = 2.5
 """Seconds after the last frame until its count is on the bus; where the daemon lags behind the count goes on."""
 
 _BARE = """
@@ -70,7 +70,7 @@ def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
     """
     _check_quiet(channel)
     ready, libraries, bare = zip(
-        *((_time_to_ready(channel), _time_of(_LIBRARIES), _time_of("")) for _ in range(STARTS)), strict=True
+        *((_time_to_ready(channel), _time_of(_LIBRARIES), _time_of("")) for _ in range(N_STARTS)), strict=True
     )
     with TemporaryDirectory() as folder, _daemon(channel, Path(folder)) as daemon:
         ear, traffic = Ear(channel), Traffic(channel, 1.5 * seconds)
@@ -90,7 +90,8 @@ def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
     return {
         "bus_lost": Figure(
             traffic.sent - received, 0.0, f"kernel's drop counter: {overruns}",
-            f"of {traffic.sent} frames at our filters, {traffic.sent / (1.5 * seconds):.0f} of {FULL:.0f} a second",
+            f"of {traffic.sent} frames at our filters, "
+            f"{traffic.sent / (1.5 * seconds):.0f} of {FULL_BUS_RATE:.0f} a second",
             at_most=True, digits=0,
         ),
         "bus_latency_ms": _latency(np.minimum(late, seconds), ear.longest_pause()),
@@ -99,7 +100,7 @@ def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
         "bus_ready_s": Figure(
             float(np.median([wall for wall, _ in ready])), 1.5,
             f"python with its libraries: {np.median(libraries):.2f} s, without: {np.median(bare):.2f} s",
-            f"from start to READY=1, median of {STARTS}: " + ", ".join(f"{wall:.2f}" for wall, _ in ready) + " s",
+            f"from start to READY=1, median of {N_STARTS}: " + ", ".join(f"{wall:.2f}" for wall, _ in ready) + " s",
             at_most=True, digits=2,
             more=("Processor time to READY=1: " + ", ".join(f"{used:.2f}" for _, used in ready) + " s.",),
         ),
@@ -123,9 +124,9 @@ def _latency(late: Array, pause: float) -> Figure:
 def _time_of_a_call() -> float:
     """Time [s] that the kernel takes for next to nothing."""
     begin = time.perf_counter()
-    for _ in range(CALLS):
+    for _ in range(N_SYSTEM_CALLS):
         os.getppid()
-    return (time.perf_counter() - begin) / CALLS
+    return (time.perf_counter() - begin) / N_SYSTEM_CALLS
 
 
 def _wait_until_counted(ear: Ear) -> None:
@@ -133,12 +134,12 @@ def _wait_until_counted(ear: Ear) -> None:
     before = -1
     while (count := ear.books()[0]) != before:
         before = count
-        time.sleep(SETTLED)
+        time.sleep(COUNT_TIME)
 
 
 def _check_quiet(channel: str) -> None:
     with open_bus({"interface": "socketcan", "channel": channel}) as bus:
-        if bus.recv(QUIET) is not None:
+        if bus.recv(QUIET_TIME) is not None:
             raise NotMeasured(f"{channel}: others are on this bus; the bench would fill it up")
 
 

@@ -17,7 +17,7 @@ from soilbus.pipeline.intake import EDGE_LEAD, Intake
 from soilbus.pipeline.outputs import WINDOW_MODULUS
 from soilbus.simulator.reference import reference_configuration
 
-LITTLE_ROOM = 0.05
+MAX_PAUSE_SMALL_BUFFER = 0.05
 """Longest time [s] between two looks where the kernel does not keep the frames of seconds for us."""
 
 
@@ -63,9 +63,9 @@ class Ear:
     def _pause(self) -> float:
         """Time [s] for which frames may gather: the kernel stamps them, and listening takes the daemon time."""
         if not self._mapped:
-            return LITTLE_ROOM
+            return MAX_PAUSE_SMALL_BUFFER
         pause = until_middle(time.time(), self._mapped[0], self._config.estimator.window, self._config.estimator.hop)
-        return pause if self._wire.room >= RECEIVE_BUFFER else min(pause, LITTLE_ROOM)
+        return pause if self._wire.room >= RECEIVE_BUFFER else min(pause, MAX_PAUSE_SMALL_BUFFER)
 
     def latencies(self) -> Array:
         """Time [s] from the last mapped frame of each window so far to the frame SoilStrength that tells of it."""

@@ -18,9 +18,9 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 
-FULL = 7350.0
+FULL_BUS_RATE = 7350.0
 """Frames a second of 8 bytes with 29-bit identifiers that 1 Mbit/s carries, at 136 bits each with their stuff bits."""
-OURS = 0.1
+MAPPED_SHARE = 0.1
 """Share of them that is mapped."""
 
 _POSITION = 0xFEF3
@@ -39,7 +39,7 @@ class Traffic:
         self.sent = 0
         config = reference_configuration()
         drive = list(frames(simulate(config, excited("loam", seconds), seed=1), config))
-        self._played = _thickened(drive, FULL * OURS)
+        self._played = _thickened(drive, FULL_BUS_RATE * MAPPED_SHARE)
         self._channel = channel
         self._thread = threading.Thread(target=self._play, daemon=True)
 
@@ -81,7 +81,7 @@ def others(channel: str) -> Iterator[None]:
     with can.Bus(interface="socketcan", channel=channel, can_filters=[]) as bus:
         tasks = [
             bus.send_periodic(can.Message(arbitration_id=_OTHERS + i, data=bytes(8)), _OTHERS_PERIOD)
-            for i in range(round(FULL * (1.0 - OURS) * _OTHERS_PERIOD))
+            for i in range(round(FULL_BUS_RATE * (1.0 - MAPPED_SHARE) * _OTHERS_PERIOD))
         ]
         try:
             yield

@@ -22,11 +22,11 @@ from soilbus.simulator.scenario import excited
 from soilbus.validation.bench.figure import Figure, in_turn
 
 WHEELS = (1, 2, 4, 8)
-LENGTHS = (5.0, 10.0, 20.0, 40.0)
+WINDOW_LENGTHS = (5.0, 10.0, 20.0, 40.0)
 ROUNDS = 12
 STEPS = 5
 """Gauss-Newton steps that are timed in a row."""
-TARGET = 1.1
+MAX_EXPONENT = 1.1
 
 
 def exponents() -> dict[str, Figure]:
@@ -47,7 +47,7 @@ def exponents() -> dict[str, Figure]:
     size, times = np.array(sizes, float), in_turn(works, ROUNDS) / STEPS
     fixed, each = line(size, times)
     off = float(np.max(np.abs((fixed + each * size) / times - 1.0)))
-    grid = times.reshape(len(WHEELS), len(LENGTHS))
+    grid = times.reshape(len(WHEELS), len(WINDOW_LENGTHS))
     what = "exponent of one Gauss-Newton step's time"
     more = (
         f"A Gauss-Newton step takes {1e3 * fixed:.1f} ms + {1e6 * each:.1f} us each wheel-instant, to "
@@ -56,13 +56,14 @@ def exponents() -> dict[str, Figure]:
     )
     return {
         "wheels_exponent": Figure(
-            float(np.log2(grid[-1, -1] / grid[-2, -1])), TARGET,
+            float(np.log2(grid[-1, -1] / grid[-2, -1])), MAX_EXPONENT,
             f"{WHEELS[-2]} wheels {1e3 * grid[-2, -1]:.1f} ms, {WHEELS[-1]} wheels {1e3 * grid[-1, -1]:.1f} ms",
-            f"{what}, {LENGTHS[-1]:g} s window", at_most=True, digits=2,
+            f"{what}, {WINDOW_LENGTHS[-1]:g} s window", at_most=True, digits=2,
         ),
         "samples_exponent": Figure(
-            float(np.log2(grid[-1, -1] / grid[-1, -2])), TARGET,
-            f"{LENGTHS[-2]:g} s {1e3 * grid[-1, -2]:.1f} ms, {LENGTHS[-1]:g} s {1e3 * grid[-1, -1]:.1f} ms",
+            float(np.log2(grid[-1, -1] / grid[-1, -2])), MAX_EXPONENT,
+            f"{WINDOW_LENGTHS[-2]:g} s {1e3 * grid[-1, -2]:.1f} ms, "
+            f"{WINDOW_LENGTHS[-1]:g} s {1e3 * grid[-1, -1]:.1f} ms",
             f"{what}, {WHEELS[-1]} wheels", at_most=True, digits=2, more=more,
         ),
     }  # fmt: skip
@@ -98,7 +99,7 @@ def _steps(problem: ObservationModel, prior: SoilPrior, soil: Array) -> Callable
 def _problems(wheels: int) -> Iterator[tuple[ObservationModel, SoilPrior]]:
     """Windows of all lengths of a tractor with so many wheels, half of them on each axle; one: a test rig."""
     config = _configuration(max(wheels, 2))
-    recording = simulate(config, excited("loam", max(LENGTHS)), seed=1)
+    recording = simulate(config, excited("loam", max(WINDOW_LENGTHS)), seed=1)
     samples = {name: (column.t, column.value) for name, column in recording.channels.items()}
     if wheels == 1:
         config = config.model_copy(update={"wheel": config.wheel[:1], "vehicle": None})
@@ -108,7 +109,7 @@ def _problems(wheels: int) -> Iterator[tuple[ObservationModel, SoilPrior]]:
     rig, settings = rig_of(config), config.estimator
     store = Bins(rig, settings.bin, 0.0)
     store.add({name: samples[name] for name in rig.channels if name in samples})
-    for length in LENGTHS:
+    for length in WINDOW_LENGTHS:
         yield ObservationModel(store.window(0.0, length), rig, model_of(config), settings.min_speed), prior_of(config)
 
 
@@ -126,6 +127,6 @@ def _configuration(wheels: int) -> Config:
 def _rows(times: Array, each: Array, iterations: Sequence[int]) -> list[str]:
     """A line for each number of wheels."""
     cells = [f"{t:8.1f}{e:6.1f}{i:4d}" for t, e, i in zip(times, each, iterations, strict=True)]
-    rows = [cells[i : i + len(LENGTHS)] for i in range(0, len(cells), len(LENGTHS))]
-    head = "wheels" + "".join(f"{f'{length:g} s':>18}" for length in LENGTHS)
+    rows = [cells[i : i + len(WINDOW_LENGTHS)] for i in range(0, len(cells), len(WINDOW_LENGTHS))]
+    head = "wheels" + "".join(f"{f'{length:g} s':>18}" for length in WINDOW_LENGTHS)
     return [head, *(f"{wheels:6d}" + "".join(row) for wheels, row in zip(WHEELS, rows, strict=True))]

@@ -28,19 +28,19 @@ from soilbus.terra.wheel import Soil, sinkage, state_on, wheel_forces
 from soilbus.validation.bench.figure import Figure, in_turn
 
 SOILS = ("loam", "wet_clay", "dry_sand")
-KNOWN = (("c", "K"), ("K", "c"))
+EXACT_AND_ROUGH = (("c", "K"), ("K", "c"))
 """Which of two parameters is known exactly, and which to a quarter (and told too large by as much)."""
-LENGTH = 10.0
+WINDOW_LENGTH = 10.0
 ROUNDS = 4
-AGREEMENT = 0.05
+MAX_DISTANCE_SD = 0.05
 """Posterior standard deviations that the two ends may be apart in any parameter."""
-PASSES = (1e-2, 1e-3, 1e-4, 1e-8)
+PASS_TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-8)
 """Relative fall of the cost that ends each pass of least_squares (its ftol; the last is its default).
 
 Each pass has its weights and eliminated loads and speeds from where the one before ended;
 an exact end of all but the last would be wasted.  Four is the least that brings all six
 windows to the same end as ours."""
-DIFFERENCE = 1e-5
+RELATIVE_DIFFERENCE = 1e-5
 """Relative step of the finite differences.  The default, 1.5e-8, takes more steps: entry angles are solved to 1e-12."""
 
 
@@ -58,11 +58,11 @@ class Window(NamedTuple):
 
 def window_solve_speedup() -> Figure:
     """10 s, four wheels, five free parameters, cold; AssertionError where the two come to different ends."""
-    windows = [_window(soil, *known) for known in KNOWN for soil in SOILS]
+    windows = [_window(soil, *known) for known in EXACT_AND_ROUGH for soil in SOILS]
     apart, times = [], []
     for window in windows:
         apart.append(distance(window, fit_window(*window), by_finite_differences(window)))
-        if not apart[-1] < AGREEMENT:
+        if not apart[-1] < MAX_DISTANCE_SD:
             raise AssertionError(f"ours and least_squares end {apart[-1]:.2g} standard deviations apart")
         times.append(in_turn(_works(window), ROUNDS))
     ours, alone, peer = np.array(times).T
@@ -107,7 +107,7 @@ def by_finite_differences(window: Window) -> Soil:
     x = np.zeros(len(free))
     latents = problem.start(soil_at(x))
     at = problem.linearise(soil_at(x), gains, latents)
-    for turn, ftol in enumerate(PASSES):
+    for turn, ftol in enumerate(PASS_TOLERANCES):
         if turn:
             soil = soil_at(x)
             at = problem.linearise(soil, gains, latents)
@@ -116,7 +116,7 @@ def by_finite_differences(window: Window) -> Soil:
         residuals = _whitened(problem, at, latents)
         x = least_squares(
             lambda x, residuals=residuals: np.concatenate([residuals(soil_at(x)), x]), x,
-            jac="2-point", diff_step=DIFFERENCE, ftol=ftol,
+            jac="2-point", diff_step=RELATIVE_DIFFERENCE, ftol=ftol,
         ).x  # fmt: skip
     return soil_at(x)
 
@@ -167,8 +167,8 @@ def _window(name: str, exact: str, rough: str) -> Window:
         *(f"noise.{quantity}.gain=0" for quantity in ("torque", "load", "speed", "ground_speed", "draft")),
     ])  # fmt: skip
     rig, settings = rig_of(config), config.estimator
-    channels = simulate(config, excited(name, LENGTH), seed=1).channels
+    channels = simulate(config, excited(name, WINDOW_LENGTH), seed=1).channels
     store = Bins(rig, settings.bin, 0.0)
     store.add({n: (channels[n].t, channels[n].value) for n in rig.channels if n in channels})
-    problem = ObservationModel(store.window(0.0, LENGTH), rig, model_of(config), settings.min_speed)
+    problem = ObservationModel(store.window(0.0, WINDOW_LENGTH), rig, model_of(config), settings.min_speed)
     return Window(problem, prior_of(config))
