@@ -335,7 +335,7 @@ def test_the_lead_is_that_of_the_last_warning_that_holds_until_the_end():
     assert begins == pytest.approx([10.0, 40.0], abs=0.11)
     found = judged("draft", seen)
     assert (found.warnings, found.lead) == (2, pytest.approx(10.0, abs=0.11))
-    assert found.way == pytest.approx(found.lead, abs=0.11)
+    assert found.distance == pytest.approx(found.lead, abs=0.11)
     over = observation([(10.0, 12.0, 0.65)], [(0.0, CURVE)], 50.0)
     assert (judged("draft", over).warnings, judged("draft", over).lead) == (1, 0.0)  # it had gone again
 
@@ -386,7 +386,7 @@ def test_thresholds_are_tuned_on_other_drives_than_are_reported(monkeypatch):
 def test_a_simulated_bogging_is_foreseen(kind, seed):
     found = trial(Task(CONFIG, kind, seed))
     assert found.lead >= 3.0
-    assert found.way >= 3.0
+    assert found.distance >= 3.0
     assert found.possible > found.lead - 1.0
 
 

@@ -1,4 +1,12 @@
-"""The daemon's loop: receive, admit, publish, with the estimate beside it."""
+"""The daemon's loop: receive, admit, publish; a worker thread estimates beside it.
+
+    every round    receive frames until the next tick -> intake
+                   windows that have ended -> work queue -> worker -> results -> SoilStrength ... frames
+    every tick     (10 Hz) wheel slip, immobilisation watch, decision -> frames; state, watchdog, state store
+
+No step of the loop waits for the estimator. The decision that goes out is valid only while inputs are fresh and no
+interruption (silent bus, stale input, foreign sender, fault) came after the end of the window that it rests on.
+"""
 
 from __future__ import annotations
 
@@ -42,30 +50,52 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 SILENCE_TIME = 1.0
-"""Seconds without any frame after which the bus counts as silent."""
+"""Time [s] without any frame after which the bus counts as silent."""
 MAX_FRAMES_PER_ROUND = 4000
-"""Frames taken in one go before the loop looks at its clock again."""
+"""Frames taken in one round before the loop reads its clock again."""
 MAX_WAIT, MAX_WAIT_WHILE_SOLVING = 0.02, 0.003
-"""Longest wait for a frame [s], and while the worker has a window: then its result may come any moment."""
+"""Longest wait for a frame [s]; the second one while the worker has a window, whose result may come any moment."""
 UNDISTURBED_TIME, UNDISTURBED_TIME_LARGE_BUFFER = 0.04, 0.08
-"""So long [s] after the worker got a window frames are left with the kernel: the two share one interpreter, and each
-frame taken halts the worker.  No longer where the kernel has its default's room, for those of 75 ms of a full bus."""
+"""Time [s] for which frames stay with the kernel after the worker got a window: loop and worker share one interpreter,
+and each frame taken halts the worker. The second one where the kernel's buffer holds seconds of frames; its default
+holds 75 ms of a full bus."""
 MAX_CURVE_AGE = 60.0
-"""Age [s] up to which a valid window's pull over slip serves to watch for immobilisation."""
+"""Age [s] up to which a valid window's pull over slip is used to watch for immobilisation."""
 FOREIGN_SENDER_HOLD_TIME = 3.0
-"""Seconds for which another sender under our identifiers is reported: until every reader has seen it."""
+"""Time [s] for which another sender under our identifiers is reported, so that every reader sees it."""
 INTERRUPTIONS = frozenset(("bus_down", "no_frames", "input_missing", "input_stale", "foreign_sender"))
-"""Reasons, beside a bus-off and a fault, for which no window that ended before is believed any more."""
+"""Reasons, beside bus-off and fault, that end the validity of every window that ended before."""
 
 
 class Service:
     """One vehicle on one bus.
 
-    The loop receives and publishes; `workers` (one thread) estimates beside it, so that a
-    hard window neither delays a frame nor loses one.  `clock` is monotonic [s], and `waiting` by it
-    (as in Backlog); frame stamps only space the samples.  `step` makes one round and returns; `run` repeats it
-    until `stop`.  What `open_persistence` returns begins with what another run knew of the sensors,
-    and keeps what this one knows; the worker opens it, and makes the estimator, before the first window.
+    Parameters
+    ----------
+    config
+        The vehicle's configuration.
+    pipeline
+        Intake and estimator.
+    bus
+        The open bus, or one that will be opened.
+    publisher
+        Encodes our frames.
+    notifier
+        systemd's notification socket.
+    workers
+        One thread, which estimates.
+    clock
+        Monotonic time [s]; stamps of frames only space the samples.
+    on_window
+        Called with each window's result.
+    open_persistence
+        Called in the worker before the first window; returns the stored state of the last run, or None.
+    waiting
+        Waits for a future, for at most the seconds given (as WorkQueue).
+
+    Notes
+    -----
+    `step` makes one round and returns; `run` repeats it until `stop`.
     """
 
     def __init__(
@@ -112,7 +142,7 @@ class Service:
         self._state: tuple[ServiceState, str] = (ServiceState.STARTING, "none")
 
     def _first_estimator(self) -> WindowEstimator:
-        """In the worker: the estimator, with what was known before."""
+        """In the worker: the estimator, with the posterior of the last run as its prior where one is stored."""
         estimator, persistence = self._pipeline.estimator, self._open_persistence()
         if persistence is not None and persistence.stored_prior is not None:
             estimator.tracker.recall(*persistence.stored_prior)
@@ -129,7 +159,7 @@ class Service:
         self._stopping = True
 
     def run(self) -> None:
-        """Work until `stop`, then tell everybody that nothing follows."""
+        """Work until `stop`, then send one last decision "unknown"."""
         self.notifier.ready("starting")
         while not self._stopping:
             self.step()
@@ -185,7 +215,7 @@ class Service:
                 return
 
     def _hand_out(self, now: float) -> None:
-        """Give the windows that have ended to the worker; what it cannot keep up with is dropped."""
+        """Put the windows that have ended into the work queue; it drops what the worker cannot keep up with."""
         for task in self.intake.due(self._time.heard(self.intake.next_end, now)):
             ended = now - max(0.0, self._time.at(now) - task.end)
             self.deadline_misses += self._work_queue.add(task, ended, task.epoch, now)
@@ -284,9 +314,17 @@ class Service:
         return state_after(self.result), reason
 
     def present_way(self, now: float) -> Traversability:
-        """The decision as of now: only while all works, no needed input is stale and its data are young.
+        """The present decision.
 
-        After an interruption only a window that ended later counts.
+        Parameters
+        ----------
+        now
+            Monotonic time [s].
+
+        Returns
+        -------
+        The decision of the last window, judged at `now`; unknown while an input is stale or a fault holds, and until
+        a window has ended after the last interruption.
         """
         if _interrupts(self._present_state(now)) or self._fault or self._guarded_estimator.in_fault:
             return Traversability()
@@ -401,7 +439,7 @@ def _interrupts(state: tuple[ServiceState, str]) -> bool:
 
 
 def _first_word(reason: str) -> str:
-    """Of a reason such as "input_stale load.FL", what the value table knows."""
+    """First word of a reason such as "input_stale load.FL": the name in the DBC's value table."""
     return reason.split()[0]
 
 

@@ -1,9 +1,10 @@
-"""A rehearsal: a few windows are estimated before anything depends on how long a window takes.
+"""Warm-up: a few windows are solved before anything depends on how long a window takes.
 
-The first pass through any code takes several times as long as later ones: memory comes page by page from the
-kernel, caches are empty.  The rehearsal's samples come from the wheel-soil model: at each instant the configured
-vehicle stands on the soil of the prior's medians, each wheel has the entry angle at which that soil carries its
-load, all wheels have the same slip, and draft is the sum of their drawbar pulls.
+    slip(t) between 0.10 and 0.40, one period a window;   side load share 0.15 sin(4 pi t / window)
+    load, pull, torque, sinkage = wheel-soil model at the prior's medians;   draft = sum of the wheels' pulls
+
+The first pass through any code takes several times as long as later ones: memory comes page by page from the kernel,
+caches are empty. The samples come from the wheel-soil model with the sensors' noise; results and frames are dropped.
 """
 
 from __future__ import annotations

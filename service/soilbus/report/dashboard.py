@@ -1,6 +1,7 @@
-"""A live terminal dashboard that knows the tractor only by our frames, as any dashboard ECU would.
+"""A live terminal dashboard that reads only our frames, as any dashboard ECU would.
 
-Grey is what soilbus guesses but does not vouch for (Status other than valid); - is what nobody knows.
+Grey figures have a Status other than valid: they are guesses that must not be acted on. "-" is a value that is not
+available or too old.
 """
 
 from __future__ import annotations
@@ -46,7 +47,15 @@ WIDTH = 78
 
 
 def panel(known: ReceivedFrames, fault: str = "") -> Panel:
-    """What a driver sees; `fault` is what keeps the bus away."""
+    """The dashboard's picture.
+
+    Parameters
+    ----------
+    known
+        The received frames.
+    fault
+        Why the bus is away; empty while it is there.
+    """
     way = str(known.value("Traversability", "State"))
     way = way if way in COLOURS else "unknown"
     head = Text(f" {way.upper().replace('_', '-')} ", style=f"bold black on {COLOURS[way]}")
@@ -184,9 +193,12 @@ def _figures(value: float, spread: float) -> str:
 
 
 def watch(config: Config, seconds: float | None = None) -> None:
-    """Show the dashboard of the configured bus until interrupted, or for some seconds.
+    """Show the dashboard of the configured bus until interrupted or for some seconds; wait for a bus that goes away.
 
-    A bus that goes away is waited for.  Raises BusError where it cannot be opened to begin with.
+    Raises
+    ------
+    BusError
+        The bus cannot be opened at the start.
     """
     database = output_database(config)
     settings, filters = config.bus.model_dump(), filters_of(database)
@@ -202,7 +214,21 @@ def show(
     until: float | None = None,
     done: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Feed readings from a bus and redraw them five times a second until `until` (monotonic) or `done`."""
+    """Feed received frames from a bus and redraw five times a second.
+
+    Parameters
+    ----------
+    known
+        Takes the frames.
+    bus
+        The open bus.
+    console
+        Where to draw.
+    until
+        Monotonic time [s] at which to stop; None for never.
+    done
+        Whether to stop, asked in every round.
+    """
     with Live(panel(known), console=console, auto_refresh=False, screen=False) as live:
         redraw = time.monotonic()
         while not done() and (until is None or time.monotonic() < until):

@@ -1,7 +1,6 @@
-"""Soil along the way as GeoJSON (RFC 7946): one point for each window, in the middle of its data.
+"""Soil along the route as GeoJSON (RFC 7946): one point for each window, in the middle of its data.
 
-Coordinates are WGS84 in degrees, longitude first.  Every property has its unit in its
-name; what is not known is null, never a nan.
+Coordinates are WGS84 in degrees, longitude first. Every property has its unit in its name; an unknown value is null.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from soilbus.pipeline.outputs import known
 from soilbus.pipeline.result import WindowResult
 
 DEGREE_DECIMALS = 7
-"""Of a degree: a centimetre."""
+"""Decimals of a degree: the seventh is a centimetre."""
 
 
 def check_position_is_mapped(config: Config) -> None:
@@ -28,7 +27,12 @@ def check_position_is_mapped(config: Config) -> None:
 
 
 def soil_map(results: Iterable[WindowResult]) -> tuple[str, int]:
-    """A FeatureCollection as text, a feature a line, and how many windows have no position and are left out."""
+    """A FeatureCollection, one feature a line.
+
+    Returns
+    -------
+    The text, and the number of windows without a position, which it leaves out.
+    """
     features: list[str] = []
     left_out = 0
     for result in results:

@@ -1,4 +1,9 @@
-"""What the configuration takes for granted of the soil, beside the soils that are known."""
+"""The soil prior as a table: 95 % interval of each parameter, and the table's soils outside it.
+
+    low, high = median exp(-+1.96 log_std)
+
+A soil outside an interval is where a badly determined parameter would stay near the prior, with too small an sd.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +22,7 @@ SHOWN = {
     "c": ("kPa", 1e3), "K": ("mm", 1e-3),
 }  # fmt: skip
 MAX_SOILS_NAMED = 3
+"""Soils outside an interval that are named; the others are counted."""
 
 
 def prior_text(config: Config) -> str:
@@ -24,8 +30,8 @@ def prior_text(config: Config) -> str:
     head = ("parameter", "assumed", "95 % from", "to", "unit", "known soils outside")
     return (
         table(head, list(_rows(config)))
-        + "\nOn a soil outside, what the sensors tell badly stays near what is assumed, with a deviation too small; set"
-        "\n[soil] there.  Bearing pressure, drafts and slopes follow from what the sensors tell well."
+        + "\nOn a soil outside, a badly determined parameter stays near the prior, with a deviation too small; set"
+        "\n[soil] there.  Bearing pressure, drafts and slopes depend on what the sensors determine well."
     )
 
 

@@ -1,4 +1,8 @@
-"""The windows of a replay as a short summary and as an HTML report."""
+"""Windows of a replay as a short summary and as an HTML report with plots over time.
+
+The summary counts windows by status and reason, with advice for each reason, then gives medians of the bearing
+pressure, decisions, failed solves, and samples used and refused.
+"""
 
 from __future__ import annotations
 
@@ -19,18 +23,38 @@ from soilbus.report.advice import advice, of_use
 from soilbus.report.page import html_table, page, picture
 
 RECORDING_GAP = 5.0
-"""Room [s] between two recordings in a plot."""
+"""Space [s] between two recordings in a plot."""
 
 
 def summary(results: Sequence[WindowResult], pipeline: Pipeline) -> str:
-    """A few lines: windows by log and by status, why and what to do, soil, decisions, failed solves, samples."""
+    """Summary of a replay of logs.
+
+    Parameters
+    ----------
+    results
+        Every window.
+    pipeline
+        Counted frames and refusals while it made them.
+    """
     counts, refusals = pipeline.admission.counts, pipeline.intake.refusals
     heard = f"{sum(counts.received.values())} mapped frames ({counts.unknown} of other identifiers)"
     return summary_of(results, heard, refusals.used, refusals.total)
 
 
 def summary_of(results: Sequence[WindowResult], heard: str, used: int | None, refused: Counter[str]) -> str:
-    """The same of windows from anything that `heard` tells of, with samples used, and refused by reason."""
+    """Summary of windows from any source.
+
+    Parameters
+    ----------
+    results
+        Every window.
+    heard
+        What they were made from, such as "5000 mapped frames".
+    used
+        Samples used; None where that was not counted.
+    refused
+        Samples refused by reason.
+    """
     good = [r for r in results if r.status is Status.VALID]
     estimated = len(of_use(results)) - len(good)
     lines = [f"{len(results)} windows from {heard}"]
@@ -61,7 +85,15 @@ def unused(results: Sequence[WindowResult]) -> int:
 
 
 def why_of_no_use(results: Sequence[WindowResult], window: float) -> str:
-    """One line on windows of which none is of use; `window` is their length [s]."""
+    """One line on windows of which none has an estimate.
+
+    Parameters
+    ----------
+    results
+        Every window.
+    window
+        Length of a window [s].
+    """
     if not results:
         return f"no window could be made: no recording lasts the {window:g} s of a window"
     (status, reason), group = _groups(results)[0]
@@ -97,7 +129,7 @@ def counted(counts: Counter[str]) -> str:
 
 
 def html_report(results: Sequence[WindowResult], text: str, logs: Sequence[Path]) -> str:
-    """A self-contained page with plots over time under a summary; needs matplotlib (extra: plots)."""
+    """A self-contained page: summary, plots over time, one row for each window; needs matplotlib (extra: plots)."""
     rows = [
         (
             r.log or "-",

@@ -1,4 +1,4 @@
-"""A recording onto a bus in real time, or into a log."""
+"""Play a recording: onto a bus in real time, or into a log."""
 
 from __future__ import annotations
 
@@ -21,9 +21,12 @@ _ASSUMED_SPEED = 1.4
 
 
 def scenario_over(soils: Sequence[str], duration: float, course: Course = NORTHWARD) -> Scenario:
-    """The soils one after the other in equal parts of the time, with all the excitation they bear.
+    """A scenario over several soils, each for an equal part of the time, with slip swept from 0.05 to 0.40.
 
-    KeyError for a name that is not known.
+    Raises
+    ------
+    KeyError
+        A soil is unknown.
     """
     for name in soils:
         if name not in SOILS:
@@ -36,8 +39,14 @@ def scenario_over(soils: Sequence[str], duration: float, course: Course = NORTHW
 def play(recording: Recording, config: Config, log: Path | None) -> None:
     """Write the recording's frames to a log, or send them to the configured bus in real time.
 
-    Raises BusError where the bus cannot be opened or goes away, OSError for a log that cannot be written, and
-    ValueError for a log format that is not known.
+    Raises
+    ------
+    BusError
+        The bus cannot be opened, or goes away.
+    OSError
+        The log cannot be written.
+    ValueError
+        The log's format is unknown.
     """
     messages = frames(recording, config)
     if log is not None:
@@ -58,7 +67,19 @@ def send_in_time(
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> None:
-    """Send messages spaced as their time stamps are, `speed` times as fast."""
+    """Send messages spaced as their stamps are.
+
+    Parameters
+    ----------
+    messages
+        In the order of their stamps.
+    send
+        Sends one.
+    speed
+        Seconds of the recording per second.
+    clock, sleep
+        Monotonic time [s] and waiting by it.
+    """
     first: float | None = None
     begin = clock()
     for message in messages:

@@ -1,4 +1,12 @@
-"""Simulated boggings and firm ground: how long before slip passes its limit soilbus warns, and how often in vain."""
+"""Trials of the immobilisation warning on simulated drives: how early it comes, and how often it is false.
+
+    lead = time at which slip passes its limit - time at which the last warning began
+
+A drive into trouble (validation/boggings.py) counts as predictable if MIN_LEAD_TIME + REACTION_TIME pass, or the
+distance that belongs to them is driven, between the first perceptible loss of draft and the moment when slip passes
+its limit. On firm ground
+(validation/firm_drives.py) every warning is false. Drives with even seeds are reported; thresholds are set on odd ones.
+"""
 
 from __future__ import annotations
 
@@ -29,15 +37,15 @@ from soilbus.validation.windows import task_of
 
 HALVES = ("report", "tune")
 LOOK_PERIOD = 0.1
-"""Time [s] between two looks, as in the service."""
+"""Time [s] between two looks of the watch, as in the service."""
 MIN_LEAD_TIME, MIN_LEAD_DISTANCE = 3.0, 3.0
-"""Warning ahead that is enough: [s] or [m]."""
+"""Lead of a warning that is early enough: [s], or [m] for the second one."""
 REACTION_TIME = 1.0
-"""Time [s] without which no change is told from noise."""
+"""Time [s] that a change needs to rise out of the noise."""
 PERCEPTIBLE_DRAFT_LOSS = 0.05
-"""Loss, as a share of the largest draft, that slip and pull can tell from their noise."""
+"""Loss, as a share of the largest draft, that slip and pull show above their noise."""
 MIN_DRIVE_TIME = 5.0
-"""Slip that passes within this time [s] of the first window cannot be foreseen: no drive to judge by."""
+"""Time [s] after the first window within which slip may pass with no time for a warning: no such drive counts."""
 
 
 class Task(NamedTuple):
@@ -50,43 +58,59 @@ class Task(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class WarningTrial:
-    """One drive: seconds watched, warnings begun before slip passed, and where it did the lead of the last one.
+    """One drive.
 
-    lead [s] and way [m] are nan where slip never passed, or at once (EARLIEST), and 0 where
-    it passed unwarned.  possible and possible_way are what went by from when the ground could be felt
-    to give way (FELT), or the first window, until slip passed: nobody can warn earlier.
+    Attributes
+    ----------
+    kind
+        Of boggings.KINDS or firm_drives.FIRM_KINDS.
+    seconds
+        Time watched [s].
+    warnings
+        Warnings begun before slip passed its limit.
+    lead, distance
+        Of the last warning [s], [m]; nan where slip never passed, or passed before MIN_DRIVE_TIME; 0 without a warning.
+    possible, possible_distance
+        Time [s] and distance [m] from the first perceptible loss of draft, or the first window, until slip passed.
     """
 
     kind: str
     seconds: float
     warnings: int
     lead: float
-    way: float
+    distance: float
     possible: float = np.inf
-    possible_way: float = np.inf
+    possible_distance: float = np.inf
 
     @property
     def in_time(self) -> bool:
         """Whether the warning was early enough."""
-        return self.lead >= MIN_LEAD_TIME or self.way >= MIN_LEAD_DISTANCE
+        return self.lead >= MIN_LEAD_TIME or self.distance >= MIN_LEAD_DISTANCE
 
     @property
     def sudden(self) -> bool:
         """Whether slip passed too soon after the first sign for any warning to be early enough."""
-        speed = self.possible_way / self.possible if 0.0 < self.possible < np.inf else 0.0
+        speed = self.possible_distance / self.possible if 0.0 < self.possible < np.inf else 0.0
         return (
             self.possible < MIN_LEAD_TIME + REACTION_TIME
-            and self.possible_way < MIN_LEAD_DISTANCE + REACTION_TIME * speed
+            and self.possible_distance < MIN_LEAD_DISTANCE + REACTION_TIME * speed
         )
 
 
 @dataclass(frozen=True, slots=True)
 class WarningFigures:
-    """One kind.
+    """Figures of one kind.
 
-    Boggings: how many that could be foreseen in time, how many of these were, median and
-    least lead [s]; how many were too sudden, and the median delay [s] of their warnings behind
-    the first sign.  Firm ground: hours and false warnings.
+    Attributes
+    ----------
+    boggings, warned
+        Predictable boggings, and those warned of early enough.
+    lead, least
+        Median and least lead [s].
+    sudden, delay
+        Boggings that were too sudden, and the median delay [s] of their warnings behind the first perceptible loss.
+    hours, false
+        On firm ground: hours and false warnings.
     """
 
     kind: str
@@ -101,10 +125,20 @@ class WarningFigures:
 
 
 class Observation(NamedTuple):
-    """One drive as the watch sees it: moments, and pull over slip from the times [s] on at which it is known.
+    """One drive as the watch sees it.
 
-    end [s] is when slip passed its limit (passed) or the drive ended, felt [s] when the ground could first
-    be felt to give way; way is the distance [m] driven at times t [s] (both (N,)).
+    Attributes
+    ----------
+    moments
+        What the watch reads at each look.
+    curves
+        Times [s] from which on a curve of pull over slip is known, and the curve.
+    start, end
+        Of the watched time [s]; it ends when slip passes its limit (`passed`), or with the drive.
+    t, distance
+        Times [s] and distances driven [m] (N,).
+    felt
+        Time [s] of the first perceptible loss of draft.
     """
 
     moments: list[Moment]
@@ -113,17 +147,17 @@ class Observation(NamedTuple):
     end: float
     passed: bool
     t: Array
-    way: Array
+    distance: Array
     felt: float
 
 
 def trial(task: Task) -> WarningTrial:
-    """Drive, estimate every hop as the service does, and watch."""
+    """Simulate one drive, estimate every hop as the service does, and watch."""
     return judged(task.kind, observed(task))
 
 
 def observed(task: Task) -> Observation:
-    """Drive and estimate."""
+    """Simulate one drive and estimate every hop."""
     config, rig = task.config, rig_of(task.config)
     rng = np.random.default_rng([task.seed, 3])
     if task.kind in FIRM_KINDS:
@@ -144,7 +178,7 @@ def observed(task: Task) -> Observation:
 
 
 def _first_perceptible(task: Task, trouble: BoggingDrive, end: float) -> float:
-    """From when on, until the end [s], the largest draft that the way truly holds is less by FELT than at the start.
+    """Time [s] of the first perceptible loss: the ground's largest draft has fallen by PERCEPTIBLE_DRAFT_LOSS for good.
 
     0 where it is not: then the demand is what grows.
     """
@@ -157,29 +191,32 @@ def _first_perceptible(task: Task, trouble: BoggingDrive, end: float) -> float:
     return float(firm[-1]) if len(firm) and firm[-1] < t[t <= end][-1] else 0.0
 
 
-def judged(kind: str, seen: Observation) -> WarningTrial:
-    """What the watch makes of a drive."""
-    t, warned = watch(seen)
+def judged(kind: str, observation: Observation) -> WarningTrial:
+    """The trial's result from what the watch saw."""
+    t, warned = watch(observation)
     begins = t[1:][warned[1:] & ~warned[:-1]]
-    seconds = seen.end - seen.start
-    if not seen.passed or seconds <= MIN_DRIVE_TIME:
+    seconds = observation.end - observation.start
+    if not observation.passed or seconds <= MIN_DRIVE_TIME:
         return WarningTrial(kind, seconds, len(begins), np.nan, np.nan)
-    lead = seen.end - float(begins[-1]) if len(begins) and warned[-1] else 0.0
-    possible = seen.end - min(max(seen.felt, seen.start), seen.end)
-    way, possible_way = (_distance_since(seen, seen.end - s) for s in (lead, possible))
-    return WarningTrial(kind, seconds, len(begins), lead, way, possible, possible_way)
+    lead = observation.end - float(begins[-1]) if len(begins) and warned[-1] else 0.0
+    possible = observation.end - min(max(observation.felt, observation.start), observation.end)
+    distance, possible_distance = (_distance_since(observation, observation.end - s) for s in (lead, possible))
+    return WarningTrial(kind, seconds, len(begins), lead, distance, possible, possible_distance)
 
 
-def _distance_since(seen: Observation, since: float) -> float:
+def _distance_since(observation: Observation, since: float) -> float:
     """Distance [m] driven from a time [s] until the end."""
-    return float(np.interp(seen.end, seen.t, seen.way) - np.interp(since, seen.t, seen.way))
+    return float(
+        np.interp(observation.end, observation.t, observation.distance)
+        - np.interp(since, observation.t, observation.distance)
+    )
 
 
-def watch(seen: Observation) -> tuple[Array, NDArray[np.bool_]]:
+def watch(observation: Observation) -> tuple[Array, NDArray[np.bool_]]:
     """Times [s] (N,) of the looks, and whether each warned."""
-    state, curve, curves, out = Watch(), None, iter(seen.curves), []
+    state, curve, curves, out = Watch(), None, iter(observation.curves), []
     due = next(curves, None)
-    for moment in seen.moments:
+    for moment in observation.moments:
         while due is not None and moment.t >= due[0]:
             curve, due = due[1], next(curves, None)
         state = watched(state, moment.t, moment.slip, moment.pull, curve, moment.inertia)
@@ -214,10 +251,29 @@ def half_of(seed: int) -> str:
 def warning_trials(
     config: Config, boggings: int, hours: float, seed: int, each: Each = map, half: str = "report"
 ) -> tuple[WarningFigures, ...]:
-    """Figures of so many boggings, evenly of all kinds, and of so many hours without one, half of them hard.
+    """Figures of simulated boggings and of hours without one.
 
-    All drives are of one half (half_of).  The same seed gives the same drives.  Raises SimulationError where the
-    vehicle cannot be driven, ValueError for another half.
+    Parameters
+    ----------
+    config
+        The vehicle.
+    boggings
+        Number of drives into trouble, evenly of all kinds.
+    hours
+        Hours on firm ground, half of them on hard drives.
+    seed
+        The same seed gives the same drives.
+    each
+        The built-in map, or that of monte_carlo.processes.
+    half
+        The half of all drives that these belong to (half_of).
+
+    Raises
+    ------
+    SimulationError
+        The vehicle cannot be driven.
+    ValueError
+        Another half.
     """
     if half not in HALVES:
         raise ValueError(f"no half of the drives is called {half}; known: {', '.join(HALVES)}")
@@ -236,7 +292,7 @@ def warning_trials(
 
 
 def figures(kind: str, trials: Sequence[WarningTrial]) -> WarningFigures:
-    """The figures of some trials of one kind: boggings are those whose slip passed."""
+    """Figures of trials of one kind; those whose slip passed are boggings."""
     bogged = [t for t in trials if np.isfinite(t.lead)]
     asked = [t for t in bogged if not t.sudden]
     rest = [t for t in trials if t.kind in FIRM_KINDS]

@@ -1,4 +1,10 @@
-"""Drives that end with the vehicle stuck, in the ways in which fields do that."""
+"""Simulated drives that end with the vehicle stuck, one function of random parameters for each kind.
+
+    digging:  v = rim speed (1 - slip),  slip from a first drive at constant speed over the same ground
+
+The kinds are soft ground with a long or a short transition, a draft or a grade that outgrows firm ground, wheels that
+dig themselves in at constant throttle, and uneven variants of softening and draft.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +28,7 @@ from soilbus.validation.draft_trials import true_largest_draft
 
 FIRM_SOILS = ("rubicon_sandy_loam_43", "north_gower_clayey_loam_46", "upland_sandy_loam_51", "loam")
 SLIPPING_SOILS = FIRM_SOILS[:2] + FIRM_SOILS[3:]
-"""Where the reference tractor's motors can turn the wheels into slip: on the others a draft only stalls them."""
+"""Soils on which the reference tractor's motors can turn the wheels into slip; on the others a draft stalls them."""
 SOFT_SOILS = ("wet_clay", "clayey_soil_38", "lean_clay_32", "heavy_clay_40")
 KINDS = ("softening", "patch", "draft", "grade", "digging", "uneven_softening", "uneven_draft")
 """Ground that softens over many metres; a soft patch with an edge; a draft and a grade that outgrow firm ground;
@@ -30,11 +36,11 @@ wheels that dig themselves in at constant throttle; ground that softens, or a dr
 DRIVE_TIME = 60.0
 """Length of a drive [s]."""
 FAST_SWING_BAND = (0.1, 0.4)
-"""Frequencies [Hz] between which a draft swings fast."""
+"""Frequencies [Hz] of a draft that swings fast."""
 SPEED_TIME_CONSTANT = 0.5
-"""Time constant [s] of the ground speed behind the slip, at constant throttle."""
+"""Time constant [s] of the ground speed behind the slip at constant throttle."""
 MIN_SPEED = 0.3
-"""Ground speed [m/s] at which a drive at constant throttle is as good as stuck."""
+"""Ground speed [m/s] at which a drive at constant throttle counts as stuck."""
 LIFT_SLIP = Swing(0.9, 0.9)
 """Slip at which the driver lifts the implement: too late."""
 
@@ -47,7 +53,24 @@ class BoggingDrive(NamedTuple):
 
 
 def bogging(config: Config, kind: str, rng: np.random.Generator) -> BoggingDrive:
-    """A drive of one of KINDS that is meant to end stuck; SimulationError where the vehicle cannot be driven."""
+    """A drive that is meant to end stuck.
+
+    Parameters
+    ----------
+    config
+        The vehicle.
+    kind
+        One of KINDS.
+    rng
+        Picks soils, lengths and drafts.
+
+    Raises
+    ------
+    SimulationError
+        The vehicle cannot be driven.
+    ValueError
+        Another kind.
+    """
     firm = str(rng.choice(SLIPPING_SOILS if kind in ("draft", "grade", "uneven_draft") else FIRM_SOILS))
     most = largest_draft(config, firm)
     start = rng.uniform(22.0, 32.0)
@@ -74,7 +97,7 @@ def bogging(config: Config, kind: str, rng: np.random.Generator) -> BoggingDrive
 
 
 def largest_draft(config: Config, soil: str) -> float:
-    """Largest draft [N] on a soil of the table within the allowed slip, whatever the motors can give."""
+    """Largest draft [N] on a soil of the table within the allowed slip, without a torque limit."""
     rig = rig_of(config)
     no_limit = np.full(len(rig.radius), np.nan)
     return true_largest_draft(soil_named(soil), rig, no_limit, config.traversability.max_slip, WheelModel())

@@ -1,4 +1,4 @@
-"""Figures of the decision beside their targets, a section for each question."""
+"""Report of `soilbus decisions`: figures of the decision beside their targets, a section for each question."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def _warning_section(warnings: Sequence[WarningFigures]) -> Iterator[str]:
     boggings = [found for found in warnings if found.boggings or found.sudden]
     head = ("boggings", "foreseeable", "in time", "median lead", "least", "too sudden", "warned after")
     yield table(head, [_bogging_row(found) for found in boggings])
-    yield "Target: all that can be foreseen in time.  Too sudden: from where the ground has lost"
+    yield "Target: all that can be predicted in time.  Too sudden: from where the ground has lost"
     lost = f"{100.0 * PERCEPTIBLE_DRAFT_LOSS:.0f} % of the largest draft"
     yield f"{lost}, slip passes in less than that and {REACTION_TIME:g} s to react."
     yield ""
@@ -104,7 +104,7 @@ def _pooled(firm: Sequence[WarningFigures]) -> dict[str, _Pooled]:
 
 
 def poisson_interval(count: int) -> tuple[float, float]:
-    """Exact 95 % interval of the expectation of a Poisson count (Garwood 1936, Biometrika 28:437)."""
+    """95 % interval of the expectation of a Poisson count (Garwood 1936, Biometrika 28:437)."""
     least = float(gammaincinv(count, 0.025)) if count else 0.0
     return least, float(gammaincinv(count + 1, 0.975))
 
@@ -122,7 +122,7 @@ def _seconds(value: float) -> str:
 
 def _draft_section(drafts: Sequence[DraftFigures]) -> Iterator[str]:
     low, high = (100.0 * share for share in COVERAGE)
-    yield "Largest draft on the level, foretold from one window"
+    yield "Largest draft on the level, predicted from one window"
     yield ""
     head = ("soil", "drives", "failed", "true", "|error|", "bias", "in 95 %")
     yield table(head, [_draft_row(of_soil) for of_soil in drafts])

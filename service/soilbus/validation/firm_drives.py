@@ -1,4 +1,8 @@
-"""Drives on ground that holds: easy work, and work that is hard on every trend, in the ways in which fields are."""
+"""Simulated drives on ground that holds, one function for each kind of work; every warning on them is false.
+
+The easy kind is steady work. The hard kinds have fast changes that could look like a loss of traction: uneven ground,
+an implement lifted at headlands, stop and go, short hills, clods, and soil that is soft all over.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +24,7 @@ HARD = ("harsh", "headland", "stop_and_go", "hills", "clods", "soft")
 hills; stones and clods in the implement's way; a light draft on soil that is soft all over."""
 FIRM_KINDS = (EASY, *HARD)
 GROUND_SPEED = Swing(1.0, 1.8)
-"""Ground speed [m/s], where a drive is not about it."""
+"""Ground speed [m/s], where a kind of drive does not set its own."""
 _KNOT_PERIOD = 0.1  # s, between the knots of a draft
 
 

@@ -1,10 +1,11 @@
-"""The posterior of a window by importance sampling: no assumption about its shape, only patience.
+"""Importance sampling of a window's posterior: no assumption about its shape.
 
-Soils are drawn from a mixture along n as `marginal` averages it, made wider and with heavier tails,
-and each is weighed by the whole nonlinear model (e.g. Robert & Casella 2004, Monte Carlo
-Statistical Methods, sect. 3.3).  The mean of such a posterior has the least mean square error that any
-estimate can have, on average over the soils that what was known and the window allow.  It
-takes hundreds of evaluations: for judging the estimator, not for the service.
+    share_i = p(soil_i | window) / q(soil_i), normalised;     q: mixture of Student's t along n
+
+The proposal q takes the nodes in n of the nested Laplace approximation (estimation/laplace.py), with a wider covariance
+and heavier tails; each draw is weighed by the whole nonlinear model (Robert & Casella 2004, Monte Carlo Statistical
+Methods, sect. 3.3). The mean of such a posterior has the least mean square error of any estimate, averaged over the
+soils that prior and window allow. It takes hundreds of evaluations, so it serves to judge the estimator only.
 """
 
 from __future__ import annotations
@@ -27,20 +28,27 @@ from soilbus.estimation.solver import Iterate, Objective, QuadraticModel
 from soilbus.terra.wheel import Soil
 
 PROPOSAL_DOF = 5.0
-"""Degrees of freedom of Student's t that the draws follow given n."""
+"""Degrees of freedom of the Student's t that the draws follow at a given n."""
 COVARIANCE_RATIO = 1.2
-"""Their covariance over that of the fit with this n."""
+"""Covariance of the draws over that of the fit at the same n."""
 MIN_EIGENVALUE = 1e-9
-"""Least eigenvalue of a matrix of correlations up to which it is singular."""
+"""Least eigenvalue of a correlation matrix that is not singular."""
 PROPOSAL_DENSITY_POWER = 0.5
 """Power of the density of n that n is drawn from."""
 _K_C, _K_PHI, _N, _PHI = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "phi"))
 
 
 class PosteriorSamples(NamedTuple):
-    """Logarithms (M, 6) of soils and their shares (M,) of the posterior probability.
+    """Weighted samples of the posterior.
 
-    bound (M, 6, 6) is the Cramér-Rao bound of the logarithms where the window is of that soil.
+    Attributes
+    ----------
+    logs
+        Logarithms of the soils (M, 6).
+    share
+        Posterior probabilities (M,).
+    bound
+        Cramer-Rao bounds of the logarithms at each soil (M, 6, 6).
     """
 
     logs: Array
@@ -49,23 +57,37 @@ class PosteriorSamples(NamedTuple):
 
     @property
     def effective(self) -> float:
-        """How many equally likely samples would tell as much (Kong)."""
+        """Number of equally likely samples with the same information (Kong)."""
         return float(1.0 / (self.share @ self.share))
 
 
 def sample_posterior(
-    problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, found: Fit, count: int, rng: np.random.Generator
+    problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, fit: Fit, count: int, rng: np.random.Generator
 ) -> PosteriorSamples | None:
-    """So many soils of the posterior; None where k_c, k_phi and n are not all free and told apart by the tyres."""
+    """Samples of the posterior of a window.
+
+    Parameters
+    ----------
+    problem, prior, joint_prior, fit
+        The window, its priors and its fit.
+    count
+        Number of draws.
+    rng
+        Random numbers.
+
+    Returns
+    -------
+    None where k_c, k_phi and n are not all free, or the tyres do not separate k_c from k_phi.
+    """
     with np.errstate(all="ignore"):
-        along = profile_over_n(problem, prior, joint_prior, found)
+        along = profile_over_n(problem, prior, joint_prior, fit)
         if along is None or len(along.nodes) < 3:
             return None
         coordinates = Coordinates(prior, float(problem.rig.width.mean()))
-        drawn = _draws(along.nodes, coordinates, count, rng)
-        position = drawn.position
+        draws = _draws(along.nodes, coordinates, count, rng)
+        position = draws.position
         u, nodes = np.array([node.u for node in along.nodes]), along.nodes
-        fitting = Objective(along.problem, prior, joint_prior)
+        objective = Objective(along.problem, prior, joint_prior)
         log_share = np.full(count, -np.inf)
         logs = np.empty((count, len(PARAMETERS)))
         bound = np.zeros((count, len(PARAMETERS), len(PARAMETERS)))
@@ -74,13 +96,13 @@ def sample_posterior(
             logs[i] = np.log(soil)
             if soil[_K_PHI] > 0.0 and soil[_PHI] < MAX_PHI:
                 near = nodes[int(np.argmin(np.abs(u - logs[i, _N])))]
-                place, point = _quadratic_at(fitting, soil, near)
-                if point is None:
+                iterate, quadratic = _quadratic_at(objective, soil, near)
+                if quadratic is None:
                     continue
                 jacobian = np.linalg.slogdet(coordinates.log_directions(soil)[coordinates.free])[1]
-                log_share[i] = jacobian - 0.5 * _neg2_log_density(fitting, point) - drawn.log_density[i]
-                covariance = np.asarray(np.linalg.inv(point.information))
-                bound[i] = fitting.gaussian_with(place, covariance).posterior.log_covariance
+                log_share[i] = jacobian - 0.5 * _neg2_log_density(objective, quadratic) - draws.log_density[i]
+                covariance = np.asarray(np.linalg.inv(quadratic.information))
+                bound[i] = objective.gaussian_with(iterate, covariance).posterior.log_covariance
     share = softmax(np.where(np.isfinite(log_share), log_share, -np.inf))
     kept = share > 0.0
     return PosteriorSamples(logs[kept], share[kept], bound[kept])
@@ -144,20 +166,20 @@ def _soil_at(position: Array, coordinates: Coordinates) -> Array:
     return soil if inside else np.where(np.arange(len(soil)) == _K_PHI, 0.0, soil)
 
 
-def _quadratic_at(fitting: Objective, soil: Array, near: Node) -> tuple[Iterate, QuadraticModel | None]:
-    """The window at a soil (6,), with the latents that are likeliest there."""
-    problem, optimum = fitting.problem, near.fit.optimum
+def _quadratic_at(objective: Objective, soil: Array, near: Node) -> tuple[Iterate, QuadraticModel | None]:
+    """The quadratic model at a soil (6,), with the likeliest latents there."""
+    problem, optimum = objective.problem, near.fit.optimum
     latents = problem.with_entry_angles(optimum.latents, Soil(*soil.tolist()), optimum.gains)
-    place = Iterate(soil, optimum.gains, latents, np.inf, 1)
-    at = problem.linearise(place.as_soil(), place.gains, latents)
-    latents = problem.updated(at, latents, np.zeros(len(PARAMETERS)), np.zeros(len(place.gains)))
-    place = replace(place, latents=latents)
-    return place, fitting.point(place)
+    iterate = Iterate(soil, optimum.gains, latents, np.inf, 1)
+    at = problem.linearise(iterate.as_soil(), iterate.gains, latents)
+    latents = problem.updated(at, latents, np.zeros(len(PARAMETERS)), np.zeros(len(iterate.gains)))
+    iterate = replace(iterate, latents=latents)
+    return iterate, objective.point(iterate)
 
 
-def _neg2_log_density(fitting: Objective, point: QuadraticModel) -> float:
-    """-2 log posterior density of a soil's logarithms up to a constant, whatever the gains (Laplace, all but exact)."""
-    gains = slice(len(fitting.free), None)
-    information, gradient = point.information[gains, gains], point.gradient[gains]
+def _neg2_log_density(objective: Objective, quadratic: QuadraticModel) -> float:
+    """-2 log posterior density of a soil's logarithms up to a constant, gains integrated out (Laplace)."""
+    gains = slice(len(objective.free), None)
+    information, gradient = quadratic.information[gains, gains], quadratic.gradient[gains]
     fall = float(gradient @ np.linalg.solve(information, gradient))
-    return point.neg2_log_posterior - fall + float(np.linalg.slogdet(information)[1])
+    return quadratic.neg2_log_posterior - fall + float(np.linalg.slogdet(information)[1])

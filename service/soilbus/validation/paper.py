@@ -1,12 +1,12 @@
 """The method of Xi et al. 2024 (World Electr. Veh. J. 15:217): one operating point, three equations.
 
-Load, drawbar pull and torque at a known sinkage and slip are solved for K_L, phi and n
-by Newton's method (eqs. 34-42).  Its integrals are Simpson sums over three angles of
-each branch (eqs. 23-33).  Equations are corrected as report/paper_corrections.py lists;
-`Equations` selects what is printed where that makes a difference.
+    F = r b theta1 [K_L (normal(n) + tan(phi) rubbed(n)) + c stuck]      F = W, DP, T / r
+    Newton: x <- x - J^-1 (F(x) - F measured),   x = (K_L, phi, n)       (eqs. 34-42)
 
-The method is here to be compared with: one operating point hardly tells K_L from n
-(estimation/paper_noise.py).
+Load, drawbar pull and torque at a known sinkage and slip are solved for K_L, phi and n. The integrals are Simpson sums
+over three angles of each branch (eqs. 23-33). Misprints are corrected as validation/paper_corrections.py lists;
+`Equations` selects what is printed where that makes a difference. The method is here to be compared with: one
+operating point hardly separates K_L from n (validation/paper_noise.py).
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ RELATIVE_STEP_TOLERANCE = 1e-8
 N_STEP_TOLERANCE = 1e-4
 """Step of n that ends the elimination: Newton squares it, so n is then right to 1e-9 and K_L to 1e-7 of itself."""
 N_OFFSET = 1.5
-"""The forces under small angles go as 1/(n + 3/2), so in that variable they are nearly straight."""
+"""The forces at small angles go as 1/(n + 3/2), so Newton steps in that variable are nearly exact."""
 MAX_N = 20.0
-"""Beyond this Newton has gone astray, and powers of the sinkage would overflow."""
+"""Exponent beyond which Newton has diverged, and powers of the sinkage would overflow."""
 
 
 class OperatingPoint(NamedTuple):
@@ -168,7 +168,17 @@ class WheelEquations:
         return np.array(self.forces_and_columns(x)[1]).T
 
     def newton(self, measured: Forces, start: Unknowns, most: int = MAX_ITERATIONS) -> Solution:
-        """The paper's iteration: Newton's method on all three unknowns (eq. 41), neither damped nor bounded."""
+        """The paper's iteration: Newton's method on all three unknowns (eq. 41), neither damped nor bounded.
+
+        Parameters
+        ----------
+        measured
+            Forces.
+        start
+            First K_L, phi and n.
+        most
+            Greatest number of steps.
+        """
         x = start
         for done in range(most):
             (W, DP, T), (u, v, w) = self.forces_and_columns(x)
@@ -186,10 +196,19 @@ class WheelEquations:
         return Solution(x, most, False)
 
     def solve(self, measured: Forces, n: float) -> Solution:
-        """Ours for the same equations: Newton's method on 1/(n + 3/2) alone, from a start of n.
+        """Ours for the same equations: Newton's method on 1/(n + 3/2) alone.
 
-        For a given n the forces are linear in K_L and in s = K_L tan(phi), so T gives s and
-        W then K_L; what this leaves of the drawbar pull must be zero.
+        Parameters
+        ----------
+        measured
+            Forces.
+        n
+            Start.
+
+        Notes
+        -----
+        For a given n the forces are linear in K_L and in s = K_L tan(phi), so T gives s and W then K_L; the remaining
+        residual of the drawbar pull must be zero.
         """
         W, DP, T = self._from_normal_stress(measured)
         done, converged, K_L, s = 0, False, math.nan, math.nan
@@ -210,9 +229,11 @@ class WheelEquations:
         return Solution(Unknowns(K_L, math.atan2(s, K_L), n), done, converged)
 
     def all_solutions(self, measured: Forces, largest_n: float = 3.0, steps: int = 100) -> list[Unknowns]:
-        """Every soil with n up to largest_n that solves the equations, wherever an iteration might start.
+        """Every soil with n up to largest_n that solves the equations, from no particular start.
 
-        They are where the drawbar pull left over by solve() changes sign on `steps` equal steps.
+        Notes
+        -----
+        They are where the residual of the drawbar pull changes sign on `steps` equal steps of n.
         """
         n = np.linspace(largest_n / steps, largest_n, steps)
         b, a, w, d, t = self._rows[:5] @ self._z[:, None] ** n

@@ -1,4 +1,4 @@
-"""`soilbus paper`: the tables of Xi et al. 2024 beside ours, and what holds of the method."""
+"""`soilbus paper`: the tables of Xi et al. 2024 beside ours, and which of its conclusions hold."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ PARAMETERS = ("phi [deg]", "K_L", "n")
 DECIMALS = (4, 3, 5)
 REPEATS = 20
 SINKAGE_MARGIN = 1e-6
-"""[m] How near to none, and to the radius, a sinkage is looked for."""
+"""Distance [m] from zero and from the radius within which no sinkage is looked for."""
 
 
 def paper_report(sinkage: float, seed: int) -> str:
@@ -114,7 +114,7 @@ def what_holds(sinkage: float) -> list[str]:
         f"The accuracy {_verdict(off <= before)} where data and solver do not share three angles of each branch: "
         f"forces of the exact integrals give {K_L} instead of {truth.K_L / 1e3:.0f} on wet clay.",
         f"Robustness to noise (conclusion 3) {_verdict(bound <= before)}: noise of 0.1 % leaves K_L of wet clay a "
-        f"standard deviation of at least {bound:.0f} %. A window with varied load and slip tells it.",
+        f"standard deviation of at least {bound:.0f} %. A window with varied load and slip determines it.",
         f"Figure 13's torques on the two soils fit {_what_fits()} of tractor 1 at slip 0.2.",
         f"Real time {_verdict(seconds < fastest)}: ours takes at most {seconds:.1e} s, the paper's at least "
         f"{fastest:g} s; see the last two columns of the tables.",

@@ -1,7 +1,6 @@
 """What Xi et al. 2024 (World Electr. Veh. J. 15:217) print: Tables 2-7 and section 5.
 
-Soils of Tables 2 and 5 are in terra/soils.py.  Units here are the paper's: degrees,
-kN/m^(n+2), per cent, seconds.
+Soils of Tables 2 and 5 are in terra/soils.py. Units are the paper's: degrees, kN/m^(n+2), per cent, seconds.
 """
 
 from __future__ import annotations

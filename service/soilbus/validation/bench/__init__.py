@@ -1,4 +1,9 @@
-"""`soilbus bench`: every performance figure beside its peer, both measured in one run."""
+"""`soilbus bench`: every performance figure beside its peer, both measured in one run.
+
+    speed-up = time of the peer / our time
+
+Times are the least of several rounds, taken in turn, so that a busy machine slows both alike.
+"""
 
 from __future__ import annotations
 
@@ -38,11 +43,23 @@ MEASUREMENTS: tuple[Measurement, ...] = (
 
 
 def run_bench() -> dict[str, Any]:
-    """Measure; value by figure's name, beside "details" of each and the "machine".
+    """Measure everything.
 
-    With one thread for linear algebra, as the service has by its unit: with two, both wait for each other
-    all the time, and both are counted.  ModuleNotFoundError, with a line for the user, where
-    threadpoolctl is not installed; AssertionError where ours and a peer come to different results.
+    Returns
+    -------
+    Value by figure's name, beside "details" of each and the "machine".
+
+    Raises
+    ------
+    ModuleNotFoundError
+        threadpoolctl is not installed; one line for the user.
+    AssertionError
+        Ours and a peer come to different results.
+
+    Notes
+    -----
+    Linear algebra runs with one thread, as the service's unit sets it: two threads would wait for each other, and both
+    would be counted.
     """
     try:
         from threadpoolctl import threadpool_limits

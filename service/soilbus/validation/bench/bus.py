@@ -1,6 +1,9 @@
-"""The daemon itself on a fully loaded bus of the kernel: losses, latency, processor, memory, start.
+"""The daemon on a fully loaded bus of the kernel: losses, latency, processor, memory, start.
 
-The channel must be one of our own, such as a vcan: it is filled to the brim.
+    lost = frames sent - frames that the daemon says it received
+    processor ratio = processor time of the daemon / that of a bare python-can loop in the same seconds
+
+The channel must be one of our own, such as a vcan, because it is filled up.
 """
 
 from __future__ import annotations
@@ -31,8 +34,9 @@ from soilbus.validation.bench.figure import Figure
 N_STARTS, N_SYSTEM_CALLS = 3, 1000
 """How often a start and a system call are timed."""
 QUIET_TIME = 1.0
+"""Time [s] without a frame after which the channel counts as unused."""
 COUNT_TIME = 2.5
-"""Seconds after the last frame until its count is on the bus; where the daemon lags behind the count goes on."""
+"""Time [s] after the last frame until its count is on the bus."""
 
 _BARE = """
 import socket, sys
@@ -55,7 +59,7 @@ from pydantic import BaseModel
 class Anything(BaseModel):
     number: float = 0.0
 """
-"""What the daemon cannot start without, whatever it does with it; pydantic loads most of itself for a first model."""
+"""The libraries that the daemon cannot start without; pydantic loads most of itself for a first model."""
 
 
 class NotMeasured(Exception):
@@ -63,10 +67,25 @@ class NotMeasured(Exception):
 
 
 def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
-    """All figures, from `seconds` of a full bus and half as many with a bare python-can loop beside.
+    """All figures of the daemon on a full bus.
 
-    A window whose result never came counts as late as the run is long.  Raises NotMeasured;
-    BusError for a channel that cannot be opened.
+    Parameters
+    ----------
+    channel
+        A vcan.
+    seconds
+        Time on a full bus [s]; half as long again with a bare python-can loop beside.
+
+    Raises
+    ------
+    NotMeasured
+        The bus is not ours alone, or the daemon did not do its work.
+    BusError
+        The channel cannot be opened.
+
+    Notes
+    -----
+    A window whose result never came counts as late as the run is long.
     """
     _check_quiet(channel)
     ready, libraries, bare = zip(

@@ -1,4 +1,7 @@
-"""What an onlooker hears of a daemon at work: when each window's result came, how many frames it took."""
+"""A listener beside the daemon: when each window's result came, and how many frames the daemon received.
+
+latency = time of the frame SoilStrength - time of the window's last mapped frame    (kernel time stamps)
+"""
 
 from __future__ import annotations
 
@@ -18,14 +21,14 @@ from soilbus.pipeline.outputs import WINDOW_MODULUS
 from soilbus.simulator.reference import reference_configuration
 
 MAX_PAUSE_SMALL_BUFFER = 0.05
-"""Longest time [s] between two looks where the kernel does not keep the frames of seconds for us."""
+"""Longest time [s] between two looks where the kernel's buffer does not hold seconds of frames."""
 
 
 class Ear:
-    """Hears the mapped messages and the daemon's on a channel, with the kernel's time stamps.
+    """Receives the mapped messages and the daemon's on a channel, with the kernel's time stamps.
 
-    To be made while the channel is quiet: a socket hears all frames until it has its filters, and one
-    of others would pass for the first mapped one.
+    It must be made while the channel is quiet: a socket receives all frames until its filters are set, and a foreign
+    one would pass for the first mapped one.
     """
 
     def __init__(self, channel: str) -> None:
@@ -68,7 +71,7 @@ class Ear:
         return pause if self._wire.room >= RECEIVE_BUFFER else min(pause, MAX_PAUSE_SMALL_BUFFER)
 
     def latencies(self) -> Array:
-        """Time [s] from the last mapped frame of each window so far to the frame SoilStrength that tells of it."""
+        """Time [s] from the last mapped frame of each window so far to its frame SoilStrength."""
         said = self._of("SoilStrength", "Window")
         settings = self._config.estimator
         return latencies(np.array(self._mapped), np.array(said), settings.window, settings.hop)

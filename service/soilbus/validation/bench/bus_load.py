@@ -1,4 +1,7 @@
-"""A fully loaded bus: a tractor that drives, and everybody else on the wire."""
+"""A fully loaded bus: a simulated tractor's frames, and unmapped frames for the rest of the load.
+
+frames a second = 1 Mbit/s / 136 bits, of which a tenth is mapped
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,7 @@ from soilbus.simulator.scenario import excited
 FULL_BUS_RATE = 7350.0
 """Frames a second of 8 bytes with 29-bit identifiers that 1 Mbit/s carries, at 136 bits each with their stuff bits."""
 MAPPED_SHARE = 0.1
-"""Share of them that is mapped."""
+"""Share of the frames that is mapped."""
 
 _POSITION = 0xFEF3
 _OTHERS_PERIOD = 0.01
@@ -29,10 +32,9 @@ _OTHERS = 0x18EE0000  # address claims, which nothing is mapped to
 
 
 class Traffic:
-    """Plays a simulated drive onto a channel in real time, from `start` on; `sent` counts its frames.
+    """Plays a simulated drive onto a channel in real time; `sent` counts its frames, all of them mapped.
 
-    All of them are mapped.  The drive alone is less than a tenth of a full bus, so its position
-    is said more often: that tells the estimate nothing.
+    The drive alone is less than a tenth of a full bus, so its position is sent more often, which adds no information.
     """
 
     def __init__(self, channel: str, seconds: float) -> None:

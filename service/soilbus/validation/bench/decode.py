@@ -1,4 +1,4 @@
-"""Frames to columns: ours beside cantools."""
+"""Bench of decoding: frames to columns, ours beside cantools frame by frame."""
 
 from __future__ import annotations
 

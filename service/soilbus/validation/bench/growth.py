@@ -1,4 +1,8 @@
-"""How the cost of a fit grows with samples and wheels."""
+"""Bench of growth: how the time of a Gauss-Newton step grows with samples and wheels.
+
+exponent = log2(time at the largest size / time at half of it)
+time = fixed + each (wheels x instants)
+"""
 
 from __future__ import annotations
 
@@ -30,10 +34,10 @@ MAX_EXPONENT = 1.1
 
 
 def exponents() -> dict[str, Figure]:
-    """How a Gauss-Newton step's time grows where it grows most: at the most wheels, at the longest window.
+    """The exponents for wheels and for samples.
 
-    The exponents are those of doubling wheels or window to the largest size, where the
-    fixed cost hides least.  A fit takes about a dozen steps whatever the size.
+    They are those of doubling to the largest size, where the fixed time hides least. A fit takes about a dozen steps at
+    any size.
     """
     sizes, works, iterations = [], [], []
     for wheels in WHEELS:
@@ -77,21 +81,21 @@ def line(size: Array, times: Array) -> tuple[float, float]:
 
 def _steps(problem: ObservationModel, prior: SoilPrior, soil: Array) -> Callable[[], Any]:
     """Some Gauss-Newton steps at the optimum."""
-    fitting = Objective(problem, prior, Gaussian.of(prior, problem.gain_std))
+    objective = Objective(problem, prior, Gaussian.of(prior, problem.gain_std))
 
-    def moved(place: Iterate) -> Iterate:
-        point = fitting.point(place)
-        step = None if point is None else point.step()
-        if point is None or step is None:
+    def next_iterate(iterate: Iterate) -> Iterate:
+        quadratic = objective.point(iterate)
+        step = None if quadratic is None else quadratic.step()
+        if quadratic is None or step is None:
             raise AssertionError("a Gauss-Newton step failed at the optimum")
-        return fitting.stepped(place, point, step)
+        return objective.stepped(iterate, quadratic, step)
 
-    start = moved(moved(fitting.start(soil)))
+    start = next_iterate(next_iterate(objective.start(soil)))
 
     def work() -> None:
-        place = start
+        iterate = start
         for _ in range(STEPS):
-            place = moved(place)
+            iterate = next_iterate(iterate)
 
     return work
 

@@ -1,4 +1,4 @@
-"""The bench of the paper's 3x3 problem: ours beside scipy.optimize.fsolve on scipy.integrate.quad."""
+"""Bench of the paper's 3x3 problem: ours beside scipy.optimize.fsolve on scipy.integrate.quad."""
 
 from __future__ import annotations
 

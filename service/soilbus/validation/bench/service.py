@@ -1,4 +1,4 @@
-"""One window after the other in the running service."""
+"""Bench of the service: processor time of each window of a log, split into intake, estimate and decision."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ MAX_WINDOW_MS = 10.0
 
 
 def window_times(log: Path) -> dict[str, Figure]:
-    """Processor time [ms] of each window of a log: its estimate, and all that the service does for it.
+    """Processor time [ms] of a window: its estimate, and all that the service does for it.
 
-    A window's time is the least of several rounds.  window_ms is the estimate from bins to
-    posterior and status (the tracker's); service_window_ms has decoding, binning and
-    screening of the last second and the decision besides.
+    Notes
+    -----
+    A window's time is the least of several rounds. window_ms is the estimate from bins to posterior and status (the
+    tracker's); service_window_ms has decoding, binning and outlier test of the last hop and the decision besides.
     """
     config = reference_configuration()
     intake, estimate, decision = 1e3 * np.min([seconds_of_windows(log, config) for _ in range(ROUNDS)], axis=0).T

@@ -1,8 +1,9 @@
-"""A window's fit: ours beside scipy.optimize.least_squares with finite differences.
+"""Bench of a window's fit: ours beside scipy.optimize.least_squares with finite differences.
 
-Both have the same window, prior, wheel model, noise and unknowns: five soil parameters,
-each as logarithm, gains known, loads and speeds of every instant eliminated.  Both start
-at the prior's median; ours then also tries other soils, least_squares does not.
+    minimise |whitened residuals(log soil)|^2 + |(log soil - prior median) / prior sd|^2
+
+Both have the same window, prior, wheel model, noise and unknowns: five soil parameters as logarithms, gains known,
+loads and speeds of every instant eliminated. Both start at the prior's median; ours then also tries other soils.
 """
 
 from __future__ import annotations
@@ -29,19 +30,18 @@ from soilbus.validation.bench.figure import Figure, in_turn
 
 SOILS = ("loam", "wet_clay", "dry_sand")
 EXACT_AND_ROUGH = (("c", "K"), ("K", "c"))
-"""Which of two parameters is known exactly, and which to a quarter (and told too large by as much)."""
+"""Pairs: the parameter known exactly, and the one known to a quarter, whose prior median is a quarter too large."""
 WINDOW_LENGTH = 10.0
 ROUNDS = 4
 MAX_DISTANCE_SD = 0.05
-"""Posterior standard deviations that the two ends may be apart in any parameter."""
+"""Greatest distance of the two ends in any parameter, in posterior standard deviations."""
 PASS_TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-8)
 """Relative fall of the cost that ends each pass of least_squares (its ftol; the last is its default).
 
-Each pass has its weights and eliminated loads and speeds from where the one before ended;
-an exact end of all but the last would be wasted.  Four is the least that brings all six
-windows to the same end as ours."""
+Each pass has the weights and the eliminated loads and speeds of the end of the one before, so an exact end of all but
+the last would be wasted. Four passes are the least that bring all six windows to the same end as ours."""
 RELATIVE_DIFFERENCE = 1e-5
-"""Relative step of the finite differences.  The default, 1.5e-8, takes more steps: entry angles are solved to 1e-12."""
+"""Relative step of the finite differences. The default, 1.5e-8, takes more steps: entry angles are solved to 1e-12."""
 
 
 class Window(NamedTuple):
@@ -122,10 +122,10 @@ def by_finite_differences(window: Window) -> Soil:
 
 
 def _whitened(problem: ObservationModel, at: Linearisation, latents: Latents) -> Callable[[Soil], Array]:
-    """Readings less model of torques, draft balance and sinkages, whitened, by soil.
+    """Measured less predicted torques, draft balance and sinkages, whitened, as a function of the soil.
 
-    Loads and speeds are eliminated as in ours: they are measured with noise that travels
-    through the model, linear about `latents`, into every residual.
+    Loads and speeds are eliminated as in ours: they are measured with noise that goes through the model, linear about
+    `latents`, into every residual.
     """
     own = np.concatenate([problem.torque_var, problem.demand_var[:, None], problem.sinkage_var], axis=1)
     covariance = at.by_latents * at.variance[:, None] @ at.by_latents.swapaxes(1, 2)
@@ -160,10 +160,10 @@ def _works(window: Window) -> tuple[Callable[[], object], ...]:
 def _window(name: str, exact: str, rough: str) -> Window:
     """A simulated drive with slip swept from 0.05 to 0.4."""
     soil = soil_named(name)
-    told = 1.25 * getattr(soil, rough)
+    median = 1.25 * getattr(soil, rough)
     config = reference_configuration([
         f"soil.{exact}.value={getattr(soil, exact)}", f"soil.{exact}.std=0",
-        f"soil.{rough}.value={told}", f"soil.{rough}.std={0.25 * told}",
+        f"soil.{rough}.value={median}", f"soil.{rough}.std={0.25 * median}",
         *(f"noise.{quantity}.gain=0" for quantity in ("torque", "load", "speed", "ground_speed", "draft")),
     ])  # fmt: skip
     rig, settings = rig_of(config), config.estimator
