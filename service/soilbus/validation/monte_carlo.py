@@ -72,7 +72,7 @@ class Task(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    posterior_samples is the number of posterior samples beside each fit; around the sd of the free parameters'
+    """One window: error, std and Cramer-Rao bound (6 + 1,) of the logarithms of parameters and bearing pressure.
 
     Held parameters have zeros. All are nan where the fit failed. bayes_risk is None where no posterior was sampled.
     """
