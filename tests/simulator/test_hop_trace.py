@@ -1,9 +1,12 @@
 """The tracer of one hop: what it counts, and that it counts the same again."""
 
+import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
+import soilbus
 from soilbus.validation.hop_trace import hop_trace
 
 LINE = re.compile(r"one hop enters (\d+) files, (\d+) functions, (\d+) calls of soilbus\n")
@@ -17,7 +20,8 @@ def test_a_hop_enters_the_same_code_in_two_runs():
 
 def test_another_process_prints_the_same_counts_as_one_line():
     program = [sys.executable, "-m", "soilbus.validation.hop_trace"]
-    text = subprocess.run(program, check=True, capture_output=True, text=True).stdout
+    env = {**os.environ, "PYTHONPATH": str(Path(soilbus.__file__).parents[1])}
+    text = subprocess.run(program, check=True, capture_output=True, text=True, env=env).stdout
     found = LINE.fullmatch(text)
     assert found is not None
     assert tuple(map(int, found.groups())) == hop_trace()
