@@ -1,9 +1,8 @@
 """`soilbus demo`: a simulated tractor, the service and a dashboard, without hardware.
 
-Three parties on one bus: the tractor's ECUs (simulator) send, the service estimates, the
-dashboard reads only the service's frames.  On vcan where the kernel has it, else on
-python-can's in-process virtual bus.  Time is compressed: the tractor's seconds pass
-faster, so the service's times are shortened by the same factor.
+Three parties share one bus: the tractor's ECUs (simulator) send, the service estimates, the dashboard reads only the
+service's frames. The bus is a vcan where the kernel has it, else python-can's in-process virtual bus. The simulated
+drive plays TIME_COMPRESSION times as fast as real time, so the service's times are shortened by the same factor.
 """
 
 from __future__ import annotations
@@ -38,8 +37,11 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import demo as demo_scenario
 
 TIME_COMPRESSION = 8.0
+"""Seconds of the simulated drive per second."""
 SEED = 1
+"""Picks the simulated drive."""
 STORY_PERIOD = 4.0
+"""Time [s] of the simulated drive between two rows of the table at the end."""
 
 
 def run_demo(duration: float, picture: Path | None = None) -> None:

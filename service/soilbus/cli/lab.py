@@ -1,4 +1,7 @@
-"""Commands of the lab: paper, montecarlo, decisions, bench."""
+"""Commands that validate the method: paper, montecarlo, decisions, bench.
+
+Each function takes the parsed arguments, imports what it needs, does the work and prints a report or writes JSON.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""What the configuration's model finds wrong -> lines in the words of the configuration file.
+"""Faults that the configuration's model finds -> lines in the words of the configuration file.
 
-The checks are pydantic's; its words ("valid dictionary or instance of Noise") are not those of
-someone who configures a vehicle.  Each type of error has a sentence of ours; a type without one
-says only that the value cannot be used.
+pydantic does the checks; its messages ("valid dictionary or instance of Noise") name Python types, so each type of
+error has a sentence of ours with the dotted key. A type without one says only that the value cannot be used.
 """
 
 from __future__ import annotations

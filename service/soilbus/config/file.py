@@ -1,4 +1,4 @@
-"""A configuration, from a file with KEY=VALUE overrides or as nested mappings -> a checked Config."""
+"""A configuration from a TOML file with KEY=VALUE overrides, or from nested mappings -> a checked Config."""
 
 from __future__ import annotations
 
@@ -26,9 +26,19 @@ DBC_FOLDERS = (_PACKAGE / "dbc", _PACKAGE.parents[1] / "dbc")
 
 
 def load_config(path: Path | str, overrides: Iterable[str] = ()) -> Config:
-    """Read a TOML file, apply KEY=VALUE overrides (dotted paths), check everything.
+    """Read a TOML file, apply overrides, check everything.
 
-    Raises ConfigError with one line for each fault.
+    Parameters
+    ----------
+    path
+        The file.
+    overrides
+        KEY=VALUE with dotted paths.
+
+    Raises
+    ------
+    ConfigError
+        With one line for each fault.
     """
     path = Path(path)
     try:

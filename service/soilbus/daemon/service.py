@@ -313,7 +313,7 @@ class Service:
             reason = f"bus_error {self.bus.state}"
         return state_after(self.result), reason
 
-    def present_way(self, now: float) -> Traversability:
+    def present_decision(self, now: float) -> Traversability:
         """The present decision.
 
         Parameters
@@ -329,8 +329,8 @@ class Service:
         if _interrupts(self._present_state(now)) or self._fault or self._guarded_estimator.in_fault:
             return Traversability()
         result = None if self._ended <= self._interrupted else self.result
-        way, basis = (Traversability(), Basis()) if result is None else (result.traversability, result.basis)
-        return at_present(way, basis, self._loss, self._present_time(now), self.config)
+        decision, basis = (Traversability(), Basis()) if result is None else (result.traversability, result.basis)
+        return at_present(decision, basis, self._loss, self._present_time(now), self.config)
 
     def _present_time(self, now: float) -> float:
         """The bus's time, or that of the last window's end and ours since, whichever is later: the stamps' may halt."""
@@ -359,8 +359,8 @@ class Service:
         if latest.motion is not None:
             settings = self.config.traversability
             self._loss = observed(self._loss, latest.motion, self.config.estimator.min_speed, settings)
-        way = self.present_way(now)
-        known = way.state is not State.UNKNOWN
+        decision = self.present_decision(now)
+        known = decision.state is not State.UNKNOWN
         window = self.result.index % WINDOW_MODULUS if self.result is not None else None
         for message, values in slip_frames(latest.slip):
             self.bus.send(self.publisher.frame(message, values))
@@ -374,9 +374,9 @@ class Service:
             self.publisher.frame(
                 "Traversability",
                 {
-                    "State": str(way.state),
-                    "LimitingCause": way.limit if known else None,
-                    "Probability": way.probability if known else None,
+                    "State": str(decision.state),
+                    "LimitingCause": decision.limit if known else None,
+                    "Probability": decision.probability if known else None,
                     "Age": max(age, 0.0) if math.isfinite(age := self._age(now)) else None,
                     "SinceValid": self._since_valid(now),
                     "Window": window,
@@ -387,8 +387,8 @@ class Service:
             self.publisher.frame(
                 "TorqueDemand",
                 {
-                    "TorqueRequired": way.torque_required if known else None,
-                    "TorqueAvailable": way.torque_available if known else None,
+                    "TorqueRequired": decision.torque_required if known else None,
+                    "TorqueAvailable": decision.torque_available if known else None,
                     "Window": window,
                 },
             )
@@ -424,7 +424,7 @@ class Service:
         if self.result is not None and self.result.bearing is not None:
             bearing = self.result.bearing
             text += f", bearing pressure {bearing.value / 1e3:.1f} +- {bearing.std / 1e3:.1f} kPa"
-            text += f", {self.present_way(now).state}"
+            text += f", {self.present_decision(now).state}"
         if self.deadline_misses:
             text += f", deadline misses {self.deadline_misses}"
         if self.failures:

@@ -13,8 +13,8 @@ import zlib
 
 import numpy as np
 from cantools.database.can import Database
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.can.channels import Channel, Column, Decoded
 from soilbus.can.publish import Publisher
 from soilbus.config.model import Config
@@ -28,8 +28,6 @@ from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.vehicle import axle_loads
 from soilbus.terra.wheel import Soil, state_on
 
-Array = NDArray[np.float64]
-
 WINDOWS = 3
 """The first one searches for the soil, later ones follow it."""
 SAMPLE_RATE = 50.0
@@ -40,7 +38,7 @@ SLIP_RANGE = 0.10, 0.40
 """Least and greatest slip, once in each window: from easy work to where pull hardly grows any more."""
 SIDE_LOAD_SHARE = 0.15
 """Share of a wheel's load that passes to its mate and back, twice in each window: a side slope of 9 degrees.  Where no
-load swings, depths are alike and k_c and k_phi hard to tell apart: a window takes five times as long."""
+load swings, depths are alike and k_c and k_phi hardly separate: a window takes five times as long."""
 FIXED_POINT_ROUNDS = 5
 """Fixed-point rounds between draft and wheel loads, and to the loads that effects leave: both within a few per cent."""
 

@@ -98,7 +98,7 @@ def _read(path: Path, batches: Callable[[Any], Iterator[list[_T]]]) -> Iterator[
 
 
 def _reader(path: Path) -> Any:
-    """python-can's reader; it cannot tell the format of a name such as a.b.log.gz, so that is done here."""
+    """python-can's reader; it does not recognise a name such as a.b.log.gz, which is done here."""
     if path.suffixes[-2:] == [".log", ".gz"]:
         return can.CanutilsLogReader(gzip.open(path, "rt"))
     return can.LogReader(path)

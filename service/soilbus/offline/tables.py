@@ -46,8 +46,11 @@ RIM_SPEED_RATIO = 100.0
 MISSING_CELLS = frozenset({"", "nan", "na", "n/a", "null", "none"})
 """Texts, in small letters, of a cell without a value."""
 OF_TRUE_SPEED = frozenset({"rate_stiffening", "inertia"})
+"""Effects that depend on the true speed, which a table does not hold."""
 OF_TIME = frozenset({"torque_lag", "channel_lag", "soil_drift", "grade"})
+"""Effects that depend on time."""
 OF_SEVERAL_WHEELS = frozenset({"multipass"})
+"""Effects that need another wheel."""
 
 
 class TableError(LogError):

@@ -31,10 +31,10 @@ PARAMETERS = {
     "K": ("SoilShearModulus", "mm"),
 }
 LIMITS = {
-    # what: messages of draft and of slope
     "on the level": ("DraftCapability", "GradeCapability"),
     "here and now": ("TractionLimits", "TractionLimits"),
 }
+"""Messages of draft and of slope, by what they hold for."""
 ADVICE = {"efficiency": "SlipForEfficiency", "pull": "SlipForPull"}
 FAULTS_OF_BUS = {
     "Overruns": "overruns",
@@ -44,6 +44,7 @@ FAULTS_OF_BUS = {
     "Reopened": "reopened",
 }
 WIDTH = 78
+"""Characters of the dashboard."""
 
 
 def panel(known: ReceivedFrames, fault: str = "") -> Panel:
@@ -56,9 +57,9 @@ def panel(known: ReceivedFrames, fault: str = "") -> Panel:
     fault
         Why the bus is away; empty while it is there.
     """
-    way = str(known.value("Traversability", "State"))
-    way = way if way in COLOURS else "unknown"
-    head = Text(f" {way.upper().replace('_', '-')} ", style=f"bold black on {COLOURS[way]}")
+    decision = str(known.value("Traversability", "State"))
+    decision = decision if decision in COLOURS else "unknown"
+    head = Text(f" {decision.upper().replace('_', '-')} ", style=f"bold black on {COLOURS[decision]}")
     ground, task = (Table.grid(padding=(0, 4)) for _ in range(2))
     ground.add_row(_soil(known), _wheels(known))
     task.add_row(_limits(known), _advice(known))

@@ -56,7 +56,7 @@ def _feature(result: WindowResult) -> dict[str, Any]:
 
 
 def _properties(result: WindowResult) -> dict[str, Any]:
-    way, parameters = result.traversability, {} if result.posterior is None else result.posterior.parameters()
+    decision, parameters = result.traversability, {} if result.posterior is None else result.posterior.parameters()
     likeliest = max(result.soil_class.items(), key=lambda item: item[1]) if result.soil_class else (None, None)
     return {
         "log": result.log,
@@ -69,10 +69,10 @@ def _properties(result: WindowResult) -> dict[str, Any]:
         **_value_std("phi", "deg", parameters.get("phi"), math.pi / 180.0),
         "soil_class": likeliest[0],
         "soil_class_probability": likeliest[1],
-        "state": str(way.state),
-        "probability": way.probability,
-        **_value_std("max_draft", "n", way.max_draft, 1.0),
-        "limit": way.limit,
+        "state": str(decision.state),
+        "probability": decision.probability,
+        **_value_std("max_draft", "n", decision.max_draft, 1.0),
+        "limit": decision.limit,
     }
 
 

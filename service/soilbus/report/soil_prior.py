@@ -17,10 +17,10 @@ from soilbus.report.table import table
 from soilbus.terra.soils import KINDS, SOILS
 
 SHOWN = {
-    # unit, and its value in SI
     "k_c": ("kN/m^(n+1)", 1e3), "k_phi": ("kN/m^(n+2)", 1e3), "n": ("", 1.0), "phi": ("deg", math.pi / 180.0),
     "c": ("kPa", 1e3), "K": ("mm", 1e-3),
 }  # fmt: skip
+"""Unit of each parameter, and its value in SI."""
 MAX_SOILS_NAMED = 3
 """Soils outside an interval that are named; the others are counted."""
 

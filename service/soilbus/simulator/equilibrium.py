@@ -35,10 +35,14 @@ from soilbus.terra.wheel import (
 MAX_SLIP = 0.95
 """Beyond this common slip the tractor counts as bogged down."""
 _MIN_SLIP = -0.5
+"""Least common slip: a wheel that is braked."""
 _RESIDUAL_TOLERANCE = 1e-10
+"""Residual over the vehicle's weight, plus step of slip, that ends the iteration."""
 _MAX_NEWTON_STEPS = 60
-_RELATIVE_DIFFERENCE = 1e-6  # relative; Newton's steps need not be exact
-_COARSE_STRIDE = 10  # every tenth instant first: its neighbours then start next to their solution
+_RELATIVE_DIFFERENCE = 1e-6
+"""Step of the finite differences; Newton's steps need not be exact."""
+_COARSE_STRIDE = 10
+"""Every tenth instant is solved first; its neighbours then start next to their solution."""
 
 
 class Situation(NamedTuple):

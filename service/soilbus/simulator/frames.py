@@ -35,7 +35,9 @@ from soilbus.simulator.sensors import channel_rng
 START_TIME = 1_700_000_000.0
 """Stamp [s, Unix] of a recording's first instant: logs hold wall clock time."""
 _MAX_JITTER = 1e-3
+"""Greatest jitter of a stamp [s]."""
 _PHASE_STEP = 0.9e-3
+"""Phase [s] between one message and the next, which begins again after _PHASES messages."""
 _PHASES = 12
 
 _WRITERS: dict[str, Callable[[Any], Any]] = {

@@ -18,6 +18,7 @@ from soilbus.terra.soils import SOILS
 from soilbus.words import did_you_mean
 
 _ASSUMED_SPEED = 1.4
+"""Ground speed [m/s] by which time becomes distance: the middle of a scenario's default speeds."""
 
 
 def scenario_over(soils: Sequence[str], duration: float, course: Course = NORTHWARD) -> Scenario:

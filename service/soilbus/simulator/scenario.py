@@ -35,7 +35,8 @@ __all__ = [
 SAMPLE_RATE = 50.0
 """Samples of the true values a second [Hz]."""
 _N_SINES = 4
-_REFERENCE_TIME = 60.0  # s; a shorter scenario shows a part of such a wave, not a steeper one
+_REFERENCE_TIME = 60.0
+"""Time [s] in which a wave touches its bounds; a shorter scenario shows a part of the wave, not a steeper one."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,7 @@ from soilbus.arrays import Array
 WEIGHT_POWERS = (-1.0, 0.0, 1.0, 2.0)
 """Powers p of the weights b^(-p): the greater, the more the soils with small Cramer-Rao bounds count."""
 UNWEIGHTED = WEIGHT_POWERS.index(0.0)
+"""Index of the power 0, at which all soils count alike."""
 MAX_SUM_OF_SQUARED_SHARES = 0.5
 """Greatest sum of squared shares that the correction for few samples, 1 / (1 - sum), assumes."""
 

@@ -36,6 +36,7 @@ from soilbus.validation.monte_carlo import Each
 from soilbus.validation.windows import task_of
 
 HALVES = ("report", "tune")
+"""Drives by the parity of their seeds: even ones are reported, odd ones serve to set thresholds."""
 LOOK_PERIOD = 0.1
 """Time [s] between two looks of the watch, as in the service."""
 MIN_LEAD_TIME, MIN_LEAD_DISTANCE = 3.0, 3.0

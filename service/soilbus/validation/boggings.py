@@ -30,6 +30,7 @@ FIRM_SOILS = ("rubicon_sandy_loam_43", "north_gower_clayey_loam_46", "upland_san
 SLIPPING_SOILS = FIRM_SOILS[:2] + FIRM_SOILS[3:]
 """Soils on which the reference tractor's motors can turn the wheels into slip; on the others a draft stalls them."""
 SOFT_SOILS = ("wet_clay", "clayey_soil_38", "lean_clay_32", "heavy_clay_40")
+"""Soft soils of the table."""
 KINDS = ("softening", "patch", "draft", "grade", "digging", "uneven_softening", "uneven_draft")
 """Ground that softens over many metres; a soft patch with an edge; a draft and a grade that outgrow firm ground;
 wheels that dig themselves in at constant throttle; ground that softens, or a draft that grows, as the draft swings."""

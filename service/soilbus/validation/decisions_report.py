@@ -23,7 +23,9 @@ from soilbus.validation.verdict_trials import Bin, Reliability
 SHARED = """The drives are simulated with the estimator's own wheel-soil model, noise and priors about the true soil:
 the figures show that numbers and intervals follow from the model, not that the model is the field's."""
 MAX_ERROR = 0.05
+"""Target of the median relative error of the largest draft."""
 COVERAGE = (0.90, 0.98)
+"""Target of the share of 95 % intervals that hold the truth."""
 
 
 def decisions_report(drafts: Sequence[DraftFigures], calls: Reliability, warnings: Sequence[WarningFigures]) -> str:

@@ -25,7 +25,8 @@ hills; stones and clods in the implement's way; a light draft on soil that is so
 FIRM_KINDS = (EASY, *HARD)
 GROUND_SPEED = Swing(1.0, 1.8)
 """Ground speed [m/s], where a kind of drive does not set its own."""
-_KNOT_PERIOD = 0.1  # s, between the knots of a draft
+_KNOT_PERIOD = 0.1
+"""Time [s] between the knots of a draft."""
 
 
 def firm_ground(config: Config, kind: str, rng: np.random.Generator) -> Scenario:

@@ -35,6 +35,7 @@ PACKAGE = str(Path(__file__).resolve().parents[1])
 WARM_HOPS = 10
 """Windows solved before the traced one: one window's length of hops, after which no datum of the first is left."""
 SEED = 1
+"""Picks the simulated drive."""
 
 
 class HopTrace(NamedTuple):

@@ -47,7 +47,9 @@ from soilbus.workers import workers
 
 SOILS = ("loam", "wet_clay", "dry_sand")
 WINDOW_LENGTHS = (2.0, 10.0, 60.0)
+"""Lengths of the windows [s]."""
 SLIP_RANGE = Swing(0.05, 0.40)
+"""Slip of every drive."""
 ROUGHLY_KNOWN = ("soil.c.value=3000", "soil.c.std=750", "soil.K.value=0.02", "soil.K.std=0.005")
 """Settings with which cohesion and shear modulus are known to 25 %."""
 MAX_SOIL_DRAWS = 20

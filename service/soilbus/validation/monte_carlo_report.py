@@ -15,7 +15,9 @@ from soilbus.validation.monte_carlo import SOILS, WINDOW_LENGTHS, BayesRiskFigur
 MAX_RMS_RATIO = 1.15
 """Target of the RMS error over the Cramer-Rao bound."""
 COVERAGE = (0.93, 0.97)
+"""Target of the share of 95 % intervals that hold the truth."""
 MAX_CHI2_OFF = 0.03
+"""Target of the distance of the mean reduced chi-square from 1."""
 BAYES_RISK_NOTE = """Bayes-risk bound of each quantity, in root mean square errors over the Cramer-Rao bound: the least
 error of any estimate, averaged over the soils that prior and window allow; the error here of the estimate that attains
 it; ours over that.  Where the first is above {most}, no estimate is within the target on all of these soils.

@@ -26,6 +26,7 @@ from soilbus.terra.wheel import EXACT_NODES
 Three = tuple[float, float, float]
 
 MAX_ITERATIONS = 50
+"""Steps after which an iteration counts as not converged."""
 RELATIVE_STEP_TOLERANCE = 1e-8
 """Relative step of every unknown that ends the iteration; the paper does not print its own."""
 N_STEP_TOLERANCE = 1e-4

@@ -42,6 +42,7 @@ LEVELS = {
     "0.1 %": Noise(0.001, 0.001, 0.001, 0.0001, 0.001),
     "1 %": Noise(0.01, 0.01, 0.02, 0.003, 0.01),
 }
+"""Levels of noise by name."""
 
 
 def cramer_rao(point: OperatingPoint, x: Unknowns, noise: Noise, equations: Equations = EXACT) -> Array:

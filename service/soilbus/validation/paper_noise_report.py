@@ -22,7 +22,9 @@ from soilbus.validation.paper_noise import (
 from soilbus.validation.paper_tables import SANDY_LOAM, WET_CLAY, Trial
 
 DRAWS = 500
+"""Noise draws of one instant."""
 WINDOWS = 20
+"""Windows of 100 instants."""
 FEWEST = 20
 """Solutions below which no statistics of them are shown."""
 HEAD = ("soil", "noise", "what", "solved %", "K_L %", "phi %", "n %", "p %", "K_L between")

@@ -43,9 +43,12 @@ from soilbus.validation.paper_tables import (
 )
 
 WIDTH = 118
+"""Characters of a line."""
 PARAMETERS = ("phi [deg]", "K_L", "n")
 DECIMALS = (4, 3, 5)
+"""Decimals of phi, K_L and n."""
 REPEATS = 20
+"""Timed runs, of which the shortest counts."""
 SINKAGE_MARGIN = 1e-6
 """Distance [m] from zero and from the radius within which no sinkage is looked for."""
 
@@ -279,8 +282,8 @@ def _other_data(sinkage: float) -> str:
     return (
         _title("Other data, same method")
         + _text(
-            "All solutions (phi, K_L, n) with n up to 3 of the three equations, whatever the start. The solver has "
-            "Simpson's rule and the rational law where nothing else is said."
+            "All solutions (phi, K_L, n) with n up to 3 of the three equations, from no particular start. The solver "
+            "has Simpson's rule and the rational law where nothing else is said."
         )
         + table(("data", *TRIALS), rows)
     )

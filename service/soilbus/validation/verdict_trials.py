@@ -52,8 +52,10 @@ TORQUE_LIMIT_RANGE, SINKAGE_LIMIT_RANGE = (400.0, 1600.0), (0.02, 0.15)
 """Ranges of a motor's torque limit at the wheel [N m] and of a sinkage limit [m]."""
 NEAR_LIMIT_SHARE = 0.75
 """Share of drives that ask for a margin near the limit."""
-LEAST = 1e-3
+MIN_PROBABILITY = 1e-3
+"""Least and, from 1, greatest probability that a margin near the limit is drawn for."""
 BINS = 10
+"""Equal intervals of probability."""
 MAX_DRAWS = 100
 
 
@@ -166,12 +168,12 @@ def trial(task: Task) -> Call:
     def judged(by: Settings) -> Traversability:
         return judge(posterior, status, demand, rig, estimate.model, ground.torque_limit, by)[0]
 
-    way = judged(settings)
-    if rng.random() < NEAR_LIMIT_SHARE and (margin := _margin(way, demand, rng)) is not None:
+    decision = judged(settings)
+    if rng.random() < NEAR_LIMIT_SHARE and (margin := _margin(decision, demand, rng)) is not None:
         settings = settings.model_copy(update={"margin": margin})
-        way = judged(settings)
-    probability = math.nan if way.probability is None else way.probability
-    return Call(ground.name, probability, way.state, way.limit, _can(config, ground, settings, asked.pull))
+        decision = judged(settings)
+    probability = math.nan if decision.probability is None else decision.probability
+    return Call(ground.name, probability, decision.state, decision.limit, _can(config, ground, settings, asked.pull))
 
 
 def _with_prior(config: Config, prior: SoilPrior) -> Config:
@@ -182,11 +184,11 @@ def _with_prior(config: Config, prior: SoilPrior) -> Config:
     return config.model_copy(update={"soil": soil})
 
 
-def _margin(way: Traversability, demand: Demand, rng: np.random.Generator) -> float | None:
+def _margin(decision: Traversability, demand: Demand, rng: np.random.Generator) -> float | None:
     """A margin with which the pull suffices with a probability drawn from all; None where no pull does."""
-    if way.capability is None or (most := way.capability.likely_pull) is None or demand.pull <= 0.0:
+    if decision.capability is None or (most := decision.capability.likely_pull) is None or demand.pull <= 0.0:
         return None
-    sure = float(ndtri(rng.uniform(LEAST, 1.0 - LEAST)))
+    sure = float(ndtri(rng.uniform(MIN_PROBABILITY, 1.0 - MIN_PROBABILITY)))
     return (most.value - sure * math.hypot(most.std, demand.std)) / demand.pull - 1.0
 
 

@@ -27,7 +27,9 @@ from soilbus.validation.bench import decode, growth, paper, replay, service, win
 from soilbus.validation.bench.figure import Figure
 
 RECORDING_TIME = 120.0
+"""Length of the simulated log [s]."""
 THREADS = 1
+"""Threads of linear algebra."""
 
 Measurement = Callable[[Path], Mapping[str, Figure]]
 """Figures by name, from a recorded log that they may use."""

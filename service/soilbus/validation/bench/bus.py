@@ -51,6 +51,7 @@ with can.Bus(interface="socketcan", channel=sys.argv[1]) as bus:
     except KeyboardInterrupt:
         print(n, flush=True)
 """
+"""A loop that receives the whole bus with python-can and does nothing else."""
 
 
 _LIBRARIES = """

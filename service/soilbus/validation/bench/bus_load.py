@@ -27,7 +27,9 @@ MAPPED_SHARE = 0.1
 """Share of the frames that is mapped."""
 
 _POSITION = 0xFEF3
+"""PGN of the vehicle position."""
 _OTHERS_PERIOD = 0.01
+"""Period [s] of each unmapped message."""
 _OTHERS = 0x18EE0000  # address claims, which nothing is mapped to
 
 

@@ -27,10 +27,13 @@ from soilbus.validation.bench.figure import Figure, in_turn
 
 WHEELS = (1, 2, 4, 8)
 WINDOW_LENGTHS = (5.0, 10.0, 20.0, 40.0)
+"""Lengths of the windows [s]."""
 ROUNDS = 12
+"""Timed runs, of which the shortest counts."""
 STEPS = 5
 """Gauss-Newton steps that are timed in a row."""
 MAX_EXPONENT = 1.1
+"""Target: all but linear."""
 
 
 def exponents() -> dict[str, Figure]:
@@ -101,7 +104,7 @@ def _steps(problem: ObservationModel, prior: SoilPrior, soil: Array) -> Callable
 
 
 def _problems(wheels: int) -> Iterator[tuple[ObservationModel, SoilPrior]]:
-    """Windows of all lengths of a tractor with so many wheels, half of them on each axle; one: a test rig."""
+    """Windows of all lengths of a tractor with this number of wheels, half of them on each axle; one: a test rig."""
     config = _configuration(max(wheels, 2))
     recording = simulate(config, excited("loam", max(WINDOW_LENGTHS)), seed=1)
     samples = {name: (column.t, column.value) for name, column in recording.channels.items()}

@@ -16,6 +16,7 @@ from soilbus.validation.paper import EXACT, Forces, OperatingPoint, Unknowns, Wh
 from soilbus.validation.paper_tables import SINKAGE, TRIALS
 
 ROUNDS = 6
+"""Timed runs, of which the shortest counts."""
 SOLVES = 300
 """Of ours in a row: they take about as long as one of the peer's, so that both suffer alike from a busy machine."""
 MAX_RELATIVE_DIFFERENCE = 1e-6

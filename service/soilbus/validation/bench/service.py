@@ -16,7 +16,9 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.validation.bench.figure import Figure
 
 ROUNDS = 4
+"""Runs over the log, of which the least time of each window counts."""
 MAX_WINDOW_MS = 10.0
+"""Target of a window's median processor time [ms]."""
 
 
 def window_times(log: Path) -> dict[str, Figure]:

@@ -32,7 +32,9 @@ SOILS = ("loam", "wet_clay", "dry_sand")
 EXACT_AND_ROUGH = (("c", "K"), ("K", "c"))
 """Pairs: the parameter known exactly, and the one known to a quarter, whose prior median is a quarter too large."""
 WINDOW_LENGTH = 10.0
+"""[s]."""
 ROUNDS = 4
+"""Timed runs, of which the shortest counts."""
 MAX_DISTANCE_SD = 0.05
 """Greatest distance of the two ends in any parameter, in posterior standard deviations."""
 PASS_TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-8)
