@@ -12,7 +12,6 @@ from soilbus.can.channels import Channel
 from soilbus.can.dbc_files import checked_messages, load_databases
 from soilbus.can.decode import check_decodable, code_limits
 from soilbus.can.units import SI, STANDARD_GRAVITY, unit_of
-from soilbus.config.file import shipped_dbc
 from soilbus.config.model import Config, ConfigError, Wheel
 from soilbus.config.model import Signal as Mapped
 from soilbus.words import did_you_mean
@@ -259,4 +258,4 @@ def _identifiers_shared(channels: Iterable[Channel], database: Database) -> list
     return faults
 
 
-__all__ = ["channels_of", "checked_messages", "load_databases", "plausible", "shipped_dbc", "without_unit"]
+__all__ = ["channels_of", "checked_messages", "load_databases", "plausible", "without_unit"]

@@ -145,7 +145,7 @@ class Service:
         """In the worker: the estimator, with the posterior of the last run as its prior where one is stored."""
         estimator, persistence = self._pipeline.estimator, self._open_persistence()
         if persistence is not None and persistence.stored_prior is not None:
-            estimator.tracker.recall(*persistence.stored_prior)
+            estimator.tracker.start_from_last_run(*persistence.stored_prior)
         self._persistence = persistence
         return estimator
 

@@ -87,7 +87,7 @@ def _steps(problem: ObservationModel, prior: SoilPrior, soil: Array) -> Callable
     objective = Objective(problem, prior, Gaussian.of(prior, problem.gain_std))
 
     def next_iterate(iterate: Iterate) -> Iterate:
-        quadratic = objective.point(iterate)
+        quadratic = objective.quadratic_model(iterate)
         step = None if quadratic is None else quadratic.step()
         if quadratic is None or step is None:
             raise AssertionError("a Gauss-Newton step failed at the optimum")
