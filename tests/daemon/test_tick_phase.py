@@ -1,4 +1,4 @@
-"""The beat of the ten-hertz frames falls into step with the windows."""
+"""The ticks of the ten-hertz frames fall into step with the windows."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def made_up(n, spread=1.0, shift=0.0, held=(), seed=0):
     return windows
 
 
-def test_what_is_attainable_is_told_beside_what_is_attained():
+def test_the_bayes_risk_bound_is_reported_beside_what_is_attained():
     rng = np.random.default_rng(3)
     least = np.array([0.8, 1.5, 1.2])[:, None]
     made = made_up(400)

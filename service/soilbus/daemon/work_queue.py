@@ -118,5 +118,5 @@ class WorkQueue:
                 self._workers.submit(give_back_freed_memory)
 
     def close(self) -> None:
-        """Solve no more."""
+        """Shut the worker down; waiting windows are dropped."""
         self._workers.shutdown(wait=False, cancel_futures=True)

@@ -85,7 +85,7 @@ def _kind(known: ReceivedFrames) -> Iterator[str]:
 
 
 def _demand(known: ReceivedFrames) -> Iterator[str]:
-    """What the present task asks for, and what comes of it."""
+    """Torque that the present demand needs, and the slip and sinkage predicted for it."""
     needed, there = (known.number("TorqueDemand", f"Torque{what}") for what in ("Required", "Available"))
     if needed is not None or there is not None:
         yield "torque {} of {} N m".format(*("-" if x is None else f"{x:.0f}" for x in (needed, there)))
@@ -137,7 +137,7 @@ def _advice(known: ReceivedFrames) -> Table:
 
 
 def _wheels(known: ReceivedFrames) -> Table:
-    """Wheels 5 to 8 where there are that many."""
+    """One row for each wheel; wheels 5 to 8 only where they have a value."""
     wheels = _table("wheel", "slip", "sinkage, mm")
     for i in range(1, 9):
         more = "2" if i > 4 else ""

@@ -80,7 +80,7 @@ def summary_of(results: Sequence[WindowResult], heard: str, used: int | None, re
 
 
 def unused(results: Sequence[WindowResult]) -> int:
-    """How many windows say nothing of the soil."""
+    """Number of windows without an estimate of the soil."""
     return len(results) - len(of_use(results))
 
 

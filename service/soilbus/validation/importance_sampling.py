@@ -116,7 +116,7 @@ class _Draws(NamedTuple):
 
 
 def _draws(nodes: list[Node], coordinates: Coordinates, count: int, rng: np.random.Generator) -> _Draws:
-    """Positions about the nodes and what lies between them."""
+    """Positions drawn from the proposal: n from its flattened density, the other coordinates given n."""
     free = coordinates.free
     i = int(np.searchsorted(free, _N))
     others = np.delete(np.arange(len(free)), i)

@@ -142,7 +142,7 @@ def _latency(late: Array, pause: float) -> Figure:
 
 
 def _time_of_a_call() -> float:
-    """Time [s] that the kernel takes for next to nothing."""
+    """Time [s] of one cheap system call."""
     begin = time.perf_counter()
     for _ in range(N_SYSTEM_CALLS):
         os.getppid()
@@ -150,7 +150,7 @@ def _time_of_a_call() -> float:
 
 
 def _wait_until_counted(ear: Ear) -> None:
-    """Until the daemon's count of frames goes on no more."""
+    """Wait until the daemon's count of frames stays the same."""
     before = -1
     while (count := ear.books()[0]) != before:
         before = count
@@ -204,7 +204,7 @@ def _time_to_ready(channel: str) -> tuple[float, float]:
 
 
 def _time_of(program: str) -> float:
-    """Wall time [s] of a process of its own."""
+    """Wall time [s] of a program in a new process."""
     begin = time.perf_counter()
     subprocess.run([sys.executable, "-c", program], check=True)
     return time.perf_counter() - begin

@@ -47,7 +47,7 @@ class Ear:
         self._thread.start()
 
     def stop(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         self._on = False
         self._thread.join()
         self._wire.shutdown()
