@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from soilbus.diagnosis.damped_descent import descended
+from soilbus.diagnosis.damped_descent import descend_damped
 from soilbus.estimation.assembly import model_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import DEFAULT_OPTIONS, Start, fit_from, fit_from_soil, fit_window
@@ -170,7 +170,7 @@ def test_parameters_of_effects_stay_inside_their_ranges(bulldozed):
     joint_prior = Gaussian.of(prior, problem.gain_std)
     gains = np.concatenate([np.zeros(problem.n_sensors), np.ones(len(problem.free))])
     fast = fit_from(problem, prior, joint_prior, Start(np.asarray(SOILS["loam"]), gains), problem.n_sensors)
-    fit = descended(Objective(problem, prior, joint_prior), fast, DEFAULT_OPTIONS)
+    fit = descend_damped(Objective(problem, prior, joint_prior), fast, DEFAULT_OPTIONS)
     assert fit.converged
     low, high = problem.gain_bounds()
     for found in (fast, fit):
