@@ -67,7 +67,7 @@ MUTATIONS = (
     ),
     Mutation(
         "wheels that spin leave go as it was", "decision/judgement.py",
-        "if loss.spinning and way.state is not State.NO_GO:", "if False:",
+        "if loss.spinning and decision.state is not State.NO_GO:", "if False:",
         (f"{DECISION}::test_a_wheel_that_spins_is_caution_at_best_and_at_least",),
     ),
     Mutation(
@@ -87,7 +87,7 @@ MUTATIONS = (
     ),
     Mutation(
         "hysteresis without a past", "pipeline/estimator.py",
-        "settled(self._held, way", "settled(Held(), way",
+        "settled(self._held, decision", "settled(Held(), decision",
         (f"{DECISION}::test_a_better_state_needs_two_windows_in_a_row",),
     ),
     Mutation(

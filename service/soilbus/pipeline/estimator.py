@@ -13,7 +13,7 @@ from soilbus.config.model import Config
 from soilbus.decision.capability import Demand, OverSlip
 from soilbus.decision.demand import present_demand
 from soilbus.decision.hysteresis import Held, doubted, settled
-from soilbus.decision.immobilisation import SPAN, Watch, moments, watched, with_loss
+from soilbus.decision.immobilisation import BINS_OF_A_MOMENT, Watch, moments, watched, with_loss
 from soilbus.decision.judgement import Basis, judge
 from soilbus.decision.torque_ceiling import TorqueCeiling
 from soilbus.decision.traction_loss import NO_LOSS, idle, motion_of, observed
@@ -36,7 +36,7 @@ from soilbus.terra.effects.effect import Active, Surroundings, true_draft
 from soilbus.terra.effects.steady import CompletedModel
 from soilbus.terra.wheel import sinkage
 
-AMBIGUOUS = 2.0
+AMBIGUITY_SD = 2.0
 """Standard deviations of bearing pressure or tan phi by which another optimum makes a window ambiguous."""
 
 
@@ -78,7 +78,7 @@ class WindowEstimator:
         self._idle = np.zeros(len(self.rig.wheels), bool)
         self._ceiling = TorqueCeiling.unknown(len(self.rig.wheels))
         self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
-        self._guess = guessed(self.prior, prior_of(Config()))
+        self._class_prior = guessed(self.prior, prior_of(Config()))
         settings = config.estimator
         least = MIN_ROWS if config.table is None else 1  # a table's rows are chosen with care, and few
         self._tracker = Tracker(
@@ -110,7 +110,7 @@ class WindowEstimator:
         tracked = self._tracker.estimate(task.window, task.end)
         fit = tracked.fit
         status, reason = self._status(task, tracked)
-        own = None if fit is None or status is Status.INVALID else self._honest(tracked, fit)
+        own = None if fit is None or status is Status.INVALID else self._widened_posterior(tracked, fit)
         posterior = None if own is None or fit is None else _with_form(own, fit, self.prior)
         basis = self._basis(task, fit)
         if status is Status.VALID and task.end - basis.end > self.config.traversability.max_age:
@@ -132,10 +132,10 @@ class WindowEstimator:
             soil_class=self._soil_class(posterior),
             position=task.track.at((tracked.since + task.end) / 2.0),
             failure=self._failure(tracked),
-            gaps=self._watched_gaps(task, fit),
+            gaps=self._model_gaps(task, fit),
             excitation=excitation_of(task.window, self.rig, self._settings.min_speed),
             basis=basis,
-            z_driven=None if fit is None or posterior is None else self._driven(fit),
+            z_driven=None if fit is None or posterior is None else self._sinkage_range(fit),
             search_ended=tracked.search_ended,
         )
         effects = self._effects(fit)
@@ -150,22 +150,22 @@ class WindowEstimator:
     def decide(self, window: Undecided) -> WindowResult:
         """The result with its traversability and watch; windows in their order, here or in another process."""
         result = self._decided(window)
-        self._look(window)
-        able = result.traversability.capability
-        if able is not None and result.status is Status.VALID:
-            self._curve = able.over_slip
+        self._update_watch(window)
+        capability = result.traversability.capability
+        if capability is not None and result.status is Status.VALID:
+            self._curve = capability.over_slip
         now = as_of(result, self._loss, result.t, self.config)
         return replace(now, watch=with_loss(self._watch, self._loss))
 
     def _decided(self, window: Undecided) -> WindowResult:
         """The result with its traversability."""
-        way, self._wheels = judge(
+        decision, self._wheels = judge(
             window.posterior, window.result.status, window.demand, self.rig, window.model, window.torque_limit,
             self.config.traversability, None if window.fresh else self._wheels,
         )  # fmt: skip
-        return replace(window.result, traversability=self._settle(way, window))
+        return replace(window.result, traversability=self._with_state(decision, window))
 
-    def _settle(self, way: Traversability, window: Undecided) -> Traversability:
+    def _with_state(self, decision: Traversability, window: Undecided) -> Traversability:
         """The state that the windows before allow, and how old the last valid one is."""
         if window.fresh:
             self._held, self._valid_at = Held(), None
@@ -173,11 +173,11 @@ class WindowEstimator:
         if result.status is Status.VALID:
             self._valid_at = result.t
         if window.here:
-            self._held = settled(self._held, way.probability, result.status, self.config.traversability)
+            self._held = settled(self._held, decision.probability, result.status, self.config.traversability)
         else:  # the estimate is of the ground before
-            self._held, way = doubted(self._held), Traversability(torque_available=way.torque_available)
+            self._held, decision = doubted(self._held), Traversability(torque_available=decision.torque_available)
         return replace(
-            way, state=self._held.state, since_valid=None if self._valid_at is None else result.t - self._valid_at
+            decision, state=self._held.state, since_valid=None if self._valid_at is None else result.t - self._valid_at
         )
 
     def _torque_limit(self, task: WindowTask, window: Window) -> NDArray[np.float64]:
@@ -195,7 +195,7 @@ class WindowEstimator:
         self._ceiling = self._ceiling.after(window, self.rig, hop, deviations)
         return np.where(self._idle, 0.0, np.fmin(task.torque_limit, self._ceiling.limit))
 
-    def _watched_gaps(self, task: WindowTask, fit: Fit | None) -> Mapping[str, float]:
+    def _model_gaps(self, task: WindowTask, fit: Fit | None) -> Mapping[str, float]:
         """The channels that have not fitted for minutes; windows with poor inputs have no say."""
         if task.fresh:
             self._gap.forget()
@@ -203,14 +203,14 @@ class WindowEstimator:
             self._gap.take(task.end, squares(fit.optimum.at, len(self.rig.wheels)))
         return self._gap.gaps()
 
-    def _look(self, window: Undecided) -> None:
+    def _update_watch(self, window: Undecided) -> None:
         """Watch the last hop with what was known of the soil before it."""
         if window.fresh:
             self._watch, self._curve, self._loss = Watch(), None, NO_LOSS
         since = window.result.t - self._settings.hop
         driven = window.driven
         for i in np.flatnonzero(driven.t > since).tolist():
-            few = driven.rows(np.arange(max(i + 1 - SPAN, 0), i + 1))
+            few = driven.rows(np.arange(max(i + 1 - BINS_OF_A_MOMENT, 0), i + 1))
             if (motion := motion_of(few, self.rig, window.torque_limit, self.config.traversability)) is not None:
                 self._loss = observed(self._loss, motion, self._settings.min_speed, self.config.traversability)
         for moment in moments(window.driven, self.rig, since, self._settings.min_speed):
@@ -232,7 +232,7 @@ class WindowEstimator:
             self.model, *self._completion, fit.reported, len(self.rig.wheels), speed, widening, fit.form
         )
 
-    def _honest(self, tracked: TrackerOutput, fit: Fit) -> Posterior:
+    def _widened_posterior(self, tracked: TrackerOutput, fit: Fit) -> Posterior:
         """Posterior, of both optima where there are two, widened where the residuals are larger than the noise."""
         return fit.reported.posterior.widened(_widening(tracked, fit), self.prior)
 
@@ -245,7 +245,7 @@ class WindowEstimator:
     def _bearing(self, posterior: Posterior) -> Estimate:
         return posterior.bearing_pressure(self._settings.z_ref, self._settings.b_ref)
 
-    def _driven(self, fit: Fit) -> tuple[float, float] | None:
+    def _sinkage_range(self, fit: Fit) -> tuple[float, float] | None:
         """Sinkages [m] that nine tenths of the wheels' instants lie between."""
         depth = sinkage(fit.optimum.latents.entry_angle, self.rig.radius)
         known = depth[np.isfinite(depth)]
@@ -258,7 +258,7 @@ class WindowEstimator:
         if posterior is None or self._classes is None:
             return None
         here = self._tracker.here
-        return self._classes.probabilities(posterior, self._guess if here is self.prior else here)
+        return self._classes.probabilities(posterior, self._class_prior if here is self.prior else here)
 
     def _sinkage(self, fit: Fit | None) -> dict[str, float | None]:
         if fit is None:
@@ -282,11 +282,11 @@ class WindowEstimator:
 
     def _status(self, task: WindowTask, tracked: TrackerOutput) -> tuple[Status, str]:
         """Status and its reason; a sensor that lies is the reason of all that may follow from it."""
-        status, reason = self._status_of_the_rest(task, tracked)
+        status, reason = self._status_without_plausibility(task, tracked)
         follows = reason.split()[0] in ("none", "input_stale", "model_mismatch", "no_convergence")
         return status, " ".join(["implausible", *task.implausible]) if task.implausible and follows else reason
 
-    def _status_of_the_rest(self, task: WindowTask, tracked: TrackerOutput) -> tuple[Status, str]:
+    def _status_without_plausibility(self, task: WindowTask, tracked: TrackerOutput) -> tuple[Status, str]:
         fit = tracked.fit
         if task.missing:
             return Status.INVALID, "input_missing " + " ".join(task.missing)
@@ -300,7 +300,7 @@ class WindowEstimator:
             return status, "model_mismatch" if failure == "model_mismatch" else "no_convergence"
         if task.poor:
             return Status.DEGRADED, "input_stale " + " ".join(task.poor)
-        if self._hardly_new(tracked, task.end):
+        if self._too_little_of_new_soil(tracked, task.end):
             return Status.NOT_EXCITED, "not_excited new_soil"
         if fit.off_scale:
             return Status.DEGRADED, "model_mismatch"
@@ -316,7 +316,7 @@ class WindowEstimator:
             return Status.NOT_EXCITED, " ".join(["not_excited", *(name for name, it_is in lacking.items() if it_is)])
         return Status.VALID, "none"
 
-    def _hardly_new(self, tracked: TrackerOutput, end: float) -> bool:
+    def _too_little_of_new_soil(self, tracked: TrackerOutput, end: float) -> bool:
         """Whether the window has too little of the soil that has just begun."""
         if tracked.ground in (Ground.CHANGING, Ground.SETTLING):
             return True
@@ -337,7 +337,7 @@ class WindowEstimator:
             return False
         one, other = fit.posterior, fit.second_mode.gaussian.posterior
         pairs = ((self._bearing(one), self._bearing(other)), (one.tan_phi(), other.tan_phi()))
-        return any(abs(a.value - b.value) > AMBIGUOUS * a.std for a, b in pairs)
+        return any(abs(a.value - b.value) > AMBIGUITY_SD * a.std for a, b in pairs)
 
 
 def _gated(tracked: TrackerOutput) -> str:

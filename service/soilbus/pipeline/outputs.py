@@ -26,10 +26,10 @@ TICK = 0.1
 """Cycle [s] of the frames that others act on."""
 FAST_FRAMES = ("WheelSlip", "WheelSlip2", "Traversability", "TorqueDemand", "DemandForecast")
 
-LONG = 1e6
+LONGEST_TIME = 1e6
 """A time [s] that is longer than any signal holds."""
 
-MOST_CLASSES = 3
+MAX_CLASSES = 3
 """Known soils that a window names."""
 
 PARAMETER_FRAMES = {
@@ -70,7 +70,7 @@ def check_cycle_times(config: Config, database: Database) -> None:
 
 def json_line(result: WindowResult, config: Config) -> str:
     """The result as one JSON object (keys: DESIGN.md), SI throughout, null for the unknown."""
-    way = result.traversability
+    decision = result.traversability
     bearing = {
         "z_ref": config.estimator.z_ref,
         "b_ref": config.estimator.b_ref,
@@ -92,19 +92,19 @@ def json_line(result: WindowResult, config: Config) -> str:
         "slip": result.slip,
         "sinkage": result.sinkage,
         "traversability": {
-            "state": str(way.state),
-            "probability": way.probability,
-            "torque_required": way.torque_required,
-            "torque_available": way.torque_available,
-            "max_draft": _value_std(way.max_draft),
-            "max_grade": _value_std(way.max_grade),
-            "limit": way.limit,
+            "state": str(decision.state),
+            "probability": decision.probability,
+            "torque_required": decision.torque_required,
+            "torque_available": decision.torque_available,
+            "max_draft": _value_std(decision.max_draft),
+            "max_grade": _value_std(decision.max_grade),
+            "limit": decision.limit,
             "age": result.t - result.basis.end,
-            "since_valid": way.since_valid,
+            "since_valid": decision.since_valid,
         },
         "gaps": dict(result.gaps),
         "warning": {"state": str(result.watch.warning), "time_left": result.watch.time_left},
-        "capability": None if way.capability is None else _capability(way.capability),
+        "capability": None if decision.capability is None else _capability(decision.capability),
         "chi2": result.chi2,
         "search_ended": result.search_ended,
         "samples": result.samples,
@@ -121,15 +121,15 @@ def _extrapolates(result: WindowResult, z_ref: float) -> bool | None:
     return not low <= z_ref <= high
 
 
-def _capability(able: Capability) -> dict[str, Any]:
+def _capability(capability: Capability) -> dict[str, Any]:
     """What traversability does not say already."""
-    forecast = able.forecast
+    forecast = capability.forecast
     return {
-        "max_draft_here": _value_std(able.max_draft_here),
-        "max_grade_with_draft": _value_std(able.max_grade_with_draft),
+        "max_draft_here": _value_std(capability.max_draft_here),
+        "max_grade_with_draft": _value_std(capability.max_grade_with_draft),
         "set_points": {
             axle: {"efficiency": _value_std(point.efficiency), "pull": _value_std(point.pull)}
-            for axle, point in able.set_points.items()
+            for axle, point in capability.set_points.items()
         },
         "forecast": None
         if forecast is None
@@ -139,7 +139,7 @@ def _capability(able: Capability) -> dict[str, Any]:
             "sinkage": {wheel: _value_std(depth) for wheel, depth in forecast.sinkage.items()},
         },
         "over_slip": {
-            column: getattr(able.over_slip, column).tolist()
+            column: getattr(capability.over_slip, column).tolist()
             for column in ("slip", "pull", "pull_std", "torque", "torque_std")
         },
     }
@@ -147,7 +147,7 @@ def _capability(able: Capability) -> dict[str, Any]:
 
 def likeliest(soil_class: Mapping[str, float]) -> dict[str, float]:
     """The few most likely known soils and `unknown`, likeliest first."""
-    known = [name for name in soil_class if name != UNKNOWN][:MOST_CLASSES]
+    known = [name for name in soil_class if name != UNKNOWN][:MAX_CLASSES]
     return {name: p for name, p in soil_class.items() if name in known or name == UNKNOWN}
 
 
@@ -158,38 +158,38 @@ def _value_std(estimate: Estimate | None) -> dict[str, float | None]:
 def hop_frames(result: WindowResult) -> Iterator[tuple[str, dict[str, Any]]]:
     """(message, values in the DBC's units) of the frames that go out once each window."""
     common = {"Window": result.index % WINDOW_MODULUS, "Status": str(result.status)}
-    bearing, way = result.bearing, result.traversability
+    bearing, decision = result.bearing, result.traversability
     yield (
         "SoilStrength",
-        common | {"Chi2": result.chi2} | _pair("BearingPressure", "BearingPressureStd", bearing, 1e3),
+        common | {"Chi2": result.chi2} | _value_and_std("BearingPressure", "BearingPressureStd", bearing, 1e3),
     )
-    yield "SoilClass", common | _kind(result.soil_class)
+    yield "SoilClass", common | _soil_class(result.soil_class)
     parameters = {} if result.posterior is None else result.posterior.parameters()
     for name, (message, unit) in PARAMETER_FRAMES.items():
-        yield message, common | _pair("Value", "Std", parameters.get(name), unit)
-    yield "DraftCapability", common | _pair("MaxDraft", "MaxDraftStd", way.max_draft, 1.0)
-    yield "GradeCapability", common | _pair("MaxGrade", "MaxGradeStd", way.max_grade, 1.0)
-    yield "TractionAdvice", common | _advice(way.capability)
-    yield "TractionLimits", common | {"LimitingCause": way.limit} | _limits(way.capability)
+        yield message, common | _value_and_std("Value", "Std", parameters.get(name), unit)
+    yield "DraftCapability", common | _value_and_std("MaxDraft", "MaxDraftStd", decision.max_draft, 1.0)
+    yield "GradeCapability", common | _value_and_std("MaxGrade", "MaxGradeStd", decision.max_grade, 1.0)
+    yield "TractionAdvice", common | _advice(decision.capability)
+    yield "TractionLimits", common | {"LimitingCause": decision.limit} | _limits(decision.capability)
     for message, values in _by_wheel("WheelSinkage", "SinkageWheel", result.sinkage, 1e-3):
         yield message, common | values
 
 
-def _pair(value: str, std: str, estimate: Estimate | None, unit: float) -> dict[str, float | None]:
+def _value_and_std(value: str, std: str, estimate: Estimate | None, unit: float) -> dict[str, float | None]:
     if estimate is None:
         return {value: None, std: None}
     return {value: estimate.value / unit, std: estimate.std / unit}
 
 
-def _kind(soil_class: Mapping[str, float] | None) -> dict[str, str | float | None]:
+def _soil_class(soil_class: Mapping[str, float] | None) -> dict[str, str | float | None]:
     if soil_class is None:
         return {"Kind": None, "Probability": None, "UnknownProbability": None}
     kind, probability = next(iter(soil_class.items()))
     return {"Kind": kind, "Probability": probability, "UnknownProbability": soil_class[UNKNOWN]}
 
 
-def _advice(able: Capability | None) -> dict[str, float | None]:
-    points = {} if able is None else able.set_points
+def _advice(capability: Capability | None) -> dict[str, float | None]:
+    points = {} if capability is None else capability.set_points
     values = {}
     for axle, name in (("front", "Front"), ("rear", "Rear")):
         point = points.get(axle)
@@ -198,20 +198,20 @@ def _advice(able: Capability | None) -> dict[str, float | None]:
     return values
 
 
-def _limits(able: Capability | None) -> dict[str, float | None]:
-    draft, grade = (None, None) if able is None else (able.max_draft_here, able.max_grade_with_draft)
-    return _pair("MaxDraft", "MaxDraftStd", draft, 1.0) | _pair("MaxGrade", "MaxGradeStd", grade, 1.0)
+def _limits(capability: Capability | None) -> dict[str, float | None]:
+    draft, grade = (None, None) if capability is None else (capability.max_draft_here, capability.max_grade_with_draft)
+    return _value_and_std("MaxDraft", "MaxDraftStd", draft, 1.0) | _value_and_std("MaxGrade", "MaxGradeStd", grade, 1.0)
 
 
 def forecast_frame(result: WindowResult | None, watch: Watch) -> tuple[str, dict[str, Any]]:
     """(message, values) of the forecast, from a result that may still be trusted (else None), and of the warning."""
-    able = None if result is None else result.traversability.capability
-    forecast = None if able is None else able.forecast
+    capability = None if result is None else result.traversability.capability
+    forecast = None if capability is None else capability.forecast
     return "DemandForecast", {
         "Slip": None if forecast is None else forecast.slip.value,
         "SlipStd": None if forecast is None else forecast.slip.std,
         "Sinkage": None if forecast is None else forecast.deepest.value * 1e3,
-        "TimeLeft": None if watch.time_left is None else min(watch.time_left, LONG),
+        "TimeLeft": None if watch.time_left is None else min(watch.time_left, LONGEST_TIME),
         "Warning": str(watch.warning),
         "Window": None if result is None else result.index % WINDOW_MODULUS,
         "Status": None if result is None else str(result.status),

@@ -62,7 +62,7 @@ class WindowResult:
 
 def as_of(result: WindowResult, loss: TractionLoss, now: float, config: Config) -> WindowResult:
     """The result with what is left of its decision at the time `now` [s]; of a stuck vehicle none is valid."""
-    way = at_present(result.traversability, result.basis, loss, now, config)
+    decision = at_present(result.traversability, result.basis, loss, now, config)
     if loss.stuck and result.status is Status.VALID:
-        return replace(result, traversability=way, status=Status.NOT_EXCITED, reason="standstill")
-    return replace(result, traversability=way)
+        return replace(result, traversability=decision, status=Status.NOT_EXCITED, reason="standstill")
+    return replace(result, traversability=decision)

@@ -6,7 +6,7 @@ is the value at the centre c of a bin by the samples y_j in it, with s the chann
 a mean over the bin but the value of one instant, whatever the phases of the messages.  So a nonlinear model needs no
 second-order term.  It is a weighted sum of samples, and its variance that of the sum: it is worth fewer than n.
 
-The bin is the longest at which this loses at most MOST_LOST of what the n samples are worth, in each channel that
+The bin is the longest at which this loses at most MAX_LOSS of what the n samples are worth, in each channel that
 the model needs; none shorter than the slowest of these channels' periods, at which every bin still has a sample.
 Then a bin is short beside the span of samples through which a cubic goes within noise, and a cubic between bins, as
 delays need it, errs by less than noise: by at most 3/128 of the fourth difference.
@@ -27,10 +27,10 @@ from soilbus.estimation.window import NoiseTable, Window, made_window
 from soilbus.sensors.bins import Bins
 from soilbus.sensors.outliers import Samples
 
-MOST_LOST = 0.1
+MAX_LOSS = 0.1
 """Share of a bin's samples that its value at one instant may cost: less than the noise itself is known to."""
 NEEDED = ("torque", "load", "speed", "ground_speed", "draft")
-MOST_PARTS = 10
+MAX_PARTS = 10
 """Into how many parts the configured bin is divided at most."""
 
 
@@ -91,12 +91,12 @@ def _bin_length(channels: Iterable[_Channel], longest: float, span: float) -> fl
     """Length of the bins [s]: the longest part of the longest one at which no needed channel loses too much."""
     needed = [c for c in channels if c.needed and c.curve.step > 0.0]
     slowest = max((c.curve.step for c in needed), default=longest)
-    counted = [c for c in needed if 2.0 / len(c.t) < MOST_LOST**2]  # mean squares of fewer are not known so well
-    for parts in range(1, MOST_PARTS + 1):
+    counted = [c for c in needed if 2.0 / len(c.t) < MAX_LOSS**2]  # mean squares of fewer are not known so well
+    for parts in range(1, MAX_PARTS + 1):
         length = longest / parts
         if length <= slowest:
             break
-        if all(_lost(c, length, int(span / length)) <= MOST_LOST for c in counted):
+        if all(_lost(c, length, int(span / length)) <= MAX_LOSS for c in counted):
             return length
     return min(longest, slowest)
 

@@ -41,9 +41,9 @@ from soilbus.terra.vehicle import GRAVITY, axle_loads, slip_ratio
 
 Frame = tuple[float, int, bool, bytes | bytearray, bool, bool]
 
-BATCH = 5000
+BATCH_SIZE = 5000
 """Frames that are decoded at a time."""
-SILENCE = 60.0
+LONGEST_SILENCE = 60.0
 """Seconds without a frame, or set back, after which another recording begins; the longest part is compared."""
 
 
@@ -189,7 +189,7 @@ def survey(config: Config, database: Database, frames: Iterable[Frame], limits: 
     except ConfigError:  # of a speed that nobody mapped
         with_motors, channels = config, channels_of(config, database)
     admission = Admission(channels, database, checked_messages(config))
-    parts, refused, n = _heard(admission, frames)
+    parts, refused, n = _decoded(admission, frames)
     longest = max(parts, key=lambda part: sum(len(t) for t, _ in part.values()))
     seen = tuple(_seen(c, longest, refused) for c in channels if c.name in mapped)
     if not sum(admission.counts.received.values()):
@@ -236,7 +236,7 @@ def _rotation(text: str | None) -> bool:
 Columns = dict[str, tuple[Array, Array]]
 
 
-def _heard(admission: Admission, frames: Iterable[Frame]) -> tuple[list[Columns], Counter[tuple[str, Reason]], int]:
+def _decoded(admission: Admission, frames: Iterable[Frame]) -> tuple[list[Columns], Counter[tuple[str, Reason]], int]:
     """Samples by channel of each part of the recording that has one clock, refusals, and the number of frames."""
     pieces: list[list[Columns]] = [[]]
     refused: Counter[tuple[str, Reason]] = Counter()
@@ -251,12 +251,12 @@ def _heard(admission: Admission, frames: Iterable[Frame]) -> tuple[list[Columns]
         n += 1
         if error:
             continue
-        if abs(t - last) > SILENCE:
+        if abs(t - last) > LONGEST_SILENCE:
             take()
             pieces.append([])
         last = t
         admission.feed(t, identifier, extended, data, remote)
-        if n % BATCH == 0:
+        if n % BATCH_SIZE == 0:
             if admission.counts.clock_steps != steps:
                 steps = admission.counts.clock_steps
                 pieces.append([])
@@ -329,7 +329,7 @@ def _is_optional(seen: Seen) -> bool:
     return seen.channel.quantity in {*OPTIONAL_ROLES, "sinkage", "torque_limit", "motor_speed"}
 
 
-_WHY: Mapping[Reason, str] = {
+_REFUSAL: Mapping[Reason, str] = {
     Reason.NOT_AVAILABLE: "the sender says that it is not available",
     Reason.ERROR: "the sender reports an error",
     Reason.RESERVED: "codes that the DBC reserves",
@@ -369,7 +369,7 @@ def _of_one(seen: Seen, database: Database, limits: Limits) -> Iterator[Finding]
     if share > limits.refused:
         reason, n = max(seen.refused.items(), key=lambda item: item[1])
         unit = SI.get(_dimension(channel), "")
-        why = _WHY.get(reason, str(reason).replace("_", " ")).format(low=channel.low, high=channel.high, unit=unit)
+        why = _REFUSAL.get(reason, str(reason).replace("_", " ")).format(low=channel.low, high=channel.high, unit=unit)
         text = f"{key}: {n} of {refused + seen.count} values of {channel.message}.{channel.signal} do not count: {why}"
         yield Finding(text, share > 4.0 * limits.refused, (channel.name,) if share > 4.0 * limits.refused else ())
     if math.isfinite(seen.rate) and channel.quantity not in POSITION_ROLES:
@@ -438,7 +438,7 @@ def _compared(
         ]
     findings: list[Finding] = []
     questions: list[str] = []
-    for check in (_weight, _ways, _gears, _slips, _balance, _levels, _sides, _yaw):
+    for check in (_weight, _directions, _gears, _slips, _balance, _levels, _sides, _yaw):
         try:
             found = list(check(facts, limits))
         except UndecidableError as reason:
@@ -508,15 +508,15 @@ def _why_weight(ratio: float) -> str:
     return "which of them is wrong? (ballast, unit or scale of the loads)"
 
 
-def _ways(facts: Facts, limits: Limits) -> Iterator[Finding]:
+def _directions(facts: Facts, limits: Limits) -> Iterator[Finding]:
     """Wheels that turn, or drive, against all others."""
     rig, raw = facts.rig, facts.raw
     moving = facts.straight
     with np.errstate(invalid="ignore"):
         turns = [median(np.sign(raw.speed[moving, i])) for i in range(len(rig.wheels))]
-    way = np.sign(np.nansum(turns))
+    forward_sign = np.sign(np.nansum(turns))
     for wheel, turn in zip(rig.wheels, turns, strict=True):
-        if turn * way < 0.0:
+        if turn * forward_sign < 0.0:
             text = f"wheel.{wheel}.speed: turns backward while most wheels turn forward: sign = -1?"
             yield Finding(text, True, (f"speed.{wheel}", f"torque.{wheel}"))
     thrust = [median(facts.thrust[:, i]) for i in range(len(rig.wheels))]
@@ -528,7 +528,7 @@ def _ways(facts: Facts, limits: Limits) -> Iterator[Finding]:
                 f"wheel.{wheel}.torque: brakes while most wheels drive: sign = -1?", True, (f"torque.{wheel}",)
             )
     ground = median(np.sign(raw.ground_speed[moving]))
-    if ground < 0.0 and way > 0.0:
+    if ground < 0.0 and forward_sign > 0.0:
         yield Finding("signals.ground_speed: backward while the wheels turn forward: sign = -1?", True)
 
 
