@@ -59,7 +59,7 @@ LEVEL_SINE = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Demand:
-    """Pull [N] asked by draft and slope together, its standard deviation [N], and the slope's sine (positive uphill)."""
+    """Pull [N] asked by draft and slope together, its standard deviation [N], and the slope's sine, positive uphill."""
 
     pull: float
     std: float

@@ -1,4 +1,11 @@
-"""One window's result as a JSON line and as values of our frames."""
+"""One window's result as a JSON line and as values of the CAN frames that soilbus sends.
+
+    WindowResult -> json_line                       one object per window, SI units, keys in DESIGN.md
+    WindowResult -> hop_frames                      frames sent once per window
+    WindowResult, Watch -> forecast_frame           frame sent every TICK
+
+The frames' values are in the units of output.dbc; None is sent as the signal's code for "not available".
+"""
 
 from __future__ import annotations
 
@@ -23,14 +30,14 @@ WINDOW_MODULUS = 251
 """The frames' 8-bit window number counts 0..250."""
 
 TICK = 0.1
-"""Cycle [s] of the frames that others act on."""
+"""Cycle [s] of the fast frames, on which other devices act."""
 FAST_FRAMES = ("WheelSlip", "WheelSlip2", "Traversability", "TorqueDemand", "DemandForecast")
 
 LONGEST_TIME = 1e6
-"""A time [s] that is longer than any signal holds."""
+"""Time left [s] that stands for no end: above the range of any signal."""
 
 MAX_CLASSES = 3
-"""Known soils that a window names."""
+"""Number of known soils that a window names."""
 
 PARAMETER_FRAMES = {
     # JSON name: (message, SI value of one unit of the DBC)
@@ -47,13 +54,18 @@ HOP_FRAMES = (
     "SoilStrength", "SoilClass", *(message for message, _ in PARAMETER_FRAMES.values()), "DraftCapability",
     "GradeCapability", "TractionAdvice", "TractionLimits", "WheelSinkage", "WheelSinkage2",
 )  # fmt: skip
-"""Go out once each window."""
+"""Names of the frames that are sent once per window."""
 
 
 def check_cycle_times(config: Config, database: Database) -> None:
-    """Raises ConfigError where frames would come less often than the DBC promises their readers (GenMsgCycleTime).
+    """Check that frames come at least as often as the DBC promises (GenMsgCycleTime).
 
-    Readers judge silence by it, and would take each pause for the end of soilbus.
+    Readers detect a silent sender by it: with a longer cycle each pause would look like the end of soilbus.
+
+    Raises
+    ------
+    ConfigError
+        Where a frame would come less often.
     """
     promised = {m.name: (m.cycle_time or math.inf) / 1e3 for m in database.messages}
     faults = []
@@ -69,7 +81,7 @@ def check_cycle_times(config: Config, database: Database) -> None:
 
 
 def json_line(result: WindowResult, config: Config) -> str:
-    """The result as one JSON object (keys: DESIGN.md), SI throughout, null for the unknown."""
+    """The result as one line of JSON (keys: DESIGN.md), in SI units, null where not known."""
     decision = result.traversability
     bearing = {
         "z_ref": config.estimator.z_ref,
@@ -114,7 +126,7 @@ def json_line(result: WindowResult, config: Config) -> str:
 
 
 def _extrapolates(result: WindowResult, z_ref: float) -> bool | None:
-    """Whether the bearing pressure is of a depth [m] that the wheels hardly had; None where it is not known."""
+    """Whether the depth z_ref [m] of the bearing pressure lies outside the wheels' sinkages; None where not known."""
     if result.bearing is None or result.z_driven is None:
         return None
     low, high = result.z_driven
@@ -122,7 +134,7 @@ def _extrapolates(result: WindowResult, z_ref: float) -> bool | None:
 
 
 def _capability(capability: Capability) -> dict[str, Any]:
-    """What traversability does not say already."""
+    """The parts of the capability that `traversability` does not hold."""
     forecast = capability.forecast
     return {
         "max_draft_here": _value_std(capability.max_draft_here),
@@ -146,7 +158,7 @@ def _capability(capability: Capability) -> dict[str, Any]:
 
 
 def likeliest(soil_class: Mapping[str, float]) -> dict[str, float]:
-    """The few most likely known soils and `unknown`, likeliest first."""
+    """The MAX_CLASSES most likely known soils and `unknown`, likeliest first."""
     known = [name for name in soil_class if name != UNKNOWN][:MAX_CLASSES]
     return {name: p for name, p in soil_class.items() if name in known or name == UNKNOWN}
 
@@ -156,7 +168,7 @@ def _value_std(estimate: Estimate | None) -> dict[str, float | None]:
 
 
 def hop_frames(result: WindowResult) -> Iterator[tuple[str, dict[str, Any]]]:
-    """(message, values in the DBC's units) of the frames that go out once each window."""
+    """Yield (message, values in the DBC's units) of the frames that are sent once per window."""
     common = {"Window": result.index % WINDOW_MODULUS, "Status": str(result.status)}
     bearing, decision = result.bearing, result.traversability
     yield (
@@ -204,7 +216,7 @@ def _limits(capability: Capability | None) -> dict[str, float | None]:
 
 
 def forecast_frame(result: WindowResult | None, watch: Watch) -> tuple[str, dict[str, Any]]:
-    """(message, values) of the forecast, from a result that may still be trusted (else None), and of the warning."""
+    """(message, values in the DBC's units) of forecast and warning; result is None where none is valid any more."""
     capability = None if result is None else result.traversability.capability
     forecast = None if capability is None else capability.forecast
     return "DemandForecast", {
@@ -219,7 +231,7 @@ def forecast_frame(result: WindowResult | None, watch: Watch) -> tuple[str, dict
 
 
 def known(value: Any) -> Any:
-    """What JSON can say of nested dicts, lists and numbers: null for every number that is not finite."""
+    """Nested dicts, lists and numbers for JSON: None instead of every number that is not finite."""
     if isinstance(value, Mapping):
         return {key: known(each) for key, each in value.items()}
     if isinstance(value, list):
@@ -232,7 +244,7 @@ def _value(estimate: Estimate | None) -> float | None:
 
 
 def slip_frames(slip: Mapping[str, float | None]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """(message, values) of the wheel slips, wheels in the order of the configuration."""
+    """Yield (message, values) of the wheel slips, wheels in the order of the configuration."""
     return _by_wheel("WheelSlip", "SlipWheel", slip, 1.0)
 
 
