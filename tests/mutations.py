@@ -93,7 +93,7 @@ MUTATIONS = (
     Mutation(
         "a new ground does not end what was held", "pipeline/estimator.py",
         "self._held, self._valid_at = Held(), None", "self._valid_at = None",
-        (f"{DECISION}::test_what_begins_anew_is_held_back_by_nothing",),
+        (f"{DECISION}::test_a_fresh_window_is_not_held_back_by_hysteresis",),
     ),
     Mutation(
         "a fit that leaves more than noise is as sure as any", "pipeline/estimator.py",

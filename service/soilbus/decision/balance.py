@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.decision.sigma_points import SigmaPoints
 from soilbus.decision.uncertain_model import ModelOfRows
-from soilbus.decision.wheels import MAX_SINE, Axles, WheelTable
+from soilbus.decision.wheels import DRAWBAR, MAX_SINE, Axles, WheelTable
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE
 
 SUBDIVISIONS = 5
@@ -49,6 +49,20 @@ class Duty(NamedTuple):
 LEVEL = Duty()
 
 
+class Columns(NamedTuple):
+    """Places of a balance's columns: the vehicle's pull, then three quantities for each kind of wheel."""
+
+    pull: int
+    drawbar: slice
+    torque: slice
+    angle: slice
+
+    @classmethod
+    def of(cls, kinds: int) -> Columns:
+        """The columns for this number of kinds of wheels."""
+        return cls(0, *(slice(1 + i * kinds, 1 + (i + 1) * kinds) for i in range(3)))
+
+
 @dataclass(frozen=True, slots=True)
 class Balance:
     """The steady states of D soils at F slips, for A kinds of wheels.
@@ -69,24 +83,29 @@ class Balance:
     columns: Array
 
     @property
+    def at(self) -> Columns:
+        """Places of the columns."""
+        return Columns.of(self.columns.shape[1] // 3)
+
+    @property
     def pull(self) -> Array:
         """Pull of the vehicle [N] (D, F)."""
-        return self.columns[:, 0]
+        return self.columns[:, self.at.pull]
 
     @property
     def drawbar(self) -> Array:
         """Drawbar pull of one wheel [N] (D, A, F)."""
-        return self._of_wheels(0)
+        return self.columns[:, self.at.drawbar]
 
     @property
     def torque(self) -> Array:
         """Torque of one wheel [N m] (D, A, F)."""
-        return self._of_wheels(1)
+        return self.columns[:, self.at.torque]
 
     @property
     def angle(self) -> Array:
         """Entry angle [rad] (D, A, F)."""
-        return self._of_wheels(2)
+        return self.columns[:, self.at.angle]
 
     def drawn(self, points: SigmaPoints) -> Balance:
         """The balance of a posterior's mode and draws (1 + N instead of D), from the balance of its sigma points."""
@@ -94,10 +113,6 @@ class Balance:
         if not self.known.all():
             known = known & (points.drawn(self.known.astype(float)) > 0.5)
         return Balance(self.slip, known, points.drawn(self.columns, self.known[:, None]))
-
-    def _of_wheels(self, quantity: int) -> Array:
-        kinds = self.columns.shape[1] // 3
-        return self.columns[:, 1 + quantity * kinds : 1 + (quantity + 1) * kinds]
 
 
 class Limits(NamedTuple):
@@ -209,12 +224,13 @@ def largest_pull(balance: Balance, limits: Limits) -> Largest:
     best = np.where(usable, balance.pull, -np.inf).argmax(axis=1)
     after = np.minimum(best + 1, last)
     here, there = balance.columns[row, :, best], balance.columns[row, :, after]
-    pull, slip = here[:, 0], balance.slip[best]
-    more = balance.known[row, after] & (there[:, 0] > pull)
-    kinds = len(limits.torque)
-    by_limit = _shares_to_limits(here[:, 1 + kinds :], there[:, 1 + kinds :], limits)
+    at, kinds = balance.at, len(limits.torque)
+    pull, next_pull, slip = here[:, at.pull], there[:, at.pull], balance.slip[best]
+    more = balance.known[row, after] & (next_pull > pull)
+    limited = slice(at.torque.start, at.angle.stop)
+    by_limit = _shares_to_limits(here[:, limited], there[:, limited], limits)
     share = np.where(more, by_limit.min(axis=1), 0.0)
-    pull = pull + share * (there[:, 0] - pull)
+    pull = pull + share * (next_pull - pull)
     slip = slip + share * (balance.slip[after] - slip)
     none = ~usable[row, best]
     cause: Cause = "traction"
@@ -297,8 +313,8 @@ def _columns(pull: Array, at: Iterable[Array]) -> Array:
 def _derivatives_by_slip(table: WheelTable) -> Array:
     """Derivatives by slip of the columns of the level table, with the loads following."""
     axles = table.axles
-    loss = 1.0 - (axles.count * table.by_load[0] * axles.lever).sum(axis=1)
-    pull_by_slip = (axles.count * table.by_slip[0]).sum(axis=1) / loss
+    loss = 1.0 - (axles.count * table.by_load[DRAWBAR] * axles.lever).sum(axis=1)
+    pull_by_slip = (axles.count * table.by_slip[DRAWBAR]).sum(axis=1) / loss
     by_slip = table.by_slip + table.by_load * (axles.lever * pull_by_slip[:, None])
     return _columns(pull_by_slip, by_slip)
 
@@ -311,7 +327,7 @@ def _change_under(table: WheelTable, duty: Duty) -> tuple[Array, NDArray[np.bool
     axles, weight = table.axles, table.axles.weight
     level = pull = np.where(table.balanced, table.pull, 0.0)
     by_pull = axles.lever if duty.draft is None else axles.tilt / weight
-    slope = (axles.count * table.by_load[0] * by_pull).sum(axis=1) - 1.0
+    slope = (axles.count * table.by_load[DRAWBAR] * by_pull).sum(axis=1) - 1.0
     for _ in range(NEWTON_STEPS):
         load = axles.loads(*duty.split(pull, weight))
         pull = pull - (table.pull_at(load) - pull) / slope

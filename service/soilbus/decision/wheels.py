@@ -34,6 +34,8 @@ smaller spread do not determine how pull and angles change."""
 LEAST_POSITIVE = 1e-12
 """Lower bound of a soil parameter before its logarithm is taken, and of the ridge term."""
 MAX_NEWTON_STEPS = 12
+DRAWBAR, TORQUE, ANGLE = range(3)
+"""Places of drawbar pull [N], torque [N m] and entry angle [rad] of a wheel in a table's `at`, `by_load`, `by_slip`."""
 MAX_SINE = 0.99
 """Sine of the steepest slope that is computed."""
 LOAD_RATIO = 0.9
@@ -158,7 +160,7 @@ class WheelTable:
     def pull_at(self, load: Array) -> Array:
         """Pull of the vehicle [N] (..., D, S) with its wheels at other loads (..., D, A, S)."""
         change = load - self.load
-        drawbar = self.at[0] + change * (self.by_load[0] + self.half_second_derivative[0] * change)
+        drawbar = self.at[DRAWBAR] + change * (self.by_load[DRAWBAR] + self.half_second_derivative[DRAWBAR] * change)
         return np.asarray((self.axles.count * drawbar).sum(axis=-2))
 
     def change_at(self, load: Array) -> list[Array]:
@@ -229,7 +231,7 @@ def wheel_table(
             rows = np.flatnonzero((now.step_size > last_step).any(axis=1))
             if not len(rows):
                 break
-            angle[rows] = np.clip(now.at[2, rows], 0.5 * angle[rows], 2.0 * angle[rows]).clip(max=MAX_ENTRY_ANGLE)
+            angle[rows] = np.clip(now.at[ANGLE, rows], 0.5 * angle[rows], 2.0 * angle[rows]).clip(max=MAX_ENTRY_ANGLE)
             of_rows = (
                 soils[rows],
                 axles,
@@ -242,7 +244,7 @@ def wheel_table(
             for whole, part in zip(now, _newton_step(*of_rows), strict=True):
                 whole[(slice(None),) * (part.ndim == 4) + (rows,)] = part
     pull, load, at, by_load, by_slip, slips, step_size = now
-    balanced = np.isfinite(at[2]).all(axis=1) & (load > 0.0).all(axis=1) & (step_size <= last_step)
+    balanced = np.isfinite(at[ANGLE]).all(axis=1) & (load > 0.0).all(axis=1) & (step_size <= last_step)
     of_first = soils[:1], axles, completed.first, slips[:1], load[:1], at[:, :1], by_load[:, :1]
     half_second = _half_second_derivative(*of_first)
     return WheelTable(
@@ -255,7 +257,7 @@ def _extrapolated(start: WheelTable, soils: Array) -> tuple[Array, Array]:
     n_soils, n_slips = start.pull.shape
     logs, other = (np.log(np.maximum(each, LEAST_POSITIVE)) for each in (start.soils, soils))
     with np.errstate(all="ignore"):
-        values = np.concatenate([start.pull, np.log(start.at[2]).reshape(n_soils, -1)], axis=1)
+        values = np.concatenate([start.pull, np.log(start.at[ANGLE]).reshape(n_soils, -1)], axis=1)
     apart, change = logs - logs[0], values - values[0]
     spread = apart.T @ apart
     ridge = RELATIVE_REGULARISATION * np.trace(spread) + LEAST_POSITIVE
@@ -289,19 +291,21 @@ def _newton_step(
     by_load[:2] += d.by_load[1:]
     by_slip = -by_carried * d.by_slip[0]
     by_slip[:2] += d.by_slip[1:]
-    off = load - forces[0]
-    by_torque = np.where(axles.driven, 0.0, -by_slip / by_slip[1])  # of the slip change that makes the torque zero
-    rolled = forces[2] + by_carried[1] * off
-    rolled_by_load = by_load[1].copy()
+    carried, drawbar, torque = forces
+    off = load - carried
+    by_torque = np.where(axles.driven, 0.0, -by_slip / by_slip[TORQUE])  # of the slip change that makes the torque zero
+    rolled = torque + by_carried[TORQUE] * off
+    rolled_by_load = by_load[TORQUE].copy()
     by_load += by_torque * rolled_by_load
-    gain = (axles.count * axles.lever * by_load[0]).sum(axis=1) - 1.0
-    change = -((axles.count * (forces[1] + by_carried[0] * off + by_torque[0] * rolled)).sum(axis=1) - pull) / gain
+    gain = (axles.count * axles.lever * by_load[DRAWBAR]).sum(axis=1) - 1.0
+    next_drawbar = drawbar + by_carried[DRAWBAR] * off + by_torque[DRAWBAR] * rolled
+    change = -((axles.count * next_drawbar).sum(axis=1) - pull) / gain
     shift = axles.lever * change[:, None]
     step = off + shift
-    slower = np.where(axles.driven, 0.0, (rolled + rolled_by_load * shift) / by_slip[1])
+    slower = np.where(axles.driven, 0.0, (rolled + rolled_by_load * shift) / by_slip[TORQUE])
     at = by_carried * off + by_load * shift + by_torque * rolled
     at[:2] += forces[1:]
-    at[2] += angle
+    at[ANGLE] += angle
     step_size = np.maximum(np.abs(change), np.abs(step).max(axis=1))
     slip = np.clip(slip - slower, -MAX_ROLLING_SKID, None)
     return _Step(pull + change, load + shift, at, by_load, by_slip * axles.driven, slip, step_size)
@@ -315,9 +319,9 @@ def _half_second_derivative(
     linear = at + change * by_load
     with np.errstate(all="ignore"):
         forces = model.forces(
-            _state(soil, axles, slip, np.clip(linear[2], 0.0, MAX_ENTRY_ANGLE)), ~axles.front, load + change
+            _state(soil, axles, slip, np.clip(linear[ANGLE], 0.0, MAX_ENTRY_ANGLE)), ~axles.front, load + change
         )
-        exact = np.stack([forces[1], forces[2], linear[2]]) + by_load * (load + change - forces[0])
+        exact = np.stack([forces[1], forces[2], linear[ANGLE]]) + by_load * (load + change - forces[0])
         return np.asarray((exact - linear) / change**2 * axles.driven)
 
 
