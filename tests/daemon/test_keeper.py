@@ -20,7 +20,7 @@ from soilbus.daemon.service import TICK, Service
 from soilbus.daemon.state_persistence import FILE, PERIOD, StatePersistence
 from soilbus.daemon.state_store import Owner, read
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.tracker import PERSISTENCE
+from soilbus.estimation.tracker import GAIN_CORRELATION_TIME
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
@@ -166,7 +166,7 @@ def test_a_belief_keeps_its_age_until_there_is_a_new_one(tmp_path: Path):
         second.tick(clock(), other, dict)
         assert stored(tmp_path).gaussian.at == began + 560.0
     clock.now -= 1e6
-    assert keeper_in(tmp_path, clock).recalled.elapsed == PERSISTENCE
+    assert keeper_in(tmp_path, clock).recalled.elapsed == GAIN_CORRELATION_TIME
 
 
 def test_a_belief_that_cannot_be_is_not_stored(tmp_path: Path):
@@ -183,7 +183,7 @@ def test_a_run_leaves_what_it_learnt_and_the_next_one_knows_the_sensors(recordin
     clock = FakeClock()
     service, _ = service_with(keeper_in(tmp_path, clock), clock, recording)
     run(service, clock, DURATION)
-    learnt = service._solver.estimator.tracker.newest
+    learnt = service._solver.estimator.tracker.newest_posterior
     service.stop()
     service.run()
     state = stored(tmp_path)
@@ -196,7 +196,7 @@ def test_a_run_leaves_what_it_learnt_and_the_next_one_knows_the_sensors(recordin
         service, wire = service_with(kept, clock, recording)
         run(service, clock, DURATION)
         assert first_verdict(wire) >= CONFIG.estimator.window  # what is known of sensors is no window
-        gains = service._solver.estimator.tracker.newest.gains
+        gains = service._solver.estimator.tracker.newest_posterior.gains
     assert not np.array_equal(gains, learnt.gains)
 
 

@@ -28,7 +28,7 @@ def tried(case) -> Trial:
 
 
 @pytest.mark.parametrize("start", VISIBLE)
-def test_a_hidden_effect_is_named_whatever_its_formula(start):
+def test_a_hidden_effect_is_named_by_any_formula(start):
     case = the_case(start)
     trial = tried(case)
     assert trial.verdict == "named"
@@ -37,7 +37,7 @@ def test_a_hidden_effect_is_named_whatever_its_formula(start):
     assert abs(trial.bearing_after) < max(0.15, abs(trial.bearing_before))
 
 
-def test_effects_alike_are_told_as_a_set():
+def test_effects_alike_are_reported_as_a_set():
     case = the_case("single/slip_sinkage:factor/medium/")
     trial = tried(case)
     assert trial.verdict == "ambiguous"

@@ -373,7 +373,7 @@ class Drive:
                 raise ZeroDivisionError
             tracked = self.of_soft if known.soft else self.tracked
             assert tracked is not None
-            estimator.tracker._newest = tracked.fit.reported
+            estimator.tracker._newest_posterior = tracked.fit.reported
             return tracked_at(tracked, window, since=end - self.config.estimator.window, mismatch=known.blind)
 
         if self.tracked is not None:

@@ -113,7 +113,7 @@ class Service:
         """In the worker: the estimator, with what was known before."""
         estimator, keeper = self._pipeline.estimator, self._opened_keeper()
         if keeper is not None and keeper.recalled is not None:
-            estimator.tracker.recall(*keeper.recalled)
+            estimator.tracker.start_from_last_run(*keeper.recalled)
         self._keeper = keeper
         return estimator
 

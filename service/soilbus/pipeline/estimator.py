@@ -27,13 +27,13 @@ from soilbus.decision.traction_loss import NO_LOSS, idle, motion_of, observed
 from soilbus.decision.traversability import Status, Traversability
 from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.wheels import WheelTable
-from soilbus.estimation.assembly import completion_of, form_of, model_of, prior_of, rig_of
+from soilbus.estimation.assembly import effects_and_parameters_of, form_of, model_of, prior_of, rig_of
 from soilbus.estimation.measurements import gain_names
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.nuisance_parameters import active_at
 from soilbus.estimation.posterior import Estimate, Posterior, SoilPrior
 from soilbus.estimation.soil_classes import SoilClasses, guessed
-from soilbus.estimation.tracker import MIN_ROWS, Ground, Settings, Tracker, TrackerOutput
+from soilbus.estimation.tracker import MIN_ROWS, Settings, Tracker, TrackerOutput, TrackerState
 from soilbus.estimation.window import Rig, Window
 from soilbus.pipeline.excitation import excitation_of
 from soilbus.pipeline.intake import WindowTask
@@ -94,7 +94,7 @@ class WindowEstimator:
     def __init__(self, config: Config) -> None:
         self.config = config
         self.rig, self.prior, self.model = rig_of(config), prior_of(config), model_of(config)
-        self._completion = completion_of(config)
+        self._completion = effects_and_parameters_of(config)
         self._settings = config.estimator
         self._wheels: WheelTable | None = None
         self._gap = GapWatch(config.estimator.window, config.estimator.hop)
@@ -134,7 +134,7 @@ class WindowEstimator:
     def estimate(self, task: WindowTask) -> Undecided:
         """Soil and status of one window; windows in their order."""
         if task.fresh:
-            self._tracker.forget()
+            self._tracker.reset()
         tracked = self._tracker.estimate(task.window, task.end)
         fit = tracked.fit
         status, reason = self._status(task, tracked)
@@ -170,7 +170,7 @@ class WindowEstimator:
         model = self._present_model(task.window, tracked, effects)
         window = _with_true_draft(task.window, effects, self.rig)
         demand = present_demand(window, self.rig.chassis, self._settings.hop, self._draft_gain(tracked))
-        here = tracked.ground not in (Ground.CHANGING, Ground.SETTLING)
+        here = tracked.state not in (TrackerState.SUSPECT, TrackerState.TRANSITION)
         limit = self._torque_limit(task, window)
         known = None if own is None else Posterior(own.soil, model.with_form(own.log_covariance))
         return Undecided(result, known, demand, limit, window, task.fresh, model, here)
@@ -285,8 +285,8 @@ class WindowEstimator:
     def _soil_class(self, posterior: Posterior | None) -> dict[str, float] | None:
         if posterior is None or self._classes is None:
             return None
-        here = self._tracker.here
-        return self._classes.probabilities(posterior, self._class_prior if here is self.prior else here)
+        soil_prior = self._tracker.soil_prior
+        return self._classes.probabilities(posterior, self._class_prior if soil_prior is self.prior else soil_prior)
 
     def _sinkage(self, fit: Fit | None) -> dict[str, float | None]:
         if fit is None:
@@ -348,7 +348,7 @@ class WindowEstimator:
 
     def _too_little_of_new_soil(self, tracked: TrackerOutput, end: float) -> bool:
         """Whether too little of the window is on the new soil."""
-        if tracked.ground in (Ground.CHANGING, Ground.SETTLING):
+        if tracked.state in (TrackerState.SUSPECT, TrackerState.TRANSITION):
             return True
         return tracked.since > end - self.config.traversability.min_share * self._settings.window
 
@@ -382,7 +382,7 @@ def _widening(tracked: TrackerOutput, fit: Fit) -> float:
 
 def _with_form(own: Posterior, fit: Fit, prior: SoilPrior) -> Posterior:
     """A posterior with the second moments due to the model's form added, about the same soil."""
-    return own if fit.form is None else own.beside(fit.form.log_covariance, prior, fit.form.log_shift)
+    return own if fit.form is None else own.with_added_covariance(fit.form.log_covariance, prior, fit.form.log_shift)
 
 
 def _with_true_draft(window: Window, effects: Sequence[Active], rig: Rig) -> Window:

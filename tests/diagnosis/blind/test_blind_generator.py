@@ -95,7 +95,7 @@ def test_every_effect_of_the_catalogue_and_five_others_are_hidden():
     assert 0.3 < np.mean([case.with_sinkage for case in singles]) < 0.7
 
 
-def test_the_diagnosis_is_told_neither_effect_nor_soil():
+def test_the_diagnosis_knows_neither_effect_nor_soil():
     for kind in KINDS:
         for case in cases(kind, 2):
             assert case.config.model.effects == []

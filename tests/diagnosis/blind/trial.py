@@ -29,7 +29,7 @@ class Trial:
     with probabilities.  visible: what the recording shows of the effect, of two effects of
     the less visible one beside the other, and true_gap what it leaves unexplained, by the generator
     alone (visible.py; 0 and 1 where nothing is hidden).  A diagnosis that fails has the verdict FAILED and no names.
-    bearing_*: relative errors of the bearing pressure; bearing_sd the told relative deviation in the end.
+    bearing_*: relative errors of the bearing pressure; bearing_sd the relative deviation reported in the end.
     """
 
     id: str
@@ -78,14 +78,14 @@ def tried(case: Case, candidates: Sequence[Effect] = tuple(CATALOGUE.values()), 
     if truth is None:
         truth = shown(case) if case.parts else NOTHING
     begin = time.process_time()
-    told: dict[str, Any] = FAILED
+    reported: dict[str, Any] = FAILED
     try:
         found = diagnose([record], prior, list(candidates))
     except (NotFitted, np.linalg.LinAlgError):
         pass
     else:
         before, after = (_bearing(case, soil) for soil in (found.soil_before(0), found.soil_after(0)))
-        told = {
+        reported = {
             "verdict": str(found.verdict),
             "named": tuple(a.effect.name for a in found.additions),
             "sets": tuple({a.effect.name: a.probability} | a.alternatives for a in found.additions),
@@ -108,7 +108,7 @@ def tried(case: Case, candidates: Sequence[Effect] = tuple(CATALOGUE.values()), 
         visible=truth.energy,
         true_gap=truth.gap,
         seconds=time.process_time() - begin,
-        **told,
+        **reported,
     )
 
 
@@ -124,6 +124,6 @@ def _bearing(case: Case, soil: Posterior) -> Estimate:
     return soil.bearing_pressure(settings.z_ref, settings.b_ref)
 
 
-def _bearing_error(case: Case, told: Estimate) -> float:
+def _bearing_error(case: Case, reported: Estimate) -> float:
     settings = case.config.estimator
-    return float(np.log(told.value / case.soil.bearing_pressure(settings.z_ref, settings.b_ref)))
+    return float(np.log(reported.value / case.soil.bearing_pressure(settings.z_ref, settings.b_ref)))
