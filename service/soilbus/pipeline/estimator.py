@@ -94,7 +94,7 @@ class WindowEstimator:
     def __init__(self, config: Config) -> None:
         self.config = config
         self.rig, self.prior, self.model = rig_of(config), prior_of(config), model_of(config)
-        self._completion = effects_and_parameters_of(config)
+        self._effects_and_parameters = effects_and_parameters_of(config)
         self._settings = config.estimator
         self._wheels: WheelTable | None = None
         self._gap = GapWatch(config.estimator.window, config.estimator.hop)
@@ -115,7 +115,7 @@ class WindowEstimator:
                 settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift, least,
                 form_of(config), settings.search_rate, settings.search_burst,
             ),
-            *self._completion,
+            *self._effects_and_parameters,
         )  # fmt: skip
 
     @property
@@ -246,9 +246,9 @@ class WindowEstimator:
 
     def _effects(self, fit: Fit | None) -> list[Active]:
         """The effects with their fitted parameters, or without a fit as configured."""
-        effects, free = self._completion
-        pulls = np.zeros(len(free)) if fit is None else fit.gains[len(fit.gains) - len(free) :]
-        return active_at(effects, free, pulls, len(self.rig.wheels))
+        effects, free = self._effects_and_parameters
+        standardised = np.zeros(len(free)) if fit is None else fit.gains[len(fit.gains) - len(free) :]
+        return active_at(effects, free, standardised, len(self.rig.wheels))
 
     def _present_model(self, window: Window, tracked: TrackerOutput, effects: Sequence[Active]) -> UncertainModel:
         """The model for the decision, at the window's usual speed."""
@@ -257,7 +257,7 @@ class WindowEstimator:
             return UncertainModel.over(CompletedModel.of(self.model, effects, speed))
         widening = _widening(tracked, fit)
         return UncertainModel.of(
-            self.model, *self._completion, fit.reported, len(self.rig.wheels), speed, widening, fit.form
+            self.model, *self._effects_and_parameters, fit.reported, len(self.rig.wheels), speed, widening, fit.form
         )
 
     def _widened_posterior(self, tracked: TrackerOutput, fit: Fit) -> Posterior:
