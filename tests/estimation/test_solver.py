@@ -162,7 +162,7 @@ def bulldozed(simulated):
     rig, config = rig_of(case.config), case.config
     plain = ObservationModelWithEffects(case.window, rig, model_of(config), config.estimator.min_speed)
     effect = CATALOGUE["bulldozing"]
-    return plain.completed([effect], parameters_of(effect, plain.n_wheels)), case.prior
+    return plain.with_effects([effect], parameters_of(effect, plain.n_wheels)), case.prior
 
 
 def test_parameters_of_effects_stay_inside_their_ranges(bulldozed):
@@ -184,7 +184,7 @@ def test_solved_entry_angles_carry_the_loads_with_effects(simulated):
     case = simulated(SOILS["loam"], 12)
     plain = ObservationModelWithEffects(case.window, rig_of(case.config), model_of(case.config), 0.2)
     effect = CATALOGUE["multipass"]
-    problem = plain.completed([effect], parameters_of(effect, plain.n_wheels))
+    problem = plain.with_effects([effect], parameters_of(effect, plain.n_wheels))
     gains = np.concatenate([np.zeros(problem.n_sensors), [1.0, 0.5, 0.3, -0.8]])
     objective = Objective(problem, case.prior, Gaussian.of(case.prior, problem.gain_std))
     iterate = objective.start(np.asarray(SOILS["loam"]), gains=gains)
