@@ -26,6 +26,8 @@ from soilbus.files import placed
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.sensors import channel_rng
 
+__all__ = ["START", "Payload", "encoded", "frames", "write_log"]
+
 START = 1_700_000_000.0
 """Time stamp [s] of a recording's first instant: logs hold wall clock time."""
 _JITTER = 1e-3

@@ -31,6 +31,8 @@ from soilbus.terra.vehicle import axle_loads
 from soilbus.terra.wheel import Soil, WheelModel, sinkage
 from soilbus.validation.monte_carlo import Each, missed
 
+__all__ = ["SOILS", "DraftFigures", "DraftTrial", "Task", "draft_trials", "figures", "trial", "true_largest_draft"]
+
 SOILS = ("rubicon_sandy_loam_43", "north_gower_clayey_loam_46", "upland_sandy_loam_51")
 SPREAD = 0.1
 """Sd of the logarithms by which a drive's soil parameters leave those of the named soil."""

@@ -49,6 +49,22 @@ from soilbus.validation.cramer_rao import cramer_rao
 from soilbus.validation.importance_sampling import samples
 from soilbus.workers import workers
 
+__all__ = [
+    "ROUGHLY_KNOWN",
+    "Cell",
+    "Each",
+    "Exact",
+    "Task",
+    "Trial",
+    "as_json",
+    "missed",
+    "monte_carlo",
+    "processes",
+    "summary",
+    "tasks_of",
+    "trials",
+]
+
 SOILS = ("loam", "wet_clay", "dry_sand")
 DURATIONS = (2.0, 10.0, 60.0)
 SLIP = Swing(0.05, 0.40)
