@@ -19,14 +19,16 @@ from soilbus.simulator.reference import reference_configuration
 
 FULL_BUS = 7500.0
 PAGE = 4096
+STATUS = output_database(reference_configuration()).get_message_by_name("SoilbusStatus")
 
 
 class Babbler:
-    """The same frame all the time, as fast as 1 Mbit/s carries it; keeps when what was sent."""
+    """The same frame all the time, as fast as 1 Mbit/s carries it; keeps when what was sent, and the last status."""
 
     def __init__(self, clock: FakeClock, identifier: int) -> None:
         self.clock, self.identifier, self.sent, self.given = clock, identifier, [], 0
         self.next = clock.now
+        self.status: bytes | None = None
 
     def recv(self, timeout: float) -> Received | None:
         if self.next > self.clock.now + timeout:
@@ -41,6 +43,8 @@ class Babbler:
 
     def send(self, message: can.Message) -> None:
         self.sent.append((self.clock.now, message.arbitration_id))
+        if message.arbitration_id == STATUS.frame_id:
+            self.status = bytes(message.data)
 
     def shutdown(self) -> None:
         pass
@@ -72,4 +76,5 @@ def test_a_babbling_input_leaves_beat_and_memory_as_they_are():
     assert max(b - a for a, b in itertools.pairwise(verdicts)) < 0.11
     assert service.deadline_misses == 0
     assert memory[-1] - memory[12] < 2**20  # one window is full
-    assert service._state[1].startswith("input_missing")
+    assert wire.status is not None
+    assert STATUS.decode(wire.status)["Reason"] == "input_missing"

@@ -16,9 +16,12 @@ from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import output_database
 from soilbus.can.publish import Publisher
-from soilbus.report.dashboard import WIDTH, panel, show
+from soilbus.report.dashboard import panel, show
 from soilbus.report.received_frames import Readings
 from soilbus.simulator.reference import reference_configuration
+
+WIDTH = 80
+"""Columns of the narrowest terminal."""
 
 
 @pytest.fixture

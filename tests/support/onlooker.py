@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -32,7 +33,8 @@ from soilbus.daemon.service import Service
 from soilbus.daemon.state_persistence import StatePersistence
 from soilbus.daemon.state_store import Owner
 from soilbus.decision.traversability import Status
-from soilbus.estimation.tracker import TrackerOutput
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.tracker import Tracker, TrackerOutput
 from soilbus.estimation.window import Window
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask
@@ -320,6 +322,30 @@ class Handed(NamedTuple):
 NO_WINDOW = Handed(-1, -math.inf, NOTHING, True)
 
 
+class TrueTracker(Tracker):
+    """A tracker that says of each window what a drive knows to be true, and shows the drive what it recalls."""
+
+    def __init__(self, drive: Drive, *args: Any) -> None:
+        self.drive, self.said = drive, None
+        super().__init__(*args)
+
+    @property
+    def newest(self) -> Gaussian | None:
+        return self.said
+
+    def forget(self) -> None:
+        super().forget()
+        self.said = None
+
+    def recall(self, gaussian: Gaussian, elapsed: float) -> None:
+        self.drive.recalled = gaussian, elapsed
+
+    def estimate(self, window: Window, end: float) -> TrackerOutput:
+        tracked = self.drive.truth(window, end)
+        self.said = tracked.fit.reported
+        return tracked
+
+
 class Drive:
     """A service on a wire, and what an onlooker knows of its windows.
 
@@ -339,12 +365,14 @@ class Drive:
         self.go = 0
         self.last: dict[str, Any] = {}
         self.interrupted = self.halted_until = -math.inf
+        self.recalled: tuple[Gaussian, float] | None = None
+        """What the service took over from the one before, and its age [s]."""
         self.start()
 
     def start(self) -> None:
         """A service that begins with the state that the one before has left behind."""
         pipeline = Pipeline(self.config, IN)
-        pipeline.new_estimator = lambda: self.content(WindowEstimator(self.config))
+        pipeline.new_estimator = self.estimator
         owner = Owner.of(self.config, pipeline.intake.channels, IN)
         keeper = StatePersistence(
             Path(self.folder.name), owner, InlineExecutor(), lambda: self.clock.now + self.wire.offset
@@ -364,21 +392,18 @@ class Drive:
         self.service.stop()
         self.service.run()
 
-    def content(self, estimator: WindowEstimator) -> WindowEstimator:
-        """An estimator whose tracker says of each window what is true of the ground at its end."""
+    def estimator(self) -> WindowEstimator:
+        """One whose tracker says of each window what is true of the ground at its end, or a real one."""
+        return WindowEstimator(self.config, Tracker if self.tracked is None else partial(TrueTracker, self))
 
-        def estimate(window, end):
-            known = self.handed[end].known
-            if known.raises:
-                raise ZeroDivisionError
-            tracked = self.of_soft if known.soft else self.tracked
-            assert tracked is not None
-            estimator.tracker._newest = tracked.fit.reported
-            return tracked_at(tracked, window, since=end - self.config.estimator.window, mismatch=known.blind)
-
-        if self.tracked is not None:
-            estimator.tracker.estimate = estimate
-        return estimator
+    def truth(self, window: Window, end: float) -> TrackerOutput:
+        """What the tracker says of a window."""
+        known = self.handed[end].known
+        if known.raises:
+            raise ZeroDivisionError
+        tracked = self.of_soft if known.soft else self.tracked
+        assert tracked is not None
+        return tracked_at(tracked, window, since=end - self.config.estimator.window, mismatch=known.blind)
 
     def open(self):
         if self.wire.lost:

@@ -37,6 +37,7 @@ from soilbus.pipeline.states import ServiceState, state_after
 if TYPE_CHECKING:
     from soilbus.daemon.state_persistence import StatePersistence
     from soilbus.decision.capability import OverSlip
+    from soilbus.estimation.gaussian import Gaussian
     from soilbus.pipeline.estimator import WindowEstimator
 
 log = logging.getLogger(__name__)
@@ -122,6 +123,11 @@ class Service:
         """Windows solved since the start."""
         return self._backlog.solved
 
+    @property
+    def newest(self) -> Gaussian | None:
+        """Posterior that the next window's prior comes from, as the state file keeps it; None before there is one."""
+        return self._solver.newest
+
     def stop(self) -> None:
         """Let `run` return after the present round; safe to call from a signal handler."""
         self._stopping = True
@@ -137,7 +143,7 @@ class Service:
         self._backlog.close()
         self.bus.close()
         if self._keeper is not None:
-            self._keeper.close(self._solver.newest, self._totals())
+            self._keeper.close(self.newest, self._totals())
 
     def step(self) -> None:
         """Receive until the next tick, then hand out, collect and publish what is due."""
@@ -242,7 +248,7 @@ class Service:
             self._next_watchdog = now + interval
             self.notifier.watchdog()
         if self._keeper is not None:
-            self._keeper.tick(now, self._solver.newest, self._totals)
+            self._keeper.tick(now, self.newest, self._totals)
 
     def _look_after_health(self, now: float) -> None:
         hears = self.bus.is_open and now - self._time.last_frame <= SILENCE

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -60,9 +60,12 @@ class Undecided:
 
 
 class WindowEstimator:
-    """Solves one window after the other: the tracker's soil, its status, the decision."""
+    """Solves one window after the other: the tracker's soil, its status, the decision.
 
-    def __init__(self, config: Config) -> None:
+    `tracker_of` makes the tracker from the arguments of `Tracker`; a test gives one whose soil is known.
+    """
+
+    def __init__(self, config: Config, tracker_of: Callable[..., Tracker] = Tracker) -> None:
         self.config = config
         self.rig, self.prior, self.model = rig_of(config), prior_of(config), model_of(config)
         self._completion = completion_of(config)
@@ -79,7 +82,7 @@ class WindowEstimator:
         self._guess = guessed(self.prior, prior_of(Config()))
         settings = config.estimator
         least = MIN_ROWS if config.table is None else 1  # a table's rows are chosen with care, and few
-        self._tracker = Tracker(
+        self._tracker = tracker_of(
             self.rig, self.prior, self.model,
             Settings(
                 settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift, least,

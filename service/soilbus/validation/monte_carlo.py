@@ -57,6 +57,7 @@ __all__ = [
     "Task",
     "Trial",
     "as_json",
+    "driven",
     "missed",
     "monte_carlo",
     "processes",
@@ -224,13 +225,13 @@ def trials(task: Task) -> tuple[Trial, Trial]:
 
     Raises SimulationError where the tractor cannot drive on, KeyError for an unknown soil.
     """
-    recording, soil = _driven(task)
+    recording, soil = driven(task)
     prior = missed(prior_of(task.config), soil, np.random.default_rng([task.seed, 1]))
     with_sinkage, without = (_trial(recording, task, prior, soil, fitted) for fitted in (True, False))
     return with_sinkage, without
 
 
-def _driven(task: Task) -> tuple[Recording, Soil]:
+def driven(task: Task) -> tuple[Recording, Soil]:
     """The drive and its soil: the named one, or the first drawn around it on which the tractor gets on."""
     config, name, duration, seed, _, around = task
     rng, named = np.random.default_rng([seed, 3]), soil_named(name)
