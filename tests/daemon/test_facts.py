@@ -13,8 +13,7 @@ import can
 import numpy as np
 import pytest
 
-from fakes import FakeClock, InlineExecutor, ScriptedBus
-from feeding import feed_message
+from fakes import FakeClock, InlineExecutor, ScriptedBus, feed_message
 from in_vain import (
     STANDS,
     TRIES,

@@ -6,24 +6,18 @@ import errno
 import itertools
 import logging
 import re
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 
 import can
 import pytest
 
-from fakes import FakeClock, InlineExecutor, ScriptedBus
-from soilbus.can.bus import BusError, LiveBus
+from fakes import Bench, FakeClock, HeldExecutor, drive_messages
 from soilbus.can.dbc_files import load_databases, output_database
-from soilbus.can.publish import Publisher
 from soilbus.daemon.health import Health
-from soilbus.daemon.service import Service
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.pipeline import Pipeline
-from soilbus.simulator.frames import frames
-from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
-from soilbus.simulator.scenario import excited
 
 WINDOW = 8.0
 CONFIG = reference_configuration([f"estimator.window={WINDOW}"])
@@ -61,19 +55,10 @@ class Systemd:
         return max(b - a for a, b in itertools.pairwise(fed)) > WATCHDOG
 
 
-class Worker(InlineExecutor):
-    """Does the work at once, or never."""
-
-    hangs = False
-
-    def submit(self, fn, /, *args, **kwargs):
-        return Future() if self.hangs else super().submit(fn, *args, **kwargs)
-
-
 @pytest.fixture(scope="module")
 def drive():
     """Frames of a good drive."""
-    return list(frames(simulate(CONFIG, excited("loam", 16.0), seed=3), CONFIG))
+    return drive_messages(CONFIG, 16.0)
 
 
 @pytest.fixture(scope="module")
@@ -82,15 +67,12 @@ def moments(drive):
     return [m for m in drive if m.timestamp < drive[0].timestamp + 4.0]
 
 
-class Bench:
-    """A service with these frames, or with them over and over for so many seconds."""
+class WatchedBench(Bench):
+    """A service that systemd watches, with these frames, or with them over and over for so many seconds."""
 
     def __init__(self, moments, seconds: float = 0.0, worker: Executor | None = None) -> None:
-        self.clock, self.away = FakeClock(), False
-        self.systemd = Systemd(self.clock)
-        self.wire = ScriptedBus(self.clock, list(over_and_over(moments, seconds)) if seconds else moments)
-        pipeline = Pipeline(CONFIG, DATABASE)
-        self.estimator = pipeline.estimator
+        clock, pipeline = FakeClock(), Pipeline(CONFIG, DATABASE)
+        self.systemd, self.estimator = Systemd(clock), pipeline.estimator
         self.made = 0
         """Estimators in place of the first one."""
         self.replacement: WindowEstimator | None = None
@@ -102,31 +84,8 @@ class Bench:
             return self.replacement or usual()
 
         pipeline.new_estimator = new_estimator
-        bus = LiveBus(self.open, self.clock, self.clock.sleep)
-        self.service = Service(
-            CONFIG, pipeline, bus, Publisher(OUT), self.systemd, worker or InlineExecutor(), self.clock,
-            waiting=self.clock.wait_for,
-        )  # fmt: skip
-
-    def open(self):
-        if self.away:
-            raise BusError("bus can0: no such device", may_come=True)
-        return self.wire
-
-    def run(self, seconds: float) -> float:
-        """Works on; the time at which that began."""
-        began = self.clock.now
-        while self.clock.now < began + seconds:
-            self.service.step()
-        return began
-
-    def sent(self, name: str, since: float = 0.0) -> list[dict]:
-        wanted = OUT.get_message_by_name(name)
-        return [
-            wanted.decode(bytes(m.data))
-            for t, m in self.wire.sent
-            if m.arbitration_id == wanted.frame_id and t >= since
-        ]
+        messages = over_and_over(moments, seconds) if seconds else moments
+        super().__init__(messages, CONFIG, worker, self.systemd, pipeline=pipeline, clock=clock)
 
 
 def over_and_over(moments, seconds: float):
@@ -141,13 +100,13 @@ def over_and_over(moments, seconds: float):
 
 
 def test_a_good_service_is_left_alone(moments):
-    bench = Bench(moments, 20.0)
+    bench = WatchedBench(moments, 20.0)
     began = bench.run(20.0)
     assert not bench.systemd.would_restart(began)
 
 
 def test_silence_is_no_reason_to_restart(moments):
-    bench = Bench(moments, 5.0)
+    bench = WatchedBench(moments, 5.0)
     began = bench.run(120.0)
     assert not bench.systemd.would_restart(began)
     assert bench.systemd.texts[-1].startswith("listening: no_frames")
@@ -155,7 +114,7 @@ def test_silence_is_no_reason_to_restart(moments):
 
 @pytest.mark.parametrize("at_start", [True, False])
 def test_nor_is_a_bus_that_is_down(moments, at_start):
-    bench = Bench(moments, 5.0)
+    bench = WatchedBench(moments, 5.0)
     bench.away = at_start
     began = bench.run(5.0)
     bench.away = True
@@ -167,7 +126,7 @@ def test_nor_is_a_bus_that_is_down(moments, at_start):
 
 def test_nor_is_a_bus_on_which_nobody_else_is(moments, caplog):
     """Without anybody to acknowledge them, our frames fill the queue."""
-    bench = Bench([])
+    bench = WatchedBench([])
     bench.wire.fail_send += [can.CanOperationError("No buffer space", errno.ENOBUFS)] * 100_000
     began = bench.run(120.0)
     assert bench.service.bus.counts.sent == 0
@@ -175,11 +134,11 @@ def test_nor_is_a_bus_on_which_nobody_else_is(moments, caplog):
 
 
 def test_an_estimator_that_hangs_is_restarted(moments, caplog):
-    worker = Worker()
-    bench = Bench(moments, 60.0, worker)
+    worker = HeldExecutor(holds=False)
+    bench = WatchedBench(moments, 60.0, worker)
     began = bench.run(6.0)
     assert not bench.systemd.would_restart(began)
-    worker.hangs = True
+    worker.holds = True
     hung = bench.run(HARD_WINDOW)
     assert not bench.systemd.would_restart(hung)
     bench.run(WATCHDOG + AT_LEAST)
@@ -195,7 +154,7 @@ def test_an_estimator_that_hangs_is_restarted(moments, caplog):
 
 
 def test_a_sender_that_hangs_on_a_living_bus_is_restarted(moments, caplog):
-    bench = Bench(moments, 60.0)
+    bench = WatchedBench(moments, 60.0)
     bench.run(5.0)
     bench.wire.fail_send += [can.CanOperationError("No buffer space", errno.ENOBUFS)] * 100_000
     mute = bench.run(FULL_BUS)
@@ -235,7 +194,7 @@ def broken(estimator, windows: range):
 
 
 def test_one_defect_costs_one_window(drive, caplog):
-    bench = Bench(drive)
+    bench = WatchedBench(drive)
     broken(bench.estimator, range(6, 7))
     bench.run(WINDOW + 5.5)
     known = bench.estimator.tracker.newest
@@ -259,7 +218,7 @@ def test_one_defect_costs_one_window(drive, caplog):
 
 
 def test_a_defect_in_every_window_is_a_fault_until_an_estimator_that_knows_nothing_heals_it(drive, caplog):
-    bench = Bench(drive)
+    bench = WatchedBench(drive)
     broken(bench.estimator, range(1, 100))
     bench.run(WINDOW + SEVERAL)
     assert "fault" not in {str(f["State"]) for f in bench.sent("SoilbusStatus")}
@@ -274,7 +233,7 @@ def test_a_defect_in_every_window_is_a_fault_until_an_estimator_that_knows_nothi
 
 
 def test_a_fault_that_stays_is_not_logged_window_by_window(drive, caplog):
-    bench = Bench(drive)
+    bench = WatchedBench(drive)
     bench.replacement = bench.estimator
     broken(bench.estimator, range(100))
     bench.run(16.0)

@@ -5,26 +5,19 @@ from __future__ import annotations
 import json
 import logging
 from collections import Counter
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fakes import FakeClock, InlineExecutor, ScriptedBus
-from soilbus.can.bus import LiveBus
+from fakes import Bench, FakeClock, HeldExecutor, InlineExecutor, ScriptedBus, drive_messages
 from soilbus.can.dbc_files import load_databases, output_database
-from soilbus.can.publish import Publisher
-from soilbus.daemon.notify import Notifier
-from soilbus.daemon.service import Service
 from soilbus.daemon.state_persistence import StatePersistence
 from soilbus.daemon.state_store import Owner, read
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.pipeline.pipeline import Pipeline
-from soilbus.simulator.frames import frames
-from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
-from soilbus.simulator.scenario import excited
 
 CONFIG = reference_configuration()
 DATABASE = load_databases(CONFIG)
@@ -37,18 +30,7 @@ MINUTE, DAY = 60.0, 86400.0
 
 @pytest.fixture(scope="module")
 def recording():
-    return list(frames(simulate(CONFIG, excited("loam", DURATION), seed=3), CONFIG))
-
-
-class Hung(Executor):
-    """A disk that never answers."""
-
-    def __init__(self) -> None:
-        self.asked = 0
-
-    def submit(self, fn, /, *args, **kwargs):
-        self.asked += 1
-        return Future()
+    return drive_messages(CONFIG, DURATION)
 
 
 def keeper_in(folder: Path, clock, writer: Executor | None = None) -> StatePersistence:
@@ -61,28 +43,16 @@ def stored(folder: Path):
     return state
 
 
-def service_with(keeper: StatePersistence | None, clock: FakeClock, messages=()) -> tuple[Service, ScriptedBus]:
-    wire = ScriptedBus(clock, messages)
-    bus = LiveBus(lambda: wire, clock, clock.sleep)
-    pipeline = Pipeline(CONFIG, DATABASE)
-    publisher = Publisher(output_database(CONFIG))
-    return Service(
-        CONFIG, pipeline, bus, publisher, Notifier(), InlineExecutor(), clock, opened_keeper=lambda: keeper
-    ), wire
-
-
-def run(service: Service, clock: FakeClock, seconds: float) -> None:
-    end = clock.now + seconds
-    while clock.now < end:
-        service.step()
+def service_with(keeper: StatePersistence | None, clock: FakeClock, messages=()) -> Bench:
+    return Bench(messages, CONFIG, keeper=keeper, pipeline=Pipeline(CONFIG, DATABASE), clock=clock)
 
 
 def test_whenever_it_is_killed_the_state_is_no_older_than_a_minute(tmp_path: Path):
     clock = FakeClock()
-    service, _ = service_with(keeper_in(tmp_path, clock), clock)
+    bench = service_with(keeper_in(tmp_path, clock), clock)
     oldest, writings = 0.0, set()
     for _ in range(1900):  # a killed service leaves what is there now
-        run(service, clock, 0.1)
+        bench.run(0.1)
         at = stored(tmp_path).at
         writings.add(at)
         oldest = max(oldest, 1.7e9 + clock() - at)
@@ -91,11 +61,11 @@ def test_whenever_it_is_killed_the_state_is_no_older_than_a_minute(tmp_path: Pat
 
 
 def test_a_disk_that_hangs_costs_the_loop_nothing(tmp_path: Path):
-    clock, writer = FakeClock(), Hung()
-    service, _ = service_with(keeper_in(tmp_path, clock, writer), clock)
-    run(service, clock, 300.0)
-    assert service.deadline_misses == 0
-    assert writer.asked == 1
+    clock, writer = FakeClock(), HeldExecutor()  # a disk that never answers
+    bench = service_with(keeper_in(tmp_path, clock, writer), clock)
+    bench.run(300.0)
+    assert bench.service.deadline_misses == 0
+    assert len(writer.held) == 1
 
 
 @pytest.mark.parametrize(
@@ -182,8 +152,9 @@ def test_a_belief_that_cannot_be_is_not_stored(tmp_path: Path):
 
 def test_a_run_leaves_what_it_learnt_and_the_next_one_knows_the_sensors(recording, tmp_path: Path):
     clock = FakeClock()
-    service, _ = service_with(keeper_in(tmp_path, clock), clock, recording)
-    run(service, clock, DURATION)
+    bench = service_with(keeper_in(tmp_path, clock), clock, recording)
+    service = bench.service
+    bench.run(DURATION)
     learnt = service.newest
     service.stop()
     service.run()
@@ -194,10 +165,10 @@ def test_a_run_leaves_what_it_learnt_and_the_next_one_knows_the_sensors(recordin
     assert state.totals["bus.sent"] == service.bus.counts.sent
 
     for kept in (None, keeper_in(tmp_path, clock)):
-        service, wire = service_with(kept, clock, recording)
-        run(service, clock, DURATION)
-        assert first_verdict(wire) >= CONFIG.estimator.window  # what is known of sensors is no window
-        gains = service.newest.gains
+        bench = service_with(kept, clock, recording)
+        bench.run(DURATION)
+        assert first_verdict(bench.wire) >= CONFIG.estimator.window  # what is known of sensors is no window
+        gains = bench.service.newest.gains
     assert not np.array_equal(gains, learnt.gains)
 
 

@@ -36,7 +36,7 @@ def message(frame) -> can.Message:
 
 
 def shown(dashboard) -> str:
-    console = Console(width=WIDTH, record=True, file=io.StringIO())
+    console = Console(width=2 * WIDTH, record=True, file=io.StringIO())
     console.print(panel(dashboard))
     return console.export_text()
 

@@ -21,8 +21,7 @@ from typing import Any, NamedTuple
 import can
 import numpy as np
 
-from fakes import FakeClock, InlineExecutor
-from feeding import feed_message
+from fakes import FakeClock, InlineExecutor, drive_messages, feed_message
 from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import load_databases, output_database
@@ -39,10 +38,7 @@ from soilbus.estimation.window import Window
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.pipeline import Pipeline
-from soilbus.simulator.frames import frames
-from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
-from soilbus.simulator.scenario import excited
 from soilbus.terra.soils import SOILS
 
 CONFIG = reference_configuration(["estimator.window=4.0", "traversability.max_age=2.0"])
@@ -76,7 +72,7 @@ def good_moment(seed: int = 3) -> Moment:
     """The last frames of each message in a good drive."""
     config = reference_configuration()
     found: Moment = {}
-    for message in frames(simulate(config, excited("loam", 10.0), seed), config):
+    for message in drive_messages(config, 10.0, seed):
         found.setdefault(message.arbitration_id, []).append(message)
     return {i: messages[-MOMENTS:] for i, messages in found.items()}
 
@@ -88,7 +84,7 @@ def good_tracked(seed: int = 3) -> TrackerOutput:
     estimator, found = pipeline.estimator, []
     usual = estimator.tracker.estimate
     estimator.tracker.estimate = lambda *given: found.append(usual(*given)) or found[-1]
-    messages = list(frames(simulate(config, excited("loam", 12.0), seed), config))
+    messages = drive_messages(config, 12.0, seed)
     for message in messages:
         feed_message(pipeline.admission, message)
     results = pipeline.finish(messages[-1].timestamp)
