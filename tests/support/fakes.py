@@ -155,7 +155,7 @@ class Bench:
             self.results.append, lambda: keeper, self.clock.wait_for,
         )  # fmt: skip
 
-    def _open(self) -> ScriptedBus:
+    def _open(self) -> Any:
         if self.away:
             raise BusError("bus can0: no such device", may_come=True)
         self.wire.closed = False
@@ -170,7 +170,7 @@ class Bench:
 
     def sent(self, name: str, since: float = 0.0) -> list[dict[str, Any]]:
         """The frames of a message that went out, decoded, each with the time `at` which it did."""
-        wanted = self.database.get_message_by_name(name)
+        wanted: Any = self.database.get_message_by_name(name)
         return [
             {"at": t, **wanted.decode(bytes(m.data))}
             for t, m in self.wire.sent
