@@ -6,14 +6,45 @@ import shutil
 import subprocess
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
+from xdist.scheduler import LoadFileScheduling
 
 import guest
 import soilbus  # noqa: F401  # before numpy, which it keeps to one thread
 from availability import unavailable
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
+IN_REAL_TIME = ("tests/bus/", "tests/guest/", "tests/systemd/", "tests/test_demo.py")
+"""What waits for a bus, a guest kernel or a service most of the time."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the tests in real time: one worker waits with them while the others compute."""
+    items.sort(key=lambda item: not _in_real_time(item.nodeid))
+    for item in items:
+        if (item.get_closest_marker("vcan") or item.get_closest_marker("systemd")) and not _in_real_time(item.nodeid):
+            raise pytest.UsageError(f"{item.nodeid} needs a real bus, and only tests in {IN_REAL_TIME} take turns")
+
+
+def _in_real_time(nodeid: str) -> bool:
+    return nodeid.startswith(IN_REAL_TIME)
+
+
+class _TakingTurns(LoadFileScheduling):
+    """Give the tests of a file to one worker, for they share fixtures, and those in real time all to one.
+
+    There is one vcan0, and a second guest kernel beside the first would spoil what is timed in both.
+    """
+
+    def _split_scope(self, nodeid: str) -> str:
+        return "in real time" if _in_real_time(nodeid) else super()._split_scope(nodeid)
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadFileScheduling:
+    """Return the scheduler of pytest-xdist."""
+    return _TakingTurns(config, log)
 
 
 @pytest.fixture(scope="session")

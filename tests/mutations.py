@@ -123,14 +123,15 @@ MUTATIONS = (
     ),
     Mutation(
         "gains never drift", "estimation/tracker.py",
-        "gains = problem.gain_std**2 * min((elapsed + 1.0) / GAIN_MEMORY, 1.0)", "gains = 0.0 * problem.gain_std",
-        ("tests/estimation/test_drift.py::test_gains_are_known_for_minutes_and_not_for_ever",),
+        "gains = problem.gain_std**2 * min((elapsed + 1.0) / GAIN_MEMORY_WINDOWS, 1.0)",
+        "gains = 0.0 * problem.gain_std",
+        ("tests/estimation/test_tracker_drift.py::test_gains_are_known_for_minutes_and_not_for_ever",),
     ),
     Mutation(
         "the soil never drifts", "estimation/tracker.py",
         "gaussian.drifted(self._drift(gaussian, elapsed), gains)",
         "gaussian.drifted(0.0 * self._drift(gaussian, elapsed), gains)",
-        ("tests/estimation/test_drift.py::test_the_soil_of_an_hour_ago_is_no_more_than_another_soil",),
+        ("tests/estimation/test_tracker_drift.py::test_the_soil_of_an_hour_ago_is_no_more_than_another_soil",),
     ),
     Mutation(
         "a state is written through a link", "daemon/state_store.py",
@@ -254,6 +255,7 @@ def _code(copy: Path, tests: Sequence[str]) -> int:
         "pytest",
         "-q",
         "-x",
+        "-n0",
         "-p",
         "no:cacheprovider",
         "-o",

@@ -7,7 +7,7 @@ import pytest
 
 from soilbus.decision.capability import Demand, assess
 from soilbus.decision.uncertain_model import UncertainModel
-from soilbus.estimation.assembly import completion_of, model_of, rig_of
+from soilbus.estimation.assembly import effects_and_parameters_of, model_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.nuisance_parameters import active_at
 from soilbus.estimation.posterior import Posterior
@@ -38,7 +38,7 @@ def given(text: str):
 
 def belief_of(config, seed: int = 3) -> tuple[Gaussian, np.ndarray]:
     """A joint belief with correlations all over, as windows leave it, and its std."""
-    _, free = completion_of(config)
+    _, free = effects_and_parameters_of(config)
     std = np.concatenate([LOG_STD, np.full(SENSORS, 0.005), [float(f.std > 0.0) for f in free]])
     mixed = np.random.default_rng(seed).standard_normal((len(std), 3 * len(std)))
     correlation = np.corrcoef(mixed)
@@ -49,7 +49,7 @@ def belief_of(config, seed: int = 3) -> tuple[Gaussian, np.ndarray]:
 
 def of_draw(config, gaussian, draw, torque_limit, demand):
     """The capability of one soil with one set of effects, both exactly known."""
-    effects, free = completion_of(config)
+    effects, free = effects_and_parameters_of(config)
     model = CompletedModel.of(model_of(config), active_at(effects, free, draw[6 + SENSORS :], 4), SPEED)
     known = Posterior(Soil(*np.exp(draw[:6]).tolist()), np.zeros((6, 6)))
     return assess(known, rig_of(config), model, demand, torque_limit, 0.6, 0.3)[0]
@@ -61,7 +61,7 @@ def test_deviations_with_effects_equal_monte_carlo(name):
     gaussian, _ = belief_of(config)
     torque_limit = np.full(4, 1300.0 if name == "drivetrain_loss" else np.nan)
     demand = Demand(2500.0, 20.0, 0.03)
-    uncertain = UncertainModel.of(model_of(config), *completion_of(config), gaussian, 4, SPEED)
+    uncertain = UncertainModel.of(model_of(config), *effects_and_parameters_of(config), gaussian, 4, SPEED)
     able, _ = assess(gaussian.posterior, rig_of(config), uncertain, demand, torque_limit, 0.6, 0.3)
     held, _ = assess(gaussian.posterior, rig_of(config), uncertain.mean, demand, torque_limit, 0.6, 0.3)
     mean = np.concatenate([np.log(gaussian.soil), gaussian.gains])

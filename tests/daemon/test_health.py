@@ -197,17 +197,17 @@ def test_one_defect_costs_one_window(drive, caplog):
     bench = WatchedBench(drive)
     broken(bench.estimator, range(6, 7))
     bench.run(WINDOW + 5.5)
-    known = bench.estimator.tracker.newest
+    known = bench.estimator.tracker.newest_posterior
     assert known is not None
     assert bench.service.windows == 6
     bench.run(1.0)
-    assert bench.estimator.tracker.newest is known
+    assert bench.estimator.tracker.newest_posterior is known
     assert bench.service.failures["internal"] == 1
     assert bench.sent("Traversability")[-1]["State"] == "unknown"
     assert str(bench.sent("SoilStrength")[-1]["Status"]) == "invalid"
     bench.run(1.0)
     assert "failed solves: internal 1" in bench.systemd.texts[-1]
-    assert bench.estimator.tracker.newest is not known
+    assert bench.estimator.tracker.newest_posterior is not known
     assert bench.sent("Traversability")[-1]["State"] == "go"
     assert bench.service.failures["internal"] == 1
     assert all(f["State"] != "fault" for f in bench.sent("SoilbusStatus"))

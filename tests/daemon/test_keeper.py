@@ -155,7 +155,7 @@ def test_a_run_leaves_what_it_learnt_and_the_next_one_knows_the_sensors(recordin
     bench = service_with(keeper_in(tmp_path, clock), clock, recording)
     service = bench.service
     bench.run(DURATION)
-    learnt = service.newest
+    learnt = service.newest_posterior
     service.stop()
     service.run()
     state = stored(tmp_path)
@@ -168,7 +168,7 @@ def test_a_run_leaves_what_it_learnt_and_the_next_one_knows_the_sensors(recordin
         bench = service_with(kept, clock, recording)
         bench.run(DURATION)
         assert first_verdict(bench.wire) >= CONFIG.estimator.window  # what is known of sensors is no window
-        gains = bench.service.newest.gains
+        gains = bench.service.newest_posterior.gains
     assert not np.array_equal(gains, learnt.gains)
 
 

@@ -277,9 +277,12 @@ def test_a_table_of_few_rows_learns_from_two_thirds_spread_over_all_slips(tmp_pa
     first = {k: v[:7] for k, v in measured.items()}
     recordings = recordings_of_tables(rig(), [write_csv(tmp_path / "t.csv", first)])
     (record,) = recordings.records
-    assert (record.learned.n, record.checked.n, recordings.too_short) == (5, 2, ())
+    assert (record.training.n, record.held_out.n, recordings.too_short) == (5, 2, ())
     assert (
-        record.learned.slip.min() < record.checked.slip.min() <= record.checked.slip.max() < record.learned.slip.max()
+        record.training.slip.min()
+        < record.held_out.slip.min()
+        <= record.held_out.slip.max()
+        < record.training.slip.max()
     )
     with pytest.raises(TooLittle, match="4 usable rows are too few"):
         recordings_of_tables(rig(), [write_csv(tmp_path / "s.csv", {k: v[:4] for k, v in measured.items()})])

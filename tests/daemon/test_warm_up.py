@@ -64,7 +64,7 @@ def test_all_that_a_valid_window_takes_is_rehearsed(path):
 def test_a_start_rehearses_and_knows_nothing_of_it(started):
     service, rehearsals = started(reference_configuration(VIRTUAL))
     assert len(rehearsals) == 1
-    assert service.newest is None
+    assert service.newest_posterior is None
     assert service.intake.last_seen == {}
     assert service.intake.admission.counts.received.total() == 0
     counters = {name: service.publisher.frame(name, {}).data for name in ("Traversability", "SoilStrength")}

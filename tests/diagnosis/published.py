@@ -1,7 +1,7 @@
 """`PYTHONPATH=service python -m tests.diagnosis.published`: what the model misses on published single-wheel points.
 
 The points are ../shared/field/single-wheel-published.csv: five or six rows a wheel, traced
-by eye from figures.  So each line tells what these few rows say under the errors assumed in
+by eye from figures.  So each line says what these few rows show under the errors assumed in
 rigs/*.toml, and no more.  Where the soil is from the other wheel, soil and effects are known
 beforehand as that wheel's fit left them: what is missing then is what differs between the two.
 """
@@ -75,19 +75,19 @@ def configuration(rig: str, wheel: str, errors: float = 1.0) -> Config:
     return load_config(RIGS / f"{rig}.toml", changes)
 
 
-def diagnosed(rig: str, wheel: str, errors: float, points: Path, told: FittedModel | None = None) -> Diagnosis:
-    """The diagnosis of one wheel's points; `told` is what another wheel told of the same soil."""
+def diagnosed(rig: str, wheel: str, errors: float, points: Path, other_wheel: FittedModel | None = None) -> Diagnosis:
+    """The diagnosis of one wheel's points; `other_wheel` is the model fitted to another wheel on the same soil."""
     config = configuration(rig, wheel, errors)
-    records = records_of(config, points, told)
+    records = records_of(config, points, other_wheel)
     return diagnose(records, prior_of(config), candidates(config, records))
 
 
-def records_of(config: Config, points: Path, told: FittedModel | None = None) -> tuple[Record, ...]:
-    """One wheel's points; `told` as diagnosed()."""
+def records_of(config: Config, points: Path, other_wheel: FittedModel | None = None) -> tuple[Record, ...]:
+    """One wheel's points; `other_wheel` as of diagnosed()."""
     records = recordings_of_tables(config, [points]).records
-    if told is None:
+    if other_wheel is None:
         return records
-    return tuple(r.completed(told.effects, told.free, told.fits[-1].gaussian) for r in records)
+    return tuple(r.with_effects(other_wheel.effects, other_wheel.free, other_wheel.fits[-1].gaussian) for r in records)
 
 
 class Beside(NamedTuple):
@@ -120,9 +120,9 @@ def lugs_beside_a_shifted_peak(errors: float, points: Path = POINTS) -> dict[str
     }
 
 
-def strain(completion: FittedModel) -> float:
-    """How far a fit has gone from what was known of the soil before, as chi-square per parameter."""
-    before, after = completion.joint_prior[-1], completion.fits[-1].gaussian
+def strain(fitted: FittedModel) -> float:
+    """Distance of the soil's posterior mean from its prior mean, as chi-square per parameter."""
+    before, after = fitted.joint_prior[-1], fitted.fits[-1].gaussian
     free = np.flatnonzero(np.diag(before.covariance)[:6] > 0.0)
     off = np.log(after.soil[free] / before.soil[free])
     return float(off @ np.linalg.solve(before.covariance[np.ix_(free, free)], off)) / len(free)
@@ -172,7 +172,7 @@ def soils(found: Sequence[Case]) -> str:
         fit = case.found.completed.fits[-1]
         values = fit.posterior.parameters()
         effects = case.found.completed.parameters()
-        told = "; ".join(
+        reported = "; ".join(
             f"{name} " + ", ".join(f"{p} {e.value:.3g} ± {e.std:.2g}" for p, e in of.items())
             for name, of in effects.items()
         )
@@ -187,7 +187,7 @@ def soils(found: Sequence[Case]) -> str:
                 f"{math.degrees(phi.value):.1f} ± {math.degrees(phi.std):.1f}",
                 f"{c.value / 1e3:.2f} ± {c.std / 1e3:.2f}",
                 f"{1e3 * K.value:.1f} ± {1e3 * K.std:.1f}",
-                told or "-",
+                reported or "-",
             )
         )
     return table(("rig", "wheel", "soil from", "errors", "n", "phi, deg", "c, kPa", "K, mm", "effects"), rows)
@@ -201,12 +201,14 @@ def main() -> int:
     found = [case for errors in ERRORS for case in cases(errors)]
     print(tabulated(found))
     print("effects: fall of -2 log evidence in the round that added them; beside: others in the first round")
-    print("soil strained: chi-square per parameter from what was known of the soil before\n")
+    print("soil strained: chi-square per parameter of the soil's posterior mean under its prior\n")
     print(soils(found))
     print("\nDing's lugged wheel on the smooth wheel's soil: fall of -2 log evidence (strain left of the soil)")
     for errors in (*ERRORS, 3.0):
-        told = ", ".join(f"{n} {b.fall:.0f} ({b.strain:.1f})" for n, b in lugs_beside_a_shifted_peak(errors).items())
-        print(f"  errors x{errors:g}: {told}")
+        reported = ", ".join(
+            f"{n} {b.fall:.0f} ({b.strain:.1f})" for n, b in lugs_beside_a_shifted_peak(errors).items()
+        )
+        print(f"  errors x{errors:g}: {reported}")
     return 0
 
 

@@ -72,8 +72,8 @@ def test_the_hidden_effect_is_named_and_the_gap_closes(diagnosed):
     assert [effect["name"] for effect in found["effects"]] == ["multipass"]
     effect = found["effects"][0]
     assert effect["probability"] > 0.95
-    for name, told in effect["parameters"].items():
-        assert abs(told["value"] - HIDDEN.get(name, 0.0)) < 3.0 * told["std"] < 0.2
+    for name, reported in effect["parameters"].items():
+        assert abs(reported["value"] - HIDDEN.get(name, 0.0)) < 3.0 * reported["std"] < 0.2
     assert found["gap"]["before"] > found["gap"]["limit"] > found["gap"]["after"]
     assert found["gap"]["noise_floor"] == 1.0
     assert (
@@ -89,21 +89,21 @@ def test_json_has_the_keys_of_the_design(diagnosed):
         assert 0.0 <= place["significance"] <= 0.01
     for soil in (found["soil_before"], found["soil_after"]):
         assert soil.keys() == SOIL_KEYS
-        assert all(math.isfinite(v) for told in soil.values() for v in told.values())
+        assert all(math.isfinite(v) for reported in soil.values() for v in reported.values())
     assert [soil["log"] for soil in found["soils"]] == ["ruts.log"]
     assert found["soils"][0]["after"] == found["soil_after"]
     assert found["rejected"] == {}
 
 
-def test_text_tells_verdict_effect_physics_and_soil(diagnosed):
+def test_text_has_verdict_effect_physics_and_soil(diagnosed):
     text = diagnosed.text
     assert text.startswith("named: ")
     assert "1. multipass, probability 1.00" in text
     assert "Rear wheels run in ruts" in text
     before, after = (diagnosed.found["gap"][key] for key in ("before", "after"))
     assert f"gap {before:.3f} -> {after:.3f}" in text
-    told = diagnosed.found["soil_after"]["bearing_pressure"]["value"] / 1e3
-    assert re.search(rf"bearing pressure, kPa .* {told:.4g} \+-", text)
+    reported = diagnosed.found["soil_after"]["bearing_pressure"]["value"] / 1e3
+    assert re.search(rf"bearing pressure, kPa .* {reported:.4g} \+-", text)
 
 
 def test_report_needs_nothing_but_itself(diagnosed):
@@ -123,9 +123,9 @@ def test_model_out_is_the_configuration_with_the_effect(diagnosed):
     assert "std = 0.3 # my guess" in diagnosed.model.read_text()
     names = {message.name for message in load_databases(completed).messages}
     assert names == {message.name for message in load_databases(given).messages}
-    told = diagnosed.found["effects"][0]["parameters"]
+    reported = diagnosed.found["effects"][0]["parameters"]
     for name, value in (completed.model.effects[0].model_extra or {}).items():
-        assert value == pytest.approx(told[name], rel=1e-5)
+        assert value == pytest.approx(reported[name], rel=1e-5)
 
 
 def test_check_says_what_is_estimated(diagnosed, capsys):
@@ -187,10 +187,10 @@ def test_logs_that_cannot_be_used_give_one_line_and_no_files(diagnosed, tmp_path
     capsys.readouterr()
     outputs = ["--json", str(out / "a"), "--report", str(out / "b"), "--model-out", str(out / "c")]
     assert main(["diagnose", "--config", str(diagnosed.config), str(log), *outputs]) == 1
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert len(told.err.splitlines()) == 1
-    assert message in told.err
+    reported = capsys.readouterr()
+    assert reported.out == ""
+    assert len(reported.err.splitlines()) == 1
+    assert message in reported.err
     assert list(out.iterdir()) == []
 
 
@@ -204,9 +204,9 @@ def test_logs_that_cannot_be_used_give_one_line_and_no_files(diagnosed, tmp_path
         (["--model-out", "/nonexistent/out.toml"], 1, "no folder"),
     ],
 )
-def test_mistakes_are_told_before_any_work(diagnosed, capsys, arguments, code, message):
+def test_mistakes_are_reported_before_any_work(diagnosed, capsys, arguments, code, message):
     assert main(["diagnose", "--config", str(diagnosed.config), str(diagnosed.log), *arguments]) == code
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert len(told.err.splitlines()) == 1
-    assert message in told.err
+    reported = capsys.readouterr()
+    assert reported.out == ""
+    assert len(reported.err.splitlines()) == 1
+    assert message in reported.err

@@ -11,7 +11,7 @@ from soilbus.can.dbc_files import load_databases
 from soilbus.decision.balance import LEVEL, Duty, balance
 from soilbus.decision.capability import slip_grid
 from soilbus.decision.wheels import Axles, wheel_table
-from soilbus.estimation.assembly import completion_of, effects_of, rig_of, with_effects
+from soilbus.estimation.assembly import effects_and_parameters_of, effects_of, rig_of, with_effects
 from soilbus.estimation.nuisance_parameters import active_at
 from soilbus.offline.replay import fed
 from soilbus.pipeline.pipeline import Pipeline
@@ -119,14 +119,14 @@ def test_the_demand_is_the_draft_without_the_error_of_its_load_cell(tmp_path):
         pipeline = Pipeline(known, load_databases(known))
         for now in fed(pipeline.intake, log):
             needs += [pipeline.estimator.estimate(task).demand.pull for task in pipeline.intake.due(now)]
-    told, true = needs
-    assert told - true == pytest.approx(300.0 + 0.05 * true, rel=0.02)
+    draft, true = needs
+    assert draft - true == pytest.approx(300.0 + 0.05 * true, rel=0.02)
 
 
 def test_values_in_the_decision_are_those_of_the_window():
     setting = '[{name="multipass",stiffness={value=0.4,std=0.1},density=0.05},{name="soil_drift",stiffness=0.1}]'
     config = reference_configuration([f"model.effects={setting}"])
-    effects, free = completion_of(config)
+    effects, free = effects_and_parameters_of(config)
     assert [effect.name for effect in effects] == ["multipass"]  # the drift is of one record
     assert [(f.name, f.value, f.std) for f in free] == [
         ("multipass.stiffness", 0.4, 0.1), ("multipass.density", 0.05, 0.0),
@@ -140,7 +140,7 @@ def test_values_in_the_decision_are_those_of_the_window():
 def test_each_wheel_has_its_own_values():
     text = '[{name="wheel_load_offset",offset={FL={value=100.0,std=20.0},RR=50.0},drift={value=0.5,std=0.1}}]'
     config = reference_configuration([f"model.effects={text}"])
-    _, free = completion_of(config)
+    _, free = effects_and_parameters_of(config)
     offsets, drifts, rates = free[:4], free[4:8], free[8:]
     assert all(f.std == 0.0 for f in rates)
     assert [(f.wheel, f.value, f.std) for f in offsets] == [

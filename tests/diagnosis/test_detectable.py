@@ -13,7 +13,7 @@ from soilbus.diagnosis.diagnose import Diagnosis, diagnose
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import Record, record_of
 from soilbus.diagnosis.score import scores
-from soilbus.diagnosis.verdict import Verdict, price
+from soilbus.diagnosis.verdict import Verdict, required_fall
 from soilbus.estimation.assembly import model_of, prior_of, rig_of, with_effects
 from soilbus.report.statement import pressure_error
 from soilbus.sensors.bins import Bins
@@ -60,14 +60,14 @@ def rich() -> Found:
 
 @pytest.mark.parametrize("seed", [5, 6])
 def test_an_even_drive_says_that_it_could_not_have_shown_what_it_hides(seed):
-    """Wheels that dig, at one slip only, are a softer soil: the pressure is a sixth off, told to 0.5 %."""
-    told, shown = found(driven(STEADY, seed, "slip_sinkage=1.0"))
-    assert told.verdict is Verdict.NONE
+    """Wheels that dig, at one slip only, are a softer soil: the pressure is a sixth off, reported to 0.5 %."""
+    reported, shown = found(driven(STEADY, seed, "slip_sinkage=1.0"))
+    assert reported.verdict is Verdict.NONE
     assert shown["slip_sinkage"].size is None or shown["slip_sinkage"].size > 1.0
-    pressure = told.soil_after(0).bearing_pressure(0.02, 0.3)
+    pressure = reported.soil_after(0).bearing_pressure(0.02, 0.3)
     off = pressure.value / TRUE - 1.0
     assert abs(off) > 10.0 * pressure.std / pressure.value
-    error, std = pressure_error(shown["slip_sinkage"], [told.soil_before(0)], CONFIG)
+    error, std = pressure_error(shown["slip_sinkage"], [reported.soil_before(0)], CONFIG)
     assert std == pytest.approx(pressure.std / pressure.value)
     assert 0.5 < error / off < 2.0
 
@@ -76,16 +76,16 @@ def test_a_rich_drive_says_that_it_could_have_shown_it_and_does(rich):
     assert rich.diagnosis.verdict is Verdict.NONE
     assert rich.shown["slip_sinkage"].size < 0.3
     assert {name for name, one in rich.shown.items() if one.size is None} <= {"rate_stiffening", "hardpan", "lugs"}
-    told = found(driven(RICH, 11, "slip_sinkage=1.0"))
-    assert told.diagnosis.additions[0].effect.name == "slip_sinkage"
-    assert told.shown == {}
+    reported = found(driven(RICH, 11, "slip_sinkage=1.0"))
+    assert reported.diagnosis.additions[0].effect.name == "slip_sinkage"
+    assert reported.shown == {}
 
 
 @pytest.mark.parametrize(("times", "seen"), [(2.0, True), (0.5, False)])
 @pytest.mark.parametrize("name", VALIDATED)
 def test_twice_the_size_is_seen_and_half_of_it_is_not(rich, name, times, seen):
-    told = found(driven(RICH, 21, f"{name}={times * rich.shown[name].size}")).diagnosis
-    assert (told.verdict is not Verdict.NONE) == seen
+    reported = found(driven(RICH, 21, f"{name}={times * rich.shown[name].size}")).diagnosis
+    assert (reported.verdict is not Verdict.NONE) == seen
 
 
 def test_more_of_the_same_drive_shows_less_and_a_sensor_less_shows_more():
@@ -107,7 +107,7 @@ def shown_by(record: Record) -> tuple[Detectable, ...]:
     return detectable([record], PRIOR, base, candidates)
 
 
-def test_an_effect_that_no_datum_tells_of_has_no_evidence_either_way():
+def test_an_effect_that_no_datum_depends_on_has_no_evidence_either_way():
     """Without a draft its load cell has neither an offset nor a gain: the evidence stays exactly as it is."""
     record = driven(dataclasses.replace(RICH, duration=20.0), 3, without="draft")
     base = fit_model([record], PRIOR, ())
@@ -117,12 +117,12 @@ def test_an_effect_that_no_datum_tells_of_has_no_evidence_either_way():
 
 def test_of_a_great_gap_an_effect_must_explain_a_good_part():
     """An excess of 5000 on 10 000 residuals, of which one effect explains a hundredth: that is no answer."""
-    assert 500.0 < price(0.0, 1.5, 3000, 10000) < 2500.0
-    assert price(0.0, 1.5, 3000, 10000) == pytest.approx(2.0 * price(0.0, 1.25, 3000, 10000))
+    assert 500.0 < required_fall(0.0, 1.5, 3000, 10000) < 2500.0
+    assert required_fall(0.0, 1.5, 3000, 10000) == pytest.approx(2.0 * required_fall(0.0, 1.25, 3000, 10000))
 
 
 def test_three_faults_that_have_nothing_in_common_are_not_doubted():
     record = driven(RICH, 31, "torque_lag=0.15", "draft_gain=0.15", "rate_stiffening=0.2")
-    told = diagnose([record], PRIOR, list(CATALOGUE.values()))
-    assert {a.effect.name for a in told.additions} == {"torque_lag", "draft_gain", "rate_stiffening"}
-    assert told.imitation == ()
+    reported = diagnose([record], PRIOR, list(CATALOGUE.values()))
+    assert {a.effect.name for a in reported.additions} == {"torque_lag", "draft_gain", "rate_stiffening"}
+    assert reported.imitation == ()

@@ -13,7 +13,7 @@ from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.gap import Gap
 from soilbus.diagnosis.records import record_of
-from soilbus.diagnosis.residual_terms import WARNING, Correction, Term
+from soilbus.diagnosis.residual_terms import WARNING, ResidualTerms, Term
 from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.verdict import Verdict
 from soilbus.diagnosis.where import Disagreement
@@ -55,11 +55,13 @@ def with_verdict(findings: Findings, verdict: Verdict, **changes) -> Findings:
 
 
 def unknown(findings: Findings) -> Findings:
-    learned = Correction("torque", "RL", (Term("1", 3.0), Term("sin(1 wheel angle)", -120.0)), 0.83)
-    return with_verdict(findings, Verdict.UNKNOWN, additions=(), completed=findings.diagnosis.base, learned=(learned,))
+    learned = ResidualTerms("torque", "RL", (Term("1", 3.0), Term("sin(1 wheel angle)", -120.0)), 0.83)
+    return with_verdict(
+        findings, Verdict.UNKNOWN, additions=(), completed=findings.diagnosis.base, residual_terms=(learned,)
+    )
 
 
-def test_a_set_is_told_with_probabilities_reason_and_what_would_tell(findings):
+def test_a_set_is_reported_with_probabilities_reason_and_what_would_separate_it(findings):
     text = findings_text(findings)
     assert "1. draft_offset, probability 0.60\n" in text
     assert "or: grade 0.30, bulldozing 0.10" in text
@@ -79,13 +81,13 @@ def test_a_set_in_json(findings):
 
 
 def test_what_has_no_name_is_described_with_a_warning(findings):
-    text, told = findings_text(unknown(findings)), json.loads(findings_json(unknown(findings)))
+    text, reported = findings_text(unknown(findings)), json.loads(findings_json(unknown(findings)))
     assert text.startswith("unknown: ")
     line = "torque.RL: reading less model = +3 -120 sin(1 wheel angle) [N m] (83 % of the held-out excess)"
     assert line in text
     assert WARNING in text
-    assert told["warning"] == WARNING
-    assert told["learned"][0]["terms"] == {"1": 3.0, "sin(1 wheel angle)": -120.0}
+    assert reported["warning"] == WARNING
+    assert reported["learned"][0]["terms"] == {"1": 3.0, "sin(1 wheel angle)": -120.0}
     assert line in diagnosis_report(unknown(findings))
 
 
@@ -102,8 +104,8 @@ def test_what_is_not_finite_is_null(findings):
     check = dataclasses.replace(findings.diagnosis.base.checks[0], neg2_log_evidence=float("nan"))
     base = dataclasses.replace(findings.diagnosis.base, checks=(check,))
     place = Disagreement("draft", "", "everywhere", float("inf"), 0.0)
-    told = findings_json(with_verdict(findings, Verdict.AMBIGUOUS, base=base, where=(place,)))
-    assert json.loads(told, parse_constant=pytest.fail)["where"][0]["size"] is None
+    reported = findings_json(with_verdict(findings, Verdict.AMBIGUOUS, base=base, where=(place,)))
+    assert json.loads(reported, parse_constant=pytest.fail)["where"][0]["size"] is None
 
 
 def test_page_text_and_json_say_the_same_of_what_could_be_seen(findings):
@@ -115,15 +117,15 @@ def test_page_text_and_json_say_the_same_of_what_could_be_seen(findings):
     )
     base = findings.diagnosis.base
     none = with_verdict(findings, Verdict.NONE, additions=(), where=(), completed=base, detectable=seen)
-    told, text, page = json.loads(findings_json(none)), findings_text(none), diagnosis_report(none)
-    assert told["could_show"] == [{"name": "torque_lag", "parameter": "delay", "unit": "s", "size": 0.04}]
-    assert told["could_not_show"] == ["slip_sinkage"]
-    (feared,) = told["unseen"]
+    reported, text, page = json.loads(findings_json(none)), findings_text(none), diagnosis_report(none)
+    assert reported["could_show"] == [{"name": "torque_lag", "parameter": "delay", "unit": "s", "size": 0.04}]
+    assert reported["could_not_show"] == ["slip_sinkage"]
+    (feared,) = reported["unseen"]
     assert (feared["name"], feared["size"]) == ("slip_sinkage", 1.2)
     assert feared["bearing_pressure_error"] == pytest.approx(-0.2)
     assert feared["bearing_pressure_std"] < 0.2
     for line in (
-        told["sentence"],
+        reported["sentence"],
         "slip_sinkage 1.2 by -20.0 %",
         "could not have shown, at any usual size: slip_sinkage",
     ):
@@ -137,10 +139,10 @@ def test_page_text_and_json_say_the_same_of_what_could_be_seen(findings):
 
 
 def test_json_says_whether_a_gap_is_left_and_why_names_are_near_each_other(findings):
-    told = json.loads(findings_json(findings))
-    assert told["gap"]["open"] is False
-    assert "divided by" in told["effects"][0]["why_probabilities"]
-    assert told["effects"][0]["why_probabilities"] in findings_text(findings)
+    reported = json.loads(findings_json(findings))
+    assert reported["gap"]["open"] is False
+    assert "divided by" in reported["effects"][0]["why_probabilities"]
+    assert reported["effects"][0]["why_probabilities"] in findings_text(findings)
     left = json.loads(findings_json(with_verdict(findings, Verdict.AMBIGUOUS, gap_after=Gap(1.5, 900))))
     assert left["gap"]["open"] is True
     assert "something is left besides" in left["sentence"]
@@ -148,13 +150,13 @@ def test_json_says_whether_a_gap_is_left_and_why_names_are_near_each_other(findi
 
 def test_a_small_offset_of_the_hitch_may_as_well_be_one_of_the_pitch_sensor(findings):
     """As m g sin(slope) is the same push; a great one is beyond what a pitch sensor is ever off by."""
-    told = json.loads(findings_json(findings))["effects"][0]
-    offset = told["parameters"]["offset"]["value"]
+    reported = json.loads(findings_json(findings))["effects"][0]
+    offset = reported["parameters"]["offset"]["value"]
     slope = np.degrees(offset / (CONFIG.vehicle.mass * 9.80665))
-    assert told["same_as"] == (
+    assert reported["same_as"] == (
         f"a pitch sensor that reads {abs(slope):.2f} deg too {'high' if slope > 0.0 else 'low'} would do the same"
     )
-    assert told["same_as"] in findings_text(findings)
+    assert reported["same_as"] in findings_text(findings)
     completed = findings.diagnosis.completed
     place = completed.checks[-1].problem.n_sensors
     gains = completed.fits[-1].mode.gains.copy()

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from soilbus.diagnosis.fitted_model import fit_model
-from soilbus.diagnosis.gap import CLEAR, gap_of
-from soilbus.diagnosis.records import CHECKED, HELD_OUT, record_of
+from soilbus.diagnosis.gap import gap_of
+from soilbus.diagnosis.records import record_of
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
@@ -22,6 +22,7 @@ from soilbus.terra.effects.effect import Active
 CONFIG = reference_configuration()
 PRIOR = prior_of(CONFIG)
 SECONDS = 36.0
+FOLDS = 3
 
 
 def record_with(effects=()):
@@ -40,30 +41,30 @@ def record():
 @pytest.mark.parametrize("effects", [(), ("draft_gain",)])
 def test_the_gap_is_that_of_fits_to_each_choice_of_blocks(record, effects):
     catalogue = [CATALOGUE[name] for name in effects]
-    told = gap_of([record], PRIOR, fit_model([record], PRIOR, catalogue))
-    fits = [fit_model([record.with_held_out(fold)], PRIOR, catalogue) for fold in range(CHECKED)]
+    reported = gap_of([record], PRIOR, fit_model([record], PRIOR, catalogue))
+    fits = [fit_model([record.with_held_out(fold)], PRIOR, catalogue) for fold in range(FOLDS)]
     rows = [fit.checked_rows for fit in fits]
-    assert told.rows == sum(rows)
+    assert reported.rows == sum(rows)
     expected = sum(fit.gap * n for fit, n in zip(fits, rows, strict=True)) / sum(rows)
-    assert told.value == pytest.approx(expected, abs=2e-3)
-    assert abs(told.value - 1.0) < 4.0 * math.sqrt(2.0 / told.rows) or not effects
+    assert reported.value == pytest.approx(expected, abs=2e-3)
+    assert abs(reported.value - 1.0) < 4.0 * math.sqrt(2.0 / reported.rows) or not effects
 
 
 def test_every_instant_is_held_out_once(record):
-    held_out = [record.with_held_out(fold).checked.t for fold in range(CHECKED)]
+    held_out = [record.with_held_out(fold).held_out.t for fold in range(FOLDS)]
     assert np.array_equal(np.sort(np.concatenate(held_out)), record.whole.t)
-    assert np.array_equal(held_out[HELD_OUT], record.checked.t)
-    for fold in range(CHECKED):
+    assert np.array_equal(held_out[-1], record.held_out.t)
+    for fold in range(FOLDS):
         turned = record.with_held_out(fold)
-        assert not set(turned.learned.t.tolist()) & set(turned.checked.t.tolist())
+        assert not set(turned.training.t.tolist()) & set(turned.held_out.t.tolist())
 
 
 def test_where_no_others_can_be_held_out_the_gap_is_of_those_that_are(record):
-    """Tables, a model that did not converge, and a gap of which a third of the blocks tells enough."""
+    """Tables, a model that did not converge, and a gap that a third of the blocks shows well enough."""
     found = fit_model([record], PRIOR, ())
     alone = (found.gap, found.checked_rows)
     assert gap_of([replace(record, whole=None, fold=None)], PRIOR, found) == alone
     creeping = replace(found, fits=tuple(replace(fit, converged=False) for fit in found.fits))
     assert gap_of([record], PRIOR, creeping) == alone
-    clear = replace(found, checks=tuple(replace(check, chi2=2.0 * CLEAR * check.rows) for check in found.checks))
+    clear = replace(found, checks=tuple(replace(check, chi2=3.0 * check.rows) for check in found.checks))
     assert gap_of([record], PRIOR, clear) == (clear.gap, clear.checked_rows)

@@ -1,4 +1,4 @@
-"""The completed model as a configuration file: what is written reads back as the same model, whatever the vehicle."""
+"""The completed model as a configuration file: what is written reads back as the same model."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from soilbus.config.model import ConfigError
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.model_out import effect_tables
 from soilbus.diagnosis.records import record_of
-from soilbus.estimation.assembly import completion_of, model_of, prior_of, rig_of
+from soilbus.estimation.assembly import effects_and_parameters_of, model_of, prior_of, rig_of
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import TRACTOR, reference_configuration
@@ -44,11 +44,11 @@ def test_what_is_written_is_the_model_that_was_fitted(record, tmp_path):
     fitted = fit_model([record], prior_of(reference_configuration()), effects)
     tables, notes = effect_tables(fitted)
     config = load_config(written(tmp_path, tables, notes=notes))
-    kept, free = completion_of(config)
+    kept, free = effects_and_parameters_of(config)
     assert [effect.name for effect in kept] == ["draft_offset", "wheel_load_offset"]
-    told = fitted.parameters()
-    of_wheels = [told["wheel_load_offset"][f"offset_{w}"] for w in rig_of(config).wheels]
-    expected = [told["draft_offset"]["offset"], *of_wheels]
+    reported = fitted.parameters()
+    of_wheels = [reported["wheel_load_offset"][f"offset_{w}"] for w in rig_of(config).wheels]
+    expected = [reported["draft_offset"]["offset"], *of_wheels]
     found = [f for f in free if f.parameter.name == "offset"]
     np.testing.assert_allclose([(f.value, f.std) for f in found], [(e.value, e.std) for e in expected], rtol=1e-5)
     assert all((f.value, f.std) == (f.parameter.neutral, 0.0) for f in free if f not in found)  # of that record
@@ -68,7 +68,7 @@ def test_values_and_stds_read_back(tmp_path_factory, value, std, wheels):
         {"name": "wheel_load_offset", "offset": {w: {"value": value, "std": std} for w in wheels}},
     ]
     config = load_config(written(tmp_path_factory.mktemp("x"), tables))
-    _, free = completion_of(config)
+    _, free = effects_and_parameters_of(config)
     by_name = {f.name: (f.value, f.std) for f in free}
     assert by_name["slip_sinkage.exponent"] == (value, std)
     for i, wheel in enumerate(rig_of(config).wheels):

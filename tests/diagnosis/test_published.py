@@ -1,4 +1,4 @@
-"""What published points tell whatever the details: the rest is for `python -m tests.diagnosis.published` to print."""
+"""What published points show in any case: the rest is for `python -m tests.diagnosis.published` to print."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from soilbus.diagnosis.diagnose import diagnose
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import record_of
-from soilbus.diagnosis.verdict import TEMPERATURE, Verdict, gap_limit
+from soilbus.diagnosis.verdict import Verdict, gap_limit
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
@@ -19,6 +19,8 @@ from soilbus.terra.effects.catalogue import CATALOGUE
 
 from .published import configuration, diagnosed, lugs_beside_a_shifted_peak, records_of, strain
 
+TEMPERATURE = 6.0
+"""What falls of -2 log evidence are divided by where little is explained."""
 TESTED_PHI = math.radians(31.9)
 """Friction angle of the soil of Ding et al. 2011, from their shear tests."""
 
@@ -55,21 +57,23 @@ def test_both_wheels_of_ding_dig_in_as_they_slip(ding, wheel, errors):
 
 def test_only_the_lugged_wheel_finds_the_friction_of_the_soil_itself(ding):
     """The prior holds both to 31.9 deg with 3 deg; the smooth rim slides before the soil shears."""
-    told = {wheel: ding[wheel, 1].completed.fits[-1].posterior.parameters()["phi"] for wheel in ("smooth", "lugged")}
-    assert abs(told["lugged"].value - TESTED_PHI) < 2.0 * told["lugged"].std
-    assert told["smooth"].value + 3.0 * told["smooth"].std < TESTED_PHI
+    reported = {
+        wheel: ding[wheel, 1].completed.fits[-1].posterior.parameters()["phi"] for wheel in ("smooth", "lugged")
+    }
+    assert abs(reported["lugged"].value - TESTED_PHI) < 2.0 * reported["lugged"].std
+    assert reported["smooth"].value + 3.0 * reported["smooth"].std < TESTED_PHI
 
 
 @pytest.mark.parametrize("errors", [1, 2])
 def test_the_smooth_wheels_soil_is_strained_by_the_lugged_wheel(points, ding, errors):
-    """Something differs between them beside what both share; six points each do not tell what for sure."""
+    """Something differs between them beside what both share; six points each do not show what for sure."""
     config = configuration("ding2011", "lugged", errors)
     records = records_of(config, points, ding["smooth", errors].completed)
-    shown = fit_model(records, prior_of(config), records[0].learned.effects)
+    shown = fit_model(records, prior_of(config), records[0].training.effects)
     assert shown.names == ("slip_sinkage",)
     assert strain(shown) > 1.5
     again = records_of(configuration("ding2011", "smooth", errors), points, ding["smooth", errors].completed)
-    assert strain(fit_model(again, prior_of(config), again[0].learned.effects)) < 0.5  # its own points do not
+    assert strain(fit_model(again, prior_of(config), again[0].training.effects)) < 0.5  # its own points do not
 
 
 @pytest.mark.parametrize("errors", [2.0, 3.0])

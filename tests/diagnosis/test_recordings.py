@@ -97,7 +97,7 @@ def test_a_short_silence_does_not(log, tmp_path):
     assert not np.isfinite(one.ground_speed[silent]).any()
 
 
-def test_parts_too_short_are_told_and_left_out(log, tmp_path):
+def test_parts_too_short_are_reported_and_left_out(log, tmp_path):
     lines = log.read_text().splitlines(keepends=True)
     two = tmp_path / "two.log"
     two.write_text("".join([*lines, *(shifted(line, 1000.0) for line in lines[:1000])]))
@@ -106,7 +106,7 @@ def test_parts_too_short_are_told_and_left_out(log, tmp_path):
     assert found.too_short == ("two.log, part 2",)
 
 
-def test_what_was_never_heard_is_told(log, tmp_path):
+def test_what_was_never_heard_is_reported(log, tmp_path):
     dbc = DATABASE.get_message_by_name("WheelLoads")
     deaf = tmp_path / "deaf.log"
     deaf.write_text("".join(line for line in log.open() if f"{dbc.frame_id:X}#" not in line))

@@ -62,7 +62,7 @@ def test_a_draft_offset_is_no_slope_of_four_fields(seed):
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_push_that_is_the_same_on_four_fields_is_an_offset(seed):
-    """Nothing measures the pitch, and four fields might each have that slope: by chance, which is told."""
+    """Nothing measures the pitch, and four fields might each have that slope: by chance, which counts."""
     found = diagnosed(BLIND, seed, (0.0,) * 4, "draft_offset=400")
     assert found.additions[0].effect.name == "draft_offset"
     assert chances(found)["draft_offset"] > 0.8
@@ -77,11 +77,11 @@ def test_slopes_that_differ_from_field_to_field_are_no_offset(seed):
     n_sensors = found.completed.checks[0].problem.n_sensors
     place = [f.parameter.name for f in found.completed.free].index("slope_0")
     std = found.completed.free[place].std
-    told = [fit.mode.gains[n_sensors + place] * std for fit in found.completed.fits]
-    assert told == pytest.approx(slopes, abs=0.006)
+    reported = [fit.mode.gains[n_sensors + place] * std for fit in found.completed.fits]
+    assert reported == pytest.approx(slopes, abs=0.006)
 
 
-def test_one_field_cannot_tell_a_slope_from_an_offset():
+def test_one_field_does_not_separate_a_slope_from_an_offset():
     records = [field(BLIND, with_effects(BLIND, ["draft_offset=400"]), "loam", 0.0, 5)]
     found = diagnose(records, prior_of(BLIND), list(CATALOGUE.values()))
     assert min(chances(found)[name] for name in ("draft_offset", "grade")) > 0.1
@@ -96,16 +96,16 @@ def test_a_pitch_offset_is_one_of_the_vehicle():
             with_pitch_error(field(CONFIG, CONFIG, soil, 0.0, 10 * seed + i), np.radians(degrees))
             for i, soil in enumerate(SOILS)
         ]
-        told = diagnose(records, prior_of(CONFIG), [CATALOGUE["grade"]]).completed.parameters()["grade"]
-        assert abs(told["pitch_offset"].value) <= 0.015
+        reported = diagnose(records, prior_of(CONFIG), [CATALOGUE["grade"]]).completed.parameters()["grade"]
+        assert abs(reported["pitch_offset"].value) <= 0.015
         if degrees == 0.5:
-            assert abs(told["pitch_offset"].value - np.radians(0.5)) < 4.0 * told["pitch_offset"].std < 0.005
+            assert abs(reported["pitch_offset"].value - np.radians(0.5)) < 4.0 * reported["pitch_offset"].std < 0.005
 
 
 def with_pitch_error(record: Record, error: float) -> Record:
-    """The recording as if the pitch sensor had read less by so much [rad]: by the balance alone."""
-    push = record.learned.rig.chassis.mass * GRAVITY * error
-    for part in (record.learned, record.checked, record.whole):
+    """The recording as if the pitch sensor had read less by `error` [rad]: by the balance alone."""
+    push = record.training.rig.chassis.mass * GRAVITY * error
+    for part in (record.training, record.held_out, record.whole):
         part.demand = part.demand - push
     return record
 

@@ -1,4 +1,4 @@
-"""No diagnosis contradicts itself: whatever was found, verdict, gap, places and what could be seen say the same."""
+"""No diagnosis contradicts itself: verdict, gap, places and what could be seen say the same."""
 
 from __future__ import annotations
 
@@ -105,12 +105,12 @@ def test_effects_that_are_more_together_than_apart_are_doubted_with_what_rules_t
     found = Diagnosis(
         Verdict.AMBIGUOUS, (PLACE,), added, NOTHING, NOTHING, (), Gap(9.0, 900), Gap(1.0, 900), (0.9, 0.6, 0.1)
     )
-    told = doubt(found) or ""
-    assert "tyre_deflection 90 %, rolling_radius 60 %, stress_peak_shift 10 %" in told
-    assert "imitation of something that the catalogue lacks" in told
-    assert 'say tyre = "rigid"' in told
-    assert "tyre_deflection: a rigid wheel has no tyre" in told
-    assert "rolling_radius: a rigid wheel" in told
+    reported = doubt(found) or ""
+    assert "tyre_deflection 90 %, rolling_radius 60 %, stress_peak_shift 10 %" in reported
+    assert "imitation of something that the catalogue lacks" in reported
+    assert 'say tyre = "rigid"' in reported
+    assert "tyre_deflection: a rigid wheel has no tyre" in reported
+    assert "rolling_radius: a rigid wheel" in reported
     assert verdict_of(9.0, 1.0, 900, [0.9] * 3) is Verdict.NAMED
     assert verdict_of(9.0, 1.0, 900, [0.9] * 3, imitation=True) is Verdict.AMBIGUOUS
     assert doubt(dataclasses.replace(found, imitation=())) is None
@@ -120,10 +120,10 @@ def test_probabilities_beside_falls_that_differ_little_are_explained():
     """Falls of 885, 882 and 870 would be 0.82, 0.18 and 0.0005 if formulas were right."""
     falls = {"a": 885.0, "b": 882.0, "c": 870.0}
     chances = probabilities(falls, 0.0)
-    one = Addition(CATALOGUE["lugs"], chances["a"], {"b": chances["b"]}, falls, divided_by=temperatures(885.0))
+    one = Addition(CATALOGUE["lugs"], chances["a"], {"b": chances["b"]}, falls, temperatures=temperatures(885.0))
     usual, great = temperatures(885.0)
-    told = why_probabilities(one) or ""
-    assert f"divided by {usual:.0f} (with a chance of 15 % by {great:.0f})" in told
+    reported = why_probabilities(one) or ""
+    assert f"divided by {usual:.0f} (with a chance of 15 % by {great:.0f})" in reported
     expected = {
         n: sum(
             share * np.exp(falls[n] / (2.0 * t)) / sum(np.exp(f / (2.0 * t)) for f in falls.values())
@@ -135,7 +135,7 @@ def test_probabilities_beside_falls_that_differ_little_are_explained():
     assert why_probabilities(addition("lugs", 1.0)) is None
 
 
-def test_what_could_not_be_shown_is_told_with_what_it_does_to_the_soil():
+def test_what_could_not_be_shown_is_reported_with_what_it_does_to_the_soil():
     seen = (shown("torque_lag", 0.04), shown("slip_sinkage", None, -0.2), shown("multipass", 0.03, 0.001))
     found = Diagnosis(Verdict.NONE, (), (), NOTHING, NOTHING, (), Gap(1.0, 900), Gap(1.0, 900), (), seen)
     text = "\n".join(shown_lines(found, CONFIG))

@@ -1,4 +1,4 @@
-"""How long a diagnosis takes, in units of one look at the same recording, whatever the machine."""
+"""How long a diagnosis takes, in units of one linearisation of the same recording, on any machine."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def seconds_of(work):
 
 def look(record, prior):
     """Least processor time of one linearisation of the instants to be learned from, without effects."""
-    problem, soil = record.learned, Soil(*prior.median.tolist())
+    problem, soil = record.training, Soil(*prior.median.tolist())
     gains = np.zeros(problem.n_sensors)
     latents = problem.start(soil, None, gains)
     return min(seconds_of(lambda: problem.linearise(soil, gains, latents)) for _ in range(10))

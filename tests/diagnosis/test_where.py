@@ -40,20 +40,20 @@ def places(record: Record) -> list[Disagreement]:
     return disagreements(base)
 
 
-def test_where_nothing_is_missing_no_place_is_told():
-    """Of a hundred looks a drive one is beyond 1 % by chance: all of them together must not be."""
-    told = {seed: places(recorded(SOILS[seed % 3], 40.0, seed)) for seed in range(8)}
-    assert {seed: found for seed, found in told.items() if found} == {}
+def test_where_nothing_is_missing_no_place_is_reported():
+    """Of a hundred tests a drive one is beyond 1 % by chance: all of them together must not be."""
+    reported = {seed: places(recorded(SOILS[seed % 3], 40.0, seed)) for seed in range(8)}
+    assert {seed: found for seed, found in reported.items() if found} == {}
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_what_a_fit_leaves_open_is_no_disagreement(seed):
-    """Learned from small slips alone, the model is off at great ones by far more than noise: as it says itself."""
+    """Fitted to small slips alone, the model is off at great ones by far more than noise: as it says itself."""
     record = recorded(SOILS[seed % 3], 40.0, seed)
     great = record.whole.slip.mean(axis=1) > 0.2
-    learned, checked = (record.whole.part(np.flatnonzero(part)) for part in (~great, great))
-    assert min(learned.n, checked.n) > 60
-    assert places(dataclasses.replace(record, learned=learned, checked=checked)) == []
+    training, held_out = (record.whole.part(np.flatnonzero(part)) for part in (~great, great))
+    assert min(training.n, held_out.n) > 60
+    assert places(dataclasses.replace(record, training=training, held_out=held_out)) == []
 
 
 @pytest.mark.parametrize(
@@ -79,8 +79,8 @@ def test_a_hidden_error_is_found_at_its_channel_wheel_and_region(channel, size, 
     assert 0.5 < step / size < 1.2
 
 
-def test_significances_are_of_all_looks_together_and_the_clearest_comes_first():
+def test_significances_are_of_all_tests_together_and_the_clearest_comes_first():
     error = lambda t, slip, speed: 250.0 * (t > 40.0)  # noqa: E731
-    told = [place.significance for place in places(recorded("loam", 60.0, 3, "torque.RL", error))]
-    assert told == sorted(told)
-    assert max(told) <= 0.01
+    reported = [place.significance for place in places(recorded("loam", 60.0, 3, "torque.RL", error))]
+    assert reported == sorted(reported)
+    assert max(reported) <= 0.01

@@ -23,7 +23,7 @@ from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.change_detection import Transition, without_transition
 from soilbus.estimation.observation_model import ObservationModelWithEffects
 from soilbus.estimation.posterior import Posterior
-from soilbus.estimation.tracker import elsewhere
+from soilbus.estimation.tracker import new_soil_prior
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import Recording, simulate
@@ -47,7 +47,7 @@ TOLD_DEPTH = 0.45
 """Depth, in units of a wheel's sinkage, at which it tells the pressure under it best."""
 
 
-class Told(NamedTuple):
+class Seen(NamedTuple):
     """What one window says; t [s] since the last wheel left the border.
 
     away: error of bearing pressure and tan phi, the larger one, in standard deviations, from the
@@ -79,7 +79,7 @@ class Drive(NamedTuple):
 
 
 def drive(config: Config, pair: str, speed: float, transition: float, seed: int, after: float = AFTER) -> Drive:
-    """A drive at a constant speed [m/s] over a border that is so long [m], and so many seconds more."""
+    """A drive at a constant speed [m/s] over a border of some length [m], and some seconds after it."""
     first, second = pair.split(":")
     vehicle = config.vehicle
     reached = BEFORE + SPREAD * float(np.random.default_rng([seed, 7]).random())
@@ -93,12 +93,12 @@ def drive(config: Config, pair: str, speed: float, transition: float, seed: int,
     return Drive(simulate(config, scenario, seed), soils, on, left)
 
 
-def crossed(config: Config, pair: str, speed: float, transition: float, seed: int, after: float = AFTER) -> list[Told]:
+def crossed(config: Config, pair: str, speed: float, transition: float, seed: int, after: float = AFTER) -> list[Seen]:
     """The windows of such a drive."""
     recording, soils, _, left = drive(config, pair, speed, transition, seed, after)
     behind, vehicle = config.vehicle.cg_ahead_of_rear_axle, config.vehicle
     estimator, between = WindowEstimator(config), np.linspace(-behind, vehicle.wheelbase - behind, 17)
-    told = []
+    seen = []
     for window, end in windows(config, recording):
         result = estimator.estimate(task_of(window, end, config, index=round(end - config.estimator.window))).result
         place = np.interp(end, recording.truth["t"], recording.truth["distance"])
@@ -110,8 +110,8 @@ def crossed(config: Config, pair: str, speed: float, transition: float, seed: in
             sd = result.bearing.std / result.bearing.value
             depth = {wheel.width: TOLD_DEPTH * (result.sinkage[wheel.name] or np.nan) for wheel in config.wheel}
             of_tyres = errors_of_tyres(posterior, soils_under, depth)
-        told.append(Told(end - left, result.status is Status.VALID, result.reason, away, sd, *of_tyres))
-    return told
+        seen.append(Seen(end - left, result.status is Status.VALID, result.reason, away, sd, *of_tyres))
+    return seen
 
 
 def errors_of_tyres(posterior: Posterior, soils: list[Soil], depth: dict[float, float]) -> tuple[float, float]:
@@ -119,12 +119,12 @@ def errors_of_tyres(posterior: Posterior, soils: list[Soil], depth: dict[float, 
 
     Of tan phi and of the pressure under tyres by their width [m], at these depths [m].
     """
-    told = [posterior.tan_phi(), *(posterior.bearing_pressure(z, b) for b, z in depth.items())]
+    seen = [posterior.tan_phi(), *(posterior.bearing_pressure(z, b) for b, z in depth.items())]
     away = [
-        max(abs(one.value - true) / one.std for one, true in zip(told, truth, strict=True))
+        max(abs(one.value - true) / one.std for one, true in zip(seen, truth, strict=True))
         for truth in ([np.tan(soil.phi), *(soil.bearing_pressure(z, b) for b, z in depth.items())] for soil in soils)
     ]
-    return min(away), max(one.std / one.value for one in told)
+    return min(away), max(one.std / one.value for one in seen)
 
 
 def least_sd(config: Config, driven: Drive, t: float) -> float:
@@ -144,29 +144,29 @@ def least_sd(config: Config, driven: Drive, t: float) -> float:
     window = without_transition(store.window(driven.on, end), border, rig.front)
     settings = config.estimator
     problem = ObservationModelWithEffects(window, rig, model_of(config), settings.min_speed, settings.max_turn)
-    bound = cramer_rao(problem, elsewhere(prior_of(config)), driven.soils[1].parameters())
+    bound = cramer_rao(problem, new_soil_prior(prior_of(config)), driven.soils[1].parameters())
     bearing = bound.bearing_pressure(settings.z_ref, settings.b_ref)
     return bearing.std / bearing.value
 
 
-def first_valid(told: list[Told]) -> float:
+def first_valid(seen: list[Seen]) -> float:
     """Seconds from the border until a window is valid; inf if none is."""
-    return min((w.t for w in told if w.valid and w.t > 0.0), default=np.inf)
+    return min((w.t for w in seen if w.valid and w.t > 0.0), default=np.inf)
 
 
-def first_of_tyres(told: list[Told]) -> float:
+def first_of_tyres(seen: list[Seen]) -> float:
     """Seconds from the border until a window knows what its tyres tell to a tenth; inf if none does."""
-    return min((w.t for w in told if w.knows_tyres and w.t > 0.0), default=np.inf)
+    return min((w.t for w in seen if w.knows_tyres and w.t > 0.0), default=np.inf)
 
 
-def wrong_of_tyres(told: list[Told]) -> list[Told]:
+def wrong_of_tyres(seen: list[Seen]) -> list[Seen]:
     """Windows that know what their tyres tell, and are beyond what they say."""
-    return [w for w in told if w.knows_tyres and not w.of_tyres < WRONG]
+    return [w for w in seen if w.knows_tyres and not w.of_tyres < WRONG]
 
 
-def wrong(told: list[Told]) -> list[Told]:
+def wrong(seen: list[Seen]) -> list[Seen]:
     """Windows that are valid and beyond what they say."""
-    return [w for w in told if w.valid and not w.away < WRONG]
+    return [w for w in seen if w.valid and not w.away < WRONG]
 
 
 def figures(what: str, delay: list[float], away: list[float], bad: int) -> str:
@@ -192,25 +192,25 @@ def main() -> None:
                 seed: crossed(config, pair, speed, args.transition, seed)
                 for seed in range(args.first, args.first + args.seeds)
             }
-            bad = [(seed, w) for seed, told in drives.items() for w in wrong(told)]
-            of_tyres = sum(len(wrong_of_tyres(told)) for told in drives.values())
-            valid = [w.away for told in drives.values() for w in told if w.valid]
-            known = [w.of_tyres for told in drives.values() for w in told if w.knows_tyres]
+            bad = [(seed, w) for seed, seen in drives.items() for w in wrong(seen)]
+            of_tyres = sum(len(wrong_of_tyres(seen)) for seen in drives.values())
+            valid = [w.away for seen in drives.values() for w in seen if w.valid]
+            known = [w.of_tyres for seen in drives.values() for w in seen if w.knows_tyres]
             print(f"{pair:24} {speed:5.2f} {len(drives):7d}")
-            print(figures("valid", [first_valid(told) for told in drives.values()], valid, len(bad)))
-            print(figures("what tyres tell", [first_of_tyres(told) for told in drives.values()], known, of_tyres))
+            print(figures("valid", [first_valid(seen) for seen in drives.values()], valid, len(bad)))
+            print(figures("under tyres", [first_of_tyres(seen) for seen in drives.values()], known, of_tyres))
             sys.stdout.flush()
             if args.windows:
-                for seed, told in drives.items():
-                    for w in (w for w in told if w.t > -4.0 - args.transition / speed):
+                for seed, seen in drives.items():
+                    for w in (w for w in seen if w.t > -4.0 - args.transition / speed):
                         state = "valid" if w.valid else "-"
                         print(f"  {seed:4d} {w.t:6.2f} {state:5} {w.away:5.1f} {w.sd:6.1%} {w.reason}")
                 continue
             for seed, w in bad:
                 print(f"  seed {seed}: {w.away:.1f} sd off, {w.t:+.2f} s, sd {w.sd:.1%}")
-            for seed, told in drives.items():
-                if first_valid(told) > IN_TIME:
-                    w = max((w for w in told if w.t <= IN_TIME), key=lambda w: w.t)
+            for seed, seen in drives.items():
+                if first_valid(seen) > IN_TIME:
+                    w = max((w for w in seen if w.t <= IN_TIME), key=lambda w: w.t)
                     least = least_sd(config, drive(config, pair, speed, args.transition, seed), IN_TIME)
                     said = f"sd {w.sd:.1%}, {w.away:.1f} sd off; the bound at {IN_TIME} s is {least:.1%}"
                     print(f"  seed {seed}: {w.reason} at {w.t:.2f} s: {said}")

@@ -25,7 +25,7 @@ SPREAD = float(np.sqrt(np.log1p(0.25**2)))
 
 @dataclass(frozen=True)
 class Case:
-    """One window of an excited drive on a soil, with what the driver was told of c and K."""
+    """One window of an excited drive on a soil, with a prior of c and K that is off."""
 
     soil: Soil
     config: Config
@@ -43,8 +43,8 @@ class Case:
 def case(soil: Soil, seed: int, overrides: Iterable[str] = (), without: Iterable[str] = ()) -> Case:
     """10 s with slip swept from 0.05 to 0.4; c and K are known to 25 %, so their priors miss by as much."""
     miss = np.exp(SPREAD * np.random.default_rng([seed, 77]).standard_normal(2))
-    told = {"c": soil.c * miss[0], "K": soil.K * miss[1]}
-    settings = [f"soil.{name}.{key}={v * f}" for name, v in told.items() for key, f in (("value", 1.0), ("std", 0.25))]
+    means = {"c": soil.c * miss[0], "K": soil.K * miss[1]}
+    settings = [f"soil.{name}.{key}={v * f}" for name, v in means.items() for key, f in (("value", 1.0), ("std", 0.25))]
     config = reference_configuration([*settings, *overrides])
     scenario = Scenario(10.0, (Patch(0.0, "this", soil),), slip=Swing(0.05, 0.40))
     rig = rig_of(config)

@@ -32,7 +32,7 @@ STEERING = (0.3, 3.0)
 WRONG = 3.0
 
 
-class Told(NamedTuple):
+class Seen(NamedTuple):
     """What one window says: t [s] since the curve began, status, errors (2,) in standard deviations, sd of tan phi."""
 
     t: float
@@ -48,14 +48,14 @@ def curved(window: Window, rig: Rig, curvature: np.ndarray | float) -> Window:
     return replace(window, speed=window.speed * (1.0 + sides(rig) * TRACK / 2.0 * bend))
 
 
-def driven(config: Config, soil: str, radius: float, seed: int) -> list[Told]:
+def driven(config: Config, soil: str, radius: float, seed: int) -> list[Seen]:
     """The windows of a drive with one curve of this radius [m], to the left or to the right."""
     rng = np.random.default_rng([seed, 11])
     begin, end = np.array([ENTERED, LEFT]) + SPREAD * rng.random(2)
     steering, way = rng.uniform(*STEERING), rng.choice([-1.0, 1.0])
     knots = [begin, begin + steering, end, end + steering]
     recording = simulate(config, Scenario(END, (Patch(0.0, soil),), slip=Swing(0.05, 0.40)), seed)
-    estimator, rig, told = WindowEstimator(config), rig_of(config), []
+    estimator, rig, seen = WindowEstimator(config), rig_of(config), []
     for window, at in windows(config, recording):
         bent = curved(window, rig, way / radius * np.interp(window.t, knots, [0.0, 1.0, 1.0, 0.0]))
         result = estimator.estimate(task_of(bent, at, config, index=round(at - config.estimator.window))).result
@@ -63,8 +63,8 @@ def driven(config: Config, soil: str, radius: float, seed: int) -> list[Told]:
         if result.posterior is not None:
             away = errors(result.posterior, SOILS[soil])
             sd = result.posterior.tan_phi().std / result.posterior.tan_phi().value
-        told.append(Told(at - begin, result.status is Status.VALID, result.reason, away, sd))
-    return told
+        seen.append(Seen(at - begin, result.status is Status.VALID, result.reason, away, sd))
+    return seen
 
 
 def main() -> None:
@@ -77,17 +77,17 @@ def main() -> None:
     print("radius  windows since the curve  valid  rms error / sd: bearing  tan phi  most  wrong  others")
     for radius in args.radii:
         drives = {seed: driven(config, args.soil, radius, seed) for seed in range(args.first, args.first + args.seeds)}
-        told = [(seed, w) for seed, drive in drives.items() for w in drive if w.t > 0.0]
-        away = np.array([w.away for _, w in told if w.valid])
-        rms, others = np.sqrt(np.mean(away**2, axis=0)), [w.reason for _, w in told if not w.valid]
+        seen = [(seed, w) for seed, drive in drives.items() for w in drive if w.t > 0.0]
+        away = np.array([w.away for _, w in seen if w.valid])
+        rms, others = np.sqrt(np.mean(away**2, axis=0)), [w.reason for _, w in seen if not w.valid]
         count = ", ".join(f"{others.count(reason)} {reason}" for reason in sorted(set(others)))
         wrong = int((np.abs(away).max(axis=1) > WRONG).sum())
         print(
-            f"{radius:6.0f}  {len(told):23d}  {len(away):5d}  {rms[0]:23.2f}  {rms[1]:7.2f} {np.abs(away).max():5.1f}"
+            f"{radius:6.0f}  {len(seen):23d}  {len(away):5d}  {rms[0]:23.2f}  {rms[1]:7.2f} {np.abs(away).max():5.1f}"
             f"  {wrong:5d}  {count}",
             flush=True,
         )
-        for seed, w in told:
+        for seed, w in seen:
             if args.windows or (w.valid and np.abs(w.away).max() > WRONG):
                 state = "valid" if w.valid else "-"
                 print(f"  {seed:4d} {w.t:6.2f} {state:5} {w.away[0]:5.1f} {w.away[1]:5.1f} {w.sd:6.1%} {w.reason}")

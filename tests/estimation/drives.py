@@ -42,9 +42,9 @@ def windows(config: Config, recording: Recording) -> Iterator[tuple[Window, floa
 
 def errors(posterior: Posterior, soil: Soil) -> np.ndarray:
     """Errors (2,) of bearing pressure and tan phi, in their standard deviations."""
-    told = posterior.bearing_pressure(Z_REF, B_REF), posterior.tan_phi()
+    estimates = posterior.bearing_pressure(Z_REF, B_REF), posterior.tan_phi()
     truth = soil.bearing_pressure(Z_REF, B_REF), np.tan(soil.phi)
-    return np.array([(estimate.value - value) / estimate.std for estimate, value in zip(told, truth, strict=True)])
+    return np.array([(estimate.value - value) / estimate.std for estimate, value in zip(estimates, truth, strict=True)])
 
 
 def task_of(window: Window, end: float, config: Config, index: int = 0) -> WindowTask:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from drives import errors, tracker_of, windows
 
-from soilbus.estimation.tracker import Ground
+from soilbus.estimation.tracker import TrackerState
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -40,7 +40,7 @@ def hour(soil: str, minutes: float, seed: int) -> Hour:
     good = [r.fit for r in results if r.fit is not None and not r.mismatch]
     return Hour(
         len(results),
-        sum(r.ground is not Ground.SAME for r in results),
+        sum(r.state is not TrackerState.STEADY for r in results),
         len(results) - len(good),
         np.array([errors(fit.posterior, SOILS[soil]) for fit in good]),
         np.array([fit.chi2 for fit in good]),
@@ -57,10 +57,10 @@ def main() -> None:
     print("soil          windows  false  mis-        chi2   rms error / sd       within 1.96 sd")
     print("                     changes  matches  (mean)  bearing  tan phi     bearing  tan phi")
     for soil in args.soils:
-        told = hour(soil, args.minutes, args.seed)
-        rms, within = np.sqrt(np.mean(told.errors**2, axis=0)), np.mean(np.abs(told.errors) < 1.96, axis=0)
+        result = hour(soil, args.minutes, args.seed)
+        rms, within = np.sqrt(np.mean(result.errors**2, axis=0)), np.mean(np.abs(result.errors) < 1.96, axis=0)
         print(
-            f"{soil:<12}  {told.windows:7d}  {told.changes:5d}  {told.mismatches:7d}  {told.chi2.mean():6.3f}"
+            f"{soil:<12}  {result.windows:7d}  {result.changes:5d}  {result.mismatches:7d}  {result.chi2.mean():6.3f}"
             f"  {rms[0]:7.2f}  {rms[1]:7.2f}     {within[0]:7.1%}  {within[1]:7.1%}"
         )
 

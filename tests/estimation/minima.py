@@ -1,4 +1,4 @@
-"""Does a window have one optimum?  Descents from random soils of the prior, beside what `fit_window` finds.
+"""Does a window have one optimum?  Descents from random soils of the prior, compared with `fit_window`.
 
 `PYTHONPATH=service python tests/estimation/minima.py 1000 [--only TEXT]` prints the table.
 """
@@ -18,7 +18,7 @@ from soilbus.config.model import Config
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import Fit, fit_from_soil, fit_window
 from soilbus.estimation.observation_model import ObservationModel
-from soilbus.estimation.parametrization import BOUND, Coordinates
+from soilbus.estimation.parametrization import BOUND_SD, Coordinates
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
@@ -31,8 +31,8 @@ FIELD = Path(__file__).resolve().parents[1] / "field/field.toml"
 KINDS = ("loam", "wet_clay", "dry_sand")
 EXCITED = Swing(0.05, 0.40)
 LEANING = Swing(-0.15, 0.15)
-SAME_COST, SAME_SOIL = 0.1, 0.1
-"""Cost, and deviation of any parameter in posterior standard deviations, within which two optima are one."""
+SAME_VALUE, SAME_SOIL = 0.1, 0.1
+"""-2 log posterior, and deviation of a parameter in posterior sd, within which two optima are the same."""
 
 
 class Case(NamedTuple):
@@ -44,10 +44,22 @@ class Case(NamedTuple):
 
 
 class Ends(NamedTuple):
-    """Where descents ended: at the best optimum of all, at another as good, at a worse one, or nowhere.
+    """Ends of descents, compared with the best of all.
 
-    worse (count,) are their costs above the best's; fit is what `fit_window` says, above its
-    cost above the best's and off its largest deviation from it; seconds are those of one descent.
+    Attributes
+    ----------
+    same, other
+        Descents that ended at the best optimum, and at another one with the same -2 log posterior.
+    worse
+        -2 log posterior above the best, of each descent that ended at a worse one.
+    failed
+        Descents that did not converge.
+    fit
+        The result of `fit_window`.
+    above, off
+        Its -2 log posterior above the best, and its largest deviation from the best [posterior sd].
+    seconds
+        Processor time of one descent.
     """
 
     same: int
@@ -61,7 +73,7 @@ class Ends(NamedTuple):
 
 
 def constant(slip: float) -> Swing:
-    """No swing at all."""
+    """A swing of no amplitude about this slip."""
     return Swing(slip, slip + 1e-6)
 
 
@@ -78,7 +90,7 @@ def window(
     return ObservationModel(store.window(0.0, seconds), rig, model_of(config), config.estimator.min_speed)
 
 
-def told(soil: str) -> list[str]:
+def c_and_K_known(soil: str) -> list[str]:
     """Settings by which c and K are known to 25 %."""
     values = {name: getattr(SOILS[soil], name) for name in ("c", "K")}
     return [f"soil.{name}.{key}={v * f}" for name, v in values.items() for key, f in (("value", 1.0), ("std", 0.25))]
@@ -92,11 +104,11 @@ def two_wheels(config: Config) -> Config:
 def cases() -> Iterator[Case]:
     """Windows of all kinds."""
     for soil in KINDS:
-        free, known = reference_configuration(), reference_configuration(told(soil))
+        free, known = reference_configuration(), reference_configuration(c_and_K_known(soil))
         kinds = [
             ("c and K free", free, 2.0, EXCITED), ("c and K free", free, 10.0, EXCITED),
             ("c and K known", known, 2.0, EXCITED), ("c and K known", known, 10.0, EXCITED),
-            ("field rig", load_config(FIELD, told(soil)), 10.0, EXCITED),
+            ("field rig", load_config(FIELD, c_and_K_known(soil)), 10.0, EXCITED),
             ("two wheels", two_wheels(free), 10.0, EXCITED),
             ("constant slip", free, 10.0, constant(0.15)),
         ]  # fmt: skip
@@ -107,14 +119,14 @@ def cases() -> Iterator[Case]:
 
 
 def starts(prior: SoilPrior, width: float, count: int, seed: int) -> Iterator[Soil]:
-    """Soils of the prior, kept as near to it as a fit keeps its own; width [m] is the mean tyre's."""
+    """Random soils of the prior, clipped to the bounds of a fit; width [m] is the mean tyre's."""
     coordinates = Coordinates(prior, width)
-    for deviation in np.random.default_rng(seed).standard_normal((count, len(prior.median))).clip(-BOUND, BOUND):
+    for deviation in np.random.default_rng(seed).standard_normal((count, len(prior.median))).clip(-BOUND_SD, BOUND_SD):
         yield Soil(*coordinates.within(prior.median * np.exp(prior.log_std * deviation)).tolist())
 
 
 def apart(fit: Fit, other: Fit) -> float:
-    """Largest deviation of a parameter of one fit's mode from another's, in standard deviations of the other."""
+    """Largest deviation of a parameter between two modes, in sd of the other."""
     std = np.sqrt(np.diag(other.mode.posterior.log_covariance))
     free = std > 0.0
     off = np.log(fit.mode.soil / other.mode.soil)
@@ -129,7 +141,7 @@ def descents(problem: ObservationModel, prior: SoilPrior, count: int, seed: int)
 
 
 def ends_of(case: Case, count: int, seed: int) -> Ends:
-    """Descents from so many starts, and the fit beside them."""
+    """Descents from `count` random soils, compared with the fit."""
     fit = fit_window(case.problem, case.prior)
     if fit is None or not fit.converged:
         raise ValueError(f"{case.name}: no fit")
@@ -137,12 +149,12 @@ def ends_of(case: Case, count: int, seed: int) -> Ends:
     good, failed = descents(case.problem, case.prior, count, seed)
     seconds = (time.process_time() - begin) / count
     best = min([*good, fit], key=lambda end: end.neg2_log_posterior)
-    as_good = [end for end in good if end.neg2_log_posterior < best.neg2_log_posterior + SAME_COST]
+    as_good = [end for end in good if end.neg2_log_posterior < best.neg2_log_posterior + SAME_VALUE]
     same = sum(apart(end, best) < SAME_SOIL for end in as_good)
     worse = [
         end.neg2_log_posterior - best.neg2_log_posterior
         for end in good
-        if end.neg2_log_posterior >= best.neg2_log_posterior + SAME_COST
+        if end.neg2_log_posterior >= best.neg2_log_posterior + SAME_VALUE
     ]
     return Ends(
         same,
@@ -159,8 +171,8 @@ def ends_of(case: Case, count: int, seed: int) -> Ends:
 def line(name: str, ends: Ends, count: int) -> str:
     """One line of the table."""
     shares = "  ".join(f"{100.0 * n / count:5.1f}" for n in (ends.same, ends.other, len(ends.worse), ends.failed))
-    said = "-" if ends.fit.second_mode is None else f"rival, share {ends.fit.second_mode.share:.2f}"
-    return f"{name:38s} {shares}   {ends.above:7.3f} {ends.off:6.2f}  {1e3 * ends.seconds:5.1f}  {said}"
+    second = "-" if ends.fit.second_mode is None else f"second mode, share {ends.fit.second_mode.share:.2f}"
+    return f"{name:38s} {shares}   {ends.above:7.3f} {ends.off:6.2f}  {1e3 * ends.seconds:5.1f}  {second}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -170,9 +182,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", default="", help="cases with this in their name")
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args(arguments)
-    print(f"{args.count} starts each; shares in %: at the best optimum, at another as good, at a worse one, nowhere;")
-    print("the fit: cost above the best's, deviation from it in standard deviations; ms of a descent\n")
-    print(f"{'window':38s}  same  other  worse   none     above    off     ms  the fit says")
+    print(f"{args.count} starts each; shares in %: at the best optimum, at another as good, at a worse one, failed;")
+    print("the fit: -2 log posterior above the best's, deviation from it in sd; ms of a descent\n")
+    print(f"{'window':38s}  same  other  worse failed     above    off     ms  second mode")
     for case in cases():
         if args.only in case.name:
             print(line(case.name, ends_of(case, args.count, args.seed), args.count), flush=True)

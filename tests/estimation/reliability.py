@@ -1,4 +1,4 @@
-"""Simulated windows of soils drawn from the classes and from none of them: do reported probabilities come true?
+"""Are reported class probabilities calibrated?  Simulated windows on soils drawn from the classes and `unknown`.
 
 `PYTHONPATH=service python tests/estimation/reliability.py 300 [--seconds 10] [--slip 0.4]` prints the table.
 """
@@ -19,7 +19,7 @@ from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.parametrization import TYPICAL_DEPTH
 from soilbus.estimation.soil_classes import PRIOR_UNKNOWN, SoilClasses
-from soilbus.estimation.tracker import TRUST
+from soilbus.estimation.tracker import MISMATCH_SD
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import simulate
@@ -33,15 +33,15 @@ WIDE_COHESION = ("soil.c.value=5000", "soil.c.std=8000")
 EDGES = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 1.0)
 
 
-class Said(NamedTuple):
-    """Probabilities of a window, and the class that its soil was drawn from."""
+class Prediction(NamedTuple):
+    """Class probabilities of a window, and the class of its soil."""
 
     probability: dict[str, float]
     truth: str
 
 
 def drawn(classes: SoilClasses, rng: np.random.Generator) -> tuple[str, Soil | None]:
-    """A class, as likely as it is beforehand, and a soil of it; None where it is no soil at all."""
+    """A class by its prior probability, and a soil of it; None where that is not physical."""
     known = len(classes.names) - 1
     i = known if rng.random() < PRIOR_UNKNOWN else int(rng.integers(known))
     log_k_c, log_p, *logs = classes.centre[i] + classes.spread[i] * rng.standard_normal(6)
@@ -51,17 +51,17 @@ def drawn(classes: SoilClasses, rng: np.random.Generator) -> tuple[str, Soil | N
     return classes.names[i], soil if k_phi > 0.0 and phi < 1.2 else None
 
 
-def windows(count: int, seed: int, seconds: float, slip: float = 0.4) -> Iterator[Said]:
-    """What is said of so many drawn soils; those that no tractor can drive on are left out."""
+def windows(count: int, seed: int, seconds: float, slip: float = 0.4) -> Iterator[Prediction]:
+    """Predictions for `count` drawn soils, without those that the tractor cannot drive on."""
     config = reference_configuration(WIDE_COHESION)
     classes, prior = SoilClasses.of_table(float(rig_of(config).width.mean())), prior_of(config)
     for i in range(count):
         truth, soil = drawn(classes, np.random.default_rng([seed, i]))
         problem = None if soil is None else driven(config, soil, [seed, i], seconds, slip)
         fit = None if problem is None else fit_window(problem, prior)
-        if fit is None or not fit.converged or fit.chi2 > 1.1 + TRUST * math.sqrt(2.0 / fit.rows):
+        if fit is None or not fit.converged or fit.chi2 > 1.1 + MISMATCH_SD * math.sqrt(2.0 / fit.rows):
             continue  # the service reports such a window as degraded or invalid
-        yield Said(classes.probabilities(fit.posterior, prior), truth)
+        yield Prediction(classes.probabilities(fit.posterior, prior), truth)
 
 
 def driven(config: Config, soil: Soil, seed: list[int], seconds: float, slip: float = 0.4) -> ObservationModel | None:
@@ -79,10 +79,10 @@ def driven(config: Config, soil: Soil, seed: list[int], seconds: float, slip: fl
     return ObservationModel(store.window(0.0, seconds), rig, model_of(config), config.estimator.min_speed)
 
 
-def shortfall(said: list[Said]) -> float:
-    """By how many standard deviations the Brier score is above what the probabilities promise."""
+def shortfall(predictions: list[Prediction]) -> float:
+    """Brier score above its expectation by the probabilities, in sd of chance."""
     got = promised = variance = 0.0
-    for probability, truth in said:
+    for probability, truth in predictions:
         p = np.array([*probability.values()])
         got += probability[truth]
         promised += p @ p
@@ -98,17 +98,16 @@ def main() -> None:
     parser.add_argument("--slip", type=float, default=0.4)
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
-    said = list(windows(args.count, args.seed, args.seconds, args.slip))
-    first = [(max(p.values()), next(iter(p)) == truth) for p, truth in said]
-    unknown = [(p[UNKNOWN], truth == UNKNOWN) for p, truth in said]
-    every = [(value, name == truth) for p, truth in said for name, value in p.items()]
-    print(f"{len(said)} of {args.count} windows; the first named is right in {np.mean([r for _, r in first]):.1%}")
-    brier = np.mean([1.0 + sum(q**2 for q in p.values()) - 2.0 * p[truth] for p, truth in said])
-    print(
-        f"Brier score {brier:.3f}; above what the probabilities promise by {shortfall(said):+.1f} standard deviations"
-    )
-    for title, pairs in (("first named", first), ("unknown", unknown), ("every class", every)):
-        print(f"\n{title:<12}  windows  said   true   by chance +-")
+    predictions = list(windows(args.count, args.seed, args.seconds, args.slip))
+    first = [(max(p.values()), next(iter(p)) == truth) for p, truth in predictions]
+    unknown = [(p[UNKNOWN], truth == UNKNOWN) for p, truth in predictions]
+    every = [(value, name == truth) for p, truth in predictions for name, value in p.items()]
+    right = np.mean([r for _, r in first])
+    print(f"{len(predictions)} of {args.count} windows; the likeliest class is right in {right:.1%}")
+    brier = np.mean([1.0 + sum(q**2 for q in p.values()) - 2.0 * p[truth] for p, truth in predictions])
+    print(f"Brier score {brier:.3f}; above its expectation by {shortfall(predictions):+.1f} standard deviations")
+    for title, pairs in (("likeliest", first), ("unknown", unknown), ("every class", every)):
+        print(f"\n{title:<12}  windows  mean   true   by chance +-")
         for low, high in pairwise(EDGES):
             part = np.array([pair for pair in pairs if low <= pair[0] < high or pair[0] == high == 1.0], float)
             if len(part):

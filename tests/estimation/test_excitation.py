@@ -1,4 +1,4 @@
-"""Windows with too little variation: what is missing is named, what is determined is told, and intervals are right."""
+"""Windows with too little variation: what is missing is named, what is determined is reported, intervals are right."""
 
 from __future__ import annotations
 
@@ -31,7 +31,9 @@ CHANCE = 1e-3
 def rough(soil, *more):
     """Settings by which c and K are known to 25 % and k_c to 50 %."""
     k_c = SOILS[soil].k_c
-    return reference_configuration([*minima.told(soil), f"soil.k_c.value={k_c}", f"soil.k_c.std={0.5 * k_c}", *more])
+    return reference_configuration(
+        [*minima.c_and_K_known(soil), f"soil.k_c.value={k_c}", f"soil.k_c.std={0.5 * k_c}", *more]
+    )
 
 
 def deviations(posterior, soil):
@@ -120,7 +122,7 @@ def test_both_are_named_where_both_are_missing(soil):
 
 
 @pytest.mark.parametrize("soil", ["loam", "clayey_soil_38"])
-def test_the_pressure_at_the_depth_of_the_wheels_is_told_all_the_same(soil):
+def test_the_pressure_at_the_depth_of_the_wheels_is_reported_all_the_same(soil):
     result = said(soil, minima.constant(0.15), STILL, seconds=2.0, overrides=["estimator.max_bearing_std=0.01"])
     assert result.status is Status.NOT_EXCITED
     width = 0.38

@@ -1,4 +1,4 @@
-"""Solves that fail are told, counted by kind, and leave what is known alone; ambiguous windows say that they are."""
+"""Failed fits are reported, counted by kind and become no prior; ambiguous windows are reported as such."""
 
 from __future__ import annotations
 
@@ -150,13 +150,13 @@ def test_excited_windows_of_four_wheels_are_not_ambiguous():
             assert "ambiguous" not in reasons
 
 
-def test_no_belief_grows_from_one_of_two_optima():
+def test_one_of_two_optima_becomes_no_prior():
     scenario = Scenario(12.0, (Patch(0.0, "wet_clay"),), slip=minima.EXCITED)
     estimator = WindowEstimator(TWO)
-    told = 0
+    n_ambiguous = 0
     for task in tasks(TWO, scenario, 3):
         result = estimator.solve(task)
         if result.reason == "ambiguous":
-            told += 1
-            assert not estimator._tracker._gaussians
-    assert told > 0
+            n_ambiguous += 1
+            assert not estimator._tracker._posteriors
+    assert n_ambiguous > 0

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from drives import task_of, tasks
-from soilbus.traversability import Status
 
 from other_wheel import Contact, readings
+from soilbus.decision.traversability import Status
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.window import window_of_samples
 from soilbus.pipeline.estimator import WindowEstimator

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soilbus.estimation.local_cubics import PARTS, Series, curve_of, variance_of_one
+from soilbus.estimation.local_cubics import PHASE_PARTS, Series, curve_of, variance_of_one
 from soilbus.estimation.window import Rig, SensorNoise
 from soilbus.sensors.bins import Bins
 from soilbus.sensors.rates import resolved_window
@@ -43,8 +43,8 @@ def test_a_cubic_is_its_own_curve():
     t = 0.02 * np.arange(100)
     for curve in Series.of(t, cubic(t), np.full(len(t), 1e-6)):
         now = np.linspace(0.1, 1.8, 40)
-        for told, true in zip(curve.at(now), (cubic, cubic.deriv(), cubic.deriv(2)), strict=True):
-            assert told == pytest.approx(true(now), abs=1e-5)
+        for computed, true in zip(curve.at(now), (cubic, cubic.deriv(), cubic.deriv(2)), strict=True):
+            assert computed == pytest.approx(true(now), abs=1e-5)
 
 
 @pytest.mark.parametrize("half", [2, 4, 9])
@@ -65,8 +65,8 @@ def test_the_variance_of_a_value_at_one_instant_is_what_noise_makes_of_it(half, 
     left, right, rise = slopes[:, i], slopes[:, i + 1], smooth[:, i + 1] - smooth[:, i]
     there = smooth[:, i] + u * (left + u * (3 * rise - 2 * left - right + u * (left + right - 2 * rise)))
     own = slice(reach, reach + n)
-    told = noise[:, own].mean(1) - smooth[:, own].mean(1) + there
-    assert variance_of_one(half, n, round(phase * PARTS)) == pytest.approx(told.var(), rel=0.04)
+    computed = noise[:, own].mean(1) - smooth[:, own].mean(1) + there
+    assert variance_of_one(half, n, round(phase * PHASE_PARTS)) == pytest.approx(computed.var(), rel=0.04)
 
 
 def store_of(shake: float, step: float = 0.02) -> Bins:

@@ -1,4 +1,4 @@
-"""One optimum from wherever the search starts, or a word that there are two; nothing outside what is physical."""
+"""One optimum from every start, or a second mode that is reported; no soil outside its physical range."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.multistart import fit_from_soil, fit_window
-from soilbus.estimation.parametrization import BOUND, MAX_PHI
+from soilbus.estimation.parametrization import BOUND_SD, MAX_PHI
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import SOILS
@@ -21,8 +21,8 @@ from soilbus.terra.wheel import Soil
 
 STARTS = 20
 K_C = np.array(PARAMETERS) == "k_c"
-LESS_SURE = 1.052
-"""Std of log k_c by the default prior where K_L is known, over that without: at most (test_subsets.known_before)."""
+MAX_WIDENING = 1.052
+"""Greatest sd of log k_c given K_L over its sd by the default prior (test_subsets)."""
 KINDS = [
     ("loam", 10.0, minima.EXCITED, False), ("wet_clay", 2.0, minima.EXCITED, True),
     ("dry_sand", 2.0, minima.EXCITED, False), ("wet_clay", 10.0, minima.constant(0.15), True),
@@ -31,11 +31,11 @@ KINDS = [
 
 
 @pytest.mark.parametrize(("soil", "seconds", "slip", "sinkage"), KINDS)
-def test_random_starts_of_the_prior_end_at_what_the_fit_finds(soil, seconds, slip, sinkage):
+def test_descents_from_random_soils_of_the_prior_end_at_the_fit(soil, seconds, slip, sinkage):
     config = reference_configuration()
     case = minima.Case("", minima.window(config, soil, seconds, slip, sinkage), prior_of(config))
     ends = minima.ends_of(case, STARTS, 3)
-    assert ends.above < minima.SAME_COST
+    assert ends.above < minima.SAME_VALUE
     assert ends.off < minima.SAME_SOIL
     assert ends.other == 0
     assert not ends.worse
@@ -44,29 +44,29 @@ def test_random_starts_of_the_prior_end_at_what_the_fit_finds(soil, seconds, sli
 
 
 @pytest.fixture(scope="module")
-def torn():
-    """Two wheels of unlike widths on wet clay: k_c may be what it is, or nothing."""
+def bimodal():
+    """Two wheels of different widths on wet clay: k_c may have its value, or be close to zero."""
     config = minima.two_wheels(reference_configuration())
     return minima.window(config, "wet_clay", seed=3), prior_of(config)
 
 
-def test_two_optima_as_likely_are_a_fit_with_a_rival(torn):
-    problem, prior = torn
+def test_two_optima_of_similar_evidence_are_a_fit_with_a_second_mode(bimodal):
+    problem, prior = bimodal
     fit = fit_window(problem, prior)
     assert fit.converged
-    rival = fit.second_mode
-    assert 0.05 < rival.share <= 0.5
-    again = fit_from_soil(problem, prior, rival.gaussian.posterior.soil)  # it is an optimum indeed
+    second = fit.second_mode
+    assert 0.05 < second.share <= 0.5
+    again = fit_from_soil(problem, prior, second.gaussian.posterior.soil)  # it is an optimum
     assert again.converged
     assert minima.apart(again, fit) > 2.0
-    assert again.mode.posterior.distance(rival.gaussian.posterior.soil) < 0.1
-    assert rival.share == pytest.approx(
+    assert again.mode.posterior.distance(second.gaussian.posterior.soil) < 0.1
+    assert second.share == pytest.approx(
         1.0 / (1.0 + math.exp(0.5 * (again.neg2_log_evidence - fit.neg2_log_evidence))), abs=0.01
     )
 
 
-def test_what_is_passed_on_covers_both_optima(torn):
-    fit = fit_window(*torn)
+def test_what_is_reported_covers_both_optima(bimodal):
+    fit = fit_window(*bimodal)
     one, other, whole = fit.gaussian, fit.second_mode.gaussian, fit.reported
     off = np.log(other.soil / one.soil)
     share = fit.second_mode.share
@@ -79,8 +79,8 @@ def test_what_is_passed_on_covers_both_optima(torn):
     assert abs(bearing.value - truth) < 2.0 * bearing.std
 
 
-def test_held_or_inseparable_moduli_have_no_rival(torn):
-    problem, prior = torn
+def test_without_two_separable_moduli_there_is_no_second_mode(bimodal):
+    problem, prior = bimodal
     held = SoilPrior(prior.median, np.where(np.arange(6) == PARAMETERS.index("k_c"), 0.0, prior.log_std))
     assert fit_window(problem, held).second_mode is None
     config = reference_configuration([f"wheel.{w}.width=0.3" for w in ("FL", "FR", "RL", "RR")])
@@ -92,7 +92,7 @@ def short():
     config = reference_configuration()
     scenario = minima.Scenario(2.0, (minima.Patch(0.0, "loam"),), slip=minima.EXCITED)
     rig, channels = minima.rig_of(config), minima.simulate(config, scenario, 1).channels
-    store = minima.BinStore(rig, config.estimator.bin, 0.0)
+    store = minima.Bins(rig, config.estimator.bin, 0.0)
     store.add({c: (channels[c].t, channels[c].value) for c in rig.channels if c in channels})
     return store.window(0.0, 2.0), rig, minima.model_of(config), prior_of(config)
 
@@ -135,9 +135,9 @@ def harmed(window, harms, seed):
 
 @settings(derandomize=True, deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(harms=st.lists(HARM, max_size=3), rows=st.integers(1, 20), seed=st.integers(0, 9))
-def test_whatever_the_data_every_fit_is_physical(harms, rows, seed, short):
+def test_every_fit_is_physical_for_all_data(harms, rows, seed, short):
     window, rig, model, prior = short
-    problem = minima.WindowProblem(harmed(window, harms, seed).rows(np.arange(rows)), rig, model, 0.2)
+    problem = minima.ObservationModel(harmed(window, harms, seed).rows(np.arange(rows)), rig, model, 0.2)
     fit = fit_window(problem, prior)
     if fit is None:
         return
@@ -146,14 +146,14 @@ def test_whatever_the_data_every_fit_is_physical(harms, rows, seed, short):
     assert (soil > 0.0).all()
     assert fit.posterior.soil.phi <= MAX_PHI < 0.5 * math.pi
     away = np.abs(np.log(soil / prior.median)) / prior.log_std
-    assert away.max() < BOUND * (1.0 + 1e-9)
+    assert away.max() < BOUND_SD * (1.0 + 1e-9)
     for gaussian in (fit.mode, fit.gaussian, fit.reported):
         assert np.isfinite(gaussian.gains).all()
         spread = np.sqrt(np.diag(gaussian.covariance))
         assert np.isfinite(spread).all()
         scaled = gaussian.covariance[spread > 0.0][:, spread > 0.0] / np.outer(*[spread[spread > 0.0]] * 2)
         assert np.linalg.eigvalsh(scaled).min() > -1e-9
-        known = prior.log_std * np.where(K_C & (gaussian is not fit.mode), LESS_SURE, 1.0 + 1e-6)
-        assert (spread[:6] <= known).all() or (fit.second_mode is not None and gaussian is fit.reported)
+        most = prior.log_std * np.where(K_C & (gaussian is not fit.mode), MAX_WIDENING, 1.0 + 1e-6)
+        assert (spread[:6] <= most).all() or (fit.second_mode is not None and gaussian is fit.reported)
     assert math.isfinite(fit.neg2_log_posterior) or not fit.converged
     assert math.isfinite(fit.neg2_log_evidence) or not fit.converged

@@ -1,4 +1,4 @@
-"""Prior moments and propagation of uncertainty against Monte Carlo of the log-normal."""
+"""Priors and propagated uncertainty against Monte Carlo of the log-normal distribution."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_prior_is_log_normal_with_that_median_and_coefficient_of_variation(value
     assert prior.free.tolist() == list(range(6))
 
 
-def test_a_parameter_without_std_is_held():
+def test_a_parameter_with_std_zero_is_held():
     given_ = {name: (v, 0.0 if name in ("c", "K") else 0.3 * v) for name, v in VALUES.items()} | {"c": (0.0, 0.0)}
     prior = SoilPrior.from_value_std(given_)
     assert prior.free.tolist() == [0, 1, 2, 3]
@@ -46,12 +46,12 @@ def test_a_parameter_without_std_is_held():
     assert prior.median[4] == 0.0
 
 
-def test_parameters_come_with_their_std():
+def test_parameters_have_the_std_of_a_log_normal():
     posterior = Posterior(LOAM, np.diag([0.1, 0.2, 0.05, 0.02, 0.0, 0.3]) ** 2)
     estimates = posterior.parameters()
     assert list(estimates) == list(PARAMETERS)
     assert estimates["k_phi"].value == LOAM.k_phi
-    assert estimates["k_phi"].std == pytest.approx(0.2 * LOAM.k_phi, rel=0.04)  # test_carried has the exact one
+    assert estimates["k_phi"].std == pytest.approx(0.2 * LOAM.k_phi, rel=0.04)  # test_gaussian has the exact one
     assert estimates["n"].std == pytest.approx(0.05 * LOAM.n, rel=0.003)
     assert estimates["c"].std == 0.0
 
@@ -69,7 +69,7 @@ def test_bearing_pressure_and_tan_phi_against_monte_carlo(seed):
     assert posterior.tan_phi().std == pytest.approx(np.tan(sample.phi).std(), rel=0.03)
 
 
-def test_any_scalar_is_propagated_by_its_gradient():
+def test_a_scalar_has_the_std_by_its_gradient():
     posterior = Posterior(LOAM, correlated(0.02, 7))
     weights = np.array([1e-3, 2e-6, 3.0, -4.0, 1e-3, 50.0])
     sample = draws(posterior, 200_000) @ weights
@@ -80,13 +80,13 @@ def test_any_scalar_is_propagated_by_its_gradient():
     assert certain.bearing_pressure(0.02, 0.3).std == 0.0
 
 
-def test_a_round_off_negative_variance_is_no_nan():
+def test_a_variance_below_zero_by_rounding_is_zero():
     covariance = np.diag([1e-4, -1e-20, 0.0, 0.0, 0.0, 0.0])
     assert Posterior(LOAM, covariance).propagate(np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])) == 0.0
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_derived_quantities_jointly_against_monte_carlo(seed):
+def test_derived_quantities_have_the_joint_covariance_of_monte_carlo(seed):
     soil = SOILS[("loam", "wet_clay", "lete_sand")[seed]]
     posterior = Posterior(soil, correlated(0.03, seed))
     derived = posterior.derived(0.02, 0.3, [0.26, 0.38, 0.26])
@@ -105,38 +105,39 @@ def test_derived_quantities_jointly_against_monte_carlo(seed):
 
 
 @pytest.mark.parametrize("factor", [1.0, 4.0, 1e3, 1e12])
-def test_widening_divides_what_the_data_told_and_not_the_prior(factor):
+def test_widening_divides_the_information_of_the_data_and_not_of_the_prior(factor):
     rng = np.random.default_rng(3)
     prior = SoilPrior(np.array([6e3, 8e5, 0.6, 0.4, 3e3, 0.02]), np.array([1.27, 1.19, 0.6, 0.47, 0.0, 0.47]))
     free = prior.log_std > 0.0
-    beforehand = np.diag(prior.log_std[free] ** -2.0)
-    rows = rng.normal(size=(3, 5)) * 20.0  # of some directions the data say nothing
+    of_prior = np.diag(prior.log_std[free] ** -2.0)
+    rows = rng.normal(size=(3, 5)) * 20.0  # the data determine three directions of five
     covariance = np.zeros((6, 6))
-    covariance[np.ix_(free, free)] = np.linalg.inv(beforehand + rows.T @ rows)
+    covariance[np.ix_(free, free)] = np.linalg.inv(of_prior + rows.T @ rows)
     posterior = Posterior(Soil(*prior.median.tolist()), covariance)
     widened = posterior.widened(factor, prior)
-    expected = np.linalg.inv(beforehand + rows.T @ rows / factor)
+    expected = np.linalg.inv(of_prior + rows.T @ rows / factor)
     np.testing.assert_allclose(widened.log_covariance[np.ix_(free, free)], expected, rtol=1e-6, atol=1e-9)
     assert widened.log_covariance[4].tolist() == [0.0] * 6
     assert widened.soil == posterior.soil
 
 
-def test_what_is_considered_besides_adds_up_and_never_exceeds_the_prior():
+def test_an_added_covariance_adds_up_and_never_exceeds_the_prior():
     rng = np.random.default_rng(5)
     prior = SoilPrior(np.ones(6), np.array([0.8, 0.5, 0.0, 0.4, 0.6, 0.3]))
     free = np.flatnonzero(prior.log_std)
-    told = rng.standard_normal((5, 5)) * 400.0
+    root = rng.standard_normal((5, 5)) * 400.0
     own = np.zeros((6, 6))
-    own[np.ix_(free, free)] = np.linalg.inv(told @ told.T + np.diag(prior.log_std[free] ** -2))
+    own[np.ix_(free, free)] = np.linalg.inv(root @ root.T + np.diag(prior.log_std[free] ** -2))
     by = rng.standard_normal((6, 2)) * 1e-2
     posterior = Posterior(Soil(*np.ones(6)), own)
-    small = posterior.beside(by @ by.T, prior).log_covariance
+    small = posterior.with_added_covariance(by @ by.T, prior).log_covariance
     expected = own + (by @ by.T) * np.outer(prior.log_std > 0.0, prior.log_std > 0.0)
-    assert small == pytest.approx(expected, rel=0.02, abs=1e-7)  # what data tell by far outweighs the prior
-    huge = posterior.beside(1e6 * by @ by.T, prior).log_covariance
+    assert small == pytest.approx(expected, rel=0.02, abs=1e-7)  # the data outweigh the prior by far
+    huge = posterior.with_added_covariance(1e6 * by @ by.T, prior).log_covariance
     assert np.all(np.diag(huge) <= prior.log_std**2 * (1.0 + 1e-9))
     assert np.all(np.linalg.eigvalsh(huge - small) > -1e-6)
-    assert posterior.beside(np.zeros((6, 6)), prior).log_covariance == pytest.approx(own, rel=1e-6, abs=1e-12)
+    unchanged = posterior.with_added_covariance(np.zeros((6, 6)), prior).log_covariance
+    assert unchanged == pytest.approx(own, rel=1e-6, abs=1e-12)
     shift = 5.0 * prior.log_std
-    about = posterior.beside(1e6 * by @ by.T, prior, shift).log_covariance
+    about = posterior.with_added_covariance(1e6 * by @ by.T, prior, shift).log_covariance
     assert about == pytest.approx(huge + np.outer(shift, shift))

@@ -1,4 +1,4 @@
-"""Any subset of the six soil parameters free, the others held; and what two tyre widths tell of k_c."""
+"""Any subset of the six soil parameters free, the others held; and what two tyre widths determine of k_c."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SUBSETS = [subset for size in range(1, 7) for subset in combinations(range(6), s
 
 
 def prior_of(free, log_std=LOG_STD):
-    """Free parameters told with an error of this size, the others held at the truth."""
+    """Prior medians of the free parameters with an error of this size, the others held at the truth."""
     spread = np.zeros(6)
     spread[list(free)] = log_std
     miss = np.array([1.0, -0.7, 0.5, -1.0, 0.8, -0.6]) * spread
@@ -79,9 +79,9 @@ def fits(simulated):
     def fit(widths, seed):
         wheels = {"FL": 0, "FR": 0, "RL": 1, "RR": 1}
         settings = [f"wheel.{name}.width={widths[axle]}" for name, axle in wheels.items()]
-        told = TRUTH * np.exp(spread * np.random.default_rng([seed, 5]).standard_normal(6))
+        prior_median = TRUTH * np.exp(spread * np.random.default_rng([seed, 5]).standard_normal(6))
         problem = simulated(CLAY, seed, settings).problem()
-        return told, fit_window(problem, SoilPrior(told, spread)).posterior
+        return prior_median, fit_window(problem, SoilPrior(prior_median, spread)).posterior
 
     return {which: [fit(widths, 400 + seed) for seed in range(8)] for which, widths in WIDTHS.items()}
 
@@ -103,20 +103,20 @@ def test_two_tyre_widths_separate_k_c_from_k_phi(fits):
         assert 0.86 < (z**2).sum() < 26.2  # chi-square with 8 degrees of freedom: 99.8 %
 
 
-def known_before(told, K_L, width):
+def known_before(prior_median, K_L, width):
     """Mean and std of log k_c by the prior alone, where k_c / width + k_phi is K_L."""
     k_c = width * K_L * np.linspace(0.0, 1.0, 20_002)[1:-1]
     k_phi = K_L - k_c / width
-    off = np.log(np.stack([k_c, k_phi])) - np.log(told[:2])[:, None]
+    off = np.log(np.stack([k_c, k_phi])) - np.log(prior_median[:2])[:, None]
     weight = np.exp(-0.5 * ((off[0] / PRIOR) ** 2 + off[1] ** 2)) / (k_c * k_phi)  # uniform in k_c
     mean = np.average(np.log(k_c), weights=weight)
     return mean, np.sqrt(np.average((np.log(k_c) - mean) ** 2, weights=weight))
 
 
 def test_equal_widths_leave_k_c_at_its_prior(fits):
-    # With its own part in K_L, which is known: the share of k_phi was told beforehand too, if roughly.
-    for told, posterior in fits["alike"]:
-        mean, std = known_before(told, posterior.soil.k_phi + posterior.soil.k_c / 0.35, 0.35)
+    # With its own part in K_L, which is known: the share of k_phi has a prior too, if a wide one.
+    for prior_median, posterior in fits["alike"]:
+        mean, std = known_before(prior_median, posterior.soil.k_phi + posterior.soil.k_c / 0.35, 0.35)
         assert np.sqrt(posterior.log_covariance[0, 0]) == pytest.approx(std, rel=0.06)
         assert std > 0.9 * PRIOR
         assert np.log(posterior.soil.k_c) == pytest.approx(mean, abs=0.1 * PRIOR)

@@ -25,7 +25,7 @@ from soilbus.config.model import Config, ConfigError
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.service import Service
 from soilbus.daemon.state_store import Owner, State, StateError, dumped, gaussian_of, loaded, stored_gaussian
-from soilbus.estimation.assembly import completion_of, effects_of
+from soilbus.estimation.assembly import effects_and_parameters_of, effects_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.offline.replay import LogError, read_frames
 from soilbus.pipeline.intake import Intake
@@ -234,7 +234,7 @@ def check_model(data: bytes) -> int:
         (folder / "f.toml").write_bytes(TRACTOR.read_bytes() + b"\n" + data)
         try:
             config = load_config(folder / "f.toml")
-            active, (effects, free) = effects_of(config), completion_of(config)
+            active, (effects, free) = effects_of(config), effects_and_parameters_of(config)
         except ConfigError as error:
             return _told(error.faults)
         for one in active:

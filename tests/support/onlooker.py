@@ -326,14 +326,14 @@ class TrueTracker(Tracker):
         super().__init__(*args)
 
     @property
-    def newest(self) -> Gaussian | None:
+    def newest_posterior(self) -> Gaussian | None:
         return self.said
 
-    def forget(self) -> None:
-        super().forget()
+    def reset(self) -> None:
+        super().reset()
         self.said = None
 
-    def recall(self, gaussian: Gaussian, elapsed: float) -> None:
+    def start_from_last_run(self, gaussian: Gaussian, elapsed: float) -> None:
         self.drive.recalled = gaussian, elapsed
 
     def estimate(self, window: Window, end: float) -> TrackerOutput:

@@ -13,6 +13,7 @@ import gzip
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -208,7 +209,7 @@ def _truth(rng: np.random.Generator, ground: Ground, duration: float, shake: flo
 
 def _integrated(ground: Ground, draft: Array, slope: Array, omega: Array, rough: Array) -> tuple[Array, Array, Array]:
     """Wheel loads (4, N) [N], ground speed (N,) [m/s] and acceleration (N,), by the implicit midpoint for the speed."""
-    front, rear = _PullTable(ground, 0), _PullTable(ground, 2)
+    front, rear = _pull_table(ground, 0), _pull_table(ground, 2)
     pulls = front, front, rear, rear
     level_rear = MASS * GRAVITY * (WHEELBASE - CG_AHEAD) / WHEELBASE
     n = len(draft)
@@ -268,6 +269,12 @@ class _PullTable:
         x, y = x - i, y - j
         low, high = self.rows[i], self.rows[i + 1]
         return float((1 - x) * ((1 - y) * low[j] + y * low[j + 1]) + x * ((1 - y) * high[j] + y * high[j + 1]))
+
+
+@cache
+def _pull_table(ground: Ground, wheel: int) -> _PullTable:
+    """The table of a wheel on a ground, made once."""
+    return _PullTable(ground, wheel)
 
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)

@@ -43,7 +43,7 @@ class GuardedEstimator:
     @property
     def newest(self) -> Gaussian | None:
         """What the present estimator knows; None as long as there is none."""
-        return None if self._estimator is None else self._estimator.tracker.newest
+        return None if self._estimator is None else self._estimator.tracker.newest_posterior
 
     @property
     def in_fault(self) -> bool:

@@ -114,7 +114,7 @@ class Service:
         """In the worker: the estimator, with what was known before."""
         estimator, keeper = self._pipeline.estimator, self._opened_keeper()
         if keeper is not None and keeper.recalled is not None:
-            estimator.tracker.recall(*keeper.recalled)
+            estimator.tracker.start_from_last_run(*keeper.recalled)
         self._keeper = keeper
         return estimator
 
@@ -124,7 +124,7 @@ class Service:
         return self._backlog.solved
 
     @property
-    def newest(self) -> Gaussian | None:
+    def newest_posterior(self) -> Gaussian | None:
         """Posterior that the next window's prior comes from, as the state file keeps it; None before there is one."""
         return self._solver.newest
 
@@ -143,7 +143,7 @@ class Service:
         self._backlog.close()
         self.bus.close()
         if self._keeper is not None:
-            self._keeper.close(self.newest, self._totals())
+            self._keeper.close(self.newest_posterior, self._totals())
 
     def step(self) -> None:
         """Receive until the next tick, then hand out, collect and publish what is due."""
@@ -248,7 +248,7 @@ class Service:
             self._next_watchdog = now + interval
             self.notifier.watchdog()
         if self._keeper is not None:
-            self._keeper.tick(now, self.newest, self._totals)
+            self._keeper.tick(now, self.newest_posterior, self._totals)
 
     def _look_after_health(self, now: float) -> None:
         hears = self.bus.is_open and now - self._time.last_frame <= SILENCE

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from soilbus.daemon.state_store import Owner, State, StateError, dumped, gaussian_of, read, stored_gaussian, write_whole
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.tracker import PERSISTENCE
+from soilbus.estimation.tracker import GAIN_CORRELATION_TIME
 from soilbus.words import one_line
 
 log = logging.getLogger(__name__)
@@ -53,7 +53,9 @@ class StatePersistence:
         if self._before is None or self._before.gaussian is None:
             return None
         elapsed = self._wall() - self._before.gaussian.at
-        return Recalled(gaussian_of(self._before.gaussian, self._owner), elapsed if elapsed >= 0.0 else PERSISTENCE)
+        return Recalled(
+            gaussian_of(self._before.gaussian, self._owner), elapsed if elapsed >= 0.0 else GAIN_CORRELATION_TIME
+        )
 
     def tick(self, now: float, gaussian: Gaussian | None, counts: Callable[[], Mapping[str, int]]) -> None:
         """Have the state written if that is due at the monotonic time `now` [s]; returns at once."""

@@ -25,11 +25,11 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, NonNegative
 from soilbus.arrays import Array
 from soilbus.can.channels import Channel
 from soilbus.config.model import Config
-from soilbus.estimation.assembly import completion_of, model_of, prior_of, rig_of
+from soilbus.estimation.assembly import effects_and_parameters_of, model_of, prior_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.parametrization import MAX_PHI
 from soilbus.estimation.posterior import PARAMETERS
-from soilbus.estimation.tracker import elsewhere, gain_errors
+from soilbus.estimation.tracker import gain_errors, new_soil_prior
 from soilbus.words import one_line
 
 FORMAT, VERSION = "soilbus state", 2
@@ -94,12 +94,12 @@ class Owner:
     def of(cls, config: Config, channels: Iterable[Channel], database: Database) -> Owner:
         """The vehicle of a configuration, with the signals that its channels come from."""
         prior = prior_of(config)
-        names, gain_std = gain_errors(rig_of(config), model_of(config), completion_of(config)[1])
+        names, gain_std = gain_errors(rig_of(config), model_of(config), effects_and_parameters_of(config)[1])
         return cls(
             digest([config.model_dump(mode="json", include=SECTIONS), [_wiring(c, database) for c in channels]]),
             tuple(names),
             np.concatenate([prior.median, np.zeros(len(names))]),
-            np.concatenate([elsewhere(prior).log_std, gain_std]),
+            np.concatenate([new_soil_prior(prior).log_std, gain_std]),
         )
 
 

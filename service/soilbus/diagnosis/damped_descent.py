@@ -1,12 +1,12 @@
-"""A slower descent for models whose optimum is far away, or along a valley that bends, where the fast one goes astray.
+"""Damped descent for fits that the fast descent does not bring to their optimum: far away, or along a curved valley.
 
-The cost of a soil with gains and effects depends on where the latents are, and one linear
-step does not bring them to their best where residuals are many standard deviations: then
-the fast descent refuses good steps and creeps.  Here the latents follow at every place
-before its cost counts, and no step is taken that does not lower it (Levenberg-Marquardt on
-what is left: variable projection, Golub & Pereyra 1973, SIAM J. Numer. Anal. 10:413).
-Nearer the optimum steps bend as the residuals do (geodesic acceleration: Transtrum & Sethna
-2012, arXiv:1201.5885).
+    (H + damping diag H) step = -g    (H, g: information and half the gradient of -2 log posterior, latents eliminated)
+
+Far from the optimum one linear step does not bring the latents to their own optimum, and -2 log posterior with latents
+as measured misleads.  So the latents follow at each iterate before it is compared with another (variable projection:
+Golub & Pereyra 1973, SIAM J. Numer. Anal. 10:413), and a step is taken only where it lowers -2 log posterior
+(Levenberg-Marquardt).  Nearer the optimum steps follow the second derivative of the residuals (geodesic acceleration:
+Transtrum & Sethna 2012, arXiv:1201.5885).
 """
 
 from __future__ import annotations
@@ -21,196 +21,227 @@ from soilbus.estimation.multistart import DescentOptions, Fit
 from soilbus.estimation.observation_model import Linearisation, Optimum
 from soilbus.estimation.solver import Iterate, Objective, QuadraticModel
 
+# A value whose docstring states no source has no evidence recorded.
 MAX_STEPS = 15
-ENOUGH_FAR = 2e-3
-"""Share of what the cost is above NEAR that is no fall worth a step."""
-DAMPING, EASED, HELD_BACK = 1e-2, 0.3, 10.0
-"""The damping of the first step, and what one that lowers the cost, and one that does not, makes of it."""
-MOST_DAMPING = 1e4
-NEAR = 2.0
-"""Cost for each residual below which one linear step brings the latents to their best."""
-EVEN = 1e-2
-"""Share of the cost that a further one changes where it does so elsewhere."""
-MAX_TRIED = 3
-"""Shares of a full step that are tried before damping."""
-GOOD, AS_FORETOLD = 0.3, 0.85
-"""Shares of the foretold fall that a good step brings, and one that comes out as foretold."""
-SHORT, LONGER = 0.15, 2.0
-"""Share of a full step below which the next one is longer where it came out as foretold, and how much."""
-LEAST = 1e-4
-"""Share of a full step that is none."""
-BENT, SHORTER = 4.0, 0.5
-"""How far a bent step goes over how far a straight one could, and how much shorter it is if that was too far."""
+"""Steps after which a descent ends unconverged."""
+FAR_STOP_SHARE = 2e-3
+"""Fall that is not worth a step, as a share of -2 log posterior above NEAR_PER_RESIDUAL times the residuals."""
+INITIAL_DAMPING, DAMPING_DECREASE, DAMPING_INCREASE = 1e-2, 0.3, 10.0
+"""Damping of the first step (share of the diagonal), and its factor after a step that is taken and one that is not."""
+MAX_DAMPING = 1e4
+"""Damping at which the descent ends."""
+NEAR_PER_RESIDUAL = 2.0
+"""-2 log posterior for each residual below which one linear step brings the latents to their optimum."""
+LATENTS_CONVERGED_SHARE = 1e-2
+"""The same above it: the share of -2 log posterior that a further linear step of the latents may still change."""
+MAX_CURVED_TRIALS = 3
+"""Shares of a full step that are tried before a damped step."""
+MIN_GAIN_RATIO, GOOD_GAIN_RATIO = 0.3, 0.85
+"""Fall over predicted fall (gain ratio) of a step that is taken, and of one after which the next is lengthened."""
+SHORT_SHARE, LENGTHENING = 0.15, 2.0
+"""Share of a full step below which the next one is lengthened after a good step, and the factor."""
+MIN_SHARE = 1e-4
+"""Share of a full step that counts as no step."""
+MAX_CURVED_RATIO, SHORTENING = 4.0, 0.5
+"""Longest curved step over the longest straight one that would be taken, and the factor after a step that is not."""
 
 
-class _Here(NamedTuple):
-    """A place and the normal equations there."""
+class Expansion(NamedTuple):
+    """An iterate and the quadratic model there."""
 
-    place: Iterate
-    point: QuadraticModel
+    iterate: Iterate
+    quadratic: QuadraticModel
 
 
-def descended(fitting: Objective, fast: Fit, effort: DescentOptions) -> Fit | None:
-    """The optimum below where the fast descent ended.
+def descend_damped(objective: Objective, fast: Fit, options: DescentOptions) -> Fit | None:
+    """The optimum below the point at which the fast descent ended.
 
-    It ends where no more is foreseen than decides nothing, or what is foreseen is above what is hopeless.  None where
-    the numbers are not finite.
+    Parameters
+    ----------
+    objective
+        Of the window.
+    fast
+        The fit that did not converge.
+    options
+        The descent ends where the predicted fall is negligible, or the predicted -2 log posterior is above
+        give_up_above.
+
+    Returns
+    -------
+    Fit or None
+        None where the model is not finite, or the descent is given up at once.
     """
-    ground, end = _Ground(fitting), fast.optimum
+    levenberg, end = _LevenbergSteps(objective), fast.optimum
     with np.errstate(all="ignore"):
-        ended = Iterate(end.soil, fitting.problem.allowed(end.gains), end.latents, fast.neg2_log_posterior, 0)
-        point = fitting.with_prior(ended, end.at)
-        if point is None or _foreseen(point, point.step()) > effort.give_up_above:
+        ended = Iterate(end.soil, objective.problem.allowed(end.gains), end.latents, fast.neg2_log_posterior, 0)
+        quadratic = objective.with_prior(ended, end.at)
+        if quadratic is None or _predicted(quadratic, quadratic.step()) > options.give_up_above:
             return None
-        here = ground.at(ended, end.at)
+        here = levenberg.expanded(ended, end.at)
         if here is None:
             return None
-        valley, damping, falling, steps = _Valley(fitting), DAMPING, np.inf, 0
-        while damping < MOST_DAMPING and steps < MAX_STEPS:
-            enough, full = _enough(fitting, here.point, effort.nothing), here.point.step()
-            worth = min(here.point.neg2_log_posterior - effort.nothing, effort.give_up_above)
-            if full is None or falling < enough or _foreseen(here.point, full) > worth:
+        geodesic, damping, fall, steps = GeodesicSteps(objective), INITIAL_DAMPING, np.inf, 0
+        while damping < MAX_DAMPING and steps < MAX_STEPS:
+            negligible, full = (
+                _negligible_fall(objective, here.quadratic, options.stall_tolerance),
+                here.quadratic.step(),
+            )
+            target = min(here.quadratic.neg2_log_posterior - options.stall_tolerance, options.give_up_above)
+            if full is None or fall < negligible or _predicted(here.quadratic, full) > target:
                 break
-            there, tried = valley.along(here, full) if ground.is_even(here.point) else (None, 0)
+            there, tried = geodesic.along(here, full) if levenberg.one_step_suffices(here.quadratic) else (None, 0)
             steps += tried
-            if there is None and (honest := ground.honest(here, enough)) is not None:
-                here, steps = honest, steps + 1
+            if there is None and (corrected := levenberg.with_latents_at_optimum(here, negligible)) is not None:
+                here, steps = corrected, steps + 1
                 continue
             if there is None:
-                there, steps = ground.damped(here, damping), steps + 1
-                damping *= HELD_BACK if there is None else EASED
+                there, steps = levenberg.damped(here, damping), steps + 1
+                damping *= DAMPING_INCREASE if there is None else DAMPING_DECREASE
             if there is not None:
-                falling, here = here.point.neg2_log_posterior - there.point.neg2_log_posterior, there
-        return _fit(fitting, *here, steps, converged=steps < MAX_STEPS)
+                fall, here = here.quadratic.neg2_log_posterior - there.quadratic.neg2_log_posterior, there
+        return _fit(objective, *here, steps, converged=steps < MAX_STEPS)
 
 
 @dataclass(slots=True)
-class _Ground:
-    """Places with their latents where they fit best; `even` where the linear model brings them there by itself."""
+class _LevenbergSteps:
+    """Levenberg-Marquardt steps between iterates whose latents are at their optimum.
 
-    fitting: Objective
-    even: bool = False
+    latents_converged: whether the last linear step of the latents changed -2 log posterior by a negligible share.
+    """
 
-    def is_even(self, point: QuadraticModel) -> bool:
-        """Whether one linear step brings the latents to their best: where the last one did, and near the optimum."""
-        return self.even or point.neg2_log_posterior < NEAR * self.fitting.problem.n_rows
+    objective: Objective
+    latents_converged: bool = False
 
-    def at(self, place: Iterate, at: Linearisation | None = None) -> _Here | None:
-        """A place, which may be linearised already, with its latents at their best, and the normal equations there."""
-        point = self.fitting.point(place) if at is None else self.fitting.with_prior(place, at)
-        if point is None:
+    def one_step_suffices(self, quadratic: QuadraticModel) -> bool:
+        """Whether one linear step brings the latents to their optimum: where the last one did, and near the optimum."""
+        near = NEAR_PER_RESIDUAL * self.objective.problem.n_rows
+        return self.latents_converged or quadratic.neg2_log_posterior < near
+
+    def expanded(self, iterate: Iterate, at: Linearisation | None = None) -> Expansion | None:
+        """The iterate with its latents at their optimum; `at` is its linearisation where that is at hand."""
+        quadratic = self.objective.quadratic_model(iterate) if at is None else self.objective.with_prior(iterate, at)
+        if quadratic is None:
             return None
-        here = _Here(place, point)
-        if self.is_even(point):
+        here = Expansion(iterate, quadratic)
+        if self.one_step_suffices(quadratic):
             return here
-        there = _followed(self.fitting, here)
-        self.even = (
+        there = _with_latents_stepped(self.objective, here)
+        self.latents_converged = (
             there is not None
-            and abs(there.point.neg2_log_posterior - point.neg2_log_posterior) < EVEN * point.neg2_log_posterior
+            and abs(there.quadratic.neg2_log_posterior - quadratic.neg2_log_posterior)
+            < LATENTS_CONVERGED_SHARE * quadratic.neg2_log_posterior
         )
         return there
 
-    def damped(self, here: _Here, damping: float) -> _Here | None:
-        """The place after a damped step, where it costs less."""
-        step = here.point.step(damping)
-        there = None if step is None else self.at(self.fitting.stepped(*here, step))
-        return there if there is not None and there.point.neg2_log_posterior < here.point.neg2_log_posterior else None
+    def damped(self, here: Expansion, damping: float) -> Expansion | None:
+        """The iterate after a damped step; None where that does not lower -2 log posterior."""
+        step = here.quadratic.step(damping)
+        there = None if step is None else self.expanded(self.objective.stepped(*here, step))
+        falls = there is not None and there.quadratic.neg2_log_posterior < here.quadratic.neg2_log_posterior
+        return there if falls else None
 
-    def honest(self, here: _Here, enough: float) -> _Here | None:
-        """The same place with its latents at their best where that costs more: no step lowers what it seemed to cost.
+    def with_latents_at_optimum(self, here: Expansion, negligible: float) -> Expansion | None:
+        """The same iterate with its latents stepped, where -2 log posterior is then higher: it was underestimated.
 
-        None where it does not, or where every place that is tried is so anyway.
+        None where it is not higher, or where the latents of each iterate are stepped anyway.
         """
-        if not self.is_even(here.point):
+        if not self.one_step_suffices(here.quadratic):
             return None
-        there, self.even = _followed(self.fitting, here), False
-        return (
-            there
-            if there is not None and there.point.neg2_log_posterior > here.point.neg2_log_posterior + enough
-            else None
+        there, self.latents_converged = _with_latents_stepped(self.objective, here), False
+        underestimated = (
+            there is not None and there.quadratic.neg2_log_posterior > here.quadratic.neg2_log_posterior + negligible
         )
+        return there if underestimated else None
 
 
 @dataclass(slots=True)
-class _Valley:
-    """Steps along a valley that bends.
+class GeodesicSteps:
+    """Steps along a curved valley.
 
-    share: of a full step that the next one takes; bend (R,): second derivative of the
-    residuals along a full step as the last ones foretell it, None where they do not.
+    share: of a full step that the next one takes.  second_derivative (R,): of the residuals along a full step, as
+    predicted from the last steps; None where unknown.
     """
 
-    fitting: Objective
+    objective: Objective
     share: float = 1.0
     second_derivative: Array | None = None
 
-    def along(self, here: _Here, full: Array) -> tuple[_Here | None, int]:
-        """The place after a part of a full step (F + A,), None where none lowers the cost, and how many were tried."""
-        place, point = here
-        length, least = point.length(full), None
-        for tried in range(1, MAX_TRIED + 1):
+    def along(self, here: Expansion, full: Array) -> tuple[Expansion | None, int]:
+        """The iterate after a share of a full step (F + A,), and how many were tried.
+
+        None where none lowers -2 log posterior.
+        """
+        iterate, quadratic = here
+        length, least = quadratic.squared_length(full), None
+        for tried in range(1, MAX_CURVED_TRIALS + 1):
             share = self.share
             step = (
                 share * full
                 if self.second_derivative is None
-                else self.fitting.geodesic_step(place, point, share, self.second_derivative)
+                else self.objective.geodesic_step(iterate, quadratic, share, self.second_derivative)
             )
             if step is not None:
-                reach = self.fitting.step_share(place, step)
-                share, step = reach * share, reach * step
+                within = self.objective.step_fraction(iterate, step)
+                share, step = within * share, within * step
             there = None
-            if step is not None and share > LEAST:
-                there = _at(self.fitting, self.fitting.stepped(place, point, step))
+            if step is not None and share > MIN_SHARE:
+                there = _expand(self.objective, self.objective.stepped(iterate, quadratic, step))
             if step is None or there is None:
-                self.share, self.second_derivative = SHORTER * self.share, None
+                self.share, self.second_derivative = SHORTENING * self.share, None
                 continue
-            foretold, fall = share * (2.0 - share) * length, point.neg2_log_posterior - there.point.neg2_log_posterior
-            second_derivative = self.fitting.second_derivative(place, point, step, there.point) / share**2
-            if fall > GOOD * foretold:
-                left = 1.0 - share
-                further = LONGER if share < SHORT and fall > AS_FORETOLD * foretold else 1.0
-                self.share = min(further * share / left, 1.0) if left > 0.0 else 1.0
-                self.second_derivative = second_derivative * left**2 if left > 0.0 else None
+            predicted = share * (2.0 - share) * length
+            fall = quadratic.neg2_log_posterior - there.quadratic.neg2_log_posterior
+            second_derivative = self.objective.second_derivative(iterate, quadratic, step, there.quadratic) / share**2
+            if fall > MIN_GAIN_RATIO * predicted:
+                rest = 1.0 - share
+                factor = LENGTHENING if share < SHORT_SHARE and fall > GOOD_GAIN_RATIO * predicted else 1.0
+                self.share = min(factor * share / rest, 1.0) if rest > 0.0 else 1.0
+                self.second_derivative = second_derivative * rest**2 if rest > 0.0 else None
                 return there, tried
-            if fall > 0.0 and (least is None or there.point.neg2_log_posterior < least.point.neg2_log_posterior):
+            if fall > 0.0 and (
+                least is None or there.quadratic.neg2_log_posterior < least.quadratic.neg2_log_posterior
+            ):
                 least = there
-            straight = share * (length * share / (foretold - fall)) ** (1.0 / 3.0)  # the bend costs share^4
-            self.share = min(share, BENT * straight) if self.second_derivative is None else SHORTER * share
+            straight = share * (length * share / (predicted - fall)) ** (1.0 / 3.0)  # the error grows as share^4
+            curved = MAX_CURVED_RATIO * straight
+            self.share = min(share, curved) if self.second_derivative is None else SHORTENING * share
             self.second_derivative = second_derivative
-        return least, MAX_TRIED
+        return least, MAX_CURVED_TRIALS
 
 
-def _foreseen(point: QuadraticModel, full: Array | None) -> float:
-    """The cost after a full step (F + A,), if all were linear; infinite where there is none."""
-    return np.inf if full is None else point.neg2_log_posterior - point.length(full)
+def _predicted(quadratic: QuadraticModel, full: Array | None) -> float:
+    """-2 log posterior after a full step (F + A,) by the quadratic model; infinite where there is no step."""
+    return np.inf if full is None else quadratic.neg2_log_posterior - quadratic.squared_length(full)
 
 
-def _at(fitting: Objective, place: Iterate) -> _Here | None:
-    point = fitting.point(place)
-    return None if point is None else _Here(place, point)
+def _negligible_fall(objective: Objective, quadratic: QuadraticModel, nothing: float) -> float:
+    """Fall of -2 log posterior below which a step was the last."""
+    above = quadratic.neg2_log_posterior - NEAR_PER_RESIDUAL * objective.problem.n_rows
+    return max(nothing, FAR_STOP_SHARE * above)
 
 
-def _followed(fitting: Objective, here: _Here) -> _Here | None:
-    """The place with its latents where the linear model there says that they fit best."""
-    return _at(fitting, fitting.stepped(*here, np.zeros(len(here.point.gradient))))
+def _expand(objective: Objective, iterate: Iterate) -> Expansion | None:
+    quadratic = objective.quadratic_model(iterate)
+    return None if quadratic is None else Expansion(iterate, quadratic)
 
 
-def _enough(fitting: Objective, point: QuadraticModel, nothing: float) -> float:
-    """Fall of the cost at a point below which a step was the last."""
-    return max(nothing, ENOUGH_FAR * (point.neg2_log_posterior - NEAR * fitting.problem.n_rows))
+def _with_latents_stepped(objective: Objective, here: Expansion) -> Expansion | None:
+    """The iterate with its latents at the optimum of the linear model there."""
+    return _expand(objective, objective.stepped(*here, np.zeros(len(here.quadratic.gradient))))
 
 
-def _fit(fitting: Objective, place: Iterate, point: QuadraticModel, steps: int, converged: bool) -> Fit | None:
-    gaussians = fitting.gaussians_at(place, point, place.soil)
+def _fit(objective: Objective, iterate: Iterate, quadratic: QuadraticModel, steps: int, converged: bool) -> Fit | None:
+    gaussians = objective.gaussians_at(iterate, quadratic, iterate.soil)
     if gaussians is None:
         return None
     return Fit(
         gaussian=gaussians[1],
         mode=gaussians[1],
-        sinkage=fitting.problem.mean_sinkage(place.as_soil(), place.gains, place.latents),
-        optimum=Optimum(fitting.problem.t, place.soil, place.gains, place.latents, point.at),
-        neg2_log_posterior=point.neg2_log_posterior,
-        neg2_log_evidence=point.neg2_log_evidence,
-        rows=fitting.problem.n_rows,
+        sinkage=objective.problem.mean_sinkage(iterate.as_soil(), iterate.gains, iterate.latents),
+        optimum=Optimum(objective.problem.t, iterate.soil, iterate.gains, iterate.latents, quadratic.linearisation),
+        neg2_log_posterior=quadratic.neg2_log_posterior,
+        neg2_log_evidence=quadratic.neg2_log_evidence,
+        rows=objective.problem.n_rows,
         iterations=steps,
         converged=converged,
     )

@@ -1,13 +1,15 @@
-"""How late a channel is: the joint posterior of its dead time d and the time constant tau of its low pass.
+"""How late a channel is: joint posterior of the dead time d and the time constant tau of its low pass.
 
-Evenly driven recordings tell the sum d + tau well and the parts hardly: what tau does besides goes with tau^2, so
-that the likelihood is a bent ridge, and a Gaussian at its top is too wide where tau is 0 and too narrow elsewhere.
-So the cost -2 log posterior, least over soil, gains and other effects (which are linear about the fit), is taken
-along the ridge: at each tau a parabola over the sum, then moments over all tau (Laplace's method with one
-parameter integrated outright; Tierney & Kadane 1986, J. Am. Stat. Assoc. 81:82).
+    p(d, tau) ~ exp(-cost(d, tau) / 2),  cost = squared prior terms + sum over recordings of min -2 log posterior / T
+    E[x] = integral over tau of  sd(tau) exp(-cost(tau) / 2) x(tau)      (sum d + tau: Laplace at each tau)
 
-Costs are tempered as the verdict's evidences are: curves of the readings leave bias and noise that are not the
-model's, and a delay shares them with a low pass.
+Evenly driven recordings determine the sum d + tau well and its parts hardly: the effect of tau beyond the sum goes
+with tau^2.  The likelihood is a curved ridge, of which a Gaussian at the top is too wide where tau is 0 and too narrow
+elsewhere.  So -2 log posterior, minimised over soil, gains and other effects (in which it is taken as quadratic about
+the fit), is evaluated along the ridge: at each tau a parabola over the sum, then moments over all tau (Laplace's
+method with one parameter integrated numerically: Tierney & Kadane 1986, J. Am. Stat. Assoc. 81:82).  It is divided by
+the temperature T of `verdict`: interpolating measurements leaves bias and noise that are not the model's, and a delay
+shares them with a low pass.
 """
 
 from __future__ import annotations
@@ -32,22 +34,28 @@ from soilbus.estimation.solver import Iterate, Objective
 from soilbus.terra.effects.effect import Effect, Late
 
 Cost = Callable[[float, float], float]
+"""-2 log posterior, tempered, of dead time [s] and time constant [s]."""
 
 _SOIL = len(PARAMETERS)
+# A value whose docstring states no source has no evidence recorded.
 NODES = 11
-"""Time constants at which the cost is taken: over all their range, and again over where the posterior is."""
-STEP, ROUNDS = 0.005, 12
-"""Half the span of sums [s] that a parabola goes through, and how often it is moved downhill at most."""
-
-FORM_OF_PARTS, FORM_OF_SUM = 0.1, 0.02
-"""Sd of a part and of the sum besides, as shares of the sum: what of a channel moves faster than its curve is not
-shifted.  Of delays and low passes of 0.04 to 0.2 s of the second generator (tests/support/shaking.py)."""
-SETTLED = 2.0
-"""Fall of the tempered -2 log posterior along a ridge from which a fit is taken up again there."""
+"""Time constants of the quadrature: over the whole range, and again over where the posterior is."""
+SUM_STEP = 0.005
+"""Half the span of sums [s] that a parabola goes through."""
+MAX_NEWTON_STEPS = 12
+"""Steps along the sum at one time constant."""
+ERROR_OF_PARTS, ERROR_OF_SUM = 0.1, 0.02
+"""Further sd of a part and of the sum, as shares of the sum: what moves faster than a channel's interpolating curve is
+not shifted.  Of delays and low passes of 0.04 to 0.2 s of the second generator (tests/support/shaking.py)."""
+REFIT_FALL = 2.0
+"""Fall of the tempered -2 log posterior along a ridge from which the model is fitted again from there."""
 
 
 class DelayPosterior(NamedTuple):
-    """Mean and sd [s] of dead time, time constant and their sum; where the cost is least, and by how much."""
+    """Mean and sd [s] of dead time, time constant and their sum.
+
+    best: dead time and time constant [s] of the least -2 log posterior; fall: by how much that is below the fit's.
+    """
 
     delay: Estimate
     time_constant: Estimate
@@ -56,27 +64,22 @@ class DelayPosterior(NamedTuple):
     fall: float
 
 
-class _Ridge(NamedTuple):
-    """At time constants (K,): the likeliest sum, its sd, and the cost there."""
-
-    tau: Array
-    total: Array
-    sd: Array
-    cost: Array
-
-    def weights(self) -> Array:
-        """Shares (K,) of the posterior's mass."""
-        edges = np.concatenate([self.tau[:1], (self.tau[1:] + self.tau[:-1]) / 2.0, self.tau[-1:]])
-        return np.asarray(softmax(np.log(self.sd * np.diff(edges)) - 0.5 * self.cost))
-
-
 def with_delays(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, explained: float) -> FittedModel:
-    """A fitted model that tells how late channels are by their posteriors; from where the cost is least along these.
+    """A fitted model that reports delays by their joint posteriors.
 
-    explained: fall of -2 log evidence by its effects.
+    Fitted again from the best delays where these lower -2 log posterior by more than REFIT_FALL.
+
+    Parameters
+    ----------
+    records, prior
+        Those of the fit.
+    fitted
+        The model.
+    explained
+        Fall of -2 log evidence by its effects.
     """
     found = delay_posteriors(records, prior, fitted, explained)
-    if any(posterior.fall > SETTLED * temperature(explained) for posterior in found.values()):
+    if any(posterior.fall > REFIT_FALL * temperature(explained) for posterior in found.values()):
         better = fit_model(records, prior, fitted.effects, _starts(fitted, found))
         if better is not None and better.neg2_log_evidence < fitted.neg2_log_evidence:
             fitted, found = better, delay_posteriors(records, prior, better, explained)
@@ -91,43 +94,30 @@ def with_delays(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel
 
 
 def _starts(fitted: FittedModel, found: Mapping[tuple[str, Late], DelayPosterior]) -> list[Start]:
-    """Where these fits ended, with channels as late as is likeliest."""
+    """Where these fits ended, with the best delays."""
     starts = []
     n_sensors = fitted.checks[0].problem.n_sensors
     for start in fitted.as_starts():
         gains = start.gains.copy()
-        for i, free in enumerate(fitted.beforehand):
+        for i, free in enumerate(fitted.free_unheld):
             for (name, late), posterior in found.items():
                 if free.effect == name and free.parameter.name in (late.delay, late.time_constant):
                     best = posterior.best[free.parameter.name == late.time_constant]
-                    gains[n_sensors + i] = free.pull_at(best)
+                    gains[n_sensors + i] = free.standardised(best)
         starts.append(start._replace(gains=gains))
     return starts
 
 
-def delay_posteriors(
-    records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, explained: float
-) -> dict[tuple[str, Late], DelayPosterior]:
-    """The posterior of each channel that a fitted model lets be late, by effect and names of the parameters."""
-    found: dict[tuple[str, Late], DelayPosterior] = {}
-    heat = temperature(explained)
-    for effect in fitted.effects:
-        for late in effect.late.values():
-            names = [(f.effect, f.parameter.name) for f in fitted.beforehand]
-            at = names.index((effect.name, late.delay)), names.index((effect.name, late.time_constant))
-            if all(fitted.beforehand[i].std > 0.0 for i in at):
-                found[effect.name, late] = _posterior(records, prior, fitted, at, heat)
-    return found
+def exceeds_sampling_delay(
+    records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, effect: Effect, explained: float
+) -> bool:
+    """Whether an effect of a fitted model delays any channel by more than half its sample time, by two deviations.
 
-
-def is_late(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, effect: Effect, explained: float) -> bool:
-    """Whether any channel is surely later, by an effect of a fitted model, than half the time between its samples.
-
-    A stamp says when a frame was on the bus: what it holds was measured up to a cycle before, half of one in the mean.
-    Surely: by two standard deviations.
+    A stamp says when a frame was on the bus: its value was measured up to a cycle before, half of one on average.
+    True where no channel's sample time is known.
     """
-    half = {late: records[-1].learned.sample_time(quantity) / 2.0 for quantity, late in effect.late.items()}
-    if not any(half.values()):  # nobody knows when its samples came
+    half = {late: records[-1].training.sample_time(quantity) / 2.0 for quantity, late in effect.late.items()}
+    if not any(half.values()):
         return True
     totals = [
         (posterior.total, half[late])
@@ -137,19 +127,38 @@ def is_late(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, ef
     return any(abs(total.value) - 2.0 * total.std > of_cycle for total, of_cycle in totals)
 
 
+def delay_posteriors(
+    records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, explained: float
+) -> dict[tuple[str, Late], DelayPosterior]:
+    """The posterior of each channel that a fitted model lets be late, by effect and names of its parameters.
+
+    Parameters as of with_delays().
+    """
+    found: dict[tuple[str, Late], DelayPosterior] = {}
+    divisor = temperature(explained)
+    for effect in fitted.effects:
+        for late in effect.late.values():
+            names = [(f.effect, f.parameter.name) for f in fitted.free_unheld]
+            at = names.index((effect.name, late.delay)), names.index((effect.name, late.time_constant))
+            if all(fitted.free_unheld[i].std > 0.0 for i in at):
+                found[effect.name, late] = _posterior(records, prior, fitted, at, divisor)
+    return found
+
+
 def _posterior(
-    records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, at: tuple[int, int], heat: float
+    records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, at: tuple[int, int], divisor: float
 ) -> DelayPosterior:
-    first, second = (fitted.beforehand[i] for i in at)
-    here = tuple(fitted.free[i].at(_pull(fitted, i)) for i in at)
-    parts = [_Part(record, prior, fitted, i, at) for i, record in enumerate(records)]
+    """The posterior of the parameters at two indices (dead time, time constant)."""
+    first, second = (fitted.free_unheld[i] for i in at)
+    here = tuple(fitted.free[i].at(_standardised(fitted, i)) for i in at)
+    profiles = [_RecordProfile(record, prior, fitted, i, at) for i, record in enumerate(records)]
 
     def cost(delay: float, tau: float) -> float:
-        of_prior = first.pull_at(delay) ** 2 + second.pull_at(tau) ** 2
-        return of_prior + sum(part.cost(delay, tau) for part in parts) / heat
+        of_prior = first.standardised(delay) ** 2 + second.standardised(tau) ** 2
+        return of_prior + sum(profile.cost(delay, tau) for profile in profiles) / divisor
 
     low, high = first.parameter.low, first.parameter.high
-    most = min(second.parameter.high, max(sum(here) - low, STEP) + 2.0 * STEP)
+    most = min(second.parameter.high, max(sum(here) - low, SUM_STEP) + 2.0 * SUM_STEP)
     bounds, start = (low, high), (sum(here), here[1])
     ridge = _ridge(cost, np.linspace(0.0, most, NODES), start, bounds, first.std)
     share = ridge.weights()
@@ -160,21 +169,35 @@ def _posterior(
     ridge = _ridge(cost, np.linspace(begin, end, NODES), start, bounds, first.std)
     share, best = ridge.weights(), int(np.argmin(ridge.cost))
 
-    sums = float(share @ ridge.total)
+    mean_total = float(share @ ridge.total)
 
-    def estimate_of(values: Array, sd: Array, form: float) -> Estimate:
+    def estimate_of(values: Array, sd: Array, error: float) -> Estimate:
         mean = float(share @ values)
-        return Estimate(mean, float(np.sqrt(share @ (sd**2 + (values - mean) ** 2) + (form * sums) ** 2)))
+        return Estimate(mean, float(np.sqrt(share @ (sd**2 + (values - mean) ** 2) + (error * mean_total) ** 2)))
 
-    within = np.full(NODES, (ridge.tau[1] - ridge.tau[0]) / np.sqrt(12.0))  # of a node's own stretch
+    within = np.full(NODES, (ridge.tau[1] - ridge.tau[0]) / np.sqrt(12.0))  # sd inside a node's interval
     delay = ridge.total - ridge.tau
     return DelayPosterior(
-        estimate_of(delay, np.hypot(ridge.sd, within), FORM_OF_PARTS),
-        estimate_of(ridge.tau, within, FORM_OF_PARTS),
-        estimate_of(ridge.total, ridge.sd, FORM_OF_SUM),
+        estimate_of(delay, np.hypot(ridge.sd, within), ERROR_OF_PARTS),
+        estimate_of(ridge.tau, within, ERROR_OF_PARTS),
+        estimate_of(ridge.total, ridge.sd, ERROR_OF_SUM),
         (float(delay[best]), float(ridge.tau[best])),
-        heat * (cost(*here) - float(ridge.cost[best])),
+        divisor * (cost(*here) - float(ridge.cost[best])),
     )
+
+
+class _Ridge(NamedTuple):
+    """At time constants (K,): the best sum [s], its sd [s], and the cost there."""
+
+    tau: Array
+    total: Array
+    sd: Array
+    cost: Array
+
+    def weights(self) -> Array:
+        """Shares (K,) of the posterior's mass."""
+        edges = np.concatenate([self.tau[:1], (self.tau[1:] + self.tau[:-1]) / 2.0, self.tau[-1:]])
+        return np.asarray(softmax(np.log(self.sd * np.diff(edges)) - 0.5 * self.cost))
 
 
 def _ridge(cost: Cost, taus: Array, here: tuple[float, float], bounds: tuple[float, float], std: float) -> _Ridge:
@@ -188,89 +211,96 @@ def _ridge(cost: Cost, taus: Array, here: tuple[float, float], bounds: tuple[flo
         total = here[0] if order.step > 0 else float(found[0, first])
         for i in order:
             tau = float(taus[i])
-            total, found[1, i], found[2, i] = _downhill(cost, tau, total, (bounds[0] + tau, bounds[1] + tau), std)
+            total, found[1, i], found[2, i] = _best_sum(cost, tau, total, (bounds[0] + tau, bounds[1] + tau), std)
             found[0, i] = total
     return _Ridge(taus, *found)
 
 
-def _downhill(
+def _best_sum(
     cost: Cost, tau: float, total: float, bounds: tuple[float, float], std: float
 ) -> tuple[float, float, float]:
-    """The likeliest sum at a time constant, its sd, no more than the prior's std, and the cost there."""
-    low, high = bounds[0] + STEP, bounds[1] - STEP
-    for _ in range(ROUNDS):
+    """The best sum at a time constant, its sd (at most the prior's std), and the cost there, by Newton's method."""
+    low, high = bounds[0] + SUM_STEP, bounds[1] - SUM_STEP
+    for _ in range(MAX_NEWTON_STEPS):
         total = min(max(total, low), high)
-        earlier, here, later = (cost(s - tau, tau) for s in (total - STEP, total, total + STEP))
-        curved, slope = (earlier + later - 2.0 * here) / STEP**2, (later - earlier) / (2.0 * STEP)
-        move = -slope / curved if curved > 0.0 else -np.sign(slope) * np.inf
-        if abs(move) <= STEP or not low < min(max(total + move, low), high) < high:
+        earlier, here, later = (cost(s - tau, tau) for s in (total - SUM_STEP, total, total + SUM_STEP))
+        curvature, slope = (earlier + later - 2.0 * here) / SUM_STEP**2, (later - earlier) / (2.0 * SUM_STEP)
+        move = -slope / curvature if curvature > 0.0 else -np.sign(slope) * np.inf
+        if abs(move) <= SUM_STEP or not low < min(max(total + move, low), high) < high:
             break
-        total += float(np.clip(move, -4.0 * STEP, 4.0 * STEP))
-    curved, move = max(curved, 2.0 / std**2), float(np.clip(move, -STEP, STEP))
-    return total + move, float(np.sqrt(2.0 / curved)), here + slope * move + 0.5 * curved * move**2
+        total += float(np.clip(move, -4.0 * SUM_STEP, 4.0 * SUM_STEP))
+    curvature, move = max(curvature, 2.0 / std**2), float(np.clip(move, -SUM_STEP, SUM_STEP))
+    return total + move, float(np.sqrt(2.0 / curvature)), here + slope * move + 0.5 * curvature * move**2
 
 
-class _Part:
-    """One recording, linear about its fit in all but how late one channel is."""
+class _RecordProfile:
+    """-2 log posterior of one recording over the lateness of one channel, minimised over all else.
+
+    All else is linear about the fit.
+    """
 
     def __init__(self, record: Record, prior: SoilPrior, fitted: FittedModel, i: int, at: tuple[int, int]) -> None:
         self.fit: Fit = fitted.fits[i]
-        free = tuple(fitted.beforehand[k] if k in at else f for k, f in enumerate(fitted.free))
-        self.problem = record.learned.completed(fitted.effects, free)
+        free = tuple(fitted.free_unheld[k] if k in at else f for k, f in enumerate(fitted.free))
+        self.problem = record.training.with_effects(fitted.effects, free)
         self.columns = [self.problem.n_sensors + k for k in at]
         self.free = [free[k] for k in at]
-        joint_prior = _without(fitted.joint_prior[i], self.columns)
+        joint_prior = _with_held(fitted.joint_prior[i], self.columns)
         self.gains = self.fit.optimum.gains.copy()
         for f, k, column in zip(self.free, at, self.columns, strict=True):
-            self.gains[column] = f.pull_at(fitted.free[k].at(float(self.gains[column])))
+            self.gains[column] = f.standardised(fitted.free[k].at(float(self.gains[column])))
         optimum = self.fit.optimum
-        fitting = Objective(self.problem, prior, joint_prior)
-        place = Iterate(optimum.soil, self.gains, optimum.latents, np.inf, 0)
-        point = fitting.point(place)
-        if point is None:
+        objective = Objective(self.problem, prior, joint_prior)
+        iterate = Iterate(optimum.soil, self.gains, optimum.latents, np.inf, 0)
+        quadratic = objective.quadratic_model(iterate)
+        if quadratic is None:
             raise np.linalg.LinAlgError("the model is not finite where it was fitted")
-        self.point, self.directions = point, fitting.directions(place)
+        self.quadratic, self.directions = quadratic, objective.directions(iterate)
         variance, row_var = self.problem.variances(self.gains)
-        self.inverse = inverse_covariance(point.at.by_latents, variance, row_var, self.problem.n_wheels)
+        self.inverse = inverse_covariance(quadratic.linearisation.by_latents, variance, row_var, self.problem.n_wheels)
         self.torque = self.problem.torques(optimum.soil, self.gains, optimum.latents)
-        self.alone = self.problem.completed(
+        self.alone = self.problem.with_effects(
             [e for e in fitted.effects if e.name == self.free[0].effect], _alone(free, at)
         )
         self.sensors = self.gains[: self.problem.n_sensors]
         self.here = self._residuals(*(f.at(float(self.gains[c])) for f, c in zip(self.free, self.columns, strict=True)))
 
     def _residuals(self, *values: float) -> Array:
-        """What this channel alone is off where it is so late (delay, time constant)."""
-        pulls = iter(f.pull_at(v) for f, v in zip(self.free, values, strict=True))
-        gains = np.concatenate([self.sensors, [next(pulls) if f.std else 0.0 for f in self.alone.free]])
-        late = self.alone.lateness(gains, self.fit.optimum.latents, self.torque)
-        return self.alone.late_residuals(late, self.point.at.by_latents, gains)
+        """Residuals that this channel alone leaves at a delay and a time constant [s]."""
+        standardised = iter(f.standardised(v) for f, v in zip(self.free, values, strict=True))
+        gains = np.concatenate([self.sensors, [next(standardised) if f.std else 0.0 for f in self.alone.free]])
+        late = self.alone.delay_terms(gains, self.fit.optimum.latents, self.torque)
+        return self.alone.delay_residuals(late, self.quadratic.linearisation.by_latents, gains)
 
     def cost(self, delay: float, tau: float) -> float:
-        """-2 log posterior of this recording, least over all the rest."""
-        off = self._residuals(delay, tau) - self.here
-        weighed = (self.inverse @ off[:, :, None])[:, :, 0]
-        at = self.point.at
-        gradient = self.point.gradient + self.directions.T @ (at.rows.T @ weighed.ravel())
-        fall = gradient @ np.linalg.solve(self.point.information, gradient)
+        """-2 log posterior of this recording at a delay and a time constant [s], minimised over all else."""
+        change = self._residuals(delay, tau) - self.here
+        weighed = (self.inverse @ change[:, :, None])[:, :, 0]
+        at = self.quadratic.linearisation
+        gradient = self.quadratic.gradient + self.directions.T @ (at.rows.T @ weighed.ravel())
+        fall = gradient @ np.linalg.solve(self.quadratic.information, gradient)
         return float(
-            self.point.neg2_log_posterior + 2.0 * at.weighed[:, 0] @ off.ravel() + (off * weighed).sum() - fall
+            self.quadratic.neg2_log_posterior
+            + 2.0 * at.weighed[:, 0] @ change.ravel()
+            + (change * weighed).sum()
+            - fall
         )
 
 
 def _alone(free: Sequence[Free], at: tuple[int, int]) -> list[Free]:
-    """The parameters of one effect of which two may vary, and the others leave nothing."""
+    """The parameters of one effect, of which the two at these indices may vary and the others have no influence."""
     own = [i for i, f in enumerate(free) if f.effect == free[at[0]].effect]
     return [free[i] if i in at else replace(free[i], value=0.0, std=0.0) for i in own]
 
 
-def _without(joint_prior: Gaussian, columns: Sequence[int]) -> Gaussian:
-    """What was known before of all but these gains, which are held."""
+def _with_held(joint_prior: Gaussian, columns: Sequence[int]) -> Gaussian:
+    """A joint prior under which these gains are held: without variance."""
     covariance = joint_prior.covariance.copy()
     held = [_SOIL + c for c in columns]
     covariance[held] = covariance[:, held] = 0.0
     return Gaussian(joint_prior.soil, joint_prior.gains, covariance)
 
 
-def _pull(fitted: FittedModel, i: int) -> float:
+def _standardised(fitted: FittedModel, i: int) -> float:
+    """The i-th effect parameter of a fitted model, in units of its prior std."""
     return float(fitted.fits[-1].mode.gains[fitted.checks[-1].problem.n_sensors + i])

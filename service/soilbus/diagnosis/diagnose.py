@@ -1,4 +1,12 @@
-"""Find where model and data disagree, name the missing effect, add it, show the gap shrink."""
+"""The diagnosis: where model and data disagree, which effects are missing, and how much of the gap they explain.
+
+    gap = reduced chi-square of held-out blocks;  fall = -2 log evidence before - after an effect is added
+
+The present model is fitted and its held-out residuals are tested place by place (`where`).  Effects are added one at a
+time, at most MAX_EFFECTS, by stepwise search (`search`); `verdict` turns evidences and remaining gap into a verdict.
+Where the verdict is unknown, `residual_terms` describes what remains; where it is none, `detectable` says what these
+recordings could have shown.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +20,17 @@ from soilbus.diagnosis.detectable import Detectable, detectable
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.gap import Gap, gap_of
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.residual_terms import Correction, corrections
-from soilbus.diagnosis.search import ASTRAY, THINNED, Addition, Fits, Standing, converged, named, reconsidered
+from soilbus.diagnosis.residual_terms import ResidualTerms, residual_terms
+from soilbus.diagnosis.search import (
+    MAX_REFINED_GAP,
+    THINNING,
+    Addition,
+    FitCache,
+    PresentModel,
+    best_addition,
+    fitted_to_convergence,
+    with_swaps,
+)
 from soilbus.diagnosis.verdict import Verdict, verdict_of
 from soilbus.diagnosis.where import Disagreement, disagreements
 from soilbus.estimation.posterior import Posterior, SoilPrior
@@ -23,7 +40,8 @@ from soilbus.terra.effects.vehicle import GRADE, GRADE_BESIDE_PITCH
 __all__ = ["Diagnosis", "NotFitted", "diagnose"]
 
 MAX_EFFECTS = 3
-OVERLAP = 0.25
+"""Effects that are added at most."""
+MAX_OVERLAP = 0.25
 """Share by which the sum of what effects explain alone may differ from what they explain together: of 9 blind pairs
 (seed 132) with nothing in common it was 0.96 to 1.08, of 5 that look alike 1.1 to 1.6."""
 
@@ -34,12 +52,27 @@ class NotFitted(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """What was found; base is the present model, completed the one with the effects added.
+    """What was found.
 
-    additions are in the order of what they explain beside each other, the most first.
-    learned describes what is left where the verdict is unknown.  The gaps are those of
-    gap_of().  imitation: what each effect explains alone, where all may be an imitation (see shares_alone()).
-    detectable tells of a verdict `none` what these recordings could have shown.
+    Attributes
+    ----------
+    verdict
+        None, named, ambiguous or unknown.
+    where
+        Places of significant disagreement under the present model, the clearest first.
+    additions
+        Effects added, in the order of what they explain beside each other, the most first.
+    base, completed
+        The present model, and the model with the effects added.
+    residual_terms
+        Description of what remains, where the verdict is unknown.
+    gap_before, gap_after
+        Gaps of these two models over all folds.
+    imitation
+        What each effect explains alone, as a share of what all explain, where all may be an imitation (see
+        shares_alone()).
+    detectable
+        Where the verdict is none, what these recordings could have shown.
     """
 
     verdict: Verdict
@@ -47,25 +80,26 @@ class Diagnosis:
     additions: tuple[Addition, ...]
     base: FittedModel
     completed: FittedModel
-    learned: tuple[Correction, ...]
+    residual_terms: tuple[ResidualTerms, ...]
     gap_before: Gap
     gap_after: Gap
     imitation: tuple[float, ...] = ()
     detectable: tuple[Detectable, ...] = ()
 
     def soil_before(self, record: int) -> Posterior:
-        """The soil of a recording as the present model tells it."""
+        """The soil of a recording under the present model."""
         return self.base.fits[record].posterior
 
     def soil_after(self, record: int) -> Posterior:
-        """As the completed model tells it, with a share of each change of a logarithm as a further deviation.
+        """The soil of a recording under the completed model.
 
-        One for all parameters together: what the effects changed they may have changed too much or too little.
+        A share of each change of a logarithm counts as a further standard deviation (`verdict.soil_error_share`), one
+        for all parameters together: what the effects changed they may have changed too much or too little.
         """
-        told, before = self.completed.fits[record].posterior, self.soil_before(record)
-        share = max((addition.form_left for addition in self.additions), default=0.0)
-        left = share * np.log(np.array(told.soil) / np.array(before.soil))
-        return Posterior(told.soil, told.log_covariance + np.outer(left, left))
+        after, before = self.completed.fits[record].posterior, self.soil_before(record)
+        share = max((addition.soil_error_share for addition in self.additions), default=0.0)
+        error = share * np.log(np.array(after.soil) / np.array(before.soil))
+        return Posterior(after.soil, after.log_covariance + np.outer(error, error))
 
 
 def diagnose(
@@ -74,70 +108,86 @@ def diagnose(
     catalogue: Sequence[Effect],
     progress: Callable[[str], None] = lambda _: None,
 ) -> Diagnosis:
-    """The whole of it; NotFitted where already the present model cannot be fitted."""
+    """The whole diagnosis.
+
+    Parameters
+    ----------
+    records
+        Recordings of one vehicle, each divided into training and held-out blocks.
+    prior
+        Of the soil, the same for each recording.
+    catalogue
+        Effects that may be missing.
+    progress
+        Called with each stage's name.
+
+    Raises
+    ------
+    NotFitted
+        Where already the present model cannot be fitted.
+    """
     progress("fitting the present model")
-    whole, few = Fits(records, prior), Fits([record.thinned(THINNED) for record in records], prior)
-    base = whole.of(records[0].learned.effects)
+    full, thinned = FitCache(records, prior), FitCache([record.thinned(THINNING) for record in records], prior)
+    base = full.fit(records[0].training.effects)
     if base is None:
         raise NotFitted("the present model does not converge on these recordings")
-    law = records[0].learned.model.shear_law
+    law = records[0].training.model.shear_law
     candidates = [of_vehicle(effect, records) for effect in catalogue if effect.base_law in (None, law)]
     where = disagreements(base)
     present = base
     additions: list[Addition] = []
     while len(additions) < MAX_EFFECTS:
         progress(f"looking for effect {len(additions) + 1}")
-        left = [effect for effect in candidates if effect.name not in present.names]
-        found = named(
-            whole, few, Standing.of(present, whole, few), left, base.neg2_log_evidence - present.neg2_log_evidence
-        )
+        possible = [effect for effect in candidates if effect.name not in present.names]
+        explained = base.neg2_log_evidence - present.neg2_log_evidence
+        found = best_addition(full, thinned, PresentModel.of(present, full, thinned), possible, explained)
         if found is None:
             break
         addition, present = found
         additions.append(addition)
-        if len(additions) > 1 and present.gap < ASTRAY:
-            additions, present = reconsidered(whole, few, base, present, additions, candidates)
-    present = converged(whole, base.neg2_log_evidence, present)
+        if len(additions) > 1 and present.gap < MAX_REFINED_GAP:
+            additions, present = with_swaps(full, thinned, base, present, additions, candidates)
+    present = fitted_to_convergence(full, base.neg2_log_evidence, present)
     if any(effect.late for effect in present.effects):
-        progress("telling delays from low passes")
+        progress("separating delays from low passes")
         present = with_delays(records, prior, present, base.neg2_log_evidence - present.neg2_log_evidence)
     additions.sort(key=lambda addition: -addition.falls[addition.effect.name])
     progress("holding out every block in turn")
     before = gap_of(records, prior, base)
     after = gap_of(records, prior, present) if additions else before
-    imitation = shares_alone(whole, base, present, additions)
+    imitation = shares_alone(full, base, present, additions)
     chances = [addition.probability for addition in additions]
     verdict = verdict_of(before.value, after.value, min(before.rows, after.rows), chances, bool(imitation))
-    learned = corrections(list(records), present) if verdict is Verdict.UNKNOWN else []
+    remaining = residual_terms(list(records), present) if verdict is Verdict.UNKNOWN else []
     shown: tuple[Detectable, ...] = ()
     if verdict is Verdict.NONE:
-        progress("asking what these recordings could have shown")
+        progress("finding what these recordings could have shown")
         shown = detectable(records, prior, base, [effect for effect in candidates if effect.name not in base.names])
     return Diagnosis(
-        verdict, tuple(where), tuple(additions), base, present, tuple(learned), before, after, imitation, shown
+        verdict, tuple(where), tuple(additions), base, present, tuple(remaining), before, after, imitation, shown
     )
 
 
 def shares_alone(
-    whole: Fits, base: FittedModel, present: FittedModel, additions: Sequence[Addition]
+    full: FitCache, base: FittedModel, present: FittedModel, additions: Sequence[Addition]
 ) -> tuple[float, ...]:
     """What each effect explains alone, as a share of what all explain together; empty where nothing is to be doubted.
 
-    Faults that have nothing in common explain together the sum of what each explains alone.  Where as many effects as
-    are ever added do not, the signature of one lies over that of another, which hides it or cancels part of it: as
-    likely an imitation of something that the catalogue lacks as so many faults at once.
+    Faults that have nothing in common explain together the sum of what each explains alone.  Where MAX_EFFECTS effects
+    do not, the signature of one lies over that of another, which hides it or cancels part of it: an imitation of
+    something that the catalogue lacks is then as likely as that number of faults at once.
     """
     if len(additions) < MAX_EFFECTS:
         return ()
-    alone = [whole.of((*base.effects, addition.effect)) for addition in additions]
+    alone = [full.fit((*base.effects, addition.effect)) for addition in additions]
     together = base.neg2_log_evidence - present.neg2_log_evidence
     shares = tuple(
         0.0 if one is None else max(base.neg2_log_evidence - one.neg2_log_evidence, 0.0) / together for one in alone
     )
-    return () if abs(sum(shares) - 1.0) < OVERLAP else shares
+    return () if abs(sum(shares) - 1.0) < MAX_OVERLAP else shares
 
 
 def of_vehicle(effect: Effect, records: Sequence[Record]) -> Effect:
     """The effect as it can be on the vehicle of these recordings: beside a pitch sensor a slope is measured."""
-    with_pitch = all(record.learned.with_pitch for record in records)
+    with_pitch = all(record.training.with_pitch for record in records)
     return GRADE_BESIDE_PITCH if with_pitch and effect is GRADE else effect

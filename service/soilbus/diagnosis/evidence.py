@@ -1,14 +1,14 @@
-"""Evidence for an effect of which nobody knows how great, nor how simple, it is.
+"""Evidence of an effect whose size, and whose simplest sufficient form, are unknown.
 
-The catalogue's prior ranges are those of large effects.  Held to them alone, one with
-eight parameters that is there, but small, has to beat eight large penalties, and one
-beyond its range another.  So the evidence is that of a mixture: the parameters that say
-how great an effect is have, together, one of several times their prior std (a scale
-mixture of Gaussians, as heavy-tailed as it is peaked: Andrews & Mallows 1974, J. R. Stat.
-Soc. B 36:99).  And what is there may be simpler than all that the effect could be: a curve
-along the way with fewer bends, one wheel of four, one of a loss's parts.  Each simpler
-case has the same chance as the whole (averaging over models: Hoeting et al. 1999, Stat.
-Sci. 14:382).
+    p(data | effect) = mean over cases c, mean over scales s of  integral L(u) N(u; 0, s^2 I) du,
+    log L(u) = b' u - u' H u / 2    (u: the effect's parameters in units of their prior std)
+
+The catalogue's prior ranges are those of large effects.  With these ranges alone, a small effect of eight parameters
+has to overcome eight large penalties.  So the parameters that say how large an effect is share a scale, one of
+PRIOR_SCALES times their prior std, each equally likely (a scale mixture of Gaussians, as heavy-tailed as it is peaked:
+Andrews & Mallows 1974, J. R. Stat. Soc. B 36:99).  And an effect may be simpler than all it could be: a curve along
+the way with fewer knots, one wheel of four, one part of a loss.  Each simpler case has the same prior probability as
+the full effect (Bayesian model averaging: Hoeting et al. 1999, Stat. Sci. 14:382).
 """
 
 from __future__ import annotations
@@ -24,72 +24,98 @@ from soilbus.estimation.nuisance_parameters import Free
 from soilbus.terra.effects.along import splines
 from soilbus.terra.effects.effect import Knot
 
-SCALES = tuple(2.0**k for k in range(-4, 3))
-"""Times the prior std, all as likely."""
+PRIOR_SCALES = tuple(2.0**k for k in range(-4, 3))
+"""Scales of the mixture, in units of the catalogue's prior std; all equally likely."""
 
 
-def evidence_of_any_size(information: Array, pull: Array, free: Sequence[Free]) -> float:
-    """-2 log evidence over that of the effect's absence, from what the data tell of its parameters.
+def mixture_neg2_log_evidence(information: Array, information_vector: Array, free: Sequence[Free]) -> float:
+    """-2 log evidence of an effect, relative to its absence.
 
-    Of parameters (P,) in units of their prior std the data's log likelihood is
-    pull u - u information u / 2, whatever all else may be.
+    Parameters
+    ----------
+    information
+        H (P, P), Fisher information of the effect's parameters in units of their prior std, all others maximised or
+        marginalised.
+    information_vector
+        b (P,), gradient of the log likelihood at zero.
+    free
+        The parameters.
     """
-    found = [_evidences(rows @ information @ rows.T, rows @ pull, sized) for rows, sized in _cases(free)]
+    found = [_per_scale(rows @ information @ rows.T, rows @ information_vector, sized) for rows, sized in _cases(free)]
     each = np.concatenate([evidences + 2.0 * np.log(len(evidences)) for evidences in found])
     return float(-2.0 * np.logaddexp.reduce(-0.5 * each) + 2.0 * np.log(len(found)))
 
 
+def mixture_correction(standardised: Array, covariance: Array, free: Sequence[Free]) -> float:
+    """Difference of the -2 log evidence under the mixture to that under the catalogue's prior std.
+
+    Parameters
+    ----------
+    standardised, covariance
+        Posterior mean (P,) and covariance (P, P) of the effect's parameters in units of their prior std.
+    free
+        The parameters.
+    """
+    information, information_vector = _likelihood(standardised, covariance)
+    fixed = np.zeros(len(standardised), bool)
+    mixture = mixture_neg2_log_evidence(information, information_vector, free)
+    return mixture - float(_per_scale(information, information_vector, fixed)[0])
+
+
 class OwnParameters(NamedTuple):
-    """What one recording tells of the parameters (P,) that are its own, as evidence_of_any_size() wants it."""
+    """Likelihood of the parameters (P,) that one recording has for itself.
+
+    information (P, P) and information_vector (P,) are as mixture_neg2_log_evidence() takes them.
+    """
 
     information: Array
-    pull: Array
+    information_vector: Array
     free: tuple[Free, ...]
 
     def surcharge(self, temperature: float) -> float:
-        """By how much more they cost than their share of a -2 log evidence that is divided by a temperature.
+        """By how much more these parameters cost than their share of a -2 log evidence divided by a temperature.
 
-        That division is for formulas that are not the field's: as if there were so many times less data.  What
-        parameters cost for being there does not shrink in proportion, but as their information does (coarsened
-        posterior: Miller & Dunson 2019, J. Am. Stat. Assoc. 114:1113).
+        Dividing by a temperature T allows for formulas that are not the field's, as if there were T times less data.
+        The penalty for having the parameters does not shrink in that proportion, but as their information does
+        (coarsened posterior: Miller & Dunson 2019, J. Am. Stat. Assoc. 114:1113).
         """
-        coarse = evidence_of_any_size(self.information / temperature, self.pull / temperature, self.free)
-        return coarse - evidence_of_any_size(self.information, self.pull, self.free) / temperature
+        coarse = mixture_neg2_log_evidence(
+            self.information / temperature, self.information_vector / temperature, self.free
+        )
+        return coarse - mixture_neg2_log_evidence(self.information, self.information_vector, self.free) / temperature
 
 
-def own_parameters(pulls: Array, covariance: Array, free: Sequence[Free], times: float = 1.0) -> OwnParameters:
-    """The same from what a fit came to, with so many times the data."""
-    information, pull = _likelihood(pulls, covariance)
-    return OwnParameters(times * information, times * pull, tuple(free))
+def own_parameters(
+    standardised: Array, covariance: Array, free: Sequence[Free], data_ratio: float = 1.0
+) -> OwnParameters:
+    """OwnParameters from posterior mean (P,) and covariance (P, P) of a fit, as of data_ratio times its data."""
+    information, information_vector = _likelihood(standardised, covariance)
+    return OwnParameters(data_ratio * information, data_ratio * information_vector, tuple(free))
 
 
-def _likelihood(pulls: Array, covariance: Array) -> tuple[Array, Array]:
-    """Information (P, P) and pull (P,) of the data alone."""
+def _likelihood(standardised: Array, covariance: Array) -> tuple[Array, Array]:
+    """Information (P, P) and information vector (P,) of the data alone: posterior less the standard normal prior."""
     precision = np.linalg.inv(covariance)
-    return precision - np.eye(len(pulls)), precision @ pulls
+    return precision - np.eye(len(standardised)), precision @ standardised
 
 
-def correction(pulls: Array, covariance: Array, free: Sequence[Free]) -> float:
-    """What that changes of a -2 log evidence found with the prior std themselves, from what the fit came to."""
-    information, pull = _likelihood(pulls, covariance)
-    fixed = np.zeros(len(pulls), bool)
-    return evidence_of_any_size(information, pull, free) - float(_evidences(information, pull, fixed)[0])
-
-
-def _evidences(information: Array, pull: Array, sized: NDArray[np.bool_]) -> Array:
-    """One -2 log evidence for each scale of the parameters that have one; for 1 alone where none has."""
-    scales = np.where(sized, np.array(SCALES if sized.any() else (1.0,))[:, None], 1.0)
-    scaled = np.eye(len(pull)) + scales[:, :, None] * information * scales[:, None, :]
-    pulls = scales * pull
-    explained = np.einsum("sp,sp->s", pulls, np.linalg.solve(scaled, pulls[:, :, None])[:, :, 0])
+def _per_scale(information: Array, information_vector: Array, sized: NDArray[np.bool_]) -> Array:
+    """-2 log evidence (S,) for each scale of the parameters that have one; (1,), for scale 1, where none has."""
+    scales = np.where(sized, np.array(PRIOR_SCALES if sized.any() else (1.0,))[:, None], 1.0)
+    scaled = np.eye(len(information_vector)) + scales[:, :, None] * information * scales[:, None, :]
+    vectors = scales * information_vector
+    explained = np.einsum("sp,sp->s", vectors, np.linalg.solve(scaled, vectors[:, :, None])[:, :, 0])
     return np.asarray(np.linalg.slogdet(scaled)[1] - explained)
 
 
 def _cases(free: Sequence[Free]) -> Iterator[tuple[Array, NDArray[np.bool_]]]:
-    """The whole effect and simpler ones: parameters (Q,) of each as rows (Q, P) in these, and which have a size."""
+    """The full effect and its simpler cases.
+
+    Of each, its parameters as rows (Q, P) in those of the full effect, and which (Q,) of them have a size.
+    """
     sized = np.array([f.parameter.neutral == 0.0 for f in free])
-    whole = np.eye(len(free))
-    yield whole, sized
+    full = np.eye(len(free))
+    yield full, sized
     intervals = {f.parameter.knot.intervals for f in free if f.parameter.knot is not None}
     if intervals:
         for every in range(2, max(intervals) + 1):
@@ -101,22 +127,22 @@ def _cases(free: Sequence[Free]) -> Iterator[tuple[Array, NDArray[np.bool_]]]:
     if not wheels:
         parts = [(np.arange(len(free)) == i) | ~sized for i in np.flatnonzero(sized)]
     for part in parts if len(parts) > 1 else ():
-        yield whole[part], sized[part]
+        yield full[part], sized[part]
 
 
 def _with_fewer_knots(free: Sequence[Free], every: int) -> tuple[Array, NDArray[np.bool_]]:
-    """Only every so manieth knot of the curves; those between follow the smooth curve through them."""
+    """The case with each `every`-th knot of the curves; heights between follow the natural spline through these."""
     rows, sized = [], []
     for i, f in enumerate(free):
         knot = f.parameter.knot
         if knot is None or knot.number % every == 0:
-            rows.append(np.eye(len(free))[i] if knot is None else [_share_in(g, knot, every) for g in free])
+            rows.append(np.eye(len(free))[i] if knot is None else [_cardinal_height(g, knot, every) for g in free])
             sized.append(f.parameter.neutral == 0.0)
     return np.array(rows).reshape(-1, len(free)), np.array(sized, bool)
 
 
-def _share_in(other: Free, knot: Knot, every: int) -> float:
-    """Height at another parameter's knot of the curve that is one at this of the fewer knots and zero at the rest."""
+def _cardinal_height(other: Free, knot: Knot, every: int) -> float:
+    """Height, at another parameter's knot, of the spline that is 1 at `knot` and 0 at the other remaining knots."""
     there = other.parameter.knot
     if there is None or there.curve != knot.curve:
         return 0.0

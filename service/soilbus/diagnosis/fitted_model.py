@@ -1,10 +1,12 @@
-"""A model with some effects, fitted to the recordings of one vehicle.
+"""A model with effects, fitted to the recordings of one vehicle.
 
-The vehicle's gain errors and the parameters of its effects are the same in all recordings;
-the soil is each recording's own, and so is what an effect says of one record only.  So one
-recording after the other is fitted, each with what those before it told of gains and
-effects; the evidences of the parts add up to that of the whole, as do those of the blocks
-learned from and of the blocks held out.
+    -2 log evidence = sum over recordings of [-2 log p(training blocks) - 2 log p(held-out blocks | training blocks)]
+
+Sensor gain errors and parameters of effects belong to the vehicle and are the same in all recordings.  The soil
+belongs to a recording, and so do the parameters of an effect of the record (see terra.effects.effect).  So recordings
+are fitted one after the other, each with the posterior of the previous ones as its prior, and the evidences of the
+parts add up to that of all data.  FittedModel.gap, the reduced chi-square of the held-out blocks, says how well the
+model predicts data that it was not fitted to.
 """
 
 from __future__ import annotations
@@ -15,31 +17,33 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.diagnosis.damped_descent import descended
-from soilbus.diagnosis.evidence import OwnParameters, correction, own_parameters
+from soilbus.diagnosis.damped_descent import descend_damped
+from soilbus.diagnosis.evidence import OwnParameters, mixture_correction, own_parameters
 from soilbus.diagnosis.records import Record
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import DEFAULT_OPTIONS, DescentOptions, Fit, Start, fit_from, fit_window
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModelWithEffects
-from soilbus.estimation.parametrization import at_edges
+from soilbus.estimation.parametrization import at_bounds
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.wheel import Soil
 
 _SOIL = len(PARAMETERS)
-CHECK_ROUNDS, CHECK_AGAIN = 3, 2
-"""Linearisations that bring the latents of held-out blocks to their values under a model: from what was measured,
-and from what they were under a model much like it."""
+# A value whose docstring states no source has no evidence recorded.
+CHECK_ROUNDS, CHECK_ROUNDS_NEAR = 3, 2
+"""Linearisations that bring the latents of held-out blocks to their optimum: from the measurements, and from latents
+under a model much like it."""
 
 
 @dataclass(frozen=True, slots=True)
-class Checked:
-    """Held-out blocks of one recording under a fitted model: the problem, its latents and residuals there.
+class HeldOutCheck:
+    """Held-out blocks of one recording under a fitted model: the problem, its latents and the linearisation there.
 
-    chi2 weighs the residuals by what the fit leaves open of soil, gains and effects besides
-    the noise: with a dozen rows learned from that is no less than the noise itself.
+    neg2_log_evidence is -2 log p(held-out blocks | training blocks).  chi2 is the weighed square of the residuals,
+    with what the fit leaves uncertain of soil, gains and effects besides the noise: with a dozen training rows that is
+    no less than the noise itself.
     """
 
     problem: ObservationModelWithEffects
@@ -56,43 +60,61 @@ class Checked:
 
 @dataclass(frozen=True, slots=True)
 class FittedModel:
-    """A model with effects as fitted: one Fit and one Checked for each recording.
+    """A model with effects as fitted: one Fit (training blocks) and one HeldOutCheck for each recording.
 
-    free are the parameters as fitted, those held at the edge of their ranges without a
-    deviation; beforehand the same as nothing was held yet.  before holds what was known when
-    each recording's turn came; reported are parameters by effect and name whose posterior is no
-    Gaussian about the fit; sizes what it changes of the evidence that nobody knows how
-    great effects are (see `sizes`).
+    Attributes
+    ----------
+    effects
+        Those of the model.
+    free
+        Parameters of the effects; one that is held at the edge of its range has std 0.
+    free_unheld
+        The same before any was held.
+    joint_prior
+        Of each recording, the prior of soil, gains and parameters: the posterior of the recordings before it.
+    fits, checks
+        Of each recording.
+    mixture_correction
+        Change of -2 log evidence by the prior of unknown scale (see `evidence`).
+    reported
+        Estimates by effect and parameter that replace the Gaussian ones, where the posterior is not Gaussian.
     """
 
     effects: tuple[Effect, ...]
     free: tuple[Free, ...]
-    beforehand: tuple[Free, ...]
+    free_unheld: tuple[Free, ...]
     joint_prior: tuple[Gaussian, ...]
     fits: tuple[Fit, ...]
-    checks: tuple[Checked, ...]
-    sizes: float = 0.0
+    checks: tuple[HeldOutCheck, ...]
+    mixture_correction: float = 0.0
     reported: Mapping[tuple[str, str], Estimate] = field(default_factory=dict)
 
     @property
-    def neg2_log_evidence(self) -> float:
-        """-2 log of the likelihood of all data, whatever soils, gains and parameters may be, up to a constant."""
-        return sum(fit.neg2_log_evidence for fit in self.fits) + self.predicted + self.sizes
-
-    def foreseen(self, rows: int) -> float:
-        """The evidence from so many residuals like these: what the model leaves of them grows with them alone."""
-        left = self.neg2_log_posterior + self.gap * self.checked_rows
-        return self.neg2_log_evidence + (rows / self.rows - 1.0) * left
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects."""
+        return tuple(effect.name for effect in self.effects)
 
     @property
-    def predicted(self) -> float:
-        """-2 log of the likelihood of the held-out blocks after the others, up to the same."""
+    def neg2_log_evidence(self) -> float:
+        """-2 log of the marginal likelihood of all data, up to a constant."""
+        return (
+            sum(fit.neg2_log_evidence for fit in self.fits) + self.held_out_neg2_log_evidence + self.mixture_correction
+        )
+
+    @property
+    def held_out_neg2_log_evidence(self) -> float:
+        """-2 log of the predictive likelihood of the held-out blocks given the training blocks, up to a constant."""
         return sum(check.neg2_log_evidence for check in self.checks)
 
     @property
     def neg2_log_posterior(self) -> float:
-        """-2 log posterior of what was learned from, up to a constant."""
+        """-2 log posterior of the training blocks at the optimum, up to a constant."""
         return sum(fit.neg2_log_posterior for fit in self.fits)
+
+    def predicted_neg2_log_evidence(self, rows: int) -> float:
+        """-2 log evidence expected from this number of residuals like these: the misfit grows in proportion."""
+        misfit = self.neg2_log_posterior + self.gap * self.checked_rows
+        return self.neg2_log_evidence + (rows / self.rows - 1.0) * misfit
 
     @property
     def gap(self) -> float:
@@ -111,18 +133,35 @@ class FittedModel:
 
     @property
     def converged(self) -> bool:
-        """Whether every fit ended at its optimum."""
+        """Whether the fit of every recording ended at an optimum."""
         return all(fit.converged for fit in self.fits)
 
+    def parameters(self) -> dict[str, dict[str, Estimate]]:
+        """Value and std of each parameter by effect, after the last recording; a wheel's own is named name_WHEEL."""
+        gaussian, problem = self.fits[-1].mode, self.checks[-1].problem
+        std = np.sqrt(np.diag(gaussian.covariance))[_SOIL + problem.n_sensors :]
+        out: dict[str, dict[str, Estimate]] = {name: {} for name in self.names}
+        for free, standardised, spread in zip(
+            self.free, gaussian.gains[problem.n_sensors :].tolist(), std.tolist(), strict=True
+        ):
+            name = free.parameter.name + ("" if free.wheel is None else f"_{problem.rig.wheels[free.wheel]}")
+            out[free.effect][name] = Estimate(free.at(standardised), free.std * spread)
+        for (effect, name), estimate in self.reported.items():
+            out[effect][name] = estimate
+        return out
+
     def as_starts(self, effects: Sequence[Effect] | None = None) -> tuple[Start, ...]:
-        """Where these fits ended, for fits that hold nothing yet; of other effects those they had not are absent."""
+        """A start at each optimum, for fits in which no parameter is held yet.
+
+        With `effects`, for a model with these effects; those that this model has not start absent.
+        """
         starts = [_start(fit, check.latents) for fit, check in zip(self.fits, self.checks, strict=True)]
-        problem = self.checks[0].problem
-        told = self.effects if effects is None else effects
-        return tuple(s._replace(gains=self._of_effects(self.unheld(s.gains), told, problem.n_wheels)) for s in starts)
+        n_wheels = self.checks[0].problem.n_wheels
+        wanted = self.effects if effects is None else effects
+        return tuple(s._replace(gains=self._of_effects(self.unheld(s.gains), wanted, n_wheels)) for s in starts)
 
     def _of_effects(self, gains: Array, effects: Sequence[Effect], n_wheels: int) -> Array:
-        """Gains (G,) of the sensors and of these effects."""
+        """Sensor gains and standardised parameters (G,) of these effects."""
         n_sensors = len(gains) - len(self.free)
         parts = [gains[:n_sensors]]
         for effect in effects:
@@ -131,44 +170,25 @@ class FittedModel:
         return np.concatenate(parts)
 
     def unheld(self, gains: Array) -> Array:
-        """Gains (G,) of these fits by the prior deviations that the parameters have beforehand."""
+        """Sensor gains and parameters (G,) of these fits, standardised by the priors before any was held."""
         n_sensors = len(gains) - len(self.free)
-        pulls = [
-            first.pull_at(f.at(u)) if f.std < first.std else u
-            for f, first, u in zip(self.free, self.beforehand, gains[n_sensors:].tolist(), strict=True)
+        standardised = [
+            first.standardised(f.at(u)) if f.std < first.std else u
+            for f, first, u in zip(self.free, self.free_unheld, gains[n_sensors:].tolist(), strict=True)
         ]
-        return np.concatenate([gains[:n_sensors], pulls])
+        return np.concatenate([gains[:n_sensors], standardised])
 
-    def further_parameters(self, effect: Effect, times: float = 1.0) -> tuple[OwnParameters, ...]:
-        """What each recording after the first tells of its own values of an effect of the record.
+    def own_parameters(self, effect: Effect, data_ratio: float = 1.0) -> tuple[OwnParameters, ...]:
+        """Likelihood of each later recording's own values of an effect of the record, as of data_ratio times its data.
 
-        As of so many times the data.  A zero that wanders in each recording is not meant: without a wander it is
-        the same effect.
+        Empty for other effects, even where they have a zero that wanders in each recording: without the wander they
+        are the same effect.
         """
-        own = [i for i in _members(effect, self.free) if effect.own_in_each_record(self.free[i].parameter)]
+        own = [i for i in _not_held(effect, self.free) if effect.own_in_each_record(self.free[i].parameter)]
         if not own or not effect.of_record:
             return ()
         n_sensors, free = self.checks[0].problem.n_sensors, [self.free[i] for i in own]
-        return tuple(own_parameters(*_of_parameters(fit, n_sensors, own), free, times) for fit in self.fits[1:])
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the effects."""
-        return tuple(effect.name for effect in self.effects)
-
-    def parameters(self) -> dict[str, dict[str, Estimate]]:
-        """Value and std of each parameter by effect, as the last recording leaves them; wheels' own as name_WHEEL."""
-        gaussian, problem = self.fits[-1].mode, self.checks[-1].problem
-        std = np.sqrt(np.diag(gaussian.covariance))[_SOIL + problem.n_sensors :]
-        out: dict[str, dict[str, Estimate]] = {name: {} for name in self.names}
-        for free, pull, spread in zip(
-            self.free, gaussian.gains[problem.n_sensors :].tolist(), std.tolist(), strict=True
-        ):
-            name = free.parameter.name + ("" if free.wheel is None else f"_{problem.rig.wheels[free.wheel]}")
-            out[free.effect][name] = Estimate(free.at(pull), free.std * spread)
-        for (effect, name), estimate in self.reported.items():
-            out[effect][name] = estimate
-        return out
+        return tuple(own_parameters(*_moments(fit, n_sensors, own), free, data_ratio) for fit in self.fits[1:])
 
 
 def fit_model(
@@ -176,39 +196,82 @@ def fit_model(
     prior: SoilPrior,
     effects: Sequence[Effect],
     starts: Sequence[Start] | None = None,
-    effort: DescentOptions = DEFAULT_OPTIONS,
+    options: DescentOptions = DEFAULT_OPTIONS,
 ) -> FittedModel | None:
-    """A model with these effects fitted to all recordings; None where a fit fails, or is given up.
+    """A model with these effects fitted to all recordings.
 
-    Parameters of effects that the records' model has already keep the prior they have
-    there; one that would leave its range is held at the edge.
+    Parameters
+    ----------
+    records
+        Recordings of one vehicle.
+    prior
+        Of the soil, the same for each recording.
+    effects
+        Those that the records' model has already keep the prior that their parameters have there.
+    starts
+        One for each recording; None searches from several.
+    options
+        When a descent stops or is given up.
+
+    Returns
+    -------
+    FittedModel or None
+        None where a fit fails or is given up.  A parameter that would leave its range is held at the edge.
     """
-    present = records[0].learned
+    present = records[0].training
     known = {e.name: [f for f in present.free if f.effect == e.name] for e in present.effects}
-    beforehand = tuple(
+    free_unheld = tuple(
         f for effect in effects for f in known.get(effect.name) or parameters_of(effect, present.n_wheels)
     )
-    free = beforehand
+    free = free_unheld
     near = None if starts is None else [start.checked for start in starts]
-    fitted = _fits(records, prior, effects, free, starts, effort)
+    fitted = _fits(records, prior, effects, free, starts, options)
     for _ in range(len(free)):
-        inside = (
-            None if fitted is None else _held_at_edges(records[0].learned.completed(effects, free), fitted[1], free)
+        held = (
+            None if fitted is None else _held_at_edges(records[0].training.with_effects(effects, free), fitted[1], free)
         )
-        if fitted is None or inside is None:
+        if fitted is None or held is None:
             break
-        free, starts = inside, [_start(fit) for fit in fitted[1]]
-        fitted = _fits(records, prior, effects, free, starts, effort)
+        free, starts = held, [_start(fit) for fit in fitted[1]]
+        fitted = _fits(records, prior, effects, free, starts, options)
     if fitted is None:
         return None
     joint_priors, fits = fitted
     checks = [
-        check(record.checked.completed(effects, free), prior, fit, None if near is None else near[i])
+        check(record.held_out.with_effects(effects, free), prior, fit, None if near is None else near[i])
         for i, (record, fit) in enumerate(zip(records, fits, strict=True))
     ]
     added = [effect for effect in effects if effect not in present.effects]
-    sizes = sum(_sizes(effect, free, fits, checks) for effect in added)
-    return FittedModel(tuple(effects), free, beforehand, tuple(joint_priors), tuple(fits), tuple(checks), sizes)
+    correction = sum(_mixture_correction(effect, free, fits, checks) for effect in added)
+    return FittedModel(tuple(effects), free, free_unheld, tuple(joint_priors), tuple(fits), tuple(checks), correction)
+
+
+def check(
+    problem: ObservationModelWithEffects, prior: SoilPrior, fit: Fit, near: Latents | None = None
+) -> HeldOutCheck:
+    """Held-out blocks under a model fitted to the others.
+
+    near: their latents under a model much like it, from which fewer linearisations are needed.  Evidence and chi2 are
+    infinite where the model is not finite.
+    """
+    soil, gains = Soil(*fit.mode.soil.tolist()), fit.mode.gains
+    objective = Objective(problem, prior, fit.mode)
+    rounds = CHECK_ROUNDS if near is None or len(near.load) != problem.n else CHECK_ROUNDS_NEAR
+    with np.errstate(all="ignore"):
+        latents = objective.start_near(fit.mode.soil, gains, near).latents
+        latents = problem.with_entry_angles(latents, soil, gains)
+        at = problem.linearise(soil, gains, latents)
+        for _ in range(rounds - 1):
+            latents = problem.updated(at, latents, np.zeros(_SOIL), np.zeros(len(gains)))
+            at = problem.linearise(soil, gains, latents)
+        quadratic = objective.with_prior(Iterate(fit.mode.soil, gains, latents, np.inf, 0), at)
+        step = None if quadratic is None else quadratic.step()
+    if quadratic is None or step is None:
+        return HeldOutCheck(problem, latents, at, np.inf, np.inf)
+    length = quadratic.squared_length(step)
+    return HeldOutCheck(
+        problem, latents, at, quadratic.neg2_log_evidence - length, quadratic.neg2_log_posterior - length
+    )
 
 
 def _fits(
@@ -217,15 +280,17 @@ def _fits(
     effects: Sequence[Effect],
     free: tuple[Free, ...],
     starts: Sequence[Start] | None,
-    effort: DescentOptions,
+    options: DescentOptions,
 ) -> tuple[list[Gaussian], list[Fit]] | None:
-    """What was known before each recording, and its fit."""
+    """The joint prior of each recording, and its fit; None where one fails."""
     joint_priors: list[Gaussian] = []
     fits: list[Fit] = []
     for i, record in enumerate(records):
-        problem = record.learned.completed(effects, free)
-        joint_prior = _of_next(fits[-1].mode, prior, problem, effects) if fits else _of_first(record, prior, problem)
-        fit = _fitted(problem, prior, joint_prior, None if starts is None else starts[i], effort)
+        problem = record.training.with_effects(effects, free)
+        joint_prior = (
+            _prior_of_next(fits[-1].mode, prior, problem, effects) if fits else _prior_of_first(record, prior, problem)
+        )
+        fit = _fitted(problem, prior, joint_prior, None if starts is None else starts[i], options)
         if fit is None:
             return None
         joint_priors.append(joint_prior)
@@ -233,61 +298,34 @@ def _fits(
     return joint_priors, fits
 
 
-def _held_at_edges(
-    problem: ObservationModelWithEffects, fits: Sequence[Fit], free: tuple[Free, ...]
-) -> tuple[Free, ...] | None:
-    """The parameters with those held that would leave their range; None where none would, or fits did not converge."""
-    gains = fits[-1].mode.gains
-    edges = at_edges(gains, *problem.gain_bounds())[problem.n_sensors :].tolist()
-    leaves = [f.std > 0.0 and edge != 0.0 for f, edge in zip(free, edges, strict=True)]
-    if not any(leaves) or not all(fit.converged for fit in fits):
-        return None
-    pulls = gains[problem.n_sensors :].tolist()
-    return tuple(
-        replace(f, value=f.at(u), std=0.0) if leaving else f for f, u, leaving in zip(free, pulls, leaves, strict=True)
-    )
-
-
-def _start(fit: Fit, checked: Latents | None = None) -> Start:
-    """Where a fit ended."""
-    if not fit.converged:
-        return Start(fit.mode.soil, fit.mode.gains)
-    return Start(fit.mode.soil, fit.mode.gains, True, fit.optimum.latents, checked)
-
-
-def _sizes(effect: Effect, free: Sequence[Free], fits: Sequence[Fit], checks: Sequence[Checked]) -> float:
-    """Correction of the evidence for one effect of unknown size: once, or for each recording where it is its own.
-
-    What all recordings share of it counts with the last one, which knows what all of them told.
-    """
-    n_sensors, told = checks[0].problem.n_sensors, 0.0
-    for fit in fits if effect.of_record else fits[-1:]:
-        members = [f for f in _members(effect, free) if fit is fits[-1] or effect.own_in_each_record(free[f].parameter)]
-        if members:
-            told += correction(*_of_parameters(fit, n_sensors, members), [free[i] for i in members])
-    return told
-
-
-def _members(effect: Effect, free: Sequence[Free]) -> list[int]:
-    """Places of an effect's parameters that are not held."""
-    return [i for i, f in enumerate(free) if f.effect == effect.name and f.std > 0.0]
-
-
-def _of_parameters(fit: Fit, n_sensors: int, members: Sequence[int]) -> tuple[Array, Array]:
-    """Pulls (P,) and covariance (P, P) of some of the effects' parameters."""
-    gains = n_sensors + np.array(members)
-    return fit.mode.gains[gains], fit.mode.covariance[np.ix_(_SOIL + gains, _SOIL + gains)]
-
-
-def _of_first(record: Record, prior: SoilPrior, problem: ObservationModelWithEffects) -> Gaussian:
-    """What is known before the first recording; nothing yet of effects that its model had not."""
+def _prior_of_first(record: Record, prior: SoilPrior, problem: ObservationModelWithEffects) -> Gaussian:
+    """Joint prior of the first recording: its own if it has one, and the catalogue's for effects that are added."""
     joint_prior = Gaussian.of(prior, problem.gain_std)
-    if record.known is None:
+    if record.joint_prior is None:
         return joint_prior
     gains, covariance = joint_prior.gains.copy(), joint_prior.covariance.copy()
-    n = len(record.known.gains)
-    gains[:n], covariance[: _SOIL + n, : _SOIL + n] = record.known.gains, record.known.covariance
-    return Gaussian(record.known.soil, gains, covariance)
+    n = len(record.joint_prior.gains)
+    gains[:n], covariance[: _SOIL + n, : _SOIL + n] = record.joint_prior.gains, record.joint_prior.covariance
+    return Gaussian(record.joint_prior.soil, gains, covariance)
+
+
+def _prior_of_next(
+    posterior: Gaussian, prior: SoilPrior, problem: ObservationModelWithEffects, effects: Sequence[Effect]
+) -> Gaussian:
+    """Joint prior of the next recording: the posterior, with the prior of what is each recording's own."""
+    after = posterior.with_prior_soil(prior)
+    by_name = {effect.name: effect for effect in effects}
+    own = [
+        problem.n_sensors + i
+        for i, free in enumerate(problem.free)
+        if by_name[free.effect].own_in_each_record(free.parameter)
+    ]
+    gains, covariance = after.gains.copy(), after.covariance.copy()
+    for i in own:
+        covariance[_SOIL + i] = covariance[:, _SOIL + i] = 0.0
+        covariance[_SOIL + i, _SOIL + i] = problem.gain_std[i] ** 2
+        gains[i] = 0.0
+    return Gaussian(after.soil, gains, covariance)
 
 
 def _fitted(
@@ -295,55 +333,68 @@ def _fitted(
     prior: SoilPrior,
     joint_prior: Gaussian,
     start: Start | None,
-    effort: DescentOptions,
+    options: DescentOptions,
 ) -> Fit | None:
-    """From the given start, or from anywhere; a fit that has not converged goes on from where it is, slowly."""
+    """Fit from the start, or from several if None; one that has not converged goes on by the damped descent."""
     if start is None:
         fit = fit_window(problem, prior, joint_prior)
         if fit is None or fit.converged:
             return fit
         start = Start(fit.mode.soil, fit.mode.gains)
-    fit = fit_from(problem, prior, joint_prior, start, problem.n_sensors, effort)
+    fit = fit_from(problem, prior, joint_prior, start, problem.n_sensors, options)
     if fit is None or fit.converged:
         return fit
-    slow = descended(Objective(problem, prior, joint_prior), fit, effort)
-    return None if (slow or fit).neg2_log_posterior > effort.give_up_above else slow or fit
+    damped = descend_damped(Objective(problem, prior, joint_prior), fit, options)
+    return None if (damped or fit).neg2_log_posterior > options.give_up_above else damped or fit
 
 
-def _of_next(
-    known: Gaussian, prior: SoilPrior, problem: ObservationModelWithEffects, effects: Sequence[Effect]
-) -> Gaussian:
-    """What one recording tells of the next: all but the soil and what belongs to one recording only."""
-    after = known.of_another_soil(prior)
-    by_name = {effect.name: effect for effect in effects}
-    gone = [
-        problem.n_sensors + i
-        for i, free in enumerate(problem.free)
-        if by_name[free.effect].own_in_each_record(free.parameter)
-    ]
-    gains, covariance = after.gains.copy(), after.covariance.copy()
-    for i in gone:
-        covariance[_SOIL + i] = covariance[:, _SOIL + i] = 0.0
-        covariance[_SOIL + i, _SOIL + i] = problem.gain_std[i] ** 2
-        gains[i] = 0.0
-    return Gaussian(after.soil, gains, covariance)
+def _held_at_edges(
+    problem: ObservationModelWithEffects, fits: Sequence[Fit], free: tuple[Free, ...]
+) -> tuple[Free, ...] | None:
+    """The parameters with those held that would leave their range; None where none would, or fits did not converge."""
+    gains = fits[-1].mode.gains
+    edges = at_bounds(gains, *problem.gain_bounds())[problem.n_sensors :].tolist()
+    leaves = [f.std > 0.0 and edge != 0.0 for f, edge in zip(free, edges, strict=True)]
+    if not any(leaves) or not all(fit.converged for fit in fits):
+        return None
+    standardised = gains[problem.n_sensors :].tolist()
+    return tuple(
+        replace(f, value=f.at(u), std=0.0) if leaving else f
+        for f, u, leaving in zip(free, standardised, leaves, strict=True)
+    )
 
 
-def check(problem: ObservationModelWithEffects, prior: SoilPrior, fit: Fit, near: Latents | None = None) -> Checked:
-    """Held-out blocks under a model fitted to the others; near are their latents under a model much like it."""
-    soil, gains = Soil(*fit.mode.soil.tolist()), fit.mode.gains
-    fitting = Objective(problem, prior, fit.mode)
-    rounds = CHECK_ROUNDS if near is None or len(near.load) != problem.n else CHECK_AGAIN
-    with np.errstate(all="ignore"):
-        latents = fitting.near(fit.mode.soil, gains, near).latents
-        latents = problem.with_entry_angles(latents, soil, gains)
-        at = problem.linearise(soil, gains, latents)
-        for _ in range(rounds - 1):
-            latents = problem.updated(at, latents, np.zeros(_SOIL), np.zeros(len(gains)))
-            at = problem.linearise(soil, gains, latents)
-        point = fitting.with_prior(Iterate(fit.mode.soil, gains, latents, np.inf, 0), at)
-        step = None if point is None else point.step()
-    if point is None or step is None:
-        return Checked(problem, latents, at, np.inf, np.inf)
-    length = point.length(step)
-    return Checked(problem, latents, at, point.neg2_log_evidence - length, point.neg2_log_posterior - length)
+def _start(fit: Fit, held_out: Latents | None = None) -> Start:
+    """A start where a fit ended; with its latents if it converged."""
+    if not fit.converged:
+        return Start(fit.mode.soil, fit.mode.gains)
+    return Start(fit.mode.soil, fit.mode.gains, True, fit.optimum.latents, held_out)
+
+
+def _mixture_correction(
+    effect: Effect, free: Sequence[Free], fits: Sequence[Fit], checks: Sequence[HeldOutCheck]
+) -> float:
+    """Change of -2 log evidence by the prior of unknown scale, for one effect.
+
+    Once; or, for an effect of the record, for each recording.  Parameters that all recordings share count with the
+    last one, whose posterior has the data of all.
+    """
+    n_sensors, total = checks[0].problem.n_sensors, 0.0
+    for fit in fits if effect.of_record else fits[-1:]:
+        members = [
+            f for f in _not_held(effect, free) if fit is fits[-1] or effect.own_in_each_record(free[f].parameter)
+        ]
+        if members:
+            total += mixture_correction(*_moments(fit, n_sensors, members), [free[i] for i in members])
+    return total
+
+
+def _not_held(effect: Effect, free: Sequence[Free]) -> list[int]:
+    """Indices of an effect's parameters that are not held."""
+    return [i for i, f in enumerate(free) if f.effect == effect.name and f.std > 0.0]
+
+
+def _moments(fit: Fit, n_sensors: int, members: Sequence[int]) -> tuple[Array, Array]:
+    """Posterior mean (P,) and covariance (P, P) of some of the effects' standardised parameters."""
+    gains = n_sensors + np.array(members)
+    return fit.mode.gains[gains], fit.mode.covariance[np.ix_(_SOIL + gains, _SOIL + gains)]

@@ -1,4 +1,4 @@
-"""A completed model as the tables that a configuration's model.effects takes."""
+"""A fitted model as the tables that model.effects of a configuration takes."""
 
 from __future__ import annotations
 
@@ -7,36 +7,42 @@ from typing import Any
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.estimation.posterior import Estimate
 
-DIGITS = 6
+SIGNIFICANT_DIGITS = 6
+"""Of values and std as written."""
 
 
-def effect_tables(completion: FittedModel) -> tuple[list[dict[str, Any]], list[str]]:
-    """A table for each effect, {name, parameter = {value, std}}, and notes on those left out.
+def effect_tables(fitted: FittedModel) -> tuple[list[dict[str, Any]], list[str]]:
+    """The effects of a fitted model for a configuration.
 
-    A parameter that every wheel has for itself is a table by wheel.  Left out is what
-    describes the recording only: its ground, how a zero wandered in it.
+    Returns
+    -------
+    list of dict
+        A table for each effect, {name, parameter = {value, std}}; a parameter that every wheel has for itself is a
+        table by wheel.
+    list of str
+        Notes on what is left out: what describes the recording only, as its ground, or how a zero wandered in it.
     """
     tables: list[dict[str, Any]] = []
     notes: list[str] = []
-    values = completion.parameters()
-    wheels = completion.checks[-1].problem.rig.wheels
-    for effect in completion.effects:
-        found = {name: _told(estimate) for name, estimate in values[effect.name].items()}
+    values = fitted.parameters()
+    wheels = fitted.checks[-1].problem.rig.wheels
+    for effect in fitted.effects:
+        found = {name: _value_table(estimate) for name, estimate in values[effect.name].items()}
         kept: dict[str, Any] = {}
-        gone: list[str] = []
+        left_out: list[str] = []
         for p in effect.parameters:
             names = {w: f"{p.name}_{w}" for w in wheels} if effect.each_wheel else {"": p.name}
             if effect.of_record or p.of_record:
-                gone += [f"{name} = {found[name]['value']:g}" for name in names.values()]
+                left_out += [f"{name} = {found[name]['value']:g}" for name in names.values()]
             else:
                 kept[p.name] = {w: found[n] for w, n in names.items()} if effect.each_wheel else found[p.name]
-        if gone:
-            notes.append(f"{effect.name} ({', '.join(gone)}) describes the recording only and is left out")
+        if left_out:
+            notes.append(f"{effect.name} ({', '.join(left_out)}) describes the recording only and is left out")
         if kept:
             tables.append({"name": effect.name, **kept})
     return tables, notes
 
 
-def _told(estimate: Estimate) -> dict[str, float]:
-    told = {"value": estimate.value} if estimate.std == 0.0 else {"value": estimate.value, "std": estimate.std}
-    return {name: float(f"{number:.{DIGITS}g}") for name, number in told.items()}
+def _value_table(estimate: Estimate) -> dict[str, float]:
+    table = {"value": estimate.value} if estimate.std == 0.0 else {"value": estimate.value, "std": estimate.std}
+    return {name: float(f"{number:.{SIGNIFICANT_DIGITS}g}") for name, number in table.items()}

@@ -1,4 +1,10 @@
-"""Recordings as the diagnosis wants them: time blocks to learn from, and others to check with."""
+"""Recordings divided for the diagnosis: training blocks that models are fitted to, and held-out blocks.
+
+    fold = floor(t / BLOCK) mod FOLDS,  the last fold is held out
+
+Successive instants are correlated, so whole time blocks are held out, in turn with the training blocks.  A table of
+steady states has no time: each third row in the order of slip is held out.
+"""
 
 from __future__ import annotations
 
@@ -19,13 +25,13 @@ __all__ = ["Record", "TooLittle", "record_of", "record_of_rows"]
 
 BLOCK = 4.0
 """Length of a time block [s]: long beside a sensor's lag, short beside a sweep of slip."""
-CHECKED = 3
-"""Every so manieth block is held out."""
-HELD_OUT = CHECKED - 1
-"""Which of them."""
-FEWEST = 12
+FOLDS = 3
+"""Folds that the blocks belong to by turns."""
+HELD_OUT_FOLD = FOLDS - 1
+"""The fold that is held out."""
+MIN_INSTANTS = 12
 """Instants that each part of a recording must have."""
-FEWEST_ROWS = 5
+MIN_ROWS = 5
 """Rows that a table must have."""
 
 
@@ -35,70 +41,100 @@ class TooLittle(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One recording: the instants that models are fitted to, and those held out.
+    """One recording: training blocks and held-out blocks.
 
-    known is what an earlier fit on the same soil left behind of soil, gains and the
-    parameters that the model has; it counts in place of the prior in the first recording.
-    whole are all instants and fold (N,) which of CHECKED folds each is in, the last one held
-    out; None where others cannot be held out in its place.
+    Attributes
+    ----------
+    name
+        Of the log or table.
+    training, held_out
+        Observation models of the two parts.
+    joint_prior
+        Posterior of soil, gains and parameters from an earlier fit on the same soil; it replaces the prior in the
+        first recording.
+    whole, fold
+        Observation model of all instants, and the fold (N,) of each; None where no other fold can be held out.
     """
 
     name: str
-    learned: ObservationModelWithEffects
-    checked: ObservationModelWithEffects
-    known: Gaussian | None = None
+    training: ObservationModelWithEffects
+    held_out: ObservationModelWithEffects
+    joint_prior: Gaussian | None = None
     whole: ObservationModelWithEffects | None = None
     fold: NDArray[np.intp] | None = None
 
-    def completed(self, effects: Sequence[Effect], free: Sequence[Free], known: Gaussian | None = None) -> Record:
-        """The same under a model with these effects and parameters, of which so much is known."""
-        learned, checked = (part.completed(effects, free) for part in (self.learned, self.checked))
-        whole = None if self.whole is None else self.whole.completed(effects, free)
-        return Record(self.name, learned, checked, known, whole, self.fold)
+    def with_effects(
+        self, effects: Sequence[Effect], free: Sequence[Free], joint_prior: Gaussian | None = None
+    ) -> Record:
+        """The same under a model with these effects and parameters."""
+        training, held_out = (part.with_effects(effects, free) for part in (self.training, self.held_out))
+        whole = None if self.whole is None else self.whole.with_effects(effects, free)
+        return Record(self.name, training, held_out, joint_prior, whole, self.fold)
 
     def with_held_out(self, fold: int) -> Record | None:
         """The same with another fold held out; None where that cannot be."""
         if self.whole is None or self.fold is None:
             return None
-        learned, checked = (self.whole.part(np.flatnonzero(part)) for part in (self.fold != fold, self.fold == fold))
-        return replace(self, learned=learned, checked=checked)
+        training, held_out = (self.whole.part(np.flatnonzero(part)) for part in (self.fold != fold, self.fold == fold))
+        return replace(self, training=training, held_out=held_out)
 
     def thinned(self, every: int) -> Record:
-        """The same with every so manieth instant; a table of few rows stays whole."""
-        parts = self.learned, self.checked
-        learned, checked = (part.part(slice(None, None, min(every, part.n // FEWEST + 1))) for part in parts)
-        return Record(self.name, learned, checked, self.known)
+        """The same with each `every`-th instant; a table of few rows keeps all of them."""
+        parts = self.training, self.held_out
+        training, held_out = (part.part(slice(None, None, min(every, part.n // MIN_INSTANTS + 1))) for part in parts)
+        return Record(self.name, training, held_out, self.joint_prior)
 
 
 def record_of(name: str, window: Window, rig: Rig, model: WheelModel, min_speed: float, max_turn: float) -> Record:
-    """One recording divided into blocks; TooLittle where it has not enough usable instants."""
+    """One recording divided into blocks.
+
+    Parameters
+    ----------
+    name
+        Of the log.
+    window
+        All of the recording.
+    rig, model
+        The vehicle and its wheel-soil model.
+    min_speed, max_turn
+        Limits within which an instant is usable: speed [m/s], relative difference of an axle's rim speeds [1].
+
+    Raises
+    ------
+    TooLittle
+        Where the recording has not enough usable instants.
+    """
     problem = ObservationModelWithEffects(window, rig, model, min_speed, max_turn)
     fold = folds(problem.since)
-    parts = np.flatnonzero(fold != HELD_OUT), np.flatnonzero(fold == HELD_OUT)
-    if min(map(len, parts)) < FEWEST:
+    parts = np.flatnonzero(fold != HELD_OUT_FOLD), np.flatnonzero(fold == HELD_OUT_FOLD)
+    if min(map(len, parts)) < MIN_INSTANTS:
         raise TooLittle(f"{name}: {problem.n} usable instants are too few to learn from some and check with others")
-    learned, checked = (problem.part(part) for part in parts)
-    return Record(name, learned, checked, whole=problem, fold=fold)
+    training, held_out = (problem.part(part) for part in parts)
+    return Record(name, training, held_out, whole=problem, fold=fold)
 
 
 def record_of_rows(name: str, window: Window, rig: Rig, model: WheelModel) -> Record:
-    """A table of steady states, of which a third is held out; TooLittle where it has not enough usable rows.
+    """A table of steady states, of which a third is held out.
 
-    Rows do not hang together in time as the instants of a drive do, and blocks of them would
-    only part small slips from large.  So it is every third row in the order of slip, that
-    has its neighbours among the others.
+    Rows are not correlated in time as the instants of a drive are, and blocks of them would only separate small slips
+    from large.  So each third row in the order of slip is held out, with its neighbours in training.
+
+    Raises
+    ------
+    TooLittle
+        Where the table has not enough usable rows.
     """
     problem = ObservationModelWithEffects(window, rig, model, min_speed=0.0)
-    if problem.n < FEWEST_ROWS:
+    if problem.n < MIN_ROWS:
         raise TooLittle(f"{name}: {problem.n} usable rows are too few to learn from some and check with others")
     rank = np.argsort(np.argsort(problem.slip.mean(1), kind="stable"))
-    held_out = rank % CHECKED == CHECKED // 2
-    learned, checked = (problem.part(np.flatnonzero(part)) for part in (~held_out, held_out))
-    return Record(name, learned, checked)
+    held_out_rows = rank % FOLDS == FOLDS // 2
+    training, held_out = (problem.part(np.flatnonzero(part)) for part in (~held_out_rows, held_out_rows))
+    return Record(name, training, held_out)
 
 
 def folds(since: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Which fold instants, so many seconds since the start (N,), are in: blocks by turns."""
+    """Fold (N,) of instants at these times (N,) [s] since the start: blocks by turns."""
     span = float(since[-1] - since[0]) if len(since) else 0.0
-    length = min(BLOCK, span / (3 * CHECKED)) if span > 0.0 else BLOCK
-    return np.asarray((since / max(length, 1e-9)).astype(int) % CHECKED)
+    length = min(BLOCK, span / (3 * FOLDS)) if span > 0.0 else BLOCK
+    return np.asarray((since / max(length, 1e-9)).astype(int) % FOLDS)

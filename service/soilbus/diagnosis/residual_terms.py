@@ -1,31 +1,37 @@
-"""What no effect of the catalogue explains, described as simply as the data allow.
+"""Residual terms: what no effect of the catalogue explains, described by a sparse regression.
 
-For each channel a sparse regression of the residuals on a library of plain terms: forward
-selection, each term chosen and counted by what it does on the blocks learned from (BIC),
-judged by what it does on those held out.  A description, not a mechanism: it holds for the
-vehicle, the ground and the range of driving of these recordings and may mean nothing beyond.
+    residual = sum over terms of coefficient * regressor(slip, load, speed, time, ...)
+
+For each channel, terms are chosen by forward selection on the training blocks while BIC falls, and judged by the
+share of the held-out blocks' excess chi-square that they explain.  This is a description, not a mechanism: it holds
+for the vehicle, the ground and the range of driving of these recordings and may mean nothing beyond.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.diagnosis.fitted_model import Checked, FittedModel
+from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.where import channels
 from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModelWithEffects
 from soilbus.terra.wheel import sinkage
 
+# A value whose docstring states no source has no evidence recorded.
 MAX_TERMS = 3
+"""Terms of a channel."""
+MIN_RESIDUALS = 20
+"""Residuals up to which nothing is selected."""
 HARMONICS = (1, 2)
-WORTH = 0.1
-"""Share of a channel's held-out excess that a description must explain to be told."""
+"""Of the wheel angle, as regressors."""
+MIN_EXPLAINED_SHARE = 0.1
+"""Share of a channel's held-out excess chi-square that a description must explain to be reported."""
 WARNING = (
     "learned from these recordings alone: a description within the range driven, not a mechanism; "
     "do not rely on it on other ground or outside that range"
@@ -34,15 +40,15 @@ WARNING = (
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """coefficient [SI unit of the channel] times a regressor of no unit."""
+    """A coefficient [SI unit of the channel] and its regressor, which has no unit."""
 
     regressor: str
     coefficient: float
 
 
 @dataclass(frozen=True, slots=True)
-class Correction:
-    """Reading less model of one channel as a sum of terms; explained: share of the held-out excess."""
+class ResidualTerms:
+    """Residual (reading less model) of one channel as a sum of terms; explained: share of the held-out excess."""
 
     channel: str
     wheel: str
@@ -56,49 +62,49 @@ class Correction:
         return " ".join(parts)
 
 
+def residual_terms(records: Sequence[Record], fitted: FittedModel) -> list[ResidualTerms]:
+    """Descriptions of what a fitted model leaves, one a channel, the one that explains most first."""
+    found = []
+    names = channels(records[0].training.rig.wheels, records[0].training.with_sinkage)
+    for column, (channel, wheel) in enumerate(names):
+        training, held_out = (_joined(list(part)) for part in zip(*_samples(records, fitted, column), strict=True))
+        if not len(training.z) or not len(held_out.z):  # a channel that is not there
+            continue
+        terms = _selected(training)
+        explained = _explained(held_out, terms)
+        if terms and explained > MIN_EXPLAINED_SHARE:
+            found.append(ResidualTerms(channel, wheel, tuple(terms), explained))
+    return sorted(found, key=lambda description: -description.explained)
+
+
 class _Sample(NamedTuple):
-    """Standardised residuals (n,), their std in SI (n,), and regressors (n,) by name."""
+    """Standardised residuals (n,), their std (n,) [SI], and regressors (n,) by name."""
 
     z: Array
     std: Array
     regressors: dict[str, Array]
 
 
-def corrections(records: list[Record], completion: FittedModel) -> list[Correction]:
-    """Descriptions of what the model leaves, channel by channel, the one that explains most first."""
-    found = []
-    names = channels(records[0].learned.rig.wheels, records[0].learned.with_sinkage)
-    for place, (channel, wheel) in enumerate(names):
-        learned, checked = (_joined(list(part)) for part in zip(*_samples(records, completion, place), strict=True))
-        if not len(learned.z) or not len(checked.z):  # a channel that is not there
-            continue
-        terms = _selected(learned)
-        explained = _explained(checked, terms)
-        if terms and explained > WORTH:
-            found.append(Correction(channel, wheel, tuple(terms), explained))
-    return sorted(found, key=lambda correction: -correction.explained)
-
-
-def _samples(records: list[Record], completion: FittedModel, place: int) -> Iterator[tuple[_Sample, _Sample]]:
-    for record, fit, check in zip(records, completion.fits, completion.checks, strict=True):
-        learned = record.learned.completed(completion.effects, completion.free)
-        of_fit = _sample(learned, fit.optimum.at, fit.optimum.latents, fit.optimum.gains, place)
-        yield of_fit, _of_check(check, fit.mode.gains, place)
-
-
-def _of_check(check: Checked, gains: Array, place: int) -> _Sample:
-    return _sample(check.problem, check.at, check.latents, gains, place)
+def _samples(records: Sequence[Record], fitted: FittedModel, column: int) -> Iterator[tuple[_Sample, _Sample]]:
+    """Training and held-out sample of one residual column, for each recording."""
+    for record, fit, check in zip(records, fitted.fits, fitted.checks, strict=True):
+        training = record.training.with_effects(fitted.effects, fitted.free)
+        yield (
+            _sample(training, fit.optimum.at, fit.optimum.latents, fit.optimum.gains, column),
+            _sample(check.problem, check.at, check.latents, fit.mode.gains, column),
+        )
 
 
 def _sample(
-    problem: ObservationModelWithEffects, at: Linearisation, latents: Latents, gains: Array, place: int
+    problem: ObservationModelWithEffects, at: Linearisation, latents: Latents, gains: Array, column: int
 ) -> _Sample:
+    """Residuals of one column with the regressors of its wheel, or their means over wheels for the draft."""
     z, _ = problem.standardised(at, gains)
     W, r = problem.n_wheels, problem.rig.radius
-    known = np.isfinite(z[:, place])
-    raw = at.rows[:, 0].reshape(z.shape)[:, place]
-    scale = np.abs(raw[known]).sum() / max(float(np.abs(z[known, place]).sum()), 1e-12)
-    own = None if place == W else place % (W + 1)
+    known = np.isfinite(z[:, column])
+    raw = at.rows[:, 0].reshape(z.shape)[:, column]
+    scale = np.abs(raw[known]).sum() / max(float(np.abs(z[known, column]).sum()), 1e-12)
+    own = None if column == W else column % (W + 1)
     slip = 1.0 - latents.ground_speed[:, None] / (r * latents.speed)
     wheels = {"slip": slip, "load": latents.load / latents.load.mean(0), "sinkage": sinkage(latents.entry_angle, r)}
     by = {name: (v.mean(1) if own is None else v[:, own]) for name, v in wheels.items()}
@@ -112,7 +118,7 @@ def _sample(
     angle = problem.wheel_angle.mean(1) if own is None else problem.wheel_angle[:, own]
     waves = {f"{f.__name__}({k} wheel angle)": f(k * angle) for k in HARMONICS for f in (np.sin, np.cos)}
     regressors = {"1": np.ones(len(z))} | by | products | waves
-    return _Sample(z[known, place], np.full(int(known.sum()), scale), {n: v[known] for n, v in regressors.items()})
+    return _Sample(z[known, column], np.full(int(known.sum()), scale), {n: v[known] for n, v in regressors.items()})
 
 
 def _joined(parts: list[_Sample]) -> _Sample:
@@ -125,36 +131,39 @@ def _joined(parts: list[_Sample]) -> _Sample:
 
 
 def _selected(sample: _Sample) -> list[Term]:
-    """Terms by forward selection while BIC falls."""
+    """Terms by forward selection while BIC, with the choice among candidates counted, falls."""
     chosen: list[str] = []
-    left, n = float(sample.z @ sample.z), len(sample.z)
-    while len(chosen) < MAX_TERMS and n > 20:
-        trials = {name: _rest(sample, [*chosen, name]) for name in sample.regressors if name not in chosen}
+    chi2, n = float(sample.z @ sample.z), len(sample.z)
+    while len(chosen) < MAX_TERMS and n > MIN_RESIDUALS:
+        trials = {name: _chi2_after(sample, [*chosen, name]) for name in sample.regressors if name not in chosen}
         best = min(trials, key=lambda name: trials[name])
-        if left - trials[best] < 2.0 * math.log(n) + 2.0 * math.log(len(trials)):
+        if chi2 - trials[best] < 2.0 * math.log(n) + 2.0 * math.log(len(trials)):
             break
         chosen.append(best)
-        left = trials[best]
+        chi2 = trials[best]
     return [Term(n, float(c)) for n, c in zip(chosen, _solution(sample, chosen), strict=True)] if chosen else []
 
 
 def _design(sample: _Sample, names: list[str]) -> Array:
+    """Regressors (n, K) over the residuals' std."""
     return np.column_stack([sample.regressors[name] / sample.std for name in names])
 
 
 def _solution(sample: _Sample, names: list[str]) -> Array:
+    """Least-squares coefficients (K,) [SI]."""
     return np.asarray(np.linalg.lstsq(_design(sample, names), sample.z, rcond=None)[0])
 
 
-def _rest(sample: _Sample, names: list[str]) -> float:
-    miss = sample.z - _design(sample, names) @ _solution(sample, names)
-    return float(miss @ miss)
+def _chi2_after(sample: _Sample, names: list[str]) -> float:
+    """Chi-square that the terms leave, fitted to this sample."""
+    rest = sample.z - _design(sample, names) @ _solution(sample, names)
+    return float(rest @ rest)
 
 
 def _explained(sample: _Sample, terms: list[Term]) -> float:
-    """Share of the excess of chi-square over noise that terms explain where they were not learned."""
+    """Share of the excess of chi-square over noise that terms fitted to another sample explain in this one."""
     if not terms:
         return 0.0
     before = float(sample.z @ sample.z)
-    miss = sample.z - _design(sample, [t.regressor for t in terms]) @ np.array([t.coefficient for t in terms])
-    return (before - float(miss @ miss)) / max(before - len(sample.z), 1e-9) if before > len(sample.z) else 0.0
+    rest = sample.z - _design(sample, [t.regressor for t in terms]) @ np.array([t.coefficient for t in terms])
+    return (before - float(rest @ rest)) / max(before - len(sample.z), 1e-9) if before > len(sample.z) else 0.0

@@ -1,8 +1,15 @@
 """From evidences to a verdict: none, named, ambiguous or unknown, with probabilities.
 
+    P(name) = (1 - q) softmax(fall / (2 T)) + q softmax(fall / (2 T')),  fall = -2 log evidence before - after
+
+No effect's formula is exactly that of the field.  A formula that is off by a share e of its effect leaves e^2 of what
+there was to explain, so differences of evidence are divided by a temperature that grows with what is explained: T
+usually, the larger T' with probability q (P_LARGE_FORMULA_ERROR).  An effect is added only if its fall exceeds a
+required fall, and the verdict is `unknown` if the gap that remains is too large.
+
 The constants were set looking at the blind cases of seeds 1 and 2 and the `tune` half of seed 3
-(`python -m tests.diagnosis.blind`), UNEXPLAINED_FAR at the `tune` halves of seeds 107 to 111; what is
-reported are `report` halves of seeds from 3 on.
+(`python -m tests.diagnosis.blind`), MAX_UNEXPLAINED_SHARE_OF_LARGE_GAP at the `tune` halves of seeds 107 to 111;
+what is reported are `report` halves of seeds from 3 on.
 """
 
 from __future__ import annotations
@@ -17,6 +24,48 @@ from scipy.special import expit, softmax
 
 from soilbus.diagnosis.evidence import OwnParameters
 
+FALL_REQUIRED_ALONE, FALL_REQUIRED_BESIDE = 12.0, 30.0
+"""Least fall of -2 log evidence with which an effect is added: alone, and beside others, as these leave more than
+noise."""
+LEAST_ADDED_SHARE = 0.001
+"""Share of what is explained already that a further effect must explain: less than that formulas are off."""
+LEAST_GAP_SHARE = 0.25
+"""Share of a real gap's excess over noise that an effect must explain to be added."""
+
+TEMPERATURE = 6.0
+"""What differences of -2 log evidence are divided by where little is explained."""
+FORMULA_ERROR, LARGE_FORMULA_ERROR = 0.001, 0.1
+"""Growth of the temperature per unit of -2 log evidence that is explained: usual, and with P_LARGE_FORMULA_ERROR."""
+MAX_LARGE_ERROR_FALL = 1500.0
+"""Explained fall of -2 log evidence beyond which the large formula error grows no more: blind cases with large
+effects could be distinguished."""
+P_LARGE_FORMULA_ERROR = 0.15
+"""Probability of the large formula error."""
+FORMULA_ERROR_OF_EXISTENCE = 0.02
+"""Growth of the temperature with which it is decided whether there is a further effect at all, per explained unit."""
+DOMINATED_TEMPERATURES = 4.0
+"""Large temperatures behind the best candidate beyond which a candidate is dominated: not fitted to all instants."""
+
+NAMED_PROBABILITY = 0.8
+"""Probability from which a name stands alone."""
+SET_PROBABILITY = 0.02
+"""Probability from which a name belongs to the set."""
+MAX_UNEXPLAINED_SHARE, MAX_UNEXPLAINED_SHARE_OF_LARGE_GAP = 0.35, 0.08
+"""Share of the gap's excess over noise that named effects may leave, as no formula is that of the field: where the
+remaining gap is small, and where it is large."""
+LARGE_GAP = 1.5
+"""Reduced chi-square from which a remaining gap is large."""
+GAP_LIMIT_SD = 4.0
+"""Standard deviations of a reduced chi-square beyond which a gap is real."""
+LEAST_GAP_LIMIT = 1.04
+"""Reduced chi-square up to which no gap is reported, however many residuals: noise is not known better."""
+
+SOIL_ERROR_SHARE = 0.125
+"""Share of what an effect changes of the soil's parameters by which these are off (standard deviation), as no
+effect's formula is the field's: of the blind `tune` halves of seeds 109 to 113."""
+SOIL_ERROR_SHARE_OF: Mapping[str, float] = MappingProxyType({"tyre_deflection": 1.0})
+"""The same by name, for effects whose share is another."""
+
 
 class Verdict(StrEnum):
     """What the diagnosis comes to."""
@@ -27,38 +76,57 @@ class Verdict(StrEnum):
     UNKNOWN = "unknown"
 
 
-PAYS, PAYS_BESIDE = 12.0, 30.0
-"""Fall of -2 log evidence from which an effect is added, alone and beside others: they leave more than noise."""
-TEMPERATURE = 6.0
-"""By how much evidences are less certain than they say, where little is to be explained."""
-FORM_ERROR, GREAT_FORM_ERROR = 0.001, 0.1
-"""By how much less besides, for each unit that is explained: no effect's formula is the field's, and a formula
-that is off by a share e of the effect leaves e^2 of what there was to explain.  Usually, and at times."""
-GROWN = 1500.0
-"""Fall of -2 log evidence from which the greater error grows no more: great effects have been seen to tell apart."""
-AT_TIMES = 0.15
-"""How often it is the greater one."""
-FORM_LEFT = 0.02
-"""The same for whether there is a further effect at all: share of what is explained that its formula may leave."""
-HOPELESS = 4.0
-"""Great temperatures behind the best one from which a name is so improbable that it is not fitted to all instants."""
-SURE = 0.8
-"""Probability from which a name stands alone."""
-PLAUSIBLE = 0.02
-"""Probability from which a name belongs to the set."""
-ADDS = 0.001
-"""Share of what is explained already that a further effect must explain: less than that formulas are off."""
-WORTH = 0.25
-"""Share of a real gap's excess over noise that an effect must explain to be added."""
-UNEXPLAINED, UNEXPLAINED_FAR = 0.35, 0.08
-"""Share of it that may be left by effects that are named, none of which has the formula of the field: of a gap that
-is left small, and of one that is not."""
-FAR_GAP = 1.5
-"""Reduced chi-square from which a gap that is left is not small."""
-REAL_GAP = 4.0
-"""Standard deviations of a reduced chi-square beyond which a gap is real."""
-LEAST_GAP = 1.04
-"""Reduced chi-square up to which no gap is told, however many residuals: noise is not known better."""
+def verdict_of(before: float, after: float, rows: int, chances: Sequence[float], imitation: bool = False) -> Verdict:
+    """The verdict of a diagnosis.
+
+    Parameters
+    ----------
+    before, after
+        Gaps (reduced chi-square) under the present model and with the effects added.
+    rows
+        Held-out residuals of which the gaps are.
+    chances
+        Probability of each effect added.
+    imitation
+        Whether the effects explain the data only together, see `diagnose.shares_alone`.
+    """
+    if is_unexplained(before, after, rows):
+        return Verdict.UNKNOWN
+    if not chances:
+        return Verdict.NONE
+    return Verdict.NAMED if min(chances) >= NAMED_PROBABILITY and not imitation else Verdict.AMBIGUOUS
+
+
+def is_unexplained(before: float, after: float, checked_rows: int) -> bool:
+    """Whether a gap (reduced chi-square) remains that the effects added do not explain."""
+    share = MAX_UNEXPLAINED_SHARE_OF_LARGE_GAP if after > LARGE_GAP else MAX_UNEXPLAINED_SHARE
+    return after > gap_limit(checked_rows) and after - 1.0 > share * (before - 1.0)
+
+
+def gap_limit(rows: int) -> float:
+    """Reduced chi-square of this number of held-out residuals up to which noise explains them."""
+    return max(LEAST_GAP_LIMIT, 1.0 + GAP_LIMIT_SD * math.sqrt(2.0 / max(rows, 1)))
+
+
+def required_fall(explained: float, gap: float, checked_rows: int, rows: int) -> float:
+    """Fall of -2 log evidence from which an effect is added.
+
+    Parameters
+    ----------
+    explained
+        Fall of -2 log evidence by the effects that the present model has already.
+    gap, checked_rows
+        Reduced chi-square under the present model, and the number of held-out residuals of which it is.
+    rows
+        Residuals of all blocks.
+    """
+    excess = (gap - 1.0) * rows if gap > gap_limit(checked_rows) else 0.0
+    return max(least_required_fall(explained), LEAST_GAP_SHARE * excess)
+
+
+def least_required_fall(explained: float) -> float:
+    """The least required fall at any gap."""
+    return max(FALL_REQUIRED_BESIDE if explained > 0.0 else FALL_REQUIRED_ALONE, LEAST_ADDED_SHARE * explained)
 
 
 def probabilities(
@@ -66,49 +134,63 @@ def probabilities(
     explained: float,
     further: Mapping[str, Sequence[OwnParameters]] = MappingProxyType({}),
 ) -> dict[str, float]:
-    """Probability of each name from its fall of -2 log evidence, the largest first, where others explain so much.
+    """Probability of each candidate's name, the largest first.
 
-    further are the parameters that recordings after the first have for themselves under a name: that they come out
-    alike is a chance, which no error of a formula makes more likely.  What is left to one is the probability that
-    nothing more is missing.
+    Parameters
+    ----------
+    falls
+        Fall of -2 log evidence by name.
+    explained
+        Fall of -2 log evidence by the effects that the present model has already.
+    further
+        By name, the parameters that each recording after the first has for itself: that their values agree is a
+        coincidence, which no error of a formula makes more likely.
+
+    Returns
+    -------
+    dict
+        Probabilities; what they lack to one is the probability that nothing more is missing.
     """
     most = max(falls.values())
-    usual, great = (_shares(falls, t, further) for t in temperatures(explained + most))
-    something = float(expit(most / (2.0 * temperature(explained, FORM_LEFT))))
-    chances = {n: something * ((1.0 - AT_TIMES) * usual[n] + AT_TIMES * great[n]) for n in falls}
+    usual, large = (_tempered_shares(falls, t, further) for t in temperatures(explained + most))
+    something = float(expit(most / (2.0 * temperature(explained, FORMULA_ERROR_OF_EXISTENCE))))
+    chances = {
+        n: something * ((1.0 - P_LARGE_FORMULA_ERROR) * usual[n] + P_LARGE_FORMULA_ERROR * large[n]) for n in falls
+    }
     return dict(sorted(chances.items(), key=lambda item: -item[1]))
 
 
-def out_of_reach(behind: float, explained: float) -> bool:
-    """Whether a name so far behind the best one in -2 log evidence cannot get into the set."""
-    return behind > out_of_reach_from(explained)
+def is_dominated(deficit: float, explained: float) -> bool:
+    """Whether a candidate this far (-2 log evidence) behind the best one cannot get into the set of names."""
+    return deficit > dominated_deficit(explained)
 
 
-def out_of_reach_from(explained: float) -> float:
-    """How far behind that is."""
-    return HOPELESS * _great_temperature(explained)
+def dominated_deficit(explained: float) -> float:
+    """Deficit of -2 log evidence, behind the best candidate, beyond which a candidate is dominated."""
+    return DOMINATED_TEMPERATURES * _large_temperature(explained)
 
 
 def temperatures(explained: float) -> tuple[float, float]:
-    """What differences of -2 log evidence between names are divided by, where so much is explained: usually, at times.
+    """What differences of -2 log evidence between names are divided by: usually, and with P_LARGE_FORMULA_ERROR.
 
-    At times is AT_TIMES.
+    explained: fall of -2 log evidence by all effects, the candidate included.
     """
-    return temperature(explained), _great_temperature(explained)
+    return temperature(explained), _large_temperature(explained)
 
 
-def temperature(explained: float, form_error: float = FORM_ERROR) -> float:
-    """What differences of -2 log evidence are divided by, where so much of it is explained in all."""
+def temperature(explained: float, form_error: float = FORMULA_ERROR) -> float:
+    """The usual temperature where this fall of -2 log evidence is explained in all."""
     return TEMPERATURE + form_error * max(explained, 0.0)
 
 
-def _great_temperature(explained: float) -> float:
-    return temperature(min(explained, GROWN), GREAT_FORM_ERROR)
+def _large_temperature(explained: float) -> float:
+    return temperature(min(explained, MAX_LARGE_ERROR_FALL), LARGE_FORMULA_ERROR)
 
 
-def _shares(
+def _tempered_shares(
     falls: Mapping[str, float], temperature: float, further: Mapping[str, Sequence[OwnParameters]]
 ) -> dict[str, float]:
+    """Softmax of the tempered falls, halved."""
     tempered = [
         fall / temperature - sum(own.surcharge(temperature) for own in further.get(name, ()))
         for name, fall in falls.items()
@@ -116,38 +198,11 @@ def _shares(
     return dict(zip(falls, softmax(np.array(tempered) / 2.0).tolist(), strict=True))
 
 
-def gap_limit(rows: int) -> float:
-    """Reduced chi-square of so many held-out residuals up to which noise explains them."""
-    return max(LEAST_GAP, 1.0 + REAL_GAP * math.sqrt(2.0 / max(rows, 1)))
+def soil_error_share(name: str) -> float:
+    """Share of the change of the soil's parameters by an effect of this name that counts as a standard deviation."""
+    return SOIL_ERROR_SHARE_OF.get(name, SOIL_ERROR_SHARE)
 
 
-def price(explained: float, gap: float, checked_rows: int, rows: int) -> float:
-    """Fall of -2 log evidence beyond which an effect is worth adding, where others explain so much already.
-
-    gap is the present one, on so many residuals.
-    """
-    excess = (gap - 1.0) * rows if gap > gap_limit(checked_rows) else 0.0
-    return max(least_that_pays(explained), WORTH * excess)
-
-
-def least_that_pays(explained: float) -> float:
-    """The least that it ever is."""
-    return max(PAYS_BESIDE if explained > 0.0 else PAYS, ADDS * explained)
-
-
-def verdict_of(before: float, after: float, rows: int, chances: Sequence[float], imitation: bool = False) -> Verdict:
-    """The verdict from the gaps before and after on so many residuals, and the probability of each effect added.
-
-    imitation: whether the effects explain what they do only together, see `diagnose`.
-    """
-    if is_real(before, after, rows):
-        return Verdict.UNKNOWN
-    if not chances:
-        return Verdict.NONE
-    return Verdict.NAMED if min(chances) >= SURE and not imitation else Verdict.AMBIGUOUS
-
-
-def is_real(before: float, after: float, checked_rows: int) -> bool:
-    """Whether a gap is left that the effects added do not explain."""
-    share = UNEXPLAINED_FAR if after > FAR_GAP else UNEXPLAINED
-    return after > gap_limit(checked_rows) and after - 1.0 > share * (before - 1.0)
+def mean_soil_error_share(chances: Mapping[str, float]) -> float:
+    """Root mean square of the shares of these names, weighted by their probabilities."""
+    return math.sqrt(sum(p * soil_error_share(name) ** 2 for name, p in chances.items()) / sum(chances.values()))

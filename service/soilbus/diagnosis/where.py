@@ -1,9 +1,11 @@
-"""Where model and data disagree: channel, wheel, region of slip, load, speed or time.
+"""Where model and data disagree: channel, wheel, and region of slip, load, speed or time.
 
-Each residual of the held-out blocks, given the others of its instant, is standard normal
-where nothing is missing.  So is its mean over a region, times a known factor: noise, and
-what the fit leaves open of soil, gains and effects, are both in it.  Many looks are taken,
-and each significance says what is left of it after that (Holm 1979, Scand. J. Statist. 6:65).
+    z = mean standardised residual of a region / sqrt(1/n + s' P s)     (s: its mean slope, P: posterior covariance)
+
+Each residual of the held-out blocks, given the others of its instant, is standard normal where nothing is missing.  So
+is the mean over a region divided by its standard deviation, which includes noise and what the fit leaves uncertain of
+soil, gains and effects.  Each region is one test; the significance reported is corrected for the number of all tests
+(Holm 1979, Scand. J. Statist. 6:65).
 """
 
 from __future__ import annotations
@@ -17,13 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.diagnosis.fitted_model import Checked, FittedModel
+from soilbus.diagnosis.fitted_model import FittedModel, HeldOutCheck
 from soilbus.estimation.posterior import PARAMETERS
 
-FEWEST = 20
+# A value whose docstring states no source has no evidence recorded.
+MIN_RESIDUALS = 20
 """Residuals that a region must have."""
-SIGNIFICANT = 0.01
-"""Chance, all looks taken together, below which a disagreement is told."""
+SIGNIFICANCE_LEVEL = 0.01
+"""Probability under noise alone, corrected for all tests, below which a disagreement is reported."""
+MIN_VARIANCE_SHARE = 0.01
+"""Share of a gain's prior variance that the data must determine for its error to be tested."""
 _SOIL = len(PARAMETERS)
 _REGRESSORS = ("slip", "load", "speed", "time")
 
@@ -32,11 +37,19 @@ _REGRESSORS = ("slip", "load", "speed", "time")
 class Disagreement:
     """One place where model and data disagree.
 
-    channel: torque, draft or sinkage, or a sensor whose gain error is implausible; wheel is
-    empty for the vehicle's.  region: `everywhere`, `slip 0.20..0.35` and the like, `scatter`
-    (residuals larger than noise, whatever their sign) or `gain`.  size: mean of reading less
-    model in SI (of a scatter: the residuals' std over the noise's; of a gain: the gain
-    error); significance: the chance that noise alone does as much in any of the looks.
+    Attributes
+    ----------
+    channel
+        torque, draft or sinkage, or a sensor whose gain error is implausible.
+    wheel
+        Its name; empty for a channel of the vehicle.
+    region
+        `everywhere`, `slip 0.20..0.35` and the like, `scatter` (residuals larger than noise, of either sign) or
+        `gain`.
+    size
+        Mean of reading less model [SI]; of a scatter the residuals' std over the noise's, of a gain the gain error.
+    significance
+        Probability that noise alone does as much in any of the tests.
     """
 
     channel: str
@@ -47,7 +60,9 @@ class Disagreement:
 
 
 @dataclass(frozen=True, slots=True)
-class _Look:
+class _Test:
+    """One test, with its statistic in standard deviations."""
+
     channel: str
     wheel: str
     region: str
@@ -55,17 +70,17 @@ class _Look:
     deviations: float
 
 
-def disagreements(completion: FittedModel) -> list[Disagreement]:
+def disagreements(fitted: FittedModel) -> list[Disagreement]:
     """All significant disagreements of the held-out blocks, the clearest first."""
-    looks = [look for i, check in enumerate(completion.checks) for look in _looks(check, completion, i)]
-    looks += list(_gain_looks(completion))
-    looks.sort(key=lambda look: -abs(look.deviations))
+    tests = [test for i, check in enumerate(fitted.checks) for test in _tests(check, fitted, i)]
+    tests += list(_gain_tests(fitted))
+    tests.sort(key=lambda test: -abs(test.deviations))
     found, worst = [], 0.0
-    for rank, look in enumerate(looks):
-        worst = max(worst, min(1.0, math.erfc(abs(look.deviations) / math.sqrt(2.0)) * (len(looks) - rank)))
-        if worst > SIGNIFICANT:
+    for rank, test in enumerate(tests):
+        worst = max(worst, min(1.0, math.erfc(abs(test.deviations) / math.sqrt(2.0)) * (len(tests) - rank)))
+        if worst > SIGNIFICANCE_LEVEL:
             break
-        found.append(Disagreement(look.channel, look.wheel, look.region, look.size, worst))
+        found.append(Disagreement(test.channel, test.wheel, test.region, test.size, worst))
     return found
 
 
@@ -75,10 +90,11 @@ def channels(wheels: Sequence[str], with_sinkage: bool) -> list[tuple[str, str]]
     return names + ([("sinkage", w) for w in wheels] if with_sinkage else [])
 
 
-def _looks(check: Checked, completion: FittedModel, record: int) -> Iterator[_Look]:
-    problem, gaussian = check.problem, completion.fits[record].mode
-    z, by = problem.standardised(check.at, gaussian.gains)
-    by = by * np.concatenate([gaussian.soil, np.ones(len(gaussian.gains))])
+def _tests(check: HeldOutCheck, fitted: FittedModel, record: int) -> Iterator[_Test]:
+    """The tests of one recording: mean by region, and scatter, of each channel."""
+    problem, gaussian = check.problem, fitted.fits[record].mode
+    z, slopes = problem.standardised(check.at, gaussian.gains)
+    slopes = slopes * np.concatenate([gaussian.soil, np.ones(len(gaussian.gains))])
     raw = check.at.rows[:, 0].reshape(z.shape)
     W = problem.n_wheels
     slip = 1.0 - check.latents.ground_speed[:, None] / (problem.rig.radius * check.latents.speed)
@@ -93,22 +109,24 @@ def _looks(check: Checked, completion: FittedModel, record: int) -> Iterator[_Lo
         known = np.isfinite(z[:, i])
         for region, members in _regions(regressors, known):
             n = len(members)
-            mean, slope = z[members, i].mean(), by[members, i].mean(0)
+            mean, slope = z[members, i].mean(), slopes[members, i].mean(0)
             sd = math.sqrt(1.0 / n + float(slope @ gaussian.covariance @ slope))
-            yield _Look(channel, wheel, region, float(raw[members, i].mean()), mean / sd)
+            yield _Test(channel, wheel, region, float(raw[members, i].mean()), mean / sd)
         n = int(known.sum())
-        if n >= FEWEST:
+        if n >= MIN_RESIDUALS:
             square = float((z[known, i] ** 2).mean())
-            left_open = gaussian.covariance @ (by[known, i].T @ by[known, i])  # of I + M: M's trace, and that of M^2
-            expected, of_squares = float(left_open.trace()), float((left_open @ left_open).trace())
+            uncertain = gaussian.covariance @ (
+                slopes[known, i].T @ slopes[known, i]
+            )  # of I + M: M's trace, and that of M^2
+            expected, of_squares = float(uncertain.trace()), float((uncertain @ uncertain).trace())
             sd = math.sqrt(2.0 * (n + 2.0 * expected + of_squares)) / n
-            yield _Look(channel, wheel, "scatter", math.sqrt(square), (square - 1.0 - expected / n) / sd)
+            yield _Test(channel, wheel, "scatter", math.sqrt(square), (square - 1.0 - expected / n) / sd)
 
 
 def _regions(regressors: dict[str, Array], known: NDArray[np.bool_]) -> Iterator[tuple[str, NDArray[np.intp]]]:
     """Everywhere, and each third of each regressor, where there is enough in it."""
     every = np.flatnonzero(known)
-    if len(every) < FEWEST:
+    if len(every) < MIN_RESIDUALS:
         return
     yield "everywhere", every
     for name in _REGRESSORS:
@@ -118,17 +136,17 @@ def _regions(regressors: dict[str, Array], known: NDArray[np.bool_]) -> Iterator
             continue
         for low, high in pairwise(edges.tolist()):
             members = every[(values[every] >= low) & (values[every] <= high)]
-            if len(members) >= FEWEST:
+            if len(members) >= MIN_RESIDUALS:
                 yield f"{name} {low:.3g}..{high:.3g}", members
 
 
-def _gain_looks(completion: FittedModel) -> Iterator[_Look]:
-    """Gain errors that are larger than they may be: a fit hides an effect in them."""
-    problem, gaussian = completion.checks[-1].problem, completion.fits[-1].mode
+def _gain_tests(fitted: FittedModel) -> Iterator[_Test]:
+    """Tests of the gain errors against their priors: a fit may hide an effect in them."""
+    problem, gaussian = fitted.checks[-1].problem, fitted.fits[-1].mode
     for i in range(problem.n_sensors):
         std = float(problem.gain_std[i])
-        told = std**2 - float(gaussian.covariance[_SOIL + i, _SOIL + i])  # what the data moved it by, were it noise
-        if std > 0.0 and told > 0.01 * std**2:
+        shift_variance = std**2 - float(gaussian.covariance[_SOIL + i, _SOIL + i])  # of the posterior mean, under noise
+        if std > 0.0 and shift_variance > MIN_VARIANCE_SHARE * std**2:
             quantity, _, wheel = problem.gain_names[i].partition(".")
             gain = float(gaussian.gains[i])
-            yield _Look(quantity, wheel, "gain", gain, gain / math.sqrt(told))
+            yield _Test(quantity, wheel, "gain", gain, gain / math.sqrt(shift_variance))

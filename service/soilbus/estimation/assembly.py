@@ -1,4 +1,10 @@
-"""Configuration -> the parts that the rooms work with."""
+"""Assembly: the estimator's parts from the configuration.
+
+    Config -> Rig, Chassis, SoilPrior, WheelModel, effects with values and prior sd, delays
+
+Each function takes the validated configuration and returns one part; a ConfigError carries a line for each fault.
+Without effects in model.effects the catalogue is not imported, which keeps the start short.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +26,23 @@ from soilbus.words import did_you_mean
 
 
 def rig_of(config: Config) -> Rig:
-    """The vehicle with all its wheels; the one wheel of a test rig; no wheel where none is measured.
+    """The vehicle with all its wheels, or a test rig with one.
 
-    ConfigError with a line for each wheel that is not measured while others are, and for an
-    axle without wheels: what it carries and its rolling resistance would be put down to the
-    soil under the others.
+    Parameters
+    ----------
+    config : Config
+        Validated configuration.
+
+    Returns
+    -------
+    Rig
+        Without wheels if none is measured.
+
+    Raises
+    ------
+    ConfigError
+        With a line for each wheel that is not measured while others are, and for each axle
+        without wheels: its load and rolling resistance would be attributed to the soil under the others.
     """
     of_table = config.table is not None
     if faults := [] if of_table else list(_unmeasured(config)):
@@ -32,7 +50,7 @@ def rig_of(config: Config) -> Rig:
     wheels = [w for w in config.wheel if of_table or not w.lacking]
     noise = {q: SensorNoise(**getattr(config.noise, q).model_dump()) for q in type(config.noise).model_fields}
     slip = noise.pop("slip")
-    if of_table:  # its speeds are stand-ins for the slip, see tables.py
+    if of_table:  # its speeds are computed from the slip, see tables.py
         noise |= {"speed": SensorNoise(), "ground_speed": slip}
     return Rig(
         wheels=tuple(w.name for w in wheels),
@@ -46,7 +64,7 @@ def rig_of(config: Config) -> Rig:
 
 
 def _unmeasured(config: Config) -> Iterator[str]:
-    """A line for each wheel that carries the vehicle unseen, where others are measured."""
+    """A line for each wheel that carries the vehicle without being measured, where others are."""
     if all(w.lacking for w in config.wheel):
         return
     for w in config.wheel:
@@ -63,22 +81,22 @@ def _unmeasured(config: Config) -> Iterator[str]:
 
 
 def chassis_of(config: Config) -> Chassis | None:
-    """Mass and geometry, where the configuration has a vehicle."""
+    """Mass and geometry; None for a test rig."""
     return None if config.vehicle is None else Chassis(**config.vehicle.model_dump(exclude={"track"}))
 
 
 def prior_of(config: Config) -> SoilPrior:
-    """The soil's prior."""
+    """Prior of the soil parameters."""
     return SoilPrior.from_value_std({name: (p.value, p.std) for name, p in config.soil_prior.items()})
 
 
 def model_of(config: Config) -> WheelModel:
-    """The wheel-soil model for fits, without effects."""
+    """The wheel-soil model of fits, without effects."""
     return WheelModel(shear_law=config.model.shear_law, nodes=FAST_NODES)
 
 
 def form_of(config: Config) -> tuple[float, ...]:
-    """How far the form of the contact may be from the model's, as form.FORM: not at all where an effect names it."""
+    """How far each of `model_form.FORM` may be from the model; 0 where an effect of the model has that parameter."""
     named, form = {effect.name for effect in config.model.effects}, config.model.form
     peak = 0.0 if "stress_peak_shift" in named else 1.0
     leave, shear = float("rut_recovery" not in named), float("exponential_shear" not in named)
@@ -88,41 +106,53 @@ def form_of(config: Config) -> tuple[float, ...]:
 def effects_of(config: Config, wheels: Sequence[str] | None = None) -> tuple[Active, ...]:
     """The effects of model.effects with their values, in the order of the catalogue.
 
-    A parameter is a number or, as `diagnose --model-out` writes it, {value = x, std = y};
-    without any it stays neutral.  One that every wheel has for itself may also be a table of
-    these by wheel, {FL = x, RR = {value = y, std = z}}; wheels not in it stay neutral.  It
-    becomes an array (W,) of `wheels`, by default all wheels of the configuration.
+    Parameters
+    ----------
+    config : Config
+        Validated configuration.
+    wheels : Sequence of str, optional
+        Wheels of the arrays (W,), by default all of the configuration.
 
-    ConfigError with a line for each effect and parameter that the catalogue lacks, value out of
-    range or no number, effect given twice, or shear law that the effect cannot be added to.
+    Returns
+    -------
+    tuple of Active
+        A parameter is a number or, as `diagnose --model-out` writes it, {value = x, std = y};
+        one not given stays neutral.  A parameter of each wheel may also be a table of these,
+        {FL = x, RR = {value = y, std = z}}, and becomes an array (W,); wheels not given stay neutral.
+
+    Raises
+    ------
+    ConfigError
+        With a line for each unknown effect or parameter, value out of range or not a number,
+        effect given twice, or shear law that the effect cannot be combined with.
     """
     if not config.model.effects:
         return ()
-    from soilbus.terra.effects.catalogue import CATALOGUE  # a start without effects need not wait for it
+    from soilbus.terra.effects.catalogue import CATALOGUE  # not needed at a start without effects
 
-    of_all = [wheel.name for wheel in config.wheel]
+    all_wheels = [wheel.name for wheel in config.wheel]
     faults: list[str] = []
-    found: dict[str, Active] = {}
+    active_effects: dict[str, Active] = {}
     for setting in config.model.effects:
         try:
-            if setting.name in found:
+            if setting.name in active_effects:
                 raise ConfigError([f"two effects are named {setting.name}"])
-            found[setting.name] = _active(setting, config.model.shear_law, of_all)
+            active_effects[setting.name] = _active(setting, config.model.shear_law, all_wheels)
             if CATALOGUE[setting.name].of_tyre and not _has_tyres(config):
                 raise ConfigError([f"{setting.name} is of a tyre, and every wheel is said to be rigid"])
         except ConfigError as error:
             faults += error.faults
     if faults:
         raise ConfigError(f"model.effects: {fault}" for fault in faults)
-    place = [of_all.index(name) for name in (of_all if wheels is None else wheels)]
+    columns = [all_wheels.index(name) for name in (all_wheels if wheels is None else wheels)]
     return tuple(
-        Active(effect, {name: value[place] if np.ndim(value) else value for name, value in values.items()})
-        for effect, values in (found[name] for name in CATALOGUE if name in found)
+        Active(effect, {name: value[columns] if np.ndim(value) else value for name, value in values.items()})
+        for effect, values in (active_effects[name] for name in CATALOGUE if name in active_effects)
     )
 
 
 def possible_effects(config: Config) -> list[Effect]:
-    """The effects of the catalogue that can be there on the configured machine: without tyres none of a tyre."""
+    """The effects of the catalogue that the machine can have; those of tyres only with flexible tyres."""
     from soilbus.terra.effects.catalogue import CATALOGUE
 
     return [effect for effect in CATALOGUE.values() if _has_tyres(config) or not effect.of_tyre]
@@ -133,7 +163,7 @@ def _has_tyres(config: Config) -> bool:
 
 
 def delays_of(config: Config) -> dict[str, float]:
-    """How late each quantity is [s] by the effect channel_lag of model.effects; ConfigError as `effects_of`."""
+    """Delay [s] of each quantity by the effect channel_lag of model.effects; ConfigError as `effects_of`."""
     if not config.model.effects:
         return {}
     from soilbus.terra.effects.sensors import CHANNEL_LAG, lateness
@@ -141,41 +171,64 @@ def delays_of(config: Config) -> dict[str, float]:
     return lateness([active for active in effects_of(config) if active.effect is CHANNEL_LAG])
 
 
-def completion_of(config: Config, in_time: bool = True) -> tuple[tuple[Effect, ...], tuple[Free, ...]]:
-    """The effects that complete the estimator's model, and what is known of their parameters.
+def effects_and_parameters_of(config: Config, undelayed: bool = True) -> tuple[tuple[Effect, ...], tuple[Free, ...]]:
+    """The effects of the estimator's model and their parameters.
 
-    in_time: samples come as the service takes them in, so that no channel is late any more (see `delays_of`).
+    Parameters
+    ----------
+    config : Config
+        Validated configuration.
+    undelayed : bool
+        Whether the intake has already corrected the delays of channels (`delays_of`), so that channel_lag is left out.
 
-    Those of model.effects but for what describes one recording: effects of_record are left
-    out, such parameters stay neutral.  Another parameter's value is the prior's mean and its
-    std the prior's; one without std is held.  Wheels count as in rig_of.  ConfigError as `effects_of`.
+    Returns
+    -------
+    effects : tuple of Effect
+        Those of model.effects, without effects that describe one record only.
+    parameters : tuple of Free
+        Value and sd of each prior; sd 0 holds a parameter.  Parameters that describe one record
+        only are held neutral.  Wheels are those of `rig_of`.
+
+    Raises
+    ------
+    ConfigError
+        As `effects_of`.
     """
     wheels = rig_of(config).wheels
     settings = {setting.name: setting.model_extra or {} for setting in config.model.effects}
     active = [
         a
         for a in effects_of(config, wheels)
-        if not (a.effect.of_record or (in_time and a.effect.name == "channel_lag"))
+        if not (a.effect.of_record or (undelayed and a.effect.name == "channel_lag"))
     ]
     free: list[Free] = []
     for effect, values in active:
         for parameter in effect.parameters:
             given, value = settings[effect.name].get(parameter.name), values[parameter.name]
             if not effect.each_wheel:
-                free.append(Free(effect.name, parameter, None, *_known(parameter, value, given)))
+                free.append(Free(effect.name, parameter, None, *_prior_value_std(parameter, value, given)))
                 continue
             for i, name in enumerate(wheels):
                 of_wheel = given.get(name) if isinstance(given, Mapping) and _by_wheel(given) else given
-                free.append(Free(effect.name, parameter, i, *_known(parameter, value[i], of_wheel)))
+                free.append(Free(effect.name, parameter, i, *_prior_value_std(parameter, value[i], of_wheel)))
     return tuple(effect for effect, _ in active), tuple(free)
 
 
 def with_effects(config: Config, texts: Iterable[str]) -> Config:
-    """The configuration with effects added, or with other values of those it has.
+    """The configuration with effects added or changed.
 
-    Each text is NAME=VALUE for the first parameter of an effect, NAME.PARAMETER=VALUE for
-    another one, or NAME.PARAMETER.WHEEL=VALUE for that of one wheel.  ConfigError for a text
-    of another form, an unknown effect, and as `effects_of`.
+    Parameters
+    ----------
+    config : Config
+        Validated configuration; not changed.
+    texts : Iterable of str
+        NAME=VALUE for the first parameter of an effect, NAME.PARAMETER=VALUE for another one,
+        NAME.PARAMETER.WHEEL=VALUE for that of one wheel.
+
+    Raises
+    ------
+    ConfigError
+        For a text of another form, an unknown effect, and as `effects_of`.
     """
     effects_of(config)
     settings: dict[str, dict[str, Any]] = {e.name: dict(e.model_extra or {}) for e in config.model.effects}
@@ -201,8 +254,8 @@ def _set_effect(settings: dict[str, dict[str, Any]], text: str, wheels: Sequence
     if not wheel:
         setting[parameter] = number
         return
-    before = setting.get(parameter, {})
-    setting[parameter] = {**(before if _by_wheel(before) else dict.fromkeys(wheels, before)), wheel[0]: number}
+    previous = setting.get(parameter, {})
+    setting[parameter] = {**(previous if _by_wheel(previous) else dict.fromkeys(wheels, previous)), wheel[0]: number}
 
 
 def _active(setting: EffectSetting, shear_law: str, wheels: Sequence[str]) -> Active:
@@ -259,14 +312,14 @@ def _within(given: Any, parameter: Parameter) -> float:
     return value
 
 
-def _known(parameter: Parameter, value: Any, given: Any) -> tuple[float, float]:
-    """Value and std of the prior; of what describes one record nothing is known in another."""
+def _prior_value_std(parameter: Parameter, value: Any, given: Any) -> tuple[float, float]:
+    """Value and sd of a parameter's prior; neutral and held where it describes one record only."""
     std = _std(given)
     return (parameter.neutral, 0.0) if parameter.of_record else (float(value), std)
 
 
 def _std(given: Any) -> float:
-    """The std that a parameter is given with, 0 where it has none."""
+    """The sd given with a parameter; 0 without."""
     std = _number(given.get("std", 0.0)) if isinstance(given, Mapping) else 0.0
     if std < 0.0:
         raise ConfigError([f"std {std:g} is less than 0"])

@@ -1,9 +1,12 @@
-"""Where one soil ends and the next begins, told by how the newest instants disagree with what was known.
+"""Change detection: from which instant on the newest residuals disagree with the predicted soil.
 
-A generalised likelihood ratio over the instant of change, as in Page's cumulative sum
-(Basseville & Nikiforov, Detection of Abrupt Changes, 1993, ch. 2): from the residuals since
-a candidate instant, what the known soil could still explain within its uncertainty is
-taken off, and the rest is compared with noise alone.
+    Q(k) = min over d of  sum_{i >= k} |r_i + J_i d|^2_{S_i^-1} + d' H d          H information of the predicted soil
+    GLR(k) = n_k / 2 (q - 1 - log q),    q = max(Q(k) / n_k, 1)                     n_k residuals from instant k on
+
+A generalised log likelihood ratio over the instant k of change (GLR; Basseville & Nikiforov, Detection of Abrupt
+Changes, 1993, ch. 2): residuals larger than noise against noise alone, after the part that the predicted
+soil explains within its covariance (step d) is removed.  The likeliest k is where a new soil may begin.
+`Transition` is the time between two soils, when wheels of the two axles stand on different ones.
 """
 
 from __future__ import annotations
@@ -16,57 +19,74 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.observation_model import Linearisation
+from soilbus.estimation.observation_model import RESIDUAL, Linearisation
 from soilbus.estimation.solver import Iterate, Objective
 from soilbus.estimation.window import Window
 
 
 class ChangeStatistic(NamedTuple):
-    """First instant (index) that may be on another soil, and the log likelihood ratio that speaks for it."""
+    """Index of the first instant that may be on another soil, and its log likelihood ratio."""
 
     instant: int
     ratio: float
 
 
 def change_statistic(
-    fitting: Objective, joint_prior: Gaussian, place: Iterate, at: Linearisation, first: int, enough: float
+    objective: Objective, joint_prior: Gaussian, iterate: Iterate, at: Linearisation, first: int, threshold: float
 ) -> ChangeStatistic:
     """The likeliest beginning of another soil among the instants from `first` on.
 
-    The residuals are linearised at a place that earlier data told (`at`); `joint_prior` is what
-    they told.  Below `enough` the ratio is only an upper bound.
+    Parameters
+    ----------
+    objective : Objective
+        Of the window.
+    joint_prior : Gaussian
+        Prediction of soil and gains by earlier data.
+    iterate : Iterate
+        Where the residuals are linearised: the prediction's mean.
+    at : Linearisation
+        The residuals there.
+    first : int
+        Index of the first instant that may be on another soil.
+    threshold : float
+        Log likelihood ratio up to which an upper bound suffices, to save time.
+
+    Returns
+    -------
+    ChangeStatistic
     """
     n, m = at.by_latents.shape[:2]
     if first >= n:
         return ChangeStatistic(max(n - 1, 0), 0.0)
     rows, weighed = (a.reshape(n, m, -1)[first:] for a in (at.rows, at.weighed))
-    misfit = np.einsum("im,im->i", rows[:, :, 0], weighed[:, :, 0])
+    misfit = np.einsum("im,im->i", rows[:, :, RESIDUAL], weighed[:, :, RESIDUAL])
     count = np.count_nonzero(rows.any(axis=2), axis=1).astype(float)
-    ratio = _ratio(misfit, count)
-    if ratio.max() <= enough:
+    ratio = _log_likelihood_ratio(misfit, count)
+    if ratio.max() <= threshold:
         return ChangeStatistic(first + int(np.argmax(ratio)), float(ratio.max()))
-    known = fitting.given(joint_prior)
-    by_known = known.directions(place)
-    gradient = np.einsum("imk,im->ik", weighed, rows[:, :, 0]) @ by_known
-    information = by_known.T @ np.einsum("imk,iml->ikl", rows, weighed) @ by_known
-    told = known.prior_at(place).information
-    begin = int(np.argmax(_ratio(misfit - _explained(gradient, information + told), count)))
-    # From there on together: another point within what is known must not pass for another soil.
-    left = misfit[begin:].sum() - _explained(gradient[begin:].sum(0), information[begin:].sum(0) + told)
-    return ChangeStatistic(first + begin, float(_ratio(left[None], count[begin:].sum(keepdims=True))[0]))
+    with_prior = objective.with_joint_prior(joint_prior)
+    directions = with_prior.directions(iterate)
+    gradient = np.einsum("imk,im->ik", weighed, rows[:, :, RESIDUAL]) @ directions
+    information = directions.T @ np.einsum("imk,iml->ikl", rows, weighed) @ directions
+    prior_information = with_prior.prior_at(iterate).information
+    begin = int(np.argmax(_log_likelihood_ratio(misfit - _explained(gradient, information + prior_information), count)))
+    # One common step for all instants from there on: the predicted soil itself must not pass for another.
+    unexplained = misfit[begin:].sum() - _explained(
+        gradient[begin:].sum(0), information[begin:].sum(0) + prior_information
+    )
+    return ChangeStatistic(
+        first + begin, float(_log_likelihood_ratio(unexplained[None], count[begin:].sum(keepdims=True))[0])
+    )
 
 
 def _explained(gradient: Array, information: Array) -> Array:
-    """Misfit that the best step of what is known takes away, for (..., K) and (..., K, K)."""
+    """Part of Q that the best step d explains, for half gradients (..., K) and information (..., K, K)."""
     step = np.linalg.solve(information, gradient[..., None])[..., 0]
     return np.asarray((gradient * step).sum(-1))
 
 
-def _ratio(misfit: Array, count: Array) -> Array:
-    """Log likelihood ratio of residuals larger than noise from each instant on.
-
-    From each instant's sum of squares and number of residuals (N,).
-    """
+def _log_likelihood_ratio(misfit: Array, count: Array) -> Array:
+    """GLR (N,) from each instant on, by the sum of squares and the number of residuals of each instant (N,)."""
     misfit, count = (np.cumsum(a[::-1])[::-1] for a in (misfit, count))
     with np.errstate(divide="ignore", invalid="ignore"):
         excess = np.maximum(misfit / count, 1.0)
@@ -74,21 +94,32 @@ def _ratio(misfit: Array, count: Array) -> Array:
 
 
 class Transition(NamedTuple):
-    """Wheels come onto another soil: the front ones from `begin` to `end` [s], the rear ones `lag` [s] later."""
+    """Wheels come onto another soil: the front ones between `begin` and `end` [s], the rear ones `lag` [s] later."""
 
     begin: float
     end: float
     lag: float
 
 
-def without_transition(window: Window, crossing: Transition, front: NDArray[np.bool_]) -> Window:
-    """The window without what wheels measured on the way from one soil to the other.
+def without_transition(window: Window, transition: Transition, front: NDArray[np.bool_]) -> Window:
+    """The window without the wheels' measurements during a transition.
 
-    Before crossing.begin everything counts as of the first soil, and a wheel counts again
-    when it must be on the second.  `front` (W,) tells the wheels of the front axle.
+    Parameters
+    ----------
+    window : Window
+        The whole window.
+    transition : Transition
+        Before its `begin` all data are of the first soil; a wheel's data count again when it has arrived.
+    front : Array
+        Which wheels (W,) are on the front axle.
+
+    Returns
+    -------
+    Window
+        With nan in torque, load, speed and sinkage of wheels between the soils.
     """
-    arrived = crossing.end + np.where(front, 0.0, crossing.lag)
-    between = (window.t[:, None] >= crossing.begin) & (window.t[:, None] < arrived)
+    arrived = transition.end + np.where(front, 0.0, transition.lag)
+    between = (window.t[:, None] >= transition.begin) & (window.t[:, None] < arrived)
 
     def blanked(values: Array) -> Array:
         return np.where(between, np.nan, values)

@@ -1,23 +1,16 @@
-"""The soil under the wheels now, where a window's fit takes it for constant.
+"""Drift filter: the soil at the end of a window, by a random walk through pieces of the window.
 
-At the optimum of the fit the window is linear.  It is cut into pieces of which each has
-its own soil, a random walk away from that of the piece before, while the sensors' gain
-errors stay what they are: an information filter from piece to piece (e.g. Anderson &
-Moore, Optimal Filtering, 1979, sect. 6.3).  What the last piece has is the present soil;
-a constant one would be late by half a window, and too sure of itself.
+    theta_1 = theta_start,    theta_{j+1} = theta_j + w_j,    w_j ~ N(0, drift^2 / 5)      coordinates of piece j of 5
+    r_i = r_i(optimum) + J_i [theta_j; gains; path curvature]                              linear at the optimum
+    or besides the walk a steady change,  theta(t) = theta_end + (t - t_end) / window d,   d ~ N(0, (7 drift)^2)
 
-A field changes along the way by and by, so that within a window a soil which changes much
-does so steadily.  A walk that is to follow it must be so wide that it makes every
-estimate unsure, and knows nothing of steps that all go one way.  So the change in a window is
-either the walk alone or the walk and a steady change, each as likely as it foretells
-the data, and what they say is averaged (multiple models: Bar-Shalom, Li & Kirubarajan,
-Estimation with Applications to Tracking and Navigation, 2001, sect. 11.6).
-
-On a way that bends (`bends`) its curves are unknown besides, as the gains are.
-
-The linear window tells the mode.  By as much as the filter moves that, and by what it adds
-to the covariance there (never less than nothing: what may wander is known the worse), all
-else that a fit says moves too: moments, averages and rivals keep their shape.
+A fit takes the soil as constant in its window; its estimate is late by half a window and too certain.  Here the
+window is linear at that fit's optimum, and an information filter runs from piece to piece (Anderson & Moore,
+Optimal Filtering, 1979, sect. 6.3); sensor gains and path curvatures (path_curvature) stay constant.  A walk wide
+enough to follow a field that changes steadily would make every estimate uncertain.  So two models, with and without a
+steady change, are averaged by their evidence (multiple models: Bar-Shalom, Li & Kirubarajan, Estimation with
+Applications to Tracking and Navigation, 2001, sect. 11.6).  The step and the added covariance of the mode are applied
+to all Gaussians of a fit; mixtures and second modes keep their shape, and no covariance shrinks.
 """
 
 from __future__ import annotations
@@ -35,16 +28,18 @@ from soilbus.estimation.path_curvature import by_curvature
 from soilbus.estimation.solver import GaussianApproximation, Iterate, Objective
 
 PIECES = 5
-"""Pieces of a whole window."""
-STEADY = 7.0
-"""Sd of a steady change of the soil in the time of one window, in units of how far it wanders."""
+"""Pieces of a window, each with its own soil; no evidence recorded."""
+STEADY_DRIFT_SD = 7.0
+"""Prior sd of a steady change of the soil in one window, in units of `drift`; no evidence recorded."""
 _ENDS = np.arange(1.0, PIECES + 1.0) / PIECES
+"""Ends of the pieces, in windows."""
 
 
 class DriftStep(NamedTuple):
-    """From the optimum of a constant soil to the present one: step (F + A,) to take off, covariance, -2 log evidence.
+    """From the optimum of a constant soil to the soil at the window's end, of F coordinates and A active gains.
 
-    Of coordinates and active gains; evidences of one window compare with each other alone.
+    step (F + A,) is to be subtracted; covariance (F + A, F + A) is the marginal one there.
+    neg2_log_evidence compares models of the same window only.
     """
 
     step: Array
@@ -52,90 +47,109 @@ class DriftStep(NamedTuple):
     neg2_log_evidence: float
 
 
-def at_window_end(fitting: Objective, fit: Fit, window: float, drift: float) -> Fit:
-    """The fit with everything it believes of a soil that wanders.
+def at_window_end(objective: Objective, fit: Fit, window: float, drift: float) -> Fit:
+    """The fit with its Gaussians moved to the soil at the window's end.
 
-    drift: sd by which each coordinate of the soil changes in the time of one window [s].
-    The same fit where nothing wanders or the numbers stop being finite.  Cost and evidence
-    stay those of a constant soil: a wandering one would explain too much that is no soil.
+    Parameters
+    ----------
+    objective : Objective
+        Of the fitted window.
+    fit : Fit
+        Its fit with a constant soil.
+    window : float
+        Length of a window [s].
+    drift : float
+        Sd of the change of each soil coordinate in one window.
+
+    Returns
+    -------
+    Fit
+        The same fit without drift and path curvature, or where the numbers are not finite.
+        neg2_log_posterior and neg2_log_evidence stay those of a constant soil: a drifting soil
+        would explain too much that is no soil.
     """
     if not (drift or fit.curved_path):
         return fit
-    optimum, still = fit.optimum, fitting.approximation_at(fit.optimum)
-    if still is None:
+    optimum, constant = fit.optimum, objective.approximation_at(fit.optimum)
+    if constant is None:
         return fit
-    place, free = Iterate(optimum.soil, optimum.gains, optimum.latents, fit.neg2_log_posterior, 0), len(fitting.free)
-    likely = _changes(_joint(fitting, fit, still, window, drift), len(still.step), free, drift)
-    if not likely:
+    iterate, free = (
+        Iterate(optimum.soil, optimum.gains, optimum.latents, fit.neg2_log_posterior, 0),
+        len(objective.free),
+    )
+    models = _drift_models(_joint(objective, fit, constant, window, drift), len(constant.step), free, drift)
+    if not models:
         return fit
-    step, covariance = _averaged(likely)
+    step, covariance = _model_average(models)
     covariance[:free, :free] += np.eye(free) * drift**2 / (3.0 * PIECES)  # the end of the last piece is not its mean
-    gains = place.gains.copy()
-    gains[fitting.active] -= step[free:]
-    now = replace(place, soil=fitting.coordinates.moved(place.soil, -step[:free]), gains=gains)
-    mode = fitting.gaussian_with(now, covariance)
+    gains = iterate.gains.copy()
+    gains[objective.active] -= step[free:]
+    at_end = replace(iterate, soil=objective.coordinates.stepped(iterate.soil, -step[:free]), gains=gains)
+    mode = objective.gaussian_with(at_end, covariance)
 
-    def moved(gaussian: Gaussian) -> Gaussian:
+    def shifted(gaussian: Gaussian) -> Gaussian:
         return (
             mode
             if gaussian is fit.mode
-            else fitting.shifted(gaussian, still.step - step, covariance - still.covariance)
+            else objective.shifted(gaussian, constant.step - step, covariance - constant.covariance)
         )
 
     return replace(
         fit,
         mode=mode,
-        gaussian=moved(fit.gaussian),
+        gaussian=shifted(fit.gaussian),
         second_mode=None
         if fit.second_mode is None
-        else fit.second_mode._replace(gaussian=moved(fit.second_mode.gaussian)),
-        marginalised=None if fit.marginalised is None else moved(fit.marginalised),
+        else fit.second_mode._replace(gaussian=shifted(fit.second_mode.gaussian)),
+        marginalised=None if fit.marginalised is None else shifted(fit.marginalised),
     )
 
 
-def _changes(joint: Array, told: int, free: int, drift: float) -> list[DriftStep]:
-    """How the soil may have changed: it wanders, or changes steadily besides; without what is not finite."""
-    walk, steady = len(joint) - free, STEADY * drift
-    both = [_change(joint[:walk, :walk], told)]
+def _drift_models(joint: Array, n_reported: int, free: int, drift: float) -> list[DriftStep]:
+    """Steps under the two models, walk alone and walk with a steady change; those that are finite."""
+    walk, steady = len(joint) - free, STEADY_DRIFT_SD * drift
+    models = [_marginal_step(joint[:walk, :walk], n_reported)]
     if drift:
         of_steady = np.arange(walk, len(joint))
         joint[of_steady, of_steady] += 1.0 / steady**2
-        both.append(_change(joint, told, 2.0 * free * math.log(steady)))
-    return [change for change in both if change is not None]
+        models.append(_marginal_step(joint, n_reported, 2.0 * free * math.log(steady)))
+    return [model for model in models if model is not None]
 
 
-def _joint(fitting: Objective, fit: Fit, still: GaussianApproximation, window: float, drift: float) -> Array:
-    """Cost, half its gradient and information of the last piece's soil, gains, bends, and of a steady change (F,).
+def _joint(objective: Objective, fit: Fit, constant: GaussianApproximation, window: float, drift: float) -> Array:
+    """Joint quadratic at the window's end: columns 1 | F coordinates, A gains | K path curvatures | F steady changes.
 
-    The last, of the coordinates in the time of a window, as if nothing were known of it beforehand.
+    Element (0, 0) is -2 log posterior, row 0 half the gradient, the rest the information.  The
+    steady change is that of the coordinates in one window, here without a prior.
     """
-    at, t, directions, prior = fit.optimum.at, fit.optimum.t, still.directions, still.prior
-    free, told, m = len(fitting.free), directions.shape[1], at.by_latents.shape[1]
+    at, t, directions, prior = fit.optimum.at, fit.optimum.t, constant.directions, constant.prior
+    free, n_reported, m = len(objective.free), directions.shape[1], at.by_latents.shape[1]
     ago = (t - t[-1]) / window
     soil, steady = slice(1, 1 + free), slice(-free, None)
-    parts = []
-    for residuals, bends in zip((at.rows, at.weighed), _by_bends(fitting, fit), strict=True):
-        known = residuals @ directions
-        parts.append(np.hstack([residuals[:, :1], known, bends, known[:, :free] * np.repeat(ago, m)[:, None]]))
-    rows, weighed = parts
-    then = np.eye(told, rows.shape[1] - 1)  # what was known before is of the soil then
-    then[:free, steady] = ago[0] * np.eye(free)
+    stacked = []
+    for residuals, by_path_curvature in zip((at.rows, at.weighed), _by_path_curvature(objective, fit), strict=True):
+        by_unknowns = residuals @ directions
+        by_steady_change = by_unknowns[:, :free] * np.repeat(ago, m)[:, None]
+        stacked.append(np.hstack([residuals[:, :1], by_unknowns, by_path_curvature, by_steady_change]))
+    rows, weighed = stacked
+    to_window_start = np.eye(n_reported, rows.shape[1] - 1)  # the prior is of the soil at the window's begin
+    to_window_start[:free, steady] = ago[0] * np.eye(free)
     joint = np.zeros((rows.shape[1],) * 2)
     joint[0, 0] = prior.neg2_log_prior
-    joint[1:, 1:] = then.T @ prior.information @ then
-    joint[0, 1:] = joint[1:, 0] = then.T @ prior.gradient
-    of_bends = np.arange(1 + told, len(joint) - free)
-    joint[of_bends, of_bends] += 1.0
+    joint[1:, 1:] = to_window_start.T @ prior.information @ to_window_start
+    joint[0, 1:] = joint[1:, 0] = to_window_start.T @ prior.gradient
+    curvature_columns = np.arange(1 + n_reported, len(joint) - free)
+    joint[curvature_columns, curvature_columns] += 1.0
     steps = _ENDS if drift else _ENDS[-1:]
-    stiff = np.eye(free) * PIECES / drift**2 if drift else np.zeros((free, free))
+    walk_information = np.eye(free) * PIECES / drift**2 if drift else np.zeros((free, free))
     ends = np.searchsorted(ago, steps - 1.0, side="right").tolist()
     for begin, end in zip([0, *ends[:-1]], ends, strict=True):
         if begin:
             link = joint[:, soil].copy()
-            step = link[soil] + stiff
-            link[soil] = -stiff
+            step = link[soil] + walk_information
+            link[soil] = -walk_information
             joint[soil] = joint[:, soil] = 0.0
-            joint[soil, soil] = stiff
+            joint[soil, soil] = walk_information
             joint -= link @ np.linalg.solve(step, link.T)
         if end > begin:
             part = slice(begin * m, end * m)
@@ -143,35 +157,35 @@ def _joint(fitting: Objective, fit: Fit, still: GaussianApproximation, window: f
     return joint
 
 
-def _by_bends(fitting: Objective, fit: Fit) -> tuple[Array, Array]:
-    """Derivatives (N m, K) of the residuals by bends in their standard deviations, and these weighed."""
+def _by_path_curvature(objective: Objective, fit: Fit) -> tuple[Array, Array]:
+    """Derivatives (N m, K) of the residuals by the K path curvatures over their prior sd, and these weighed."""
     m = fit.optimum.at.by_latents.shape[1]
     if not fit.curved_path:
         none = np.zeros((len(fit.optimum.t) * m, 0))
         return none, none
-    of_bends = np.repeat(fit.curved_path.basis, m, axis=0)
-    by_curve, weighed = by_curvature(fitting, fit)
-    return of_bends * by_curve.reshape(-1, 1), of_bends * weighed.reshape(-1, 1)
+    basis = np.repeat(fit.curved_path.basis, m, axis=0)
+    by_curve, weighed = by_curvature(objective, fit)
+    return basis * by_curve.reshape(-1, 1), basis * weighed.reshape(-1, 1)
 
 
-def _change(joint: Array, told: int, room: float = 0.0) -> DriftStep | None:
-    """What the first `told` unknowns change; room: -2 log of the density beforehand of the others at zero."""
+def _marginal_step(joint: Array, n_reported: int, neg2_log_prior_volume: float = 0.0) -> DriftStep | None:
+    """Step and marginal covariance of the first `n_reported` unknowns; the volume is log det of the others' prior."""
     solution = solve_with_inverse(joint[1:, 1:], joint[1:, 0])
     if solution is None:
         return None
     step, covariance = solution
     cost = float(joint[0, 0] - joint[0, 1:] @ step)
-    neg2_log_evidence = cost + room + float(np.linalg.slogdet(joint[1:, 1:])[1])
-    return DriftStep(step[:told], covariance[:told, :told], neg2_log_evidence)
+    neg2_log_evidence = cost + neg2_log_prior_volume + float(np.linalg.slogdet(joint[1:, 1:])[1])
+    return DriftStep(step[:n_reported], covariance[:n_reported, :n_reported], neg2_log_evidence)
 
 
-def _averaged(likely: list[DriftStep]) -> tuple[Array, Array]:
-    """Mean and covariance of changes that were as likely as each other before the data."""
-    neg2_log_evidence = np.array([change.neg2_log_evidence for change in likely])
+def _model_average(models: list[DriftStep]) -> tuple[Array, Array]:
+    """Mean and covariance of the mixture of models with equal prior probability."""
+    neg2_log_evidence = np.array([model.neg2_log_evidence for model in models])
     probability = np.exp(-0.5 * (neg2_log_evidence - neg2_log_evidence.min()))
     probability /= probability.sum()
-    steps = np.array([change.step for change in likely])
+    steps = np.array([model.step for model in models])
     step = probability @ steps
     off = steps - step
-    covariance = np.tensordot(probability, np.array([change.covariance for change in likely]), axes=1)
+    covariance = np.tensordot(probability, np.array([model.covariance for model in models]), axes=1)
     return step, covariance + (off.T * probability) @ off

@@ -1,4 +1,12 @@
-"""A window's data as the model wants it: what is usable, in which instants, with which variance."""
+"""Measurements of a window as the observation model uses them: usable instants, values, variances, masks.
+
+    slip_w = 1 - V / (r_w omega_w)                   usable where MIN_SLIP < slip < MAX_SLIP, load > 0, V > min_speed
+    demand = draft + m (G sin(pitch) + dV/dt)        drawbar pull that the wheels must give, with its variance
+
+`Measurements` keeps the instants at which some wheel is usable: forward motion (`window.forward` mirrors reversing),
+faster than `min_speed`, not in a turn (`window.turning`).  A value that is missing or has no finite variance is
+zero with a false mask.  Where no acceleration is measured it is the slope of the ground speed (`differentiated_speed`).
+"""
 
 from __future__ import annotations
 
@@ -15,14 +23,21 @@ from soilbus.estimation.local_cubics import Series
 from soilbus.estimation.window import Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
 
-Reading = tuple[Array, Array, NDArray[np.bool_]]
-"""Values, variances of them, and which of them are known; zero where not."""
+Masked = tuple[Array, Array, NDArray[np.bool_]]
+"""Values, their variances, and a mask of which are known; zero where not."""
 
 MAX_SLIP = 0.98
+"""Slip from which a wheel is unusable; no evidence recorded."""
 MIN_SLIP = -1.0
-BENT = 6.0
-"""Standard deviations by which cubics must differ from lines to be taken."""
+"""Slip (braking) up to which a wheel is unusable; no evidence recorded."""
+CUBIC_SELECTION_SD = 6.0
+"""Sd of the noise by which cubics must differ from lines to be used; no evidence recorded."""
+SUBSTITUTE_LOAD = 1e3
+"""Load [N] of unusable wheel-instants; their rows are zero, so it only has to be positive."""
+SUBSTITUTE_SPEED_RATIO = 0.8
+"""Ground speed over rim speed of unusable wheel-instants; their rows are zero, so it only has to be positive."""
 GAIN_QUANTITIES = ("torque", "load", "speed", "ground_speed", "draft")
+"""Quantities with a gain error, in the order of `gain_names`."""
 
 _BY_INSTANT = (
     "t", "usable", "torque", "torque_var", "has_torque", "sinkage", "sinkage_var", "has_sinkage", "load", "load_var",
@@ -30,11 +45,11 @@ _BY_INSTANT = (
     "has_balance", "pitch", "since", "distance", "wheel_angle", "acceleration", "acceleration_var",
     "_measured", "_measured_var", "_row_var", "_known",
 )  # fmt: skip
-"""Attributes of a window's problem with a row for each instant."""
+"""Attributes of `Measurements` with a row for each instant."""
 
 
 def gain_names(rig: Rig) -> list[str]:
-    """Names of the sensors' gain errors, in the order of every window's."""
+    """Names of the sensor gains: torque, load and speed of each wheel, ground speed, draft."""
     per_wheel = ("torque", "load", "speed")
     return [n for q in GAIN_QUANTITIES for n in ([f"{q}.{w}" for w in rig.wheels] if q in per_wheel else [q])]
 
@@ -42,8 +57,19 @@ def gain_names(rig: Rig) -> list[str]:
 class Measurements:
     """The usable instants (N) of a window: arrays (N, W) of the wheels and (N,) of the vehicle, in SI.
 
-    Each has its variance and a mask of what is known; both are zero where it is not.
+    Each has its variance and a mask of what is known; all are zero where it is not.
     `standstill` and `turning` count instants left out; reversing counts as driving forward.
+
+    Parameters
+    ----------
+    window : Window
+        Bin means and variances.
+    rig : Rig
+        Wheels, geometry and sensor noise.
+    min_speed : float
+        Ground speed [m/s] up to which instants are left out.
+    max_turn : float
+        Relative difference of an axle's rim speeds above which instants are left out.
     """
 
     def __init__(self, window: Window, rig: Rig, min_speed: float, max_turn: float) -> None:
@@ -53,10 +79,10 @@ class Measurements:
         n_wheels = len(rig.wheels)
         moving, in_turn = window.ground_speed > min_speed, turning(window, rig, max_turn)
         straight = moving & ~in_turn
-        rim = rig.radius * window.speed
+        rim_speed = rig.radius * window.speed
         with np.errstate(invalid="ignore", divide="ignore"):
-            slip = 1.0 - window.ground_speed[:, None] / rim
-            usable = straight[:, None] & (window.load > 0.0) & (rim > 0.0) & (slip < MAX_SLIP) & (slip > MIN_SLIP)
+            slip = 1.0 - window.ground_speed[:, None] / rim_speed
+            usable = straight[:, None] & (window.load > 0.0) & (rim_speed > 0.0) & (slip < MAX_SLIP) & (slip > MIN_SLIP)
         kept = np.flatnonzero(usable.any(axis=1))
         self.standstill = int(np.count_nonzero(~moving & np.isfinite(window.ground_speed)))
         self.turning = int(np.count_nonzero(moving & in_turn))
@@ -64,7 +90,7 @@ class Measurements:
         self.usable = usable = usable[kept]
         self.n_wheels = n_wheels
 
-        def take(quantity: str) -> Reading:
+        def take(quantity: str) -> Masked:
             value = getattr(window, quantity)[kept]
             variance = window.variance[quantity][kept]
             known = np.isfinite(value) & np.isfinite(variance)
@@ -78,14 +104,13 @@ class Measurements:
         load, load_var, _ = take("load")
         speed, speed_var, _ = take("speed")
         self.ground_speed, self.ground_speed_var, _ = take("ground_speed")
-        # Unusable wheel-instants get a harmless stand-in; none of their rows counts.
-        self.load = np.where(usable, load, 1e3)
-        self.speed = np.where(usable, speed, self.ground_speed[:, None] / (0.8 * rig.radius))
+        self.load = np.where(usable, load, SUBSTITUTE_LOAD)
+        self.speed = np.where(usable, speed, self.ground_speed[:, None] / (SUBSTITUTE_SPEED_RATIO * rig.radius))
         self.load_var, self.speed_var = np.where(usable, load_var, 0.0), np.where(usable, speed_var, 0.0)
         self.since, self.distance = travelled(self.t, self.ground_speed, window.t)
         self.duration = float(window.t[-1] - window.t[0]) if len(window.t) else 0.0
         self.length = float(self.distance[-1]) if len(self.distance) else 0.0
-        self.wheel_angle = turned(self.t, self.speed)
+        self.wheel_angle = wheel_rotation(self.t, self.speed)
         self._balance(take, usable)
         self.gain_names = gain_names(rig)
         self.gain_std = np.array([rig.noise[name.partition(".")[0]].gain for name in self.gain_names])
@@ -102,14 +127,14 @@ class Measurements:
         self._count()
 
     def _count(self) -> None:
-        """What follows from the number of instants and the masks."""
+        """Set the attributes that follow from the number of instants and the masks."""
         self.n = len(self.t)
         self._n_known = int(self._known.sum())
         self._missing = None if self._n_known == self._known.size else ~self._known
         self._radius, self._width = (np.tile(a, self.n) for a in (self.rig.radius, self.rig.width))
 
-    def _balance(self, take: Callable[[str], Reading], usable: NDArray[np.bool_]) -> None:
-        """The pull that draft, slope and inertia ask of the wheels, and its variance."""
+    def _balance(self, take: Callable[[str], Masked], usable: NDArray[np.bool_]) -> None:
+        """Set the demand: pull [N] for draft, slope and inertia, and its variance."""
         self.draft, draft_var, known = take("draft")
         self.with_pitch = False
         demand, variance = self.draft.copy(), draft_var.copy()
@@ -136,22 +161,22 @@ class Measurements:
 
     @property
     def _n_residuals(self) -> int:
-        """Residuals of an instant."""
+        """Number m of residuals of an instant."""
         return int(self._row_var.shape[1])
 
     @property
     def n_rows(self) -> int:
-        """Number of residuals that count."""
+        """Number of residuals with a measurement."""
         return self._n_known
 
     def sample_time(self, quantity: str) -> float:
-        """Time [s] between a quantity's samples, the longest of its channels; 0 where only bins are known."""
+        """Time [s] between samples of a quantity, the longest of its channels; 0 where only bins are known."""
         names = (quantity, *(f"{quantity}.{wheel}" for wheel in self.rig.wheels))
         curves = self._curves.window.curves
         return max((curves[name].smooth.step for name in names if name in curves), default=0.0)
 
     def part(self, instants: slice | NDArray[np.intp]) -> Self:
-        """The same with only these of its instants."""
+        """The same with the given instants only."""
         part = copy(self)
         for name in _BY_INSTANT:
             setattr(part, name, getattr(self, name)[instants])
@@ -160,23 +185,28 @@ class Measurements:
 
 
 class Curves:
-    """A window's measured series as smooth curves, made when they are asked for."""
+    """Smooth curves of a window's measured series, computed on first use."""
 
     def __init__(self, window: Window, wheels: tuple[str, ...]) -> None:
         self.window = window
         self._wheels = wheels
-        self._made: dict[str, list[Series]] = {}
+        self._cache: dict[str, list[Series]] = {}
 
     def of(self, quantity: str) -> list[Series]:
-        """One curve for each wheel, or one for the vehicle."""
-        if quantity not in self._made:
+        """The curves of a quantity: one for each wheel, or one for the vehicle."""
+        if quantity not in self._cache:
             values, variances = getattr(self.window, quantity), self.window.variance[quantity]
             names = [quantity] if values.ndim == 1 else [f"{quantity}.{wheel}" for wheel in self._wheels]
             if all(name in self.window.curves for name in names):
-                return self._made.setdefault(quantity, [self.window.curves[name] for name in names])
+                return self._cache.setdefault(quantity, [self.window.curves[name] for name in names])
             columns = values.reshape(len(self.window.t), -1), variances.reshape(len(self.window.t), -1)
-            self._made[quantity] = [self._curve(v, var) for v, var in zip(*(c.T for c in columns), strict=True)]
-        return self._made[quantity]
+            self._cache[quantity] = [self._curve(v, var) for v, var in zip(*(c.T for c in columns), strict=True)]
+        return self._cache[quantity]
+
+    def number_of(self, quantity: str) -> int:
+        """Number of curves that `of` returns, without computing them."""
+        values = getattr(self.window, quantity)
+        return 1 if values.ndim == 1 else int(values.shape[1])
 
     def _curve(self, values: Array, variance: Array) -> Series:
         known = np.isfinite(values) & np.isfinite(variance)
@@ -192,38 +222,50 @@ def travelled(t: Array, ground_speed: Array, window: Array) -> tuple[Array, Arra
     return t - window[0], np.concatenate([[0.0], np.cumsum(mean * np.diff(t))]) + first
 
 
-def turned(t: Array, speed: Array) -> Array:
-    """Angles [rad] (N, W) that wheels of these speeds [rad/s] (N, W) have turned since the first of times t (N,)."""
+def wheel_rotation(t: Array, speed: Array) -> Array:
+    """Rotation [rad] (N, W) of wheels with speeds [rad/s] (N, W) since the first of times t (N,) [s]."""
     steps = (speed[1:] + speed[:-1]) / 2.0 * np.diff(t)[:, None]
     return np.concatenate([np.zeros((min(len(t), 1), speed.shape[1])), np.cumsum(steps, axis=0)])
 
 
 def differentiated_speed(t: Array, speed: Array, variance: Array, half_width: int = 3) -> tuple[Array, Array]:
-    """Acceleration [m/s^2] and its variance from ground speed by local polynomials.
+    """Acceleration and its variance as slopes of the ground speed, by local polynomials.
 
-    t [s], speed [m/s] and variance of speed, all (N,).  Straight lines where the data show
-    no more; cubics, which follow harsh driving and are noisier, where the two differ by
-    more than noise does (lines then flatten every swing, and the vehicle seems lighter
-    than it is).  The misfit adds to the variance, so that harsh driving is not mistaken for
-    a precise reading.
+    Parameters
+    ----------
+    t, speed, variance : Array
+        Times [s], ground speeds [m/s] and variances of these, (N,).
+    half_width : int
+        Samples on each side of a line.
+
+    Returns
+    -------
+    acceleration, variance : Array
+        [m/s^2] and its square, (N,).
+
+    Notes
+    -----
+    Straight lines, unless cubics differ from them by more than noise: cubics follow harsh
+    driving and are noisier, lines then flatten every swing and the vehicle seems lighter than
+    it is.  The misfit adds to the variance, so that harsh driving does not pass for precise data.
     """
     n = len(t)
     if n < 3:
         return np.zeros(n), np.full(n, 1.0 if n else np.inf)
-    lines = _slopes(t, speed, variance, half_width, 1)
+    lines = _polynomial_slopes(t, speed, variance, half_width, 1)
     if n < 2 * half_width + 3:
         return lines.value, lines.variance
-    cubics = _slopes(t, speed, variance, half_width + 1, 3)
+    cubics = _polynomial_slopes(t, speed, variance, half_width + 1, 3)
     difference = cubics.weights - np.pad(lines.weights, ((0, 0), (1, 1)))
     noise = float((difference**2 * variance[cubics.near]).sum())
     square = float(((cubics.value - lines.value) ** 2).sum())
-    bent = square > noise * (1.0 + BENT * math.sqrt(2.0 * (half_width + 1) / n))
-    chosen = cubics if bent else lines
+    use_cubics = square > noise * (1.0 + CUBIC_SELECTION_SD * math.sqrt(2.0 * (half_width + 1) / n))
+    chosen = cubics if use_cubics else lines
     return chosen.value, chosen.variance
 
 
 class _Slopes(NamedTuple):
-    """Slopes at all instants (N,) with their variances; weights (N, 2 half_width + 1) of the speeds at `near`."""
+    """Slopes (N,) with variances; weights (N, 2 half_width + 1) of the speeds with indices `near`."""
 
     value: Array
     variance: Array
@@ -231,16 +273,18 @@ class _Slopes(NamedTuple):
     near: NDArray[np.intp]
 
 
-def _slopes(t: Array, speed: Array, variance: Array, half_width: int, degree: int) -> _Slopes:
-    """Slope at each instant of a polynomial through it and its neighbours, fewer of them at the ends."""
+def _polynomial_slopes(t: Array, speed: Array, variance: Array, half_width: int, degree: int) -> _Slopes:
+    """Slope at each instant of the polynomial through it and its neighbours; fewer neighbours at the ends."""
     n = len(t)
-    places = np.arange(n)[:, None] + np.arange(-half_width, half_width + 1)
-    there, near = (places >= 0) & (places < n), np.clip(places, 0, n - 1)
-    powers = (t[near] - t[:, None])[:, :, None] ** np.arange(degree + 1) * there[:, :, None]
-    fit = np.linalg.pinv(powers)  # (N, degree + 1, 2 half_width + 1), zero where nobody is
+    indices = np.arange(n)[:, None] + np.arange(-half_width, half_width + 1)
+    exists, near = (indices >= 0) & (indices < n), np.clip(indices, 0, n - 1)
+    powers = (t[near] - t[:, None])[:, :, None] ** np.arange(degree + 1) * exists[:, :, None]
+    fit = np.linalg.pinv(powers)  # (N, degree + 1, 2 half_width + 1), zero beyond the ends
     values = speed[near]
-    misfit = np.where(there, values - (powers @ (fit @ values[:, :, None]))[:, :, 0], 0.0)
-    count = there.sum(axis=1)
-    spread = np.maximum((variance[near] * there).sum(1) / count, (misfit**2).sum(1) / np.maximum(count - degree - 1, 1))
+    misfit = np.where(exists, values - (powers @ (fit @ values[:, :, None]))[:, :, 0], 0.0)
+    count = exists.sum(axis=1)
+    spread = np.maximum(
+        (variance[near] * exists).sum(1) / count, (misfit**2).sum(1) / np.maximum(count - degree - 1, 1)
+    )
     weights = fit[:, 1]
     return _Slopes((weights * values).sum(1), spread * (weights**2).sum(1), weights, near)

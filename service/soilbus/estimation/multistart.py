@@ -1,11 +1,23 @@
-"""Gauss-Newton on a window: soil posterior from whitened residuals and priors."""
+"""Fits of a window: from several starts, from one soil, from a given start, or warm from the window before.
+
+Equations.  A fit is the minimum of the objective of `solver` (chi-square of the whitened residuals plus the
+prior) and the Gaussian there,
+
+    mode = argmin -2 log posterior,    covariance = H^-1,
+    -2 log evidence = -2 log posterior(mode) + log det H - log det H_prior          (Laplace)
+
+`fit_window` finds it where nothing is known: the soil alone descends on a few instants from the prior's
+median, loam and the likeliest soils of the table until two descents meet; from the best end soil, gains and
+latents descend together on all instants.  Where the data allow a second mode, it is looked for too, and the
+two share the probability by their evidence.  `fit_warm` starts at the optimum of the window before, `fit_from`
+at a given soil with gains and effect parameters.  All return a `Fit`.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -24,13 +36,14 @@ from soilbus.estimation.observation_model import (
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
 from soilbus.estimation.soil_classes import ranked_by_likelihood
 from soilbus.estimation.solver import (
-    CONVERGED_RESUMED,
-    FAR,
-    LEFT_OVER_RESUMED,
-    LITTLE,
+    GAINS_RELATIVE_TOLERANCE,
+    OTHER_OPTIMUM_SD,
+    WARM_NEXT_STEP_TOLERANCE,
+    WARM_STEP_TOLERANCE,
     Descent,
     Iterate,
     Objective,
+    StoppingRule,
     descend_jointly,
     descend_soil,
 )
@@ -42,71 +55,113 @@ __all__ = ["DEFAULT_OPTIONS", "DescentOptions", "Fit", "SecondMode", "Start", "f
 _K_C = PARAMETERS.index("k_c")
 
 MAX_ITERATIONS = 30
-MAX_RESUMED = 10
-COMPARED = 2e-2
-"""Foreseen fall of the cost that ends fits which are compared by cost."""
-SLOWLY = 15.0
-"""Fall of the cost that decides nothing, a few tenths, over that: near the end steps are cheap, in a valley they
-are not."""
+"""Evaluations of a cold descent.  No evidence recorded."""
+MAX_WARM_ITERATIONS = 10
+"""Evaluations of a descent from near the optimum.  No evidence recorded."""
+COMPARED_STEP_TOLERANCE = 2e-2
+"""Squared length of a step in posterior sd [1] that ends fits which are compared by their objective.
+
+No evidence recorded.
+"""
+STALL_RATIO = 15.0
+"""Stall tolerance over that [1]: 0.3 of -2 log, which decides nothing, while in a curved valley steps are costly."""
 THINNED = 24
-"""Instants of a window that the search for good starts looks at."""
+"""Instants of a window that the search for starts uses.  No evidence recorded."""
 MAX_KINDS = 2
-"""Known soils that the search starts from where the first starts did not agree."""
-MAX_APPROACH = 10
-AS_MEASURED = 2.5
-"""How many times the cost of an optimum that with the latents as measured may be, at the most."""
-MAX_SETTLED = 2
-MAX_HOPELESS = 5
-HOPELESS = 60.0
-"""Cost for each thinned instant beyond which the window cannot be one soil."""
-APART = 2.0
-"""Standard deviations between two optima from which they are told apart."""
-ALIKE, WIDER = 0.5, 1.2
-"""How far, and how many times wider, a posterior may be than its top says and count as Gaussian [sd]."""
-RARE = 0.05
-"""Share of the probability below which a rival does not count."""
-PLAUSIBLE = 3.0
-"""Cost per residual, gains held, up to which an optimum of the search may be the soil's."""
-ILL_TOLD = 0.6
-"""Std of log k_c below which a fit tells k_c, and no other optimum across it is looked for."""
-FAR_ABOVE = 1.5
-"""Ratio of costs on a few instants beyond which an end is no rival."""
-SAME_END = 0.02
-"""Relative difference in cost of two descents that are taken to have met at one optimum."""
+"""Soils of the table that the search starts from.  No evidence recorded."""
+MAX_SEARCH_EVALUATIONS = 10
+"""Evaluations of each descent of the search.  No evidence recorded."""
+AS_MEASURED_RATIO = 2.5
+"""The objective with latents as measured over that at the optimum [1], at most.  No evidence recorded."""
+MAX_JOINT_DESCENTS = 2
+"""Ends of the search from which all instants are fitted.  No evidence recorded."""
+MAX_IMPLAUSIBLE_ITERATIONS = 5
+"""Evaluations from an end whose objective exceeds IMPLAUSIBLE.  No evidence recorded."""
+IMPLAUSIBLE = 60.0
+"""Objective per thinned instant [-2 log] above which a window cannot be of one soil.  No evidence recorded."""
+DISTINCT_SD = 2.0
+"""Mahalanobis distance [sd] of two optima from which they are two modes.  No evidence recorded."""
+GAUSSIAN_SHIFT_SD, GAUSSIAN_WIDENING = 0.5, 1.2
+"""How far the mean may be from the mode's [sd], and how much wider [1], for a posterior to count as Gaussian.
+
+No evidence recorded.
+"""
+MIN_MODE_SHARE = 0.05
+"""Share of the probability [1] below which a second mode does not count.  No evidence recorded."""
+PLAUSIBLE_CHI2 = 3.0
+"""Objective per residual [1] up to which an optimum of the search may be the soil's.  No evidence recorded."""
+DETERMINED_K_C_SD = 0.6
+"""Sd of log k_c [1] below which the data determine k_c, so that no second mode is looked for across it.
+
+No evidence recorded.
+"""
+SECOND_MODE_RATIO = 1.5
+"""Ratio of objectives on a few instants [1] above which an end is no second mode.  No evidence recorded."""
+SAME_END_RATIO = 0.02
+"""Relative difference of two objectives [1] below which two descents have met.  No evidence recorded."""
+START_PRIOR_SD = 2.0
+"""How far a start may be from the prior's median [prior sd].  No evidence recorded."""
 
 
 class Start(NamedTuple):
-    """Where a fit may begin: soil (6,), sensors' gains and effects' parameters (G,).
+    """Where a fit begins.
 
-    near: a fit of the same model, be it to fewer instants, ended there.  latents: what is
-    foreseen of the latents there, of use to fits to the same instants; checked: of those of
-    instants that are held out.
+    Attributes
+    ----------
+    soil : (6,)
+        In SI.
+    gains : (G,)
+        Sensors' gains and effects' parameters.
+    near_optimum
+        Whether a fit of the same model ended there, on the same or on fewer instants.
+    latents
+        Prediction of the latents there, if of the same instants.
+    checked
+        The same for the instants that are held out.
     """
 
     soil: Array
     gains: Array
-    near: bool = False
+    near_optimum: bool = False
     latents: Latents | None = None
     checked: Latents | None = None
 
 
 class DescentOptions(NamedTuple):
-    """What a fit is worth that is compared with others by cost.
+    """Effort of a fit that is compared with others by its objective.
 
-    most: steps, half as many as long as the latents are as measured; hopeless: a cost such
-    that a fit that will stay above it is given up; enough: foreseen fall of the cost that is
-    not worth a further step; little: relative fall that is not while latents are as measured.
+    Attributes
+    ----------
+    max_iterations
+        Evaluations; half of them with latents as measured.
+    give_up_above
+        Value of the objective: a fit that is predicted to stay above it is given up.
+    step_tolerance
+        Squared length of the last step in posterior sd.
+    relative_tolerance
+        Relative decrease that ends the descent with latents as measured.
     """
 
-    most: int = MAX_ITERATIONS
+    max_iterations: int = MAX_ITERATIONS
     give_up_above: float = math.inf
-    enough: float = COMPARED
-    little: float = LITTLE
+    step_tolerance: float = COMPARED_STEP_TOLERANCE
+    relative_tolerance: float = GAINS_RELATIVE_TOLERANCE
 
     @property
-    def nothing(self) -> float:
-        """Fall of the cost that decides nothing."""
-        return SLOWLY * self.enough
+    def stall_tolerance(self) -> float:
+        """Decrease of -2 log posterior that decides nothing."""
+        return STALL_RATIO * self.step_tolerance
+
+    def stopping_rule(self, max_iterations: int) -> StoppingRule:
+        """The rule of a joint descent: the first step that is rejected ends it."""
+        return StoppingRule(
+            max_iterations,
+            step_tolerance=self.step_tolerance,
+            next_step_tolerance=self.step_tolerance,
+            max_rejected=0,
+            stall_tolerance=self.stall_tolerance,
+            give_up_above=self.give_up_above,
+        )
 
 
 DEFAULT_OPTIONS = DescentOptions()
@@ -114,7 +169,7 @@ DEFAULT_OPTIONS = DescentOptions()
 
 
 class SecondMode(NamedTuple):
-    """Another optimum than a fit's, by mode and curvature, and its share of the probability of both (Laplace)."""
+    """Another optimum, by mode and curvature, and its share of the probability of both (Laplace)."""
 
     gaussian: Gaussian
     share: float
@@ -122,20 +177,38 @@ class SecondMode(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """Outcome of one fit.
+    """Outcome of one fit.  All of it is of a constant soil until `drift_filter` moves it to the window's end.
 
-    cost is -2 log posterior up to a constant: chi-square of the residuals and of what was
-    known before; evidence is -2 log of the data's likelihood, up to the same.  chi2 is
-    cost per residual (reduced: each parameter has its prior as one more residual).
-    mode is where soil and gains (relative errors, by problem.gain_names) are most probable,
-    with the curvature there; belief holds them by their moments along k_c's share (see
-    `moments`), or as the mode does where that does not apply: short of convergence, or with a rival.
-    sinkage (W,) is the mean over the window [m], nan where unknown; optimum is for resume();
-    rival is another optimum that the data leave about as likely, where one was looked for
-    and found; averaged is the mean of the whole posterior, where that was worked out (see
-    `marginal`); bend: cost and evidence are those on a way that bends (see `bends`);
-    off_scale: sinkages and all else agree on no soil (see `scale`); form: what the model's form leaves open.
-    All are of a constant soil until `present` moves them to the window's end.
+    Attributes
+    ----------
+    gaussian
+        Soil and gains by their moments along k_c's share; as `mode` where these do not apply.
+    mode
+        Soil and gains at the minimum, with the inverse of the information as covariance.
+    sinkage : (W,)
+        Mean over the window by wheel [m], nan where unknown.
+    optimum
+        The last iterate at which the model was evaluated, with its linearisation: start of the next window.
+    neg2_log_posterior
+        Objective at the minimum: chi-square of residuals and prior, up to a constant.
+    neg2_log_evidence
+        -2 log of the data's likelihood with the parameters integrated out, up to the same constant.
+    rows
+        Residuals of the data.
+    iterations
+        Evaluations of the model.
+    converged
+        Whether the stopping rule was met.
+    second_mode
+        Another optimum that is about as likely, where one was found.
+    marginalised
+        Mean and covariance of the posterior averaged along n (`laplace`), where that was done.
+    curved_path
+        What was removed from the data for a curved path (`path_curvature`); objective and evidence include it.
+    off_scale
+        Whether sinkages and the other measurements agree on no soil (see `tracker.sinkages_off_scale`).
+    form
+        What the model's form leaves open (`model_form`).
     """
 
     gaussian: Gaussian
@@ -155,12 +228,12 @@ class Fit:
 
     @property
     def posterior(self) -> Posterior:
-        """What is known of the soil."""
+        """The marginal of the soil in `gaussian`."""
         return self.gaussian.posterior
 
     @property
     def reported(self) -> Gaussian:
-        """Soil and gains to be reported and passed on: the average where there is one, else both optima, or belief."""
+        """Soil and gains to be reported: `marginalised`, else the mixture with the second mode, else `gaussian`."""
         if self.marginalised is not None:
             return self.marginalised
         return (
@@ -171,13 +244,14 @@ class Fit:
 
     @property
     def is_gaussian(self) -> bool:
-        """Whether the whole posterior is much as its top says; else it cannot be the prior of later windows."""
+        """Whether one mode describes the posterior; only then can it be the prior of later windows."""
         if self.marginalised is None or self.second_mode is not None:
             return self.second_mode is None
-        known = np.flatnonzero(np.diag(self.gaussian.covariance) > 0.0)
-        own, whole = (b.covariance[np.ix_(known, known)] for b in (self.gaussian, self.marginalised))
-        wider = np.linalg.eigvals(np.linalg.solve(own, whole)).real
-        return bool(self.posterior.distance(self.marginalised.posterior.soil) < ALIKE and wider.max() < WIDER**2)
+        free = np.flatnonzero(np.diag(self.gaussian.covariance) > 0.0)
+        own, averaged = (b.covariance[np.ix_(free, free)] for b in (self.gaussian, self.marginalised))
+        widening = np.linalg.eigvals(np.linalg.solve(own, averaged)).real
+        shift = self.posterior.distance(self.marginalised.posterior.soil)
+        return bool(shift < GAUSSIAN_SHIFT_SD and widening.max() < GAUSSIAN_WIDENING**2)
 
     @property
     def gains(self) -> Array:
@@ -186,156 +260,62 @@ class Fit:
 
     @property
     def chi2(self) -> float:
-        """Reduced chi-square."""
+        """Objective per residual (reduced chi-square)."""
         return self.neg2_log_posterior / max(self.rows, 1)
 
 
 def fit_window(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian | None = None) -> Fit | None:
-    """Posterior of a window of which nothing is known: descents from several soils, of which the best counts.
+    """Posterior of a window of which only the prior is known, from several starts.
 
-    `joint_prior` is what earlier windows told, in place of the prior.  None if no descent ends
-    at a finite optimum.
+    Parameters
+    ----------
+    problem
+        The window.
+    prior
+        Of the soil.
+    joint_prior
+        Posterior of earlier windows, in place of the prior.
+
+    Returns
+    -------
+    Fit or None
+        None if no descent ends at a finite optimum.
     """
     joint_prior = Gaussian.of(prior, problem.gain_std) if joint_prior is None else joint_prior
-    fitting = Objective(problem, prior, joint_prior)
+    objective = Objective(problem, prior, joint_prior)
     thin = Objective(problem.thinned(THINNED), prior, joint_prior, with_gains=False)
     with np.errstate(all="ignore"):
-        ends = _ends(thin)
-        best, led = _best(fitting, ends)
-        if best is None or best.chi2 > PLAUSIBLE:
+        ends = _search(thin)
+        best, origin = _best(objective, ends)
+        if best is None or best.chi2 > PLAUSIBLE_CHI2:
             return best
         if not best.converged:
-            near = descend_soil(
-                Objective(problem, prior, joint_prior, with_gains=False), best.mode.soil, MAX_ITERATIONS, 0.0
-            )
-            best = best if near is None else _fit_at(fitting, descend_jointly(fitting, near, MAX_ITERATIONS)) or best
+            soil_only = Objective(problem, prior, joint_prior, with_gains=False)
+            start = descend_soil(soil_only, best.mode.soil, MAX_ITERATIONS, relative_tolerance=0.0)
+            best = best if start is None else _cold_fit_at(objective, start) or best
         if not best.converged:
-            return refit_denoised(fitting, best)
-        return _with_rival(fitting, thin, best, ends, led)
-
-
-def _best(fitting: Objective, ends: Sequence[Iterate]) -> tuple[Fit | None, Iterate | None]:
-    """Where the first of the optima on a few instants, the best first, leads that leads to one of all, and that one."""
-    unlike = [
-        end
-        for i, end in enumerate(ends)
-        if i == 0 or end.neg2_log_posterior > ends[i - 1].neg2_log_posterior * (1.0 + SAME_END)
-    ]
-    best, led = None, None
-    for end in unlike[:MAX_SETTLED]:
-        most = MAX_ITERATIONS if end.neg2_log_posterior < HOPELESS * THINNED else MAX_HOPELESS
-        start = replace(fitting.start(end.soil), trials=end.trials)
-        fit = _fit_at(fitting, descend_jointly(fitting, start, most))
-        if fit is not None and (
-            best is None or (fit.converged, -fit.neg2_log_posterior) > (best.converged, -best.neg2_log_posterior)
-        ):
-            best, led = fit, end
-        if best is not None and best.converged:
-            break
-    return best, led
-
-
-def _with_rival(fitting: Objective, thin: Objective, found: Fit, ends: Sequence[Iterate], led: Iterate | None) -> Fit:
-    """The more likely of an optimum and another one, with the other as its rival.
-
-    The other is one of the ends on a few instants, but what `led` here, or the one across from what was found.
-    That stays alone where there is no other, or none that is nearly as likely and that its
-    standard deviations exclude.  Optima are compared, and mixed, as each is about its mode:
-    moments along k_c's share would count the other one already.
-    """
-    end = _other_end(fitting, thin, found, ends, led) if np.ptp(fitting.problem.rig.width) > 0.0 else None
-    if end is None:
-        return found
-    other = _fit_at(fitting, descend_jointly(fitting, fitting.start(end.soil), MAX_ITERATIONS))
-    if other is None or not other.converged:
-        return found
-    better, worse = (found, other) if found.neg2_log_evidence <= other.neg2_log_evidence else (other, found)
-    share = 1.0 / (1.0 + math.exp(min(0.5 * (worse.neg2_log_evidence - better.neg2_log_evidence), 50.0)))
-    if share < RARE or better.mode.posterior.distance(worse.mode.posterior.soil) < APART:
-        return better
-    return replace(better, gaussian=better.mode, second_mode=SecondMode(worse.mode, share))
-
-
-def _other_end(
-    fitting: Objective, thin: Objective, found: Fit, ends: Sequence[Iterate], led: Iterate | None
-) -> Iterate | None:
-    """Where a descent on a few instants ended about as low as at what was found, and far from it."""
-    ill_told = math.sqrt(found.mode.covariance[_K_C, _K_C]) > ILL_TOLD
-    apart = len({end.soil.tobytes() for end in ends}) > 1
-    here = thin.point(thin.start(found.mode.soil)) if apart or ill_told else None
-    if here is None:
-        return None
-    position = thin.coordinates.position(found.mode.soil)
-
-    def off(end: Iterate) -> float:
-        return here.length(thin.coordinates.position(end.soil) - position)
-
-    def is_elsewhere(end: Iterate) -> bool:
-        return end.neg2_log_posterior < FAR_ABOVE * here.neg2_log_posterior and off(end) > FAR**2
-
-    def led_here(end: Iterate) -> bool:
-        return led is not None and np.array_equal(end.soil, led.soil)
-
-    nearest = min(map(off, ends))
-    known = next((end for end in ends if is_elsewhere(end) and off(end) > nearest and not led_here(end)), None)
-    start = fitting.coordinates.across(found.mode.soil) if ill_told and known is None else None
-    if start is None:
-        return known
-    end = descend_soil(thin, start, MAX_APPROACH)
-    return end if end is not None and is_elsewhere(end) else None
-
-
-def _ends(thin: Objective) -> list[Iterate]:
-    """Optima on a few instants of the window, the best first.
-
-    Descents from unlike soils that meet at a plausible cost are proof enough; otherwise
-    every start is tried.
-    """
-    ends: list[Iterate] = []
-    for start in starting_soils(thin.problem, thin.coordinates.prior, thin.joint_prior):
-        end = descend_soil(thin, np.asarray(start), MAX_APPROACH, known=ends)
-        if end is None:
-            continue
-        met = any(
-            abs(end.neg2_log_posterior - other.neg2_log_posterior) < SAME_END * other.neg2_log_posterior
-            for other in ends
-        )
-        ends.append(end)
-        if met and end.neg2_log_posterior < PLAUSIBLE * thin.problem.n_rows:
-            break
-    return sorted(ends, key=lambda end: end.neg2_log_posterior)
-
-
-def starting_soils(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian | None = None) -> Iterator[Soil]:
-    """What is believed (else the prior median), loam, and the known soils that foretell the window best."""
-    yield Soil(*(prior.median if joint_prior is None else joint_prior.soil).tolist())
-    likeliest, *others = ranked_by_likelihood(problem, [near(prior, SOILS[kind]) for kind in KINDS])
-    yield likeliest
-    yield near(prior, SOILS["loam"])
-    yield from others[: MAX_KINDS - 1]
-
-
-def near(prior: SoilPrior, soil: Soil) -> Soil:
-    """The soil with held parameters at their values and the others within two standard deviations of the prior."""
-    reach = np.exp(2.0 * prior.log_std)
-    return Soil(*np.clip(soil, prior.median / reach, prior.median * reach).tolist())
+            return refit_denoised(objective, best)
+        return _with_second_mode(objective, thin, best, ends, origin)
 
 
 def fit_from_soil(
     problem: ObservationModel, prior: SoilPrior, start: Soil, joint_prior: Gaussian | None = None
 ) -> Fit | None:
-    """Gauss-Newton from one start; None where the numbers stop being finite.
+    """Posterior of a window from one start.
 
-    Far from the optimum only the soil moves, with the latents at their measured values:
-    latents and gains would take up whatever a wrong soil leaves.  Near it everything is
-    relinearised together.
+    Far from the optimum only the soil moves, with the latents as measured: latents and gains would absorb
+    the residuals of a wrong soil.  Near it everything moves together.
+
+    Returns
+    -------
+    Fit or None
+        None where the numbers are not finite.
     """
     joint_prior = Gaussian.of(prior, problem.gain_std) if joint_prior is None else joint_prior
     soil = np.where(prior.log_std > 0.0, np.asarray(start, float), prior.median)
     with np.errstate(all="ignore"):
         near = descend_soil(Objective(problem, prior, joint_prior, with_gains=False), soil, MAX_ITERATIONS)
-        fitting = Objective(problem, prior, joint_prior)
-        return None if near is None else _fit_at(fitting, descend_jointly(fitting, near, MAX_ITERATIONS))
+        return None if near is None else _cold_fit_at(Objective(problem, prior, joint_prior), near)
 
 
 def fit_from(
@@ -343,126 +323,266 @@ def fit_from(
     prior: SoilPrior,
     joint_prior: Gaussian,
     start: Start,
-    first: int,
-    effort: DescentOptions = DEFAULT_OPTIONS,
+    first_gain: int,
+    options: DescentOptions = DEFAULT_OPTIONS,
 ) -> Fit | None:
-    """Descent from a start, of whose gains those from the `first` on move with the soil from the beginning.
+    """Fit from a given start, to be compared with others by its objective.
 
-    Where a fit of the same model ended is near the optimum: everything moves from there,
-    unless the numbers stop being finite.  The first step that makes things worse ends it: a slower descent is better.
+    Parameters
+    ----------
+    problem, prior, joint_prior
+        The window and its priors.
+    start
+        Near an optimum everything moves from there.  Otherwise the soil and some gains move first, with the
+        latents as measured.
+    first_gain
+        Gains from this index on move with the soil from the beginning.
+    options
+        Tolerances.  The first rejected step ends the descent: `diagnosis.damped_descent` is better from there.
+
+    Returns
+    -------
+    Fit or None
+        None where the numbers are not finite, or where the fit is given up.
     """
-    fitting, (most, give_up_above, enough, little) = Objective(problem, prior, joint_prior), effort
-    compared = partial(
-        descend_jointly,
-        fitting,
-        left_over=enough,
-        refusals=0,
-        give_up_above=give_up_above,
-        enough=enough,
-        nothing=effort.nothing,
-    )
+    objective = Objective(problem, prior, joint_prior)
     gains = problem.allowed(np.where(problem.gain_std > 0.0, start.gains, 0.0))
     with np.errstate(all="ignore"):
-        if start.near:
-            place = fitting.near(start.soil, gains, start.latents)
-            fit = _fit_at(fitting, compared(place, MAX_RESUMED))
+        if start.near_optimum:
+            iterate = objective.start_near(start.soil, gains, start.latents)
+            fit = _fit_at(objective, descend_jointly(objective, iterate, options.stopping_rule(MAX_WARM_ITERATIONS)))
             if fit is not None:
                 return fit
-        moving = Objective(problem, prior, joint_prior, first=first)
-        near = descend_soil(moving, start.soil, most // 2, little, gains, give_up_above=AS_MEASURED * give_up_above)
+        near = descend_soil(
+            Objective(problem, prior, joint_prior, first_gain=first_gain),
+            start.soil,
+            options.max_iterations // 2,
+            options.relative_tolerance,
+            gains,
+            give_up_above=AS_MEASURED_RATIO * options.give_up_above,
+        )
         if near is None:
             return None
-        return _fit_at(fitting, compared(near, most))
+        return _fit_at(objective, descend_jointly(objective, near, options.stopping_rule(options.max_iterations)))
 
 
 @dataclass(frozen=True, slots=True)
 class WarmStart:
-    """A window as the one just before lets expect it: linearised at that one's optimum."""
+    """A window linearised at the optimum of the window before."""
 
-    fitting: Objective
-    place: Iterate
-    at: Linearisation
+    objective: Objective
+    iterate: Iterate
+    linearisation: Linearisation
 
 
 def warm_start(
     problem: ObservationModel, prior: SoilPrior, last: Fit, joint_prior: Gaussian | None = None
 ) -> WarmStart:
-    """A window at the optimum of the one just before, where what both share is linearised already."""
-    fitting = Objective(problem, prior, Gaussian.of(prior, problem.gain_std) if joint_prior is None else joint_prior)
+    """A window at the optimum of the window before, whose linearisation is reused for the instants of both."""
+    objective = Objective(problem, prior, Gaussian.of(prior, problem.gain_std) if joint_prior is None else joint_prior)
     with np.errstate(all="ignore"):
-        latents, at = problem.after(last.optimum)
+        latents, linearisation = problem.after(last.optimum)
     soil = np.where(prior.log_std > 0.0, last.optimum.soil, prior.median)
-    return WarmStart(fitting, Iterate(soil, last.optimum.gains, latents, np.inf, 1), at)
+    return WarmStart(objective, Iterate(soil, last.optimum.gains, latents, np.inf, 1), linearisation)
 
 
-def fit_warm(ahead: WarmStart) -> Fit | None:
-    """Descent from the optimum of the window just before; the first step costs nothing more."""
-    fitting, near = ahead.fitting, ahead.place
+def fit_warm(start: WarmStart) -> Fit | None:
+    """Fit from a warm start, whose first step needs no evaluation; None where the numbers are not finite."""
+    objective, iterate = start.objective, start.iterate
+    rule = StoppingRule(MAX_WARM_ITERATIONS, WARM_STEP_TOLERANCE, WARM_NEXT_STEP_TOLERANCE)
     with np.errstate(all="ignore"):
-        point = fitting.with_prior(near, ahead.at)
-        step = None if point is None else point.step()
-        if point is not None and step is not None:
-            near = fitting.stepped(near, point, step)
-        first = 0.0 if point is None or step is None else point.length(step)
-        end = descend_jointly(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED, first, enough=CONVERGED_RESUMED)
-        return _fit_at(fitting, end)
+        model = objective.with_prior(iterate, start.linearisation)
+        step = None if model is None else model.step()
+        if model is not None and step is not None:
+            iterate = objective.stepped(iterate, model, step)
+        decrease = 0.0 if model is None or step is None else model.squared_length(step)
+        return _fit_at(objective, descend_jointly(objective, iterate, rule, decrease))
 
 
-def refit_denoised(fitting: Objective, fit: Fit) -> Fit:
-    """A fit that has not converged, with the optimum of the denoised problem near it; as it is where there is none.
+def refine(objective: Objective, start: Iterate) -> Fit | None:
+    """Fit from near the optimum; None where the numbers are not finite."""
+    rule = StoppingRule(MAX_WARM_ITERATIONS, next_step_tolerance=WARM_NEXT_STEP_TOLERANCE)
+    return _fit_at(objective, descend_jointly(objective, start, rule))
 
-    Where loads and slips hardly vary, the fitted latents vary by noise alone, which Gauss-Newton takes for information:
-    the steps it foresees are short, and the valley that they creep along has no end that means anything.  Without
-    that noise (see `denoised`) the window is a plain regression, which prior and data make convex.
+
+def refit_denoised(objective: Objective, fit: Fit) -> Fit:
+    """A fit that has not converged, with the optimum of the denoised observation model near it.
+
+    Where loads and slips hardly vary, the fitted latents vary by noise alone.  Gauss-Newton takes that noise for
+    information: the predicted steps are short, and the descent creeps along a valley without a meaningful end.
+    Without the noise (`DenoisedObservationModel`) the window is a regression with known regressors, and prior
+    and data make it convex.
+
+    Returns
+    -------
+    Fit
+        The fit itself where its chi2 exceeds PLAUSIBLE_CHI2 or no such optimum is found.
     """
-    if not fit.chi2 < PLAUSIBLE:
+    if not fit.chi2 < PLAUSIBLE_CHI2:
         return fit
     optimum = fit.optimum
     with np.errstate(all="ignore"):
-        calm = DenoisedObservationModel(fitting.problem, optimum)
-        again = Objective(calm, fitting.coordinates.prior, fitting.joint_prior)
-        calm_place = Iterate(optimum.soil, optimum.gains, calm.latents, np.inf, 1)
-        found = _fit_at(again, descend_jointly(again, calm_place, MAX_ITERATIONS, enough=CONVERGED_RESUMED))
+        denoised = DenoisedObservationModel(objective.problem, optimum)
+        again = Objective(denoised, objective.coordinates.prior, objective.joint_prior)
+        start = Iterate(optimum.soil, optimum.gains, denoised.latents, np.inf, 1)
+        rule = StoppingRule(MAX_ITERATIONS, step_tolerance=WARM_STEP_TOLERANCE)
+        found = _fit_at(again, descend_jointly(again, start, rule))
         if found is None or not found.converged:
             return fit
-        near = fitting.start(found.optimum.soil, optimum.latents.entry_angle, found.optimum.gains)
-        first = fitting.point(near)
-        place = near if first is None else fitting.stepped(near, first, np.zeros(len(first.gradient)))
-        point = fitting.point(place)
-    if first is None or point is None:
+        near = objective.start(found.optimum.soil, optimum.latents.entry_angle, found.optimum.gains)
+        first = objective.quadratic_model(near)
+        iterate = near if first is None else objective.stepped(near, first, np.zeros(len(first.gradient)))
+        model = objective.quadratic_model(iterate)
+    if first is None or model is None:
         return fit
     return replace(
         fit,
         gaussian=found.gaussian,
         mode=found.mode,
         sinkage=found.sinkage,
-        optimum=Optimum(fitting.problem.t, place.soil, place.gains, place.latents, point.at),
-        neg2_log_posterior=point.neg2_log_posterior,
-        neg2_log_evidence=point.neg2_log_evidence,
+        optimum=Optimum(objective.problem.t, iterate.soil, iterate.gains, iterate.latents, model.linearisation),
+        neg2_log_posterior=model.neg2_log_posterior,
+        neg2_log_evidence=model.neg2_log_evidence,
         iterations=fit.iterations + found.iterations,
         converged=True,
     )
 
 
-def refine(fitting: Objective, near: Iterate) -> Fit | None:
-    """Descent from a place near the optimum; None where the numbers stop being finite."""
-    return _fit_at(fitting, descend_jointly(fitting, near, MAX_RESUMED, LEFT_OVER_RESUMED))
+def starting_soils(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian | None = None) -> Iterator[Soil]:
+    """The joint prior's soil (else the prior median), the likeliest soil of the table, loam, further ones of the table.
+
+    See `soil_classes.ranked_by_likelihood`.
+    """
+    yield Soil(*(prior.median if joint_prior is None else joint_prior.soil).tolist())
+    likeliest, *others = ranked_by_likelihood(problem, [clip_to_prior(prior, SOILS[kind]) for kind in KINDS])
+    yield likeliest
+    yield clip_to_prior(prior, SOILS["loam"])
+    yield from others[: MAX_KINDS - 1]
 
 
-def _fit_at(fitting: Objective, end: Descent | None) -> Fit | None:
-    """The end of a descent, with what is known there; None where the numbers stopped being finite."""
-    gaussians = None if end is None else fitting.gaussians_at(end.place, end.point, end.last.soil)
+def clip_to_prior(prior: SoilPrior, soil: Soil) -> Soil:
+    """The soil with held parameters at their values and the others within START_PRIOR_SD of the prior's median."""
+    factor = np.exp(START_PRIOR_SD * prior.log_std)
+    return Soil(*np.clip(soil, prior.median / factor, prior.median * factor).tolist())
+
+
+def _search(thin: Objective) -> list[Iterate]:
+    """Ends of descents of the soil alone on a few instants, the best first.
+
+    Descents from the starts in turn; two that meet at a plausible objective end the search.
+    """
+    ends: list[Iterate] = []
+    for start in starting_soils(thin.problem, thin.coordinates.prior, thin.joint_prior):
+        end = descend_soil(thin, np.asarray(start), MAX_SEARCH_EVALUATIONS, ends=ends)
+        if end is None:
+            continue
+        met = any(
+            abs(end.neg2_log_posterior - other.neg2_log_posterior) < SAME_END_RATIO * other.neg2_log_posterior
+            for other in ends
+        )
+        ends.append(end)
+        if met and end.neg2_log_posterior < PLAUSIBLE_CHI2 * thin.problem.n_rows:
+            break
+    return sorted(ends, key=lambda end: end.neg2_log_posterior)
+
+
+def _best(objective: Objective, ends: Sequence[Iterate]) -> tuple[Fit | None, Iterate | None]:
+    """The first fit that converges from the distinct ends of the search, else the best, and the end it started from."""
+    distinct = [
+        end
+        for i, end in enumerate(ends)
+        if i == 0 or end.neg2_log_posterior > ends[i - 1].neg2_log_posterior * (1.0 + SAME_END_RATIO)
+    ]
+    best, origin = None, None
+    for end in distinct[:MAX_JOINT_DESCENTS]:
+        is_plausible = end.neg2_log_posterior < IMPLAUSIBLE * THINNED
+        start = replace(objective.start(end.soil), evaluations=end.evaluations)
+        fit = _cold_fit_at(objective, start, MAX_ITERATIONS if is_plausible else MAX_IMPLAUSIBLE_ITERATIONS)
+        if fit is not None and (
+            best is None or (fit.converged, -fit.neg2_log_posterior) > (best.converged, -best.neg2_log_posterior)
+        ):
+            best, origin = fit, end
+        if best is not None and best.converged:
+            break
+    return best, origin
+
+
+def _with_second_mode(
+    objective: Objective, thin: Objective, found: Fit, ends: Sequence[Iterate], origin: Iterate | None
+) -> Fit:
+    """The likelier of an optimum and another one, with the other as its second mode.
+
+    The candidate is an end of the search other than `origin`, from which `found` was reached, or the soil
+    with k_c's other share.  There is no second mode where its share of the probability is below MIN_MODE_SHARE
+    or the two are less than DISTINCT_SD apart.  Both then are by mode and curvature: the moments along
+    k_c's share would count the other mode twice.
+    """
+    has_two_widths = np.ptp(objective.problem.rig.width) > 0.0
+    end = _other_end(objective, thin, found, ends, origin) if has_two_widths else None
+    if end is None:
+        return found
+    other = _cold_fit_at(objective, objective.start(end.soil))
+    if other is None or not other.converged:
+        return found
+    better, worse = (found, other) if found.neg2_log_evidence <= other.neg2_log_evidence else (other, found)
+    share = 1.0 / (1.0 + math.exp(min(0.5 * (worse.neg2_log_evidence - better.neg2_log_evidence), 50.0)))
+    if share < MIN_MODE_SHARE or better.mode.posterior.distance(worse.mode.posterior.soil) < DISTINCT_SD:
+        return better
+    return replace(better, gaussian=better.mode, second_mode=SecondMode(worse.mode, share))
+
+
+def _other_end(
+    objective: Objective, thin: Objective, found: Fit, ends: Sequence[Iterate], origin: Iterate | None
+) -> Iterate | None:
+    """The end of a descent on a few instants that is about as low as `found` there, and far from it."""
+    is_k_c_open = math.sqrt(found.mode.covariance[_K_C, _K_C]) > DETERMINED_K_C_SD
+    has_several_ends = len({end.soil.tobytes() for end in ends}) > 1
+    here = thin.quadratic_model(thin.start(found.mode.soil)) if has_several_ends or is_k_c_open else None
+    if here is None:
+        return None
+    position = thin.coordinates.position(found.mode.soil)
+
+    def squared_distance(end: Iterate) -> float:
+        return here.squared_length(thin.coordinates.position(end.soil) - position)
+
+    def is_elsewhere(end: Iterate) -> bool:
+        is_low = end.neg2_log_posterior < SECOND_MODE_RATIO * here.neg2_log_posterior
+        return is_low and squared_distance(end) > OTHER_OPTIMUM_SD**2
+
+    def is_origin(end: Iterate) -> bool:
+        return origin is not None and np.array_equal(end.soil, origin.soil)
+
+    nearest = min(map(squared_distance, ends))
+    other = next(
+        (end for end in ends if is_elsewhere(end) and squared_distance(end) > nearest and not is_origin(end)), None
+    )
+    start = objective.coordinates.with_other_share(found.mode.soil) if is_k_c_open and other is None else None
+    if start is None:
+        return other
+    end = descend_soil(thin, start, MAX_SEARCH_EVALUATIONS)
+    return end if end is not None and is_elsewhere(end) else None
+
+
+def _cold_fit_at(objective: Objective, start: Iterate, max_iterations: int = MAX_ITERATIONS) -> Fit | None:
+    """The fit at the end of a cold joint descent; None where the numbers are not finite."""
+    return _fit_at(objective, descend_jointly(objective, start, StoppingRule(max_iterations)))
+
+
+def _fit_at(objective: Objective, end: Descent | None) -> Fit | None:
+    """The fit at the end of a descent; None where the numbers are not finite."""
+    gaussians = None if end is None else objective.gaussians_at(end.iterate, end.model, end.previous.soil)
     if end is None or gaussians is None:
         return None
-    fallen = end.length if end.converged else 0.0
+    last_decrease = end.predicted_decrease if end.converged else 0.0
+    previous = end.previous
     return Fit(
         gaussian=gaussians[0] if end.converged else gaussians[1],
         mode=gaussians[1],
-        sinkage=fitting.problem.mean_sinkage(end.place.as_soil(), end.place.gains, end.place.latents),
-        optimum=Optimum(fitting.problem.t, end.last.soil, end.last.gains, end.last.latents, end.point.at),
-        neg2_log_posterior=end.point.neg2_log_posterior - fallen,
-        neg2_log_evidence=end.point.neg2_log_evidence - fallen,
-        rows=fitting.problem.n_rows,
+        sinkage=objective.problem.mean_sinkage(end.iterate.as_soil(), end.iterate.gains, end.iterate.latents),
+        optimum=Optimum(objective.problem.t, previous.soil, previous.gains, previous.latents, end.model.linearisation),
+        neg2_log_posterior=end.model.neg2_log_posterior - last_decrease,
+        neg2_log_evidence=end.model.neg2_log_evidence - last_decrease,
+        rows=objective.problem.n_rows,
         iterations=end.iterations,
         converged=end.converged,
     )

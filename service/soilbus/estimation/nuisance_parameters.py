@@ -1,4 +1,10 @@
-"""Parameters of effects as unknowns of a fit: what is known of each beforehand, and effects with given values."""
+"""Effect parameters as nuisance parameters of a fit.
+
+    u = (value - prior value) / prior sd,    u ~ N(0, 1) before any data
+
+A fit works with the standardised u of each free parameter.  `active_at` turns standardised values into
+effects with values; `active_with_derivatives` does so with derivatives by each u.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +21,7 @@ from soilbus.terra.effects.effect import Active, Effect, Parameter
 
 @dataclass(frozen=True, slots=True)
 class Free:
-    """One parameter of an effect, of one wheel (its number) or of all (None): value and std of the prior."""
+    """A free parameter of an effect, of one wheel (its number) or of all (None), with value and sd of its prior."""
 
     effect: str
     parameter: Parameter
@@ -28,43 +34,61 @@ class Free:
         """effect.parameter, with the wheel's number where it has one."""
         return f"{self.effect}.{self.parameter.name}" + ("" if self.wheel is None else f".{self.wheel}")
 
-    def within(self, pull: float) -> bool:
-        """Whether so many prior std from the prior value is inside the parameter's range."""
-        return self.parameter.low <= self.value + self.std * pull <= self.parameter.high
+    def within(self, u: float) -> bool:
+        """Whether the value at a standardised u is inside the parameter's range."""
+        return self.parameter.low <= self.value + self.std * u <= self.parameter.high
 
-    def allowed(self, pull: float) -> float:
-        """So many prior std, kept inside the parameter's range."""
-        return pull if self.within(pull) or self.std == 0.0 else self.pull_at(self.at(pull))
+    def allowed(self, u: float) -> float:
+        """A standardised u clipped to the parameter's range."""
+        return u if self.within(u) or self.std == 0.0 else self.standardised(self.at(u))
 
-    def pull_at(self, value: float) -> float:
-        """How many prior std a value is from the prior value, for a parameter that has a std; the inverse of at()."""
+    def standardised(self, value: float) -> float:
+        """The standardised u of a value; the inverse of `at`, for a parameter with prior sd > 0."""
         return (value - self.value) / self.std
 
-    def at(self, pull: float) -> float:
-        """The parameter's value so many prior std from its prior value, kept inside its range."""
-        return min(max(self.value + self.std * pull, self.parameter.low), self.parameter.high)
+    def at(self, u: float) -> float:
+        """The value at a standardised u, clipped to the parameter's range."""
+        return min(max(self.value + self.std * u, self.parameter.low), self.parameter.high)
 
 
 def parameters_of(effect: Effect, n_wheels: int) -> list[Free]:
-    """The parameters of an effect as before any data: absent, with the catalogue's prior."""
+    """The parameters of an effect at their neutral values, with the catalogue's prior sd."""
     wheels: Sequence[int | None] = range(n_wheels) if effect.each_wheel else (None,)
     return [Free(effect.name, p, w, p.neutral, p.std) for p in effect.parameters for w in wheels]
 
 
-def active_at(effects: Sequence[Effect], free: Sequence[Free], pulls: Array, n_wheels: int) -> list[Active]:
-    """The effects with their values where the parameters are so many std (P,) from their prior values.
+def active_at(effects: Sequence[Effect], free: Sequence[Free], standardised: Array, n_wheels: int) -> list[Active]:
+    """The effects with their values at standardised parameters (P,).
 
-    Those of which every parameter is zero and absent there are left out: they would do nothing, at a cost.
+    Effects without any influence at these values are left out, to save time.
+
+    Parameters
+    ----------
+    effects : Sequence of Effect
+        In the order of the catalogue.
+    free : Sequence of Free
+        Their P parameters.
+    standardised : Array
+        (P,), (value - prior value) / prior sd.
+    n_wheels : int
+        W.
+
+    Returns
+    -------
+    list of Active
+        Values are floats, or (W,) where each wheel has its own.
     """
-    values = _values(effects, free, [f.at(u) for f, u in zip(free, pulls.tolist(), strict=True)], n_wheels)
+    values = _values(effects, free, [f.at(u) for f, u in zip(free, standardised.tolist(), strict=True)], n_wheels)
     return [Active(e, values[e.name]) for e in effects if not _absent(e, values[e.name])]
 
 
-def varied_at(effects: Sequence[Effect], free: Sequence[Free], pulls: Array, n_wheels: int) -> list[Active]:
-    """The same with values that carry their derivatives by the pulls, each by its place, where these may vary."""
+def active_with_derivatives(
+    effects: Sequence[Effect], free: Sequence[Free], standardised: Array, n_wheels: int
+) -> list[Active]:
+    """As `active_at`; values of parameters with prior sd > 0 are Duals, with the derivative by u number i at key i."""
     numbers = [
         Dual(f.at(u), {i: f.std}) if f.std > 0.0 else f.at(u)
-        for i, (f, u) in enumerate(zip(free, pulls.tolist(), strict=True))
+        for i, (f, u) in enumerate(zip(free, standardised.tolist(), strict=True))
     ]
     values, varied = _values(effects, free, numbers, n_wheels), {f.effect for f in free if f.std > 0.0}
     return [Active(e, values[e.name]) for e in effects if e.name in varied or not _absent(e, values[e.name])]
@@ -73,19 +97,19 @@ def varied_at(effects: Sequence[Effect], free: Sequence[Free], pulls: Array, n_w
 def _values(
     effects: Sequence[Effect], free: Sequence[Free], numbers: Sequence[Any], n_wheels: int
 ) -> dict[str, dict[str, Any]]:
-    """Parameters by effect and name; of those that every wheel has for itself one for each wheel (W,)."""
+    """Values by effect and parameter; (W,) where each wheel has its own."""
     values: dict[str, dict[str, Any]] = {e.name: {} for e in effects}
     for f, number in zip(free, numbers, strict=True):
         of_effect, name = values[f.effect], f.parameter.name
         if f.wheel is None:
             of_effect[name] = number
         else:
-            alone = np.zeros(n_wheels)
-            alone[f.wheel] = 1.0
-            of_effect[name] = of_effect.get(name, 0.0) + alone * number
+            own_wheel = np.zeros(n_wheels)
+            own_wheel[f.wheel] = 1.0
+            of_effect[name] = of_effect.get(name, 0.0) + own_wheel * number
     return values
 
 
 def _absent(effect: Effect, values: dict[str, Any]) -> bool:
-    """Whether nothing is left of it, not even the place at which it would be: the depth of a pan without stiffness."""
+    """Whether every neutral value is zero and every value is too, so that the effect has no influence."""
     return all(neutral == 0.0 and not np.any(values[name]) for name, neutral in effect.neutral.items())

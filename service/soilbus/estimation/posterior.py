@@ -1,7 +1,13 @@
-"""Prior and posterior of the soil parameters, on the scale where they are near Gaussian.
+"""Prior and posterior of the soil's parameters, and quantities that follow from them.
 
-Free parameters are positive and spread over decades, so both are Gaussian in the
-logarithm of the parameter; a held parameter has no variance.
+Equations.
+
+    prior, posterior    log parameter ~ N(log value, covariance)          (log-normal; a held one has variance 0)
+    derived quantity    var q = (dq/dlog parameter)' covariance (dq/dlog parameter)
+    e.g.                bearing pressure = (k_c / b_ref + k_phi) z_ref^n
+
+Free parameters are positive and spread over decades, so both distributions are Gaussian in the parameters'
+logarithms.  `SoilPrior` and `Posterior` hold them; `Estimate` and `Derived` are what is reported.
 """
 
 from __future__ import annotations
@@ -38,14 +44,29 @@ NORMAL_95 = 1.959964
 
 @dataclass(frozen=True, slots=True)
 class SoilPrior:
-    """Median (6,) in SI and sd of the logarithm (6,); sd 0 holds the parameter."""
+    """Log-normal prior of the parameters: median (6,) in SI and sd of the logarithm (6,); sd 0 holds the parameter."""
 
     median: Array
     log_std: Array
 
     @classmethod
     def from_value_std(cls, values: Mapping[str, tuple[float, float]]) -> SoilPrior:
-        """From (value, std) of each parameter: log-normal with that median and std/value as its variation."""
+        """From value and std of each parameter.
+
+        Parameters
+        ----------
+        values
+            (value, std) by parameter, in SI: median, and median times the coefficient of variation.
+
+        Examples
+        --------
+        >>> values = dict.fromkeys(PARAMETERS, (2.0, 1.0)) | {"K": (0.025, 0.0)}
+        >>> prior = SoilPrior.from_value_std(values)
+        >>> prior.free
+        array([0, 1, 2, 3, 4])
+        >>> prior.log_std.round(3)
+        array([0.472, 0.472, 0.472, 0.472, 0.472, 0.   ])
+        """
         value, std = np.array([values[name] for name in PARAMETERS], float).T
         ratio = np.divide(std, value, out=np.zeros(len(value)), where=std > 0.0)
         return cls(value, np.sqrt(np.log1p(ratio**2)))
@@ -89,22 +110,33 @@ class Derived:
 
 @dataclass(frozen=True, slots=True)
 class Posterior:
-    """Typical soil (see Belief) and covariance (6, 6) of the parameters' logarithms (held ones: 0)."""
+    """Log-normal posterior of the parameters.
+
+    Attributes
+    ----------
+    soil
+        In SI: the mean in the window's coordinates (see `gaussian.Gaussian`).
+    log_covariance : (6, 6)
+        Covariance of the parameters' logarithms; rows of held ones are zero.
+    """
 
     soil: Soil
     log_covariance: Array
 
     def parameters(self) -> dict[str, Estimate]:
-        """Each soil parameter with the root mean square by which one of this log-normal distribution is off its median.
+        """Each parameter with its median and the root mean square deviation from it.
 
-        So value +- 1.96 std holds 94 to 97 % of it, however wide it is: many k_c are far above their median.
+        Notes
+        -----
+        E (x / median - 1)^2 = exp(2 v) - 2 exp(v / 2) + 1 for log variance v.  So value +- 1.96 std contains 94
+        to 97 % of the log-normal distribution at every width: it has a long upper tail.
         """
         variance = np.diag(self.log_covariance)
-        apart = np.sqrt(np.expm1(2.0 * variance) - 2.0 * np.expm1(0.5 * variance))
-        return {n: Estimate(v, v * a) for n, v, a in zip(PARAMETERS, self.soil, apart.tolist(), strict=True)}
+        relative = np.sqrt(np.expm1(2.0 * variance) - 2.0 * np.expm1(0.5 * variance))
+        return {n: Estimate(v, v * r) for n, v, r in zip(PARAMETERS, self.soil, relative.tolist(), strict=True)}
 
     def propagate(self, gradient: Array) -> float:
-        """Std of a scalar with this gradient (6,) by the parameters in SI."""
+        """Sd of a scalar with this gradient (6,) by the parameters in SI (first order)."""
         g = gradient * np.asarray(self.soil)
         return _root(float(g @ self.log_covariance @ g))
 
@@ -117,11 +149,19 @@ class Posterior:
         return self._estimate(tan_phi(self.soil))
 
     def widened(self, factor: float, prior: SoilPrior) -> Posterior:
-        """The same where the data's noise variance is `factor` (>= 1) times what was assumed.
+        """The posterior if the data's noise variance is `factor` times what was assumed.
 
-        The information that the data gave beyond the prior, not the prior's own, is divided by the
-        factor: in units of the prior's standard deviations each principal variance s becomes
-        1 / (1 + (1/s - 1) / factor).  So nothing is ever known less than beforehand.
+        Parameters
+        ----------
+        factor
+            1 or more; else nothing changes.
+        prior
+            The prior that the posterior holds.
+
+        Notes
+        -----
+        The information of the data is divided by the factor, that of the prior is not: in units of the prior's
+        sd each principal variance s becomes 1 / (1 + (1 / s - 1) / factor).  So no variance exceeds the prior's.
         """
         free = prior.free
         if factor <= 1.0 or not len(free):
@@ -134,12 +174,19 @@ class Posterior:
         covariance[np.ix_(free, free)] = (axes * wide) @ axes.T * np.outer(unit, unit)
         return Posterior(self.soil, covariance)
 
-    def beside(self, more: Array, prior: SoilPrior, shift: Array | None = None) -> Posterior:
-        """The same with `more` left open besides, a covariance (6, 6) of the logarithms, as by considered parameters.
+    def with_added_covariance(self, more: Array, prior: SoilPrior, shift: Array | None = None) -> Posterior:
+        """The posterior with a covariance of the logarithms added, as by considered parameters.
 
-        C + more, of which no principal variance in units of the prior's exceeds 1, or what it was before.  With a
-        shift (6,) of the logarithms, from this soil to the mean, it is the second moment about this soil: its square
-        comes on top, and is not bounded by the prior's variance, which is about another soil.
+        Parameters
+        ----------
+        more : (6, 6)
+            Added.  Principal variances of the sum, in units of the prior's, are clipped to 1, or to the greatest
+            that the posterior has itself.
+        prior
+            Of the soil.
+        shift : (6,), optional
+            Of the logarithms, from this soil to the mean.  Then the result is the second moment about this soil: the
+            square of the shift is added, and not clipped, because the prior's variance is about another soil.
         """
         free = prior.free
         if not len(free):
@@ -155,15 +202,25 @@ class Posterior:
         return Posterior(self.soil, covariance)
 
     def distance(self, soil: Soil) -> float:
-        """How many standard deviations a soil is away, all free parameters together (Mahalanobis)."""
+        """Mahalanobis distance of a soil, in sd, by all free parameters together."""
         free = np.flatnonzero(np.diag(self.log_covariance) > 0.0)
         off = np.log(np.asarray(soil)[free] / np.asarray(self.soil)[free])
         return _root(float(off @ np.linalg.solve(self.log_covariance[np.ix_(free, free)], off)))
 
     def derived(self, z_ref: float, b_ref: float, widths: Iterable[float] = ()) -> Derived:
-        """What a window tells best, jointly: bearing_pressure (z_ref, b_ref [m]), tan_phi and K_L of tyres.
+        """The combinations that a window determines best, jointly.
 
-        K_L of a tyre of width b [m] is called K_L(b), as in K_L(0.26).
+        Parameters
+        ----------
+        z_ref, b_ref
+            Depth and plate width [m] of the bearing pressure.
+        widths
+            Tyre widths [m].
+
+        Returns
+        -------
+        Derived
+            bearing_pressure [Pa], tan_phi [1], and for each width b K_L(b) [N/m^(n+2)], as in K_L(0.26).
         """
         scalars = {"bearing_pressure": bearing_pressure(self.soil, z_ref, b_ref), "tan_phi": tan_phi(self.soil)}
         scalars |= {f"K_L({width:g})": tyre_modulus(self.soil, width) for width in widths}

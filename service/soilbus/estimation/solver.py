@@ -1,6 +1,21 @@
-"""One Gauss-Newton step on a window: normal equations of the residuals and of what was known before.
+"""A window's objective, its quadratic model, and the two descents to its minimum (damped Gauss-Newton).
 
-Descents of one fit: far from the optimum by the soil alone, near it by soil, gains and latents together.
+Equations.  With theta the free soil coordinates and the active gains, r the residuals and W their inverse
+covariance, p the residuals of the prior and P its precision,
+
+    objective     -2 log posterior (theta) = r' W r + p' P p + constant
+    Jacobian      J = dr/dtheta,   J_p = dp/dtheta
+    model         gradient g = J' W r + J_p' P p,   information H = J' W J + J_p' P J_p
+    step          (H + C + damping diag(H + C)) d = -g,   subject to the active bounds
+    prediction    predicted decrease of -2 log posterior along the full step = d' H d
+
+C is the positive part of the curvature that the coordinates add (parametrization.Coordinates.curvature).
+
+`Objective` evaluates residuals, Jacobian and prior at an `Iterate` and returns the `QuadraticModel` there.
+`descend_soil` runs far from the optimum: the latents stay as measured, and Levenberg-Marquardt damping rejects
+every step that does not lower the objective.  `descend_jointly` runs near the optimum: soil, gains and latents
+move together, and a step may raise the objective a little, because the latents follow one linearisation late.
+`StoppingRule` holds every condition that ends `descend_jointly`.
 """
 
 from __future__ import annotations
@@ -14,38 +29,89 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian, PriorFactor, PriorQuadratic, solve_with_inverse
-from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModel, Optimum
+from soilbus.estimation.observation_model import FIRST_GAIN, SOIL, Latents, Linearisation, ObservationModel, Optimum
 from soilbus.estimation.parametrization import (
-    MAX_STEP,
+    MAX_LOG_STEP,
     TYPICAL_DEPTH,
     Coordinates,
     Moments,
-    at_edges,
+    at_bounds,
     moments_along_share,
-    step_share_within,
+    step_fraction_within,
 )
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.terra.wheel import Soil
 
-LONG_TURN = 0.2
-"""Relative change of an entry angle from which the angles are solved again, not extrapolated."""
-LONG_TURN_WITH_EFFECTS = 0.1
-"""The same where effects have a part in the load: they may bend where the soil alone does not."""
-WELL_TOLD = 0.5
-"""Sd of the logarithm of K_L at a typical depth from which on k_c and k_phi are each as known before."""
+MAX_ANGLE_CHANGE = 0.2
+"""Relative change of an entry angle [1] above which the angles are solved again instead of extrapolated.
+
+No evidence recorded.
+"""
+MAX_ANGLE_CHANGE_WITH_EFFECTS = 0.1
+"""The same [1] where effects have a part in the load: they may be curved where the soil alone is not."""
+MAX_MODULUS_SD = 0.5
+"""Sd of log K_L at the typical depth [1] above which k_c and k_phi are each known by the prior alone.
+
+The moments along k_c's share are not worked out there.  No evidence recorded.
+"""
+STEP_TOLERANCE, WARM_STEP_TOLERANCE = 1e-6, 3e-3
+"""Squared length of a step in posterior sd [1] below which a descent has converged: a cold one, and a warm-started
+one, which starts so close that the error after such a step is much smaller than the step."""
+NEXT_STEP_TOLERANCE, WARM_NEXT_STEP_TOLERANCE = 2e-8, 1e-4
+"""The same [1] for the squared length of the next step, predicted from the ratio of the last two.
+
+No evidence recorded.
+"""
+STALLED_DECREASE = 1.0
+"""Predicted decrease [-2 log] below which a stalled descent ends.  No evidence recorded."""
+MAX_STALLED = 2
+"""Steps in a row without a decrease after which a descent has stalled.  No evidence recorded."""
+MAX_REJECTED = 5
+"""Rejected steps in a row after which a descent fails: what is left is the noise of the linear model."""
+ALLOWED_INCREASE = 20.0
+"""Rise [-2 log] that a joint step may bring: where the objective is curved, steps that overshoot return by
+themselves."""
+ALLOWED_FIRST_INCREASE = 0.02
+"""Share of the objective [1] allowed besides at the first joint step: with latents as measured it looks too low."""
+SHORTENING = 0.4
+"""Factor [1] on the fraction of the full step after a rejected step.  No evidence recorded."""
+SLOW_RATIO = 0.5
+"""Length of a step over that of the last, along it [1], above which steps are extrapolated.  No evidence recorded."""
+MAX_EXTRAPOLATION = 8.0
+"""Largest multiple of a full step [1] by extrapolation.  No evidence recorded."""
+SOIL_STEP_TOLERANCE = 1.0
+"""Squared length of a step in posterior sd [1] below which the soil alone is near enough for the joint descent."""
+SOIL_RELATIVE_TOLERANCE = 0.02
+"""Relative decrease of the objective [1] by a step of the soil alone below which the joint descent takes over.
+
+No evidence recorded.
+"""
+GAINS_RELATIVE_TOLERANCE = 1e-3
+"""The same [1] where gains move with the soil.  No evidence recorded."""
+FIRST_DAMPING, MAX_DAMPING = 1e-3, 1e6
+"""Damping of the first step of the soil alone, as a share of the diagonal [1], and the one at which it ends."""
+OTHER_OPTIMUM_SD = 10.0
+"""Posterior sd on a few instants [1] beyond which the end of a descent is another optimum.  No evidence recorded."""
+
 _SOIL = len(PARAMETERS)
 _K_C, _K_PHI, _N = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n"))
+_SHARE, _LOG_SHARE, _LOG_REST, _OTHERS = 0, 1, 2, 3
+"""Columns of changes for the moments along k_c's share s: of s, log s and log (1 - s); the others follow."""
 
 
 @dataclass(frozen=True, slots=True)
 class Iterate:
-    """A soil (6,) in SI with gains (G,) and latents, what it costs, and how many evaluations led there."""
+    """A point of a descent: soil (6,) in SI, gains (G,) and latents, with the objective's value there.
+
+    neg2_log_posterior is the value at the iterate before where this one has not been evaluated, and
+    evaluations is how many evaluations of the model led here.
+    """
 
     soil: Array
     gains: Array
     latents: Latents
     neg2_log_posterior: float
-    trials: int
+    evaluations: int
 
     def as_soil(self) -> Soil:
         """The soil by name."""
@@ -54,12 +120,24 @@ class Iterate:
 
 @dataclass(frozen=True, slots=True)
 class QuadraticModel:
-    """Normal equations by the free coordinates (F) and active gains (A) at one place.
+    """The objective's quadratic model at an iterate, by F free coordinates and A active gains.
 
-    information (F + A, F + A) is Gauss-Newton's, of which `prior_information` is what was known
-    before; bend, which comes on top for a step, is the curvature of the coordinates.
-    cost is -2 log posterior up to a constant.  edges (E, F + A) are the directions in which
-    no step can go.
+    Attributes
+    ----------
+    information : (F + A, F + A)
+        Gauss-Newton Hessian, half that of -2 log posterior: data and prior.
+    prior_information : (F + A, F + A)
+        The prior's part of it.
+    curvature : (F + A, F + A)
+        What the coordinates' own curvature adds for a step.
+    gradient : (F + A,)
+        Half the gradient of -2 log posterior.
+    neg2_log_posterior : float
+        Value of the objective, up to a constant.
+    active_bounds : (E, F + A)
+        Outward directions of the bounds that the iterate is at: no step goes there.
+    linearisation
+        Residuals and Jacobian of the data.
     """
 
     information: Array
@@ -67,48 +145,66 @@ class QuadraticModel:
     curvature: Array
     gradient: Array
     neg2_log_posterior: float
-    edges: Array
-    at: Linearisation
+    active_bounds: Array
+    linearisation: Linearisation
 
     def step(self, damping: float = 0.0, gradient: Array | None = None) -> Array | None:
-        """Step (F + A,) to the minimum, held back in proportion to the diagonal; None where there is none.
+        """The step to the model's minimum within the active bounds.
 
-        A step that would go beyond an edge goes along it, to where the cost then is least.
-        With another gradient it is that of the parabola with that slope here.
+        Parameters
+        ----------
+        damping
+            Share of the diagonal added to it (Levenberg-Marquardt).
+        gradient : (F + A,), optional
+            In place of the model's own.
+
+        Returns
+        -------
+        step : (F + A,) or None
+            A step that would cross an active bound goes along it, to the least value there.  None where the
+            model has no minimum.
         """
         gradient = self.gradient if gradient is None else gradient
         curved = self.information + self.curvature
         curved.flat[:: len(curved) + 1] *= 1.0 + damping
-        solution = _solution(curved, np.concatenate([gradient[None], self.edges]).T)
+        solution = _solution(curved, np.concatenate([gradient[None], self.active_bounds]).T)
         if solution is None:
             return None
         step = -solution[:, 0]
-        if not len(self.edges):
+        if not len(self.active_bounds):
             return step if np.isfinite(step).all() else None
-        held = np.zeros(len(self.edges), bool)
-        while (beyond := ~held & (self.edges @ step > 0.0)).any():
-            held |= beyond
-            along, edges = solution[:, 1:][:, held], self.edges[held]
-            step = along @ np.linalg.lstsq(edges @ along, edges @ solution[:, 0], rcond=None)[0] - solution[:, 0]
+        held = np.zeros(len(self.active_bounds), bool)
+        while (outward := ~held & (self.active_bounds @ step > 0.0)).any():
+            held |= outward
+            along, bounds = solution[:, 1:][:, held], self.active_bounds[held]
+            step = along @ np.linalg.lstsq(bounds @ along, bounds @ solution[:, 0], rcond=None)[0] - solution[:, 0]
         return step if np.isfinite(step).all() else None
 
     @property
     def neg2_log_evidence(self) -> float:
-        """-2 log of the data's likelihood whatever the soil may be (Laplace), up to the same constant."""
+        """-2 log of the data's likelihood with the parameters integrated out (Laplace), up to the same constant."""
         return self.neg2_log_posterior + float(
             np.linalg.slogdet(self.information)[1] - np.linalg.slogdet(self.prior_information)[1]
         )
 
-    def length(self, step: Array) -> float:
-        """Squared length of a step in standard deviations."""
+    def squared_length(self, step: Array) -> float:
+        """Squared length of a step (F + A,) in posterior sd; of a full step it is the predicted decrease."""
         return float(step @ self.information @ step)
 
 
 class GaussianApproximation(NamedTuple):
-    """A window that is linear about an optimum: what its data and what was known before tell there.
+    """A window's linear model at its optimum, with the prior.
 
-    directions (1 + 6 + G, F + A): as Fitting.directions; known: what was known before; step (F + A,), to be taken
-    off, and covariance (F + A, F + A): to the minimum of the parabola, and there.
+    Attributes
+    ----------
+    directions : (1 + 6 + G, F + A)
+        As `Objective.directions`.
+    prior
+        The prior's quadratic there.
+    step : (F + A,)
+        H^-1 g, to be subtracted: leads to the minimum.
+    covariance : (F + A, F + A)
+        H^-1.
     """
 
     directions: Array
@@ -122,7 +218,26 @@ class GaussianApproximation(NamedTuple):
 
 
 class Objective:
-    """A window's residuals and those of its prior (`prior_factor`): free coordinates (F), active gains (A)."""
+    """-2 log posterior of a window: its residuals and those of its prior, with derivatives.
+
+    Parameters
+    ----------
+    problem
+        The window's observation model: N instants, W wheels, G gains.
+    prior
+        Prior of the soil, which sets the free coordinates (F).
+    joint_prior
+        Prior of soil and gains for this window.
+    with_gains
+        Whether gains move at all.
+    first_gain
+        Gains before this index are held; those that are not held and have a variance are active (A).
+
+    Raises
+    ------
+    ValueError
+        Where `joint_prior` has no proper covariance.
+    """
 
     def __init__(
         self,
@@ -130,245 +245,546 @@ class Objective:
         prior: SoilPrior,
         joint_prior: Gaussian,
         with_gains: bool = True,
-        first: int = 0,
+        first_gain: int = 0,
     ) -> None:
-        """Raises ValueError where `joint_prior` has no proper covariance; gains before the `first` one are held."""
         self.problem, self.joint_prior = problem, joint_prior
         self.coordinates = Coordinates(prior, float(problem.rig.width.mean()))
-        known = np.diag(joint_prior.covariance)[_SOIL:] > 0.0 if with_gains else np.zeros(len(joint_prior.gains), bool)
-        known[:first] = False
-        self.active = np.flatnonzero(known)
+        is_active = (
+            np.diag(joint_prior.covariance)[_SOIL:] > 0.0 if with_gains else np.zeros(len(joint_prior.gains), bool)
+        )
+        is_active[:first_gain] = False
+        self.active = np.flatnonzero(is_active)
         self._gain_bounds = tuple(bound[self.active] for bound in problem.gain_bounds())
-        self._has_bounds = bool(np.isfinite(self._gain_bounds).any())
+        self._has_gain_bounds = bool(np.isfinite(self._gain_bounds).any())
         self.free = self.coordinates.free
         self._identity = np.eye(len(self.free) + len(self.active))
-        self._of_gains = np.zeros((7 + len(joint_prior.gains), len(self._identity)))
-        self._of_gains[7 + self.active] = self._identity[len(self.free) :]
-        self._by_sensors = with_gains and first == 0
+        self._gain_directions = np.zeros((FIRST_GAIN + len(joint_prior.gains), len(self._identity)))
+        self._gain_directions[FIRST_GAIN + self.active] = self._identity[len(self.free) :]
+        self._by_sensors = with_gains and first_gain == 0
         self.prior_factor = PriorFactor(joint_prior, prior, self.active)
-        self._last: tuple[Array, Array, PriorQuadratic] | None = None
+        self._prior_cache: tuple[Array, Array, PriorQuadratic] | None = None
         self._approximation: tuple[Optimum, GaussianApproximation | None] | None = None
 
-    def given(self, joint_prior: Gaussian) -> Objective:
-        """The same with something else known before."""
+    def with_joint_prior(self, joint_prior: Gaussian) -> Objective:
+        """The same window under another joint prior."""
         return Objective(self.problem, self.coordinates.prior, joint_prior)
 
+    # Iterates
+
     def start(self, soil: Array, guess: Array | None = None, gains: Array | None = None) -> Iterate:
-        """A soil with gains as believed, or these (G,), and latents as measured; angles solved from a guess (N, W)."""
+        """An iterate with the latents as measured.
+
+        Parameters
+        ----------
+        soil : (6,)
+            In SI.
+        guess : (N, W), optional
+            Entry angles [rad] to solve them from.
+        gains : (G,), optional
+            Those of the joint prior if not given.
+        """
         gains = self.joint_prior.gains if gains is None else gains
         return Iterate(soil, gains, self.problem.start(Soil(*soil.tolist()), guess, gains), np.inf, 0)
 
-    def near(self, soil: Array, gains: Array, latents: Latents | None) -> Iterate:
-        """A soil with gains (G,) and the latents foreseen there where they are of these instants, else as measured."""
+    def start_near(self, soil: Array, gains: Array, latents: Latents | None) -> Iterate:
+        """Soil (6,) and gains (G,) with these latents where they are of this window's instants, else as measured."""
         if latents is None or latents.load.shape != (self.problem.n, self.problem.n_wheels):
             return self.start(soil, gains=gains)
         return Iterate(soil, gains, latents, np.inf, 0)
 
-    def stepped_with_measured_latents(self, place: Iterate, point: QuadraticModel, step: Array) -> Iterate:
-        """The place after a step (F + A,) with latents as measured, as they are at this place already."""
-        free, gains = len(self.free), place.gains.copy()
-        step = self.step_share(place, step) * step
-        gains[self.active] += step[free:]
-        soil, gains = self.coordinates.moved(place.soil, step[:free]), self.problem.allowed(gains)
-        angle = self.problem.stepped_entry_angle(
-            point.at, place.latents.entry_angle, soil - place.soil, gains - place.gains
-        )
-        return self._reached(place, point, soil, gains, replace(place.latents, entry_angle=angle))
-
-    def point(self, place: Iterate) -> QuadraticModel | None:
-        """The normal equations at a place; None where the model is not finite."""
-        at = self.problem.linearise(place.as_soil(), place.gains, place.latents, self._by_sensors)
-        return self.with_prior(place, at)
-
-    def with_prior(self, place: Iterate, at: Linearisation) -> QuadraticModel | None:
-        """Those of residuals linearised already."""
+    def stepped(self, iterate: Iterate, model: QuadraticModel, step: Array) -> Iterate:
+        """The iterate after a step (F + A,), shortened at bounds, with latents as the linear model predicts them."""
         free = len(self.free)
-        directions = self.directions(place)
+        step = self.step_fraction(iterate, step) * step
+        soil = self.coordinates.stepped(iterate.soil, step[:free])
+        gain_step = np.zeros(len(iterate.gains))
+        gain_step[self.active] = step[free:]
+        latents = self.problem.updated(model.linearisation, iterate.latents, soil - iterate.soil, gain_step)
+        return self._with_latents(iterate, model, soil, iterate.gains + gain_step, latents)
+
+    def stepped_with_measured_latents(self, iterate: Iterate, model: QuadraticModel, step: Array) -> Iterate:
+        """The iterate after a step (F + A,) with latents as measured, as they already are at this iterate."""
+        free, gains = len(self.free), iterate.gains.copy()
+        step = self.step_fraction(iterate, step) * step
+        gains[self.active] += step[free:]
+        soil, gains = self.coordinates.stepped(iterate.soil, step[:free]), self.problem.allowed(gains)
+        angle = self.problem.stepped_entry_angle(
+            model.linearisation, iterate.latents.entry_angle, soil - iterate.soil, gains - iterate.gains
+        )
+        return self._with_latents(iterate, model, soil, gains, replace(iterate.latents, entry_angle=angle))
+
+    def _with_latents(
+        self, iterate: Iterate, model: QuadraticModel, soil: Array, gains: Array, latents: Latents
+    ) -> Iterate:
+        """Soil (6,), gains (G,) and predicted latents as an iterate; entry angles that change far are solved."""
+        change = np.abs(latents.entry_angle / iterate.latents.entry_angle - 1.0).max(initial=0.0)
+        has_effects = len(model.linearisation.load_by_effects)
+        if change > (MAX_ANGLE_CHANGE_WITH_EFFECTS if has_effects else MAX_ANGLE_CHANGE):
+            latents = self.problem.with_entry_angles(latents, Soil(*soil.tolist()), gains)
+        return Iterate(soil, gains, latents, model.neg2_log_posterior, iterate.evaluations)
+
+    def with_entry_angles(self, iterate: Iterate) -> Iterate:
+        """The same iterate with its entry angles solved, after linear predictions in a row."""
+        latents = self.problem.with_entry_angles(iterate.latents, iterate.as_soil(), iterate.gains)
+        return replace(iterate, latents=latents)
+
+    def step_fraction(self, iterate: Iterate, step: Array) -> float:
+        """Largest fraction of a step (F + A,), 1 at most, within the bounds and step limits."""
+        free = len(self.free)
+        of_soil = self.coordinates.step_fraction(iterate.soil, step[:free])
+        if not self._has_gain_bounds:
+            return of_soil
+        low, high = self._gain_bounds
+        room = np.where(step[free:] > 0.0, high, low) - iterate.gains[self.active]
+        return min(of_soil, step_fraction_within(room, step[free:]))
+
+    def _active_bounds(self, iterate: Iterate) -> Array:
+        """Outward directions (E, F + A) of the bounds that an iterate is at."""
+        of_soil = self.coordinates.active_bounds(iterate.soil)
+        if not (self._has_gain_bounds or len(of_soil)):
+            return self._identity[:0]
+        sides = at_bounds(iterate.gains[self.active], *self._gain_bounds)
+        own = np.flatnonzero(sides)
+        bounds = np.zeros((len(of_soil) + len(own), len(self.free) + len(self.active)))
+        bounds[: len(of_soil), : len(self.free)] = of_soil
+        bounds[len(of_soil) + np.arange(len(own)), len(self.free) + own] = sides[own]
+        return bounds
+
+    # Residuals, Jacobian, prior: the quadratic model
+
+    def quadratic_model(self, iterate: Iterate) -> QuadraticModel | None:
+        """The quadratic model at an iterate; None where the observation model is not finite there."""
+        linearisation = self.problem.linearise(iterate.as_soil(), iterate.gains, iterate.latents, self._by_sensors)
+        return self.with_prior(iterate, linearisation)
+
+    def with_prior(self, iterate: Iterate, linearisation: Linearisation) -> QuadraticModel | None:
+        """The quadratic model from the data's linearisation at an iterate; None where it is not finite."""
+        free = len(self.free)
+        directions = self.directions(iterate)
         if not self._by_sensors:
-            directions = np.delete(directions, slice(7, 7 + self.problem.n_sensors), axis=0)
-        gradient = directions.T @ at.normal[:, 0]
-        known = self.prior_at(place)
-        cost = at.chi2 + known.neg2_log_prior
-        if not math.isfinite(cost):
+            directions = np.delete(directions, self.problem.layout.sensor_columns, axis=0)
+        gradient = directions.T @ linearisation.normal[:, 0]
+        prior = self.prior_at(iterate)
+        neg2_log_posterior = linearisation.chi2 + prior.neg2_log_prior
+        if not math.isfinite(neg2_log_posterior):
             return None
         curvature = np.zeros_like(self._identity)
-        curvature[:free, :free] = self.coordinates.curvature((gradient + known.of_data)[:free])
+        curvature[:free, :free] = self.coordinates.curvature((gradient + prior.gradient_of_data)[:free])
         return QuadraticModel(
-            information=directions.T @ at.normal @ directions + known.information,
-            prior_information=known.information,
+            information=directions.T @ linearisation.normal @ directions + prior.information,
+            prior_information=prior.information,
             curvature=curvature,
-            gradient=gradient + known.gradient,
-            neg2_log_posterior=cost,
-            edges=self._edges(place),
-            at=at,
+            gradient=gradient + prior.gradient,
+            neg2_log_posterior=neg2_log_posterior,
+            active_bounds=self._active_bounds(iterate),
+            linearisation=linearisation,
         )
 
-    def prior_at(self, place: Iterate) -> PriorQuadratic:
-        """What was known before, seen from a place; asked again from the last one's soil and gains, it is at hand."""
-        if self._last is None or self._last[0] is not place.soil or self._last[1] is not place.gains:
+    def prior_at(self, iterate: Iterate) -> PriorQuadratic:
+        """The prior's quadratic at an iterate; kept for the next call with the same soil and gains."""
+        last = self._prior_cache
+        if last is None or last[0] is not iterate.soil or last[1] is not iterate.gains:
             by_logs = self._identity.copy()
-            by_logs[: len(self.free), : len(self.free)] = self._log_directions(place.soil)[self.free]
-            self._last = place.soil, place.gains, self.prior_factor.quadratic_at(place.soil, place.gains, by_logs)
-        return self._last[2]
+            by_logs[: len(self.free), : len(self.free)] = self._log_directions(iterate.soil)[self.free]
+            prior = self.prior_factor.quadratic_at(iterate.soil, iterate.gains, by_logs)
+            last = self._prior_cache = iterate.soil, iterate.gains, prior
+        return last[2]
+
+    def directions(self, iterate: Iterate) -> Array:
+        """Derivatives (1 + 6 + G, F + A) of (1, soil in SI, gains) by free coordinates and active gains.
+
+        So Linearisation.rows times `directions` is the residuals' Jacobian.
+        """
+        directions = self._gain_directions.copy()
+        directions[SOIL, : len(self.free)] = iterate.soil[:, None] * self._log_directions(iterate.soil)
+        return directions
+
+    def parameter_jacobian(self, optimum: Optimum) -> Array:
+        """Derivatives (6 + G, F + A) of the soil's logarithms and the gains by coordinates and active gains."""
+        jacobian = self._gain_directions[1:].copy()
+        jacobian[:_SOIL, : len(self.free)] = self._log_directions(optimum.soil)
+        return jacobian
+
+    def prior_jacobian(self, optimum: Optimum) -> Array:
+        """Derivatives (R, F + A) of the prior's residuals by coordinates and active gains."""
+        unknowns = np.concatenate([self.free, _SOIL + self.active])
+        return self.prior_factor.jacobian(optimum.soil, self.parameter_jacobian(optimum)[unknowns])
+
+    def second_derivative(self, iterate: Iterate, model: QuadraticModel, step: Array, there: QuadraticModel) -> Array:
+        """Second derivative of the residuals (R,) along a step (F + A,), from the models at both of its ends."""
+        straight = model.linearisation.rows @ (self.directions(iterate) @ step)
+        change = there.linearisation.rows[:, 0] - model.linearisation.rows[:, 0]
+        return np.asarray(2.0 * (change - straight))
+
+    def geodesic_step(
+        self, iterate: Iterate, model: QuadraticModel, fraction: float, second_derivative: Array
+    ) -> Array | None:
+        """A fraction of the full step with its geodesic acceleration (F + A,); None where there is no step.
+
+        Parameters
+        ----------
+        fraction
+            Of the full step [1].
+        second_derivative : (R,)
+            That of the residuals along the full step.
+
+        References
+        ----------
+        Transtrum & Sethna 2012, arXiv:1201.5885.
+        """
+        acceleration = self.directions(iterate).T @ (model.linearisation.weighed.T @ second_derivative)
+        return model.step(gradient=fraction * model.gradient + 0.5 * fraction**2 * acceleration)
+
+    # Gaussians at an optimum
 
     def approximation_at(self, optimum: Optimum) -> GaussianApproximation | None:
-        """The linear window about an optimum, at hand when asked for it again; None where it tells nothing."""
+        """The linear model at an optimum, kept for the next call; None where its information is singular."""
         if self._approximation is None or self._approximation[0] is not optimum:
-            place = Iterate(optimum.soil, optimum.gains, optimum.latents, math.nan, 0)
-            directions, known = self.directions(place), self.prior_at(place)
+            iterate = Iterate(optimum.soil, optimum.gains, optimum.latents, math.nan, 0)
+            directions, prior = self.directions(iterate), self.prior_at(iterate)
             by_unknowns = directions.T @ optimum.at.normal
             solution = solve_with_inverse(
-                by_unknowns @ directions + known.information, by_unknowns[:, 0] + known.gradient
+                by_unknowns @ directions + prior.information, by_unknowns[:, 0] + prior.gradient
             )
             self._approximation = (
                 optimum,
-                None if solution is None else GaussianApproximation(directions, known, *solution),
+                None if solution is None else GaussianApproximation(directions, prior, *solution),
             )
         return self._approximation[1]
 
-    def parameter_jacobian(self, optimum: Optimum) -> Array:
-        """Derivatives (6 + G, F + A) of the soil's logarithms and the gains by coordinates and active gains there."""
-        spread = self._of_gains[1:].copy()
-        spread[:_SOIL, : len(self.free)] = self._log_directions(optimum.soil)
-        return spread
+    def gaussians_at(self, iterate: Iterate, model: QuadraticModel, base: Array) -> tuple[Gaussian, Gaussian] | None:
+        """Gaussians of the posterior at an optimum: by its moments along k_c's share, and by its curvature.
 
-    def prior_jacobian(self, optimum: Optimum) -> Array:
-        """Derivatives (R, F + A) of the residuals of what was known before."""
-        kept = np.concatenate([self.free, _SOIL + self.active])
-        return self.prior_factor.jacobian(optimum.soil, self.parameter_jacobian(optimum)[kept])
+        Parameters
+        ----------
+        iterate
+            The optimum.
+        model
+            The quadratic model one step before it.
+        base : (6,)
+            The soil of that model.
 
-    def directions(self, place: Iterate) -> Array:
-        """What a column of Linearised.rows (1 + 6 + G) has of each coordinate and active gain (F + A)."""
-        directions = self._of_gains.copy()
-        directions[1:7, : len(self.free)] = place.soil[:, None] * self._log_directions(place.soil)
-        return directions
-
-    def stepped(self, place: Iterate, point: QuadraticModel, step: Array) -> Iterate:
-        """The place after a step (F + A,), with the latents that the linear model foresees."""
-        free = len(self.free)
-        step = self.step_share(place, step) * step
-        soil = self.coordinates.moved(place.soil, step[:free])
-        gain_step = np.zeros(len(place.gains))
-        gain_step[self.active] = step[free:]
-        latents = self.problem.updated(point.at, place.latents, soil - place.soil, gain_step)
-        return self._reached(place, point, soil, place.gains + gain_step, latents)
-
-    def second_derivative(self, place: Iterate, point: QuadraticModel, step: Array, there: QuadraticModel) -> Array:
-        """Second derivative of the residuals (R,) along a step (F + A,) that led from the place to `there`."""
-        straight = point.at.rows @ (self.directions(place) @ step)
-        return np.asarray(2.0 * (there.at.rows[:, 0] - point.at.rows[:, 0] - straight))
-
-    def geodesic_step(self, place: Iterate, point: QuadraticModel, share: float, bend: Array) -> Array | None:
-        """A share of the full step that bends (R,) as the valley does (F + A,); None where there is no step.
-
-        Geodesic acceleration: Transtrum & Sethna 2012, arXiv:1201.5885.
+        Returns
+        -------
+        moments, mode
+            Both by the curvature where there are no finite moments, or k_c and k_phi are not both free, or
+            the sd of log K_L exceeds MAX_MODULUS_SD.  None where the information is singular.
         """
-        turning = self.directions(place).T @ (point.at.weighed.T @ bend)
-        return point.step(gradient=share * point.gradient + 0.5 * share**2 * turning)
-
-    def _edges(self, place: Iterate) -> Array:
-        """Directions (E, F + A) in which no step from there can go."""
-        of_soil = self.coordinates.edges(place.soil)
-        if not (self._has_bounds or len(of_soil)):
-            return self._identity[:0]
-        at = at_edges(place.gains[self.active], *self._gain_bounds)
-        own = np.flatnonzero(at)
-        edges = np.zeros((len(of_soil) + len(own), len(self.free) + len(self.active)))
-        edges[: len(of_soil), : len(self.free)] = of_soil
-        edges[len(of_soil) + np.arange(len(own)), len(self.free) + own] = at[own]
-        return edges
-
-    def step_share(self, place: Iterate, step: Array) -> float:
-        """Share of a step (F + A,) that can be taken."""
-        free = len(self.free)
-        of_soil = self.coordinates.step_share(place.soil, step[:free])
-        if not self._has_bounds:
-            return of_soil
-        low, high = self._gain_bounds
-        room = np.where(step[free:] > 0.0, high, low) - place.gains[self.active]
-        return min(of_soil, step_share_within(room, step[free:]))
-
-    def _reached(self, place: Iterate, point: QuadraticModel, soil: Array, gains: Array, latents: Latents) -> Iterate:
-        """Soil (6,), gains (G,) and foreseen latents as a place, with the entry angles solved where they turn far."""
-        turn = np.abs(latents.entry_angle / place.latents.entry_angle - 1.0).max(initial=0.0)
-        if turn > (LONG_TURN_WITH_EFFECTS if len(point.at.load_by_effects) else LONG_TURN):
-            latents = self.problem.with_entry_angles(latents, Soil(*soil.tolist()), gains)
-        return Iterate(soil, gains, latents, point.neg2_log_posterior, place.trials)
-
-    def with_entry_angles(self, place: Iterate) -> Iterate:
-        """The same place with the entry angles solved anew: linear models in a row may have lost them."""
-        return replace(place, latents=self.problem.with_entry_angles(place.latents, place.as_soil(), place.gains))
-
-    def gaussians_at(self, place: Iterate, point: QuadraticModel, at: Array) -> tuple[Gaussian, Gaussian] | None:
-        """What this optimum tells, by its moments and by its curvature; None where the information is singular.
-
-        The point is of a soil (6,) one step away, `at`.  Without moments that are finite both are the curvature's.
-        """
-        inverse = solve_with_inverse(point.information, point.gradient)
+        inverse = solve_with_inverse(model.information, model.gradient)
         if inverse is None:
             return None
         covariance = inverse[1]
-        mode = self._gaussian(place.soil, place.gains, covariance, at)
-        if not {_K_C, _K_PHI} <= set(self.free.tolist()) or covariance[_K_PHI, _K_PHI] > WELL_TOLD**2:
+        mode = self._gaussian(iterate.soil, iterate.gains, covariance, base)
+        if not {_K_C, _K_PHI} <= set(self.free.tolist()) or covariance[_K_PHI, _K_PHI] > MAX_MODULUS_SD**2:
             return mode, mode
-        moments = self._moments(place, point)
+        moments = self._moments(iterate, model)
         if moments is None:
             return mode, mode
-        free, gains = len(self.free), place.gains.copy()
-        step = self._by_share(place.soil) @ moments.mean
-        soil = self.coordinates.soil_at(self.coordinates.position(place.soil) + step[:free])
+        free, gains = len(self.free), iterate.gains.copy()
+        step = self._by_share(iterate.soil) @ moments.mean
+        soil = self.coordinates.soil_at(self.coordinates.position(iterate.soil) + step[:free])
         gains[self.active] += step[free:]
         by_share = self._by_share(soil)
         return self._gaussian(soil, gains, by_share @ moments.covariance @ by_share.T), mode
 
-    def _moments(self, place: Iterate, point: QuadraticModel) -> Moments | None:
-        """Moments of the logarithm of k_c's share in K_L, the other coordinates and the gains, about the optimum."""
-        others = np.arange(1, len(point.gradient))
-        by_share = self._by_share(place.soil)
-        by_changes = np.zeros((len(others) + 1, len(others) + 3))  # of what was known: k_c and k_phi have s K_L each
-        by_changes[others, others + 2] = 1.0
-        by_changes[[_K_C, _K_PHI], 3:] = by_share[_K_C, 1:]
-        by_changes[[_K_C, _K_PHI], [1, 2]] = 1.0
+    def _moments(self, iterate: Iterate, model: QuadraticModel) -> Moments | None:
+        """Moments of log s, s = k_c's share in K_L, of the other coordinates and of the gains, about the optimum."""
+        others = np.arange(1, len(model.gradient))
+        by_share = self._by_share(iterate.soil)
+        by_changes = np.zeros((len(others) + 1, len(others) + _OTHERS))  # of log k_c = log s K_L b, log (1 - s) K_L, ..
+        by_changes[others, others + _OTHERS - 1] = 1.0
+        by_changes[[_K_C, _K_PHI], _OTHERS:] = by_share[_K_C, 1:]
+        by_changes[[_K_C, _K_PHI], [_LOG_SHARE, _LOG_REST]] = 1.0
         by_k_c = by_changes[_K_C].copy()
-        by_k_c[[0, 1]] = 1.0, 0.0
-        slopes = self.prior_factor.jacobian(place.soil, by_changes, by_k_c)
+        by_k_c[[_SHARE, _LOG_SHARE]] = 1.0, 0.0
+        slopes = self.prior_factor.jacobian(iterate.soil, by_changes, by_k_c)
         quadratic = slopes.T @ self.prior_factor.precision @ slopes
-        of_data = np.concatenate([[0], others + 2])
-        quadratic[of_data[:, None], of_data] += by_share.T @ (point.information - point.prior_information) @ by_share
-        k_c, k_phi = place.soil[[_K_C, _K_PHI]]
+        of_data = np.concatenate([[_SHARE], others + _OTHERS - 1])
+        quadratic[of_data[:, None], of_data] += by_share.T @ (model.information - model.prior_information) @ by_share
+        k_c, k_phi = iterate.soil[[_K_C, _K_PHI]]
         share = k_c / (k_c + k_phi * self.coordinates.width)
-        pull = slopes.T @ self.prior_factor.precision @ self.prior_factor.residuals(place.soil, place.gains)
-        gradient = np.zeros(len(quadratic))
-        gradient[:3] = pull[2] * share / (1.0 - share) - pull[1], *pull[1:3]  # the data pull as much the other way
+        of_prior = slopes.T @ self.prior_factor.precision @ self.prior_factor.residuals(iterate.soil, iterate.gains)
+        gradient = np.zeros(len(quadratic))  # at the optimum the data's gradient is minus the prior's
+        gradient[:_OTHERS] = of_prior[_LOG_REST] * share / (1.0 - share) - of_prior[_LOG_SHARE], *of_prior[1:_OTHERS]
         return moments_along_share(quadratic, gradient, share)
 
     def _by_share(self, soil: Array) -> Array:
-        """Derivatives (F + A, F + A) of the coordinates, where log k_c is one, by those where that of its share is."""
+        """Derivatives (F + A, F + A) of coordinates and gains by the same with log k_c's share in place of log k_c."""
         by_share = np.eye(len(self.free) + len(self.active))
         by_share[_K_C, _K_PHI] = 1.0
         by_share[_K_C, : len(self.free)] += np.where(self.free == _N, -soil[_N] * np.log(TYPICAL_DEPTH), 0.0)
         return by_share
 
-    def _gaussian(self, soil: Array, gains: Array, covariance: Array, at: Array | None = None) -> Gaussian:
-        """The belief with this covariance (F + A, F + A) of coordinates and active gains, there or at a soil nearby."""
+    def _gaussian(self, soil: Array, gains: Array, covariance: Array, base: Array | None = None) -> Gaussian:
+        """The Gaussian with this covariance (F + A, F + A) of coordinates and active gains, taken at soil `base`."""
         free = len(self.free)
-        spread = self._of_gains[1:].copy()
-        spread[:_SOIL, :free] = self._log_directions(soil if at is None else at)
-        return Gaussian(soil, gains, spread @ covariance @ spread.T)
+        jacobian = self._gain_directions[1:].copy()
+        jacobian[:_SOIL, :free] = self._log_directions(soil if base is None else base)
+        return Gaussian(soil, gains, jacobian @ covariance @ jacobian.T)
 
-    def gaussian_with(self, place: Iterate, covariance: Array) -> Gaussian:
-        """A place with the covariance (F + A, F + A) of its coordinates and active gains."""
-        return self._gaussian(place.soil, place.gains, covariance)
+    def gaussian_with(self, iterate: Iterate, covariance: Array) -> Gaussian:
+        """The Gaussian at an iterate with this covariance (F + A, F + A) of coordinates and active gains."""
+        return self._gaussian(iterate.soil, iterate.gains, covariance)
 
     def shifted(self, gaussian: Gaussian, step: Array, covariance: Array) -> Gaussian:
-        """A belief after a step (F + A,) that brings as much covariance (F + A, F + A) with it."""
+        """A Gaussian shifted by a step (F + A,), with this covariance (F + A, F + A) of the step added."""
         free, gains = len(self.free), gaussian.gains.copy()
         gains[self.active] += step[free:]
-        added = self._gaussian(self.coordinates.moved(gaussian.soil, step[:free]), gains, covariance)
+        added = self._gaussian(self.coordinates.stepped(gaussian.soil, step[:free]), gains, covariance)
         return replace(added, covariance=gaussian.covariance + added.covariance)
 
     def _log_directions(self, soil: Array) -> Array:
         return self.coordinates.log_directions(soil)
+
+
+class Descent(NamedTuple):
+    """The end of a descent.
+
+    Attributes
+    ----------
+    iterate
+        The last iterate, one step after `previous`.
+    previous
+        The iterate at which `model` was evaluated.
+    model
+        The quadratic model there, whose step led to `iterate`.
+    predicted_decrease
+        Squared length of the model's full step in posterior sd.
+    iterations
+        Evaluations of the model, those before this descent included.
+    converged
+        Whether the stopping rule says so.
+    """
+
+    iterate: Iterate
+    previous: Iterate
+    model: QuadraticModel
+    predicted_decrease: float
+    iterations: int
+    converged: bool
+
+
+class StoppingRule(NamedTuple):
+    """When `descend_jointly` stops.  All decreases are of -2 log posterior; d is the predicted decrease of a full step.
+
+    ==========  ================================================================================
+    reason      condition
+    ==========  ================================================================================
+    converged   d < step_tolerance, or after a full step d^2 / (d of the full step before) < next_step_tolerance
+    stalled     MAX_STALLED steps in a row did not lower the least value by stall_tolerance, and d < STALLED_DECREASE
+                at the least value
+    given up    value - d > give_up_above
+    rejected    more than max_rejected steps in a row were rejected
+    exhausted   max_iterations evaluations
+    ==========  ================================================================================
+
+    Converged is the last iterate, stalled the one after the least value.  In the other three cases the one after
+    the least value counts as converged if d < WARM_STEP_TOLERANCE there; else the descent has not converged.
+
+    Attributes
+    ----------
+    max_iterations
+        Evaluations of the model.
+    step_tolerance, next_step_tolerance
+        Squared lengths in posterior sd.
+    max_rejected
+        Rejected steps in a row.
+    stall_tolerance
+        Decrease that counts as none; 0 where a descent may not end as stalled.
+    give_up_above
+        Value of the objective above which the fit is of no use.
+    """
+
+    max_iterations: int
+    step_tolerance: float = STEP_TOLERANCE
+    next_step_tolerance: float = NEXT_STEP_TOLERANCE
+    max_rejected: int = MAX_REJECTED
+    stall_tolerance: float = 0.0
+    give_up_above: float = math.inf
+
+    def is_converged(self, decrease: float, previous_decrease: float, is_full_step: bool) -> bool:
+        """Whether this step is short, or the next one will be: steps shrink by the ratio of the last two."""
+        if decrease < self.step_tolerance:
+            return True
+        return is_full_step and decrease * decrease < self.next_step_tolerance * previous_decrease
+
+    def is_given_up(self, model: QuadraticModel, decrease: float) -> bool:
+        """Whether the predicted value is still too high."""
+        return model.neg2_log_posterior - decrease > self.give_up_above
+
+    def is_stalled(self, n_stalled: int, lowest: Descent) -> bool:
+        """Whether steps no longer lower the objective: along a curved valley they overshoot without end."""
+        return self.stall_tolerance > 0.0 and n_stalled >= MAX_STALLED and lowest.predicted_decrease < STALLED_DECREASE
+
+    def is_lower(self, model: QuadraticModel, lowest: Descent) -> bool:
+        """Whether a value is lower than the least so far by at least the stall tolerance."""
+        return lowest.model.neg2_log_posterior - model.neg2_log_posterior >= self.stall_tolerance
+
+
+def descend_jointly(
+    objective: Objective, start: Iterate, rule: StoppingRule, previous_decrease: float = 0.0
+) -> Descent | None:
+    """Gauss-Newton steps of soil, gains and latents together, from near the optimum.
+
+    A step is rejected where it raises the objective by more than ALLOWED_INCREASE.  The descent then returns
+    to the last accepted iterate and takes SHORTENING of the step; damping would hold back only the weak
+    directions, along which steps overshoot.  At the second rejection in a row the entry angles are solved.
+    Full steps that shrink slowly are extrapolated (`_extrapolation`).
+
+    Parameters
+    ----------
+    objective
+        Of the window.
+    start
+        Near the optimum.
+    rule
+        When to stop.
+    previous_decrease
+        Squared length of the step that led to `start`, if it was one of these.
+
+    Returns
+    -------
+    Descent or None
+        None where the numbers are not finite.
+    """
+    iterate, iterations = start, start.evaluations
+    accepted: tuple[Iterate, QuadraticModel] | None = None
+    lowest: Descent | None = None
+    last_step: Array | None = None
+    fraction, last_fraction = 1.0, 1.0
+    decrease, allowed_increase, converged = np.inf, np.inf, False
+    n_rejected = n_stalled = 0
+    for _ in range(rule.max_iterations):
+        iterations += 1
+        model = objective.quadratic_model(iterate)
+        if accepted is not None and (
+            model is None or model.neg2_log_posterior > accepted[1].neg2_log_posterior + allowed_increase
+        ):
+            iterate, model = accepted
+            if n_rejected == 1:
+                iterate = objective.with_entry_angles(iterate)
+                model = objective.quadratic_model(iterate)
+            fraction = SHORTENING * min(fraction, 1.0)
+            previous_decrease, last_step = 0.0, None  # after a rejected step nothing can be extrapolated
+            n_rejected += 1
+            if n_rejected > rule.max_rejected:
+                break
+        else:
+            fraction, n_rejected = min(2.0 * fraction, 1.0), 0
+        full = None if model is None else model.step()
+        if model is None or full is None:
+            return None
+        is_first = accepted is None
+        allowed_increase = (
+            ALLOWED_INCREASE + ALLOWED_FIRST_INCREASE * model.neg2_log_posterior if is_first else ALLOWED_INCREASE
+        )
+        accepted = (iterate, model)
+        decrease = model.squared_length(full)
+        if last_step is not None and fraction == 1.0:
+            fraction = _extrapolation(model, last_step, last_fraction, full)
+        iterate = objective.stepped(iterate, model, fraction * full)
+        last_step, last_fraction = full, fraction
+        converged = rule.is_converged(decrease, previous_decrease, fraction == 1.0)
+        previous_decrease = decrease if fraction == 1.0 else 0.0
+        if converged or rule.is_given_up(model, decrease):
+            break
+        n_stalled = 0 if lowest is None or rule.is_lower(model, lowest) else n_stalled + 1
+        if lowest is None or model.neg2_log_posterior < lowest.model.neg2_log_posterior:
+            lowest = Descent(iterate, *accepted, decrease, iterations, converged=True)
+        if rule.is_stalled(n_stalled, lowest):
+            return lowest._replace(iterations=iterations)
+    if accepted is None:
+        return None
+    if not converged and lowest is not None and lowest.predicted_decrease < WARM_STEP_TOLERANCE:
+        return lowest._replace(iterations=iterations)
+    return Descent(iterate, *accepted, decrease, iterations, converged)
+
+
+def _extrapolation(model: QuadraticModel, last: Array, last_fraction: float, step: Array) -> float:
+    """Multiple of a full step (F + A,) to take, from the last one (F + A,) and the fraction of it that was taken.
+
+    Aitken's extrapolation: above 1 where steps shrink slowly, below 1 where they turn back, else 1.
+    """
+    ratio = 1.0 - (1.0 - float(last @ model.information @ step) / model.squared_length(last)) / last_fraction
+    is_slow = abs(ratio) > SLOW_RATIO
+    return min(1.0 / max(1.0 - ratio, 1.0 / MAX_EXTRAPOLATION), MAX_EXTRAPOLATION) if is_slow else 1.0
+
+
+def descend_soil(
+    objective: Objective,
+    soil: Array,
+    max_evaluations: int,
+    relative_tolerance: float = SOIL_RELATIVE_TOLERANCE,
+    gains: Array | None = None,
+    ends: Sequence[Iterate] = (),
+    give_up_above: float = np.inf,
+) -> Iterate | None:
+    """Levenberg-Marquardt steps of the soil and the active gains with the latents as measured.
+
+    It ends where the squared length of a step is below SOIL_STEP_TOLERANCE, where a step lowers the objective
+    by less than `relative_tolerance` of it, at `max_evaluations`, or at MAX_DAMPING.  Steps that do not lower the
+    objective are rejected and the damping is raised.
+
+    Parameters
+    ----------
+    objective
+        Of the window, or of a few of its instants.
+    soil : (6,)
+        Start, in SI.
+    max_evaluations
+        Of the model.
+    relative_tolerance
+        See above [1].
+    gains : (G,), optional
+        Start; those of the joint prior if not given.
+    ends
+        Where other descents ended: one that is predicted to end there ends there at once.
+    give_up_above
+        Value of the objective: a descent that is predicted to end above it is given up.
+
+    Returns
+    -------
+    Iterate or None
+        None where it is given up, or where there is no further step.
+    """
+    iterate = objective.start(soil, gains=gains)
+    model = objective.quadratic_model(iterate)
+    damping, easing, evaluations = FIRST_DAMPING, 0.1, 1
+    while model is not None:
+        step = model.step(damping)
+        if step is None:
+            return None
+        length = model.squared_length(step)
+        if model.neg2_log_posterior - length > give_up_above:
+            return None
+        if length < SOIL_STEP_TOLERANCE or evaluations >= max_evaluations or damping > MAX_DAMPING:
+            return replace(iterate, neg2_log_posterior=model.neg2_log_posterior, evaluations=evaluations)
+        for end in ends:
+            if _leads_to(objective, iterate, model, step, end):
+                return replace(end, evaluations=evaluations)
+        new_iterate = objective.stepped_with_measured_latents(iterate, model, step)
+        new = objective.quadratic_model(new_iterate)
+        evaluations += 1
+        if new is None or new.neg2_log_posterior >= model.neg2_log_posterior:
+            damping, easing = 10.0 * damping, 1.0
+            continue
+        decrease = model.neg2_log_posterior - new.neg2_log_posterior
+        is_small = decrease < relative_tolerance * model.neg2_log_posterior
+        iterate, model, damping, easing = new_iterate, new, damping * easing, 0.1
+        if is_small:
+            return replace(iterate, neg2_log_posterior=model.neg2_log_posterior, evaluations=evaluations)
+    return None
+
+
+def _leads_to(objective: Objective, iterate: Iterate, model: QuadraticModel, step: Array, end: Iterate) -> bool:
+    """Whether a step of the soil comes within OTHER_OPTIMUM_SD of where another descent ended.
+
+    False for a step that the coordinates would shorten: the quadratic model does not hold that far.
+    """
+    if np.abs(step).max() > MAX_LOG_STEP:
+        return False
+    off = objective.coordinates.position(end.soil) - objective.coordinates.position(iterate.soil) - step
+    return model.squared_length(off) < OTHER_OPTIMUM_SD**2
 
 
 def _solution(information: Array, right: Array) -> Array | None:
@@ -380,180 +796,3 @@ def _solution(information: Array, right: Array) -> Array | None:
         )
     except np.linalg.LinAlgError:
         return None
-
-
-CONVERGED, CONVERGED_RESUMED = 1e-6, 3e-3
-"""Squared length of a step in posterior standard deviations that ends the fit, and one that is resumed from the
-window before: what such a step leaves behind is much less."""
-LEFT_OVER, LEFT_OVER_RESUMED = 2e-8, 1e-4
-"""The same for what a full step leaves behind, foreseen from how fast the steps shrink."""
-SETTLING = 1.0
-"""The same, below which the latents and gains join in."""
-ENOUGH = 0.02
-"""Relative fall of the cost below which the approach has done its part."""
-LITTLE = 1e-3
-"""The same where other parameters than the soil's move too."""
-WORSE = 20.0
-"""Rise of the cost that a step may bring: where the cost bends, steps that overshoot come back by themselves."""
-AT_FIRST = 0.02
-"""Share of the cost by which it may rise besides at the first step: with latents as measured it seems too low."""
-SLOWLY = 0.5
-"""Length of a step over that of the last, along it, above which steps are extrapolated."""
-MAX_STRIDE = 8.0
-MAX_REFUSED = 5
-"""Steps taken back one after the other after which a fit has failed: what is left is noise of the linear model."""
-IDLE, NEARLY = 2, 1.0
-"""Steps in a row that do not lower the cost, and how little they must foresee, after which no further one will."""
-FAR = 10.0
-"""Standard deviations on a few instants beyond which an end is not the optimum looked at."""
-
-
-class Descent(NamedTuple):
-    """Where a descent ended: the place one step on from the `last` one, whose `point` foresaw it.
-
-    length is the squared length of that step in posterior standard deviations.
-    """
-
-    place: Iterate
-    last: Iterate
-    point: QuadraticModel
-    length: float
-    iterations: int
-    converged: bool
-
-
-def descend_soil(
-    fitting: Objective,
-    soil: Array,
-    most: int,
-    least: float = ENOUGH,
-    gains: Array | None = None,
-    known: Sequence[Iterate] = (),
-    give_up_above: float = np.inf,
-) -> Iterate | None:
-    """Levenberg-damped steps of the soil and the active gains, latents as measured, until they are short.
-
-    A descent that is foreseen to end at one of the `prior_information` places ends there at once; one
-    that is foreseen to cost more than `give_up_above`, or that has no further step, is None.
-    """
-    place = fitting.start(soil, gains=gains)
-    point = fitting.point(place)
-    damping, ease, trials = 1e-3, 0.1, 1
-    while point is not None:
-        step = point.step(damping)
-        if step is None:
-            return None
-        length = point.length(step)
-        if point.neg2_log_posterior - length > give_up_above:
-            return None
-        if length < SETTLING or trials >= most or damping > 1e6:
-            return replace(place, neg2_log_posterior=point.neg2_log_posterior, trials=trials)
-        for end in known:
-            if _leads_to(fitting, place, point, step, end):
-                return replace(end, trials=trials)
-        new_place = fitting.stepped_with_measured_latents(place, point, step)
-        new = fitting.point(new_place)
-        trials += 1
-        if new is None or new.neg2_log_posterior >= point.neg2_log_posterior:
-            damping, ease = 10.0 * damping, 1.0
-            continue
-        enough = point.neg2_log_posterior - new.neg2_log_posterior < least * point.neg2_log_posterior
-        place, point, damping, ease = new_place, new, damping * ease, 0.1
-        if enough:
-            return replace(place, neg2_log_posterior=point.neg2_log_posterior, trials=trials)
-    return None
-
-
-def _leads_to(fitting: Objective, place: Iterate, point: QuadraticModel, step: Array, end: Iterate) -> bool:
-    """Whether a step of the soil comes so near to where another descent ended that this one will end there too.
-
-    Only a short step is trusted to tell.
-    """
-    if np.abs(step).max() > MAX_STEP:
-        return False
-    off = fitting.coordinates.position(end.soil) - fitting.coordinates.position(place.soil) - step
-    return point.length(off) < FAR**2
-
-
-def _stride(point: QuadraticModel, last: Array, share: float, step: Array) -> float:
-    """How many times a step to go that follows this share of the last one (Aitken's extrapolation).
-
-    More than once where steps shrink slowly, less where they turn back.
-    """
-    left = 1.0 - (1.0 - float(last @ point.information @ step) / point.length(last)) / share
-    return min(1.0 / max(1.0 - left, 1.0 / MAX_STRIDE), MAX_STRIDE) if abs(left) > SLOWLY else 1.0
-
-
-def descend_jointly(
-    fitting: Objective,
-    near: Iterate,
-    most: int,
-    left_over: float = LEFT_OVER,
-    previous_length: float = 0.0,
-    refusals: int = MAX_REFUSED,
-    give_up_above: float = np.inf,
-    enough: float = CONVERGED,
-    nothing: float = 0.0,
-) -> Descent | None:
-    """Steps of soil, gains and latents together from a place near the optimum.
-
-    `joint_prior` is the squared length of the step that led there, if it was one of these; a step
-    of less than `enough` is the last, and one after which the cost twice fell by less than
-    `nothing` though little more was foreseen: along a bent valley steps overshoot for ever.
-    Given up after more `refusals` in a row, and where the foreseen cost is above `give_up_above`.
-    None where the numbers stop being finite.
-
-    A step that makes things worse is taken back and tried again shorter: damping would
-    hold back just the weak directions, along which the steps overshoot.
-    """
-    best: tuple[Iterate, QuadraticModel] | None = None
-    share, length, refused = 1.0, np.inf, 0
-    iterations, converged = near.trials, False
-    last_step: Array | None = None
-    last_share = 1.0
-    worse = np.inf
-    lowest: Descent | None = None
-    idle = 0
-    for _ in range(most):
-        iterations += 1
-        point = fitting.point(near)
-        if best is not None and (point is None or point.neg2_log_posterior > best[1].neg2_log_posterior + worse):
-            near, point = best
-            if refused == 1:
-                near = fitting.with_entry_angles(near)
-                point = fitting.point(near)
-            share = 0.4 * min(share, 1.0)
-            previous_length, last_step = 0.0, None  # nothing can be foreseen after a refused step
-            refused += 1
-            if refused > refusals:
-                break
-        else:
-            share, refused = min(2.0 * share, 1.0), 0
-        full = None if point is None else point.step()
-        if point is None or full is None:
-            return None
-        worse = WORSE if best is not None else WORSE + AT_FIRST * point.neg2_log_posterior
-        best = (near, point)
-        length = point.length(full)
-        if last_step is not None and share == 1.0:
-            share = _stride(point, last_step, last_share, full)
-        near = fitting.stepped(near, point, share * full)
-        last_step, last_share = full, share
-        converged = length < enough or (share == 1.0 and length * length < left_over * previous_length)
-        previous_length = length if share == 1.0 else 0.0
-        if converged or point.neg2_log_posterior - length > give_up_above:
-            break
-        idle = (
-            idle + 1
-            if lowest is not None and lowest.point.neg2_log_posterior - point.neg2_log_posterior < nothing
-            else 0
-        )
-        if lowest is None or point.neg2_log_posterior < lowest.point.neg2_log_posterior:
-            lowest = Descent(near, *best, length, iterations, converged=True)
-        if nothing > 0.0 and idle >= IDLE and lowest.length < NEARLY:
-            return lowest._replace(iterations=iterations)
-    if best is None:
-        return None
-    if not converged and lowest is not None and lowest.length < CONVERGED_RESUMED:
-        return lowest._replace(iterations=iterations)
-    return Descent(near, *best, length, iterations, converged)

@@ -11,7 +11,7 @@ from cantools.database.can import Database
 
 from soilbus.config.model import Config
 from soilbus.diagnosis.records import Record, TooLittle, record_of
-from soilbus.estimation.assembly import completion_of, model_of, rig_of
+from soilbus.estimation.assembly import effects_and_parameters_of, model_of, rig_of
 from soilbus.estimation.window import Window
 from soilbus.offline.replay import fed, log_names
 from soilbus.pipeline.intake import Intake
@@ -41,7 +41,7 @@ def recordings_of(
     for one without a usable part, ConfigError where configuration and database do not fit.
     """
     rig, model, settings = rig_of(config), model_of(config), config.estimator
-    effects, free = completion_of(config, in_time=False)
+    effects, free = effects_and_parameters_of(config, undelayed=False)
     records: list[Record] = []
     first, too_short, rejected, samples = [], [], Counter[str](), 0
     for path, log in zip(logs, log_names(logs), strict=True):
@@ -57,7 +57,7 @@ def recordings_of(
                 fault = fault or error
                 too_short.append(name)
                 continue
-            records.append(record.completed(effects, free))
+            records.append(record.with_effects(effects, free))
         rejected += intake.refusals.total
         if len(records) == first[-1]:
             raise TooLittle(_why(log, intake, fault))

@@ -22,7 +22,7 @@ from soilbus.arrays import Array
 from soilbus.can.log_lines import LogLines
 from soilbus.config.model import Column, Config, Table
 from soilbus.diagnosis.records import Record, TooLittle, record_of_rows
-from soilbus.estimation.assembly import completion_of, model_of, possible_effects, rig_of
+from soilbus.estimation.assembly import effects_and_parameters_of, model_of, possible_effects, rig_of
 from soilbus.estimation.measurements import MAX_SLIP, MIN_SLIP
 from soilbus.estimation.window import Rig, Window, window_of_samples
 from soilbus.offline.recordings import Recordings
@@ -120,7 +120,7 @@ def _task(index: int, run: Run, rig: Rig) -> WindowTask:
 def recordings_of_tables(config: Config, paths: Sequence[Path]) -> Recordings:
     """The runs of tables as the diagnosis wants them; TableError as runs_of(), TooLittle for a table of short runs."""
     rig, model = rig_of(config), model_of(config)
-    effects, free = completion_of(config)
+    effects, free = effects_and_parameters_of(config)
     records: list[Record] = []
     first, too_short, rejected, samples = [], [], Counter[str](), 0
     for path in paths:
@@ -134,7 +134,7 @@ def recordings_of_tables(config: Config, paths: Sequence[Path]) -> Recordings:
                 too_short.append(run.name)
                 fault = error
                 continue
-            records.append(record.completed(effects, free))
+            records.append(record.with_effects(effects, free))
         if len(records) == first[-1]:
             raise fault
     return Recordings(tuple(records), tuple(first), samples, dict(rejected.most_common()), tuple(too_short))
@@ -149,7 +149,7 @@ def candidates(config: Config, records: Sequence[Record]) -> list[Effect]:
     unknown = OF_TRUE_SPEED | OF_SEVERAL_WHEELS
     if config.table is None or config.table.t is None:
         unknown |= OF_TIME
-    load = float(np.mean(np.concatenate([record.learned.load[:, 0] for record in records])))
+    load = float(np.mean(np.concatenate([record.training.load[:, 0] for record in records])))
     radius = config.wheel[0].radius
     return [for_wheel(effect, load, radius) for effect in possible_effects(config) if effect.name not in unknown]
 

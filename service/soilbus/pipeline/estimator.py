@@ -15,17 +15,18 @@ from soilbus.decision.demand import present_demand
 from soilbus.decision.hysteresis import Held, doubted, settled
 from soilbus.decision.immobilisation import SPAN, Watch, moments, watched, with_loss
 from soilbus.decision.judgement import Basis, judge
+from soilbus.decision.torque_ceiling import TorqueCeiling
 from soilbus.decision.traction_loss import NO_LOSS, idle, motion_of, observed
 from soilbus.decision.traversability import Status, Traversability
 from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.wheels import WheelTable
-from soilbus.estimation.assembly import completion_of, form_of, model_of, prior_of, rig_of
+from soilbus.estimation.assembly import effects_and_parameters_of, form_of, model_of, prior_of, rig_of
 from soilbus.estimation.measurements import gain_names
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.nuisance_parameters import active_at
 from soilbus.estimation.posterior import Estimate, Posterior, SoilPrior
 from soilbus.estimation.soil_classes import SoilClasses, guessed
-from soilbus.estimation.tracker import MIN_ROWS, Ground, Settings, Tracker, TrackerOutput
+from soilbus.estimation.tracker import MIN_ROWS, Settings, Tracker, TrackerOutput, TrackerState
 from soilbus.estimation.window import Rig, Window
 from soilbus.pipeline.excitation import excitation_of
 from soilbus.pipeline.intake import WindowTask
@@ -68,7 +69,7 @@ class WindowEstimator:
     def __init__(self, config: Config, tracker_of: Callable[..., Tracker] = Tracker) -> None:
         self.config = config
         self.rig, self.prior, self.model = rig_of(config), prior_of(config), model_of(config)
-        self._completion = completion_of(config)
+        self._completion = effects_and_parameters_of(config)
         self._settings = config.estimator
         self._wheels: WheelTable | None = None
         self._gap = GapWatch(config.estimator.window, config.estimator.hop)
@@ -78,6 +79,7 @@ class WindowEstimator:
         self._curve: OverSlip | None = None
         self._loss = NO_LOSS
         self._idle = np.zeros(len(self.rig.wheels), bool)
+        self._ceiling = TorqueCeiling.unknown(len(self.rig.wheels))
         self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
         self._guess = guessed(self.prior, prior_of(Config()))
         settings = config.estimator
@@ -107,7 +109,7 @@ class WindowEstimator:
     def estimate(self, task: WindowTask) -> Undecided:
         """Soil and status of one window."""
         if task.fresh:
-            self._tracker.forget()
+            self._tracker.reset()
         tracked = self._tracker.estimate(task.window, task.end)
         fit = tracked.fit
         status, reason = self._status(task, tracked)
@@ -143,11 +145,8 @@ class WindowEstimator:
         model = self._present_model(task.window, tracked, effects)
         window = _with_true_draft(task.window, effects, self.rig)
         demand = present_demand(window, self.rig.chassis, self._settings.hop, self._draft_gain(tracked))
-        here = tracked.ground not in (Ground.CHANGING, Ground.SETTLING)
-        if task.fresh:
-            self._idle = np.zeros(len(self.rig.wheels), bool)
-        self._idle = idle(task.window, self.rig, task.end - self._settings.hop, self._idle)
-        limit = np.where(self._idle, 0.0, task.torque_limit)
+        here = tracked.state not in (TrackerState.SUSPECT, TrackerState.TRANSITION)
+        limit = self._torque_limit(task, window)
         known = None if own is None else Posterior(own.soil, model.with_form(own.log_covariance))
         return Undecided(result, known, demand, limit, window, task.fresh, model, here)
 
@@ -183,6 +182,21 @@ class WindowEstimator:
         return replace(
             way, state=self._held.state, since_valid=None if self._valid_at is None else result.t - self._valid_at
         )
+
+    def _torque_limit(self, task: WindowTask, window: Window) -> NDArray[np.float64]:
+        """Greatest torque (W,) [N m] that may be counted on: none of an idle wheel, no more than a ceiling that shows.
+
+        window: the task's, with the true draft.
+        """
+        hop, deviations = self._settings.hop, self.config.traversability.contradiction
+        if task.fresh:
+            self._idle, self._ceiling = (
+                np.zeros(len(self.rig.wheels), bool),
+                TorqueCeiling.unknown(len(self.rig.wheels)),
+            )
+        self._idle = idle(task.window, self.rig, task.end - hop, self._idle)
+        self._ceiling = self._ceiling.after(window, self.rig, hop, deviations)
+        return np.where(self._idle, 0.0, np.fmin(task.torque_limit, self._ceiling.limit))
 
     def _watched_gaps(self, task: WindowTask, fit: Fit | None) -> Mapping[str, float]:
         """The channels that have not fitted for minutes; windows with poor inputs have no say."""
@@ -246,7 +260,7 @@ class WindowEstimator:
     def _soil_class(self, posterior: Posterior | None) -> dict[str, float] | None:
         if posterior is None or self._classes is None:
             return None
-        here = self._tracker.here
+        here = self._tracker.soil_prior
         return self._classes.probabilities(posterior, self._guess if here is self.prior else here)
 
     def _sinkage(self, fit: Fit | None) -> dict[str, float | None]:
@@ -307,7 +321,7 @@ class WindowEstimator:
 
     def _hardly_new(self, tracked: TrackerOutput, end: float) -> bool:
         """Whether the window has too little of the soil that has just begun."""
-        if tracked.ground in (Ground.CHANGING, Ground.SETTLING):
+        if tracked.state in (TrackerState.SUSPECT, TrackerState.TRANSITION):
             return True
         return tracked.since > end - self.config.traversability.min_share * self._settings.window
 
@@ -341,7 +355,7 @@ def _widening(tracked: TrackerOutput, fit: Fit) -> float:
 
 def _with_form(own: Posterior, fit: Fit, prior: SoilPrior) -> Posterior:
     """A posterior with what the form of the model leaves open besides: second moments about the same soil."""
-    return own if fit.form is None else own.beside(fit.form.log_covariance, prior, fit.form.log_shift)
+    return own if fit.form is None else own.with_added_covariance(fit.form.log_covariance, prior, fit.form.log_shift)
 
 
 def _with_true_draft(window: Window, effects: Sequence[Active], rig: Rig) -> Window:

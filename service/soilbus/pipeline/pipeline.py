@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from cantools.database.can import Database
 
 from soilbus.config.model import Config
-from soilbus.estimation.assembly import completion_of
+from soilbus.estimation.assembly import effects_and_parameters_of
 from soilbus.pipeline.intake import Intake
 from soilbus.pipeline.result import WindowResult
 
@@ -31,7 +31,7 @@ class Pipeline:
     def __init__(self, config: Config, database: Database) -> None:
         self.config, self.database = config, database
         self._hear_with(Intake(config, database))
-        completion_of(config)  # its faults are raised now, and not when the estimator is made
+        effects_and_parameters_of(config)  # its faults are raised now, and not when the estimator is made
 
     def _hear_with(self, intake: Intake) -> None:
         self.intake, self.admission, self.feed = intake, intake.admission, intake.admission.feed

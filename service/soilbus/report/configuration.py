@@ -12,7 +12,7 @@ from soilbus.can.channels import Channel
 from soilbus.can.dbc_files import checked_messages, load_databases, output_database
 from soilbus.can.mapping import channels_of, without_unit
 from soilbus.config.model import Config, Table
-from soilbus.estimation.assembly import completion_of, delays_of, effects_of, rig_of
+from soilbus.estimation.assembly import delays_of, effects_and_parameters_of, effects_of, rig_of
 from soilbus.pipeline.outputs import check_cycle_times
 from soilbus.report.soil_prior import prior_text
 from soilbus.report.table import table
@@ -21,7 +21,7 @@ from soilbus.sensors.survey import Seen, Survey
 
 def configuration_report(config: Config) -> str:
     """The whole report as text; ConfigError lists every fault."""
-    completion_of(config)
+    effects_and_parameters_of(config)
     if config.table is not None:
         columns = [(role, c.column, f"{c.factor:g}") for role, c in config.table.columns.items()]
         return _report(config, [table(("role", "column", "factor to SI"), columns)])
@@ -122,7 +122,7 @@ def defaults_text(config: Config) -> str:
 
 def effect_lines(config: Config) -> list[str]:
     """A line for each effect: which of its parameters are estimated and which held, or why it does not count."""
-    effects, free = completion_of(config)
+    effects, free = effects_and_parameters_of(config)
     lines = []
     for effect, _ in effects_of(config):
         if effect.name == "channel_lag":

@@ -10,7 +10,7 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import FittedModel
-from soilbus.diagnosis.verdict import PAYS, PAYS_BESIDE
+from soilbus.diagnosis.verdict import FALL_REQUIRED_ALONE, FALL_REQUIRED_BESIDE
 from soilbus.diagnosis.where import channels
 from soilbus.offline.diagnose import Findings
 from soilbus.report.findings import (
@@ -18,8 +18,8 @@ from soilbus.report.findings import (
     chance_text,
     effect_lines,
     gap_line,
-    learned_lines,
     place_lines,
+    residual_lines,
     size_text,
     soil_rows,
 )
@@ -27,10 +27,12 @@ from soilbus.report.page import html_table, page, picture
 from soilbus.report.statement import doubt, shown_lines, statement, why_probabilities
 
 REGRESSORS = ("slip", "load of a wheel, kN", "time, s")
-MOST_POINTS = 3000
+"""Columns of the pictures."""
+MAX_POINTS = 3000
 """Residuals of a channel that a picture shows; the means are of all."""
 BINS = 12
-REACH = 5.0
+"""Equally filled bins of a picture's means."""
+PLOT_RANGE_SD = 5.0
 """Standard deviations that a picture shows."""
 
 
@@ -52,7 +54,7 @@ def diagnosis_report(findings: Findings) -> str:
         "<p>Each residual given the others of its instant, in standard deviations of the whole noise. "
         f"Lines: means over {BINS} equally filled bins; where nothing is missing they stay near 0.</p>",
         *_pictures(findings),
-        *_learned(findings),
+        *_residual_terms(findings),
         "<h2>Soil</h2>",
         *_soils(findings),
         f"<p>{html.escape(admission_line(findings))}</p>",
@@ -77,7 +79,7 @@ def _candidates(findings: Findings) -> Iterator[str]:
         yield f"<h2>Candidates for effect {number}</h2>"
         yield html_table(("effect", "fall of -2 log evidence", "probability"), rows)
         why = why_probabilities(addition)
-        least = PAYS_BESIDE if addition.beside else PAYS
+        least = FALL_REQUIRED_BESIDE if addition.beside else FALL_REQUIRED_ALONE
         yield f"<p>An effect is added from a fall of {least:g} on." + (f" {html.escape(why)}.</p>" if why else "</p>")
 
 
@@ -89,10 +91,10 @@ def _places(findings: Findings) -> str:
     return html_table(("channel", "wheel", "region", "size", "chance that noise does it"), rows)
 
 
-def _learned(findings: Findings) -> Iterator[str]:
-    if findings.diagnosis.learned:
+def _residual_terms(findings: Findings) -> Iterator[str]:
+    if findings.diagnosis.residual_terms:
         yield "<h2>What is left, described</h2>"
-        yield f"<pre>{html.escape(chr(10).join(learned_lines(findings.diagnosis.learned)))}</pre>"
+        yield f"<pre>{html.escape(chr(10).join(residual_lines(findings.diagnosis.residual_terms)))}</pre>"
 
 
 def _soils(findings: Findings) -> Iterator[str]:
@@ -109,11 +111,11 @@ def _pictures(findings: Findings) -> Iterator[str]:
         yield picture(_residuals(completed, f"after: gap {after.value:.3f}"), "residuals after")
 
 
-def _residuals(completion: FittedModel, title: str) -> Any:
+def _residuals(fitted: FittedModel, title: str) -> Any:
     """Standardised residuals by channel (rows) over slip, load and time (columns); a colour for each wheel."""
     from matplotlib.figure import Figure
 
-    clouds = _clouds(completion)
+    clouds = _clouds(fitted)
     figure = Figure(figsize=(10, 2.4 * len(clouds)), layout="constrained")
     figure.suptitle(title)
     axes: Any = figure.subplots(len(clouds), len(REGRESSORS), sharey=True, sharex="col", squeeze=False)
@@ -122,7 +124,7 @@ def _residuals(completion: FittedModel, title: str) -> Any:
             for i, axis in enumerate(row):
                 _cloud(axis, table[:, i], table[:, -1], wheel)
         row[0].set_ylabel(f"{channel}, σ")
-        row[0].set_ylim(-REACH, REACH)
+        row[0].set_ylim(-PLOT_RANGE_SD, PLOT_RANGE_SD)
         if len(of_wheels) > 1:
             row[-1].legend(ncols=4, fontsize="x-small")
     for axis, name in zip(axes[-1], REGRESSORS, strict=True):
@@ -131,7 +133,7 @@ def _residuals(completion: FittedModel, title: str) -> Any:
 
 
 def _cloud(axis: Any, x: Array, z: Array, label: str) -> None:
-    step = max(len(x) // MOST_POINTS, 1)
+    step = max(len(x) // MAX_POINTS, 1)
     colour = axis.plot(x[::step], z[::step], ".", ms=2, alpha=0.3)[0].get_color()
     parts = np.array_split(np.argsort(x, kind="stable"), BINS)
     means = np.array([(x[part].mean(), z[part].mean()) for part in parts if len(part)]).reshape(-1, 2)
@@ -139,10 +141,10 @@ def _cloud(axis: Any, x: Array, z: Array, label: str) -> None:
     axis.axhline(0.0, color="grey", lw=0.5)
 
 
-def _clouds(completion: FittedModel) -> dict[str, dict[str, Array]]:
+def _clouds(fitted: FittedModel) -> dict[str, dict[str, Array]]:
     """Columns slip, load [kN], time [s], residual (M, 4) of the held-out blocks by channel and wheel."""
     found: dict[str, dict[str, list[Array]]] = {}
-    for check, fit in zip(completion.checks, completion.fits, strict=True):
+    for check, fit in zip(fitted.checks, fitted.fits, strict=True):
         problem, latents = check.problem, check.latents
         z, _ = problem.standardised(check.at, fit.gains)
         slip = 1.0 - latents.ground_speed[:, None] / (problem.rig.radius * latents.speed)

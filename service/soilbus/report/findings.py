@@ -1,4 +1,10 @@
-"""What `soilbus diagnose` tells: as JSON (keys: DESIGN.md) and as text."""
+"""A diagnosis as `soilbus diagnose` prints it: JSON (keys: DESIGN.md) and text.
+
+    Findings -> findings_json(), findings_text()
+
+Both say the same: verdict and sentence, places of disagreement, effects with parameters and alternatives, the gap
+before and after, and the soil of each recording before and after.  The sentences are made in `statement`.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +15,7 @@ from typing import Any
 
 from soilbus.config.model import Config
 from soilbus.diagnosis.fitted_model import FittedModel
-from soilbus.diagnosis.residual_terms import WARNING, Correction
+from soilbus.diagnosis.residual_terms import WARNING, ResidualTerms
 from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.verdict import gap_limit
 from soilbus.diagnosis.where import Disagreement
@@ -29,18 +35,22 @@ from soilbus.report.statement import (
 from soilbus.report.table import table
 from soilbus.terra.effects.catalogue import CATALOGUE
 
-MOST_PLACES = 8
+MAX_PLACES = 8
 """Places of disagreement that the text lists."""
 UNITS = {"torque": "N m", "draft": "N", "sinkage": "m"}
+"""Unit of each channel's residuals."""
 
 
 def findings_json(findings: Findings) -> str:
-    """The whole as one JSON object; null for what is not finite."""
+    """All findings as one JSON object, with null for numbers that are not finite.
+
+    Its keys are listed in DESIGN.md.
+    """
     diagnosis, recordings = findings.diagnosis, findings.recordings
     soils = [
         {"log": name, "before": _soil(b, findings), "after": _soil(a, findings)} for name, b, a in findings.soils()
     ]
-    told = {
+    document = {
         "verdict": str(diagnosis.verdict),
         "sentence": statement(diagnosis),
         "doubt": doubt(diagnosis),
@@ -59,18 +69,18 @@ def findings_json(findings: Findings) -> str:
         "soil_after": soils[0]["after"],
         "soils": soils,
         "model": {name: _estimates(values) for name, values in findings.diagnosis.completed.parameters().items()},
-        "learned": [_correction(correction) for correction in diagnosis.learned],
-        "warning": WARNING if diagnosis.learned else None,
+        "learned": [_residual_terms(description) for description in diagnosis.residual_terms],
+        "warning": WARNING if diagnosis.residual_terms else None,
         "samples": recordings.samples,
         "rejected": recordings.rejected,
         "too_short": list(recordings.too_short),
         "seconds": round(findings.seconds, 3),
     }
-    return json.dumps(known(told), indent=1, allow_nan=False) + "\n"
+    return json.dumps(known(document), indent=1, allow_nan=False) + "\n"
 
 
 def _shown(findings: Findings) -> dict[str, Any]:
-    """What the recordings could have shown, from which size on, and what not; null where nobody asked."""
+    """What the recordings could have shown, from which size on, and what not; null unless the verdict is `none`."""
     diagnosis = findings.diagnosis
     if not diagnosis.detectable:
         return {"could_show": None, "could_not_show": None, "unseen": None}
@@ -111,18 +121,18 @@ def _effect(addition: Addition, completed: FittedModel) -> dict[str, Any]:
     }
 
 
-def _correction(correction: Correction) -> dict[str, Any]:
+def _residual_terms(description: ResidualTerms) -> dict[str, Any]:
     return {
-        "channel": correction.channel,
-        "wheel": correction.wheel,
-        "formula": correction.formula,
-        "terms": {term.regressor: term.coefficient for term in correction.terms},
-        "explained": correction.explained,
+        "channel": description.channel,
+        "wheel": description.wheel,
+        "formula": description.formula,
+        "terms": {term.regressor: term.coefficient for term in description.terms},
+        "explained": description.explained,
     }
 
 
 def why_ambiguous(addition: Addition) -> str | None:
-    """Why the alternatives of an effect stay in the set; None where there are none."""
+    """Why the alternatives of an effect stay in the set; None where it has none."""
     if not addition.alternatives:
         return None
     best = addition.falls[addition.effect.name]
@@ -145,21 +155,21 @@ def _estimates(estimates: dict[str, Estimate]) -> dict[str, dict[str, float]]:
 
 
 def findings_text(findings: Findings) -> str:
-    """The whole for a reader at a terminal."""
+    """All findings for a reader at a terminal."""
     diagnosis = findings.diagnosis
     lines = [f"{diagnosis.verdict}: {statement(diagnosis)}", *filter(None, [doubt(diagnosis)]), "", gap_line(findings)]
     lines += [f"  {line}" for line in place_lines(findings)]
     lines += shown_lines(diagnosis, findings.config)
     for number, addition in enumerate(diagnosis.additions, 1):
         lines += ["", *effect_lines(number, addition, findings.diagnosis.completed)]
-    if diagnosis.learned:
-        lines += ["", "what is left, described:", *(f"  {line}" for line in learned_lines(diagnosis.learned))]
+    if diagnosis.residual_terms:
+        lines += ["", "what is left, described:", *(f"  {line}" for line in residual_lines(diagnosis.residual_terms))]
     lines += ["", *_soil_lines(findings), "", admission_line(findings)]
     return "\n".join(lines) + "\n"
 
 
 def gap_line(findings: Findings) -> str:
-    """The gap before and after, beside what noise alone does."""
+    """The gap before and after, and that of noise alone."""
     before, after = findings.diagnosis.gap_before, findings.diagnosis.gap_after
     return (
         f"gap {before.value:.3f} -> {after.value:.3f} (reduced chi-square of {after.rows} held-out residuals; "
@@ -173,7 +183,7 @@ def place_lines(findings: Findings) -> list[str]:
     if not where:
         return [no_places(findings.diagnosis)]
     shown = [
-        f"{_channel(p)}, {p.region}: {size_text(p)} (chance {chance_text(p.significance)})" for p in where[:MOST_PLACES]
+        f"{_channel(p)}, {p.region}: {size_text(p)} (chance {chance_text(p.significance)})" for p in where[:MAX_PLACES]
     ]
     left = len(where) - len(shown)
     return [*shown, f"and {left} more"] if left else shown
@@ -184,7 +194,7 @@ def chance_text(chance: float) -> str:
     return f"{chance:.0e}" if chance > 0.0 else "< 1e-300"
 
 
-def _channel(place: Disagreement | Correction) -> str:
+def _channel(place: Disagreement | ResidualTerms) -> str:
     return f"{place.channel}.{place.wheel}" if place.wheel else place.channel
 
 
@@ -198,7 +208,7 @@ def size_text(place: Disagreement) -> str:
 
 
 def effect_lines(number: int, addition: Addition, completed: FittedModel) -> list[str]:
-    """One effect: its parameters, what it is, what else it may be, what would tell."""
+    """One effect: its physics, parameters, alternatives, and what would distinguish it from these."""
     effect = addition.effect
     lines = [f"{number}. {effect.name}, probability {addition.probability:.2f}", f"   {effect.physics}"]
     units = {parameter.name: parameter.unit for parameter in effect.parameters}
@@ -216,14 +226,14 @@ def effect_lines(number: int, addition: Addition, completed: FittedModel) -> lis
     return lines
 
 
-def learned_lines(learned: Sequence[Correction]) -> list[str]:
-    """The descriptions of what no effect explains, and what they are worth."""
-    told = [
+def residual_lines(descriptions: Sequence[ResidualTerms]) -> list[str]:
+    """The residual terms, and a warning of what they are worth."""
+    lines = [
         f"{_channel(c)}: reading less model = {c.formula} [{UNITS[c.channel]}] "
         f"({100 * c.explained:.0f} % of the held-out excess)"
-        for c in learned
+        for c in descriptions
     ]
-    return [*told, WARNING]
+    return [*lines, WARNING]
 
 
 def _soil_lines(findings: Findings) -> list[str]:
@@ -241,10 +251,10 @@ def soil_rows(before: Posterior, after: Posterior, config: Config) -> list[tuple
     both = [{"bearing pressure, kPa": _scaled(p.bearing_pressure(z_ref, b_ref), 1e3)} for p in (before, after)]
     units = {"k_c": ("kN/m^(n+1)", 1e3), "k_phi": ("kN/m^(n+2)", 1e3), "n": ("", 1.0)}
     units |= {"phi": ("deg", math.pi / 180.0), "c": ("kPa", 1e3), "K": ("mm", 1e-3)}
-    for told, posterior in zip(both, (before, after), strict=True):
+    for row, posterior in zip(both, (before, after), strict=True):
         for name, estimate in posterior.parameters().items():
             unit, size = units[name]
-            told[f"{name}, {unit}".rstrip(", ")] = _scaled(estimate, size)
+            row[f"{name}, {unit}".rstrip(", ")] = _scaled(estimate, size)
     return [(name, both[0][name], both[1][name]) for name in both[0]]
 
 

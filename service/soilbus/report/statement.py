@@ -1,6 +1,8 @@
-"""What a diagnosis comes to, in sentences that do not contradict each other: text, page and JSON print these.
+"""A diagnosis in sentences, which text, page and JSON print alike.
 
-What is said depends on all there is to say at once: verdict, effects added, gap left, places of disagreement.
+    sentence = f(verdict, effects added, gap that remains, places of disagreement)
+
+Each sentence depends on all four at once, so that no two of them contradict each other.
 """
 
 from __future__ import annotations
@@ -15,22 +17,22 @@ from soilbus.diagnosis.detectable import Detectable
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.search import Addition
-from soilbus.diagnosis.verdict import AT_TIMES, Verdict, gap_limit
+from soilbus.diagnosis.verdict import P_LARGE_FORMULA_ERROR, Verdict, gap_limit
 from soilbus.estimation.posterior import Posterior, bearing_pressure
 from soilbus.terra.effects.vehicle import GRADE_BESIDE_PITCH
 from soilbus.terra.vehicle import GRAVITY
 
-MOST_FEARED = 3
-"""Effects that may be there unseen which the text lists."""
+MAX_UNSEEN = 3
+"""Effects that may be there unseen that the text lists."""
 
 
 def is_open(diagnosis: Diagnosis) -> bool:
-    """Whether the gap that is left is above what noise alone does."""
+    """Whether the gap that remains is above that of noise alone."""
     return diagnosis.gap_after.value > gap_limit(diagnosis.gap_after.rows)
 
 
 def statement(diagnosis: Diagnosis) -> str:
-    """One line: what was found, and whether something is left besides."""
+    """One line: what was found, and whether a gap remains."""
     names = [addition.effect.name for addition in diagnosis.additions]
     text = _found(diagnosis.verdict, names, bool(diagnosis.where))
     if names and diagnosis.verdict is not Verdict.UNKNOWN and is_open(diagnosis):
@@ -61,14 +63,14 @@ def _found(verdict: Verdict, names: Sequence[str], disagree: bool) -> str:
 
 
 def no_places(diagnosis: Diagnosis) -> str:
-    """What is said where no single place of disagreement stands out."""
+    """The sentence where no single place of disagreement stands out."""
     if diagnosis.additions or diagnosis.verdict is not Verdict.NONE:
         return "no single place stands out from noise: what is missing shows in all of them together"
     return "no channel disagrees with the model anywhere by more than noise"
 
 
 def doubt(diagnosis: Diagnosis) -> str | None:
-    """Why effects that explain the data only together are to be doubted; None where they are not such."""
+    """Why effects that explain the data only together are doubtful; None for other effects."""
     if not diagnosis.imitation:
         return None
     shares = zip(diagnosis.additions, diagnosis.imitation, strict=True)
@@ -86,7 +88,7 @@ def doubt(diagnosis: Diagnosis) -> str | None:
 
 
 def same_push(addition: Addition, completed: FittedModel) -> str | None:
-    """The error of the pitch sensor that would do the same as an offset of the hitch; None where none may."""
+    """The pitch sensor's error that does the same as an offset of the hitch; None where it is implausible."""
     problem = completed.checks[-1].problem
     chassis = problem.rig.chassis
     if addition.effect.name != "draft_offset" or chassis is None or not problem.with_pitch:
@@ -99,27 +101,40 @@ def same_push(addition: Addition, completed: FittedModel) -> str | None:
 
 
 def why_probabilities(addition: Addition) -> str | None:
-    """Why probabilities are so near each other beside falls that are not; None where there is one name only."""
+    """How probabilities follow from the falls of -2 log evidence; None where there is one name only."""
     if len(addition.falls) < 2:
         return None
-    usual, great = addition.divided_by
+    usual, large = addition.temperatures
+    chance = 100 * P_LARGE_FORMULA_ERROR
     return (
         "probabilities: no formula of an effect is the field's, and of falls this great such an error may tip the "
-        f"balance; so their differences are divided by {usual:.0f} (with a chance of {100 * AT_TIMES:.0f} % by "
-        f"{great:.0f}) before half of each is taken as a logarithm of odds"
+        f"balance; so their differences are divided by {usual:.0f} (with a chance of {chance:.0f} % by "
+        f"{large:.0f}) before half of each is taken as a logarithm of odds"
     )
 
 
 def size_of(found: Detectable, size: float) -> str:
-    """A size of an effect with its unit."""
+    """A size of an effect with its unit, as text."""
     unit = found.parameter.unit
     return f"{found.effect.name} {size:.2g}" + ("" if unit == "1" else f" {unit}")
 
 
 def pressure_error(found: Detectable, before: Sequence[Posterior], config: Config) -> tuple[float, float]:
-    """Relative error of the bearing pressure under an unseen effect, and the relative std that is reported.
+    """Bearing pressure under an effect that these recordings could not have shown.
 
-    Of the recording in which it is greatest beside that std.
+    Parameters
+    ----------
+    found
+        The effect with its unseen size.
+    before
+        Soil of each recording as reported.
+    config
+        Names the reference plate.
+
+    Returns
+    -------
+    (float, float)
+        Relative error, and relative std as reported, of the recording in which their ratio is greatest.
     """
     errors = []
     for posterior, soil_error in zip(before, found.soil_error, strict=True):
@@ -130,7 +145,7 @@ def pressure_error(found: Detectable, before: Sequence[Posterior], config: Confi
 
 
 def shown_lines(diagnosis: Diagnosis, config: Config) -> Iterator[str]:
-    """What these recordings could have shown, what not, and what may hide behind the soil's std."""
+    """What these recordings could have shown, what not, and what that may do to the bearing pressure."""
     shown = [found for found in diagnosis.detectable if found.size is not None]
     if shown:
         sizes = ", ".join(size_of(found, found.size) for found in shown if found.size is not None)
@@ -139,13 +154,11 @@ def shown_lines(diagnosis: Diagnosis, config: Config) -> Iterator[str]:
         yield f"they could not have shown, at any usual size: {', '.join(hidden)}"
     before = [diagnosis.soil_before(i) for i in range(len(diagnosis.base.fits))]
     errors = [(found, *pressure_error(found, before, config)) for found in diagnosis.detectable]
-    feared = sorted((e for e in errors if abs(e[1]) > e[2]), key=lambda e: -abs(e[1]))
-    if feared:
-        parts = [
-            f"{size_of(found, found.unseen)} by {100.0 * error:+.1f} %" for found, error, _ in feared[:MOST_FEARED]
-        ]
-        more = f" (and {len(feared) - MOST_FEARED} more by less)" if len(feared) > MOST_FEARED else ""
+    unseen = sorted((e for e in errors if abs(e[1]) > e[2]), key=lambda e: -abs(e[1]))
+    if unseen:
+        parts = [f"{size_of(found, found.unseen)} by {100.0 * error:+.1f} %" for found, error, _ in unseen[:MAX_UNSEEN]]
+        more = f" (and {len(unseen) - MAX_UNSEEN} more by less)" if len(unseen) > MAX_UNSEEN else ""
         yield (
             "what they could not have shown may move the bearing pressure by more than its "
-            f"+- {100.0 * feared[0][2]:.1f} %: {', '.join(parts)}{more}"
+            f"+- {100.0 * unseen[0][2]:.1f} %: {', '.join(parts)}{more}"
         )

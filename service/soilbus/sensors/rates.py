@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.estimation.local_cubics import PARTS, Curve, Series, curve_of, faithful, variance_of_one
+from soilbus.estimation.local_cubics import PHASE_PARTS, Curve, Series, curve_of, faithful, variance_of_one
 from soilbus.estimation.window import NoiseTable, Window, made_window
 from soilbus.sensors.bins import Bins
 from soilbus.sensors.outliers import Samples
@@ -121,7 +121,7 @@ def _binned(channel: _Channel, length: float, n: int) -> _Binned:
 
     left = mean(channel.value[kept] - channel.curve.at(t)[0])
     step = channel.curve.step or length
-    phase = np.rint((centre - mean(t)) / step * PARTS).astype(int)
+    phase = np.rint((centre - mean(t)) / step * PHASE_PARTS).astype(int)
     worth = np.ones(len(bins))  # of straight lines from sample to sample
     if channel.curve.half_width:
         kinds, which = np.unique(np.stack([count.astype(int), phase]), axis=1, return_inverse=True)

@@ -18,7 +18,7 @@ from scipy.special import softmax
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.laplace import FINE, Node, density, profile_over_n
+from soilbus.estimation.laplace import GRID_POINTS, Node, density, profile_over_n
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.parametrization import MAX_PHI, Coordinates
@@ -99,11 +99,11 @@ def _drawn(nodes: list[Node], coordinates: Coordinates, count: int, rng: np.rand
     i = int(np.searchsorted(free, _N))
     others = np.delete(np.arange(len(free)), i)
     u = np.array([node.u for node in nodes])
-    fine = np.linspace(u[0], u[-1], FINE)
-    weight = density(u, FLATTER * np.array([node.unlikelihood for node in nodes]), fine)
+    fine = np.linspace(u[0], u[-1], GRID_POINTS)
+    weight = density(u, FLATTER * np.array([node.neg2_log_density for node in nodes]), fine)
     normals = [_normal(node, coordinates, others) for node in nodes]
     centre, roots = np.array([normal[0] for normal in normals]), np.array([normal[1] for normal in normals])
-    cell = rng.choice(FINE, count, p=weight)
+    cell = rng.choice(GRID_POINTS, count, p=weight)
     log_n = np.clip(fine[cell] + (fine[1] - fine[0]) * (rng.random(count) - 0.5), u[0], u[-1])
     below = np.clip(np.searchsorted(u, log_n) - 1, 0, len(u) - 2)
     share = (log_n - u[below]) / (u[below + 1] - u[below])
@@ -150,7 +150,7 @@ def _point_at(fitting: Objective, soil: Array, near: Node) -> tuple[Iterate, Qua
     at = problem.linearise(place.as_soil(), place.gains, latents)
     latents = problem.updated(at, latents, np.zeros(len(PARAMETERS)), np.zeros(len(place.gains)))
     place = replace(place, latents=latents)
-    return place, fitting.point(place)
+    return place, fitting.quadratic_model(place)
 
 
 def _unlikelihood(fitting: Objective, point: QuadraticModel) -> float:

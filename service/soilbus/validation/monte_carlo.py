@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from soilbus.allocator import keep_freed_memory
 from soilbus.arrays import Array
 from soilbus.config.model import Config
-from soilbus.estimation.assembly import completion_of, model_of, prior_of, rig_of
+from soilbus.estimation.assembly import effects_and_parameters_of, model_of, prior_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.laplace import with_nested_laplace
 from soilbus.estimation.multistart import fit_window
@@ -292,7 +292,7 @@ def _problem(
     })  # fmt: skip
     window, settings = store.window(0.0, duration), config.estimator
     return ObservationModelWithEffects(
-        window, rig, model_of(config), settings.min_speed, settings.max_turn, *completion_of(config)
+        window, rig, model_of(config), settings.min_speed, settings.max_turn, *effects_and_parameters_of(config)
     )
 
 

@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--kind", choices=KINDS, action="append", help="repeatable; all by default")
     parser.add_argument("--half", choices=HALVES, help="all by default")
     parser.add_argument("--only", default="", help="only cases with this in their id")
-    parser.add_argument("--every", type=int, default=1, help="only one of so many of them (1)")
+    parser.add_argument("--every", type=int, default=1, help="only one case in this many (1)")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--list", action="store_true", help="name the cases without driving them")
     parser.add_argument("--json", help="write one object a line for each case")
@@ -40,12 +40,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("\n".join(f"{case.half:7}{case.id}" for case in wanted))
         return 0
     with open(chosen.json, "w") if chosen.json else nullcontext() as out:
-        trials = list(_told(_trials(wanted, chosen.processes), out))
+        trials = list(_reported(_trials(wanted, chosen.processes), out))
     print(report(trials))
     return int(not targets_are_met(trials))
 
 
-def _told(found: Iterable[tuple[Case, Trial | None]], out: TextIO | None) -> Iterator[Trial]:
+def _reported(found: Iterable[tuple[Case, Trial | None]], out: TextIO | None) -> Iterator[Trial]:
     """The trials of cases that can be driven, each printed in a line, and written to `out` as JSON."""
     for case, trial in found:
         if trial is None:

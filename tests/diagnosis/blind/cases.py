@@ -128,7 +128,7 @@ def _case(kind: str, seed: int, number: int, forms: tuple[Form, ...], size: str)
     rng = np.random.default_rng([seed, zlib.crc32("/".join([kind, *titles, size, str(number)]).encode())])
     name = str(rng.choice(SOILS))
     soil, with_sinkage = soil_named(name), bool(rng.integers(2)) or any(form.by_sinkage for form in forms)
-    config = _told(kind, soil, with_sinkage, rng)
+    config = _configured(kind, soil, with_sinkage, rng)
     setting = Setting(soil, _plain_sinkage(soil), rng)
     parts = tuple(form.hide(form.size(size, with_sinkage), setting) for form in forms)
     sensors = "sinkage" if with_sinkage else "bare"
@@ -143,15 +143,15 @@ def _case(kind: str, seed: int, number: int, forms: tuple[Form, ...], size: str)
         soil_name=name,
         soil=soil,
         with_sinkage=with_sinkage,
-        config=together(parts).told(config),
+        config=together(parts).configured(config),
         scenario=_scenario(kind, name, rng),
         seed=int(rng.integers(2**31)),
         parts=parts,
     )
 
 
-def _told(kind: str, soil: Soil, with_sinkage: bool, rng: np.random.Generator) -> Config:
-    """What the diagnosis is told: sensors, and c and K off by 20 to 25 %.
+def _configured(kind: str, soil: Soil, with_sinkage: bool, rng: np.random.Generator) -> Config:
+    """The configuration that the diagnosis has: sensors, and c and K off by 20 to 25 %.
 
     Hard: c and K off by 30 to 40 %, three times the gain errors, and half the time no accelerometer.
     """

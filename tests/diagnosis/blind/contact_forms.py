@@ -139,13 +139,15 @@ def _rolls(flattened: Any) -> Any:
 
 
 def _shear(size: float, setting: Setting) -> Hidden:
-    """Exponential data, rational model; how much tells the two apart is the range of slip."""
+    """Exponential data, rational model; how well the two are distinguished depends on the range of slip."""
 
     def law(name: str) -> Any:
         return lambda config: config.model_copy(update={"model": config.model.model_copy(update={"shear_law": name})})
 
     return Hidden(
-        tractor=law("exponential"), told=law("rational"), way=lambda scenario: replace(scenario, slip=Swing(0.05, size))
+        tractor=law("exponential"),
+        configured=law("rational"),
+        way=lambda scenario: replace(scenario, slip=Swing(0.05, size)),
     )
 
 

@@ -33,13 +33,13 @@ class Hidden(NamedTuple):
     """How an effect gets into a recording.
 
     effects: on the simulated drive.  tractor: the configuration that is truly driven, from
-    the one that the diagnosis is given.  told: that one, from the usual one.  way: the
+    the one that the diagnosis is given.  configured: that one, from the usual one.  way: the
     scenario.  after: the recording, once measured.
     """
 
     effects: tuple[Active, ...] = ()
     tractor: Callable[[Config], Config] = _same
-    told: Callable[[Config], Config] = _same
+    configured: Callable[[Config], Config] = _same
     way: Callable[[Scenario], Scenario] = _same
     after: Callable[[Recording], Recording] = _same
 

@@ -66,12 +66,12 @@ def _sticking(draft: Array, around: Any, values: Any) -> Array:
 
 def _held_back(true: Array, band: float) -> Array:
     """Error (N,) of a reading that follows the truth (N,) only when that has moved away by more than the band."""
-    told = np.empty_like(true)
+    reported = np.empty_like(true)
     held = true[0]
     for i, now in enumerate(true):
         held = min(max(held, now - band), now + band)
-        told[i] = held
-    return told - true
+        reported[i] = held
+    return reported - true
 
 
 def _swaying(draft: Array, around: Any, values: Any) -> Array:

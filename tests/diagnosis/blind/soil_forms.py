@@ -21,7 +21,7 @@ def _ding(state: WheelState, model: Any, around: Any, values: Any) -> Any:
 
 
 def _lyasko(state: WheelState, model: Any, around: Any, values: Any) -> Any:
-    """z = z_0 ((1 + s) / (1 - 0.5 s))^m: so much of the depth carries nothing."""
+    """z = z_0 ((1 + s) / (1 - 0.5 s))^m: that share of the depth carries nothing."""
     slip = np.maximum(state.slip, 0.0)
     deeper = ((1.0 + slip) / (1.0 - 0.5 * slip)) ** values["size"]
     return state._replace(K_L=state.K_L * deeper**-state.n), model
@@ -55,7 +55,7 @@ def _denser(state: WheelState, model: Any, around: Any, values: Any) -> Any:
 
 
 def _in_the_rut(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
-    """Rear wheels load soil again that has borne the pressure at the depth of the rut: stiff up to there, then anew."""
+    """Rear wheels load soil that has borne the pressure at the depth of the rut: stiff up to there, then virgin."""
     rut = values["size"] * values["sinkage"] * np.asarray(around.rear, float)
     borne, stiff = state.K_L * rut**state.n, _STIFFER * state.K_L * values["sinkage"] ** (state.n - 1.0)
 

@@ -17,7 +17,7 @@ VISIBLE, BARELY = 100.0, 20.0
 CLEAR_GAP = 1.1
 FAR = "of which the catalogue leaves over 10 %"
 BINS = (0.0, 0.2, 0.5, 0.8, 0.95, 1.001)
-UNTOLD = 0.005
+UNNAMED = 0.005
 """Probability that a name outside the set is taken to be given."""
 
 
@@ -37,7 +37,7 @@ def report(trials: Sequence[Trial]) -> str:
             parts.append(f"== {half}: {len(chosen)} cases")
             parts += [f"  {figure.text}" + "  MISSED" * (figure.met is False) for figure in figures(chosen)]
     parts += ["", "== confusion, visible single effects (rows: hidden; columns: named first)", confusion(trials)]
-    parts += ["", "== calibration: probability told of a name, names, share that was right", *calibration(trials)]
+    parts += ["", "== calibration: reported probability of a name, names, share that was right", *calibration(trials)]
     return "\n".join(parts) + "\n"
 
 
@@ -54,7 +54,7 @@ def targets_are_met(trials: Sequence[Trial]) -> bool:
 def figures(trials: Sequence[Trial]) -> Iterator[Figure]:
     """One for each line.
 
-    What is visible the generator alone says.  Every case that is counts, whatever the diagnosis made of it: one that
+    What is visible the generator alone says.  Every case that is counts, with any diagnosis: one that
     was not named, or failed, is a miss of each figure.
     """
     single = [t for t in trials if t.kind == "single"]
@@ -72,8 +72,8 @@ def figures(trials: Sequence[Trial]) -> Iterator[Figure]:
         yield _share(f"nulls, {kind}: falsely named", [bool(t.named) for t in nulls], most=most)
         yield _share(f"nulls, {kind}: falsely named or unknown", [t.verdict != "none" for t in nulls])
     outside = [t for t in trials if t.kind == "outside" and not t.imitable and t.true_gap > CLEAR_GAP]
-    told = [t.verdict == "unknown" for t in outside]
-    yield _share(f"outside the catalogue, not imitable, true gap > {CLEAR_GAP}: unknown", told, least=0.90)
+    reported = [t.verdict == "unknown" for t in outside]
+    yield _share(f"outside the catalogue, not imitable, true gap > {CLEAR_GAP}: unknown", reported, least=0.90)
     pairs = [t for t in trials if t.kind == "pair" and t.visible >= VISIBLE]
     yield _share("pairs: both named", [set(t.hidden) <= set(t.named) for t in pairs])
     yield _share("pairs: both in the sets", [set(t.hidden) <= in_set(t) for t in pairs], least=0.80)
@@ -96,7 +96,7 @@ def figures(trials: Sequence[Trial]) -> Iterator[Figure]:
         yield Figure(text, after <= 0.02)
         errors = np.array([(t.bearing_after, t.bearing_sd) for t in visible if t.verdict != "failed"]).reshape(-1, 2)
         expected, z = np.median(errors[:, 1]) * norm.ppf(0.75), np.median(np.abs(errors[:, 0] / errors[:, 1]))
-        yield Figure(f"  of normal errors of the told sd: {100 * expected:.1f} %; error over told sd: {z:.2f}  (0.67)")
+        yield Figure(f"  of normal errors of the reported sd: {100 * expected:.1f} %; error over sd: {z:.2f}  (0.67)")
     if trials:
         seconds = [t.seconds for t in trials]
         median, nearly_all = np.quantile(seconds, (0.5, 0.95))
@@ -109,7 +109,7 @@ def _honest(trial: Trial) -> bool:
 
 
 def _by_noise(least: float, rows: int) -> float:
-    """Probability that a reduced chi-square of so many residuals that are noise is no farther above 1 than this."""
+    """Probability that a reduced chi-square of `rows` residuals of noise is no farther above 1 than `least`."""
     return float(chi2.cdf((1.0 + least) * rows, rows))
 
 
@@ -136,23 +136,23 @@ def confusion(trials: Sequence[Trial]) -> str:
 
 
 def calibration(trials: Sequence[Trial]) -> Iterator[str]:
-    """Every name of the first sets of visible and barely visible single effects: told, cases, share that was right.
+    """Every name of the first sets of visible and barely visible single effects: reported, cases, share that was right.
 
     Then the expected calibration error, over these bins, and the mean logarithmic score of
-    what was told of the truth (Gneiting & Raftery 2007, J. Am. Stat. Assoc. 102:359); a
-    name that is not told of shares UNTOLD.
+    what was reported of the truth (Gneiting & Raftery 2007, J. Am. Stat. Assoc. 102:359); a
+    name that is not in the set counts with UNNAMED.
     """
     chosen = [t for t in trials if t.kind == "single" and t.visible >= BARELY]
-    told = [(p, name == t.hidden[0]) for t in chosen if t.sets for name, p in t.sets[0].items()]
+    reported = [(p, name == t.hidden[0]) for t in chosen if t.sets for name, p in t.sets[0].items()]
     error = 0.0
     for low, high in itertools.pairwise(BINS):
-        members = [(p, right) for p, right in told if low <= p < high]
+        members = [(p, right) for p, right in reported if low <= p < high]
         if members:
             mean, share = (float(np.mean(column)) for column in zip(*members, strict=True))
-            error += abs(mean - share) * len(members) / len(told)
+            error += abs(mean - share) * len(members) / len(reported)
             yield f"  {mean:.2f}  {len(members):4}  {share:.2f}"
     if chosen:
-        score = float(np.mean([-np.log(t.sets[0].get(t.hidden[0], UNTOLD) if t.sets else UNTOLD) for t in chosen]))
+        score = float(np.mean([-np.log(t.sets[0].get(t.hidden[0], UNNAMED) if t.sets else UNNAMED) for t in chosen]))
         yield f"  expected calibration error {error:.3f}, logarithmic score {score:.3f} of {len(chosen)} cases"
 
 

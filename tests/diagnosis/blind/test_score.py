@@ -86,11 +86,11 @@ def test_an_effect_broken_on_purpose_lowers_the_score():
 
 
 def a_trial(**changes: object) -> Trial:
-    told = {"verdict": "named", "named": ("lugs",), "sets": ({"lugs": 1.0},), "falls": ({},), "gap_before": 2.0}
-    told |= {"gap_after": 1.0, "rows": 3000, "bearing_before": 0.1, "bearing_after": 0.01, "bearing_sd": 0.01}
+    reported = {"verdict": "named", "named": ("lugs",), "sets": ({"lugs": 1.0},), "falls": ({},), "gap_before": 2.0}
+    reported |= {"gap_after": 1.0, "rows": 3000, "bearing_before": 0.1, "bearing_after": 0.01, "bearing_sd": 0.01}
     truth = {"id": "a", "kind": "single", "half": "report", "hidden": ("lugs",), "size": "large", "imitable": False}
     truth |= {"far": False, "visible": 1000.0, "true_gap": 2.0, "seconds": 1.0}
-    return Trial(**truth | told | changes)
+    return Trial(**truth | reported | changes)
 
 
 GOOD = [a_trial() for _ in range(9)]

@@ -29,7 +29,7 @@ class Trial:
     with probabilities.  visible: what the recording shows of the effect, of two effects of
     the less visible one beside the other, and true_gap what it leaves unexplained, by the generator
     alone (visible.py; 0 and 1 where nothing is hidden).  A diagnosis that fails has the verdict FAILED and no names.
-    bearing_*: relative errors of the bearing pressure; bearing_sd the told relative deviation in the end.
+    bearing_*: relative errors of the bearing pressure; bearing_sd the relative deviation reported in the end.
     """
 
     id: str
@@ -69,18 +69,23 @@ def record_of_case(case: Case) -> Record:
     return record_of(case.id, store.window(0.0, end), rig, model_of(config), settings.min_speed, settings.max_turn)
 
 
-def tried(case: Case, candidates: Sequence[Effect] = tuple(CATALOGUE.values())) -> Trial:
-    """The case diagnosed; SimulationError if it cannot be driven."""
-    record, prior, truth = record_of_case(case), prior_of(case.config), shown(case) if case.parts else NOTHING
+def tried(case: Case, candidates: Sequence[Effect] = tuple(CATALOGUE.values()), truth: Shown | None = None) -> Trial:
+    """The case diagnosed; SimulationError if it cannot be driven.
+
+    truth: what the recording shows of the effect; None: worked out, which takes longer than the diagnosis.
+    """
+    record, prior = record_of_case(case), prior_of(case.config)
+    if truth is None:
+        truth = shown(case) if case.parts else NOTHING
     begin = time.process_time()
-    told: dict[str, Any] = FAILED
+    reported: dict[str, Any] = FAILED
     try:
         found = diagnose([record], prior, list(candidates))
     except (NotFitted, np.linalg.LinAlgError):
         pass
     else:
         before, after = (_bearing(case, soil) for soil in (found.soil_before(0), found.soil_after(0)))
-        told = {
+        reported = {
             "verdict": str(found.verdict),
             "named": tuple(a.effect.name for a in found.additions),
             "sets": tuple({a.effect.name: a.probability} | a.alternatives for a in found.additions),
@@ -103,7 +108,7 @@ def tried(case: Case, candidates: Sequence[Effect] = tuple(CATALOGUE.values())) 
         visible=truth.energy,
         true_gap=truth.gap,
         seconds=time.process_time() - begin,
-        **told,
+        **reported,
     )
 
 
@@ -119,6 +124,6 @@ def _bearing(case: Case, soil: Posterior) -> Estimate:
     return soil.bearing_pressure(settings.z_ref, settings.b_ref)
 
 
-def _bearing_error(case: Case, told: Estimate) -> float:
+def _bearing_error(case: Case, reported: Estimate) -> float:
     settings = case.config.estimator
-    return float(np.log(told.value / case.soil.bearing_pressure(settings.z_ref, settings.b_ref)))
+    return float(np.log(reported.value / case.soil.bearing_pressure(settings.z_ref, settings.b_ref)))

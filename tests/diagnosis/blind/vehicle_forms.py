@@ -35,7 +35,7 @@ def _delayed(torque: Array, around: Any, values: Any) -> Array:
 
 
 def _averaged(torque: Array, around: Any, values: Any) -> Array:
-    """The mean of so many seconds before, as of a node that samples faster than it sends."""
+    """The mean of the time `size` [s] before, as of a node that samples faster than it sends."""
     t = np.ravel(around.t)
     longer = np.concatenate([[t[0] - values["size"]], t])
     out = []
@@ -89,22 +89,22 @@ def _hill(size: float, setting: Setting) -> Hidden:
 
 
 def _no_pitch_sensor(size: float, setting: Setting) -> Hidden:
-    """An undulating field, and a tractor on which nothing tells the pitch."""
+    """An undulating field, and a tractor on which nothing measures the pitch."""
     x = np.cumsum(setting.rng.uniform(15.0, 35.0, 14)) - 20.0
     slope = size * setting.rng.uniform(-1.0, 1.0, 14)
 
-    def told(config: Config) -> Config:
+    def configured(config: Config) -> Config:
         return config.model_copy(update={"signals": config.signals.model_copy(update={"pitch": None})})
 
     return Hidden(
-        told=told,
-        tractor=told,
+        configured=configured,
+        tractor=configured,
         way=lambda scenario: replace(scenario, slope=tuple(zip(x.tolist(), slope.tolist(), strict=True))),
     )
 
 
 def _towed(around: Any, values: Any) -> Array:
-    """An implement of this mass behind a hitch that tells soil forces only."""
+    """An implement of this mass behind a hitch that measures soil forces only."""
     return np.ravel(values["size"] * np.asarray(around.acceleration))
 
 

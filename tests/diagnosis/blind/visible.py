@@ -32,9 +32,9 @@ from .form import Hidden, together
 from .rim import rim_forces
 
 BIN = 0.1
-"""Readings are averaged over so much time [s], as any analyst of slow drives may."""
+"""Time [s] over which readings are averaged, as any analyst of slow drives may."""
 EVERY = 3
-"""Of so many bins one is looked at, and counts for all."""
+"""One bin in this many is used, and counts for all."""
 STEP = 1e-4
 """Of the finite differences: rad, 1, m/s, m/s^2, and relative for soil parameters."""
 ROUNDS, HALVINGS = 16, 6
@@ -187,7 +187,7 @@ def _instants(case: Case, recording: Recording, count: int) -> _Instants:
 
 
 def _binned(t: Array, value: Array, count: int) -> Array:
-    """Means over every so manieth of `count` bins of samples (N,)."""
+    """Means of samples (N,) over each EVERY-th of `count` bins."""
     place = np.floor(t / BIN + 1e-9).astype(int)
     kept = place < count
     means = np.bincount(place[kept], value[kept], count) / np.bincount(place[kept], minlength=count)
@@ -227,8 +227,8 @@ class _Fit:
 
     def energy(self, at: _Unknowns) -> float:
         """What is to be least."""
-        told = at.of_drive[self.free] / self.prior_sd[self.free]
-        return float(np.sum(self.residuals(at) ** 2) + np.sum(told**2))
+        standardised = at.of_drive[self.free] / self.prior_sd[self.free]
+        return float(np.sum(self.residuals(at) ** 2) + np.sum(standardised**2))
 
     def least(self) -> float:
         """Gauss-Newton: a step of all unknowns, after which the latents follow those of the whole drive."""
@@ -246,8 +246,8 @@ class _Fit:
 
     def gap(self) -> float:
         """Reduced chi-square."""
-        told = [name.partition(".")[0] in ABOUT_THE_SOIL for name in self.drive.names]
-        return 1.0 + float(np.sum(self.residuals(self.at) ** 2)) / (EVERY * len(self.S) * sum(told))
+        of_soil = [name.partition(".")[0] in ABOUT_THE_SOIL for name in self.drive.names]
+        return 1.0 + float(np.sum(self.residuals(self.at) ** 2)) / (EVERY * len(self.S) * sum(of_soil))
 
     def relaxed(self, at: _Unknowns) -> _Unknowns:
         """The same with the likeliest latents, each instant for itself."""

@@ -203,5 +203,4 @@ TYRE_DEFLECTION = Effect(
     forces=_flattened_forces,
     of_tyre=True,
     ruled_out="a rigid wheel has no tyre that could flatten",
-    form_left=1.0,
 )

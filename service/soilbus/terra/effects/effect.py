@@ -121,8 +121,6 @@ class Effect:
     of_record: its parameters describe the ground of one record and mean nothing in another.
     of_tyre: it is there only where a wheel has a tyre.
     ruled_out: what on the vehicle makes it impossible, where anything does.
-    form_left: share of what it changes of the soil's parameters by which these are off (standard deviation), as no
-    effect's formula is the field's: of the blind tune halves of seeds 109 to 113.
     """
 
     name: str
@@ -142,7 +140,6 @@ class Effect:
     of_tyre: bool = False
     ruled_out: str = ""
     late: Mapping[str, Late] = field(default_factory=dict, hash=False)
-    form_left: float = 0.125
 
     @property
     def neutral(self) -> dict[str, float]:

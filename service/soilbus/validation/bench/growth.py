@@ -79,7 +79,7 @@ def _steps(problem: ObservationModel, prior: SoilPrior, soil: Array) -> Callable
     fitting = Objective(problem, prior, Gaussian.of(prior, problem.gain_std))
 
     def moved(place: Iterate) -> Iterate:
-        point = fitting.point(place)
+        point = fitting.quadratic_model(place)
         step = None if point is None else point.step()
         if point is None or step is None:
             raise AssertionError("a Gauss-Newton step failed at the optimum")

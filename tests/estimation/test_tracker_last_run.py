@@ -1,4 +1,4 @@
-"""What a tracker knows of its sensors after a pause, on the same or another soil."""
+"""Gains of the last run as prior after a pause, on the same or another soil."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from drives import errors, tracker_of, windows
 
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.tracker import PERSISTENCE, gain_errors, prior_from_last_run
+from soilbus.estimation.tracker import GAIN_CORRELATION_TIME, gain_errors, prior_from_last_run
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -37,16 +37,16 @@ def learned(before) -> Gaussian:
     tracker = tracker_of(CONFIG)
     for window, end in before:
         tracker.estimate(window, end)
-    assert tracker.newest is not None
-    return tracker.newest
+    assert tracker.newest_posterior is not None
+    return tracker.newest_posterior
 
 
 def first_fit(window, gaussian: Gaussian | None, elapsed: float = NIGHT):
     """Of a run that knew this beforehand."""
     tracker = tracker_of(CONFIG)
     if gaussian is not None:
-        tracker.recall(gaussian, elapsed)
-    tracker.forget()  # as the first window of every run asks
+        tracker.start_from_last_run(gaussian, elapsed)
+    tracker.reset()  # as the first window of every run asks
     tracked = tracker.estimate(*window)
     assert not tracked.mismatch
     return tracked.fit
@@ -62,10 +62,10 @@ def test_gains_wander_about_their_prior_as_long_as_nobody_looks():
     rng = np.random.default_rng(1)
     root = 0.1 * rng.standard_normal((20, 20)) * np.concatenate([np.ones(6), GAIN_STD])[:, None]
     gaussian = Gaussian(PRIOR.median * 2.0, GAIN_STD * rng.standard_normal(14), root @ root.T)
-    for elapsed in (0.0, 60.0, PERSISTENCE, 30 * PERSISTENCE):
+    for elapsed in (0.0, 60.0, GAIN_CORRELATION_TIME, 30 * GAIN_CORRELATION_TIME):
         left = prior_from_last_run(gaussian, PRIOR, GAIN_STD, elapsed)
         # simulated: dg = -g dt / T + sqrt(2 / T) std dW, whose steps over any time are known exactly
-        still = math.exp(-elapsed / PERSISTENCE)
+        still = math.exp(-elapsed / GAIN_CORRELATION_TIME)
         at_first = rng.multivariate_normal(gaussian.gains, gaussian.covariance[6:, 6:], 200_000, method="cholesky")
         wandered = still * at_first + math.sqrt(1 - still**2) * GAIN_STD * rng.standard_normal(at_first.shape)
         assert left.gains == pytest.approx(wandered.mean(0), abs=0.02 * GAIN_STD.max())
@@ -89,31 +89,31 @@ def test_a_gain_that_is_held_stays_held():
 @pytest.mark.parametrize(("first", "second", "seed"), [("wet_clay", "loam", 2), ("loam", "dry_sand", 3)])
 def test_a_tractor_that_was_moved_meanwhile_is_not_drawn_to_the_old_soil(first, second, seed):
     before, after = drive(first, second, seed)
-    fit, anew = first_fit(after, learned(before)), first_fit(after, None)
-    off, off_anew = errors(fit.posterior, SOILS[second]), errors(anew.posterior, SOILS[second])
+    fit, alone = first_fit(after, learned(before)), first_fit(after, None)
+    off, off_alone = errors(fit.posterior, SOILS[second]), errors(alone.posterior, SOILS[second])
     assert np.abs(off).max() < 3.0
-    assert np.abs(off - off_anew).max() < 1.0
-    assert fit.posterior.tan_phi().std < anew.posterior.tan_phi().std
+    assert np.abs(off - off_alone).max() < 1.0
+    assert fit.posterior.tan_phi().std < alone.posterior.tan_phi().std
 
 
 def test_known_gains_make_the_first_window_surer(onto_clay):
     gaussian, after = onto_clay
-    fit, anew = first_fit(after, gaussian), first_fit(after, None)
+    fit, alone = first_fit(after, gaussian), first_fit(after, None)
     assert np.abs(errors(fit.posterior, SOILS["wet_clay"])).max() < 3.0
-    assert fit.posterior.tan_phi().std < 0.97 * anew.posterior.tan_phi().std
-    assert not np.array_equal(fit.gains, anew.gains)
+    assert fit.posterior.tan_phi().std < 0.97 * alone.posterior.tan_phi().std
+    assert not np.array_equal(fit.gains, alone.gains)
 
 
 def test_gains_that_the_data_speak_against_are_forgotten(onto_clay):
     gaussian, _ = onto_clay
     for seed in (6, 7):  # the simulator draws other gains for each recording: the sensors were all exchanged
         _, of_other_sensors = drive("loam", "dry_sand", seed)
-        fit, anew = first_fit(of_other_sensors, gaussian, 600.0), first_fit(of_other_sensors, None)
-        assert np.array_equal(fit.gaussian.soil, anew.gaussian.soil)
-        assert np.array_equal(fit.gaussian.covariance, anew.gaussian.covariance)
+        fit, alone = first_fit(of_other_sensors, gaussian, 600.0), first_fit(of_other_sensors, None)
+        assert np.array_equal(fit.gaussian.soil, alone.gaussian.soil)
+        assert np.array_equal(fit.gaussian.covariance, alone.gaussian.covariance)
 
 
 def test_after_years_nothing_is_left(onto_clay):
     gaussian, after = onto_clay
-    fit, anew = first_fit(after, gaussian, 1e9), first_fit(after, None)
-    assert fit.gaussian.soil == pytest.approx(anew.gaussian.soil, rel=1e-6)
+    fit, alone = first_fit(after, gaussian, 1e9), first_fit(after, None)
+    assert fit.gaussian.soil == pytest.approx(alone.gaussian.soil, rel=1e-6)

@@ -1,4 +1,4 @@
-"""A soil that drifts: what is said is of the soil at the end of the window, and as sure as that can be."""
+"""A soil that drifts: the estimate is of the soil at the end of the window, with the sd that it has there."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from drives import errors, task_of, tracker_of, windows
 from scipy.special import expit
 
 from soilbus.decision.traversability import Status
-from soilbus.estimation.drift_filter import PIECES, STEADY, at_window_end
+from soilbus.estimation.drift_filter import PIECES, STEADY_DRIFT_SD, at_window_end
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.solver import Iterate, Objective
@@ -91,11 +91,11 @@ def test_the_filter_is_the_joint_solution_for_the_soils_of_all_pieces(drift, sim
     ).mode  # of which the linear window tells
 
     # The same by dense systems: soil of piece 0, 1, ..., then gains, then a steady change or none.
-    fitting = Objective(problem, case.prior, before)
+    objective = Objective(problem, case.prior, before)
     place = Iterate(fit.optimum.soil, fit.optimum.gains, fit.optimum.latents, 0.0, 0)
-    at, directions = fit.optimum.at, fitting.directions(place)
-    free, kept = len(fitting.free), directions.shape[1]
-    known = fitting.prior_at(place)
+    at, directions = fit.optimum.at, objective.directions(place)
+    free, kept = len(objective.free), directions.shape[1]
+    known = objective.prior_at(place)
     m = at.by_latents.shape[1]
     ago = (fit.optimum.t - fit.optimum.t[-1]) / 10.0
     steps, covariances, evidences = [], [], []
@@ -125,22 +125,24 @@ def test_the_filter_is_the_joint_solution_for_the_soils_of_all_pieces(drift, sim
             else:
                 link = (of(piece, 0.0) - of(piece - 1, 0.0))[:free]
                 information += link.T @ link * PIECES / drift**2
-        information[n - steady :, n - steady :] += np.eye(steady) / (STEADY * drift) ** 2
+        information[n - steady :, n - steady :] += np.eye(steady) / (STEADY_DRIFT_SD * drift) ** 2
         last = np.concatenate([np.arange(free) + free * (PIECES - 1), np.arange(free * PIECES, n - steady)])
         covariance = np.linalg.inv(information)
         steps.append(-(covariance @ gradient)[last])
         covariances.append(covariance[np.ix_(last, last)])
         cost -= gradient @ covariance @ gradient
-        evidences.append(cost + np.linalg.slogdet(information)[1] + 2.0 * steady * np.log(STEADY * drift))
+        evidences.append(cost + np.linalg.slogdet(information)[1] + 2.0 * steady * np.log(STEADY_DRIFT_SD * drift))
     probable = expit((evidences[0] - evidences[1]) / 2.0)  # the steady change
     off = steps[1] - steps[0]
     step = steps[0] + probable * off
     covariance = (1.0 - probable) * covariances[0] + probable * covariances[1]
     covariance += probable * (1.0 - probable) * np.outer(off, off)
-    soil = fitting.coordinates.moved(place.soil, step[:free])
+    soil = objective.coordinates.stepped(place.soil, step[:free])
     np.testing.assert_allclose(now.soil, soil, rtol=1e-6)
-    np.testing.assert_allclose(now.gains[fitting.active], fit.optimum.gains[fitting.active] + step[free:], atol=1e-7)
-    spread = fitting.coordinates.log_directions(soil)
+    np.testing.assert_allclose(
+        now.gains[objective.active], fit.optimum.gains[objective.active] + step[free:], atol=1e-7
+    )
+    spread = objective.coordinates.log_directions(soil)
     within = drift**2 / 3.0 / PIECES * np.eye(free)  # the end of the last piece is not its middle
     expected = spread @ (covariance[:free, :free] + within) @ spread.T
     np.testing.assert_allclose(now.covariance[:6, :6], expected, rtol=1e-5, atol=1e-12)
@@ -151,9 +153,9 @@ def test_what_does_not_drift_stays_as_it_was(simulated):
     problem = case.problem()
     before = Gaussian.of(case.prior, problem.gain_std)
     fit = fit_window(problem, case.prior, before)
-    fitting = Objective(problem, case.prior, before)
-    assert at_window_end(fitting, fit, 10.0, 0.0) is fit
-    still = at_window_end(fitting, fit, 10.0, 1e-5).gaussian
+    objective = Objective(problem, case.prior, before)
+    assert at_window_end(objective, fit, 10.0, 0.0) is fit
+    still = at_window_end(objective, fit, 10.0, 1e-5).gaussian
     np.testing.assert_allclose(np.log(still.soil / fit.gaussian.soil), 0.0, atol=2e-3)
     np.testing.assert_allclose(np.diag(still.covariance), np.diag(fit.gaussian.covariance), rtol=0.02)
 
@@ -166,13 +168,13 @@ def test_all_that_a_fit_says_moves_as_its_mode_does_and_is_less_sure(overrides, 
     before = Gaussian.of(prior, problem.gain_std)
     fit = fit_window(problem, prior, before)
     fit = replace(fit, marginalised=fit.mode.mixture(fit.mode, 0.5))
-    fitting = Objective(problem, prior, before)
-    now = at_window_end(fitting, fit, 10.0, 0.03)
+    objective = Objective(problem, prior, before)
+    now = at_window_end(objective, fit, 10.0, 0.03)
     assert (fit.second_mode is None) == (wheels == 4)
     assert (fit.gaussian is fit.mode) == (now.gaussian is now.mode) == (bool(overrides) or wheels == 2)
 
     def step(old, new):
-        at = fitting.coordinates.position
+        at = objective.coordinates.position
         return np.concatenate([at(new.soil) - at(old.soil), new.gains - old.gains])
 
     pairs = [(fit.gaussian, now.gaussian), (fit.marginalised, now.marginalised)]
@@ -181,7 +183,7 @@ def test_all_that_a_fit_says_moves_as_its_mode_does_and_is_less_sure(overrides, 
         assert now.second_mode.share == fit.second_mode.share
     moved = step(fit.mode, now.mode)
     assert np.abs(moved).max() > 0.01
-    free = np.concatenate([prior.free, 6 + fitting.active])
+    free = np.concatenate([prior.free, 6 + objective.active])
     for old, new in pairs:
         assert step(old, new) == pytest.approx(moved, abs=2e-3)
         std = np.sqrt(np.diag(new.covariance)[free])

@@ -19,7 +19,7 @@ SOILS = ("loam", "wet_clay", "dry_sand", "clayey_soil_38")
 
 
 def results(soil: str, scale: float | np.ndarray, seed: int) -> list[WindowResult]:
-    """Windows of a drive whose sinkage sensors read so many times (W,) what they should."""
+    """Windows of a drive whose sinkage sensors read the truth times a factor (W,)."""
     config = reference_configuration()
     scenario = Scenario(14.0, (Patch(0.0, soil),), slip=Swing(0.05, 0.40))
     estimator = WindowEstimator(config)

@@ -11,7 +11,7 @@ from drives import errors, tracker_of, windows
 
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.path_curvature import curve_of, rim_difference, sides, with_curve
+from soilbus.estimation.path_curvature import curvature_of, rim_difference, sides, with_curvature
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -24,13 +24,13 @@ def test_a_curve_changes_neither_the_soil_nor_how_sure_of_it_a_window_is(radius)
     rig, scenario = rig_of(config), Scenario(14.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))
     straight, bent = tracker_of(config), tracker_of(config)
     for window, end in windows(config, simulate(config, scenario, 1)):
-        expected, told = straight.estimate(window, end), bent.estimate(curved(window, rig, 1.0 / radius), end)
-        assert not told.mismatch
-        of_curve, of_line = (errors(r.fit.posterior, SOILS["loam"]) for r in (told, expected))
+        expected, output = straight.estimate(window, end), bent.estimate(curved(window, rig, 1.0 / radius), end)
+        assert not output.mismatch
+        of_curve, of_line = (errors(r.fit.posterior, SOILS["loam"]) for r in (output, expected))
         assert of_curve == pytest.approx(of_line, abs=0.3)
-        std = [r.fit.posterior.tan_phi().std for r in (told, expected)]
+        std = [r.fit.posterior.tan_phi().std for r in (output, expected)]
         assert std[0] == pytest.approx(std[1], rel=0.1)
-        gains = told.fit.gains[[i for i, name in enumerate(_names(bent, window)) if name.startswith("speed")]]
+        gains = output.fit.gains[[i for i, name in enumerate(_names(bent, window)) if name.startswith("speed")]]
         assert gains @ sides(rig) / 4.0 == pytest.approx(TRACK / (2.0 * radius), abs=0.004)
 
 
@@ -39,8 +39,8 @@ def _names(tracker, window):
 
 
 def test_without_that_unknown_a_curve_is_a_mismatch(monkeypatch):
-    monkeypatch.setattr("soilbus.estimation.tracker.with_curve", lambda gaussian, curve: gaussian)
-    monkeypatch.setattr("soilbus.estimation.path_curvature.BENT", np.inf)
+    monkeypatch.setattr("soilbus.estimation.tracker.with_curvature", lambda gaussian, curve: gaussian)
+    monkeypatch.setattr("soilbus.estimation.path_curvature.MIN_CURVATURE_GAIN", np.inf)
     config = reference_configuration()
     scenario = Scenario(11.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))
     window, end = next(windows(config, simulate(config, scenario, 1)))
@@ -53,12 +53,12 @@ def test_a_curve_that_begins_within_a_window_is_no_soil(seed, monkeypatch):
     config = reference_configuration([f"model.form.{name}=0" for name in ("peak", "peak_by_slip", "exit", "shear")])
 
     def away() -> np.ndarray:
-        told = [w for w in driven(config, "loam", 75.0, seed) if w.t > 0.0]
-        assert all(w.valid for w in told)
-        return np.array([w.away for w in told])
+        output = [w for w in driven(config, "loam", 75.0, seed) if w.t > 0.0]
+        assert all(w.valid for w in output)
+        return np.array([w.away for w in output])
 
     assert np.abs(away()).max() < 3.0
-    monkeypatch.setattr("soilbus.estimation.path_curvature.BENT", np.inf)
+    monkeypatch.setattr("soilbus.estimation.path_curvature.MIN_CURVATURE_GAIN", np.inf)
     assert np.abs(away()[:, 1]).max() > 3.0
 
 
@@ -74,7 +74,7 @@ def test_only_differences_between_the_sides_are_freed_and_by_as_much_as_the_rims
     problem = case.problem(curved(case.window, case.rig, 1.0 / 50.0))
     assert rim_difference(problem) == pytest.approx(TRACK / 100.0, abs=0.007)
     before = Gaussian.of(case.prior, problem.gain_std)
-    added = with_curve(before, curve_of(problem)).covariance - before.covariance
+    added = with_curvature(before, curvature_of(problem)).covariance - before.covariance
     speeds = [6 + problem.gain_names.index(f"speed.{wheel}") for wheel in case.rig.wheels]
     assert np.flatnonzero(added.any(axis=0)).tolist() == speeds
     of_speeds = added[np.ix_(speeds, speeds)]

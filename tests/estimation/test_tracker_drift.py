@@ -1,4 +1,4 @@
-"""What was known of soil and sensors fades while nothing tells them: an hour at the road leaves little of it."""
+"""Soil and gains drift while nothing measures them: an hour at the road leaves little of their posterior."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ N_GAINS = len(gain_names(rig_of(CONFIG)))
 
 
 @pytest.fixture(scope="module")
-def told() -> list[tuple[Window, float]]:
-    """Four windows that tell the soil well."""
+def rich() -> list[tuple[Window, float]]:
+    """Four windows that determine the soil well."""
     return list(windows(CONFIG, simulate(CONFIG, excited("loam", 40.0), 1)))
 
 
@@ -34,10 +34,10 @@ def little() -> Window:
     return window.rows((window.t > LENGTH - 1.5).nonzero()[0])
 
 
-def after(pause: float, told, little: Window) -> Fit:
-    """What the little says, so many seconds after what was told."""
+def after(pause: float, rich, little: Window) -> Fit:
+    """Fit of the little window, `pause` seconds after the informative ones."""
     tracker, end = tracker_of(CONFIG), 0.0
-    for window, end in told:
+    for window, end in rich:
         tracker.estimate(window, end)
     end += pause + LENGTH
     tracked = tracker.estimate(replace(little, t=little.t + (end - LENGTH)), end)
@@ -55,14 +55,14 @@ def gain_stds(fit: Fit) -> list[float]:
     return [fit.reported.gain(i).std for i in range(N_GAINS)]
 
 
-def test_the_soil_of_an_hour_ago_is_no_more_than_another_soil(told, little):
-    alone, soon, late = (spreads(after(*given, little)) for given in ((0.0, []), (60.0, told), (3600.0, told)))
+def test_the_soil_of_an_hour_ago_is_no_more_than_another_soil(rich, little):
+    alone, soon, late = (spreads(after(*given, little)) for given in ((0.0, []), (60.0, rich), (3600.0, rich)))
     assert soon[1] < 0.5 * alone[1]
     assert late[1] > 0.6 * alone[1]
     assert late[0] > 0.85 * alone[0]
 
 
-def test_gains_are_known_for_minutes_and_not_for_ever(told, little):
-    alone, soon, late = (gain_stds(after(*given, little)) for given in ((0.0, []), (60.0, told), (900.0, told)))
+def test_gains_are_known_for_minutes_and_not_for_ever(rich, little):
+    alone, soon, late = (gain_stds(after(*given, little)) for given in ((0.0, []), (60.0, rich), (900.0, rich)))
     assert sum(soon) < 0.8 * sum(alone)
     assert sum(late) > 0.9 * sum(alone)

@@ -1,4 +1,4 @@
-"""Fits that do not converge fast: along valleys that bend, at costs that only seem low, at the edge of a range."""
+"""The damped descent: along curved valleys, where -2 log posterior is underestimated, at the edge of a range."""
 
 from __future__ import annotations
 
@@ -8,14 +8,22 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from soilbus.diagnosis.damped_descent import DAMPING, EASED, HELD_BACK, MAX_STEPS, _Here, _Valley, descended
+from soilbus.diagnosis.damped_descent import Expansion, GeodesicSteps, descend_damped
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.score import scores
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import DescentOptions, _fit_at
-from soilbus.estimation.solver import IDLE, Descent, Iterate, Objective, QuadraticModel, descend_jointly
+from soilbus.estimation.solver import (
+    MAX_STALLED,
+    Descent,
+    Iterate,
+    Objective,
+    QuadraticModel,
+    StoppingRule,
+    descend_jointly,
+)
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -25,7 +33,7 @@ from soilbus.terra.effects.effect import Active
 
 CONFIG = reference_configuration()
 PRIOR = prior_of(CONFIG)
-NOTHING = DescentOptions().nothing
+NOTHING = DescentOptions().stall_tolerance
 
 
 class Banana:
@@ -40,13 +48,13 @@ class Banana:
     def directions(self, place):
         return np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 
-    def step_share(self, place, step):
+    def step_fraction(self, place, step):
         return 1.0
 
     def stepped(self, place, point, step):
         return replace(place, soil=place.soil + step)
 
-    def point(self, place):
+    def quadratic_model(self, place):
         self.asked += 1
         x, y = place.soil
         rows = np.array([[10.0 * self.STEEP * (y - x * x), -20.0 * self.STEEP * x, 10.0 * self.STEEP], [1 - x, -1, 0]])
@@ -58,23 +66,23 @@ class Banana:
 
 def begun(banana):
     place = Iterate(np.array([-1.0, 1.0]), np.zeros(0), None, np.inf, 0)
-    return _Here(place, banana.point(place))
+    return Expansion(place, banana.quadratic_model(place))
 
 
-def test_steps_that_bend_follow_a_valley_that_does():
+def test_curved_steps_follow_a_curved_valley_in_half_the_steps_of_damped_ones():
     banana = Banana()
-    here, valley = begun(banana), _Valley(banana)
-    while here.point.neg2_log_posterior > 1e-6 and banana.asked < 100:
-        here, _ = valley.along(here, here.point.step())
-    damped, damping = Banana(), DAMPING
+    here, geodesic = begun(banana), GeodesicSteps(banana)
+    while here.quadratic.neg2_log_posterior > 1e-6 and banana.asked < 100:
+        here, _ = geodesic.along(here, here.quadratic.step())
+    damped, damping = Banana(), 1e-2
     there = begun(damped)
-    while there.point.neg2_log_posterior > 1e-6 and damped.asked < 1000:
-        place = damped.stepped(*there, there.point.step(damping))
-        point = damped.point(place)
-        falls = point.neg2_log_posterior < there.point.neg2_log_posterior
-        damping *= EASED if falls else HELD_BACK
-        there = _Here(place, point) if falls else there
-    assert banana.asked <= MAX_STEPS
+    while there.quadratic.neg2_log_posterior > 1e-6 and damped.asked < 1000:
+        place = damped.stepped(*there, there.quadratic.step(damping))
+        point = damped.quadratic_model(place)
+        falls = point.neg2_log_posterior < there.quadratic.neg2_log_posterior
+        damping *= 0.3 if falls else 10.0
+        there = Expansion(place, point) if falls else there
+    assert banana.asked <= 15
     assert damped.asked > 2 * banana.asked
 
 
@@ -82,13 +90,12 @@ def test_the_second_derivative_along_a_step_is_that_of_the_residuals():
     banana = Banana()
     place, point = begun(banana)
     step = np.array([0.3, -0.2])
-    there = banana.point(banana.stepped(place, point, step))
-    assert banana.second_derivative(place, point, step, there) == pytest.approx(
-        [-20.0 * banana.STEEP * 0.3**2, 0.0], abs=1e-9
-    )
+    there = banana.quadratic_model(banana.stepped(place, point, step))
+    found = banana.second_derivative(place, point, step, there)
+    assert found == pytest.approx([-20.0 * banana.STEEP * 0.3**2, 0.0], abs=1e-9)
 
 
-def test_a_parabola_has_the_step_of_the_slope_that_it_is_given():
+def test_a_quadratic_model_steps_by_the_gradient_that_it_is_given():
     _, point = begun(Banana())
     gradient = np.array([3.0, -1.0])
     assert point.information @ point.step(gradient=gradient) == pytest.approx(-gradient)
@@ -108,22 +115,22 @@ def recorded(soil="loam", hidden=()):
     return record_of("x", store.window(0.0, 60.0), rig, model_of(CONFIG), 0.2, 0.15)
 
 
-def test_what_a_slow_descent_tells_is_the_cost_with_the_latents_at_their_best():
+def test_a_damped_descent_ends_at_the_posterior_with_the_latents_at_their_optimum():
     """With latents as measured it seems too low, and then no step lowers it."""
     record = recorded("wet_clay")
     known = fit_model([record], PRIOR, ())
-    problem, optimum = record.learned, known.fits[0].mode
+    problem, optimum = record.training, known.fits[0].mode
     fitting = Objective(problem, PRIOR, Gaussian.of(PRIOR, problem.gain_std))
     place = fitting.start(optimum.soil, gains=optimum.gains)
-    point = fitting.point(place)
+    point = fitting.quadratic_model(place)
     assert point.neg2_log_posterior < known.neg2_log_posterior - 5.0
     fast = _fit_at(fitting, Descent(place, place, point, np.inf, 1, converged=False))
-    slow = descended(fitting, fast, DescentOptions())
+    slow = descend_damped(fitting, fast, DescentOptions())
     here = Iterate(slow.optimum.soil, slow.optimum.gains, slow.optimum.latents, slow.neg2_log_posterior, 0)
     for _ in range(3):
-        here = fitting.stepped(here, fitting.point(here), np.zeros(len(point.gradient)))
+        here = fitting.stepped(here, fitting.quadratic_model(here), np.zeros(len(point.gradient)))
     assert slow.converged
-    assert slow.neg2_log_posterior == pytest.approx(fitting.point(here).neg2_log_posterior, abs=NOTHING)
+    assert slow.neg2_log_posterior == pytest.approx(fitting.quadratic_model(here).neg2_log_posterior, abs=NOTHING)
     assert slow.neg2_log_posterior == pytest.approx(known.neg2_log_posterior, abs=2.0 * NOTHING)
 
 
@@ -137,36 +144,36 @@ def test_fits_go_on_from_where_a_parameter_was_held_at_the_edge_of_its_range():
     i = [f.parameter.name for f in held.free].index("exponent")
     assert (held.free[i].std, held.free[i].value) == (0.0, 0.05)
     (start,) = held.as_starts()
-    assert held.beforehand[i].std > 0.0
-    assert held.beforehand[i].at(start.gains[record.learned.n_sensors + i]) == pytest.approx(0.05)
+    assert held.free_unheld[i].std > 0.0
+    assert held.free_unheld[i].at(start.gains[record.training.n_sensors + i]) == pytest.approx(0.05)
     again = fit_model([record], PRIOR, [narrow], [start])
     assert again.fits[0].iterations == 1
     assert again.neg2_log_evidence == pytest.approx(held.neg2_log_evidence, abs=0.1)
     (score,) = scores([record], PRIOR, held, [CATALOGUE["lugs"]])
-    assert held.beforehand[i].at(score.starts[0].gains[record.learned.n_sensors + i]) == pytest.approx(0.05, abs=1e-3)
+    assert held.free_unheld[i].at(score.starts[0].gains[record.training.n_sensors + i]) == pytest.approx(0.05, abs=1e-3)
 
 
 def test_a_start_with_other_effects_has_those_that_are_new_absent(record):
     slip, lugs = CATALOGUE["slip_sinkage"], CATALOGUE["lugs"]
     one = fit_model([record], PRIOR, [slip])
     (own,), (both,), (none,) = one.as_starts(), one.as_starts([lugs, slip]), one.as_starts([])
-    n_sensors, n_lugs = record.learned.n_sensors, len(lugs.parameters)
+    n_sensors, n_lugs = record.training.n_sensors, len(lugs.parameters)
     assert both.gains[n_sensors : n_sensors + n_lugs].tolist() == [0.0] * n_lugs
     assert both.gains[n_sensors + n_lugs :].tolist() == own.gains[n_sensors:].tolist()
     assert none.gains.tolist() == own.gains[:n_sensors].tolist()
 
 
 class Flat:
-    """Places whose costs go up and down by less than is foreseen at each."""
+    """Iterates whose -2 log posterior goes up and down by less than is predicted at each."""
 
     def __init__(self, costs):
         self.costs, self.asked = costs, 0
 
-    def point(self, place):
+    def quadratic_model(self, place):
         self.asked += 1
         cost = self.costs[min(self.asked, len(self.costs)) - 1]
         return SimpleNamespace(
-            neg2_log_posterior=cost, step=lambda: np.ones(1), length=lambda step: 0.5, information=np.eye(1)
+            neg2_log_posterior=cost, step=lambda: np.ones(1), squared_length=lambda step: 0.5, information=np.eye(1)
         )
 
     def stepped(self, place, point, step):
@@ -176,19 +183,19 @@ class Flat:
 def test_a_fit_whose_cost_no_longer_falls_ends_where_it_was_least():
     costs = [10.0, 9.0, 9.4, 9.1, 8.9, 8.8]
     flat = Flat(costs)
-    end = descend_jointly(flat, Trial(0), 30, refusals=0, nothing=0.3)
+    end = descend_jointly(flat, Trial(0), StoppingRule(30, max_rejected=0, stall_tolerance=0.3))
     assert end.converged
-    assert flat.asked == 2 + IDLE
-    assert (end.last, end.place, end.point.neg2_log_posterior) == (1, 2, 9.0)
+    assert flat.asked == 2 + MAX_STALLED
+    assert (end.previous, end.iterate, end.model.neg2_log_posterior) == (1, 2, 9.0)
     unending = Flat(costs)
-    assert not descend_jointly(unending, Trial(0), 30, refusals=0).converged
+    assert not descend_jointly(unending, Trial(0), StoppingRule(30, max_rejected=0)).converged
     assert unending.asked == 30
 
 
 class Trial(int):
-    """A place by its number."""
+    """An iterate by its number."""
 
-    trials = 0
+    evaluations = 0
 
     def __add__(self, other):
         return Trial(int(self) + other)

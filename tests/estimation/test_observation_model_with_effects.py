@@ -1,4 +1,4 @@
-"""What the completed model tells, and its derivatives, for each effect of the catalogue."""
+"""Predictions of the observation model with effects and their derivatives, for each effect of the catalogue."""
 
 from __future__ import annotations
 
@@ -42,23 +42,23 @@ def at(request, problems):
     effect = CATALOGUE[request.param]
     plain = problems[effect.base_law or "exponential"]
     free = parameters_of(effect, plain.n_wheels)
-    problem = plain.completed([effect], free)
+    problem = plain.with_effects([effect], free)
     gains = np.concatenate([np.zeros(problem.n_sensors), np.full(len(free), PULL)])
     latents = problem.with_entry_angles(problem.start(SOIL), SOIL, gains)
     for _ in range(4):
         there = problem._response(SOIL, gains, latents)
-        latents = replace(latents, entry_angle=latents.entry_angle + there.off / there.load_slope)
+        latents = replace(latents, entry_angle=latents.entry_angle + there.load_residual / there.load_slope)
     return problem, gains, latents
 
 
-def told(problem, soil, gains, latents):
-    """Drawbar pull, torque and sinkage (3, N, W), and what the wheels must pull besides (N,)."""
+def predicted(problem, soil, gains, latents):
+    """Drawbar pull, torque and sinkage (3, N, W), and the pull beyond the measured demand (N,)."""
     response = problem._response(soil, gains, latents)
-    return response.value, response.pull
+    return response.value, response.extra_pull
 
 
 def moved(problem, gains, latents):
-    """By derivative of a response, with a step: what it then is of."""
+    """Derivatives of a response by name and number, with a step and the arguments after it."""
     for i, name in enumerate(SOIL._fields):
         step = 1e-5 * getattr(SOIL, name)
         yield ("by_soil", i), step, lambda way, n=name, d=step: (
@@ -75,11 +75,11 @@ def moved(problem, gains, latents):
         )  # fmt: skip
 
 
-def test_derivatives_are_those_of_what_is_told(at):
+def test_derivatives_are_those_of_the_predictions(at):
     problem, gains, latents = at
     response = problem._response(SOIL, gains, latents)
     for (field, *place), step, change in moved(problem, gains, latents):
-        (up, pull_up), (down, pull_down) = (told(problem, *change(way)) for way in (1.0, -1.0))
+        (up, pull_up), (down, pull_down) = (predicted(problem, *change(way)) for way in (1.0, -1.0))
         ours, expected = getattr(response, field), (up - down) / (2.0 * step)
         ours = ours[:, place[0]] if place else ours
         for one, other, size in zip(ours, expected, response.value, strict=True):
@@ -87,10 +87,10 @@ def test_derivatives_are_those_of_what_is_told(at):
             assert np.abs(one - other).max() < 1e-4 * scale, (field, place)
         if field == "by_effects":
             of_pull = (pull_up - pull_down) / (2.0 * step)
-            assert response.pull_by_effects[place[0]] == pytest.approx(of_pull, rel=1e-4, abs=1e-6)
+            assert response.extra_pull_by_effects[place[0]] == pytest.approx(of_pull, rel=1e-4, abs=1e-6)
 
 
-def test_what_is_told_is_what_the_hooks_make_of_the_forces(at):
+def test_predictions_are_the_forces_after_the_hooks(at):
     problem, gains, latents = at
     (active,) = problem.active(gains[problem.n_sensors :])
     response = problem._response(SOIL, gains, latents)

@@ -48,15 +48,15 @@ def test_nothing_is_missing_where_loads_shake():
     assert np.mean([f.gap_before.value for f in found]) == pytest.approx(1.0, abs=0.02)
 
 
-def test_a_torque_40_ms_late_is_named_and_told():
+def test_a_torque_40_ms_late_is_named_with_its_delay():
     found = diagnosed(503, "torque", 0.04)
     assert [a.effect.name for a in found.additions] == ["torque_lag"]
     assert str(found.verdict) == "named"
     assert found.gap_before.value > 5.0
     assert found.gap_after.value == pytest.approx(1.0, abs=0.04)
-    told = found.completed.parameters()["torque_lag"]
-    assert abs(told["delay"].value - 0.04) < 2.0 * told["delay"].std < 0.05
-    assert abs(told["total"].value - 0.04) < 2.0 * told["total"].std < 0.02
+    reported = found.completed.parameters()["torque_lag"]
+    assert abs(reported["delay"].value - 0.04) < 2.0 * reported["delay"].std < 0.05
+    assert abs(reported["total"].value - 0.04) < 2.0 * reported["total"].std < 0.02
 
 
 @pytest.mark.parametrize(("quantity", "delay"), [("ground_speed", 0.2), ("load", 0.06)])
@@ -64,9 +64,9 @@ def test_a_channel_that_is_late_is_named_and_the_others_are_not_late(quantity, d
     found = diagnosed(504, quantity, delay, 0.0)
     assert [a.effect.name for a in found.additions] == ["channel_lag"]
     assert str(found.verdict) == "named"
-    told = found.completed.parameters()["channel_lag"]
+    reported = found.completed.parameters()["channel_lag"]
     for other in ("ground_speed", "load", "draft"):
-        total, true = told[f"{other}_total"], delay if other == quantity else 0.0
+        total, true = reported[f"{other}_total"], delay if other == quantity else 0.0
         assert abs(total.value - true) < 3.0 * total.std < 0.1, other
 
 
@@ -74,15 +74,15 @@ def test_a_channel_that_is_late_is_named_and_the_others_are_not_late(quantity, d
     ("seed", "quantity", "delay", "lag"),
     [(504, "ground_speed", 0.2, 0.0), (505, "ground_speed", 0.0, 0.2), (505, "torque", 0.0, 0.2)],
 )
-def test_delay_and_time_constant_are_told_jointly(seed, quantity, delay, lag):
+def test_delay_and_time_constant_are_estimated_jointly(seed, quantity, delay, lag):
     """Each within three standard deviations of the truth, their sum much more surely than either."""
     found = diagnosed(seed, quantity, delay, lag)
     name = "torque_lag" if quantity == "torque" else "channel_lag"
     late: Late = CATALOGUE[name].late[quantity]
-    told = found.completed.parameters()[name]
+    reported = found.completed.parameters()[name]
     for parameter, true in ((late.delay, delay), (late.time_constant, lag), (late.total, delay + lag)):
-        assert abs(told[parameter].value - true) < 3.0 * told[parameter].std, parameter
-    assert told[late.total].std < 0.03
+        assert abs(reported[parameter].value - true) < 3.0 * reported[parameter].std, parameter
+    assert reported[late.total].std < 0.03
 
 
 SPEED = "GroundBasedSpeedAndDistance.GroundBasedMachineSpeed"
@@ -104,16 +104,16 @@ def test_a_configured_delay_is_taken_out_by_the_service(tmp_path):
     by_effect = windows("--set", f'model.effects=[{{name="channel_lag",{of_effect}}}]')
     in_time = np.median([w["chi2"] for w in windows(delay=0.0)])
     assert np.median([w["chi2"] for w in windows()]) > 2.0 * in_time
-    for told in (at_signal, by_effect):
-        assert np.median([w["chi2"] for w in told]) == pytest.approx(in_time, abs=0.05)
-        assert {w["status"] for w in told} == {"valid"}
-        pressures = [w["bearing_pressure"] for w in told]
+    for reported in (at_signal, by_effect):
+        assert np.median([w["chi2"] for w in reported]) == pytest.approx(in_time, abs=0.05)
+        assert {w["status"] for w in reported} == {"valid"}
+        pressures = [w["bearing_pressure"] for w in reported]
         true = shaking.LOAM.bearing_pressure()
         assert np.mean([abs(p["value"] - true) < 2.5 * p["std"] for p in pressures]) > 0.9
 
 
 def test_all_channels_wait_for_the_latest():
-    """A step at one moment stands in the same bin of a channel that tells it in time and of one 0.3 s late."""
+    """A step at one moment stands in the same bin of a channel that is in time and of one 0.3 s late."""
     late = CONFIG.signals.ground_speed.model_copy(update={"delay": 0.3})
     config = CONFIG.model_copy(update={"signals": CONFIG.signals.model_copy(update={"ground_speed": late})})
     database = load_databases(config)

@@ -1,4 +1,4 @@
-"""The least error of any estimate against brute force, and against estimates that try to do better."""
+"""The Bayes-risk bound against brute force, and against estimators by powers of the bound."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from soilbus.validation.bayes_risk_bound import TILTS, attainable
 GRID = np.linspace(-3.0, 3.0, 601)
 NOISE = 0.4
 BOUND = NOISE / np.sqrt((1.2 * GRID**2 + 0.1) ** 2 + NOISE**2)
-"""Of a cubic that is read with noise and known to a std of one besides: flat in the middle."""
+"""Cramér-Rao sd of x, of which a cubic is measured with noise and x itself with sd 1: large at the flat middle."""
 
 
-def read(soil):
+def cubic(soil):
     return 0.4 * soil**3 + 0.1 * soil
 
 
-def posterior(reading, told):
-    """Shares of the grid, whatever is the true one, by a reading (R,) and what was told of it (R,)."""
-    likelihood = norm.pdf(reading[:, None], read(GRID), NOISE) * norm.pdf(told[:, None], GRID, 1.0)
+def posterior(of_cubic, of_soil):
+    """Probabilities (R, grid) under a flat prior, by measurements (R,) of the cubic and of the soil itself."""
+    likelihood = norm.pdf(of_cubic[:, None], cubic(GRID), NOISE) * norm.pdf(of_soil[:, None], GRID, 1.0)
     return likelihood / likelihood.sum(axis=1, keepdims=True)
 
 
 def windows(truth, n, rng):
-    return posterior(read(truth) + NOISE * rng.standard_normal(n), truth + rng.standard_normal(n))
+    return posterior(cubic(truth) + NOISE * rng.standard_normal(n), truth + rng.standard_normal(n))
 
 
-def test_no_choice_has_a_smaller_mean_than_the_one_told():
+def test_no_estimate_has_a_smaller_weighted_loss_than_the_risk():
     rng = np.random.default_rng(1)
     share = rng.dirichlet(np.ones(5000))
     value, bound = rng.standard_normal((5000, 2)), rng.uniform(0.1, 0.8, (5000, 2))
@@ -45,7 +45,7 @@ def test_no_choice_has_a_smaller_mean_than_the_one_told():
     assert found.effective == pytest.approx(1.0 / (share**2).sum())
 
 
-def test_few_samples_tell_the_same_on_average():
+def test_the_risk_of_few_samples_is_unbiased():
     rng = np.random.default_rng(2)
     (share,) = windows(1.0, 1, rng)
     (risk,) = attainable(GRID[:, None], share, BOUND[:, None], np.zeros(1)).risk[TILTS.index(0.0)]
@@ -57,7 +57,7 @@ def test_few_samples_tell_the_same_on_average():
     assert np.mean(of_few) == pytest.approx(risk, abs=4.0 * np.std(of_few) / 20.0)
 
 
-def test_what_is_held_has_no_error_and_no_risk():
+def test_a_held_quantity_has_no_error_and_no_risk():
     value = np.column_stack([np.linspace(-1.0, 1.0, 9), np.full(9, 0.3)])
     bound = np.column_stack([np.full(9, 0.5), np.zeros(9)])
     found = attainable(value, np.full(9, 1 / 9), bound, np.array([0.0, 0.3]))
@@ -67,8 +67,8 @@ def test_what_is_held_has_no_error_and_no_risk():
 
 
 @pytest.mark.parametrize("power", [-2.0, 0.0, 1.0, 2.0, 3.0, 4.0])
-def test_every_estimate_is_worse_than_that_on_some_soil(power):
-    # Means of the posterior by any power of the bound; soils as the windows allow them: uniform.
+def test_every_estimator_exceeds_the_bound_on_some_soil(power):
+    # Posterior means weighted by a power of the bound; soils are uniform.
     rng = np.random.default_rng(3)
     soils = np.linspace(-1.5, 1.5, 31)
     risk, weight, error = [], [], []
@@ -81,11 +81,11 @@ def test_every_estimate_is_worse_than_that_on_some_soil(power):
         own = (counted @ GRID) / counted.sum(axis=1) - soil
         error.append(np.sqrt(np.mean((own / np.interp(soil, GRID, BOUND)) ** 2)))
     least = np.sqrt((np.sum(risk, axis=0) / np.sum(weight, axis=0)).max())
-    assert least > 1.1  # the bound of a soil alone is too small here
+    assert least > 1.1  # the Cramér-Rao bound of one soil is too small here
     assert max(error) > least
 
 
-def test_where_all_soils_are_told_alike_the_bound_is_what_is_attained():
+def test_with_one_bound_for_all_soils_the_bound_is_attained():
     rng = np.random.default_rng(4)
     value = 0.3 * rng.standard_normal((100_000, 1))
     found = attainable(value, np.full(100_000, 1e-5), np.full((100_000, 1), 0.3), np.zeros(1))

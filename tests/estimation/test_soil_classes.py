@@ -1,4 +1,4 @@
-"""Soil classes: probabilities against Bayes by sampling, on exact Gaussians and on simulated windows."""
+"""Probabilities of soil classes against Bayes' rule by sampling, on Gaussians and on simulated windows."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 import pytest
-from reliability import WIDE_COHESION, Said, driven, shortfall, windows
+from reliability import WIDE_COHESION, Prediction, driven, shortfall, windows
 
 from soilbus.estimation.assembly import prior_of
-from soilbus.estimation.multistart import fit_window, near
+from soilbus.estimation.multistart import clip_to_prior, fit_window
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
-from soilbus.estimation.soil_classes import PRIOR_UNKNOWN, WITHIN, SoilClasses, guessed, ranked_by_likelihood
+from soilbus.estimation.soil_classes import PRIOR_UNKNOWN, WITHIN_CLASS_SD, SoilClasses, guessed, ranked_by_likelihood
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import KINDS, SOILS, UNKNOWN
 from soilbus.terra.wheel import Soil
@@ -39,15 +39,15 @@ def posterior_about(position: np.ndarray, covariance: np.ndarray) -> Posterior:
     return Posterior(soil, directions @ covariance @ directions.T)
 
 
-def readings(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance of a posterior whose data told the origin 0 with unequal, correlated errors."""
+def measurements(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of a posterior of data at the origin with unequal, correlated errors."""
     root = rng.standard_normal((6, 6)) * rng.uniform(0.02, 0.5, 6)
     covariance = root @ root.T + 1e-4 * np.eye(6)
     return np.linalg.cholesky(covariance) @ rng.standard_normal(6), covariance
 
 
-def test_a_posterior_without_a_guess_is_weighed_as_bayes_does():
-    """Each class's density averaged over soils drawn from what the data say, against the closed form."""
+def test_probabilities_without_a_guess_are_those_of_bayes_rule():
+    """Each class's density averaged over soils drawn from the likelihood, against the closed form."""
     rng = np.random.default_rng(3)
     about = CLASSES.centre[KINDS.index("rubicon_sandy_loam_43")] + 0.05
     covariance = np.diag([1.0, 0.3, 0.2, 0.1, 0.5, 0.3]) ** 2
@@ -59,48 +59,48 @@ def test_a_posterior_without_a_guess_is_weighed_as_bayes_does():
     ]
     prior = np.append(np.full(len(KINDS), (1.0 - PRIOR_UNKNOWN) / len(KINDS)), PRIOR_UNKNOWN)
     expected = dict(zip(CLASSES.names, prior * likelihood / (prior @ likelihood), strict=True))
-    said = CLASSES.probabilities(posterior_about(about, covariance), NO_GUESS)
-    assert next(iter(said)) == max(expected, key=expected.__getitem__)
-    assert sum(p > 0.02 for p in expected.values()) >= 4  # a case with something to weigh
+    found = CLASSES.probabilities(posterior_about(about, covariance), NO_GUESS)
+    assert next(iter(found)) == max(expected, key=expected.__getitem__)
+    assert sum(p > 0.02 for p in expected.values()) >= 4  # several classes are likely
     for name, p in expected.items():
-        assert said[name] == pytest.approx(p, rel=0.05, abs=1e-3), name
+        assert found[name] == pytest.approx(p, rel=0.05, abs=1e-3), name
 
 
-def test_what_the_data_owe_to_a_guess_is_taken_out():
+def test_a_guess_is_divided_out():
     """The same data with two guesses, one of them far off, lead to the same probabilities."""
     rng = np.random.default_rng(5)
     about = CLASSES.centre[KINDS.index("clayey_soil_38")] + 0.1
     error = np.array([0.5, 0.2, 0.2, 0.1, 0.6, 0.3]) ** 2
-    said = []
+    found = []
     for shift in (0.0, 0.7):
         guess = SoilPrior(np.exp(rng.normal(0.0, shift, 6)) * np.asarray(soil_at(about)), np.full(6, 0.8))
-        # Bayes for Gaussians, linear about the soil that the data tell
+        # Bayes' rule for Gaussians, linear about the soil of the data
         by_log = np.linalg.inv(ALL.log_directions(np.asarray(soil_at(about))))
-        owed = np.linalg.inv(by_log @ np.diag(guess.log_std**2) @ by_log.T)
+        of_guess = np.linalg.inv(by_log @ np.diag(guess.log_std**2) @ by_log.T)
         centre = about + by_log @ np.log(guess.median / np.asarray(soil_at(about)))
-        covariance = np.linalg.inv(np.diag(1.0 / error) + owed)
-        mean = covariance @ (about / error + owed @ centre)
+        covariance = np.linalg.inv(np.diag(1.0 / error) + of_guess)
+        mean = covariance @ (about / error + of_guess @ centre)
         directions = ALL.log_directions(np.asarray(soil_at(mean)))
-        said.append(CLASSES.probabilities(Posterior(soil_at(mean), directions @ covariance @ directions.T), guess))
-    one, other = said
+        found.append(CLASSES.probabilities(Posterior(soil_at(mean), directions @ covariance @ directions.T), guess))
+    one, other = found
     assert one["clayey_soil_38"] > 0.5
-    for name in one:  # the coordinates bend a little between the two means
+    for name in one:  # the coordinates are slightly curved between the two means
         assert other[name] == pytest.approx(one[name], abs=0.03)
 
 
-def test_on_exact_gaussians_probabilities_come_true():
-    """Soils drawn from the classes, measured with known errors: every bin of said probabilities holds."""
+def test_probabilities_are_calibrated_on_gaussians():
+    """Soils drawn from the classes, measured with known errors: relative frequencies in bins of probability."""
     rng = np.random.default_rng(11)
     prior = np.append(np.full(len(KINDS), (1.0 - PRIOR_UNKNOWN) / len(KINDS)), PRIOR_UNKNOWN)
-    said = []
+    found = []
     for i in rng.choice(len(prior), 2000, p=prior):
         truth = CLASSES.centre[i] + CLASSES.spread[i] * rng.standard_normal(6)
-        error, covariance = readings(rng)
+        error, covariance = measurements(rng)
         if soil_at(truth + error).k_phi > 0.0:
             posterior = posterior_about(truth + error, covariance)
-            said.append(Said(CLASSES.probabilities(posterior, NO_GUESS), CLASSES.names[i]))
-    assert abs(shortfall(said)) < 3.0
-    p, true = np.array([(v, name == s.truth) for s in said for name, v in s.probability.items()]).T
+            found.append(Prediction(CLASSES.probabilities(posterior, NO_GUESS), CLASSES.names[i]))
+    assert abs(shortfall(found)) < 3.0
+    p, true = np.array([(v, name == s.truth) for s in found for name, v in s.probability.items()]).T
     for low, high in ((0.02, 0.1), (0.1, 0.3), (0.3, 0.5), (0.5, 0.7), (0.7, 0.9), (0.9, 0.98), (0.98, 1.01)):
         part = (p >= low) & (p < high)
         assert part.sum() > 100
@@ -108,15 +108,15 @@ def test_on_exact_gaussians_probabilities_come_true():
         assert true[part].mean() == pytest.approx(p[part].mean(), abs=3.5 * scatter), (low, high)
 
 
-def test_on_simulated_windows_probabilities_come_true():
+def test_probabilities_are_calibrated_on_simulated_windows():
     """A small version of the run in reliability.py."""
-    said = list(windows(18, seed=2, seconds=10.0, slip=0.15))
-    assert len(said) >= 10
-    assert abs(shortfall(said)) < 3.0
-    p = np.array([s.probability[UNKNOWN] for s in said])
-    unknown = sum(s.truth == UNKNOWN for s in said)
+    found = list(windows(18, seed=2, seconds=10.0, slip=0.15))
+    assert len(found) >= 10
+    assert abs(shortfall(found)) < 3.0
+    p = np.array([s.probability[UNKNOWN] for s in found])
+    unknown = sum(s.truth == UNKNOWN for s in found)
     assert unknown == pytest.approx(p.sum(), abs=3.0 * math.sqrt((p * (1.0 - p)).sum()))
-    assert np.mean([next(iter(s.probability)) == s.truth for s in said]) > 0.6
+    assert np.mean([next(iter(s.probability)) == s.truth for s in found]) > 0.6
 
 
 @pytest.mark.parametrize(
@@ -126,33 +126,33 @@ def test_on_simulated_windows_probabilities_come_true():
     + [(Soil(5e3, 6e6, 1.1, 0.85, 400.0, 0.02), UNKNOWN), (Soil(5e3, 9e5, 1.0, 0.12, 2e3, 0.02), UNKNOWN)],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_a_soil_of_the_table_is_named_and_one_far_from_all_is_not(soil, kind):
+def test_a_soil_of_the_table_is_named_and_one_far_from_all_is_unknown(soil, kind):
     problem = driven(CONFIG, soil, [4], 10.0)
-    said = CLASSES.probabilities(fit_window(problem, PRIOR).posterior, PRIOR)
-    assert next(iter(said)) == kind
-    assert said[kind] > 0.7
-    assert sum(said.values()) == pytest.approx(1.0)
-    assert list(said.values()) == sorted(said.values(), reverse=True)
+    found = CLASSES.probabilities(fit_window(problem, PRIOR).posterior, PRIOR)
+    assert next(iter(found)) == kind
+    assert found[kind] > 0.7
+    assert sum(found.values()) == pytest.approx(1.0)
+    assert list(found.values()) == sorted(found.values(), reverse=True)
 
 
-def test_nothing_measured_leaves_what_was_likely_beforehand():
+def test_without_data_the_prior_probabilities_stay():
     soil = SOILS["loam"]
     guess = SoilPrior(np.asarray(soil), np.full(6, 0.6))
     only_k_c = np.diag([0.3, 0.0, 0.0, 0.0, 0.0, 0.0])
     for covariance in (np.diag(guess.log_std**2), np.zeros((6, 6)), only_k_c, 4.0 * np.diag(guess.log_std**2)):
-        said = CLASSES.probabilities(Posterior(soil, covariance), guess)
-        assert said[UNKNOWN] == pytest.approx(PRIOR_UNKNOWN)
-        assert said["snow_us"] == pytest.approx((1.0 - PRIOR_UNKNOWN) / len(KINDS))
+        found = CLASSES.probabilities(Posterior(soil, covariance), guess)
+        assert found[UNKNOWN] == pytest.approx(PRIOR_UNKNOWN)
+        assert found["snow_us"] == pytest.approx((1.0 - PRIOR_UNKNOWN) / len(KINDS))
 
 
-def test_held_parameters_count_neither_way():
+def test_held_parameters_do_not_count():
     sharp = np.diag([0.0, 0.02, 0.02, 0.02, 0.1, 0.1]) ** 2
     guess = SoilPrior(np.ones(6), np.append(0.0, np.full(5, 1e3)))
     loam = SOILS["loam"]
-    # all of the stiffness in k_phi, as somebody does who holds k_c at 0: the same pressure under the tyre
+    # all of the stiffness in k_phi, with k_c held at 0: the same pressure under the tyre
     lumped = loam._replace(k_c=0.0, k_phi=loam.k_phi + loam.k_c / WIDTH)
-    said = CLASSES.probabilities(Posterior(lumped, sharp), guess)
-    assert next(iter(said)) == "sandy_loam_15"
+    found = CLASSES.probabilities(Posterior(lumped, sharp), guess)
+    assert next(iter(found)) == "sandy_loam_15"
     wrong_c = sharp.copy()
     wrong_c[4, 4] = 0.0
     held = CLASSES.probabilities(Posterior(loam._replace(c=50e3), wrong_c), guess)
@@ -161,36 +161,36 @@ def test_held_parameters_count_neither_way():
     assert next(iter(free)) == UNKNOWN
 
 
-def test_what_somebody_told_counts_and_defaults_do_not():
+def test_a_configured_prior_is_evidence_and_a_default_is_not():
     default = prior_of(reference_configuration())
-    told = prior_of(reference_configuration(["soil.c.value=1700", "soil.c.std=200", "soil.K.std=0"]))
-    guess = guessed(told, default)
+    configured = prior_of(reference_configuration(["soil.c.value=1700", "soil.c.std=200", "soil.K.std=0"]))
+    guess = guessed(configured, default)
     changed = dict(zip(PARAMETERS, guess.log_std != default.log_std, strict=True))
     assert changed == {"k_c": False, "k_phi": False, "n": False, "phi": False, "c": True, "K": True}
-    # a window that tells nothing: what was told of c still speaks for soils of that cohesion
-    said = CLASSES.probabilities(Posterior(Soil(*told.median.tolist()), np.diag(told.log_std**2)), guess)
-    assert said["sandy_loam_15"] > 5.0 * said["heavy_clay_25"]
+    # without data the configured prior of c still favours soils of that cohesion
+    found = CLASSES.probabilities(Posterior(Soil(*configured.median.tolist()), np.diag(configured.log_std**2)), guess)
+    assert found["sandy_loam_15"] > 5.0 * found["heavy_clay_25"]
     plain = CLASSES.probabilities(Posterior(Soil(*default.median.tolist()), np.diag(default.log_std**2)), default)
     assert plain["sandy_loam_15"] == pytest.approx(plain["heavy_clay_25"])
 
 
-def test_the_classes_are_those_of_the_table_with_a_spread_below_that_of_the_table():
+def test_the_classes_are_those_of_the_table_with_a_smaller_spread_than_the_table():
     assert CLASSES.names == (*KINDS, UNKNOWN)
     assert len({tuple(SOILS[name]) for name in KINDS}) == len(KINDS)
     assert {tuple(SOILS[name][:2]) for name in SOILS} - {tuple(SOILS[name][:2]) for name in KINDS} == {(5300.0, 1515e3)}
     within, among = CLASSES.spread[0], CLASSES.spread[-1]
-    assert within == pytest.approx([*WITHIN.values()])
-    assert np.all(among > 1.5 * within - (within == WITHIN["K"]))  # K in the table is a planning figure
+    assert within == pytest.approx([*WITHIN_CLASS_SD.values()])
+    assert np.all(among > 1.5 * within - (within == WITHIN_CLASS_SD["K"]))  # K in the table is a planning figure
     depth = soil_at(CLASSES.centre[KINDS.index("dry_sand")])
     assert depth == pytest.approx(SOILS["dry_sand"])
 
 
 @pytest.mark.parametrize("sensors", ["all", "no sinkage", "no draft", "only torque"])
-def test_start_values_are_the_soils_that_foretell_the_window(simulated, sensors):
+def test_the_true_soil_has_the_greatest_likelihood_of_the_table(simulated, sensors):
     without = {"all": (), "no sinkage": ("sinkage",), "no draft": ("draft",), "only torque": ("sinkage", "draft")}
     problem = simulated(SOILS["upland_sandy_loam_51"], 6, without=without[sensors]).problem()
-    soils = [near(PRIOR, SOILS[name]) for name in KINDS]
+    soils = [clip_to_prior(PRIOR, SOILS[name]) for name in KINDS]
     order = [KINDS[soils.index(soil)] for soil in ranked_by_likelihood(problem, soils)]
     assert order[0] == "upland_sandy_loam_51"
     assert sorted(order) == sorted(KINDS)
-    assert set(order[-3:]) & {"snow_us", "snow_sweden"}  # which do not carry it
+    assert set(order[-3:]) & {"snow_us", "snow_sweden"}  # which cannot carry it

@@ -1,4 +1,4 @@
-"""What the average along n says of a window whose sensors were perfect, and whose prior was told the truth."""
+"""The average along n of a window without noise, with the prior's median at the truth."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ DURATION = 10.0
 
 
 @pytest.mark.parametrize("seed", [21, 22])
-def test_without_noise_a_window_that_tells_k_c_says_the_truth(seed):
-    # Means of logarithms lie a third of the bound beside it: of k_c's, and so of n's and the pressure's.
+def test_without_noise_a_window_that_determines_k_c_reports_the_truth(seed):
+    # Plain means of logarithms are a third of the bound off: that of k_c, and so those of n and the pressure.
     config, soil = reference_configuration(ROUGHLY_KNOWN), SOILS["wet_clay"]
     rig, truth = rig_of(config), SoilPrior(np.asarray(soil), prior_of(config).log_std)
     drive = simulate(config, Scenario(DURATION, (Patch(0.0, "wet_clay", soil),), slip=SLIP), seed)
@@ -31,12 +31,12 @@ def test_without_noise_a_window_that_tells_k_c_says_the_truth(seed):
     times = {name: drive.channels[name].t for name in fitted}
     store.add({name: (t, np.interp(t, drive.truth["t"], drive.truth[name])) for name, t in times.items()})
     problem = ObservationModel(store.window(0.0, DURATION), rig, model_of(config), config.estimator.min_speed)
-    told = cold_fit(problem, truth).reported.posterior
+    reported = cold_fit(problem, truth).reported.posterior
     bound = cramer_rao(problem, truth, soil)
     std = np.sqrt(np.diag(bound.log_covariance))
-    off = np.log(np.asarray(told.soil) / np.asarray(soil)) / std
-    assert std[0] < 0.3  # k_c is told
+    off = np.log(np.asarray(reported.soil) / np.asarray(soil)) / std
+    assert std[0] < 0.3  # the data determine k_c
     assert np.abs(off).max() < 0.15
     z_ref, b_ref = config.estimator.z_ref, config.estimator.b_ref
-    pressure, least = (of.bearing_pressure(z_ref, b_ref) for of in (told, bound))
+    pressure, least = (of.bearing_pressure(z_ref, b_ref) for of in (reported, bound))
     assert abs(pressure.value - least.value) < 0.15 * least.std

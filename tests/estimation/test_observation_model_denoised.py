@@ -1,4 +1,4 @@
-"""Denoised latents: known cases of shrinkage, and information that noise does not make."""
+"""The denoised observation model: latents shrunk to their expectation, and no information from noise."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import fit_window, refine
-from soilbus.estimation.observation_model import DenoisedObservationModel, expected
+from soilbus.estimation.observation_model import DenoisedObservationModel, shrunk_latents
 from soilbus.estimation.solver import Iterate, Objective
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Swing
@@ -17,33 +17,33 @@ from soilbus.terra.soils import SOILS
 from soilbus.validation.cramer_rao import cramer_rao
 
 
-def test_noise_alone_is_the_mean_and_signals_stay():
+def test_noise_is_shrunk_to_the_mean_and_a_signal_stays():
     rng = np.random.default_rng(2)
     signal = np.outer(np.sin(np.arange(200.0) / 9.0), [3.0, -1.0, 2.0, 0.0])
     sd = np.array([0.1, 0.2, 0.3, 0.1])
     noise = sd * rng.standard_normal(signal.shape)
     variance = np.broadcast_to(sd**2, signal.shape)
     level = 5.0 + noise
-    assert expected(level, variance) == pytest.approx(np.broadcast_to(level.mean(0), level.shape))
-    calm = expected(signal + noise, variance)
+    assert shrunk_latents(level, variance) == pytest.approx(np.broadcast_to(level.mean(0), level.shape))
+    calm = shrunk_latents(signal + noise, variance)
     left, before = (((x - signal) / sd).std() for x in (calm, signal + noise))
     assert left < 0.6 * before  # one direction of four
     exact = variance * np.array([1.0, 1.0, 1.0, 0.0])
-    assert expected(signal + noise, exact)[:, 3] == pytest.approx((signal + noise)[:, 3])
+    assert shrunk_latents(signal + noise, exact)[:, 3] == pytest.approx((signal + noise)[:, 3])
 
 
-def test_a_window_without_variation_tells_no_more_than_the_bound():
-    # With the latents as fitted, noise tells n: a third less spread here than any unbiased estimate has.
+def test_a_window_without_variation_is_no_more_certain_than_the_bound():
+    # With the latents as fitted, noise counts as information on n: the sd is a third below the Cramér-Rao bound.
     soil, still = SOILS["wet_clay"], Swing(0.0, 1e-9)
-    config = reference_configuration([*minima.told("wet_clay"), "soil.k_c.value=43680", "soil.k_c.std=20000"])
+    config = reference_configuration([*minima.c_and_K_known("wet_clay"), "soil.k_c.value=43680", "soil.k_c.std=20000"])
     prior, ratio = prior_of(config), []
     for seed in range(8):
         problem = minima.window(config, "wet_clay", 10.0, minima.constant(0.1), False, 40 + seed, still)
         fit = fit_window(problem, prior)
         calm = DenoisedObservationModel(problem, fit.optimum)
         before = Gaussian.of(prior, problem.gain_std)
-        place = Iterate(fit.optimum.soil, fit.optimum.gains, calm.latents, np.inf, 1)
-        top = refine(Objective(calm, prior, before), place)
+        iterate = Iterate(fit.optimum.soil, fit.optimum.gains, calm.latents, np.inf, 1)
+        top = refine(Objective(calm, prior, before), iterate)
         bound = cramer_rao(calm, prior, soil).log_covariance[2, 2]
         ratio.append([one.mode.covariance[2, 2] / bound for one in (fit, top)])
     fitted, denoised = np.sqrt(np.median(ratio, axis=0))

@@ -9,7 +9,7 @@ import pytest
 from drives import B_REF, Z_REF, errors, task_of, tracker_of, windows
 
 from soilbus.decision.traversability import Status
-from soilbus.estimation.tracker import Ground, TrackerOutput
+from soilbus.estimation.tracker import TrackerOutput, TrackerState
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -34,11 +34,13 @@ def test_a_new_soil_is_known_two_seconds_after_its_border(first, second):
     for seed in range(3):
         tracker = tracker_of(config)
         results = {round(end): tracker.estimate(w, end) for w, end in windows(config, simulate(config, scenario, seed))}
-        assert all(r.ground is Ground.SAME and abs(off(r, first)) < 3.5 for end, r in results.items() if end < CROSSED)
+        assert all(
+            r.state is TrackerState.STEADY and abs(off(r, first)) < 3.5 for end, r in results.items() if end < CROSSED
+        )
         after = [r for end, r in results.items() if end >= CROSSED + 2.0]
         assert len(after) == 5
         for r in after:
-            assert r.ground is Ground.NEW
+            assert r.state is TrackerState.NEW_SOIL
             assert not r.mismatch
             assert abs(off(r, second)) < 3.0
 
@@ -69,13 +71,13 @@ def test_a_border_may_be_longer_than_thought(first, second, seed, at, how):
     for window, end in windows(config, recording):
         result = tracker.estimate(window, end)
         if end < reached:
-            assert result.ground is Ground.SAME
+            assert result.state is TrackerState.STEADY
             assert abs(off(result, first)) < 3.5
         elif end < reached + 3.0:
             assert not result.mismatch
         elif end > left + 2.0:
             assert not result.mismatch
-            assert result.ground is not Ground.CHANGING
+            assert result.state is not TrackerState.SUSPECT
             assert abs(off(result, second)) < 3.5
 
 
@@ -120,9 +122,9 @@ def test_a_soil_found_afresh_is_another_one_from_where_its_data_begin():
             results.append(tracker.estimate(late, end + first))
         empty = replace(window, t=window.t + first, ground_speed=np.full(len(window.t), np.nan))
         assert tracker.estimate(empty, end + first).fit is None
-    assert [r.ground for r in results] == [Ground.NEW] + [Ground.SAME] * (len(results) - 1)
+    assert [r.state for r in results] == [TrackerState.NEW_SOIL] + [TrackerState.STEADY] * (len(results) - 1)
     assert all(abs(off(r, "wet_clay")) < 3.5 for r in results)
-    assert tracker._crossing.end == pytest.approx(30.0, abs=0.2)
+    assert tracker._transition.end == pytest.approx(30.0, abs=0.2)
 
 
 def test_what_no_soil_explains_is_a_mismatch_and_no_new_soil():
@@ -142,13 +144,13 @@ def test_one_soil_for_minutes_stays_one_soil_and_the_errors_as_said():
     scenario = Scenario(200.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.40))
     tracker = tracker_of(config)
     results = [tracker.estimate(w, end) for w, end in windows(config, simulate(config, scenario, 1))]
-    assert {r.ground for r in results} == {Ground.SAME}
+    assert {r.state for r in results} == {TrackerState.STEADY}
     assert not any(r.mismatch for r in results)
     away = np.array([off(r, "loam") for r in results])
     # Gains are fixed over the drive and windows overlap: this is not many independent errors.
     assert np.sqrt(np.mean(away**2)) < 1.6
     assert np.abs(away).max() < 3.5
-    # What windows before told is worth something: the last estimates are surer than the first.
+    # The windows before add information: the last estimates have smaller sd than the first.
     std = [r.fit.posterior.bearing_pressure(Z_REF, B_REF).std for r in results]
     assert np.median(std[-20:]) < 0.9 * np.median(std[:5])
 
@@ -162,10 +164,10 @@ def test_a_window_that_fails_leaves_what_is_known_alone():
     for i, (window, end) in enumerate(drive):
         undisturbed.estimate(window, end)
         if i == 3:
-            wild = window.torque * nonsense.choice([-3.0, 3.0], window.torque.shape)
-            bad = disturbed.estimate(replace(window, torque=wild), end)
+            outliers = window.torque * nonsense.choice([-3.0, 3.0], window.torque.shape)
+            bad = disturbed.estimate(replace(window, torque=outliers), end)
             assert bad.mismatch
-            assert all(at != end for at, _ in disturbed._gaussians)
+            assert all(at != end for at, _ in disturbed._posteriors)
         else:
             last = disturbed.estimate(window, end)
     expected = undisturbed.estimate(*drive[-1])

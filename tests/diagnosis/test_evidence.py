@@ -12,12 +12,15 @@ from scipy.linalg import block_diag
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
 
-from soilbus.diagnosis.evidence import SCALES, correction, evidence_of_any_size
-from soilbus.diagnosis.verdict import PLAUSIBLE, is_real, out_of_reach, price, probabilities
+from soilbus.diagnosis.evidence import mixture_correction, mixture_neg2_log_evidence
+from soilbus.diagnosis.verdict import is_dominated, is_unexplained, probabilities, required_fall
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Parameter
 
+SCALES = tuple(2.0**k for k in range(-4, 3))
+"""Of the prior std, all as likely."""
+SET_PROBABILITY = 0.02
 SIZE = Free("x", Parameter("size", "1", 0.0, 1.0, -9.0, 9.0), None, 0.0, 1.0)
 PLACE = Free("x", Parameter("place", "1", 0.5, 1.0, -9.0, 9.0), None, 0.5, 1.0)
 
@@ -42,21 +45,21 @@ def test_the_evidence_is_that_of_a_mixture_of_prior_scales(information, best):
         expected = np.array([of(scale) for scale in SCALES])
     if not np.isfinite(expected).all():
         return
-    told = evidence_of_any_size(np.array([[information]]), np.array([pull]), [SIZE])
-    assert told == pytest.approx(-2.0 * np.log(expected.mean()), abs=1e-6)
+    reported = mixture_neg2_log_evidence(np.array([[information]]), np.array([pull]), [SIZE])
+    assert reported == pytest.approx(-2.0 * np.log(expected.mean()), abs=1e-6)
 
 
 def test_only_parameters_that_say_how_great_an_effect_is_are_scaled():
     information, pull = np.diag([50.0, 50.0]), np.array([5.0, 200.0])
-    one = evidence_of_any_size(information[:1, :1], pull[:1], [SIZE])
+    one = mixture_neg2_log_evidence(information[:1, :1], pull[:1], [SIZE])
     other = np.log(51.0) - 200.0**2 / 51.0
-    assert evidence_of_any_size(information, pull, [SIZE, PLACE]) == pytest.approx(one + other)
+    assert mixture_neg2_log_evidence(information, pull, [SIZE, PLACE]) == pytest.approx(one + other)
 
 
 def test_a_small_effect_of_many_parameters_pays_less_for_them():
     free = [SIZE] * 8
     covariance = np.eye(8) * 0.02**2
-    small, usual = (correction(np.full(8, size), covariance, free) for size in (0.08, 1.0))
+    small, usual = (mixture_correction(np.full(8, size), covariance, free) for size in (0.08, 1.0))
     assert small < -10.0 < usual < 2.0 * np.log(len(SCALES) * (1 + len(free)))  # scales, and cases: all or one alone
 
 
@@ -75,8 +78,8 @@ def test_simpler_cases_of_an_effect_have_their_share_of_the_evidence(name):
     likelihoods = [marginal(design @ rows.T, sized) for rows, sized in simpler_by_hand(name)]
     found = logsumexp([logsumexp(each) - np.log(len(SCALES)) for each in likelihoods]) - np.log(len(likelihoods))
     absent = multivariate_normal.logpdf(y, np.zeros(60), np.eye(60))
-    told = evidence_of_any_size(design.T @ design, design.T @ y, free)
-    assert told == pytest.approx(-2.0 * (found - absent), abs=1e-6)
+    reported = mixture_neg2_log_evidence(design.T @ design, design.T @ y, free)
+    assert reported == pytest.approx(-2.0 * (found - absent), abs=1e-6)
 
 
 def simpler_by_hand(name: str) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -105,20 +108,20 @@ def test_alike_names_share_the_probability_and_form_errors_leave_some_to_others(
     alike = probabilities({"a": 500.0, "b": 499.0, "c": 20.0}, 0.0)
     assert alike["a"] == pytest.approx(alike["b"], abs=0.05)
     assert sum(alike.values()) == pytest.approx(1.0, abs=1e-6)
-    assert alike["c"] < PLAUSIBLE
+    assert alike["c"] < SET_PROBABILITY
     clear = probabilities({"a": 1100.0, "b": 850.0}, 0.0)
-    assert 0.9 < clear["a"] < 1.0 - PLAUSIBLE
-    assert not out_of_reach(250.0, 1100.0)
-    assert out_of_reach(1090.0, 1100.0)
+    assert 0.9 < clear["a"] < 1.0 - SET_PROBABILITY
+    assert not is_dominated(250.0, 1100.0)
+    assert is_dominated(1090.0, 1100.0)
 
 
 def test_a_further_effect_beside_a_great_one_is_doubted():
     alone, beside = (probabilities({"a": 60.0}, explained)["a"] for explained in (0.0, 5e4))
     assert alone > 0.99
     assert 0.5 < beside < 0.6
-    assert price(0.0, 1.0, 3000, 10000) < 20.0
-    assert 20.0 < price(400.0, 1.0, 3000, 10000) < 60.0
-    assert price(1e5, 1.0, 3000, 10000) > 60.0
+    assert required_fall(0.0, 1.0, 3000, 10000) < 20.0
+    assert 20.0 < required_fall(400.0, 1.0, 3000, 10000) < 60.0
+    assert required_fall(1e5, 1.0, 3000, 10000) > 60.0
 
 
 def test_every_further_start_is_of_the_catalogue():
@@ -134,8 +137,8 @@ def test_every_further_start_is_of_the_catalogue():
 
 
 def test_a_great_gap_that_is_left_is_not_explained():
-    assert is_real(30.0, 8.0, 3000)
-    assert not is_real(30.0, 3.0, 3000)
-    assert not is_real(1.6, 1.15, 3000)
-    assert is_real(1.6, 1.3, 3000)
-    assert not is_real(1.2, 1.03, 3000)
+    assert is_unexplained(30.0, 8.0, 3000)
+    assert not is_unexplained(30.0, 3.0, 3000)
+    assert not is_unexplained(1.6, 1.15, 3000)
+    assert is_unexplained(1.6, 1.3, 3000)
+    assert not is_unexplained(1.2, 1.03, 3000)

@@ -1,4 +1,4 @@
-"""Steady pulling tells little and is no error: an estimate, a decision and no gap in every window."""
+"""Steady pulling determines little and is no error: an estimate, a decision and no gap in every window."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Turns are told from wheels that spin on one side: by signs, by size, and by the yaw rate where there is one."""
+"""Turns are distinguished from wheels that spin on one side: by signs, by size, by the yaw rate if there is one."""
 
 from __future__ import annotations
 

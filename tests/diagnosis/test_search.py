@@ -1,4 +1,4 @@
-"""A diagnosis fits no more than it needs to: what few instants and scores foretell, and what is not fitted again."""
+"""The stepwise search: predictions from thinned instants and scores, and fits that are not repeated or given up."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from itertools import islice, product
 import numpy as np
 import pytest
 
-from soilbus.diagnosis import search as fits_module
+from soilbus.diagnosis import search as search_module
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import record_of
-from soilbus.diagnosis.score import further_scores, normals_of, scores
-from soilbus.diagnosis.search import THINNED, Fits
-from soilbus.estimation import multistart as gauss_newton
+from soilbus.diagnosis.score import further_scores, normal_equations, scores
+from soilbus.diagnosis.search import FitCache
+from soilbus.estimation import multistart
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import DescentOptions, fit_window
 from soilbus.estimation.nuisance_parameters import parameters_of
@@ -31,6 +31,7 @@ from .blind.trial import record_of_case
 CONFIG = reference_configuration()
 PRIOR = prior_of(CONFIG)
 DURATION = 60.0
+THINNING = 4
 SLIP_SINKAGE = CATALOGUE["slip_sinkage"]
 
 
@@ -49,25 +50,25 @@ def base(record):
     return fit_model([record], PRIOR, ())
 
 
-def fall_of(effect, record, foretold_for=None):
-    """Of -2 log evidence by an effect; foretold for so many residuals."""
+def fall_of(effect, record, rows=None):
+    """Fall of -2 log evidence by an effect; predicted for `rows` residuals where these are given."""
     before = fit_model([record], PRIOR, ())
     (score,) = scores([record], PRIOR, before, [effect])
     after = fit_model([record], PRIOR, [effect], score.starts)
-    rows = foretold_for or before.rows
-    return before.foreseen(rows) - after.foreseen(rows)
+    rows = rows or before.rows
+    return before.predicted_neg2_log_evidence(rows) - after.predicted_neg2_log_evidence(rows)
 
 
-def test_a_few_instants_foretell_what_an_effect_explains_of_all(record):
+def test_thinned_instants_predict_what_an_effect_explains_of_all(record):
     true = fall_of(SLIP_SINKAGE, record)
     rows = fit_model([record], PRIOR, ()).rows
-    foretold = fall_of(SLIP_SINKAGE, record.thinned(THINNED), rows)
+    predicted = fall_of(SLIP_SINKAGE, record.thinned(THINNING), rows)
     assert true > 100.0
-    assert foretold == pytest.approx(true, abs=3.0 * 2.0 * math.sqrt(THINNED * true))
+    assert predicted == pytest.approx(true, abs=3.0 * 2.0 * math.sqrt(THINNING * true))
 
 
-def test_what_is_foreseen_for_the_rows_there_are_is_the_evidence(base):
-    assert base.foreseen(base.rows) == pytest.approx(base.neg2_log_evidence)
+def test_the_evidence_predicted_for_its_own_rows_is_the_evidence(base):
+    assert base.predicted_neg2_log_evidence(base.rows) == pytest.approx(base.neg2_log_evidence)
 
 
 def fall_on_any_face(information, gradient, low, high):
@@ -87,19 +88,19 @@ def test_the_predicted_fall_is_the_greatest_that_the_ranges_of_the_parameters_al
     candidates = [effect for effect in CATALOGUE.values() if not effect.of_record]
     at_edge = 0
     for effect in candidates:
-        free = parameters_of(effect, len(record.learned.rig.wheels))
+        free = parameters_of(effect, len(record.training.rig.wheels))
         if len(free) > 4:  # three to this power are the faces
             continue
-        (normal,) = normals_of([record], PRIOR, base, [effect], free)
-        information = normal.left + np.eye(len(free))
+        (equations,) = normal_equations([record], PRIOR, base, [effect], free)
+        information = equations.information + np.eye(len(free))
         low, high = (
             np.array([(getattr(f.parameter, edge) - f.value) / f.std for f in free]) for edge in ("low", "high")
         )
         (score,) = scores([record], PRIOR, base, [effect])
         assert score.fall == pytest.approx(
-            fall_on_any_face(information, normal.by_effects, low, high), rel=1e-6, abs=1e-9
+            fall_on_any_face(information, equations.gradient, low, high), rel=1e-6, abs=1e-9
         )
-        inside = -np.linalg.solve(information, normal.by_effects)
+        inside = -np.linalg.solve(information, equations.gradient)
         at_edge += bool(np.any((inside < low) | (inside > high)))
     assert at_edge >= 3
 
@@ -122,38 +123,38 @@ def test_a_model_is_fitted_once_from_one_start(record, base, monkeypatch):
         calls.append(args)
         return fit_model(*args)
 
-    monkeypatch.setattr(fits_module, "complete", counted)
-    fits, give_up_above = Fits([record], PRIOR), DescentOptions(give_up_above=0.3 * base.neg2_log_posterior)
+    monkeypatch.setattr(search_module, "fit_model", counted)
+    fits, give_up_above = FitCache([record], PRIOR), DescentOptions(give_up_above=0.3 * base.neg2_log_posterior)
     (score,) = scores([record], PRIOR, base, [SLIP_SINKAGE])
     assert (
-        fits.of([SLIP_SINKAGE], [score.starts], give_up_above)
+        fits.fit([SLIP_SINKAGE], [score.starts], give_up_above)
         is None
-        is fits.of([SLIP_SINKAGE], [score.starts], give_up_above)
+        is fits.fit([SLIP_SINKAGE], [score.starts], give_up_above)
     )
     assert len(calls) == 1
-    settled = fits.of([SLIP_SINKAGE], [score.starts])
+    settled = fits.fit([SLIP_SINKAGE], [score.starts])
     assert settled.converged
     assert len(calls) == 2
-    assert fits.of([SLIP_SINKAGE], [score.starts], give_up_above) is settled is fits.of([SLIP_SINKAGE])
+    assert fits.fit([SLIP_SINKAGE], [score.starts], give_up_above) is settled is fits.fit([SLIP_SINKAGE])
     assert len(calls) == 2
 
 
 def test_no_descent_of_a_window_begins_where_another_did(monkeypatch):
-    """What led to the optimum was taken for its rival on this one."""
+    """On this case a descent towards the optimum was taken for a second mode."""
     case = next(islice(cases("pair", 11), 14, None))
-    problem, prior = record_of_case(case).learned, prior_of(case.config)
+    problem, prior = record_of_case(case).training, prior_of(case.config)
     began = []
 
     def counted(fitting, near, *args, **kwargs):
         began.append((fitting.problem.n, near.soil.tobytes()))
         return descend_jointly(fitting, near, *args, **kwargs)
 
-    monkeypatch.setattr(gauss_newton, "settle", counted)
+    monkeypatch.setattr(multistart, "descend_jointly", counted)
     assert fit_window(problem, prior) is not None
     assert len(began) == len(set(began))
 
 
-def test_a_fit_that_will_stay_above_a_hopeless_cost_is_given_up(record, base):
+def test_a_fit_that_will_stay_above_the_limit_is_given_up(record, base):
     (score,) = scores([record], PRIOR, base, [SLIP_SINKAGE])
     found = fit_model([record], PRIOR, [SLIP_SINKAGE], score.starts)
     assert (

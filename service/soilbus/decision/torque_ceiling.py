@@ -1,0 +1,149 @@
+"""Saturation: the greatest torque that a motor gives, as its torque shows it, whatever limit is reported for it.
+
+Torque T of a wheel below its motor's ceiling C follows the pull Q that is asked of the vehicle; at the ceiling it does
+not.  Nor does it follow the wheel's load N there.  Over one span of bins, with means T', Q', N':
+
+    follows      T - T' = b (Q - Q') + T' (N / N' - 1) + noise     b = T' / sum(T' / r): its share of the thrust
+    saturated    T - T' =                                noise     chi-square within noise, less than of `follows`
+
+A wheel follows where it does so with its load or without.  Q is draft, slope and what speeds the vehicle up; what slows
+it down is not asked of the motors: a vehicle that loses speed under a draft that rises while its torques stand has an
+unmet demand.  A ceiling is never exceeded, so only the highest torque measured so far can be one.
+
+A constant command below the ceiling, a pedal that is held, looks the same while it lasts.  So one plateau counts while
+the vehicle loses speed on it; a second one at the same level, with less torque between them, makes it a ceiling until
+the torque exceeds it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from soilbus.arrays import Array, Mask
+from soilbus.estimation.window import Rig, Window, inertia_of, pull_asked
+from soilbus.terra.vehicle import GRAVITY
+
+LEAST_BINS = 4
+"""Bins of a span from which scatter and trend are told apart: one mean, one slope, two degrees of freedom."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TorqueCeiling:
+    """What one recording has shown of each wheel's (W,) ceiling; `after` takes the next window.
+
+    t [s]: end of the last span.  highest [N m]: largest mean of a span.  level [N m]: of the plateau on which the
+    wheel was saturated, nan without one; weight [1/(N m)^2]: the inverse variance of level.  lasts: the torque has not
+    been below the level since.  unmet: the vehicle lost speed on this plateau, and has not gained any since.  returned:
+    the torque was below the level, and the wheel was saturated at this level again.
+    """
+
+    t: float
+    highest: Array
+    level: Array
+    weight: Array
+    lasts: Mask
+    unmet: Mask
+    returned: Mask
+
+    @classmethod
+    def unknown(cls, wheels: int) -> TorqueCeiling:
+        """Before any measurement."""
+        no = np.zeros(wheels, bool)
+        return cls(-math.inf, np.full(wheels, -np.inf), np.full(wheels, np.nan), np.zeros(wheels), no, no, no)
+
+    @property
+    def limit(self) -> Array:
+        """Greatest torque (W,) [N m] that may be counted on; nan where no ceiling shows."""
+        return np.where((self.lasts & self.unmet) | self.returned, self.level, np.nan)
+
+    def after(self, window: Window, rig: Rig, span: float, deviations: float) -> TorqueCeiling:
+        """With the spans of a window that come after the last one.
+
+        Parameters
+        ----------
+        window
+            A forward window, with the true draft.
+        rig
+            With a chassis, else nothing is known of the pull.
+        span
+            [s], of a plateau, and between two looks.
+        deviations
+            Standard deviations from which a difference is none of noise.
+        """
+        if rig.chassis is None or not len(window.t):
+            return self
+        end = float(window.t[-1])
+        first = window.t[0] if math.isinf(self.t) else max(self.t, window.t[0])
+        now = self
+        for k in reversed(range(round((end - first) / span))):
+            inside = (window.t > end - (k + 1) * span) & (window.t <= end - k * span)
+            now = now._after_span(window.rows(np.flatnonzero(inside)), rig, deviations)
+        return replace(now, t=end)
+
+    def _after_span(self, window: Window, rig: Rig, deviations: float) -> TorqueCeiling:
+        if len(window.t) < LEAST_BINS:
+            return self
+        variance = window.variance["torque"].mean(axis=0)
+        torque, var = window.torque.mean(axis=0), variance / len(window.t)
+        saturated = _saturated(window, rig, deviations)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            noise = deviations * np.sqrt(var + np.where(self.weight > 0.0, 1.0 / self.weight, np.inf))
+            exceeded, below = torque - self.level > noise, self.level - torque > noise
+            saturated &= self.highest - torque <= deviations * np.sqrt(2.0 * var)
+        known = np.isfinite(self.level) & ~exceeded
+        same = saturated & known & ~below
+        new = np.divide(1.0, var, out=np.zeros_like(var), where=saturated)
+        weight = np.where(known & (same | ~saturated), self.weight, 0.0) + new
+        share = np.divide(new, weight, out=np.zeros_like(weight), where=saturated)
+        level = np.where(known & (same | ~saturated), self.level, np.where(saturated, torque, np.nan))
+        level = np.where(saturated, level + share * (torque - level), level)
+        gain, of_noise = _speed_gained(window, deviations)
+        lasts = saturated | (self.lasts & known & ~below)
+        return replace(
+            self,
+            highest=np.fmax(self.highest, torque),
+            level=level,
+            weight=weight,
+            lasts=lasts,
+            unmet=lasts & ((self.unmet & (gain < of_noise)) | (saturated & (gain < -of_noise))),
+            returned=known & (self.returned | (same & ~self.lasts)),
+        )
+
+
+def _saturated(window: Window, rig: Rig, deviations: float) -> Mask:
+    """Which wheels' torques (W,) stand within noise while the pull asked of the vehicle changes."""
+    assert rig.chassis is not None
+    mass, n = rig.chassis.mass, len(window.t)
+    pull = pull_asked(window, rig.chassis) + np.maximum(inertia_of(window, rig.chassis), 0.0)
+    of_pull = window.variance["draft"] + (mass * GRAVITY) ** 2 * _known(window, "pitch")
+    of_pull = of_pull + mass**2 * _known(window, "acceleration")
+    mean, variance = window.torque.mean(axis=0), window.variance["torque"]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = mean / np.nansum(mean / rig.radius)
+        load = window.load.mean(axis=0)
+        of_load = (mean / load) ** 2 * window.variance["load"]
+        weighed = np.isfinite(load) & np.isfinite(of_load).all(axis=0)
+        rest = window.torque - mean - (pull - pull.mean())[:, None] * share
+        of_rest = variance + share**2 * of_pull[:, None]
+        unweighed = (rest**2 / of_rest).sum(axis=0)
+        rest = rest - np.where(weighed, mean * (window.load / load - 1.0), 0.0)
+        of_rest = of_rest + np.where(weighed, of_load, 0.0)
+        stands = ((window.torque - mean) ** 2 / variance).sum(axis=0)
+        follows = np.minimum(unweighed, (rest**2 / of_rest).sum(axis=0))
+        flat = stands <= n - 1.0 + deviations * math.sqrt(2.0 * (n - 1.0))
+        return np.asarray((share > 0.0) & flat & (follows - stands > deviations**2))
+
+
+def _speed_gained(window: Window, deviations: float) -> tuple[float, float]:
+    """Ground speed gained over the window, as its regression on time, and what noise gains; in one unit."""
+    since = window.t - window.t.mean()
+    noise = deviations * math.sqrt(float(since**2 @ window.variance["ground_speed"]))
+    return float(since @ window.ground_speed), noise
+
+
+def _known(window: Window, quantity: str) -> Array:
+    """Variance (N,) of a quantity, 0 where it is not measured."""
+    return np.where(np.isfinite(getattr(window, quantity)), window.variance[quantity], 0.0)

@@ -1,0 +1,193 @@
+"""The stopping rule of the joint descent, and steps and fits at bounds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import lsq_linear
+
+from soilbus.diagnosis.damped_descent import descend_damped
+from soilbus.estimation.assembly import model_of, rig_of
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.multistart import DEFAULT_OPTIONS, Start, fit_from, fit_from_soil, fit_window
+from soilbus.estimation.nuisance_parameters import parameters_of
+from soilbus.estimation.observation_model import ObservationModelWithEffects
+from soilbus.estimation.parametrization import BOUND_SD, Coordinates, at_bounds, step_fraction_within
+from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+from soilbus.estimation.solver import Iterate, Objective, QuadraticModel, StoppingRule, descend_jointly
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.soils import SOILS
+
+WET_CLAY = SOILS["wet_clay"]
+C = PARAMETERS.index("c")
+
+
+class OneResidual:
+    """An objective r(x)^2 of one unknown, which counts its evaluations."""
+
+    def __init__(self, residual, derivative):
+        self.residual, self.derivative = residual, derivative
+        self.tried, self.n_solved_angles = [], 0
+
+    def quadratic_model(self, iterate):
+        (x,) = iterate.soil
+        self.tried.append(x)
+        r, slope = self.residual(x), self.derivative(x)
+        if not math.isfinite(r):
+            return None
+        none = np.zeros((1, 1))
+        return QuadraticModel(np.array([[slope**2]]), none, none, np.array([slope * r]), r**2, np.zeros((0, 1)), None)
+
+    def stepped(self, iterate, model, step):
+        return replace(iterate, soil=iterate.soil + step)
+
+    def with_entry_angles(self, iterate):
+        self.n_solved_angles += 1
+        return iterate
+
+
+def begin(x):
+    return Iterate(np.array([x]), np.zeros(0), None, math.inf, 0)
+
+
+def exponential():
+    """Least at log 3."""
+    return OneResidual(lambda x: math.exp(x) - 3.0, math.exp)
+
+
+def test_a_descent_converges_where_the_step_is_shorter_than_its_tolerance():
+    end = descend_jointly(exponential(), begin(0.5), StoppingRule(30, step_tolerance=1e-12, next_step_tolerance=0.0))
+    assert end.converged
+    assert end.predicted_decrease < 1e-12 < (math.exp(0.5) - 3.0) ** 2
+    assert end.iterate.soil[0] == pytest.approx(math.log(3.0), abs=1e-9)
+
+
+def test_a_descent_converges_one_step_earlier_where_the_next_one_will_be_short():
+    early = descend_jointly(exponential(), begin(0.5), StoppingRule(30, step_tolerance=1e-12, next_step_tolerance=1e-3))
+    late = descend_jointly(exponential(), begin(0.5), StoppingRule(30, step_tolerance=1e-12, next_step_tolerance=0.0))
+    assert early.converged
+    assert early.iterations < late.iterations
+    assert early.predicted_decrease > 1e-12
+    assert early.iterate.soil[0] == pytest.approx(math.log(3.0), abs=1e-2)
+
+
+def test_a_descent_whose_predicted_value_stays_too_high_is_given_up():
+    curve = OneResidual(lambda x: 100.0 + 0.0 * x, lambda x: 1e-9)
+    rule = StoppingRule(30, step_tolerance=0.0, next_step_tolerance=0.0, give_up_above=-1.0)
+    end = descend_jointly(curve, begin(0.0), rule)
+    assert not end.converged
+    assert end.iterations == len(curve.tried) == 1
+
+
+def test_rejected_steps_are_shortened_and_end_a_descent_that_finds_none():
+    """Every step leads up a cliff."""
+    cliff = OneResidual(lambda x: 10.0 if x == 0.0 else 1e3, lambda x: -1.0)
+    end = descend_jointly(cliff, begin(0.0), StoppingRule(30, max_rejected=3))
+    assert not end.converged
+    assert end.previous.soil[0] == 0.0
+    steps = [x for x in cliff.tried if x != 0.0]
+    assert len(steps) == 4
+    assert all(later < 0.5 * step for step, later in pairwise(steps))
+    assert cliff.n_solved_angles == 1
+
+
+def test_a_descent_ends_with_its_evaluations_or_where_the_numbers_are_not_finite():
+    end = descend_jointly(exponential(), begin(0.5), StoppingRule(2, step_tolerance=1e-12, next_step_tolerance=0.0))
+    assert end.iterations == 2
+    assert not end.converged
+    assert descend_jointly(OneResidual(lambda x: math.nan, lambda x: 1.0), begin(0.0), StoppingRule(30)) is None
+
+
+@given(st.integers(0, 10_000), st.lists(st.sampled_from([-1.0, 0.0, 1.0]), min_size=4, max_size=4))
+@settings(max_examples=60, deadline=None)
+def test_a_step_never_crosses_active_bounds_and_with_one_it_is_the_constrained_optimum(seed, sides):
+    rng = np.random.default_rng(seed)
+    root, target = np.tril(rng.normal(size=(4, 4)), -1) + np.eye(4), rng.normal(size=4)
+    none = np.zeros((4, 4))
+    model = QuadraticModel(
+        root.T @ root, none, none, root.T @ target, 0.0, np.diag(sides)[np.array(sides) != 0.0], None
+    )
+    step = model.step()
+    assert np.all(step * np.array(sides) <= 1e-12)
+    value = float(np.sum((root @ step + target) ** 2))
+    assert value <= float(target @ target) + 1e-9
+    if np.count_nonzero(sides) < 2:
+        low, high = (np.where(np.array(sides) == side, 0.0, side * np.inf) for side in (-1.0, 1.0))
+        best = lsq_linear(root, -target, (low, high), method="bvls").x
+        assert step == pytest.approx(best, abs=1e-9)
+
+
+def test_steps_end_at_the_bounds():
+    assert step_fraction_within(np.array([0.5, np.inf, -0.2]), np.array([1.0, 9.0, -0.1])) == 0.5
+    assert step_fraction_within(np.array([np.inf]), np.array([3.0])) == 1.0
+    assert at_bounds(np.array([1.0, 2.0, 3.0]), np.ones(3), np.full(3, 3.0)).tolist() == [-1.0, 0.0, 1.0]
+    prior = SoilPrior.from_value_std(dict(zip(PARAMETERS, [(v, 0.25 * v) for v in WET_CLAY], strict=True)))
+    coordinates = Coordinates(prior, 0.3)
+    soil = np.asarray(WET_CLAY, float)
+    step = np.zeros(6)
+    step[C] = 0.6
+    soil = coordinates.stepped(soil, coordinates.step_fraction(soil, step) * step)
+    assert not len(coordinates.active_bounds(soil))
+    soil = coordinates.stepped(soil, coordinates.step_fraction(soil, step) * step)
+    assert coordinates.active_bounds(soil).tolist() == [np.eye(6)[C].tolist()]
+    assert soil[C] == pytest.approx(WET_CLAY.c * np.exp(BOUND_SD * prior.log_std[C]))
+
+
+def test_a_fit_converges_with_a_parameter_at_its_bound(simulated):
+    case = simulated(WET_CLAY, 5, overrides=[f"soil.c.value={0.2 * WET_CLAY.c}", f"soil.c.std={0.02 * WET_CLAY.c}"])
+    fit = fit_window(case.problem(), case.prior)
+    bound = case.prior.median[C] * np.exp(BOUND_SD * case.prior.log_std[C])
+    assert bound < 0.5 * WET_CLAY.c
+    assert fit.converged
+    assert fit.mode.soil[C] == pytest.approx(bound)
+    log_std = case.prior.log_std.copy()
+    log_std[C] = 0.0  # the others are where they are with c held at the bound
+    median = np.where(np.arange(6) == C, bound, case.prior.median)
+    held = fit_from_soil(case.problem(), SoilPrior(median, log_std), WET_CLAY._replace(c=bound))
+    std = np.sqrt(np.diag(held.posterior.log_covariance))
+    free = std > 0.0
+    assert np.abs(np.log(fit.mode.soil / held.mode.soil)[free] / std[free]).max() < 0.05
+
+
+@pytest.fixture(scope="module")
+def bulldozed(simulated):
+    """A drive without bulldozing, fitted with it: the best value is as likely below its range as in it."""
+    case = simulated(SOILS["loam"], 11)
+    rig, config = rig_of(case.config), case.config
+    plain = ObservationModelWithEffects(case.window, rig, model_of(config), config.estimator.min_speed)
+    effect = CATALOGUE["bulldozing"]
+    return plain.completed([effect], parameters_of(effect, plain.n_wheels)), case.prior
+
+
+def test_parameters_of_effects_stay_inside_their_ranges(bulldozed):
+    problem, prior = bulldozed
+    joint_prior = Gaussian.of(prior, problem.gain_std)
+    gains = np.concatenate([np.zeros(problem.n_sensors), np.ones(len(problem.free))])
+    fast = fit_from(problem, prior, joint_prior, Start(np.asarray(SOILS["loam"]), gains), problem.n_sensors)
+    fit = descend_damped(Objective(problem, prior, joint_prior), fast, DEFAULT_OPTIONS)
+    assert fit.converged
+    low, high = problem.gain_bounds()
+    for found in (fast, fit):
+        assert np.all(found.mode.gains >= low - 1e-9)
+        assert np.all(found.mode.gains <= high + 1e-9)
+    assert np.isfinite(low[problem.n_sensors :]).all()
+    assert np.isinf(low[: problem.n_sensors]).all()
+
+
+def test_solved_entry_angles_carry_the_loads_with_effects(simulated):
+    case = simulated(SOILS["loam"], 12)
+    plain = ObservationModelWithEffects(case.window, rig_of(case.config), model_of(case.config), 0.2)
+    effect = CATALOGUE["multipass"]
+    problem = plain.completed([effect], parameters_of(effect, plain.n_wheels))
+    gains = np.concatenate([np.zeros(problem.n_sensors), [1.0, 0.5, 0.3, -0.8]])
+    objective = Objective(problem, case.prior, Gaussian.of(case.prior, problem.gain_std))
+    iterate = objective.start(np.asarray(SOILS["loam"]), gains=gains)
+    iterate.latents.entry_angle *= 1.1
+    model = objective.quadratic_model(objective.with_entry_angles(iterate))
+    assert np.abs(model.linearisation.off).max() < 1e-3 * problem.load.mean()
