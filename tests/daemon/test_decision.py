@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from feeding import feed_message
+from fakes import feed_message
 from onlooker import good_tracked, of_soft_ground, tracked_at
 from soilbus.can.dbc_files import load_databases
 from soilbus.decision.judgement import Basis, at_present

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from feeding import feed_message
+from fakes import feed_message
 from soilbus.can.candump import Frame
 from soilbus.can.dbc_files import load_databases
 from soilbus.config.file import load_config

@@ -6,11 +6,9 @@ from collections import Counter
 
 import pytest
 
-from soilbus.pipeline.outputs import TICK
-
 from . import wire
 from .books import Hour
-from .run import Soak, soak
+from .run import CYCLE, Soak, soak
 from .verdict import GROWTH, demands
 
 
@@ -38,7 +36,7 @@ def test_frames_keep_their_beat(told):
     assert told.deadline_misses == 0
     assert told.off_beat <= told.faults["full"]  # once each: the newest frame goes out as soon as there is room
     assert told.sent > 0.8 * 3000
-    assert abs(told.drift) < TICK / 2 * told.epochs
+    assert abs(told.drift) < CYCLE / 2 * told.epochs
 
 
 def test_valid_windows_stay_right(told):
@@ -48,7 +46,7 @@ def test_valid_windows_stay_right(told):
 
 
 def test_a_lost_frame_is_noticed(monkeypatch):
-    monkeypatch.setattr(wire.Wire, "_hand_over", _forgetful(wire.Wire._hand_over))
+    monkeypatch.setattr(wire.Wire, "hand_over", _forgetful(wire.Wire.hand_over))
     assert soak(12.0, seed=4).lost
 
 

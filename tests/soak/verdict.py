@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from soilbus.pipeline.outputs import TICK
-
-from .run import SLACK, Soak
+from .run import CYCLE, SLACK, Soak
 
 GROWTH = 1e6
 """Of resident memory [bytes] after the first hour that is allowed."""
@@ -43,7 +41,7 @@ def demands(told: Soak) -> list[Demand]:
         Demand("every frame on its beat", f"{told.off_beat} of {told.sent} off it", told.off_beat == 0 < told.sent),
         Demand(
             "the beat drifts with the windows' ends only", f"{told.drift:+.3f} s in {told.epochs} beginnings",
-            abs(told.drift) <= TICK / 2 * told.epochs + SLACK,
+            abs(told.drift) <= CYCLE / 2 * told.epochs + SLACK,
         ),
         Demand(
             f"memory grows by at most {GROWTH / 1e6:g} MB after the first hour", f"{growth / 1e6:+.2f} MB",
