@@ -18,7 +18,7 @@ from soilbus.config.model import Config
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import Fit, fit_from_soil, fit_window
 from soilbus.estimation.observation_model import ObservationModel
-from soilbus.estimation.parametrization import BOUND_SD, Coordinates
+from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
@@ -26,6 +26,9 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
+
+BOUND_SD = 4.0
+"""Prior standard deviations to which a free parameter is confined."""
 
 FIELD = Path(__file__).resolve().parents[1] / "field/field.toml"
 KINDS = ("loam", "wet_clay", "dry_sand")

@@ -17,9 +17,7 @@ from soilbus.config.model import Config
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel
-from soilbus.estimation.parametrization import TYPICAL_DEPTH
-from soilbus.estimation.soil_classes import PRIOR_UNKNOWN, SoilClasses
-from soilbus.estimation.tracker import MISMATCH_SD
+from soilbus.estimation.soil_classes import SoilClasses
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import simulate
@@ -27,6 +25,13 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import UNKNOWN
 from soilbus.terra.wheel import Soil
+
+MISMATCH_SD = 3.5
+"""Standard deviations of chi-square that a window may have above the allowed."""
+PRIOR_UNKNOWN = 0.5
+"""Prior probability that a soil is none of the table."""
+TYPICAL_DEPTH = 0.03
+"""Depth [m] at which bearing pressures of soils are drawn."""
 
 WIDE_COHESION = ("soil.c.value=5000", "soil.c.std=8000")
 """The table has cohesions up to 69 kPa, 23 times the default prior's median."""

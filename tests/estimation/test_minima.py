@@ -13,11 +13,15 @@ from hypothesis import strategies as st
 
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.multistart import fit_from_soil, fit_window
-from soilbus.estimation.parametrization import BOUND_SD, MAX_PHI
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
+
+BOUND_SD = 4.0
+"""Prior standard deviations to which a free parameter is confined."""
+MAX_PHI = 1.2
+"""Friction angle [rad] beyond any soil's."""
 
 STARTS = 20
 K_C = np.array(PARAMETERS) == "k_c"
