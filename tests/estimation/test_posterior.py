@@ -138,6 +138,8 @@ def test_an_added_covariance_adds_up_and_never_exceeds_the_prior():
     assert np.all(np.linalg.eigvalsh(huge - small) > -1e-6)
     unchanged = posterior.with_added_covariance(np.zeros((6, 6)), prior).log_covariance
     assert unchanged == pytest.approx(own, rel=1e-6, abs=1e-12)
-    shift = 5.0 * prior.log_std
-    about = posterior.with_added_covariance(1e6 * by @ by.T, prior, shift).log_covariance
-    assert about == pytest.approx(huge + np.outer(shift, shift))
+    shift = 0.3 * prior.log_std
+    about = posterior.with_added_covariance(by @ by.T, prior, shift).log_covariance
+    assert about == pytest.approx(small + np.outer(shift, shift))
+    far = posterior.with_added_covariance(1e6 * by @ by.T, prior, 5.0 * prior.log_std).log_covariance
+    assert np.diag(far) == pytest.approx(prior.log_std**2)  # nothing is known less than beforehand

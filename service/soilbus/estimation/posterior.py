@@ -186,7 +186,8 @@ class Posterior:
             Of the soil.
         shift : (6,), optional
             Of the logarithms, from this soil to the mean.  Then the result is the second moment about this soil: the
-            square of the shift is added, and not clipped, because the prior's variance is about another soil.
+            square of the shift is added.  Each parameter's shift is clipped to what its prior sd leaves beside its
+            own variance, because no parameter is known less than beforehand.
         """
         free = prior.free
         if not len(free):
@@ -198,7 +199,9 @@ class Posterior:
         covariance = np.zeros_like(self.log_covariance)
         covariance[at] = (axes * np.clip(variance, 0.0, most)) @ axes.T * unit
         if shift is not None:
-            covariance[at] += np.outer(shift[free], shift[free])
+            room = np.sqrt(np.maximum(prior.log_std[free] ** 2 - covariance[free, free], 0.0))
+            clipped = np.clip(shift[free], -room, room)
+            covariance[at] += np.outer(clipped, clipped)
         return Posterior(self.soil, covariance)
 
     def distance(self, soil: Soil) -> float:
