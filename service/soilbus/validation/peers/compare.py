@@ -1,4 +1,4 @@
-"""All methods on the same windows: run, score, tell."""
+"""All methods on the same windows: run, score, tabulate."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ import numpy as np
 
 from soilbus.report.table import table
 from soilbus.terra.soils import SOILS
-
-from .roster import OURS, Entry
-from .scores import QUANTITIES, Duel, Score, duel
-from .windows import Answer, Case, simulated_case
+from soilbus.validation.peers.roster import OURS, Entry
+from soilbus.validation.peers.scores import QUANTITIES, Duel, Score, duel
+from soilbus.validation.peers.windows import Answer, Case, simulated_case
 
 Scores = dict[str, dict[Entry, Score]]
 """By soil and entry."""
@@ -50,14 +49,14 @@ def tables(scores: Scores) -> Iterator[str]:
         rows = [
             (
                 e.name,
-                e.told,
+                e.given,
                 f"{100.0 * s.failure_rate:.0f} %",
                 f"{s.milliseconds:.1f}",
                 *(cell(s, q) for q in QUANTITIES),
             )
             for e, s in of_soil.items()
         ]
-        yield f"{soil}\n{table(('method', 'told', 'failed', 'ms', *QUANTITIES), rows)}"
+        yield f"{soil}\n{table(('method', 'given', 'failed', 'ms', *QUANTITIES), rows)}"
 
 
 def cell(score: Score, quantity: str) -> str:
@@ -72,7 +71,7 @@ def cell(score: Score, quantity: str) -> str:
 
 
 def duels(scores: Scores) -> Iterator[tuple[Entry, str, str, Duel]]:
-    """Peer, quantity, soil, and how it does against ours that is told the same exactly."""
+    """Peer, quantity, soil, and how it does against ours that is given the same exactly."""
     for soil, of_soil in scores.items():
         mine = {e.exact: s for e, s in of_soil.items() if e.name == OURS}
         for entry, score in of_soil.items():
@@ -93,12 +92,12 @@ def verdict(scores: Scores) -> str:
         if d.better == "peer":
             doubt = " (?)" if d.by_chance else ""
             failed = scores[soil][entry].failure_rate
-            told = entry.told + (f", fails in {100.0 * failed:.0f} %" if failed else "")
+            given = entry.given + (f", fails in {100.0 * failed:.0f} %" if failed else "")
             won = f"{quantity} {100.0 * d.peer:.2g} < {100.0 * d.ours:.2g}{doubt}"
-            wins.setdefault((entry.name, told, soil), []).append(won)
+            wins.setdefault((entry.name, given, soil), []).append(won)
     rows = [(*of, ", ".join(won)) for of, won in wins.items()]
-    head = ("peer", "told", "soil", "RMS error, peer's < ours [%]; (?): may be chance, by a sign test")
-    text = "Where a peer beats ours that is told the same exactly (windows where both have a value)\n"
+    head = ("peer", "given", "soil", "RMS error, peer's < ours [%]; (?): may be chance, by a sign test")
+    text = "Where a peer beats ours that is given the same exactly (windows where both have a value)\n"
     text += table(head, rows) if rows else "nowhere\n"
     both = {who: (tally[who, False], tally[who, True]) for who in ("ours", "peer")}
     alike = tally["neither", False] + tally["neither", True]
@@ -110,7 +109,7 @@ def verdict(scores: Scores) -> str:
 
 
 def ours_is_ahead(scores: Scores) -> bool:
-    """Whether ours has a value for every window, and is the better one as often as peers that are told the same."""
+    """Whether ours has a value for every window, and is the better one as often as peers that are given the same."""
     better = Counter(d.better for _, _, _, d in duels(scores))
     failed = any(score.failure_rate > 0.0 for found in scores.values() for e, score in found.items() if e.name == OURS)
     return not failed and better["ours"] >= better["peer"]

@@ -18,8 +18,7 @@ from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import PARAMETERS, Estimate
 from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.wheel import Soil, WheelState, wheel_forces_and_derivatives
-
-from .windows import B_REF, Z_REF, Answer, Case, bearing_pressure, entry_angles, fit_model
+from soilbus.validation.peers.windows import B_REF, Z_REF, Answer, Case, bearing_pressure, entry_angles, fit_model
 
 WALK = np.array([1e-4, 2e-4])
 """Sd of the random walk of phi [rad] and n from one instant to the next."""

@@ -13,12 +13,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from soilbus.arrays import Array
+from soilbus.arrays import Array, Indices
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import Estimate
 from soilbus.terra.wheel import Soil, WheelState, wheel_forces_and_derivatives
-
-from .windows import B_REF, Answer, Case, bearing_pressure, entry_angles, fit_model
+from soilbus.validation.peers.windows import B_REF, Answer, Case, bearing_pressure, entry_angles, fit_model
 
 MAX_STEPS = 50
 CONVERGED = 1e-8
@@ -49,7 +48,7 @@ def estimate(case: Case) -> Answer | None:
     }
 
 
-def _relative_misfit(problem: ObservationModel, known: Soil, x: Array, tyre: Array) -> tuple[Array, Array]:
+def _relative_misfit(problem: ObservationModel, known: Soil, x: Array, tyre: Indices) -> tuple[Array, Array]:
     """Model less reading over reading, of loads, torques and the pull, and derivatives by the unknowns."""
     rig, shape = problem.rig, problem.load.shape
     K_L = np.broadcast_to(x[2:][tyre], shape)

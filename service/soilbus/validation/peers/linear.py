@@ -16,8 +16,7 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.estimation.posterior import Estimate
 from soilbus.terra.soil_laws import shear_displacement
-
-from .windows import Answer, Case, entry_angles
+from soilbus.validation.peers.windows import Answer, Case, entry_angles
 
 
 def estimate(case: Case) -> Answer | None:

@@ -10,8 +10,7 @@ from scipy.stats import binomtest
 
 from soilbus.arrays import Array
 from soilbus.terra.wheel import Soil
-
-from .windows import B_REF, Z_REF, Answer
+from soilbus.validation.peers.windows import B_REF, Z_REF, Answer
 
 QUANTITIES = ("bearing", "phi", "n", "c", "K")
 HIGHEST = {"phi": np.pi / 2.0}

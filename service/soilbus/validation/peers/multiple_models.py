@@ -18,8 +18,7 @@ from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import PARAMETERS, Estimate
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
-
-from .windows import B_REF, Z_REF, Answer, Case, at_measured, reading_covariance
+from soilbus.validation.peers.windows import B_REF, Z_REF, Answer, Case, at_measured, reading_covariance
 
 DOUBLE = 0.05
 """Relative difference below which two soils of the table count as one."""

@@ -11,13 +11,12 @@ from scipy.integrate import quad
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.posterior import PARAMETERS, Estimate
 from soilbus.terra.soils import SOILS
-
-from . import finite_differences, kalman, learned, linear, multiple_models, newton_raphson, ours
-from .__main__ import main
-from .compare import compared, ours_is_ahead, tables, verdict
-from .roster import OURS, Entry, roster
-from .scores import Duel, Score, duel, truth
-from .windows import configured_prior, simulated_case, told_about
+from soilbus.validation.peers import finite_differences, kalman, learned, linear, multiple_models, newton_raphson, ours
+from soilbus.validation.peers.command import main
+from soilbus.validation.peers.compare import compared, ours_is_ahead, tables, verdict
+from soilbus.validation.peers.roster import OURS, Entry, roster
+from soilbus.validation.peers.scores import Duel, Score, duel, truth
+from soilbus.validation.peers.windows import assumed_of, configured_prior, simulated_case
 
 NAMES = ("loam", "wet_clay", "dry_sand")
 TRAINING = 60
@@ -200,7 +199,7 @@ def test_a_peer_that_is_better_is_said_to_be():
     assert won.peer == pytest.approx(won.ours / 2.0)
     assert duel(bad, good, "phi").better == "ours"
     assert Duel(1.0, 1.01, 1e-6).better == "neither"
-    mine, peer = Entry(OURS, ours.estimate), Entry("a peer", ours.estimate, given="something")
+    mine, peer = Entry(OURS, ours.estimate), Entry("a peer", ours.estimate, note="something")
     said = verdict({"loam": {mine: bad, peer: good}})
     assert "phi 3.8 < 7.7" in said
     assert "a peer in 1 (" in said
@@ -214,11 +213,11 @@ def test_a_peer_that_is_better_is_said_to_be():
 
 def test_what_is_told_is_off_by_a_quarter():
     rng = np.random.default_rng(3)
-    told = np.log([told_about(LOAM, rng) for _ in range(4000)]) - np.log(LOAM)
-    assert np.exp(told).std(axis=0) / np.exp(told).mean(axis=0) == pytest.approx(np.full(6, 0.25), rel=0.06)
+    off = np.log([assumed_of(LOAM, rng) for _ in range(4000)]) - np.log(LOAM)
+    assert np.exp(off).std(axis=0) / np.exp(off).mean(axis=0) == pytest.approx(np.full(6, 0.25), rel=0.06)
     case = simulated_case(LOAM, 8)
-    assert case.known == case.told
-    assert case.knowing(("K",)).known == case.told._replace(K=LOAM.K)
+    assert case.known == case.assumed
+    assert case.knowing(("K",)).known == case.assumed._replace(K=LOAM.K)
     assert case.knowing(("K",)).prior.log_std[PARAMETERS.index("K")] == 0.0
     assert case.prior.median[PARAMETERS.index("n")] == configured_prior()["n"][0]
 

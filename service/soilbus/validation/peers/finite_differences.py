@@ -22,8 +22,7 @@ from soilbus.estimation.posterior import Posterior
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.wheel import Soil, WheelState, sinkage, wheel_forces
-
-from .windows import B_REF, Z_REF, Answer, Case, fit_model, reading_covariance
+from soilbus.validation.peers.windows import B_REF, Z_REF, Answer, Case, fit_model, reading_covariance
 
 PASSES = 4
 REACH = 4.0
@@ -97,6 +96,6 @@ def _whitened(
         misfit.append(((problem.draft - (1.0 + gains[-1]) * draft) * scale[-1])[:, None])
         misfit.append(problem.sinkage - sinkage(angle, rig.radius))
         linear = at.by_latents @ ((measured - (1.0 + gains[W:-1]) * now) * scale[W:-1])[:, :, None]
-        return (whiten @ (np.concatenate(misfit, axis=1)[:, :, None] + linear)).ravel()
+        return np.asarray(whiten @ (np.concatenate(misfit, axis=1)[:, :, None] + linear)).ravel()
 
     return residuals

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from soilbus.estimation.multistart import fit_window
-
-from .windows import B_REF, Z_REF, Answer, Case
+from soilbus.validation.peers.windows import B_REF, Z_REF, Answer, Case
 
 
 def estimate(case: Case) -> Answer | None:
-    """Parameters told exactly are held; c and K have what is told as prior, the rest the configuration's."""
+    """Parameters given exactly are held; c and K have the assumed values as prior, the rest the configuration's."""
     fit = fit_window(case.problem, case.prior)
     if fit is None or not fit.converged:
         return None

@@ -1,4 +1,4 @@
-"""`PYTHONPATH=service python -m tests.peers`: ours beside the methods of other papers, on the same windows."""
+"""`python -m soilbus.validation.peers`: ours beside the methods of other papers, on the same windows."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import sys
 import time
 from collections.abc import Sequence
 
-from .compare import compared, ours_is_ahead, tables, verdict
-from .learned import trained
-from .roster import NEEDS, roster
-from .windows import TOLD
+from soilbus.validation.peers.compare import compared, ours_is_ahead, tables, verdict
+from soilbus.validation.peers.learned import trained
+from soilbus.validation.peers.roster import NEEDS, roster
+from soilbus.validation.peers.windows import ASSUMED_SD
 
 SOILS = ("loam", "wet_clay", "dry_sand")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse, train, run, print; 1 where ours failed on a window or peers told the same are better more often."""
-    parser = argparse.ArgumentParser(prog="python -m tests.peers", description=__doc__)
+    """Parse, train, run, print; 1 where ours failed on a window or peers given the same are better more often."""
+    parser = argparse.ArgumentParser(prog="python -m soilbus.validation.peers", description=__doc__)
     parser.add_argument("--windows", type=int, default=20, help="windows of each soil (20)")
     parser.add_argument("--seed", type=int, default=1, help="picks the drives and their noise (1)")
     parser.add_argument("--train", type=int, default=400, help="training windows of the learned regressor (400)")
@@ -25,7 +25,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if chosen.windows < 1 or not 0 <= chosen.seed < 100 or chosen.train < 20:
         parser.error("at least 1 window and 20 training windows, and a seed from 0 to 99")
     begin = time.perf_counter()
-    regressor = trained(chosen.train)
+    try:
+        regressor = trained(chosen.train)
+    except ModuleNotFoundError as reason:
+        print(reason, file=sys.stderr)
+        return 1
     training = time.perf_counter() - begin
     done = 0
 
@@ -38,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     scores = compared(roster(regressor), SOILS, chosen.windows, chosen.seed, step)
     print(f"{chosen.windows} windows of 10 s on each soil, seed {chosen.seed}. Kernel ridge: {chosen.train} training")
     print(
-        f"windows, {training:.1f} s to make and fit. Told to {100 * TOLD:.0f} %: off by that, one standard deviation."
+        f"windows, {training:.1f} s to make and fit. To {100 * ASSUMED_SD:.0f} %: off by that, one standard deviation."
     )
     print("Errors relative, in %: RMS / median of the size [truths inside the 95 % interval], failures left out.")
     print("bearing: pressure at 2 cm under a plate 0.3 m wide.\n")
@@ -46,7 +50,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print("\n".join(tables(scores)))
     print(verdict(scores), end="")
     return int(not ours_is_ahead(scores))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

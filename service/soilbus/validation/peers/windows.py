@@ -1,4 +1,4 @@
-"""Noisy windows of the full simulator, what the methods are told beside them, and the form of their answers."""
+"""Noisy windows of the full simulator, what the methods are given beside them, and the form of their answers."""
 
 from __future__ import annotations
 
@@ -26,40 +26,40 @@ Method = Callable[["Case"], Answer | None]
 
 Z_REF, B_REF = 0.02, 0.3
 """Depth and width [m] of the bearing pressure that is compared."""
-TOLD = 0.25
-"""Variation of what is told of a parameter: sd over value."""
-SPREAD = float(np.sqrt(np.log1p(TOLD**2)))
+ASSUMED_SD = 0.25
+"""Sd of the assumed value of a parameter over that value."""
+SPREAD = float(np.sqrt(np.log1p(ASSUMED_SD**2)))
 LENGTH = 10.0
 
 
 @dataclass(frozen=True)
 class Case:
-    """A window, and for each parameter a value that is told: exact, or off by a quarter (one sd).
+    """A window, and for each parameter an assumed value: exact, or off by a quarter (one sd).
 
-    `exact` names the parameters that are told exactly; `soil` is the truth, for scoring only.
+    `exact` names the parameters that are given exactly; `soil` is the truth, for scoring only.
     """
 
     soil: Soil
-    told: Soil
+    assumed: Soil
     exact: frozenset[str]
     problem: ObservationModel
 
     @property
     def known(self) -> Soil:
         """What a method that holds parameters fixed takes for them."""
-        return Soil(*(getattr(self.soil if name in self.exact else self.told, name) for name in PARAMETERS))
+        return Soil(*(getattr(self.soil if name in self.exact else self.assumed, name) for name in PARAMETERS))
 
     @cached_property
     def prior(self) -> SoilPrior:
-        """The configuration's prior, but c and K as told; what is told exactly is held."""
+        """The configuration's prior, but c and K as given; what is given exactly is held."""
         values = configured_prior() | {
-            name: (getattr(self.told, name), TOLD * getattr(self.told, name)) for name in ("c", "K")
+            name: (getattr(self.assumed, name), ASSUMED_SD * getattr(self.assumed, name)) for name in ("c", "K")
         }
         return SoilPrior.from_value_std(values | {name: (getattr(self.soil, name), 0.0) for name in self.exact})
 
     def knowing(self, exact: Collection[str]) -> Case:
-        """The same window with other parameters told exactly."""
-        return Case(self.soil, self.told, frozenset(exact), self.problem)
+        """The same window with other parameters given exactly."""
+        return Case(self.soil, self.assumed, frozenset(exact), self.problem)
 
 
 @cache
@@ -80,8 +80,8 @@ def fit_model() -> WheelModel:
     return model_of(reference_configuration())
 
 
-def told_about(soil: Soil, rng: np.random.Generator) -> Soil:
-    """The soil as somebody would tell it who knows each parameter to a quarter."""
+def assumed_of(soil: Soil, rng: np.random.Generator) -> Soil:
+    """Assumed values of the parameters: log-normal about the truth, sd over value ASSUMED_SD."""
     return Soil(*(np.asarray(soil) * np.exp(SPREAD * rng.standard_normal(6))).tolist())
 
 
@@ -94,7 +94,7 @@ def simulated_case(soil: Soil, seed: int, noise_free: bool = False) -> Case:
     store = Bins(rig, estimator.bin, 0.0)
     store.add({name: (c.t, c.value) for name, c in recording.channels.items() if name in rig.channels})
     problem = ObservationModel(store.window(0.0, LENGTH), rig, fit_model(), estimator.min_speed)
-    return Case(soil, told_about(soil, np.random.default_rng([seed, 77])), frozenset(), problem)
+    return Case(soil, assumed_of(soil, np.random.default_rng([seed, 77])), frozenset(), problem)
 
 
 _NOISY = {
@@ -105,7 +105,7 @@ _NOISY = {
 
 
 def entry_angles(problem: ObservationModel) -> Array:
-    """Entry angles [rad] (N, W) that the sinkage sensors tell (eq. 1)."""
+    """Entry angles [rad] (N, W) from the sinkage sensors (eq. 1)."""
     return np.arccos(1.0 - np.maximum(problem.sinkage, 1e-4) / problem.rig.radius)
 
 
@@ -124,7 +124,7 @@ def reading_covariance(problem: ObservationModel, at: Linearisation) -> Array:
     covariance = np.einsum("nik,nk,njk->nij", at.by_latents, latent, at.by_latents)
     own = np.concatenate([problem.torque_var, problem.demand_var[:, None], problem.sinkage_var], axis=1)
     diagonals(covariance)[:] += own
-    return covariance
+    return np.asarray(covariance)
 
 
 def bearing_pressure(K_L: float, n: float, std: float = np.nan) -> Estimate:

@@ -3,7 +3,7 @@
 Xue, Li, Zou, Zong & Huang 2016 (Aerosp. Sci. Technol. 53:154): least-squares support
 vector machine; kernel ridge regression with a Gaussian kernel is the same estimator but
 for its offset, here removed with the targets' mean.  Assumes: soils to come are drawn from
-the prior that it was trained on; nothing else is known (c and K as told are features, so
+the prior that it was trained on; nothing else is known (c and K as given are features, so
 that it knows as much as ours).  Hyper-parameters by cross validation.  No error bars.
 
 Training windows come from a light generator, not from the full simulator: random smooth
@@ -14,13 +14,11 @@ noise of the sensors on top.  The windows it is tested on come from the full sim
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from sklearn.kernel_ridge import KernelRidge
-from sklearn.model_selection import GridSearchCV
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
 
+from soilbus.arrays import Array
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
 from soilbus.estimation.window import Rig, SensorNoise, window_of_samples
@@ -28,18 +26,16 @@ from soilbus.simulator.scenario import Swing, realise
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.vehicle import axle_loads
 from soilbus.terra.wheel import Soil, sinkage, state_on, wheel_forces
-
-from .windows import (
+from soilbus.validation.peers.windows import (
     B_REF,
     LENGTH,
     Z_REF,
     Answer,
-    Array,
     Case,
+    assumed_of,
     configured_prior,
     fit_model,
     reference_rig,
-    told_about,
 )
 
 TARGETS = ("bearing", "phi", "n", "c", "K")
@@ -56,7 +52,7 @@ GRID = {"kernelridge__alpha": np.logspace(-4, -1, 4), "kernelridge__gamma": np.l
 class Regressor:
     """Features -> logarithms of TARGETS."""
 
-    search: GridSearchCV
+    search: Any
     mean: Array
 
     def estimate(self, case: Case) -> Answer | None:
@@ -66,9 +62,16 @@ class Regressor:
 
 
 def trained(windows: int, seed: int = SEED) -> Regressor:
-    """A regressor on so many training windows."""
+    """Train on this number of windows.  ModuleNotFoundError, with a line for the user, without scikit-learn."""
+    try:
+        from sklearn.kernel_ridge import KernelRidge
+        from sklearn.model_selection import GridSearchCV
+        from sklearn.pipeline import make_pipeline
+        from sklearn.preprocessing import StandardScaler
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError("the learned regressor needs the extra soilbus[peers]") from None
     pairs = [training_case(np.random.default_rng([seed, i])) for i in range(windows)]
-    X = np.array([features(case.problem, case.told) for case in pairs])
+    X = np.array([features(case.problem, case.assumed) for case in pairs])
     y = np.log([targets(case.soil) for case in pairs])
     machine = make_pipeline(StandardScaler(), KernelRidge(kernel="rbf"))
     search = GridSearchCV(machine, GRID, scoring="neg_mean_squared_error", cv=5)
@@ -80,8 +83,8 @@ def targets(soil: Soil) -> list[float]:
     return [soil.bearing_pressure(Z_REF, B_REF), *(getattr(soil, name) for name in TARGETS[1:])]
 
 
-def features(problem: ObservationModel, told: Soil) -> Array:
-    """How sinkage, torque and pull depend on slip and load in this window, and c and K as told."""
+def features(problem: ObservationModel, assumed: Soil) -> Array:
+    """How sinkage, torque and pull depend on slip and load in this window, and c and K as given."""
     thrust = problem.torque / problem.rig.radius / problem.load
     log_sinkage = np.log(np.maximum(problem.sinkage, 1e-3))
     rows = []
@@ -93,7 +96,7 @@ def features(problem: ObservationModel, told: Soil) -> Array:
     slip = problem.slip.mean(1) - MEAN_SLIP
     pull = problem.demand / problem.load.sum(1)
     rows.append(np.linalg.lstsq(np.stack([np.ones_like(slip), slip, slip**2], axis=1), pull, rcond=None)[0])
-    rows.append([np.log(told.c), np.log(told.K)])
+    rows.append([np.log(assumed.c), np.log(assumed.K)])
     return np.concatenate(rows)
 
 
@@ -107,12 +110,15 @@ def training_case(rng: np.random.Generator) -> Case:
         if truth is not None:
             break
     t, samples = truth
-    fewer = {
-        q: SensorNoise(*(v / np.sqrt(SAMPLES.get(q, 10.0)) for v in noise[:3]), noise.gain)
-        for q, noise in rig.noise.items()
-    }
+    fewer = {q: _averaged(noise, SAMPLES.get(q, 10.0)) for q, noise in rig.noise.items()}
     window = window_of_samples(replace(rig, noise=fewer), t, _noisy(samples, fewer, rng))
-    return Case(soil, told_about(soil, rng), frozenset(), ObservationModel(window, rig, fit_model(), 0.2))
+    return Case(soil, assumed_of(soil, rng), frozenset(), ObservationModel(window, rig, fit_model(), 0.2))
+
+
+def _averaged(noise: SensorNoise, samples: float) -> SensorNoise:
+    """Noise of the mean of some samples; a gain error is the same in each."""
+    root = float(np.sqrt(samples))
+    return SensorNoise(noise.absolute / root, noise.relative / root, noise.of_mean / root, noise.gain)
 
 
 def _drive(rig: Rig, soil: Soil, rng: np.random.Generator) -> tuple[Array, dict[str, Array]] | None:
