@@ -17,9 +17,26 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import Soil, WheelModel, sinkage, state_on
+from soilbus.validation.blind import (
+    contact_forms,
+    far_forms,
+    further_forms,
+    late_forms,
+    outside,
+    soil_forms,
+    vehicle_forms,
+)
+from soilbus.validation.blind.form import SIZES, Form, Hidden, Setting, together
 
-from . import contact_forms, far_forms, further_forms, late_forms, outside, soil_forms, vehicle_forms
-from .form import SIZES, Form, Hidden, Setting, together
+__all__ = [
+    "DURATION",
+    "FORMS",
+    "KINDS",
+    "SOILS",
+    "Case",
+    "cases",
+    "half_of",
+]
 
 KINDS = ("single", "pair", "outside", "plain", "hard")
 """One effect of the catalogue, two of them, one that it lacks, none, and none in harsh conditions."""
@@ -34,7 +51,7 @@ FORMS = (*PAIRED, *far_forms.FORMS, *late_forms.FORMS)
 PAIRS, FURTHER_PAIRS, NULLS = 24, 8, 24
 """Cases of these kinds for each seed: pairs of earlier forms, pairs with a further one, nulls."""
 _ALIKE = ({"grade", "draft_offset"}, {"draft_offset", "draft_gain"})
-"""Pairs that no diagnosis could tell from one of the two."""
+"""Pairs that no diagnosis could distinguish from one of the two."""
 _HARSH = {"slowest": 0.15, "fastest": 0.40}
 
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import SAMPLE_RATE
-
-from .form import Form, Hidden, Setting, by_hooks
+from soilbus.terra.effects.effect import Surroundings
+from soilbus.terra.wheel import WheelModel, WheelState
+from soilbus.validation.blind.form import Form, Hidden, Setting, Sizes, by_hooks
 
 
 def _turned(omega: Array) -> Array:
@@ -20,46 +20,46 @@ def _turned(omega: Array) -> Array:
     return np.cumsum(omega, axis=0) / SAMPLE_RATE
 
 
-def _ripple(torque: Array, around: Any, values: Any) -> Array:
+def _ripple(torque: Array, around: Surroundings, values: Sizes) -> Array:
     """Five lugs a turn come into the ground one after the other."""
     return torque * (1.0 + values["size"] * np.sin(5.0 * _turned(around.wheel_speed)))
 
 
-def _draft_leak(around: Any, values: Any) -> Array:
+def _draft_leak(around: Surroundings, values: Sizes) -> Array:
     """The frame of the load cells bends under the draft: the front reads less, the rear more."""
     sign = np.where(np.asarray(around.rear), 1.0, -1.0)
     return values["size"] * np.asarray(around.draft) * sign
 
 
-def _cross_talk(torque: Array, around: Any, values: Any) -> Array:
+def _cross_talk(torque: Array, around: Surroundings, values: Sizes) -> Array:
     """Each torque takes on a share of what the other wheel of its axle has beyond it."""
     return torque + values["size"] * (torque[:, [1, 0, 3, 2]] - torque)
 
 
-def _warm_torque(torque: Array, around: Any, values: Any) -> Array:
+def _warm_torque(torque: Array, around: Surroundings, values: Sizes) -> Array:
     """The torque cells' span settles as they warm up."""
-    return torque * (1.0 + values["size"] * np.exp(-around.t / 25.0))
+    return np.asarray(torque * (1.0 + values["size"] * np.exp(-around.t / 25.0)))
 
 
-def _bouncing(around: Any, values: Any) -> Array:
-    """The axles bounce on their tyres at 1.3 Hz; the cells tell it, soil and slip do not follow."""
+def _bouncing(around: Surroundings, values: Sizes) -> Array:
+    """The axles bounce on their tyres at 1.3 Hz; the cells measure it, soil and slip do not follow."""
     phase = np.array([0.0, 0.6, 2.0, 2.6])
-    return values["size"] * np.sin(2.0 * np.pi * 1.3 * around.t + phase) + 0.0 * around.load
+    return np.asarray(values["size"] * np.sin(2.0 * np.pi * 1.3 * around.t + phase) + 0.0 * around.load)
 
 
-def _rows(state: Any, model: Any, around: Any, values: Any) -> Any:
+def _rows(state: WheelState, model: WheelModel, around: Surroundings, values: Sizes) -> tuple[WheelState, WheelModel]:
     """Harder and softer ground every 0.75 m, the spacing of maize, driven across; axles one wheelbase apart."""
     x = around.distance - 1.95 * np.asarray(around.rear)
     return state._replace(K_L=state.K_L * (1.0 + values["size"] * np.sin(2.0 * np.pi * x / 0.75))), model
 
 
-def _saturated(draft: Array, around: Any, values: Any) -> Array:
+def _saturated(draft: Array, around: Surroundings, values: Sizes) -> Array:
     """The amplifier gives no more than a part of the greatest draft."""
     greatest = (1.0 - values["size"]) * float(np.max(draft))
     return np.minimum(draft, greatest) - draft
 
 
-def _sticking(draft: Array, around: Any, values: Any) -> Array:
+def _sticking(draft: Array, around: Surroundings, values: Sizes) -> Array:
     """Friction in the pin: the reading follows only when the draft has moved away by more than the band."""
     return _held_back(draft, values["size"])
 
@@ -74,12 +74,12 @@ def _held_back(true: Array, band: float) -> Array:
     return reported - true
 
 
-def _swaying(draft: Array, around: Any, values: Any) -> Array:
+def _swaying(draft: Array, around: Surroundings, values: Sizes) -> Array:
     """The implement sways at the hitch every two and a half seconds, and the pin reads some of its pull sideways."""
     return values["size"] * np.sin(2.0 * np.pi * np.ravel(around.t) / 2.5) + 0.0 * draft
 
 
-def _stuck_gauge(torque: Array, around: Any, values: Any) -> Array:
+def _stuck_gauge(torque: Array, around: Surroundings, values: Sizes) -> Array:
     """Friction beside each torque cell takes on its share before the cell does, whichever way the torque goes."""
     return torque + np.stack([_held_back(of_wheel, values["size"]) for of_wheel in torque.T], axis=1)
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.can.channels import Column
 from soilbus.simulator.recording import Recording
-
-from .form import Form, Hidden, Setting, by_hooks
+from soilbus.terra.effects.effect import Surroundings
+from soilbus.validation.blind.form import Form, Hidden, Setting, Sizes, by_hooks
 
 
 def _from_a_receiver(size: float, setting: Setting) -> Hidden:
@@ -26,8 +25,8 @@ def _from_a_receiver(size: float, setting: Setting) -> Hidden:
     return Hidden(after=late)
 
 
-def _averaged(draft: Array, around: Any, values: Any) -> Array:
-    """The error of a draft that is the mean of so long before."""
+def _averaged(draft: Array, around: Surroundings, values: Sizes) -> Array:
+    """The error of a draft that is the mean over the last `size` [s]."""
     t = np.ravel(around.t)
     area = np.concatenate([[0.0], np.cumsum((draft[1:] + draft[:-1]) / 2.0 * np.diff(t))])
     begin = np.maximum(t - values["size"], t[0])

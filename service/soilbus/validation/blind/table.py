@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2, norm
 
-from .trial import Trial
+from soilbus.validation.blind.trial import Trial
 
 HALVES = ("tune", "mixed", "report")
 VISIBLE, BARELY = 100.0, 20.0

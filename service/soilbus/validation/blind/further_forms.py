@@ -5,22 +5,20 @@ They follow the others in the list of forms, so that cases of those stay what th
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from soilbus.arrays import Array
+from soilbus.terra.effects.effect import Surroundings
 from soilbus.terra.wheel import WheelState
-
-from .contact_forms import SOIL_WEIGHT, less_pull
-from .form import Form, by_hooks
-from .rim import change
-from .vehicle_forms import filtered
+from soilbus.validation.blind.contact_forms import SOIL_WEIGHT, less_pull
+from soilbus.validation.blind.form import Form, Sizes, by_hooks
+from soilbus.validation.blind.rim import change
+from soilbus.validation.blind.vehicle_forms import filtered
 
 _GRAVITY = 9.80665
 
 
-def _unloading(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+def _unloading(forces: Array, state: WheelState, around: Surroundings, values: Sizes) -> Array:
     """What is pressed to the depth z springs back by p(z) / (k_0 + A_u z): stiffer the deeper it was pressed.
 
     `size` is the share that comes back from the plain sinkage, where both terms are as great.
@@ -30,7 +28,7 @@ def _unloading(forces: Array, state: WheelState, around: Any, values: Any) -> Ar
     return forces + change(state, leave=-np.arccos(1.0 - back / state.radius))
 
 
-def _transported(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+def _transported(forces: Array, state: WheelState, around: Surroundings, values: Sizes) -> Array:
     """The faster the rim slips the more soil it carries behind itself, on which it leaves the ground the later.
 
     What it tears off and how fast it flings that backwards both grow with the slip.
@@ -39,7 +37,7 @@ def _transported(forces: Array, state: WheelState, around: Any, values: Any) -> 
     return forces + change(state, leave=-np.arccos(1.0 - share * (1.0 - np.cos(state.entry_angle))))
 
 
-def _thrown(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+def _thrown(forces: Array, state: WheelState, around: Surroundings, values: Sizes) -> Array:
     """A vertical blade's N factors, that grow with speed, and the soil set in motion besides, with its square.
 
     (gamma N_g z^2 + c N_c z) (1 + B v) b + rho N_a u^2 z b: drafts of tools have both parts, and the tread throws
@@ -56,21 +54,21 @@ def _thrown(forces: Array, state: WheelState, around: Any, values: Any) -> Array
 _BY_SPEED = 0.2  # s/m
 
 
-def _mesh(torque: Array, around: Any, values: Any) -> Array:
+def _mesh(torque: Array, around: Surroundings, values: Sizes) -> Array:
     """Friction between teeth falls with speed^0.7 and load^0.4; `size` is the share lost at 500 N m and 2.5 rad/s."""
     speed, load = np.maximum(np.abs(around.wheel_speed), 0.1) / 2.5, np.maximum(np.abs(torque), 1.0) / 500.0
     return np.asarray(torque + values["size"] * np.abs(torque) * speed**-0.7 * load**-0.4)
 
 
-def _twice_filtered(torque: Array, around: Any, values: Any) -> Array:
+def _twice_filtered(torque: Array, around: Surroundings, values: Sizes) -> Array:
     """Through two low passes of this time constant, one after the other."""
     return filtered(filtered(torque, around, values), around, values)
 
 
-def _creeping(around: Any, values: Any) -> Array:
+def _creeping(around: Surroundings, values: Sizes) -> Array:
     """One cell's zero, that creeps with the logarithm of time, as what is loaded does."""
     crept = np.log1p(around.t / _CREEP)
-    return values["size"] * (0.6 + 0.25 * crept) * np.array([0.0, 0.0, 1.0, 0.0]) + 0.0 * around.load
+    return np.asarray(values["size"] * (0.6 + 0.25 * crept) * np.array([0.0, 0.0, 1.0, 0.0]) + 0.0 * around.load)
 
 
 _CREEP = 5.0  # s

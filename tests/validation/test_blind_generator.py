@@ -19,12 +19,11 @@ from soilbus.terra.effects.effect import Active, Surroundings, forces_with
 from soilbus.terra.effects.sensors import read_late
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import WheelModel, WheelState, state_on, wheel_forces
-
-from . import outside
-from .__main__ import main
-from .cases import FORMS, KINDS, SOILS, Case, cases
-from .form import Form, Setting
-from .rim import rim_forces
+from soilbus.validation.blind import outside
+from soilbus.validation.blind.cases import FORMS, KINDS, SOILS, Case, cases
+from soilbus.validation.blind.command import main
+from soilbus.validation.blind.form import Form, Setting
+from soilbus.validation.blind.rim import rim_forces
 
 RADII, WIDTHS = np.array([0.50, 0.50, 0.62, 0.62]), np.array([0.26, 0.26, 0.38, 0.38])
 WHEELS = ("FL", "FR", "RL", "RR")

@@ -1,31 +1,29 @@
-"""`PYTHONPATH=service python -m tests.diagnosis.blind`: hidden effects diagnosed, and the score."""
+"""`python -m soilbus.validation.blind`: hidden effects diagnosed, and the score."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from typing import TextIO
 
 from soilbus.allocator import keep_freed_memory
 from soilbus.simulator.drive import SimulationError
+from soilbus.validation.blind.cases import KINDS, Case, cases
+from soilbus.validation.blind.table import HALVES, report, targets_are_met
+from soilbus.validation.blind.trial import Trial, tried
 from soilbus.workers import workers
-
-from .cases import KINDS, Case, cases
-from .table import HALVES, report, targets_are_met
-from .trial import Trial, tried
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse, diagnose, print; 1 where the half that nothing is tuned on misses a target (table.targets_are_met)."""
-    parser = argparse.ArgumentParser(prog="python -m tests.diagnosis.blind", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m soilbus.validation.blind", description=__doc__)
     parser.add_argument("--seed", type=int, default=1, help="picks soils, sensors and drives (1)")
     parser.add_argument("--kind", choices=KINDS, action="append", help="repeatable; all by default")
     parser.add_argument("--half", choices=HALVES, help="all by default")
     parser.add_argument("--only", default="", help="only cases with this in their id")
-    parser.add_argument("--every", type=int, default=1, help="only one case in this many (1)")
+    parser.add_argument("--every", type=int, metavar="N", default=1, help="take each N-th case only (1)")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--list", action="store_true", help="name the cases without driving them")
     parser.add_argument("--json", help="write one object a line for each case")
@@ -40,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("\n".join(f"{case.half:7}{case.id}" for case in wanted))
         return 0
     with open(chosen.json, "w") if chosen.json else nullcontext() as out:
-        trials = list(_reported(_trials(wanted, chosen.processes), out))
+        trials = list(_reported(trials_of(wanted, chosen.processes), out))
     print(report(trials))
     return int(not targets_are_met(trials))
 
@@ -62,7 +60,8 @@ def _reported(found: Iterable[tuple[Case, Trial | None]], out: TextIO | None) ->
         yield trial
 
 
-def _trials(wanted: Sequence[Case], count: int) -> Iterator[tuple[Case, Trial | None]]:
+def trials_of(wanted: Sequence[Case], count: int) -> Iterator[tuple[Case, Trial | None]]:
+    """Each case with its trial, None where it cannot be driven, in `count` processes."""
     if count < 2:
         for case in wanted:
             yield case, _trial((case.kind, case.id))
@@ -80,8 +79,3 @@ def _trial(key: tuple[str, str]) -> Trial | None:
         return tried(case)
     except SimulationError:
         return None
-
-
-if __name__ == "__main__":
-    keep_freed_memory()
-    sys.exit(main())

@@ -16,9 +16,16 @@ from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.sensors.bins import Bins
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Effect
+from soilbus.validation.blind.cases import Case
+from soilbus.validation.blind.visible import Shown, shown
 
-from .cases import Case
-from .visible import Shown, shown
+__all__ = [
+    "FAILED",
+    "NOTHING",
+    "Trial",
+    "record_of_case",
+    "tried",
+]
 
 
 @dataclass(frozen=True)
@@ -113,10 +120,12 @@ def tried(case: Case, candidates: Sequence[Effect] = tuple(CATALOGUE.values()), 
 
 
 NOTHING = Shown(0.0, 1.0)
+"""What a recording shows where nothing is hidden."""
 FAILED = {
     "verdict": "failed", "named": (), "sets": (), "falls": (), "gap_before": np.inf, "gap_after": np.inf, "rows": 1,
     "bearing_before": np.inf, "bearing_after": np.inf, "bearing_sd": np.inf,
 }  # fmt: skip
+"""Fields of a Trial whose diagnosis failed."""
 
 
 def _bearing(case: Case, soil: Posterior) -> Estimate:

@@ -5,26 +5,26 @@ They are the last of the list of forms, so that earlier cases stay what they wer
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.simulator.scenario import SAMPLE_RATE
-from soilbus.terra.wheel import WheelState
+from soilbus.terra.effects.effect import Surroundings
+from soilbus.terra.wheel import WheelModel, WheelState
+from soilbus.validation.blind.contact_forms import SOIL_WEIGHT, less_pull
+from soilbus.validation.blind.form import Form, Sizes, by_hooks
 
-from .contact_forms import SOIL_WEIGHT, less_pull
-from .form import Form, by_hooks
 
-
-def _rolled_by_slip(state: WheelState, model: Any, around: Any, values: Any) -> Any:
+def _rolled_by_slip(
+    state: WheelState, model: WheelModel, around: Surroundings, values: Sizes
+) -> tuple[WheelState, WheelModel]:
     """The front wheel kneads the soil as well as it presses it: the rut is the firmer the more it slipped."""
     front = np.maximum(state.slip[..., :2], 0.0)[..., [0, 1, 0, 1]]
     firmer = 1.0 + values["size"] * np.where(np.asarray(around.rear), 0.2 + 2.0 * front, 0.0)
     return state._replace(K_L=state.K_L * firmer), model
 
 
-def _dug_up(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+def _dug_up(forces: Array, state: WheelState, around: Surroundings, values: Sizes) -> Array:
     """A wheel that slips digs up the soil that it then pushes: a heap of its slip times its sinkage."""
     z = state.radius * (1.0 - np.cos(state.entry_angle))
     heap = z * (1.0 + 8.0 * np.maximum(state.slip, 0.0))
@@ -33,7 +33,7 @@ def _dug_up(forces: Array, state: WheelState, around: Any, values: Any) -> Array
     return less_pull(forces, values["size"] * state.width * push)
 
 
-def _sprung(around: Any, values: Any) -> Array:
+def _sprung(around: Surroundings, values: Sizes) -> Array:
     """A towed mass behind a drawbar that gives: its force follows the acceleration, and swings after it."""
     a, step = np.ravel(around.acceleration), 1.0 / SAMPLE_RATE
     rate, damping, force, change = 2.0 * np.pi * 0.5, 0.4, np.zeros(len(a)), 0.0
@@ -43,7 +43,7 @@ def _sprung(around: Any, values: Any) -> Array:
     return values["size"] * force
 
 
-def _settling_span(draft: Array, around: Any, values: Any) -> Array:
+def _settling_span(draft: Array, around: Surroundings, values: Sizes) -> Array:
     """The span of a cell that has been cold: wrong at first, right when warm."""
     return values["size"] * draft * (0.2 + np.exp(-np.ravel(around.t) / 40.0))
 

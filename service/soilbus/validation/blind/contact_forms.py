@@ -10,10 +10,10 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.simulator.scenario import Swing
-from soilbus.terra.wheel import WheelState
-
-from .form import Form, Hidden, Setting, by_hooks
-from .rim import change, rim_forces
+from soilbus.terra.effects.effect import Surroundings
+from soilbus.terra.wheel import WheelModel, WheelState
+from soilbus.validation.blind.form import Form, Hidden, Setting, Sizes, by_hooks
+from soilbus.validation.blind.rim import change, rim_forces
 
 Deflection = Callable[[Any, float], Any]
 SOIL_WEIGHT = 16e3
@@ -24,7 +24,7 @@ def less_pull(forces: Array, push: Any) -> Array:
     return np.stack([forces[0], forces[1] - push, forces[2]])
 
 
-def _rankine(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+def _rankine(forces: Array, state: WheelState, around: Surroundings, values: Sizes) -> Array:
     """Passive earth pressure on `size` widths of the wheel, under a heap of the soil pushed up."""
     z = state.radius * (1.0 - np.cos(state.entry_angle))
     phi = np.arctan(state.tan_phi)
@@ -34,7 +34,7 @@ def _rankine(forces: Array, state: WheelState, around: Any, values: Any) -> Arra
     return less_pull(forces, values["size"] * state.width * push)
 
 
-def _cutting(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+def _cutting(forces: Array, state: WheelState, around: Surroundings, values: Sizes) -> Array:
     """Bekker's bulldozing resistance by Terzaghi's bearing capacity at local shear, a share `size` of it."""
     r, z = state.radius, state.radius * (1.0 - np.cos(state.entry_angle))
     tan_phi, c = 2.0 / 3.0 * state.tan_phi, 2.0 / 3.0 * state.c
@@ -53,35 +53,35 @@ def _cutting(forces: Array, state: WheelState, around: Any, values: Any) -> Arra
     return less_pull(forces, values["size"] * push)
 
 
-def _flanks(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+def _flanks(forces: Array, state: WheelState, around: Surroundings, values: Sizes) -> Array:
     """Both sides of the lugs shear soil that presses on them as at rest."""
     return forces + change(state, sides=values["size"])
 
 
-def _tips(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+def _tips(forces: Array, state: WheelState, around: Surroundings, values: Sizes) -> Array:
     """Soil is sheared at the tips, which move farther and pull on a longer arm than the rim."""
     return forces + change(state, tip=values["size"], sides=0.5 * values["size"])
 
 
-def _constant_exit(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+def _constant_exit(forces: Array, state: WheelState, around: Surroundings, values: Sizes) -> Array:
     return forces + change(state, leave=-values["size"] + 0.0 * state.entry_angle)
 
 
-def _rebound(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+def _rebound(forces: Array, state: WheelState, around: Surroundings, values: Sizes) -> Array:
     """The rut comes up again by a share of the sinkage."""
     up = np.arccos(1.0 - values["size"] * (1.0 - np.cos(state.entry_angle)))
     return forces + change(state, leave=-up)
 
 
-def _peak_constant(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+def _peak_constant(forces: Array, state: WheelState, around: Surroundings, values: Sizes) -> Array:
     return forces + change(state, peak=0.5 - values["size"])
 
 
-def _peak_linear(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+def _peak_linear(forces: Array, state: WheelState, around: Surroundings, values: Sizes) -> Array:
     return forces + change(state, peak=np.clip(0.5 + values["size"] * (0.32 * state.slip - 0.07), 0.05, 0.95))
 
 
-def _peak_mobilised(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+def _peak_mobilised(forces: Array, state: WheelState, around: Surroundings, values: Sizes) -> Array:
     """Forward as far as shear is mobilised at the deepest point."""
     j = state.radius * np.maximum(state.slip, 0.0) * state.entry_angle
     return forces + change(state, peak=0.5 - values["size"] * np.exp(-j / (2.0 * state.K)))
@@ -90,7 +90,9 @@ def _peak_mobilised(forces: Array, state: WheelState, around: Any, values: Any) 
 def _slower(deflection: Deflection) -> Callable[..., Any]:
     """Slip from the smaller rolling radius of a flattened tyre, as a `wheel` hook."""
 
-    def wheel(state: WheelState, model: Any, around: Any, values: Any) -> Any:
+    def wheel(
+        state: WheelState, model: WheelModel, around: Surroundings, values: Sizes
+    ) -> tuple[WheelState, WheelModel]:
         flattened = deflection(np.maximum(around.load, 1.0), values["size"]) / state.radius
         return state._replace(slip=1.0 - (1.0 - state.slip) / _rolls(flattened)), model
 
@@ -100,7 +102,7 @@ def _slower(deflection: Deflection) -> Callable[..., Any]:
 def _flat_tyre(deflection: Deflection) -> Callable[[float, Setting], Hidden]:
     """A flat in the middle of the contact, and the round tyre, pushed down by it, before and behind."""
 
-    def forces(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+    def forces(forces: Array, state: WheelState, around: Surroundings, values: Sizes) -> Array:
         r, delta = state.radius, deflection(np.maximum(around.load, 1.0), values["size"])
         z = r * (1.0 - np.cos(state.entry_angle))
         entry, flat = np.arccos(1.0 - (z + delta) / r), np.arccos(1.0 - delta / r)
@@ -118,12 +120,14 @@ def _flat_tyre(deflection: Deflection) -> Callable[[float, Setting], Hidden]:
 def _round_tyre(deflection: Deflection) -> Callable[[float, Setting], Hidden]:
     """Schmid's substitute circle, sqrt(r* z) = sqrt(r (z + delta)) + sqrt(r delta)."""
 
-    def wheel(state: WheelState, model: Any, around: Any, values: Any) -> Any:
+    def wheel(
+        state: WheelState, model: WheelModel, around: Surroundings, values: Sizes
+    ) -> tuple[WheelState, WheelModel]:
         r, delta = state.radius, deflection(np.maximum(around.load, 1.0), values["size"])
         slower, model = _slower(deflection)(state, model, around, values)
         return slower._replace(radius=r + 2.0 * np.sqrt(delta * r / (1.0 - np.cos(state.entry_angle)))), model
 
-    def forces(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+    def forces(forces: Array, state: WheelState, around: Surroundings, values: Sizes) -> Array:
         delta = deflection(np.maximum(around.load, 1.0), values["size"])
         shift = delta / (1.0 - np.cos(state.entry_angle))
         r = (np.sqrt(state.radius + shift) - np.sqrt(shift)) ** 2  # of the tyre without load

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -12,29 +11,29 @@ from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import Scenario
+from soilbus.terra.effects.effect import Surroundings
+from soilbus.validation.blind.form import Form, Hidden, Setting, Sizes, by_hooks
 
-from .form import Form, Hidden, Setting, by_hooks
 
-
-def _efficiency(torque: Array, around: Any, values: Any) -> Array:
+def _efficiency(torque: Array, around: Surroundings, values: Sizes) -> Array:
     return torque / (1.0 - values["size"])
 
 
-def _dragging(torque: Array, around: Any, values: Any) -> Array:
+def _dragging(torque: Array, around: Surroundings, values: Sizes) -> Array:
     return torque + values["size"]
 
 
-def _viscous(torque: Array, around: Any, values: Any) -> Array:
-    return torque + values["size"] * around.wheel_speed
+def _viscous(torque: Array, around: Surroundings, values: Sizes) -> Array:
+    return np.asarray(torque + values["size"] * around.wheel_speed)
 
 
-def _delayed(torque: Array, around: Any, values: Any) -> Array:
+def _delayed(torque: Array, around: Surroundings, values: Sizes) -> Array:
     """Late, as from a queue."""
     t = np.ravel(around.t)
     return np.stack([np.interp(t - values["size"], t, of_wheel) for of_wheel in torque.T], axis=1)
 
 
-def _averaged(torque: Array, around: Any, values: Any) -> Array:
+def _averaged(torque: Array, around: Surroundings, values: Sizes) -> Array:
     """The mean of the time `size` [s] before, as of a node that samples faster than it sends."""
     t = np.ravel(around.t)
     longer = np.concatenate([[t[0] - values["size"]], t])
@@ -46,7 +45,7 @@ def _averaged(torque: Array, around: Any, values: Any) -> Array:
     return np.stack(out, axis=1)
 
 
-def filtered(torque: Array, around: Any, values: Any) -> Array:
+def filtered(torque: Array, around: Surroundings, values: Sizes) -> Array:
     """Through a first-order low pass of this time constant."""
     share = -np.expm1(-float(around.t[1, 0] - around.t[0, 0]) / values["size"])
     out = torque.copy()
@@ -55,7 +54,7 @@ def filtered(torque: Array, around: Any, values: Any) -> Array:
     return out
 
 
-def _swaying_slope(around: Any, values: Any) -> Array:
+def _swaying_slope(around: Surroundings, values: Sizes) -> Array:
     """A constant and two sines of the way, in no reading."""
     x = np.ravel(around.distance)
     slope = values["size"] * (0.4 + np.sin(2.0 * np.pi * x / 110.0) + 0.5 * np.sin(2.0 * np.pi * x / 61.0 + 1.0))
@@ -103,18 +102,18 @@ def _no_pitch_sensor(size: float, setting: Setting) -> Hidden:
     )
 
 
-def _towed(around: Any, values: Any) -> Array:
+def _towed(around: Surroundings, values: Sizes) -> Array:
     """An implement of this mass behind a hitch that measures soil forces only."""
     return np.ravel(values["size"] * np.asarray(around.acceleration))
 
 
-def _flywheel(torque: Array, around: Any, values: Any) -> Array:
+def _flywheel(torque: Array, around: Surroundings, values: Sizes) -> Array:
     """Torque read at motors that have to spin up themselves."""
     omega, t = around.wheel_speed, around.t
     rate = np.zeros_like(omega)
     rate[1:-1] = (omega[2:] - omega[:-2]) / (t[2:] - t[:-2])
     rate[0], rate[-1] = rate[1], rate[-2]
-    return torque + values["size"] * rate
+    return np.asarray(torque + values["size"] * rate)
 
 
 def _offsets(shares: tuple[float, ...]) -> Callable[[float, Setting], Hidden]:
@@ -128,26 +127,26 @@ def _offsets(shares: tuple[float, ...]) -> Callable[[float, Setting], Hidden]:
     return hide
 
 
-def _constant_error(draft: Array, around: Any, values: Any) -> Array:
+def _constant_error(draft: Array, around: Surroundings, values: Sizes) -> Array:
     return values["size"] + 0.0 * draft
 
 
-def _warming_up(draft: Array, around: Any, values: Any) -> Array:
+def _warming_up(draft: Array, around: Surroundings, values: Sizes) -> Array:
     """The zero is off by a quarter more while the cell gets warm: its beam soon, what it is bolted to slowly."""
     t = np.ravel(around.t)
     return values["size"] * (1.0 + 0.12 * (np.exp(-t / 10.0) + np.exp(-t / 90.0)))
 
 
-def _steeper(draft: Array, around: Any, values: Any) -> Array:
+def _steeper(draft: Array, around: Surroundings, values: Sizes) -> Array:
     return values["size"] * draft
 
 
-def _bent(draft: Array, around: Any, values: Any) -> Array:
+def _bent(draft: Array, around: Surroundings, values: Sizes) -> Array:
     """A span that grows with the draft."""
     return values["size"] * draft * (0.7 + 0.3 * np.abs(draft) / 5000.0)
 
 
-def _tyres(axles: dict[str, float]) -> Callable[[float, Setting], Hidden]:
+def _tyres(axles: dict[str | None, float]) -> Callable[[float, Setting], Hidden]:
     """Other tyres on the tractor than in the configuration: their radii differ by a share of the size."""
 
     def hide(size: float, setting: Setting) -> Hidden:

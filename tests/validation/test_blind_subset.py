@@ -1,4 +1,4 @@
-"""A few cases of the blind test (`python -m tests.diagnosis.blind` runs them all)."""
+"""A few cases of the blind test (`python -m soilbus.validation.blind` runs them all)."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from itertools import islice
 
 import pytest
 
-from .blind.cases import cases
-from .blind.table import in_set
-from .blind.trial import NOTHING, Trial
-from .blind.trial import tried as scored
+from soilbus.validation.blind.cases import cases
+from soilbus.validation.blind.table import in_set
+from soilbus.validation.blind.trial import NOTHING, Trial
+from soilbus.validation.blind.trial import tried as scored
 
 VISIBLE = (
     "single/multipass:density/medium/", "single/rate_stiffening:penetration/medium/", "single/soil_drift:ramp/medium/",

@@ -8,26 +8,26 @@ from typing import Any
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.simulator.scenario import Patch, Scenario
-from soilbus.terra.wheel import Soil, WheelState
+from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.terra.effects.effect import Surroundings
+from soilbus.terra.wheel import Soil, WheelModel, WheelState
+from soilbus.validation.blind.form import Form, Hidden, Setting, Sizes, by_hooks
+from soilbus.validation.blind.rim import change
 
-from .form import Form, Hidden, Setting, by_hooks
-from .rim import change
 
-
-def _ding(state: WheelState, model: Any, around: Any, values: Any) -> Any:
+def _ding(state: WheelState, model: WheelModel, around: Surroundings, values: Sizes) -> tuple[WheelState, WheelModel]:
     slip = np.maximum(state.slip, 0.0)
     return state._replace(n=state.n + values["size"] * (slip + 1.5 * slip**2)), model
 
 
-def _lyasko(state: WheelState, model: Any, around: Any, values: Any) -> Any:
+def _lyasko(state: WheelState, model: WheelModel, around: Surroundings, values: Sizes) -> tuple[WheelState, WheelModel]:
     """z = z_0 ((1 + s) / (1 - 0.5 s))^m: that share of the depth carries nothing."""
     slip = np.maximum(state.slip, 0.0)
     deeper = ((1.0 + slip) / (1.0 - 0.5 * slip)) ** values["size"]
     return state._replace(K_L=state.K_L * deeper**-state.n), model
 
 
-def _reece(state: WheelState, model: Any, around: Any, values: Any) -> Any:
+def _reece(state: WheelState, model: WheelModel, around: Surroundings, values: Sizes) -> tuple[WheelState, WheelModel]:
     """z = z_0 + h s / (1 - s): the wheel enters the soil below a layer that it has thrown back."""
     slip = np.clip(state.slip, 0.0, 0.9)
     lost = values["size"] * slip / (1.0 - slip) / state.radius
@@ -36,7 +36,9 @@ def _reece(state: WheelState, model: Any, around: Any, values: Any) -> Any:
     return state._replace(entry_angle=np.arccos(1.0 - left)), model
 
 
-def _compacted(state: WheelState, model: Any, around: Any, values: Any) -> Any:
+def _compacted(
+    state: WheelState, model: WheelModel, around: Surroundings, values: Sizes
+) -> tuple[WheelState, WheelModel]:
     """Ruts are stiffer, in pressing and in shearing, the more so the more the wheels before slipped."""
     worked = -np.expm1(-np.maximum(state.slip, 0.0) / _WORKED)
     more = 1.0 + values["size"] * np.asarray(around.rear, float) * (0.5 + 0.5 * worked)
@@ -46,7 +48,7 @@ def _compacted(state: WheelState, model: Any, around: Any, values: Any) -> Any:
 _WORKED = 0.1  # slip
 
 
-def _denser(state: WheelState, model: Any, around: Any, values: Any) -> Any:
+def _denser(state: WheelState, model: WheelModel, around: Surroundings, values: Sizes) -> tuple[WheelState, WheelModel]:
     """With the density, cohesion grows faster than friction, and stiffness faster than both."""
     more = values["size"] * np.asarray(around.rear, float)
     return state._replace(
@@ -54,7 +56,7 @@ def _denser(state: WheelState, model: Any, around: Any, values: Any) -> Any:
     ), model
 
 
-def _in_the_rut(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+def _in_the_rut(forces: Array, state: WheelState, around: Surroundings, values: Sizes) -> Array:
     """Rear wheels load soil that has borne the pressure at the depth of the rut: stiff up to there, then virgin."""
     rut = values["size"] * values["sinkage"] * np.asarray(around.rear, float)
     borne, stiff = state.K_L * rut**state.n, _STIFFER * state.K_L * values["sinkage"] ** (state.n - 1.0)
@@ -73,18 +75,22 @@ _STIFFER = 8.0
 """Slope of loading again over that of a chord to the plain sinkage."""
 
 
-def _logarithm(state: WheelState, model: Any, around: Any, values: Any) -> Any:
+def _logarithm(
+    state: WheelState, model: WheelModel, around: Surroundings, values: Sizes
+) -> tuple[WheelState, WheelModel]:
     faster = np.log(np.maximum(around.ground_speed, 0.05) / 1.0)
     return state._replace(K_L=state.K_L * np.maximum(1.0 + values["size"] * faster, 0.1)), model
 
 
-def _penetration(state: WheelState, model: Any, around: Any, values: Any) -> Any:
+def _penetration(
+    state: WheelState, model: WheelModel, around: Surroundings, values: Sizes
+) -> tuple[WheelState, WheelModel]:
     """A power of the speed with which the rim enters the soil, V sin(theta_1)."""
     down = np.maximum(around.ground_speed, 0.05) * np.sin(state.entry_angle)
     return state._replace(K_L=state.K_L * (down / 0.4) ** values["size"]), model
 
 
-def _sharp(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+def _sharp(forces: Array, state: WheelState, around: Surroundings, values: Sizes) -> Array:
     """Below the pan a linear bed of springs beside the soil, `size` times as stiff as the soil to there."""
     pan = 0.7 * values["sinkage"]
     bed = values["size"] * state.K_L * pan ** (state.n - 1.0)
@@ -93,7 +99,7 @@ def _sharp(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
     )
 
 
-def _graded(forces: Array, state: WheelState, around: Any, values: Any) -> Array:
+def _graded(forces: Array, state: WheelState, around: Surroundings, values: Sizes) -> Array:
     """Ever denser with depth."""
     scale = values["sinkage"]
     return forces + change(
@@ -115,18 +121,21 @@ def _ramp(size: float, setting: Setting) -> Hidden:
     ends = [_scaled(setting.soil, sign * size / 2.0) for sign in (-1.0, 1.0)]
 
     def way(scenario: Scenario) -> Scenario:
+        assert isinstance(scenario.speed, Swing)
         length = scenario.duration * (scenario.speed.low + scenario.speed.high) / 2.0
         return replace(scenario, soils=(Patch(-1.0, "start", ends[0]), Patch(0.0, "end", ends[1])), transition=length)
 
     return Hidden(way=way)
 
 
-def _border(state: WheelState, model: Any, around: Any, values: Any) -> Any:
+def _border(state: WheelState, model: WheelModel, around: Surroundings, values: Sizes) -> tuple[WheelState, WheelModel]:
     """A soft border between two soils half way."""
     return _along(state, np.tanh((around.distance / around.length - 0.5) / 0.1) * values["size"] / 2.0), model
 
 
-def _undulating(state: WheelState, model: Any, around: Any, values: Any) -> Any:
+def _undulating(
+    state: WheelState, model: WheelModel, around: Surroundings, values: Sizes
+) -> tuple[WheelState, WheelModel]:
     """Once wetter and drier along the way."""
     return _along(state, np.sin(2.0 * np.pi * around.distance / around.length) * values["size"] / 2.0), model
 

@@ -10,14 +10,13 @@ import pytest
 from soilbus.simulator.scenario import Patch
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.soils import soil_named
-
-from . import __main__ as command
-from . import trial as trials
-from .cases import Case, cases
-from .form import Hidden, Setting, by_hooks
-from .table import figures, report, targets_are_met
-from .trial import FAILED, Trial, tried
-from .visible import shown
+from soilbus.validation.blind import command
+from soilbus.validation.blind import trial as trials
+from soilbus.validation.blind.cases import Case, cases
+from soilbus.validation.blind.form import Hidden, Setting, by_hooks
+from soilbus.validation.blind.table import figures, report, targets_are_met
+from soilbus.validation.blind.trial import FAILED, Trial, tried
+from soilbus.validation.blind.visible import shown
 
 
 def the_case(start: str) -> Case:
@@ -127,7 +126,7 @@ def test_formulas_far_from_the_catalogue_count_apart():
 def test_the_exit_code_says_whether_targets_are_met(monkeypatch, capsys):
     chosen = ["--only", "1.85", "--kind", "single"]
     for found, code in ((a_trial(), 0), (a_trial(named=(), sets=()), 1), (None, 1)):
-        monkeypatch.setattr(command, "_trials", lambda wanted, count, found=found: [(wanted[0], found)])
+        monkeypatch.setattr(command, "trials_of", lambda wanted, count, found=found: [(wanted[0], found)])
         assert command.main(chosen) == code
     assert "cannot be driven" in capsys.readouterr().out
 

@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import Scenario
-from soilbus.terra.effects.effect import Active, Effect
-from soilbus.terra.wheel import Soil
+from soilbus.terra.effects.effect import (
+    Active,
+    DraftHook,
+    Effect,
+    ErrorHook,
+    Forces,
+    Surroundings,
+    TorqueHook,
+    WheelHook,
+)
+from soilbus.terra.wheel import Soil, WheelState
 
 SIZES = ("small", "medium", "large")
+Sizes = Mapping[str, float]
+"""Values that the hooks of a hidden effect get: `size` in the unit of its form, `sinkage` [m] of the plain tractor."""
+
+
+T = TypeVar("T")
 
 
 class Setting(NamedTuple):
@@ -25,7 +40,7 @@ class Setting(NamedTuple):
     rng: np.random.Generator
 
 
-def _same(what: Any) -> Any:
+def _same(what: T) -> T:
     return what
 
 
@@ -47,16 +62,21 @@ class Hidden(NamedTuple):
 def together(parts: Sequence[Hidden]) -> Hidden:
     """All of these at once."""
 
-    def one_by_one(steps: Sequence[Callable[[Any], Any]]) -> Callable[[Any], Any]:
-        def run(what: Any) -> Any:
+    def one_by_one(steps: Sequence[Callable[[T], T]]) -> Callable[[T], T]:
+        def run(what: T) -> T:
             for step in steps:
                 what = step(what)
             return what
 
         return run
 
-    effects = tuple(active for part in parts for active in part.effects)
-    return Hidden(effects, *(one_by_one([part[i] for part in parts]) for i in range(1, len(Hidden._fields))))
+    return Hidden(
+        effects=tuple(active for part in parts for active in part.effects),
+        tractor=one_by_one([part.tractor for part in parts]),
+        configured=one_by_one([part.configured for part in parts]),
+        way=one_by_one([part.way for part in parts]),
+        after=one_by_one([part.after for part in parts]),
+    )
 
 
 @dataclass(frozen=True)
@@ -93,7 +113,23 @@ class Form:
         return f"{self.effect or 'outside'}:{self.name}"
 
 
-def by_hooks(**hooks: Callable[..., Any]) -> Callable[[float, Setting], Hidden]:
-    """Hidden by hooks of an Effect, among whose values are `size` and, as `sinkage`, the plain one."""
-    effect = Effect("hidden", "", "", "", (), **hooks)
+def by_hooks(
+    *,
+    wheel: WheelHook | None = None,
+    forces: Callable[[Array, WheelState, Surroundings, Sizes], Array] | None = None,
+    torque: TorqueHook | None = None,
+    draft: DraftHook | None = None,
+    load: ErrorHook | None = None,
+    resistance: ErrorHook | None = None,
+) -> Callable[[float, Setting], Hidden]:
+    """Hidden by hooks of an Effect, which are given Sizes as its values."""
+
+    def of_arrays(of_wheel: Forces, state: WheelState, around: Surroundings, values: Sizes) -> Forces:
+        assert forces is not None
+        return forces(np.asarray(of_wheel), state, around, values)
+
+    effect = Effect(
+        "hidden", "", "", "", (),
+        wheel=wheel, forces=of_arrays if forces else None, torque=torque, draft=draft, load=load, resistance=resistance,
+    )  # fmt: skip
     return lambda size, setting: Hidden((Active(effect, {"size": size, "sinkage": setting.sinkage}),))

@@ -26,15 +26,14 @@ from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import SAMPLE_RATE
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import Soil, state_on
-
-from .cases import Case
-from .form import Hidden, together
-from .rim import rim_forces
+from soilbus.validation.blind.cases import Case
+from soilbus.validation.blind.form import Hidden, together
+from soilbus.validation.blind.rim import rim_forces
 
 BIN = 0.1
 """Time [s] over which readings are averaged, as any analyst of slow drives may."""
 EVERY = 3
-"""One bin in this many is used, and counts for all."""
+"""Only each third bin is used, and counts for three."""
 STEP = 1e-4
 """Of the finite differences: rad, 1, m/s, m/s^2, and relative for soil parameters."""
 ROUNDS, HALVINGS = 16, 6
@@ -223,7 +222,7 @@ class _Fit:
         with np.errstate(all="ignore"):
             plain = self.drive.model(at.latents, self.drive.log_soil + at.soil)
         left = self.drive.readings - (1.0 + at.gains) * plain - (1.0 + at.other[0]) * self.others
-        return np.nan_to_num(left / self.S, nan=1e9, posinf=1e9, neginf=-1e9)
+        return np.asarray(np.nan_to_num(left / self.S, nan=1e9, posinf=1e9, neginf=-1e9))
 
     def energy(self, at: _Unknowns) -> float:
         """What is to be least."""
