@@ -1,6 +1,6 @@
-"""`PYTHONPATH=service python -m tests.diagnosis.published`: what the model misses on published single-wheel points.
+"""`python -m soilbus.validation.published_wheels POINTS`: what the model misses on published single-wheel points.
 
-The points are ../shared/field/single-wheel-published.csv: five or six rows a wheel, traced
+POINTS is shared/field/single-wheel-published.csv: five or six rows a wheel, traced
 by eye from figures.  So each line says what these few rows show under the errors assumed in
 rigs/*.toml, and no more.  Where the soil is from the other wheel, soil and effects are known
 beforehand as that wheel's fit left them: what is missing then is what differs between the two.
@@ -8,6 +8,7 @@ beforehand as that wheel's fit left them: what is missing then is what differs b
 
 from __future__ import annotations
 
+import argparse
 import math
 import sys
 from collections.abc import Iterator, Sequence
@@ -29,7 +30,6 @@ from soilbus.report.table import table
 from soilbus.terra.effects.catalogue import CATALOGUE
 
 RIGS = Path(__file__).with_name("rigs")
-POINTS = Path(__file__).resolve().parents[3] / "shared/field/single-wheel-published.csv"
 LUG = 0.01
 """Height of the lugs [m] of the two rigs that had both wheels."""
 
@@ -52,7 +52,7 @@ class Case:
     found: Diagnosis
 
 
-def cases(errors: float = 1.0, points: Path = POINTS) -> Iterator[Case]:
+def cases(errors: float, points: Path) -> Iterator[Case]:
     """Every wheel by itself, then each after the other in the same soil."""
     for rig in ("ding2011", "kls1"):
         alone: dict[str, Diagnosis] = {}
@@ -97,7 +97,7 @@ class Beside(NamedTuple):
     strain: float
 
 
-def lugs_beside_a_shifted_peak(errors: float, points: Path = POINTS) -> dict[str, Beside]:
+def lugs_beside_a_shifted_peak(errors: float, points: Path) -> dict[str, Beside]:
     """Ding's lugged wheel with soil and slip sinkage as the smooth one had them: what each name then adds.
 
     "nothing" is the known model by itself.
@@ -193,12 +193,15 @@ def soils(found: Sequence[Case]) -> str:
     return table(("rig", "wheel", "soil from", "errors", "n", "phi, deg", "c, kPa", "K, mm", "effects"), rows)
 
 
-def main() -> int:
-    """Print all cases."""
-    if not POINTS.exists():
-        print(f"no {POINTS}", file=sys.stderr)
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print all cases; 1 where there are no points."""
+    parser = argparse.ArgumentParser(prog="python -m soilbus.validation.published_wheels", description=__doc__)
+    parser.add_argument("points", type=Path, help="single-wheel-published.csv")
+    points = parser.parse_args(arguments).points
+    if not points.exists():
+        print(f"no {points}", file=sys.stderr)
         return 1
-    found = [case for errors in ERRORS for case in cases(errors)]
+    found = [case for errors in ERRORS for case in cases(errors, points)]
     print(tabulated(found))
     print("effects: fall of -2 log evidence in the round that added them; beside: others in the first round")
     print("soil strained: chi-square per parameter of the soil's posterior mean under its prior\n")
@@ -206,11 +209,7 @@ def main() -> int:
     print("\nDing's lugged wheel on the smooth wheel's soil: fall of -2 log evidence (strain left of the soil)")
     for errors in (*ERRORS, 3.0):
         reported = ", ".join(
-            f"{n} {b.fall:.0f} ({b.strain:.1f})" for n, b in lugs_beside_a_shifted_peak(errors).items()
+            f"{n} {b.fall:.0f} ({b.strain:.1f})" for n, b in lugs_beside_a_shifted_peak(errors, points).items()
         )
         print(f"  errors x{errors:g}: {reported}")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

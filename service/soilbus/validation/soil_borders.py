@@ -1,11 +1,11 @@
 """Drives over borders: how soon a valid estimate of the new soil comes, and whether any valid one is wrong.
 
 A window is valid where it knows the bearing pressure of a plate at a given depth.  However
-little the loads change, it knows sooner what its own tyres tell: the pressure under each of them
-at about half its depth, and tan phi.  The table tells from when, and whether that is wrong.
+little the loads change, it knows sooner what its own tyres measure: the pressure under each of them
+at about half its depth, and tan phi.  The table has from when, and whether that is wrong.
 
-`PYTHONPATH=service:tests/support python tests/estimation/borders.py [loam:wet_clay …] [--speeds 1.5] [--transition 1]
-[--seeds 20] [--first 1]` prints a table; `--windows` every window near the border besides.
+`python -m soilbus.validation.soil_borders [loam:wet_clay …] [--speeds 1.5] [--transition 1] [--seeds 20] [--first 1]`
+prints a table; `--windows` every window near the border besides.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from drives import errors, sweep, task_of, windows
 
-from soilbus.config.model import Config
+from soilbus.config.model import Config, Vehicle
 from soilbus.decision.traversability import Status
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.change_detection import Transition, without_transition
@@ -31,6 +30,7 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, soil_along
 from soilbus.terra.wheel import Soil
 from soilbus.validation.cramer_rao import cramer_rao
+from soilbus.validation.driven_windows import errors, sweep, task_of, windows
 
 PAIRS = ("loam:wet_clay", "wet_clay:loam", "loam:clayey_soil_38", "clayey_soil_38:loam")
 BEFORE, AFTER = 15.0, 10.0
@@ -43,8 +43,8 @@ OF_THIS_SOIL = ("none", "not_excited load_range", "not_excited slip_range", "not
 """Reasons of windows whose estimate is of the soil under the wheels."""
 KNOWN = 0.10
 """Relative standard deviation up to which something is known."""
-TOLD_DEPTH = 0.45
-"""Depth, in units of a wheel's sinkage, at which it tells the pressure under it best."""
+BEST_DEPTH = 0.45
+"""Depth, in units of a wheel's sinkage, at which it determines the pressure under it best."""
 
 
 class Seen(NamedTuple):
@@ -65,7 +65,7 @@ class Seen(NamedTuple):
 
     @property
     def knows_tyres(self) -> bool:
-        """Whether what the tyres tell, of this soil, is known."""
+        """Whether what the tyres measure, of this soil, is known."""
         return self.reason in OF_THIS_SOIL and self.sd_of_tyres < KNOWN
 
 
@@ -81,7 +81,7 @@ class Drive(NamedTuple):
 def drive(config: Config, pair: str, speed: float, transition: float, seed: int, after: float = AFTER) -> Drive:
     """A drive at a constant speed [m/s] over a border of some length [m], and some seconds after it."""
     first, second = pair.split(":")
-    vehicle = config.vehicle
+    vehicle = _vehicle(config)
     reached = BEFORE + SPREAD * float(np.random.default_rng([seed, 7]).random())
     at = reached * speed + vehicle.wheelbase - vehicle.cg_ahead_of_rear_axle
     soils = (Patch(0.0, first), Patch(at, second))
@@ -96,7 +96,8 @@ def drive(config: Config, pair: str, speed: float, transition: float, seed: int,
 def crossed(config: Config, pair: str, speed: float, transition: float, seed: int, after: float = AFTER) -> list[Seen]:
     """The windows of such a drive."""
     recording, soils, _, left = drive(config, pair, speed, transition, seed, after)
-    behind, vehicle = config.vehicle.cg_ahead_of_rear_axle, config.vehicle
+    vehicle = _vehicle(config)
+    behind = vehicle.cg_ahead_of_rear_axle
     estimator, between = WindowEstimator(config), np.linspace(-behind, vehicle.wheelbase - behind, 17)
     seen = []
     for window, end in windows(config, recording):
@@ -104,18 +105,24 @@ def crossed(config: Config, pair: str, speed: float, transition: float, seed: in
         place = np.interp(end, recording.truth["t"], recording.truth["distance"])
         under = np.transpose(soil_along(soils, place + between, transition))
         posterior, away, sd, of_tyres = result.posterior, np.nan, np.nan, (np.nan, np.nan)
-        if posterior is not None:
+        if posterior is not None and result.bearing is not None:
             soils_under = [Soil(*map(float, soil)) for soil in under]
             away = min(float(np.abs(errors(posterior, soil)).max()) for soil in soils_under)
             sd = result.bearing.std / result.bearing.value
-            depth = {wheel.width: TOLD_DEPTH * (result.sinkage[wheel.name] or np.nan) for wheel in config.wheel}
+            depth = {wheel.width: BEST_DEPTH * (result.sinkage[wheel.name] or np.nan) for wheel in config.wheel}
             of_tyres = errors_of_tyres(posterior, soils_under, depth)
         seen.append(Seen(end - left, result.status is Status.VALID, result.reason, away, sd, *of_tyres))
     return seen
 
 
+def _vehicle(config: Config) -> Vehicle:
+    """The vehicle of the reference tractor, not of a rig."""
+    assert config.vehicle is not None
+    return config.vehicle
+
+
 def errors_of_tyres(posterior: Posterior, soils: list[Soil], depth: dict[float, float]) -> tuple[float, float]:
-    """Error of what the tyres tell from the nearest soil, in standard deviations, and the largest relative sd.
+    """Error of what the tyres measure from the nearest soil, in standard deviations, and the largest relative sd.
 
     Of tan phi and of the pressure under tyres by their width [m], at these depths [m].
     """
@@ -155,12 +162,12 @@ def first_valid(seen: list[Seen]) -> float:
 
 
 def first_of_tyres(seen: list[Seen]) -> float:
-    """Seconds from the border until a window knows what its tyres tell to a tenth; inf if none does."""
+    """Seconds from the border until a window knows what its tyres measure to a tenth; inf if none does."""
     return min((w.t for w in seen if w.knows_tyres and w.t > 0.0), default=np.inf)
 
 
 def wrong_of_tyres(seen: list[Seen]) -> list[Seen]:
-    """Windows that know what their tyres tell, and are beyond what they say."""
+    """Windows that know what their tyres measure, and are beyond what they say."""
     return [w for w in seen if w.knows_tyres and not w.of_tyres < WRONG]
 
 

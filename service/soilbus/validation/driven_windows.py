@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,11 +14,22 @@ from soilbus.estimation.posterior import Posterior
 from soilbus.estimation.tracker import Settings, Tracker
 from soilbus.estimation.window import Window
 from soilbus.pipeline.intake import WindowTask
-from soilbus.pipeline.positions import PositionTrack
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Scenario
 from soilbus.terra.wheel import Soil
+from soilbus.validation import windows as service_windows
+
+__all__ = [
+    "B_REF",
+    "Z_REF",
+    "errors",
+    "sweep",
+    "task_of",
+    "tasks",
+    "tracker_of",
+    "windows",
+]
 
 Z_REF, B_REF = 0.02, 0.3
 
@@ -49,12 +61,8 @@ def errors(posterior: Posterior, soil: Soil) -> np.ndarray:
 
 def task_of(window: Window, end: float, config: Config, index: int = 0) -> WindowTask:
     """What the intake says of a window of which nothing is missing; the first has index 0."""
-    wheels = rig_of(config).wheels
-    return WindowTask(
-        index=index, start=end - config.estimator.window, end=end, window=window, slip=dict.fromkeys(wheels),
-        missing=(), poor=(), torque_limit=np.full(len(wheels), np.nan), track=PositionTrack({}), rejected={},
-        fresh=index == 0,
-    )  # fmt: skip
+    no_limit = np.full(len(config.wheel), np.nan)
+    return replace(service_windows.task_of(window, end, config, no_limit, fresh=index == 0), index=index)
 
 
 def tasks(config: Config, scenario: Scenario, seed: int, without: str = "none") -> Iterator[WindowTask]:
@@ -69,7 +77,7 @@ def tasks(config: Config, scenario: Scenario, seed: int, without: str = "none") 
 
 
 def sweep(text: str, seeds: int) -> argparse.ArgumentParser:
-    """Arguments of a sweep over drives: which seeds, and whether to tell of every window."""
+    """Arguments of a sweep over drives: which seeds, and whether every window is printed."""
     parser = argparse.ArgumentParser(description=text)
     parser.add_argument("--seeds", type=int, default=seeds)
     parser.add_argument("--first", type=int, default=1)

@@ -1,6 +1,6 @@
-"""One soil for an hour, the tracker carried on all the time: false changes, mismatches, and whether errors are as said.
+"""One soil for an hour, the tracker carried on all the time: false changes, mismatches, calibration.
 
-`PYTHONPATH=service python tests/estimation/hour.py [loam wet_clay] [--minutes 60] [--seed 1]` prints the table.
+`python -m soilbus.validation.hour_of_tracking [loam wet_clay] [--minutes 60] [--seed 1]` prints the table.
 """
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ import argparse
 from typing import NamedTuple
 
 import numpy as np
-from drives import errors, tracker_of, windows
 
 from soilbus.estimation.tracker import TrackerState
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
+from soilbus.validation.driven_windows import errors, tracker_of, windows
 
 
 class Hour(NamedTuple):
-    """What was said of one soil: windows, those that say it changed, that do not fit, and errors (N, 2) of the others.
+    """Windows on one soil, those reported as changed, those that do not fit, and errors (N, 2) of the others.
 
     Errors are those of bearing pressure and tan phi in their standard deviations; chi2 (N,).
     """
@@ -32,7 +32,7 @@ class Hour(NamedTuple):
 
 
 def hour(soil: str, minutes: float, seed: int) -> Hour:
-    """Drives so long on one soil, slip wandering between 0.05 and 0.40."""
+    """Drive `minutes` on one soil, slip wandering between 0.05 and 0.40."""
     config = reference_configuration()
     scenario = Scenario(60.0 * minutes, (Patch(0.0, soil),), slip=Swing(0.05, 0.40))
     tracker = tracker_of(config)

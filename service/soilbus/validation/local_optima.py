@@ -1,6 +1,6 @@
 """Does a window have one optimum?  Descents from random soils of the prior, compared with `fit_window`.
 
-`PYTHONPATH=service python tests/estimation/minima.py 1000 [--only TEXT]` prints the table.
+`python -m soilbus.validation.local_optima 1000 [--only TEXT] [--field tests/field/field.toml]` prints the table.
 """
 
 from __future__ import annotations
@@ -27,7 +27,25 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
 
-FIELD = Path(__file__).resolve().parents[1] / "field/field.toml"
+__all__ = [
+    "EXCITED",
+    "LEANING",
+    "SAME_SOIL",
+    "SAME_VALUE",
+    "Case",
+    "Ends",
+    "apart",
+    "c_and_K_known",
+    "cases",
+    "constant",
+    "descents",
+    "ends_of",
+    "line",
+    "starts",
+    "two_wheels",
+    "window",
+]
+
 KINDS = ("loam", "wet_clay", "dry_sand")
 EXCITED = Swing(0.05, 0.40)
 LEANING = Swing(-0.15, 0.15)
@@ -101,17 +119,18 @@ def two_wheels(config: Config) -> Config:
     return config.model_copy(update={"wheel": config.wheel[::2]})
 
 
-def cases() -> Iterator[Case]:
-    """Windows of all kinds."""
+def cases(field: Path | None = None) -> Iterator[Case]:
+    """Windows of all kinds; `field`: the configuration of a further tractor."""
     for soil in KINDS:
         free, known = reference_configuration(), reference_configuration(c_and_K_known(soil))
         kinds = [
             ("c and K free", free, 2.0, EXCITED), ("c and K free", free, 10.0, EXCITED),
             ("c and K known", known, 2.0, EXCITED), ("c and K known", known, 10.0, EXCITED),
-            ("field rig", load_config(FIELD, c_and_K_known(soil)), 10.0, EXCITED),
             ("two wheels", two_wheels(free), 10.0, EXCITED),
             ("constant slip", free, 10.0, constant(0.15)),
         ]  # fmt: skip
+        if field is not None:
+            kinds.append(("field rig", load_config(field, c_and_K_known(soil)), 10.0, EXCITED))
         for name, config, seconds, slip in kinds:
             for sinkage in (True, False):
                 what = f"{name}, {soil}, {seconds:g} s{', sinkage' if sinkage else ''}"
@@ -181,11 +200,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("count", type=int)
     parser.add_argument("--only", default="", help="cases with this in their name")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--field", type=Path, help="configuration of a further tractor, such as tests/field/field.toml")
     args = parser.parse_args(arguments)
     print(f"{args.count} starts each; shares in %: at the best optimum, at another as good, at a worse one, failed;")
     print("the fit: -2 log posterior above the best's, deviation from it in sd; ms of a descent\n")
     print(f"{'window':38s}  same  other  worse failed     above    off     ms  second mode")
-    for case in cases():
+    for case in cases(args.field):
         if args.only in case.name:
             print(line(case.name, ends_of(case, args.count, args.seed), args.count), flush=True)
 

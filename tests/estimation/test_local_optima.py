@@ -5,38 +5,42 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import minima
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from soilbus.estimation.assembly import prior_of
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import fit_from_soil, fit_window
+from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.parametrization import BOUND_SD, MAX_PHI
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+from soilbus.sensors.bins import Bins
+from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
+from soilbus.validation import local_optima
 
 STARTS = 20
 K_C = np.array(PARAMETERS) == "k_c"
 MAX_WIDENING = 1.052
 """Greatest sd of log k_c given K_L over its sd by the default prior (test_subsets)."""
 KINDS = [
-    ("loam", 10.0, minima.EXCITED, False), ("wet_clay", 2.0, minima.EXCITED, True),
-    ("dry_sand", 2.0, minima.EXCITED, False), ("wet_clay", 10.0, minima.constant(0.15), True),
-    ("loam", 2.0, minima.constant(0.15), False),
+    ("loam", 10.0, local_optima.EXCITED, False), ("wet_clay", 2.0, local_optima.EXCITED, True),
+    ("dry_sand", 2.0, local_optima.EXCITED, False), ("wet_clay", 10.0, local_optima.constant(0.15), True),
+    ("loam", 2.0, local_optima.constant(0.15), False),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("soil", "seconds", "slip", "sinkage"), KINDS)
 def test_descents_from_random_soils_of_the_prior_end_at_the_fit(soil, seconds, slip, sinkage):
     config = reference_configuration()
-    case = minima.Case("", minima.window(config, soil, seconds, slip, sinkage), prior_of(config))
-    ends = minima.ends_of(case, STARTS, 3)
-    assert ends.above < minima.SAME_VALUE
-    assert ends.off < minima.SAME_SOIL
+    case = local_optima.Case("", local_optima.window(config, soil, seconds, slip, sinkage), prior_of(config))
+    ends = local_optima.ends_of(case, STARTS, 3)
+    assert ends.above < local_optima.SAME_VALUE
+    assert ends.off < local_optima.SAME_SOIL
     assert ends.other == 0
     assert not ends.worse
     assert ends.failed <= 0.1 * STARTS
@@ -46,8 +50,8 @@ def test_descents_from_random_soils_of_the_prior_end_at_the_fit(soil, seconds, s
 @pytest.fixture(scope="module")
 def bimodal():
     """Two wheels of different widths on wet clay: k_c may have its value, or be close to zero."""
-    config = minima.two_wheels(reference_configuration())
-    return minima.window(config, "wet_clay", seed=3), prior_of(config)
+    config = local_optima.two_wheels(reference_configuration())
+    return local_optima.window(config, "wet_clay", seed=3), prior_of(config)
 
 
 def test_two_optima_of_similar_evidence_are_a_fit_with_a_second_mode(bimodal):
@@ -58,7 +62,7 @@ def test_two_optima_of_similar_evidence_are_a_fit_with_a_second_mode(bimodal):
     assert 0.05 < second.share <= 0.5
     again = fit_from_soil(problem, prior, second.gaussian.posterior.soil)  # it is an optimum
     assert again.converged
-    assert minima.apart(again, fit) > 2.0
+    assert local_optima.apart(again, fit) > 2.0
     assert again.mode.posterior.distance(second.gaussian.posterior.soil) < 0.1
     assert second.share == pytest.approx(
         1.0 / (1.0 + math.exp(0.5 * (again.neg2_log_evidence - fit.neg2_log_evidence))), abs=0.01
@@ -84,17 +88,17 @@ def test_without_two_separable_moduli_there_is_no_second_mode(bimodal):
     held = SoilPrior(prior.median, np.where(np.arange(6) == PARAMETERS.index("k_c"), 0.0, prior.log_std))
     assert fit_window(problem, held).second_mode is None
     config = reference_configuration([f"wheel.{w}.width=0.3" for w in ("FL", "FR", "RL", "RR")])
-    assert fit_window(minima.window(config, "wet_clay", 2.0, seed=3), prior).second_mode is None
+    assert fit_window(local_optima.window(config, "wet_clay", 2.0, seed=3), prior).second_mode is None
 
 
 @pytest.fixture(scope="module")
 def short():
     config = reference_configuration()
-    scenario = minima.Scenario(2.0, (minima.Patch(0.0, "loam"),), slip=minima.EXCITED)
-    rig, channels = minima.rig_of(config), minima.simulate(config, scenario, 1).channels
-    store = minima.Bins(rig, config.estimator.bin, 0.0)
+    scenario = Scenario(2.0, (Patch(0.0, "loam"),), slip=local_optima.EXCITED)
+    rig, channels = rig_of(config), simulate(config, scenario, 1).channels
+    store = Bins(rig, config.estimator.bin, 0.0)
     store.add({c: (channels[c].t, channels[c].value) for c in rig.channels if c in channels})
-    return store.window(0.0, 2.0), rig, minima.model_of(config), prior_of(config)
+    return store.window(0.0, 2.0), rig, model_of(config), prior_of(config)
 
 
 CHANNELS = ("torque", "load", "speed", "sinkage", "ground_speed", "draft")
@@ -137,7 +141,7 @@ def harmed(window, harms, seed):
 @given(harms=st.lists(HARM, max_size=3), rows=st.integers(1, 20), seed=st.integers(0, 9))
 def test_every_fit_is_physical_for_all_data(harms, rows, seed, short):
     window, rig, model, prior = short
-    problem = minima.ObservationModel(harmed(window, harms, seed).rows(np.arange(rows)), rig, model, 0.2)
+    problem = ObservationModel(harmed(window, harms, seed).rows(np.arange(rows)), rig, model, 0.2)
     fit = fit_window(problem, prior)
     if fit is None:
         return

@@ -1,7 +1,7 @@
 """Drives into curves and out of them: are valid windows right while the curve changes?
 
-`PYTHONPATH=service:tests/support python tests/estimation/curves.py [--radii 75 40 25] [--soil loam] [--seeds 8]
-[--first 1]` prints a table; `--windows` every window besides.
+`python -m soilbus.validation.curved_drives [--radii 75 40 25] [--soil loam] [--seeds 8] [--first 1]` prints a table;
+`--windows` every window besides.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from drives import errors, sweep, task_of, windows
 
 from soilbus.config.model import Config
 from soilbus.decision.traversability import Status
@@ -22,6 +21,14 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
+from soilbus.validation.driven_windows import errors, sweep, task_of, windows
+
+__all__ = [
+    "TRACK",
+    "Seen",
+    "curved",
+    "driven",
+]
 
 TRACK = 1.5
 ENTERED, LEFT, END = 12.0, 25.0, 38.0
@@ -43,22 +50,25 @@ class Seen(NamedTuple):
 
 
 def curved(window: Window, rig: Rig, curvature: np.ndarray | float) -> Window:
-    """The window on a curve to the left [1/m]: each wheel with the same slip to the ground that goes by under it."""
-    bend = np.broadcast_to(np.asarray(curvature, float), window.t.shape)[:, None]
-    return replace(window, speed=window.speed * (1.0 + sides(rig) * TRACK / 2.0 * bend))
+    """The window on a path of this curvature [1/m], positive to the left.
+
+    Each wheel keeps its slip relative to the ground that passes under it.
+    """
+    left = np.broadcast_to(np.asarray(curvature, float), window.t.shape)[:, None]
+    return replace(window, speed=window.speed * (1.0 + sides(rig) * TRACK / 2.0 * left))
 
 
-def driven(config: Config, soil: str, radius: float, seed: int) -> list[Seen]:
-    """The windows of a drive with one curve of this radius [m], to the left or to the right."""
+def driven(config: Config, soil: str, radius: float, seed: int, duration: float = END) -> list[Seen]:
+    """The windows of a drive [s] with one curve of this radius [m], to the left or to the right."""
     rng = np.random.default_rng([seed, 11])
     begin, end = np.array([ENTERED, LEFT]) + SPREAD * rng.random(2)
     steering, way = rng.uniform(*STEERING), rng.choice([-1.0, 1.0])
     knots = [begin, begin + steering, end, end + steering]
-    recording = simulate(config, Scenario(END, (Patch(0.0, soil),), slip=Swing(0.05, 0.40)), seed)
+    recording = simulate(config, Scenario(duration, (Patch(0.0, soil),), slip=Swing(0.05, 0.40)), seed)
     estimator, rig, seen = WindowEstimator(config), rig_of(config), []
     for window, at in windows(config, recording):
-        bent = curved(window, rig, way / radius * np.interp(window.t, knots, [0.0, 1.0, 1.0, 0.0]))
-        result = estimator.estimate(task_of(bent, at, config, index=round(at - config.estimator.window))).result
+        on_curve = curved(window, rig, way / radius * np.interp(window.t, knots, [0.0, 1.0, 1.0, 0.0]))
+        result = estimator.estimate(task_of(on_curve, at, config, index=round(at - config.estimator.window))).result
         away, sd = np.full(2, np.nan), np.nan
         if result.posterior is not None:
             away = errors(result.posterior, SOILS[soil])

@@ -1,6 +1,6 @@
 """Are reported class probabilities calibrated?  Simulated windows on soils drawn from the classes and `unknown`.
 
-`PYTHONPATH=service python tests/estimation/reliability.py 300 [--seconds 10] [--slip 0.4]` prints the table.
+`python -m soilbus.validation.class_reliability 300 [--seconds 10] [--slip 0.4]` prints the table.
 """
 
 from __future__ import annotations
@@ -27,6 +27,15 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import UNKNOWN
 from soilbus.terra.wheel import Soil
+
+__all__ = [
+    "WIDE_COHESION",
+    "Prediction",
+    "drawn",
+    "driven",
+    "shortfall",
+    "windows",
+]
 
 WIDE_COHESION = ("soil.c.value=5000", "soil.c.std=8000")
 """The table has cohesions up to 69 kPa, 23 times the default prior's median."""
