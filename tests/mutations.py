@@ -136,17 +136,17 @@ MUTATIONS = (
     Mutation(
         "a state is written through a link", "daemon/state_store.py",
         "flags | os.O_NOFOLLOW", "flags",
-        ("tests/daemon/test_store.py::test_nothing_is_written_through_a_link",),
+        ("tests/daemon/test_state_store.py::test_nothing_is_written_through_a_link",),
     ),
     Mutation(
         "a state is read through a link", "daemon/state_store.py",
         "os.O_NONBLOCK | os.O_NOFOLLOW", "os.O_NONBLOCK",
-        ("tests/daemon/test_store.py::test_what_is_no_file_is_refused_and_nothing_is_nothing",),
+        ("tests/daemon/test_state_store.py::test_what_is_no_file_is_refused_and_nothing_is_nothing",),
     ),
     Mutation(
         "gains may be as negative as they like", "daemon/state_store.py",
-        "(np.abs(off) <= FAR * std).all()", "(off <= FAR * std).all()",
-        ("tests/daemon/test_store.py::test_each_fault_is_told_in_one_line",),
+        "(np.abs(off) <= STORED_RANGE_SD * std).all()", "(off <= STORED_RANGE_SD * std).all()",
+        ("tests/daemon/test_state_store.py::test_each_fault_is_told_in_one_line",),
     ),
     Mutation(
         "windows that overlap count as if they did not", "pipeline/model_gap.py",

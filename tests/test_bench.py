@@ -30,14 +30,14 @@ TARGETS = {
 @pytest.fixture
 def small(monkeypatch):
     """The bench of a short recording, each time taken once."""
-    monkeypatch.setattr(bench, "RECORDING", 13.0)
+    monkeypatch.setattr(bench, "RECORDING_TIME", 13.0)
     monkeypatch.setattr(paper, "SOLVES", 20)
     for module in (paper, service, window, growth):
         monkeypatch.setattr(module, "ROUNDS", 1)
     monkeypatch.setattr(window, "SOILS", ("loam",))
-    monkeypatch.setattr(window, "KNOWN", window.KNOWN[:1])
+    monkeypatch.setattr(window, "EXACT_AND_ROUGH", window.EXACT_AND_ROUGH[:1])
     monkeypatch.setattr(growth, "WHEELS", (1, 2))
-    monkeypatch.setattr(growth, "LENGTHS", (4.0, 8.0))
+    monkeypatch.setattr(growth, "WINDOW_LENGTHS", (4.0, 8.0))
 
 
 def test_every_figure_is_in_the_json_and_beside_its_target_in_the_table(small, tmp_path, capsys):
@@ -62,7 +62,7 @@ def test_every_figure_is_in_the_json_and_beside_its_target_in_the_table(small, t
 
 def test_json_to_stdout_is_nothing_but_json(monkeypatch, capsys):
     measured = {"tried": Figure(3.0, 2.0, "theirs 3 s, ours 1 s", "a try")}
-    monkeypatch.setattr(bench, "RECORDING", 1.0)
+    monkeypatch.setattr(bench, "RECORDING_TIME", 1.0)
     monkeypatch.setattr(bench, "MEASUREMENTS", (lambda _: measured,))
     assert main(["bench", "--json", "-"]) == 0
     results = json.loads(capsys.readouterr().out)
@@ -79,7 +79,7 @@ def test_all_is_measured_with_as_many_threads_as_the_unit_gives_the_service(monk
         seen.extend(pool["num_threads"] for pool in threadpool_info())
         return {}
 
-    monkeypatch.setattr(bench, "RECORDING", 1.0)
+    monkeypatch.setattr(bench, "RECORDING_TIME", 1.0)
     monkeypatch.setattr(bench, "MEASUREMENTS", (measure,))
     with threadpool_limits(2):
         bench.run_bench()
@@ -96,7 +96,7 @@ def test_a_missed_target_says_so(value, at_most, aim, met):
 
 
 @pytest.mark.parametrize("name", window.SOILS)
-@pytest.mark.parametrize("known", window.KNOWN)
+@pytest.mark.parametrize("known", window.EXACT_AND_ROUGH)
 def test_least_squares_has_the_same_problem_and_our_fit_its_optimum(name, known):
     """The peer's residuals are written out on their own; here with scipy's exact end instead of a quick one."""
     problem = window._window(name, *known)
@@ -112,7 +112,7 @@ def test_least_squares_has_the_same_problem_and_our_fit_its_optimum(name, known)
 
 def test_different_ends_are_no_figure(small, monkeypatch, capsys):
     monkeypatch.setattr(bench, "MEASUREMENTS", (lambda _: {"w": window.window_solve_speedup()},))
-    monkeypatch.setattr(window, "AGREEMENT", 1e-9)
+    monkeypatch.setattr(window, "MAX_DISTANCE_SD", 1e-9)
     assert main(["bench"]) == 1
     printed, err = capsys.readouterr()
     assert printed == ""
@@ -129,7 +129,7 @@ def test_the_papers_solve_is_the_peers_and_faster(monkeypatch):
 
 
 def test_unlike_solutions_of_the_papers_problem_are_no_figure(monkeypatch):
-    monkeypatch.setattr(paper, "AGREEMENT", 1e-12)
+    monkeypatch.setattr(paper, "MAX_RELATIVE_DIFFERENCE", 1e-12)
     with pytest.raises(AssertionError, match="apart"):
         paper.paper_solve_speedup()
 
@@ -151,7 +151,7 @@ def test_an_unwritable_place_is_told_before_the_long_work(tmp_path, monkeypatch,
 
 def test_windows_grow_as_they_are_said_to():
     for wheels in (1, 2, 8):
-        for (problem, _), length in zip(growth._problems(wheels), growth.LENGTHS, strict=True):
+        for (problem, _), length in zip(growth._problems(wheels), growth.WINDOW_LENGTHS, strict=True):
             assert (problem.n, problem.n_wheels) == (10 * length, wheels)
             assert problem.n_rows == problem.n * (2 * wheels + 1)  # torque and sinkage of each wheel, one balance
 

@@ -8,7 +8,7 @@ import pytest
 from soilbus.cli.main import main
 from soilbus.pipeline.intake import EDGE_LEAD
 from soilbus.validation.bench.bus_ear import latencies, until_middle
-from soilbus.validation.bench.bus_load import FULL, OURS, Traffic
+from soilbus.validation.bench.bus_load import FULL_BUS_RATE, MAPPED_SHARE, Traffic
 
 
 def test_latency_is_from_the_last_mapped_frame_of_the_window():
@@ -41,9 +41,9 @@ def test_window_numbers_go_round():
 
 def test_a_tenth_of_a_full_bus_is_ours():
     played = Traffic("nowhere", 4.0)._played
-    assert len(played) / 4.0 == pytest.approx(FULL * OURS, rel=0.03)
+    assert len(played) / 4.0 == pytest.approx(FULL_BUS_RATE * MAPPED_SHARE, rel=0.03)
     assert [t for t, _ in played] == sorted(t for t, _ in played)
-    bits = 1e6 / FULL
+    bits = 1e6 / FULL_BUS_RATE
     assert 131.0 < bits < 131.0 * 1.2  # an extended frame of 8 bytes, its least with some stuff bits
 
 

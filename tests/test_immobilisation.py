@@ -27,7 +27,7 @@ from soilbus.simulator.drive import drive as driven
 from soilbus.simulator.reference import reference_configuration
 from soilbus.validation import boggings, firm_drives
 from soilbus.validation.bogging_trials import (
-    REACTION,
+    REACTION_TIME,
     Observation,
     Task,
     WarningTrial,
@@ -335,7 +335,7 @@ def test_the_lead_is_that_of_the_last_warning_that_holds_until_the_end():
     assert begins == pytest.approx([10.0, 40.0], abs=0.11)
     found = judged("draft", seen)
     assert (found.warnings, found.lead) == (2, pytest.approx(10.0, abs=0.11))
-    assert found.way == pytest.approx(found.lead, abs=0.11)
+    assert found.distance == pytest.approx(found.lead, abs=0.11)
     over = observation([(10.0, 12.0, 0.65)], [(0.0, CURVE)], 50.0)
     assert (judged("draft", over).warnings, judged("draft", over).lead) == (1, 0.0)  # it had gone again
 
@@ -348,7 +348,7 @@ def test_a_curve_counts_from_the_end_of_its_window_on():
 
 def test_only_what_the_service_calls_valid_gives_a_curve(monkeypatch):
     """Where no window may be so uncertain and still be valid, there is no curve, and so no warning by the ground."""
-    monkeypatch.setattr(boggings, "BOGGING", 16.0)
+    monkeypatch.setattr(boggings, "DRIVE_TIME", 16.0)
     settings = CONFIG.estimator.model_copy(update={"max_bearing_std": 1e-6})
     strict = CONFIG.model_copy(update={"estimator": settings})
     assert [len(observed(Task(config, "draft", 11)).curves) for config in (CONFIG, strict)] == [6, 0]
@@ -386,19 +386,19 @@ def test_thresholds_are_tuned_on_other_drives_than_are_reported(monkeypatch):
 def test_a_simulated_bogging_is_foreseen(kind, seed):
     found = trial(Task(CONFIG, kind, seed))
     assert found.lead >= 3.0
-    assert found.way >= 3.0
+    assert found.distance >= 3.0
     assert found.possible > found.lead - 1.0
 
 
 def test_at_the_edge_of_a_soft_patch_the_warning_comes_as_soon_as_it_can_be_felt():
     found = trial(Task(CONFIG, "patch", 4))
-    assert found.lead > found.possible - REACTION
+    assert found.lead > found.possible - REACTION_TIME
     assert found.warnings == 1
 
 
 @pytest.mark.parametrize("kind", firm_drives.FIRM_KINDS)
 def test_firm_ground_is_left_in_peace(kind, monkeypatch):
-    monkeypatch.setattr(firm_drives, "FIRM_DRIVE", 60.0)
+    monkeypatch.setattr(firm_drives, "DRIVE_TIME", 60.0)
     found = trial(Task(CONFIG, kind, 1))
     assert found.seconds == pytest.approx(50.0, abs=0.2)
     assert found.warnings == 0

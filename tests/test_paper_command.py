@@ -104,7 +104,7 @@ def test_the_verdicts_follow_from_the_figures(output, monkeypatch):
     slow = [run._replace(seconds=1e-9) for run in RUNS]
     for name, value in (
         ("K_L_bound", lambda *_: 1e-4), ("TORQUE_ON_CLAY", clay), ("TORQUE_ON_LOAM", loam), ("RUNS", slow),
-        ("SOLVED", 0.0), ("EXACT", SIMPSON),
+        ("MAX_SOLUTION_ERROR", 0.0), ("EXACT", SIMPSON),
     ):  # fmt: skip
         monkeypatch.setattr(paper_report, name, value)
     said = " ".join(paper_report.what_holds(0.05))

@@ -1,4 +1,4 @@
-"""A node that fills the bus with one of our inputs: the beat stays, nothing piles up, the estimate says why not."""
+"""A node that fills the bus with one of our inputs: the ticks stay, nothing piles up, the estimate says why not."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_a_babbling_input_leaves_beat_and_memory_as_they_are():
     counts = service.intake.admission.counts
     assert service.bus.counts.received == wire.given > 24 * FULL_BUS * 0.99
     assert sum(counts.received.values()) == sum(counts.admitted.values()) + sum(counts.refused.values())
-    assert wire.given - sum(counts.received.values()) <= 0.11 * FULL_BUS  # those of the last beat
+    assert wire.given - sum(counts.received.values()) <= 0.11 * FULL_BUS  # those of the last tick
     verdicts = [t for t, i in wire.sent if i == out.get_message_by_name("Traversability").frame_id]
     assert max(b - a for a, b in itertools.pairwise(verdicts)) < 0.11
     assert service.deadline_misses == 0

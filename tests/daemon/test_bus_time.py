@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from soilbus.can.wire import STAMPED
-from soilbus.daemon.bus_time import GRACE, LATE, BusTime
+from soilbus.daemon.bus_time import CLOSE_DELAY, TAKING_DELAY, BusTime
 
 STAMP, NOW = 1.7e9, 500.0
 END = STAMP + 0.5
@@ -47,9 +47,9 @@ def test_the_monotonic_clock_goes_on_where_the_stamps_end(of_bus):
 
 
 def test_a_bus_that_cannot_tell_has_grace(of_bus):
-    assert of_bus.heard(END, NOW + 0.5) == pytest.approx(STAMP + 0.3 - GRACE)
-    of_bus.took_nothing(NOW + 0.5 + GRACE)
-    assert of_bus.heard(END, NOW + 0.5 + GRACE) >= END
+    assert of_bus.heard(END, NOW + 0.5) == pytest.approx(STAMP + 0.3 - CLOSE_DELAY)
+    of_bus.took_nothing(NOW + 0.5 + CLOSE_DELAY)
+    assert of_bus.heard(END, NOW + 0.5 + CLOSE_DELAY) >= END
 
 
 def test_a_bus_that_can_tell_has_none(of_bus, bus):
@@ -64,7 +64,7 @@ def test_a_clock_that_was_set_ends_no_window_that_has_not(of_bus, bus, step):
     bus.until = STAMP + 0.4 + step
     for now in (0.4, 0.48):
         assert of_bus.heard(END, NOW + now) < END
-    assert of_bus.heard(END, NOW + 0.495) <= END - 0.005 + LATE
+    assert of_bus.heard(END, NOW + 0.495) <= END - 0.005 + TAKING_DELAY
 
 
 def test_nobody_sleeps_past_an_end_that_the_bus_can_tell(of_bus, bus):

@@ -16,8 +16,8 @@ from fakes import FakeClock, InlineExecutor, ScriptedBus
 from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
-from soilbus.daemon.exception_guard import REPEATED
-from soilbus.daemon.health import LONGEST_MUTE, LONGEST_SOLVE, Health
+from soilbus.daemon.exception_guard import FAILURES_TO_FAULT
+from soilbus.daemon.health import MAX_SOLVE_TIME, MAX_TIME_WITHOUT_SEND, Health
 from soilbus.daemon.service import Service
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.frames import frames
@@ -161,7 +161,7 @@ def test_an_estimator_that_hangs_is_restarted(moments, caplog):
     began = bench.run(6.0)
     assert not bench.systemd.would_restart(began)
     worker.hangs = True
-    hung = bench.run(LONGEST_SOLVE - 2.0)
+    hung = bench.run(MAX_SOLVE_TIME - 2.0)
     assert not bench.systemd.would_restart(hung)
     bench.run(WATCHDOG + 4.0)
     assert bench.systemd.would_restart(hung)
@@ -179,7 +179,7 @@ def test_a_sender_that_hangs_on_a_living_bus_is_restarted(moments, caplog):
     bench = Bench(moments, 60.0)
     bench.run(5.0)
     bench.wire.fail_send += [can.CanOperationError("No buffer space", errno.ENOBUFS)] * 100_000
-    mute = bench.run(LONGEST_MUTE - 2.0)
+    mute = bench.run(MAX_TIME_WITHOUT_SEND - 2.0)
     assert not bench.systemd.would_restart(mute)
     bench.run(WATCHDOG + 4.0)
     assert bench.systemd.would_restart(mute)
@@ -193,12 +193,12 @@ def test_a_sender_that_hangs_on_a_living_bus_is_restarted(moments, caplog):
 
 def test_health_by_the_second():
     health = Health(0.0)
-    assert health.fault(LONGEST_SOLVE, 0.0, True, 1) is None
-    assert health.fault(LONGEST_SOLVE + 0.1, 0.0, True, 1).startswith("overload")
-    assert health.fault(LONGEST_SOLVE + LONGEST_MUTE, None, True, 1) is None
-    assert health.fault(LONGEST_SOLVE + LONGEST_MUTE + 0.1, None, True, 1).startswith("internal")
-    assert health.fault(LONGEST_SOLVE + LONGEST_MUTE + 0.2, None, False, 1) is None
-    assert health.fault(LONGEST_SOLVE + 2 * LONGEST_MUTE, None, True, 1) is None
+    assert health.fault(MAX_SOLVE_TIME, 0.0, True, 1) is None
+    assert health.fault(MAX_SOLVE_TIME + 0.1, 0.0, True, 1).startswith("overload")
+    assert health.fault(MAX_SOLVE_TIME + MAX_TIME_WITHOUT_SEND, None, True, 1) is None
+    assert health.fault(MAX_SOLVE_TIME + MAX_TIME_WITHOUT_SEND + 0.1, None, True, 1).startswith("internal")
+    assert health.fault(MAX_SOLVE_TIME + MAX_TIME_WITHOUT_SEND + 0.2, None, False, 1) is None
+    assert health.fault(MAX_SOLVE_TIME + 2 * MAX_TIME_WITHOUT_SEND, None, True, 1) is None
 
 
 def broken(estimator, windows: range):
@@ -240,24 +240,24 @@ def test_one_defect_costs_one_window(drive, caplog):
 def test_a_defect_in_every_window_is_a_fault_until_an_estimator_that_knows_nothing_heals_it(drive, caplog):
     bench = Bench(drive)
     broken(bench.estimator, range(1, 100))
-    bench.run(WINDOW + REPEATED)
+    bench.run(WINDOW + FAILURES_TO_FAULT)
     assert "fault" not in {str(f["State"]) for f in bench.sent("SoilbusStatus")}
     bench.run(0.9)  # until just before the next window ends
     last = bench.sent("SoilbusStatus")[-1]
     assert (str(last["State"]), str(last["Reason"])) == ("fault", "internal")
-    assert bench.service._solver.estimator is not bench.estimator
+    assert bench.service._guarded_estimator.estimator is not bench.estimator
     bench.run(2.2)
     assert bench.sent("SoilbusStatus")[-1]["State"] == "valid"
-    assert bench.service.failures["internal"] == REPEATED
-    assert len([r for r in caplog.records if r.levelno >= logging.ERROR]) == REPEATED
+    assert bench.service.failures["internal"] == FAILURES_TO_FAULT
+    assert len([r for r in caplog.records if r.levelno >= logging.ERROR]) == FAILURES_TO_FAULT
 
 
 def test_a_fault_that_stays_is_not_logged_window_by_window(drive, caplog):
     bench = Bench(drive)
-    bench.service._solver._again = lambda: bench.estimator
+    bench.service._guarded_estimator._again = lambda: bench.estimator
     broken(bench.estimator, range(100))
     bench.run(16.0)
-    assert bench.service.failures["internal"] > 2 * REPEATED
-    assert len([r for r in caplog.records if r.levelno >= logging.ERROR]) == REPEATED
+    assert bench.service.failures["internal"] > 2 * FAILURES_TO_FAULT
+    assert len([r for r in caplog.records if r.levelno >= logging.ERROR]) == FAILURES_TO_FAULT
     assert bench.sent("SoilbusStatus")[-1]["State"] == "fault"
     assert {str(f["State"]) for f in bench.sent("Traversability")} == {"unknown"}

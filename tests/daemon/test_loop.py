@@ -19,7 +19,7 @@ from soilbus.can.publish import Publisher
 from soilbus.can.wire import STAMPED, MessageWire
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.service import Service
-from soilbus.daemon.tick_phase import EVE
+from soilbus.daemon.tick_phase import LEAD_BEFORE_WINDOW_END
 from soilbus.pipeline.outputs import hop_frames
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.frames import frames
@@ -93,7 +93,11 @@ def test_before_each_window_ends_the_loop_has_just_done_its_work_and_then_leaves
     bench.run(DURATION)
     beats = [f["at"] + bench.wire.offset for f in bench.sent("WheelSlip")]
     for end in (result.t for result in bench.results[1:]):
-        assert EVE - 0.001 < end - max(beat for beat in beats if beat < end) < EVE + 0.02
+        assert (
+            LEAD_BEFORE_WINDOW_END - 0.001
+            < end - max(beat for beat in beats if beat < end)
+            < LEAD_BEFORE_WINDOW_END + 0.02
+        )
         assert min(beat for beat in beats if beat > end) - end > 0.08
 
 

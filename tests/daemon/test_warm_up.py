@@ -36,7 +36,7 @@ def started(monkeypatch):
 
     def of(config):
         services.append(start.start_service(config, wait=False))
-        services[-1]._backlog._workers.shutdown(wait=True)
+        services[-1]._work_queue._workers.shutdown(wait=True)
         return services[-1], rehearsals
 
     yield of
@@ -55,7 +55,7 @@ def test_all_that_a_valid_window_takes_is_rehearsed(path):
 def test_a_start_rehearses_and_knows_nothing_of_it(started):
     service, rehearsals = started(reference_configuration(VIRTUAL))
     assert [len(results) for results in rehearsals] == [WINDOWS]
-    assert service._solver.newest is None
+    assert service._guarded_estimator.newest is None
     assert service.intake.last_seen == {}
     assert service.intake.admission.counts.received.total() == 0
     counters = {name: service.publisher.frame(name, {}).data for name in ("Traversability", "SoilStrength")}

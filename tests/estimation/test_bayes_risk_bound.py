@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.stats import norm
 
-from soilbus.validation.bayes_risk_bound import TILTS, attainable
+from soilbus.validation.bayes_risk_bound import WEIGHT_POWERS, bayes_risk
 
 GRID = np.linspace(-3.0, 3.0, 601)
 NOISE = 0.4
@@ -33,8 +33,8 @@ def test_no_estimate_has_a_smaller_weighted_loss_than_the_risk():
     rng = np.random.default_rng(1)
     share = rng.dirichlet(np.ones(5000))
     value, bound = rng.standard_normal((5000, 2)), rng.uniform(0.1, 0.8, (5000, 2))
-    found = attainable(value, share, bound, np.zeros(2))
-    for i, tilt in enumerate(TILTS):
+    found = bayes_risk(value, share, bound, np.zeros(2))
+    for i, tilt in enumerate(WEIGHT_POWERS):
         for q in range(2):
             counted = share * bound[:, q] ** (-2.0 - tilt)
             loss = minimize_scalar(lambda x, q=q, counted=counted: counted @ (value[:, q] - x) ** 2)
@@ -48,21 +48,21 @@ def test_no_estimate_has_a_smaller_weighted_loss_than_the_risk():
 def test_the_risk_of_few_samples_is_unbiased():
     rng = np.random.default_rng(2)
     (share,) = windows(1.0, 1, rng)
-    (risk,) = attainable(GRID[:, None], share, BOUND[:, None], np.zeros(1)).risk[TILTS.index(0.0)]
+    (risk,) = bayes_risk(GRID[:, None], share, BOUND[:, None], np.zeros(1)).risk[WEIGHT_POWERS.index(0.0)]
     of_few = []
     for _ in range(400):
         drawn = rng.choice(len(GRID), 40, p=share)
-        found = attainable(GRID[drawn, None], np.full(40, 1 / 40), BOUND[drawn, None], np.zeros(1))
-        of_few.append(found.risk[TILTS.index(0.0), 0])
+        found = bayes_risk(GRID[drawn, None], np.full(40, 1 / 40), BOUND[drawn, None], np.zeros(1))
+        of_few.append(found.risk[WEIGHT_POWERS.index(0.0), 0])
     assert np.mean(of_few) == pytest.approx(risk, abs=4.0 * np.std(of_few) / 20.0)
 
 
 def test_a_held_quantity_has_no_error_and_no_risk():
     value = np.column_stack([np.linspace(-1.0, 1.0, 9), np.full(9, 0.3)])
     bound = np.column_stack([np.full(9, 0.5), np.zeros(9)])
-    found = attainable(value, np.full(9, 1 / 9), bound, np.array([0.0, 0.3]))
+    found = bayes_risk(value, np.full(9, 1 / 9), bound, np.array([0.0, 0.3]))
     assert found.error == pytest.approx(np.zeros(2))
-    assert found.risk[:, 1] == pytest.approx(np.zeros(len(TILTS)))
+    assert found.risk[:, 1] == pytest.approx(np.zeros(len(WEIGHT_POWERS)))
     assert (found.risk[:, 0] > 0.0).all()
 
 
@@ -74,7 +74,7 @@ def test_every_estimator_exceeds_the_bound_on_some_soil(power):
     risk, weight, error = [], [], []
     for soil in soils:
         shares = windows(soil, 300, rng)
-        each = [attainable(GRID[:, None], share, BOUND[:, None], np.array([soil])) for share in shares]
+        each = [bayes_risk(GRID[:, None], share, BOUND[:, None], np.array([soil])) for share in shares]
         risk.append(np.sum([a.risk for a in each], axis=0)[:, 0])
         weight.append(np.sum([a.weight for a in each], axis=0)[:, 0])
         counted = shares * BOUND**-power
@@ -88,5 +88,5 @@ def test_every_estimator_exceeds_the_bound_on_some_soil(power):
 def test_with_one_bound_for_all_soils_the_bound_is_attained():
     rng = np.random.default_rng(4)
     value = 0.3 * rng.standard_normal((100_000, 1))
-    found = attainable(value, np.full(100_000, 1e-5), np.full((100_000, 1), 0.3), np.zeros(1))
-    assert np.sqrt(found.risk / found.weight) == pytest.approx(np.ones((len(TILTS), 1)), rel=0.01)
+    found = bayes_risk(value, np.full(100_000, 1e-5), np.full((100_000, 1), 0.3), np.zeros(1))
+    assert np.sqrt(found.risk / found.weight) == pytest.approx(np.ones((len(WEIGHT_POWERS), 1)), rel=0.01)

@@ -18,7 +18,7 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.validation import local_optima
 from soilbus.validation.driven_windows import tasks
-from soilbus.validation.monte_carlo import missed
+from soilbus.validation.monte_carlo import prior_about
 
 STILL, LEANING = Swing(0.0, 1e-9), Swing(-0.3, 0.3)
 SLIPS = (0.05, 0.1, 0.2, 0.35)
@@ -49,7 +49,7 @@ def of_drive(soil, sinkage, seed):
     problem = local_optima.window(
         config, soil, 10.0, local_optima.constant(SLIPS[seed % 4]), sinkage, 100 + seed, STILL
     )
-    prior = missed(prior_of(config), SOILS[soil], np.random.default_rng([seed, 9]))
+    prior = prior_about(prior_of(config), SOILS[soil], np.random.default_rng([seed, 9]))
     whole = with_nested_laplace(
         problem, prior, Gaussian.of(prior, problem.gain_std), fit_window(problem, prior)
     ).reported

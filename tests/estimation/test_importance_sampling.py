@@ -18,7 +18,7 @@ from soilbus.simulator.scenario import Swing
 from soilbus.terra.wheel import Soil
 from soilbus.validation import importance_sampling, local_optima
 from soilbus.validation.cramer_rao import cramer_rao
-from soilbus.validation.importance_sampling import samples
+from soilbus.validation.importance_sampling import sample_posterior
 
 STILL = Swing(0.0, 1e-9)
 
@@ -36,7 +36,7 @@ def uncertain():
 
 def test_the_average_along_n_has_the_moments_of_the_sampled_posterior(uncertain):
     problem, prior, joint_prior, fit = uncertain
-    found = samples(problem, prior, joint_prior, fit, 500, np.random.default_rng(1))
+    found = sample_posterior(problem, prior, joint_prior, fit, 500, np.random.default_rng(1))
     assert found.share.sum() == pytest.approx(1.0)
     assert found.effective > 60.0
     reported = with_nested_laplace(problem, prior, joint_prior, fit).reported
@@ -73,9 +73,9 @@ def test_without_deviation_along_k_c_s_share_the_draws_are_by_the_curvature(unce
         return node._replace(fit=replace(node.fit, gaussian=replace(node.fit.gaussian, covariance=covariance)))
 
     flat = along._replace(nodes=[without_deviation(node) for node in along.nodes])
-    first = samples(problem, prior, joint_prior, fit, 500, np.random.default_rng(1))
+    first = sample_posterior(problem, prior, joint_prior, fit, 500, np.random.default_rng(1))
     monkeypatch.setattr(importance_sampling, "profile_over_n", lambda *_: flat)
-    again = samples(problem, prior, joint_prior, fit, 500, np.random.default_rng(2))
+    again = sample_posterior(problem, prior, joint_prior, fit, 500, np.random.default_rng(2))
     (mean, std), (other, _) = (moments(found) for found in (first, again))
     chance = 3.5 * np.sqrt(1.0 / first.effective + 1.0 / again.effective)
     assert again.effective > 30.0
@@ -89,7 +89,7 @@ def moments(found):
 
 def test_each_sample_has_the_cramer_rao_bound_of_a_window_on_its_soil(uncertain):
     problem, prior, joint_prior, fit = uncertain
-    found = samples(problem, prior, joint_prior, fit, 300, np.random.default_rng(1))
+    found = sample_posterior(problem, prior, joint_prior, fit, 300, np.random.default_rng(1))
     denoised = profile_over_n(problem, prior, joint_prior, fit).problem
     for i in np.argsort(found.share)[-20:]:
         bound = cramer_rao(denoised, prior, Soil(*np.exp(found.logs[i]).tolist())).log_covariance
@@ -102,4 +102,4 @@ def test_with_k_c_held_there_are_no_samples(uncertain):
     problem, prior, _, _ = uncertain
     held = SoilPrior(prior.median, np.where(np.arange(6) == 0, 0.0, prior.log_std))
     joint_prior, fit = Gaussian.of(held, problem.gain_std), fit_window(problem, held)
-    assert samples(problem, held, joint_prior, fit, 10, np.random.default_rng(1)) is None
+    assert sample_posterior(problem, held, joint_prior, fit, 10, np.random.default_rng(1)) is None

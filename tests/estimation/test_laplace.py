@@ -15,7 +15,7 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario
 from soilbus.terra.soils import SOILS
 from soilbus.validation.cramer_rao import cramer_rao
-from soilbus.validation.monte_carlo import ROUGHLY_KNOWN, SLIP
+from soilbus.validation.monte_carlo import ROUGHLY_KNOWN, SLIP_RANGE
 
 DURATION = 10.0
 
@@ -25,7 +25,7 @@ def test_without_noise_a_window_that_determines_k_c_reports_the_truth(seed):
     # Plain means of logarithms are a third of the bound off: that of k_c, and so those of n and the pressure.
     config, soil = reference_configuration(ROUGHLY_KNOWN), SOILS["wet_clay"]
     rig, truth = rig_of(config), SoilPrior(np.asarray(soil), prior_of(config).log_std)
-    drive = simulate(config, Scenario(DURATION, (Patch(0.0, "wet_clay", soil),), slip=SLIP), seed)
+    drive = simulate(config, Scenario(DURATION, (Patch(0.0, "wet_clay", soil),), slip=SLIP_RANGE), seed)
     store = Bins(rig, config.estimator.bin, 0.0)
     fitted = [name for name in rig.channels if name in drive.channels and not name.startswith("sinkage")]
     times = {name: drive.channels[name].t for name in fitted}

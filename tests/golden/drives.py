@@ -16,17 +16,17 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active
-from soilbus.validation.boggings import Trouble, bogging
+from soilbus.validation.boggings import BoggingDrive, bogging
 
 SLIP = Swing(0.05, 0.40)
 
 
-def _troubles() -> Iterator[tuple[str, Trouble, int]]:
+def _troubles() -> Iterator[tuple[str, BoggingDrive, int]]:
     """Name, drive and seed: one soil, one effect, two soils, and ground that softens until the tractor is stuck."""
-    yield "sand", Trouble(Scenario(22.0, (Patch(0.0, "dry_sand"),), slip=SLIP)), 21
+    yield "sand", BoggingDrive(Scenario(22.0, (Patch(0.0, "dry_sand"),), slip=SLIP)), 21
     ruts = Active(CATALOGUE["multipass"], {"stiffness": 0.15, "density": 0.015, "shear": 0.0, "reloading": 0.0})
-    yield "ruts", Trouble(Scenario(22.0, (Patch(0.0, "loam"),), slip=SLIP), (ruts,)), 22
-    yield "crossing", Trouble(Scenario(34.0, (Patch(0.0, "loam"), Patch(24.0, "wet_clay")), slip=SLIP)), 23
+    yield "ruts", BoggingDrive(Scenario(22.0, (Patch(0.0, "loam"),), slip=SLIP), (ruts,)), 22
+    yield "crossing", BoggingDrive(Scenario(34.0, (Patch(0.0, "loam"), Patch(24.0, "wet_clay")), slip=SLIP)), 23
     stuck = bogging(reference_configuration(), "softening", np.random.default_rng(6))
     yield "bogging", stuck._replace(scenario=replace(stuck.scenario, duration=31.0)), 6
 

@@ -15,7 +15,7 @@ from soilbus.pipeline.excitation import Excitation
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.report.windows import summary_of, why_of_no_use
-from soilbus.simulator.frames import START, frames, write_log
+from soilbus.simulator.frames import START_TIME, frames, write_log
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
@@ -35,7 +35,7 @@ def drives(tmp_path_factory):
 
 def truth_of(recording, windows) -> tuple[float, float, float]:
     """Medians over the windows of draft [N], its standard deviation [N], and that over the mean."""
-    t, draft = recording.truth["t"] + START, recording.truth["draft"]
+    t, draft = recording.truth["t"] + START_TIME, recording.truth["draft"]
     of = [draft[(t >= w.t - 10.0) & (t < w.t)] for w in windows]
     mean, sd = np.median([(x.mean(), x.std()) for x in of], axis=0)
     return float(mean), float(sd), float(sd / mean)

@@ -17,7 +17,7 @@ from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import output_database
 from soilbus.can.publish import Publisher
 from soilbus.report.dashboard import WIDTH, panel, show
-from soilbus.report.received_frames import Readings
+from soilbus.report.received_frames import ReceivedFrames
 from soilbus.simulator.reference import reference_configuration
 
 
@@ -25,7 +25,7 @@ from soilbus.simulator.reference import reference_configuration
 def setup():
     database = output_database(reference_configuration())
     clock = FakeClock()
-    return Publisher(database), Readings(database, clock), clock
+    return Publisher(database), ReceivedFrames(database, clock), clock
 
 
 def message(frame) -> can.Message:
@@ -211,7 +211,7 @@ def test_a_state_that_has_no_name_yet_is_unknown(setup, code):
 
 def test_no_payload_whatever_breaks_the_dashboard():
     database = output_database(reference_configuration())
-    dashboard = Readings(database, FakeClock())
+    dashboard = ReceivedFrames(database, FakeClock())
     rng = np.random.default_rng(11)
     for _ in range(30):
         for layout in database.messages:

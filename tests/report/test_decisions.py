@@ -14,7 +14,7 @@ from soilbus.validation.verdict_trials import Reliability
 NO_CALLS = Reliability(0, 0, math.nan, math.nan, 0.0, math.nan, 0, 0, 0.0, ())
 
 
-def test_easy_and_hard_drives_are_told_apart_with_an_interval():
+def test_easy_and_hard_drives_are_reported_apart_with_an_interval():
     counts = {"firm": 0, "harsh": 2, "clods": 1}
     found = [figures(kind, [WarningTrial(kind, 3600.0, n, math.nan, math.nan)]) for kind, n in counts.items()]
     pooled = as_json([], NO_CALLS, found)["false_warnings"]

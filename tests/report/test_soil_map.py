@@ -17,7 +17,7 @@ from soilbus.pipeline.estimator import WindowResult
 from soilbus.pipeline.positions import Position
 from soilbus.report.soil_map import soil_map
 from soilbus.simulator.course import course, positions
-from soilbus.simulator.frames import START
+from soilbus.simulator.frames import START_TIME
 from soilbus.simulator.play import scenario_over
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import TRACTOR, reference_configuration
@@ -66,7 +66,7 @@ def test_points_are_where_the_tractor_was_in_the_middle_of_the_window(collection
     truth = drive.truth
     sides = set()
     for feature in collection["features"]:
-        middle = feature["properties"]["t"] - START - 5.0
+        middle = feature["properties"]["t"] - START_TIME - 5.0
         latitude, longitude = positions(WAY, np.interp([middle], truth["t"], truth["distance"]))
         east, north = feature["geometry"]["coordinates"]
         sides.add(east > 0.0)
@@ -132,12 +132,12 @@ def test_gdal_opens_it_as_a_layer_of_points_in_wgs84(collection, log):
 
 def test_windows_without_a_position_are_left_out_and_counted(log, tmp_path, capsys):
     lines = log.read_text().splitlines(keepends=True)
-    gap = [i for i in lines if not (VEHICLE_POSITION in i and START + 8.3 < float(i[1:18]) < START + 11.7)]
+    gap = [i for i in lines if not (VEHICLE_POSITION in i and START_TIME + 8.3 < float(i[1:18]) < START_TIME + 11.7)]
     (tmp_path / "gap.log").write_text("".join(gap))
     capsys.readouterr()
     assert main(["replay", "--config", str(TRACTOR), str(tmp_path / "gap.log"), "--map", str(tmp_path / "m")]) == 0
     features = json.loads((tmp_path / "m").read_text())["features"]
-    middles = [round(f["properties"]["t"] - START - 5.0) for f in features]
+    middles = [round(f["properties"]["t"] - START_TIME - 5.0) for f in features]
     assert middles == [5, 6, 7, 8, *range(12, 21)]
     assert [f["properties"]["status"] for f in features] == ["valid"] * len(features)  # a position is no needed input
     assert capsys.readouterr().err == "soilbus: 3 of 16 windows have no position: not on the map\n"

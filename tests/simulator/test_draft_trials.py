@@ -1,4 +1,4 @@
-"""The largest draft foretold from a window, beside the truth; and the command that prints it."""
+"""The largest draft predicted from a window, beside the truth; and the command that prints it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_figures_of_trials_that_have_them():
     assert np.isnan(figures("x", [DraftTrial("x", np.nan, np.nan, 900.0)]).coverage)
 
 
-def test_the_largest_draft_is_foretold_on_held_soils():
+def test_the_largest_draft_is_predicted_on_held_soils():
     found = list(draft_trials(CONFIG, 12, 3))
     assert [f.soil for f in found] == [*SOILS, "all"]
     assert all(f.error < 0.05 and f.failed == 0 for f in found)

@@ -11,7 +11,7 @@ import soilbus.simulator
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.mapping import channels_of, load_databases
 from soilbus.config.file import load_config, parse_config
-from soilbus.simulator.frames import START, encoded, frames, write_log
+from soilbus.simulator.frames import START_TIME, encoded, frames, write_log
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.scenario import demo, excited
 
@@ -54,11 +54,11 @@ def test_each_message_keeps_its_cycle_time_with_little_jitter(messages):
     assert set(groups) == {message.name for message in DATABASE.messages}
     stamps = [message.timestamp for message in messages]
     assert stamps == sorted(stamps)
-    assert START <= stamps[0] < START + 0.002
+    assert START_TIME <= stamps[0] < START_TIME + 0.002
     phases = []
     for name, group in groups.items():
         cycle = DATABASE.get_message_by_name(name).cycle_time / 1000.0
-        late = np.array([m.timestamp for m in group]) - START - cycle * np.arange(len(group))
+        late = np.array([m.timestamp for m in group]) - START_TIME - cycle * np.arange(len(group))
         assert late.min() >= 0.0
         assert np.ptp(late) < 1.01e-3
         assert late.max() < 0.02

@@ -17,13 +17,13 @@ from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import SOILS
-from soilbus.validation.bayes_risk_bound import Attainable
+from soilbus.validation.bayes_risk_bound import BayesRisk
 from soilbus.validation.monte_carlo import (
     ROUGHLY_KNOWN,
     Trial,
     as_json,
-    missed,
     monte_carlo,
+    prior_about,
     summary,
     tasks_of,
     trials,
@@ -45,7 +45,7 @@ def made_up(n, spread=1.0, shift=0.0, held=(), seed=0):
     return windows
 
 
-def test_what_is_attainable_is_told_beside_what_is_attained():
+def test_the_bayes_risk_bound_is_reported_beside_what_is_attained():
     rng = np.random.default_rng(3)
     least = np.array([0.8, 1.5, 1.2])[:, None]
     made = made_up(400)
@@ -53,18 +53,18 @@ def test_what_is_attainable_is_told_beside_what_is_attained():
     for i, window in enumerate(made):
         weight = rng.uniform(0.1, 2.0) * np.ones((3, 7))
         risk = weight * least**2 * rng.exponential(1.0, 7)
-        shown.append(replace(window, exact=Attainable(window.error / 1.3, risk, weight, float(i))))
+        shown.append(replace(window, bayes_risk=BayesRisk(window.error / 1.3, risk, weight, float(i))))
     cell = summary("loam", 2.0, True, [*shown, *made_up(3, spread=50.0)])
-    assert cell.exact.windows == 400
+    assert cell.bayes_risk.windows == 400
     # the mean of n exponential numbers scatters by 1 / sqrt(n); unlike weights leave fewer of them, uniform ones 3/4
-    assert cell.exact.least_scatter == pytest.approx(np.full(7, 1.5 * 0.5 / np.sqrt(0.77 * 400)), rel=0.2)
-    assert (np.abs(cell.exact.least - 1.5) < 3.5 * cell.exact.least_scatter).all()
-    assert cell.exact.share == pytest.approx(np.full(7, 1.3))
-    assert cell.exact.scatter == pytest.approx(np.zeros(7), abs=1e-12)
-    assert cell.exact.best == pytest.approx(cell.exact.ours / 1.3)
-    assert cell.exact.ours == pytest.approx(summary("loam", 2.0, True, made).rms)
-    assert cell.exact.effective == 199.5
-    figures = (cell.exact.least[2], cell.exact.least_scatter[2], cell.exact.best[2])
+    assert cell.bayes_risk.least_scatter == pytest.approx(np.full(7, 1.5 * 0.5 / np.sqrt(0.77 * 400)), rel=0.2)
+    assert (np.abs(cell.bayes_risk.least - 1.5) < 3.5 * cell.bayes_risk.least_scatter).all()
+    assert cell.bayes_risk.share == pytest.approx(np.full(7, 1.3))
+    assert cell.bayes_risk.scatter == pytest.approx(np.zeros(7), abs=1e-12)
+    assert cell.bayes_risk.best == pytest.approx(cell.bayes_risk.ours / 1.3)
+    assert cell.bayes_risk.ours == pytest.approx(summary("loam", 2.0, True, made).rms)
+    assert cell.bayes_risk.effective == 199.5
+    figures = (cell.bayes_risk.least[2], cell.bayes_risk.least_scatter[2], cell.bayes_risk.best[2])
     assert "{:.2f}+-{:.2f} {:.2f} 1.30+-0.00".format(*figures) in monte_carlo_report([cell])
     of_n = as_json(cell)["quantities"]["n"]
     assert tuple(of_n[name] for name in ("least", "least_scatter", "best")) == pytest.approx(figures)
@@ -148,14 +148,14 @@ def test_a_prior_misses_by_as_much_as_it_says():
     prior = prior_of(CONFIG)
     held = SoilPrior(prior.median, np.where(np.arange(6) == 4, 0.0, prior.log_std))
     soil, rng = SOILS["wet_clay"], np.random.default_rng(1)
-    drawn = [missed(held, soil, rng) for _ in range(4000)]
+    drawn = [prior_about(held, soil, rng) for _ in range(4000)]
     assert all((p.log_std == held.log_std).all() for p in drawn)
     miss = np.log(np.array([p.median for p in drawn]) / np.asarray(soil))
     assert miss.std(axis=0) == pytest.approx(held.log_std, rel=0.05)
     assert np.abs(miss.mean(axis=0)).max() < 0.08
     assert not miss[:, 4].any()
     phi = PARAMETERS.index("phi")
-    steep = [missed(prior, soil._replace(phi=1.1), rng).median[phi] for _ in range(200)]
+    steep = [prior_about(prior, soil._replace(phi=1.1), rng).median[phi] for _ in range(200)]
     assert max(steep) < MAX_PHI
 
 

@@ -15,7 +15,7 @@ from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.service import Service
-from soilbus.daemon.tick_phase import SLEW
+from soilbus.daemon.tick_phase import MAX_PERIOD_CHANGE
 from soilbus.daemon.warm_up import warm_up
 from soilbus.pipeline.outputs import TICK
 from soilbus.pipeline.pipeline import Pipeline
@@ -68,7 +68,7 @@ def soak(duration: float, seed: int, each_hour: Callable[[Hour], None] = lambda 
         clock, estimates.add,
     )  # fmt: skip
     verdict = out.get_message_by_name("Traversability").frame_id
-    beat = Beat(TICK, SLACK, SLEW)
+    beat = Beat(TICK, SLACK, MAX_PERIOD_CHANGE)
     wire.on_send = lambda t, message: beat.add(t) if message.arbitration_id == verdict else None
     hours: list[Hour] = []
     end = clock.now + duration

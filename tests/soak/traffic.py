@@ -13,7 +13,7 @@ import numpy as np
 
 from soilbus.config.model import Config
 from soilbus.simulator.drive import Drive, drive
-from soilbus.simulator.frames import START, frames
+from soilbus.simulator.frames import START_TIME, frames
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.simulator.sensors import channel_rng, fitted, measure
@@ -57,7 +57,7 @@ def traffic(config: Config, seed: int) -> Iterator[can.Message]:
     told = _with_gains(drive(config, scenario, seed), config, seed)
     for lap in _laps():
         recording = Recording(told.columns, measure(told, _without_gains(config), _seed(seed, lap)), seed)
-        yield from frames(recording, config, start=START + lap * LAP)
+        yield from frames(recording, config, start=START_TIME + lap * LAP)
 
 
 def _laps() -> Iterator[int]:

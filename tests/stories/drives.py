@@ -9,7 +9,7 @@ import numpy as np
 
 from onlooker import CYCLE, Drive, Moment, good_moment, good_tracked
 from soilbus.config.model import Config
-from soilbus.simulator.frames import START, frames
+from soilbus.simulator.frames import START_TIME, frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -53,7 +53,7 @@ def at_ten_hertz(scenario: Scenario, seed: int) -> Moment:
     found: Moment = {}
     for message in frames(simulate(config, scenario, seed), config):
         found.setdefault(message.arbitration_id, []).append(message)
-    cycles = START + CYCLE * (1.0 + np.arange(int(SECONDS / CYCLE) - 2))
+    cycles = START_TIME + CYCLE * (1.0 + np.arange(int(SECONDS / CYCLE) - 2))
     chosen = {}
     for i, messages in found.items():
         last = np.searchsorted([m.timestamp for m in messages], cycles) - 1

@@ -55,18 +55,18 @@ def without_memory_of_epochs(monkeypatch):
 
 
 def with_any_status(monkeypatch):
-    monkeypatch.setattr("soilbus.hysteresis.state_of", lambda p, status, settings: "go")
+    monkeypatch.setattr("soilbus.decision.hysteresis.state_of", lambda p, status, settings: "go")
 
 
 def with_the_verdict_of_the_run_before(monkeypatch):
     """What was known when the service was stopped is taken for known now, as soon as the inputs are there."""
-    usual = Service.present_way
+    usual = Service.present_decision
 
-    def present_way(self, now):
-        knows = self.result is None and self._keeper.recalled is not None
+    def present_decision(self, now):
+        knows = self.result is None and self._persistence.stored_prior is not None
         return Traversability(Way.GO) if knows and self._state[0] is ServiceState.ESTIMATING else usual(self, now)
 
-    monkeypatch.setattr(Service, "present_way", present_way)
+    monkeypatch.setattr(Service, "present_decision", present_decision)
 
 
 @pytest.mark.parametrize(

@@ -346,7 +346,7 @@ class Drive:
         pipeline = Pipeline(self.config, IN)
         pipeline.new_estimator = lambda: self.content(WindowEstimator(self.config))
         owner = Owner.of(self.config, pipeline.intake.channels, IN)
-        keeper = StatePersistence(
+        persistence = StatePersistence(
             Path(self.folder.name), owner, InlineExecutor(), lambda: self.clock.now + self.wire.offset
         )
         bus = LiveBus(self.open, self.clock, self.clock.sleep, OWN)
@@ -357,7 +357,7 @@ class Drive:
         self.wire.good, self.wire.stamps, self.wire.powers, self.wire.counters = {}, {}, {}, {}
         self.service = Service(
             self.config, pipeline, bus, Publisher(OUT), Notifier(), self.worker, self.clock, self.take,
-            lambda: keeper, self.clock.wait_for,
+            lambda: persistence, self.clock.wait_for,
         )  # fmt: skip
 
     def stop(self) -> None:

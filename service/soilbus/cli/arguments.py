@@ -1,4 +1,7 @@
-"""The commands and their arguments, for argparse: numbers have parsers that refuse with one clear line."""
+"""The commands and their arguments, for argparse.
+
+Numbers have parsers of their own (`between`, `natural`, `counted`), which refuse a value with one clear line.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the commands share: how work fails, which configuration is meant, what must be there first."""
+"""What the commands share: the error for failed work, the configuration of a command, checks before the work."""
 
 from __future__ import annotations
 

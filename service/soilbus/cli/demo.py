@@ -1,9 +1,8 @@
 """`soilbus demo`: a simulated tractor, the service and a dashboard, without hardware.
 
-Three parties on one bus: the tractor's ECUs (simulator) send, the service estimates, the
-dashboard reads only the service's frames.  On vcan where the kernel has it, else on
-python-can's in-process virtual bus.  Time is compressed: the tractor's seconds pass
-faster, so the service's times are shortened by the same factor.
+Three parties share one bus: the tractor's ECUs (simulator) send, the service estimates, the dashboard reads only the
+service's frames. The bus is a vcan where the kernel has it, else python-can's in-process virtual bus. The simulated
+drive plays TIME_COMPRESSION times as fast as real time, so the service's times are shortened by the same factor.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from soilbus.daemon.start import start_service
 from soilbus.files import whole_file
 from soilbus.pipeline.result import WindowResult
 from soilbus.report.dashboard import WIDTH, panel, show
-from soilbus.report.received_frames import Readings
+from soilbus.report.received_frames import ReceivedFrames
 from soilbus.report.table import table
 from soilbus.simulator.frames import frames
 from soilbus.simulator.play import send_in_time
@@ -37,9 +36,12 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import demo as demo_scenario
 
-SPEED_UP = 8.0
+TIME_COMPRESSION = 8.0
+"""Seconds of the simulated drive per second."""
 SEED = 1
-SHOWN_EVERY = 4.0
+"""Picks the simulated drive."""
+STORY_PERIOD = 4.0
+"""Time [s] of the simulated drive between two rows of the table at the end."""
 
 
 def run_demo(duration: float, picture: Path | None = None) -> None:
@@ -54,7 +56,9 @@ def run_demo(duration: float, picture: Path | None = None) -> None:
     results: list[WindowResult] = []
     with _bus_settings() as overrides:
         where = "vcan" if any("socketcan" in o for o in overrides) else "the in-process virtual bus"
-        console.print(f"Simulated tractor on {where}: loam, then wet clay; {SPEED_UP:.0f} times as fast as real time.")
+        console.print(
+            f"Simulated tractor on {where}: loam, then wet clay; {TIME_COMPRESSION:.0f} times as fast as real time."
+        )
         config = reference_configuration(overrides + _compressed(real))
         ours = output_database(config)
         bus = config.bus.model_dump()
@@ -62,11 +66,11 @@ def run_demo(duration: float, picture: Path | None = None) -> None:
         with open_bus(bus, []) as tractor, closing(ear):
             ear.open()
             service = start_service(config, wait=False, on_window=results.append, rehearse=False)
-            sender = threading.Thread(target=send_in_time, args=(messages, tractor.send, SPEED_UP), daemon=True)
+            sender = threading.Thread(target=send_in_time, args=(messages, tractor.send, TIME_COMPRESSION), daemon=True)
             worker = threading.Thread(target=service.run, daemon=True)
             worker.start()
             sender.start()
-            known = Readings(ours)
+            known = ReceivedFrames(ours)
             show(known, ear, console, done=lambda: not sender.is_alive())
             shown = panel(known)
             service.stop()
@@ -102,7 +106,7 @@ def _compressed(config: Config) -> list[str]:
     if config.vehicle is not None:
         lengths = config.vehicle.model_dump(exclude={"mass"}, exclude_none=True)
         sizes |= {f"vehicle.{name}": length for name, length in lengths.items()}
-    return [f"{key}={size / SPEED_UP}" for key, size in sizes.items()]
+    return [f"{key}={size / TIME_COMPRESSION}" for key, size in sizes.items()]
 
 
 @contextmanager
@@ -148,10 +152,10 @@ def _story(results: list[WindowResult]) -> str:
     rows, due = [], 0.0
     start = results[0].t if results else 0.0
     for r in results:
-        t = (r.t - start) * SPEED_UP
+        t = (r.t - start) * TIME_COMPRESSION
         if t + 1e-6 < due:
             continue
-        due = t + SHOWN_EVERY
+        due = t + STORY_PERIOD
         draft = r.traversability.max_draft
         rows.append(
             (

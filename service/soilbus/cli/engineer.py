@@ -1,4 +1,7 @@
-"""Commands of the controls engineer: replay, simulate, diagnose."""
+"""Commands of the controls engineer: replay, simulate, diagnose.
+
+Each function takes the parsed arguments, imports what it needs, does the work and writes the outputs asked for.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Commands of the lab: paper, montecarlo, decisions, bench."""
+"""Commands that validate the method: paper, montecarlo, decisions, bench.
+
+Each function takes the parsed arguments, imports what it needs, does the work and prints a report or writes JSON.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,7 @@ def montecarlo(args: argparse.Namespace) -> None:
     config = configured(args) if args.config else reference_configuration([*ROUGHLY_KNOWN, *args.set])
     try:
         with processes(os.cpu_count() or 1) as each:
-            more = {"exact": args.exact, "around": args.around}
+            more = {"posterior_samples": args.exact, "around": args.around}
             cells = list(with_progress(monte_carlo(config, args.windows, args.seed, each=each, **more)))
     except SimulationError as error:
         raise WorkError(str(error)) from None

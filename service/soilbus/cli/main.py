@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = command_line().parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[_StandardError()])
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # what it does for itself is no news
-    logging.getLogger("can").setLevel(logging.CRITICAL)  # a bus that is away is ours to tell of, once
+    logging.getLogger("can").setLevel(logging.CRITICAL)  # we report a lost bus ourselves, once
     with loading():
         from soilbus.config.model import ConfigError
     try:

@@ -1,7 +1,7 @@
 """Pages generated from the code: configuration, commands, effects.
 
 Each page is a pure function of what it describes (the model of the configuration, the parser of the command line, the
-catalogue of effects), so that a test can hold the pages in `service/docs` against the code.
+catalogue of effects), and a test compares the pages in `service/docs` with it.
 
     python -m soilbus.cli.reference service/docs     writes them again
 """

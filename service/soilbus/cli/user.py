@@ -1,4 +1,7 @@
-"""Commands of whoever runs soilbus on a vehicle: demo, run, check, watch."""
+"""Commands of whoever runs soilbus on a vehicle: demo, run, check, watch.
+
+Each function takes the parsed arguments and imports what it needs, so that `run` loads no simulator.
+"""
 
 from __future__ import annotations
 

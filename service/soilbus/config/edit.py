@@ -1,4 +1,4 @@
-"""A configuration file with other effects, everything else as it was, comments included."""
+"""A configuration file with other effects: all else stays as it is, comments included."""
 
 from __future__ import annotations
 
@@ -18,10 +18,25 @@ EffectTable = Mapping[str, Any]
 def with_effects_text(
     path: Path, overrides: Iterable[str], effects: Sequence[EffectTable], place: Path, notes: Iterable[str] = ()
 ) -> str:
-    """The text of the file at `path` with overrides in force and these effects, to be kept in the folder `place`.
+    """The text of a configuration file with overrides in force and other effects.
 
-    DBC files are named so that they are found from there.  `notes` become comments at the
-    effects.  Raises ConfigError as load_config().
+    Parameters
+    ----------
+    path
+        The file.
+    overrides
+        KEY=VALUE.
+    effects
+        Tables of [model] effects.
+    place
+        Folder that the text will be kept in; DBC files are named so that they are found from there.
+    notes
+        Comments at the effects.
+
+    Raises
+    ------
+    ConfigError
+        As load_config().
     """
     config = load_config(path, overrides)
     document = overridden(tomlkit.parse(path.read_text(encoding="utf-8")), overrides)

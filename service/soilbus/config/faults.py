@@ -1,8 +1,7 @@
-"""What the configuration's model finds wrong -> lines in the words of the configuration file.
+"""Faults that the configuration's model finds -> lines in the words of the configuration file.
 
-The checks are pydantic's; its words ("valid dictionary or instance of Noise") are not those of
-someone who configures a vehicle.  Each type of error has a sentence of ours; a type without one
-says only that the value cannot be used.
+pydantic does the checks; its messages ("valid dictionary or instance of Noise") name Python types, so each type of
+error has a sentence of ours with the dotted key. A type without one says only that the value cannot be used.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 from soilbus.config.model import Config
 from soilbus.words import did_you_mean
 
-LONGEST_SHOWN = 40
+MAX_SHOWN_CHARACTERS = 40
 """Characters of a wrong value that a line repeats."""
 
 
@@ -114,7 +113,7 @@ def _shown(given: Any) -> str:
     if isinstance(given, bool):
         return str(given).lower()
     text = f'"{given}"' if isinstance(given, str) else str(given)
-    return text if len(text) <= LONGEST_SHOWN else text[: LONGEST_SHOWN - 3] + "..."
+    return text if len(text) <= MAX_SHOWN_CHARACTERS else text[: MAX_SHOWN_CHARACTERS - 3] + "..."
 
 
 def _named(raw: Any, location: Sequence[Any]) -> list[str]:

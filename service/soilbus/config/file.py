@@ -1,4 +1,4 @@
-"""A configuration, from a file with KEY=VALUE overrides or as nested mappings -> a checked Config."""
+"""A configuration from a TOML file with KEY=VALUE overrides, or from nested mappings -> a checked Config."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from soilbus.files import read_bounded
 
 __all__ = ["load_config", "located", "overridden", "parse_config", "shipped_dbc"]
 
-LARGEST = 2**20
+MAX_FILE_BYTES = 2**20
 """Bytes of a configuration: a thousand times those of a tractor's."""
-_SHOWN = 60
+_MAX_SHOWN_CHARACTERS = 60
 """Characters of an override that a fault repeats."""
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -26,13 +26,23 @@ DBC_FOLDERS = (_PACKAGE / "dbc", _PACKAGE.parents[1] / "dbc")
 
 
 def load_config(path: Path | str, overrides: Iterable[str] = ()) -> Config:
-    """Read a TOML file, apply KEY=VALUE overrides (dotted paths), check everything.
+    """Read a TOML file, apply overrides, check everything.
 
-    Raises ConfigError with one line for each fault.
+    Parameters
+    ----------
+    path
+        The file.
+    overrides
+        KEY=VALUE with dotted paths.
+
+    Raises
+    ------
+    ConfigError
+        With one line for each fault.
     """
     path = Path(path)
     try:
-        raw = tomllib.loads(read_bounded(path, LARGEST, regular=False).decode())
+        raw = tomllib.loads(read_bounded(path, MAX_FILE_BYTES, regular=False).decode())
     except OSError as error:
         raise ConfigError([f"{path}: {error.strerror or error}"]) from None
     except (ValueError, RecursionError) as error:
@@ -67,7 +77,7 @@ def _override(raw: dict[str, Any], text: str) -> None:
     except tomllib.TOMLDecodeError:
         parsed = value.strip()
     except (ValueError, RecursionError) as error:
-        raise ConfigError([f"--set {text[:_SHOWN]}...: {_why(error)}"]) from None
+        raise ConfigError([f"--set {text[:_MAX_SHOWN_CHARACTERS]}...: {_why(error)}"]) from None
     here: Any = raw
     for i, part in enumerate(parts[:-1]):
         here = _child(here, part, ".".join(parts[: i + 1]), text)

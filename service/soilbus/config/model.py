@@ -1,7 +1,7 @@
 """TOML file -> typed, checked configuration.
 
-Every key, unit and default of soilbus stands here and nowhere else; an unknown key is an
-error.  Values are SI; a quantity in another unit says so in its name.
+Every key, unit and default of soilbus is defined here; an unknown key is an error. Values are SI; a quantity in another
+unit says so in its name.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""How the bus does: the frame BusHealth, a few words for systemd's STATUS line."""
+"""Health of the bus: values of the frame BusHealth, and a text for systemd's STATUS line.
+
+The frame carries the controller's state and counts since the start. A count stays at the top of its range;
+the count of received frames wraps at RECEIVED_MODULUS, so that a reader can take differences.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,19 @@ _WORDS = {
 
 
 def health_frame(state: BusState, counts: BusCounts) -> tuple[str, dict[str, Any]]:
-    """Message and values; the counts since the start stay at the top of their range."""
+    """Message name and values of the frame BusHealth.
+
+    Parameters
+    ----------
+    state
+        State of the CAN controller.
+    counts
+        Events on the bus since the start.
+
+    Returns
+    -------
+    Name of the message and value by signal name.
+    """
     return "BusHealth", {
         "BusState": str(state),
         "Reopened": counts.reopened,

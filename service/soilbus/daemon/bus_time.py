@@ -1,4 +1,11 @@
-"""The bus's own time, and until when all of it was heard: a window ends when no frame of it can come any more."""
+"""Bus time, and up to which bus time all frames have been received.
+
+    bus time(now) = last stamp + (now - monotonic time at which that frame was taken)
+
+Frames are stamped by the kernel's clock; the loop runs on the monotonic clock. A window ends when no frame of it can
+come any more: when a later frame was taken, when the bus says up to when it has delivered, or CLOSE_DELAY after the
+window's end at the latest.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +15,14 @@ from soilbus.can.admission import CLOCK_STEP, LAST_TIME
 from soilbus.can.bus import LiveBus
 from soilbus.can.wire import STAMPED
 
-GRACE = 0.2
-"""A window that no later frame has closed is closed this long after its end [s], where the bus cannot tell before."""
-LATE = 0.01
-"""Seconds by which a frame may be taken later than it was stamped."""
+CLOSE_DELAY = 0.2
+"""Time [s] after its end at which a window is closed where no later frame and no report of the bus closed it before."""
+TAKING_DELAY = 0.01
+"""Longest time [s] from the stamp of a frame to the moment when the loop takes it."""
 
 
 class BusTime:
-    """The stamps of a bus's frames, and what the monotonic clock has gone on since; all times in s."""
+    """Bus time of the frames and the monotonic time since; all times in s."""
 
     def __init__(self, bus: LiveBus, now: float) -> None:
         self._bus = bus
@@ -25,36 +32,52 @@ class BusTime:
         """Monotonic time at which a frame was taken last."""
 
     def set_ahead(self, stamp: float, now: float) -> bool:
-        """Whether a frame's stamp says that the clock which stamps frames was set ahead since the last frame."""
+        """Whether a stamp shows that the stamping clock was set ahead since the last frame.
+
+        Parameters
+        ----------
+        stamp
+            Bus time of a frame [s].
+        now
+            Monotonic time [s].
+        """
         return self.last_frame > 0.0 and stamp - self.at(now) > CLOCK_STEP and stamp <= LAST_TIME
 
     def took(self, stamp: float, now: float) -> None:
-        """A frame was taken."""
+        """Note that a frame with this stamp [s] was taken at the monotonic time `now` [s]."""
         self._stamp, self.last_frame = stamp, now
 
     def took_nothing(self, now: float) -> None:
-        """There was none to take."""
+        """Note that no frame was waiting at the monotonic time `now` [s]."""
         self._nothing_left = now
 
     def at(self, now: float) -> float:
-        """The bus's own time at the monotonic time `now`."""
+        """Bus time [s] at the monotonic time `now` [s]; 0 before the first frame."""
         return self._stamp + max(0.0, now - self.last_frame) if self.last_frame > 0.0 else 0.0
 
     def present(self, now: float) -> float:
-        """The same, by the clock that stamps frames where it can be asked."""
+        """Bus time [s] by the stamping clock itself where it can be read, else as `at`."""
         stamping = self._bus.stamping_time()
         return self.at(now) if math.isnan(stamping) else stamping
 
     def heard(self, end: float, now: float) -> float:
-        """The bus's own time of which all is heard; asks the bus itself where a window may just have ended at `end`."""
-        heard, latest = max(self._stamp, self.at(self._nothing_left) - GRACE), self.at(now) + LATE
+        """Bus time [s] up to which all frames were received.
+
+        Parameters
+        ----------
+        end
+            Bus time [s] at which the next window ends; the bus is asked only near it.
+        now
+            Monotonic time [s].
+        """
+        heard, latest = max(self._stamp, self.at(self._nothing_left) - CLOSE_DELAY), self.at(now) + TAKING_DELAY
         if heard < end <= latest:
             return max(heard, min(self._bus.heard_until(), latest))  # its clock may just have been set
         return heard
 
     def wait(self, end: float, now: float, longest: float) -> float:
-        """How long to wait for a frame, `longest` at most: not past the moment when a window's end is heard."""
-        if self.at(now) + longest + LATE < end:
+        """Time [s] to wait for a frame: at most `longest`, and not beyond the receipt of the window's end."""
+        if self.at(now) + longest + TAKING_DELAY < end:
             return longest
         left = end + STAMPED - self._bus.stamping_time()
         return longest if math.isnan(left) else min(longest, max(left, 0.0))

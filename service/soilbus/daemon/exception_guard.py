@@ -1,4 +1,10 @@
-"""The estimator as the service uses it: a defect of ours costs one window, not the service."""
+"""Guarded estimator: an exception in the estimator costs one window, not the service.
+
+    failures in a row = 3  ->  a new estimator without a prior, and the service reports a fault
+
+A window at which the estimator raises becomes an invalid result with the reason "internal"; the error and its place in
+the code are logged once for each of the first three. One solved window resets the count.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +24,19 @@ log = logging.getLogger(__name__)
 
 INTERNAL = "internal"
 """Reason and kind of failure of a window at which the estimator raised."""
-REPEATED = 3
-"""Such windows in a row from which the service is in fault."""
+FAILURES_TO_FAULT = 3
+"""Failed windows in a row from which the service is in fault."""
 
 
 class GuardedEstimator:
-    """Solves windows with an estimator.
+    """Solves windows with an estimator and catches what it raises.
 
-    `first` makes it, in the worker, when it is first needed; `again` makes another one, that knows nothing.
+    Parameters
+    ----------
+    first
+        Makes the estimator; called in the worker, when it is first needed.
+    again
+        Makes a new estimator without a posterior of earlier windows.
     """
 
     def __init__(self, first: Callable[[], WindowEstimator], again: Callable[[], WindowEstimator]) -> None:
@@ -42,27 +53,38 @@ class GuardedEstimator:
 
     @property
     def newest(self) -> Gaussian | None:
-        """What the present estimator knows; None as long as there is none."""
+        """Posterior of the newest window; None as long as there is none."""
         return None if self._estimator is None else self._estimator.tracker.newest_posterior
 
     @property
     def in_fault(self) -> bool:
-        """Whether windows have failed by a defect so often in a row that the next will too."""
-        return self._in_a_row >= REPEATED
+        """Whether the last FAILURES_TO_FAULT windows all raised."""
+        return self._in_a_row >= FAILURES_TO_FAULT
 
     def solve(self, task: WindowTask) -> WindowResult:
-        """The window's result, unwatched: the loop watches; an invalid one where the estimator raised.
+        """Solve one window.
 
-        What the estimator knew stays, for it learns from whole windows only; not so after
-        several failures in a row, for it may be what makes it fail.
+        Parameters
+        ----------
+        task
+            The window.
+
+        Returns
+        -------
+        The result without a warning of immobilisation (the loop adds it); an invalid one where the estimator raised.
+
+        Notes
+        -----
+        One failure leaves the tracker's state as it was, because the tracker changes only with a whole window. After
+        FAILURES_TO_FAULT in a row that state may be the cause, and a new estimator takes over.
         """
         try:
             result = self.estimator.solve_unwatched(task)
         except Exception as error:
             self._in_a_row += 1
-            if self._in_a_row <= REPEATED:
-                log.error("window %d failed: %s", task.index, _where(error))
-            if self._in_a_row % REPEATED == 0:
+            if self._in_a_row <= FAILURES_TO_FAULT:
+                log.error("window %d failed: %s", task.index, _error_with_place(error))
+            if self._in_a_row % FAILURES_TO_FAULT == 0:
                 self._estimator = self._again()
             return _failed(task)
         self._in_a_row = 0
@@ -87,7 +109,7 @@ def _failed(task: WindowTask) -> WindowResult:
     )
 
 
-def _where(error: Exception) -> str:
+def _error_with_place(error: Exception) -> str:
     """The error in one line, with the place in our code that raised it."""
     trace, place = error.__traceback__, ""
     while trace is not None:

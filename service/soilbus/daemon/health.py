@@ -1,32 +1,48 @@
-"""Whether the service does its work: systemd hears that it lives only while it does.
+"""Watchdog conditions: whether the estimator and the sender still work.
 
-A silent bus, or none, is no fault of the service: starting it again would heal nothing.
+    fault  if  a window is being solved for more than 20 s
+    fault  if  frames were received for 30 s and none could be sent
+
+systemd is notified only while there is no fault, so it restarts the service. A silent or absent bus is no fault of
+the service, because a restart would not change it.
 """
 
 from __future__ import annotations
 
-LONGEST_SOLVE = 20.0
-"""A window that takes longer [s] is an estimator that hangs."""
-LONGEST_MUTE = 30.0
-"""Seconds of frames heard without one sent, after which it is the sender that hangs and not the bus that is full."""
+MAX_SOLVE_TIME = 20.0
+"""Time [s] after which a window's estimate counts as hung."""
+MAX_TIME_WITHOUT_SEND = 30.0
+"""Time [s] of reception without one frame sent after which the sender, not a full bus, is at fault."""
 
 
 class Health:
-    """Watches over estimator and sender; times are monotonic [s]."""
+    """Watches the estimator and the sender; times are monotonic [s]."""
 
     def __init__(self, now: float) -> None:
         self._sent, self._able = 0, now
 
     def fault(self, now: float, solving_since: float | None, hears: bool, sent: int) -> str | None:
-        """What has stopped working, as the status says it, or None; asked once a tick.
+        """What has stopped working; called once a tick.
 
-        solving_since: when the window was begun that the estimator works at, if it does;
-        hears: whether the bus is up with frames on it; sent: frames sent since the start.
+        Parameters
+        ----------
+        now
+            Monotonic time [s].
+        solving_since
+            When the worker began with its present window [s]; None where it has none.
+        hears
+            Whether the bus is up with frames on it.
+        sent
+            Frames sent since the start.
+
+        Returns
+        -------
+        The fault as the status line gives it, None without one.
         """
         if sent != self._sent or not hears:
             self._sent, self._able = sent, now
-        if solving_since is not None and now - solving_since > LONGEST_SOLVE:
+        if solving_since is not None and now - solving_since > MAX_SOLVE_TIME:
             return "overload the estimator hangs"
-        if now - self._able > LONGEST_MUTE:
+        if now - self._able > MAX_TIME_WITHOUT_SEND:
             return "internal nothing can be sent"
         return None

@@ -15,8 +15,13 @@ log = logging.getLogger(__name__)
 class Notifier:
     """Sends to systemd's notification socket; without one every call does nothing.
 
-    `watchdog_interval` [s] is how often `watchdog` should be called, half of the time
-    after which systemd takes the service for hung; None if nobody watches.
+    Attributes
+    ----------
+    address
+        Path of the socket, `@` first for an abstract one; None without systemd.
+    watchdog_interval
+        Period [s] at which `watchdog` should be called: half of systemd's own limit;
+        None where no watchdog is set.
     """
 
     address: str | None = None

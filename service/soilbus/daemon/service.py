@@ -1,4 +1,12 @@
-"""The daemon's loop: receive, admit, publish, with the estimate beside it."""
+"""The daemon's loop: receive, admit, publish; a worker thread estimates beside it.
+
+    every round    receive frames until the next tick -> intake
+                   windows that have ended -> work queue -> worker -> results -> SoilStrength ... frames
+    every tick     (10 Hz) wheel slip, immobilisation watch, decision -> frames; state, watchdog, state store
+
+No step of the loop waits for the estimator. The decision that goes out is valid only while inputs are fresh and no
+interruption (silent bus, stale input, foreign sender, fault) came after the end of the window that it rests on.
+"""
 
 from __future__ import annotations
 
@@ -41,31 +49,53 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-SILENCE = 1.0
-"""Seconds without any frame after which the bus counts as silent."""
-MAX_DRAIN = 4000
-"""Frames taken in one go before the loop looks at its clock again."""
-POLL, PROMPT = 0.02, 0.003
-"""Longest wait for a frame [s], and while the worker has a window: then its result may come any moment."""
-UNDISTURBED, WITH_ROOM = 0.04, 0.08
-"""So long [s] after the worker got a window frames are left with the kernel: the two share one interpreter, and each
-frame taken halts the worker.  No longer where the kernel has its default's room, for those of 75 ms of a full bus."""
-LONGEST_CURVE = 60.0
-"""Age [s] up to which a valid window's pull over slip serves to watch for immobilisation."""
-FOREIGN_HOLD = 3.0
-"""Seconds for which another sender under our identifiers is reported: until every reader has seen it."""
+SILENCE_TIME = 1.0
+"""Time [s] without any frame after which the bus counts as silent."""
+MAX_FRAMES_PER_ROUND = 4000
+"""Frames taken in one round before the loop reads its clock again."""
+MAX_WAIT, MAX_WAIT_WHILE_SOLVING = 0.02, 0.003
+"""Longest wait for a frame [s]; the second one while the worker has a window, whose result may come any moment."""
+UNDISTURBED_TIME, UNDISTURBED_TIME_LARGE_BUFFER = 0.04, 0.08
+"""Time [s] for which frames stay with the kernel after the worker got a window: loop and worker share one interpreter,
+and each frame taken halts the worker. The second one where the kernel's buffer holds seconds of frames; its default
+holds 75 ms of a full bus."""
+MAX_CURVE_AGE = 60.0
+"""Age [s] up to which a valid window's pull over slip is used to watch for immobilisation."""
+FOREIGN_SENDER_HOLD_TIME = 3.0
+"""Time [s] for which another sender under our identifiers is reported, so that every reader sees it."""
 INTERRUPTIONS = frozenset(("bus_down", "no_frames", "input_missing", "input_stale", "foreign_sender"))
-"""Reasons, beside a bus-off and a fault, for which no window that ended before is believed any more."""
+"""Reasons, beside bus-off and fault, that end the validity of every window that ended before."""
 
 
 class Service:
     """One vehicle on one bus.
 
-    The loop receives and publishes; `workers` (one thread) estimates beside it, so that a
-    hard window neither delays a frame nor loses one.  `clock` is monotonic [s], and `waiting` by it
-    (as in Backlog); frame stamps only space the samples.  `step` makes one round and returns; `run` repeats it
-    until `stop`.  What `opened_keeper` returns begins with what another run knew of the sensors,
-    and keeps what this one knows; the worker opens it, and makes the estimator, before the first window.
+    Parameters
+    ----------
+    config
+        The vehicle's configuration.
+    pipeline
+        Intake and estimator.
+    bus
+        The open bus, or one that will be opened.
+    publisher
+        Encodes our frames.
+    notifier
+        systemd's notification socket.
+    workers
+        One thread, which estimates.
+    clock
+        Monotonic time [s]; stamps of frames only space the samples.
+    on_window
+        Called with each window's result.
+    open_persistence
+        Called in the worker before the first window; returns the stored state of the last run, or None.
+    waiting
+        Waits for a future, for at most the seconds given (as WorkQueue).
+
+    Notes
+    -----
+    `step` makes one round and returns; `run` repeats it until `stop`.
     """
 
     def __init__(
@@ -78,14 +108,14 @@ class Service:
         workers: Executor,
         clock: Callable[[], float] = time.monotonic,
         on_window: Callable[[WindowResult], None] | None = None,
-        opened_keeper: Callable[[], StatePersistence | None] = lambda: None,
+        open_persistence: Callable[[], StatePersistence | None] = lambda: None,
         waiting: Callable[[Future[WindowResult], float], None] = wait_for,
     ) -> None:
         self.config, self.bus, self.publisher = config, bus, publisher
         self.intake = pipeline.intake
-        self._pipeline, self._opened_keeper = pipeline, opened_keeper
-        self._solver = GuardedEstimator(self._first_estimator, pipeline.new_estimator)
-        self._keeper: StatePersistence | None = None
+        self._pipeline, self._open_persistence = pipeline, open_persistence
+        self._guarded_estimator = GuardedEstimator(self._first_estimator, pipeline.new_estimator)
+        self._persistence: StatePersistence | None = None
         self.notifier, self.clock, self.on_window = notifier, clock, on_window
         self.result: WindowResult | None = None
         self.deadline_misses = 0
@@ -95,8 +125,10 @@ class Service:
         self._curve: tuple[OverSlip | None, float] = None, -math.inf
         self._stopping = False
         self._started = clock()
-        self._backlog = WorkQueue(workers, self._solver.solve, self._started, waiting)
-        workers.submit(lambda: self._solver.estimator)  # where it raises, the first window does again, and says so
+        self._work_queue = WorkQueue(workers, self._guarded_estimator.solve, self._started, waiting)
+        workers.submit(
+            lambda: self._guarded_estimator.estimator
+        )  # where it raises, the first window does again, and says so
         self._ended = -math.inf  # monotonic time of the end of the present result's window
         self._interrupted = self._started  # monotonic time at which inputs failed last
         self._epoch = self.intake.epoch
@@ -110,34 +142,34 @@ class Service:
         self._state: tuple[ServiceState, str] = (ServiceState.STARTING, "none")
 
     def _first_estimator(self) -> WindowEstimator:
-        """In the worker: the estimator, with what was known before."""
-        estimator, keeper = self._pipeline.estimator, self._opened_keeper()
-        if keeper is not None and keeper.recalled is not None:
-            estimator.tracker.start_from_last_run(*keeper.recalled)
-        self._keeper = keeper
+        """In the worker: the estimator, with the posterior of the last run as its prior where one is stored."""
+        estimator, persistence = self._pipeline.estimator, self._open_persistence()
+        if persistence is not None and persistence.stored_prior is not None:
+            estimator.tracker.start_from_last_run(*persistence.stored_prior)
+        self._persistence = persistence
         return estimator
 
     @property
     def windows(self) -> int:
         """Windows solved since the start."""
-        return self._backlog.solved
+        return self._work_queue.solved
 
     def stop(self) -> None:
         """Let `run` return after the present round; safe to call from a signal handler."""
         self._stopping = True
 
     def run(self) -> None:
-        """Work until `stop`, then tell everybody that nothing follows."""
+        """Work until `stop`, then send one last decision "unknown"."""
         self.notifier.ready("starting")
         while not self._stopping:
             self.step()
         self.notifier.stopping()
         self.result = None
         self._publish_ten_hertz(self.clock())
-        self._backlog.close()
+        self._work_queue.close()
         self.bus.close()
-        if self._keeper is not None:
-            self._keeper.close(self._solver.newest, self._totals())
+        if self._persistence is not None:
+            self._persistence.close(self._guarded_estimator.newest, self._totals())
 
     def step(self) -> None:
         """Receive until the next tick, then hand out, collect and publish what is due."""
@@ -154,13 +186,13 @@ class Service:
             self._tick(now)
 
     def _receive(self) -> None:
-        feed, longest, now = self.intake.admission.feed, POLL, self.clock()
-        if self._backlog and self.bus.is_open:
-            undisturbed = WITH_ROOM if self.bus.holds_seconds else UNDISTURBED
-            self._backlog.wait(min(self._next_tick, self._handed_out + undisturbed) - now)
-            longest, now = PROMPT, self.clock()
-        for _ in range(MAX_DRAIN):
-            if self._backlog.has_result:
+        feed, longest, now = self.intake.admission.feed, MAX_WAIT, self.clock()
+        if self._work_queue and self.bus.is_open:
+            undisturbed = UNDISTURBED_TIME_LARGE_BUFFER if self.bus.holds_seconds else UNDISTURBED_TIME
+            self._work_queue.wait(min(self._next_tick, self._handed_out + undisturbed) - now)
+            longest, now = MAX_WAIT_WHILE_SOLVING, self.clock()
+        for _ in range(MAX_FRAMES_PER_ROUND):
+            if self._work_queue.has_result:
                 return
             wait = min(self._next_tick - now, self._time.wait(self.intake.next_end, now, longest))
             message = self.bus.receive(max(0.0, wait))
@@ -183,15 +215,15 @@ class Service:
                 return
 
     def _hand_out(self, now: float) -> None:
-        """Give the windows that have ended to the worker; what it cannot keep up with is dropped."""
+        """Put the windows that have ended into the work queue; it drops what the worker cannot keep up with."""
         for task in self.intake.due(self._time.heard(self.intake.next_end, now)):
             ended = now - max(0.0, self._time.at(now) - task.end)
-            self.deadline_misses += self._backlog.add(task, ended, task.epoch, now)
+            self.deadline_misses += self._work_queue.add(task, ended, task.epoch, now)
             self._handed_out = now
 
     def _collect(self, now: float) -> None:
         """Publish the windows that are solved, in their order."""
-        for result, pending in self._backlog.results(now):
+        for result, pending in self._work_queue.results(now):
             if result.failure is not None:
                 self.failures[result.failure] += 1
             if pending.epoch == self.intake.epoch:  # else it is of a time that is none any more
@@ -215,7 +247,7 @@ class Service:
                 "model_gap: for minutes the model has not described %s (chi-square; 1 is noise); "
                 "record a drive with candump -l and run: soilbus diagnose --config F LOG", shown,
             )  # fmt: skip
-        if _kind(result.reason) == "implausible" and (self.result is None or self.result.reason != result.reason):
+        if _first_word(result.reason) == "implausible" and (self.result is None or self.result.reason != result.reason):
             log.warning("%s: contradicts the other sensors, not used in this window", result.reason)
         self.result, self._ended = result, ended
         able = result.traversability.capability
@@ -241,12 +273,12 @@ class Service:
         if interval is not None and now >= self._next_watchdog and not self._fault:
             self._next_watchdog = now + interval
             self.notifier.watchdog()
-        if self._keeper is not None:
-            self._keeper.tick(now, self._solver.newest, self._totals)
+        if self._persistence is not None:
+            self._persistence.tick(now, self._guarded_estimator.newest, self._totals)
 
     def _look_after_health(self, now: float) -> None:
-        hears = self.bus.is_open and now - self._time.last_frame <= SILENCE
-        fault = self._health.fault(now, self._backlog.solving_since, hears, self.bus.counts.sent) or ""
+        hears = self.bus.is_open and now - self._time.last_frame <= SILENCE_TIME
+        fault = self._health.fault(now, self._work_queue.solving_since, hears, self.bus.counts.sent) or ""
         if fault and fault != self._fault:
             log.error("fault: %s; systemd no longer hears that all is well", fault)
         self._fault = fault
@@ -261,16 +293,16 @@ class Service:
             return ServiceState.WAITING, "bus_down"
         if self.bus.state is BusState.OFF:
             return ServiceState.WAITING, f"bus_error {self.bus.state}"
-        if now - self._time.last_frame > SILENCE:
+        if now - self._time.last_frame > SILENCE_TIME:
             return ServiceState.LISTENING, "no_frames"
         stale = self.intake.stale(self._time.at(now))
         if stale:
             never = [name for name in stale if name not in self.intake.last_seen]
             reason = "input_missing " + " ".join(never) if never else "input_stale " + " ".join(stale)
             return ServiceState.DEGRADED, reason
-        if self._fault or self._solver.in_fault:
+        if self._fault or self._guarded_estimator.in_fault:
             return ServiceState.FAULT, self._fault or INTERNAL
-        if now - self.bus.last_foreign < FOREIGN_HOLD:
+        if now - self.bus.last_foreign < FOREIGN_SENDER_HOLD_TIME:
             return ServiceState.DEGRADED, "foreign_sender"
         if self.result is None or self._ended <= self._interrupted:
             return ServiceState.ESTIMATING, "none"
@@ -281,16 +313,24 @@ class Service:
             reason = f"bus_error {self.bus.state}"
         return state_after(self.result), reason
 
-    def present_way(self, now: float) -> Traversability:
-        """The decision as of now: only while all works, no needed input is stale and its data are young.
+    def present_decision(self, now: float) -> Traversability:
+        """The present decision.
 
-        After an interruption only a window that ended later counts.
+        Parameters
+        ----------
+        now
+            Monotonic time [s].
+
+        Returns
+        -------
+        The decision of the last window, judged at `now`; unknown while an input is stale or a fault holds, and until
+        a window has ended after the last interruption.
         """
-        if _interrupts(self._present_state(now)) or self._fault or self._solver.in_fault:
+        if _interrupts(self._present_state(now)) or self._fault or self._guarded_estimator.in_fault:
             return Traversability()
         result = None if self._ended <= self._interrupted else self.result
-        way, basis = (Traversability(), Basis()) if result is None else (result.traversability, result.basis)
-        return at_present(way, basis, self._loss, self._present_time(now), self.config)
+        decision, basis = (Traversability(), Basis()) if result is None else (result.traversability, result.basis)
+        return at_present(decision, basis, self._loss, self._present_time(now), self.config)
 
     def _present_time(self, now: float) -> float:
         """The bus's time, or that of the last window's end and ours since, whichever is later: the stamps' may halt."""
@@ -302,7 +342,7 @@ class Service:
     def _present_curve(self, now: float) -> OverSlip | None:
         """Pull over slip of the last valid window, while it is young enough to extrapolate from."""
         known, t = self._curve
-        return known if self._time.at(now) - t < LONGEST_CURVE else None
+        return known if self._time.at(now) - t < MAX_CURVE_AGE else None
 
     def _age(self, now: float) -> float:
         """Of the data that the decision rests on [s]."""
@@ -319,8 +359,8 @@ class Service:
         if latest.motion is not None:
             settings = self.config.traversability
             self._loss = observed(self._loss, latest.motion, self.config.estimator.min_speed, settings)
-        way = self.present_way(now)
-        known = way.state is not State.UNKNOWN
+        decision = self.present_decision(now)
+        known = decision.state is not State.UNKNOWN
         window = self.result.index % WINDOW_MODULUS if self.result is not None else None
         for message, values in slip_frames(latest.slip):
             self.bus.send(self.publisher.frame(message, values))
@@ -334,9 +374,9 @@ class Service:
             self.publisher.frame(
                 "Traversability",
                 {
-                    "State": str(way.state),
-                    "LimitingCause": way.limit if known else None,
-                    "Probability": way.probability if known else None,
+                    "State": str(decision.state),
+                    "LimitingCause": decision.limit if known else None,
+                    "Probability": decision.probability if known else None,
                     "Age": max(age, 0.0) if math.isfinite(age := self._age(now)) else None,
                     "SinceValid": self._since_valid(now),
                     "Window": window,
@@ -347,8 +387,8 @@ class Service:
             self.publisher.frame(
                 "TorqueDemand",
                 {
-                    "TorqueRequired": way.torque_required if known else None,
-                    "TorqueAvailable": way.torque_available if known else None,
+                    "TorqueRequired": decision.torque_required if known else None,
+                    "TorqueAvailable": decision.torque_available if known else None,
                     "Window": window,
                 },
             )
@@ -373,7 +413,7 @@ class Service:
                 message,
                 {
                     "State": str(state),
-                    "Reason": _kind(reason),
+                    "Reason": _first_word(reason),
                     "RejectedShare": 100.0 * sum(counts.refused.values()) / received if received else None,
                     "DeadlineMisses": self.deadline_misses,
                     "Window": self.result.index % WINDOW_MODULUS if self.result is not None else None,
@@ -384,7 +424,7 @@ class Service:
         if self.result is not None and self.result.bearing is not None:
             bearing = self.result.bearing
             text += f", bearing pressure {bearing.value / 1e3:.1f} +- {bearing.std / 1e3:.1f} kPa"
-            text += f", {self.present_way(now).state}"
+            text += f", {self.present_decision(now).state}"
         if self.deadline_misses:
             text += f", deadline misses {self.deadline_misses}"
         if self.failures:
@@ -395,11 +435,11 @@ class Service:
 
 
 def _interrupts(state: tuple[ServiceState, str]) -> bool:
-    return state[0] in (ServiceState.WAITING, ServiceState.FAULT) or _kind(state[1]) in INTERRUPTIONS
+    return state[0] in (ServiceState.WAITING, ServiceState.FAULT) or _first_word(state[1]) in INTERRUPTIONS
 
 
-def _kind(reason: str) -> str:
-    """Of a reason such as "input_stale load.FL", what the value table knows."""
+def _first_word(reason: str) -> str:
+    """First word of a reason such as "input_stale load.FL": the name in the DBC's value table."""
     return reason.split()[0]
 
 

@@ -1,4 +1,8 @@
-"""Configuration -> a service that is ready to run."""
+"""Configuration -> a service that is ready to run.
+
+Bus, filters, publisher and intake are made here; the worker thread loads what only it needs (estimator, stored state)
+while the loop listens already, then solves a few made-up windows, so that the first real one is not slow.
+"""
 
 from __future__ import annotations
 
@@ -28,6 +32,8 @@ if TYPE_CHECKING:
     from soilbus.daemon.state_persistence import StatePersistence
 
 SWITCH_INTERVAL = 0.0005
+"""Time [s] after which the interpreter switches threads: the loop must run between the estimator's steps, or the
+socket's buffer overflows."""
 
 
 def start_service(
@@ -36,12 +42,25 @@ def start_service(
     on_window: Callable[[WindowResult], None] | None = None,
     rehearse: bool = True,
 ) -> Service:
-    """The service with its bus open; with `wait` an interface that is not there yet may come later.
+    """The service of a configuration, with its bus open.
 
-    With `rehearse` its worker does made-up windows while the first real one fills.
+    Parameters
+    ----------
+    config
+        The vehicle's configuration.
+    wait
+        Whether an interface that does not exist yet may appear later.
+    on_window
+        Called with each window's result.
+    rehearse
+        Whether the worker solves made-up windows while the first real one fills.
 
-    Raises ConfigError for a configuration that cannot work, BusError for a bus that
-    cannot be opened.
+    Raises
+    ------
+    ConfigError
+        The configuration cannot work.
+    BusError
+        The bus cannot be opened.
     """
     pipeline, ours = Pipeline(config, load_databases(config, mapped_only=True)), output_database(config)
     check_cycle_times(config, ours)
@@ -64,7 +83,7 @@ def start_service(
         _load()
     service = Service(
         config, pipeline, bus, publisher, Notifier.from_environment(), workers, on_window=on_window,
-        opened_keeper=partial(_keeper, pipeline, os.environ),
+        open_persistence=partial(_state_persistence, pipeline, os.environ),
     )  # fmt: skip
     if rehearse:
         workers.submit(_rehearse, config, pipeline.database, ours)  # where it raises, the first window is late, no more
@@ -72,24 +91,24 @@ def start_service(
 
 
 def _load() -> None:
-    """What only the worker needs; it may load that while the service listens already.
+    """Import what only the worker needs.
 
-    It keeps the interpreter for itself for so long then that on a slow machine the kernel runs out of
-    room for frames, where it has no more than by default.
+    The service listens already. An import holds the interpreter for so long that on a slow machine the kernel's default
+    buffer runs full; then it is done before, in the loop's thread.
     """
     with loading():
         import soilbus.daemon.state_persistence  # noqa: F401
 
 
 def _rehearse(config: Config, database: Database, ours: Database) -> None:
-    """In the worker: a few windows of a drive that is made up."""
+    """In the worker: solve a few made-up windows."""
     from soilbus.daemon.warm_up import warm_up
 
     warm_up(config, database, ours)
 
 
-def _keeper(pipeline: Pipeline, environ: Mapping[str, str]) -> StatePersistence | None:
-    """In the worker: keeps the state in the folder that systemd made for it; None where there is none."""
+def _state_persistence(pipeline: Pipeline, environ: Mapping[str, str]) -> StatePersistence | None:
+    """In the worker: the state in the folder that systemd names; None where there is no folder."""
     folder = environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if not folder:
         return None

@@ -1,4 +1,10 @@
-"""When the state is stored: at the start, once a minute and at the end, beside the loop, so that no disk halts it."""
+"""State persistence: the state file is written at the start, once a minute and at the end.
+
+A thread of its own writes, so no disk halts the loop. The file holds the newest posterior of soil and sensor gains,
+the number of starts and the counters since the first start (totals = stored totals + counts of this run). A state that
+cannot be read is one warning and the estimate begins without it; a folder that cannot be written is one warning until
+it can be written again.
+"""
 
 from __future__ import annotations
 
@@ -17,51 +23,69 @@ from soilbus.words import one_line
 
 log = logging.getLogger(__name__)
 
-PERIOD = 60.0
-"""Seconds between two writings, so what a power cut takes at most."""
-LONGEST_LAST = 3.0
-"""Seconds that the end waits for the last writing."""
+STORE_PERIOD = 60.0
+"""Time [s] between two writes: the most that a power cut loses."""
+MAX_LAST_WRITE_TIME = 3.0
+"""Time [s] that the end waits for the last write."""
 FILE = "state.json"
 
 
-class Recalled(NamedTuple):
-    """What another run knew, and how many seconds ago."""
+class StoredPrior(NamedTuple):
+    """Posterior of the last run, and its age [s]."""
 
     gaussian: Gaussian
     elapsed: float
 
 
 class StatePersistence:
-    """Keeps one vehicle's state in a folder; `writer` is a thread of its own, `wall` the time of day [s, Unix].
+    """Keeps one vehicle's state in a folder.
 
-    A state that cannot be used is one warning, and everything begins afresh.  So is a folder
-    that cannot be written: one warning, until it can be again.
+    Parameters
+    ----------
+    folder
+        Where the file is.
+    owner
+        The vehicle that the state must belong to.
+    writer
+        A thread of its own.
+    wall
+        Time of day [s, Unix].
     """
 
     def __init__(self, folder: Path, owner: Owner, writer: Executor, wall: Callable[[], float] = time.time) -> None:
         self._path, self._owner, self._writer, self._wall = folder / FILE, owner, writer, wall
-        self._before = self._read()
-        self._stored = None if self._before is None else self._before.gaussian
+        self._previous = self._read()
+        self._stored = None if self._previous is None else self._previous.gaussian
         self._seen: Gaussian | None = None
         self._writing: Future[None] | None = None
         self._fails = False
         self._next = float("-inf")
 
     @property
-    def recalled(self) -> Recalled | None:
-        """What the run before knew; of unknown age, and then taken for old, where the clock was set back since."""
-        if self._before is None or self._before.gaussian is None:
+    def stored_prior(self) -> StoredPrior | None:
+        """Posterior of the last run; GAIN_CORRELATION_TIME old where the clock was set back since, None without one."""
+        if self._previous is None or self._previous.gaussian is None:
             return None
-        elapsed = self._wall() - self._before.gaussian.at
-        return Recalled(
-            gaussian_of(self._before.gaussian, self._owner), elapsed if elapsed >= 0.0 else GAIN_CORRELATION_TIME
+        elapsed = self._wall() - self._previous.gaussian.at
+        return StoredPrior(
+            gaussian_of(self._previous.gaussian, self._owner), elapsed if elapsed >= 0.0 else GAIN_CORRELATION_TIME
         )
 
     def tick(self, now: float, gaussian: Gaussian | None, counts: Callable[[], Mapping[str, int]]) -> None:
-        """Have the state written if that is due at the monotonic time `now` [s]; returns at once."""
+        """Have the state written if that is due; returns at once.
+
+        Parameters
+        ----------
+        now
+            Monotonic time [s].
+        gaussian
+            Posterior of this run; None as long as there is none.
+        counts
+            Gives the counters of this run.
+        """
         if now < self._next:
             return
-        self._next = now + PERIOD
+        self._next = now + STORE_PERIOD
         if self._writing is None or self._writing.done():
             self._write(gaussian, counts())
 
@@ -69,7 +93,7 @@ class StatePersistence:
         """Have the last state written; waits for it, but not long."""
         self._write(gaussian, counts)
         if self._writing is not None:
-            wait([self._writing], LONGEST_LAST)
+            wait([self._writing], MAX_LAST_WRITE_TIME)
         self._writer.shutdown(wait=False)
 
     def _read(self) -> State | None:
@@ -80,7 +104,7 @@ class StatePersistence:
             return None
 
     def _write(self, gaussian: Gaussian | None, counts: Mapping[str, int]) -> None:
-        """`gaussian` is None as long as this run has none: then the one of the run before stays."""
+        """`gaussian` is None as long as this run has none: then the last run's stays."""
         is_new, self._seen = gaussian is not None and gaussian is not self._seen, gaussian
         self._writing = self._writer.submit(self._store, gaussian if is_new else None, dict(counts))
 
@@ -91,14 +115,14 @@ class StatePersistence:
             try:
                 self._stored = stored_gaussian(gaussian, at, self._owner)
             except StateError as error:
-                log.info("the present belief is not stored: %s", error)
-        before = self._before
-        totals = Counter(counts) + Counter({} if before is None else before.totals)
-        starts = 1 if before is None else before.starts + 1
+                log.info("the present posterior is not stored: %s", error)
+        previous = self._previous
+        totals = Counter(counts) + Counter({} if previous is None else previous.totals)
+        starts = 1 if previous is None else previous.starts + 1
         try:
             content = dumped(State(at=at, starts=starts, gaussian=self._stored, totals=dict(totals)), self._owner)
             write_whole(self._path, content)
-        except Exception as error:  # whatever it is, a thread's error would reach nobody
+        except Exception as error:  # an error of this thread would reach nobody
             if not self._fails:
                 why = getattr(error, "strerror", None) or one_line(error)
                 log.warning("state cannot be stored in %s: %s", self._path.parent, why)

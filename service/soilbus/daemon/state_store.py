@@ -1,9 +1,10 @@
-"""What outlives the process: one JSON file that is whole or is not there, and that is believed only after checks.
+"""The state file: one JSON file that is whole or absent, and that is used only after checks.
 
-Written to a file beside it, brought to the disk, then renamed, so that a power cut at any
-moment leaves the old file or the new one.  Read back, a file counts only if it is of this
-format and version, belongs to this very configuration, has the checksum it says, and holds
-a belief that this vehicle's estimator could have had.
+    |value - prior median| <= 8 prior sd    and    posterior sd <= 8 prior sd        for each parameter
+
+The file is written beside the old one, flushed to the disk, then renamed, so a power cut leaves the old file or the
+new one. A file that is read counts only if it has this format and version, belongs to this configuration, has the
+checksum that it states, and holds a Gaussian within the bounds above.
 """
 
 from __future__ import annotations
@@ -33,12 +34,12 @@ from soilbus.estimation.tracker import gain_errors, new_soil_prior
 from soilbus.words import one_line
 
 FORMAT, VERSION = "soilbus state", 2
-LARGEST = 1 << 20
-"""Bytes of a file beyond which it is not ours."""
-FAR = 8.0
-"""Prior standard deviations beyond which no belief of ours lies, and by which its own may be wider."""
+MAX_FILE_BYTES = 1 << 20
+"""Size [bytes] beyond which a file is not a state of ours."""
+STORED_RANGE_SD = 8.0
+"""Greatest distance of a stored mean from the prior's median, and greatest stored sd, in prior standard deviations."""
 SECTIONS = {"vehicle", "wheel", "signals", "noise", "soil", "estimator", "model"}
-"""Sections of the configuration that a belief depends on."""
+"""Sections of the configuration that a posterior depends on."""
 _PHI = PARAMETERS.index("phi")
 
 
@@ -51,7 +52,7 @@ class _Model(BaseModel):
 
 
 class StoredGaussian(_Model):
-    """A belief and when it was had [s, Unix]; SI, gains relative, covariance of the soil's logarithms and the gains."""
+    """A Gaussian and its time [s, Unix]: soil in SI, relative gains, covariance of log soil and gains."""
 
     at: NonNegativeFloat
     soil: dict[str, NonNegativeFloat]
@@ -60,7 +61,7 @@ class StoredGaussian(_Model):
 
 
 class State(_Model):
-    """What is stored: when [s, Unix], how often the service was started, the belief, counters since the first start."""
+    """What is stored: time [s, Unix], number of starts, the Gaussian, counters since the first start."""
 
     at: NonNegativeFloat
     starts: PositiveInt
@@ -80,9 +81,16 @@ class _File(_Model):
 
 @dataclass(frozen=True, slots=True)
 class Owner:
-    """Whose state a file may hold: the digest of all that a belief depends on, and what bounds such a belief.
+    """Whose state a file may hold: a digest of all that a posterior depends on, and the bounds of such a posterior.
 
-    median, std: of the soil parameters (6,) and gain errors (G,) named in `gains`; std 0 is held.
+    Attributes
+    ----------
+    key
+        Digest of configuration and signals.
+    gains
+        Names of the gain errors (G,).
+    median, std
+        Of the soil parameters (6,) and the gain errors (G,); sd 0 means held.
     """
 
     key: str
@@ -104,7 +112,13 @@ class Owner:
 
 
 def stored_gaussian(gaussian: Gaussian, at: float, owner: Owner) -> StoredGaussian:
-    """The belief as it is stored; StateError for one that could not be read back."""
+    """The Gaussian as it is stored.
+
+    Raises
+    ------
+    StateError
+        It could not be read back.
+    """
     _check(gaussian, owner)
     return StoredGaussian(
         at=at,
@@ -115,30 +129,36 @@ def stored_gaussian(gaussian: Gaussian, at: float, owner: Owner) -> StoredGaussi
 
 
 def gaussian_of(stored: StoredGaussian, owner: Owner) -> Gaussian:
-    """The belief that was stored; StateError where this vehicle's estimator cannot have had it."""
+    """The Gaussian that was stored.
+
+    Raises
+    ------
+    StateError
+        This vehicle's estimator cannot have had it.
+    """
     if tuple(stored.soil) != PARAMETERS or tuple(stored.gains) != owner.gains:
-        raise StateError("the belief is of other parameters")
+        raise StateError("the Gaussian is of other parameters")
     rows = stored.covariance
     if len(rows) != len(owner.std) or any(len(row) != len(owner.std) for row in rows):
-        raise StateError("the belief's covariance has another shape")
+        raise StateError("the Gaussian's covariance has another shape")
     gaussian = Gaussian(np.array(list(stored.soil.values())), np.array(list(stored.gains.values())), np.array(rows))
     _check(gaussian, owner)
     return gaussian
 
 
 def _check(gaussian: Gaussian, owner: Owner) -> None:
-    """Raises StateError unless the belief is finite, physical, and has a proper covariance."""
+    """Raises StateError unless the Gaussian is finite, physical, and has a proper covariance."""
     if not all(np.isfinite(part).all() for part in (gaussian.soil, gaussian.gains, gaussian.covariance)):
-        raise StateError("the belief is not finite")
+        raise StateError("the Gaussian is not finite")
     n_soil = len(PARAMETERS)
     free, median = owner.std[:n_soil] > 0.0, owner.median[:n_soil]
     physical = (gaussian.soil[free] > 0.0).all() and gaussian.soil[_PHI] <= max(MAX_PHI, median[_PHI])
     if physical:
         off = np.concatenate([np.log(gaussian.soil[free]) - np.log(median[free]), gaussian.gains])
         std = np.concatenate([owner.std[:n_soil][free], owner.std[n_soil:]])
-        physical = (np.abs(off) <= FAR * std).all() and np.allclose(gaussian.soil[~free], median[~free])
+        physical = (np.abs(off) <= STORED_RANGE_SD * std).all() and np.allclose(gaussian.soil[~free], median[~free])
     if not physical:
-        raise StateError("the belief is out of physical bounds")
+        raise StateError("the Gaussian is out of physical bounds")
     _check_covariance(gaussian.covariance, owner.std)
 
 
@@ -146,20 +166,20 @@ def _check_covariance(covariance: Array, std: Array) -> None:
     """Raises StateError unless it (N, N) is symmetric and positive definite, and zero for what is held (std (N,) 0)."""
     held, variance = std == 0.0, np.diag(covariance)
     if covariance[held].any() or covariance[:, held].any() or not (variance[~held] > 0.0).all():
-        raise StateError("the belief's covariance is not positive definite")
-    if (variance > (FAR * std) ** 2).any():
-        raise StateError("the belief's covariance is out of bounds")
+        raise StateError("the Gaussian's covariance is not positive definite")
+    if (variance > (STORED_RANGE_SD * std) ** 2).any():
+        raise StateError("the Gaussian's covariance is out of bounds")
     scale = np.sqrt(variance[~held])
     with np.errstate(over="ignore"):
         correlation = covariance[np.ix_(~held, ~held)] / np.outer(scale, scale)
     if not np.allclose(correlation, correlation.T, rtol=0.0, atol=1e-9):
-        raise StateError("the belief's covariance is not symmetric")
+        raise StateError("the Gaussian's covariance is not symmetric")
     try:
         if not (np.abs(correlation) < 1.0 + 1e-9).all():
             raise np.linalg.LinAlgError
         np.linalg.cholesky(correlation)
     except np.linalg.LinAlgError:
-        raise StateError("the belief's covariance is not positive definite") from None
+        raise StateError("the Gaussian's covariance is not positive definite") from None
 
 
 def dumped(state: State, owner: Owner) -> bytes:
@@ -170,7 +190,20 @@ def dumped(state: State, owner: Owner) -> bytes:
 
 
 def loaded(content: bytes, owner: Owner) -> State:
-    """The state in a file's content; StateError where it cannot be used, whatever the bytes are."""
+    """The state in a file's content.
+
+    Parameters
+    ----------
+    content
+        Any bytes.
+    owner
+        The vehicle that the state must belong to.
+
+    Raises
+    ------
+    StateError
+        It cannot be used; one line says why.
+    """
     try:
         raw = json.loads(content)
     except (ValueError, RecursionError):
@@ -194,18 +227,24 @@ def loaded(content: bytes, owner: Owner) -> State:
 
 
 def read(path: Path, owner: Owner) -> State | None:
-    """The state in a file, None where there is no file; StateError where it cannot be used."""
+    """The state in a file; None where there is no file.
+
+    Raises
+    ------
+    StateError
+        It cannot be used; one line says why.
+    """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW)
         with open(descriptor, "rb") as file:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
                 raise StateError("it is no file")
-            content = file.read(LARGEST + 1)
+            content = file.read(MAX_FILE_BYTES + 1)
     except FileNotFoundError:
         return None
     except OSError as error:
         raise StateError(error.strerror or str(error)) from None
-    if len(content) > LARGEST:
+    if len(content) > MAX_FILE_BYTES:
         raise StateError("it is too large to be a state of soilbus")
     return loaded(content, owner)
 

@@ -1,4 +1,11 @@
-"""The beat of the ten-hertz frames, which is brought into step with the windows."""
+"""Phase of the 10 Hz ticks, locked to the ends of the windows.
+
+    phase error = (window end - 10 ms - tick) mod 0.1 s, between -50 and +50 ms
+    period      = 0.1 s + clip(phase error, -5 ms, +5 ms)
+
+A tick decodes frames, and with a tick just before a window's end little is left to decode when it ends; the next tick
+is then a full period away and does not halt the worker, with which the loop shares one interpreter.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +13,23 @@ import math
 
 from soilbus.pipeline.outputs import TICK
 
-EVE = 0.01
-"""A tick falls this long [s] before a window's end: it decodes what the window would else have to, and the next one
-does not halt the worker, with which the loop shares one interpreter, while that has the window."""
-SLEW = 0.05 * TICK
-"""By so much [s] a period may differ from TICK until it is so."""
+LEAD_BEFORE_WINDOW_END = 0.01
+"""Time [s] by which a tick comes before a window's end."""
+MAX_PERIOD_CHANGE = 0.05 * TICK
+"""Greatest change [s] of one period while the phase is brought into place."""
 
 
 def next_tick(tick: float, end: float) -> float:
-    """When the tick after that of `tick` is due, where a window ends at `end`; nan and inf: not known; all [s]."""
+    """When the next tick is due.
+
+    Parameters
+    ----------
+    tick
+        When the last one was due [s].
+    end
+        When a window ends [s]; nan or inf where that is not known.
+    """
     if not math.isfinite(end):
         return tick + TICK
-    off = math.remainder(end - EVE - tick, TICK)
-    return tick + TICK + min(max(off, -SLEW), SLEW)
+    off = math.remainder(end - LEAD_BEFORE_WINDOW_END - tick, TICK)
+    return tick + TICK + min(max(off, -MAX_PERIOD_CHANGE), MAX_PERIOD_CHANGE)

@@ -1,4 +1,4 @@
-"""What has been counted since the start, by name."""
+"""Counters since the start, by name: the part of the state file that only ever grows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,19 @@ from soilbus.can.bus import BusCounts
 def totals(
     windows: int, deadline_misses: int, failures: Mapping[str, int], bus: BusCounts, frames: Counts
 ) -> dict[str, int]:
-    """Windows solved, deadlines missed, failed solves by kind, events on the bus, frames, refused ones by reason."""
+    """Counters by name.
+
+    Parameters
+    ----------
+    windows, deadline_misses
+        Windows solved; windows dropped and ticks late.
+    failures
+        Failed solves by kind.
+    bus
+        Events on the bus.
+    frames
+        Frames received and refused.
+    """
     refused: Counter[str] = Counter()
     for (_, reason), n in frames.refused.items():
         refused[f"refused.{reason}"] += n

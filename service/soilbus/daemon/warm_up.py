@@ -1,9 +1,10 @@
-"""A rehearsal: a few windows are estimated before anything depends on how long a window takes.
+"""Warm-up: a few windows are solved before anything depends on how long a window takes.
 
-The first pass through any code takes several times as long as later ones: memory comes page by page from the
-kernel, caches are empty.  The rehearsal's samples come from the wheel-soil model: at each instant the configured
-vehicle stands on the soil of the prior's medians, each wheel has the entry angle at which that soil carries its
-load, all wheels have the same slip, and draft is the sum of their drawbar pulls.
+    slip(t) between 0.10 and 0.40, one period a window;   side load share 0.15 sin(4 pi t / window)
+    load, pull, torque, sinkage = wheel-soil model at the prior's medians;   draft = sum of the wheels' pulls
+
+The first pass through any code takes several times as long as later ones: memory comes page by page from the kernel,
+caches are empty. The samples come from the wheel-soil model with the sensors' noise; results and frames are dropped.
 """
 
 from __future__ import annotations
@@ -12,8 +13,8 @@ import zlib
 
 import numpy as np
 from cantools.database.can import Database
-from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.can.channels import Channel, Column, Decoded
 from soilbus.can.publish import Publisher
 from soilbus.config.model import Config
@@ -27,20 +28,18 @@ from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.vehicle import axle_loads
 from soilbus.terra.wheel import Soil, state_on
 
-Array = NDArray[np.float64]
-
 WINDOWS = 3
 """The first one searches for the soil, later ones follow it."""
-RATE = 50.0
+SAMPLE_RATE = 50.0
 """Samples of each channel a second [Hz]: frames every 20 ms, as motor controllers send them."""
-SPEED = 1.5
+GROUND_SPEED = 1.5
 """Ground speed [m/s]: that of ploughing."""
-SLIP = 0.10, 0.40
+SLIP_RANGE = 0.10, 0.40
 """Least and greatest slip, once in each window: from easy work to where pull hardly grows any more."""
-SIDE = 0.15
+SIDE_LOAD_SHARE = 0.15
 """Share of a wheel's load that passes to its mate and back, twice in each window: a side slope of 9 degrees.  Where no
-load swings, depths are alike and k_c and k_phi hard to tell apart: a window takes five times as long."""
-ROUNDS = 5
+load swings, depths are alike and k_c and k_phi hardly separate: a window takes five times as long."""
+FIXED_POINT_ROUNDS = 5
 """Fixed-point rounds between draft and wheel loads, and to the loads that effects leave: both within a few per cent."""
 
 
@@ -58,7 +57,7 @@ def warm_up(config: Config, database: Database, ours: Database) -> list[WindowRe
     """
     pipeline, publisher = Pipeline(config, database), Publisher(ours)
     settings, intake = config.estimator, pipeline.intake
-    t = np.arange(0.0, settings.window + (WINDOWS - 1) * settings.hop, 1.0 / RATE)
+    t = np.arange(0.0, settings.window + (WINDOWS - 1) * settings.hop, 1.0 / SAMPLE_RATE)
     truth, late = _driven(config, intake.rig, t), delays_of(config)
     columns = {c.name: _measured(c, t, truth, intake.rig, late) for c in intake.channels if c.quantity in truth}
     results: list[WindowResult] = []
@@ -77,25 +76,25 @@ def _driven(config: Config, rig: Rig, t: Array) -> dict[str, Array]:
     if rig.chassis is None or not rig.wheels:
         raise ValueError("a rehearsal needs a [vehicle] with wheels that have torque, speed and load")
     phase = 2.0 * np.pi * t / config.estimator.window
-    slip = SLIP[0] + (SLIP[1] - SLIP[0]) * (1.0 - np.cos(phase)) / 2.0
+    slip = SLIP_RANGE[0] + (SLIP_RANGE[1] - SLIP_RANGE[0]) * (1.0 - np.cos(phase)) / 2.0
     radius, width, rear = rig.radius[:, None], rig.width[:, None], ~rig.front[:, None]
     share = np.ones((len(rear), len(t))) / np.where(rear, rear.sum(), (~rear).sum())
-    share[pairs(rig)] *= 1.0 + SIDE * np.stack([np.sin(2.0 * phase), -np.sin(2.0 * phase)])[:, None]
-    model = CompletedModel.of(model_of(config), effects_of(config), SPEED)
+    share[pairs(rig)] *= 1.0 + SIDE_LOAD_SHARE * np.stack([np.sin(2.0 * phase), -np.sin(2.0 * phase)])[:, None]
+    model = CompletedModel.of(model_of(config), effects_of(config), GROUND_SPEED)
     state = state_on(Soil(*(prior.value for prior in config.soil_prior.values())), np.nan, slip, radius, width)
     draft, ratio = np.zeros(len(t)), np.ones(share.shape)
-    for _ in range(ROUNDS):
+    for _ in range(FIXED_POINT_ROUNDS):
         of_front, of_rear = axle_loads(rig.chassis, draft, 0.0, 0.0)
         load = np.where(rear, of_rear, of_front) * share
         state = state._replace(entry_angle=entry_angle_for_load(load * ratio, state, model.model))
         carried, pull, torque = model.forces(state, rear, load)
         draft, ratio = pull.sum(axis=0), ratio * load / carried
     depth = model.sinkage(state.entry_angle, Wheel(radius, width, rear, load))
-    speed, still = SPEED / (radius * (1.0 - slip)), np.zeros(len(t))
+    speed, still = GROUND_SPEED / (radius * (1.0 - slip)), np.zeros(len(t))
     return {
         "torque": torque, "torque_limit": np.full_like(torque, 2.0 * torque.max()), "load": carried,
         "speed": speed, "motor_speed": speed, "sinkage": depth,
-        "ground_speed": np.full(len(t), SPEED), "draft": draft, "pitch": still, "acceleration": still,
+        "ground_speed": np.full(len(t), GROUND_SPEED), "draft": draft, "pitch": still, "acceleration": still,
         "yaw_rate": still,
     }  # fmt: skip
 

@@ -1,4 +1,8 @@
-"""The windows that the worker has, and their results in order."""
+"""Work queue: the windows that the worker thread has, and their results in order.
+
+At most MAX_PENDING_WINDOWS wait; of more, the oldest that the worker has not begun is dropped and counted as a missed
+deadline. Free memory goes back to the kernel once every WINDOWS_PER_MEMORY_RELEASE windows, in the worker.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +15,10 @@ from soilbus.allocator import give_back_freed_memory
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.result import WindowResult
 
-MAX_PENDING = 3
+MAX_PENDING_WINDOWS = 3
 """Windows that may wait for the worker."""
-TIDIED = 60
-"""Windows after which memory that is free is given back, and after as many again."""
+WINDOWS_PER_MEMORY_RELEASE = 60
+"""Windows between two releases of free memory."""
 
 
 class Pending(NamedTuple):
@@ -31,9 +35,18 @@ def wait_for(future: Future[WindowResult], longest: float) -> None:
 
 
 class WorkQueue:
-    """What `workers` (one thread) has to solve; it works beside the loop, which never waits for it for long.
+    """Windows for `workers` (one thread), which solves them beside the loop.
 
-    `waiting` waits for a future, for at most the seconds given.
+    Parameters
+    ----------
+    workers
+        One thread.
+    solve
+        Solves a window; called in that thread.
+    now
+        Monotonic time [s].
+    waiting
+        Waits for a future, for at most the seconds given.
     """
 
     def __init__(
@@ -63,18 +76,34 @@ class WorkQueue:
         return bool(self._pending) and self._pending[0].future.done()
 
     def add(self, task: WindowTask, ended: float, epoch: int, now: float) -> int:
-        """Give the worker a window that ended at a monotonic time [s]; how many it cannot keep up with are dropped."""
+        """Give the worker a window.
+
+        Parameters
+        ----------
+        task
+            The window.
+        ended
+            Monotonic time [s] of its end.
+        epoch
+            Epoch of the intake that it belongs to.
+        now
+            Monotonic time [s].
+
+        Returns
+        -------
+        Number of waiting windows that were dropped.
+        """
         if not self._pending:
             self._busy_since = now
         self._pending.append(Pending(self._workers.submit(self._solve, task), ended, epoch))
         dropped = 0
-        while len(self._pending) > MAX_PENDING and self._pending[1].future.cancel():
+        while len(self._pending) > MAX_PENDING_WINDOWS and self._pending[1].future.cancel():
             del self._pending[1]
             dropped += 1
         return dropped
 
     def wait(self, longest: float) -> None:
-        """Until the oldest window is solved, `longest` [s] at most."""
+        """Wait until the oldest window is solved, at most `longest` [s]."""
         if self._pending and longest > 0.0:
             self._waiting(self._pending[0].future, longest)
 
@@ -85,9 +114,9 @@ class WorkQueue:
             self._busy_since = now
             self.solved += 1
             yield pending.future.result(), pending
-            if self.solved % TIDIED == 0:
+            if self.solved % WINDOWS_PER_MEMORY_RELEASE == 0:
                 self._workers.submit(give_back_freed_memory)
 
     def close(self) -> None:
-        """Solve no more."""
+        """Shut the worker down; waiting windows are dropped."""
         self._workers.shutdown(wait=False, cancel_futures=True)

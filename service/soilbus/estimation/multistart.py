@@ -165,7 +165,7 @@ class DescentOptions(NamedTuple):
 
 
 DEFAULT_OPTIONS = DescentOptions()
-"""As much as a fit can be worth."""
+"""The full budget of a fit."""
 
 
 class SecondMode(NamedTuple):

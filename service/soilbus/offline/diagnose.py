@@ -1,4 +1,8 @@
-"""From recorded logs, or tables of a test rig, to a diagnosis."""
+"""From recorded logs, or tables of a test rig, to a diagnosis.
+
+Logs become records (offline/recordings.py), tables become records (offline/tables.py); diagnosis/diagnose.py does the
+rest. Which effects may be candidates depends on the source: a table holds slip instead of speeds.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +26,19 @@ __all__ = ["Findings", "diagnose_logs"]
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """A diagnosis with what it was made from; seconds is how long it took without reading [s]."""
+    """A diagnosis with what it was made from.
+
+    Attributes
+    ----------
+    diagnosis
+        Result of diagnosis/diagnose.py.
+    recordings
+        The records, with samples used and refused.
+    config
+        The configuration that it holds for.
+    seconds
+        Time [s] that the diagnosis took, without reading.
+    """
 
     diagnosis: Diagnosis
     recordings: Recordings
@@ -36,15 +52,30 @@ class Findings:
 
 
 def diagnose_logs(config: Config, logs: Sequence[Path], say: Callable[[str], None] | None = None) -> Findings:
-    """Reads the logs and diagnoses them together; `say` gets each phase.  With [table] logs are tables.
+    """Read logs and diagnose them together.
 
-    Raises LogError and TooLittle as recordings_of(), NotFitted where the present model
-    cannot be fitted, ConfigError where configuration and database do not fit.
+    Parameters
+    ----------
+    config
+        The vehicle's configuration; with [table] `logs` are tables.
+    logs
+        Files.
+    say
+        Called with the name of each phase.
+
+    Raises
+    ------
+    LogError, TooLittle
+        As recordings_of().
+    NotFitted
+        The present model cannot be fitted.
+    ConfigError
+        Configuration and database do not fit together.
     """
-    tell = say or (lambda _: None)
+    report = say or (lambda _: None)
     if config.table is None:
         recordings = recordings_of(
-            config, load_databases(config), logs, lambda frames, _: tell(f"reading, {frames} frames") if say else None
+            config, load_databases(config), logs, lambda frames, _: report(f"reading, {frames} frames") if say else None
         )
         catalogue = possible_effects(config)
     else:
@@ -52,7 +83,7 @@ def diagnose_logs(config: Config, logs: Sequence[Path], say: Callable[[str], Non
         catalogue = candidates(config, recordings.records)
     begin = time.perf_counter()
     try:
-        diagnosis = diagnose(recordings.records, prior_of(config), catalogue, tell)
+        diagnosis = diagnose(recordings.records, prior_of(config), catalogue, report)
     except np.linalg.LinAlgError as error:
         raise NotFitted(f"the recordings do not determine the model: {error}") from None
     return Findings(diagnosis, recordings, config, time.perf_counter() - begin)

@@ -1,4 +1,8 @@
-"""Recorded logs as the diagnosis wants them: each as a whole, through the daemon's own admission and bins."""
+"""Recorded logs as records for the diagnosis: each log as one window, through the daemon's own admission and bins.
+
+A log is one record, or several where its clock was set or it was silent for long; a part without enough instants is
+left out and named.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +23,20 @@ from soilbus.pipeline.intake import Intake
 
 @dataclass(frozen=True, slots=True)
 class Recordings:
-    """Logs of one vehicle: records, samples in them, refused ones by reason, parts too short to be used.
+    """Logs of one vehicle.
 
-    A log is one record, or one for each part where its clock was set or it is silent for
-    long; `first` holds the number of the first record of each log.
+    Attributes
+    ----------
+    records
+        One for each usable part of a log.
+    first
+        Index of the first record of each log.
+    samples
+        Samples in them.
+    rejected
+        Refused samples by reason.
+    too_short
+        Names of the parts that were left out.
     """
 
     records: tuple[Record, ...]
@@ -35,10 +49,25 @@ class Recordings:
 def recordings_of(
     config: Config, database: Database, logs: Sequence[Path], progress: Callable[[int, float], None] | None = None
 ) -> Recordings:
-    """Reads the logs.
+    """Read logs.
 
-    Raises LogError for a log that cannot be read to its end or is of another bus, TooLittle
-    for one without a usable part, ConfigError where configuration and database do not fit.
+    Parameters
+    ----------
+    config, database
+        The vehicle.
+    logs
+        Files.
+    progress
+        Called with the number of frames read and the time in the recording [s].
+
+    Raises
+    ------
+    LogError
+        A log cannot be read to its end, or is of another bus.
+    TooLittle
+        A log has no usable part.
+    ConfigError
+        Configuration and database do not fit together.
     """
     rig, model, settings = rig_of(config), model_of(config), config.estimator
     effects, free = effects_and_parameters_of(config, undelayed=False)
@@ -65,9 +94,12 @@ def recordings_of(
 
 
 def parts(intake: Intake, log: Path, progress: Callable[[int, float], None] | None = None) -> Iterator[Window]:
-    """The windows of a log, each as long as its clock was not set and it was not silent for long.
+    """The windows of a log, one for each stretch in which its clock was not set and it was not silent for long.
 
-    Raises LogError for a log that cannot be read to its end.
+    Raises
+    ------
+    LogError
+        The log cannot be read to its end.
     """
     whole: list[Window] = []
 

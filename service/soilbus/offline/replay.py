@@ -1,4 +1,10 @@
-"""Recorded logs through the daemon's own pipeline, as fast as it can."""
+"""Recorded logs through the daemon's own pipeline, as fast as it can.
+
+    log -> frames -> intake -> window tasks -> estimator (in a process beside, where there are two cores) -> results
+
+Each log is a recording of its own with its own clock; windows are numbered on over all logs. Reading and estimating
+overlap in two processes, and the results are the same as in one.
+"""
 
 from __future__ import annotations
 
@@ -35,9 +41,10 @@ __all__ = ["LogError", "estimator_beside", "fed", "log_names", "read_frames", "r
 _T = TypeVar("_T")
 
 SWITCH_INTERVAL = 0.0002
-FIRST_LINES = 2000
+"""Time [s] after which the interpreter switches threads, so that the pool's thread can hand on tasks."""
+CHANNEL_SCAN_LINES = 2000
 """Lines of a log in which its channels are looked for: several seconds of a bus."""
-MAX_AHEAD = 30
+MAX_PENDING_WINDOWS = 30
 """Windows that may wait for the estimator."""
 
 
@@ -48,9 +55,12 @@ class LogError(Exception):
 
 
 def read_log(path: Path) -> Iterator[can.Message]:
-    """Messages of one log in any format that python-can reads (and MF4 with the extra `mf4`).
+    """Messages of one log, in any format that python-can reads (and MF4 with the extra `mf4`).
 
-    Raises LogError for a file that is missing, of an unknown format, or damaged.
+    Raises
+    ------
+    LogError
+        The file is missing, of an unknown format, or damaged.
     """
     return chain.from_iterable(_read(path, lambda reader: ([whole(message)] for message in reader)))
 
@@ -88,17 +98,14 @@ def _read(path: Path, batches: Callable[[Any], Iterator[list[_T]]]) -> Iterator[
 
 
 def _reader(path: Path) -> Any:
-    """python-can's reader; it cannot tell the format of a name such as a.b.log.gz, so that is done here."""
+    """python-can's reader; it does not recognise a name such as a.b.log.gz, which is done here."""
     if path.suffixes[-2:] == [".log", ".gz"]:
         return can.CanutilsLogReader(gzip.open(path, "rt"))
     return can.LogReader(path)
 
 
 def log_names(logs: Sequence[Path]) -> list[str]:
-    """What to call each of the logs: as much of the end of its path as distinguishes it.
-
-    A log that is given twice has its number besides.
-    """
+    """A name for each log: the shortest end of its path that no other log has; a log given twice has a number too."""
     paths = [path.absolute().parts for path in logs]
     ends = Counter(parts[-n:] for parts in set(paths) for n in range(1, len(parts) + 1))
     seen: Counter[tuple[str, ...]] = Counter()
@@ -117,17 +124,29 @@ def replay(
     workers: Executor | None = None,
     on_fault: Callable[[LogError], None] | None = None,
 ) -> Iterator[WindowResult]:
-    """Results of every window of the logs, one log after the other, each named by the `log` of its results.
+    """Results of every window of the logs.
 
-    Each log is a recording of its own: its windows are those that it has alone, with their
-    numbers counted on.  The pipeline counts frames and refusals of all of them.
+    Parameters
+    ----------
+    pipeline
+        Intake and estimator; it counts frames and refusals of all logs.
+    logs
+        Files, replayed one after the other.
+    progress
+        Called now and then with the number of frames read and the time in the recording [s].
+    workers
+        Executor of `estimator_beside`: reading and estimating then overlap, with the same results.
+    on_fault
+        Called with the error of a log that is damaged or of another bus; the next log follows.
 
-    `progress` is called now and then with the number of frames read and the time in the
-    recording [s].  With `workers` (of `estimator_beside`) reading and estimating go on at
-    the same time; the results are the same.
+    Yields
+    ------
+    Results in order, each named by the `log` of its results; window numbers go on from log to log.
 
-    A log that is damaged, or of another bus, raises LogError after the windows before that
-    place; with `on_fault` that is called instead, and the next log follows.
+    Raises
+    ------
+    LogError
+        A log is damaged or of another bus and `on_fault` is None; after the windows before that place.
     """
     tasks = _tasks(pipeline, logs, progress, on_fault)
     if workers is None:
@@ -145,7 +164,7 @@ def replay(
     try:
         for name, task in tasks:
             pending.append((name, workers.submit(_estimate, task)))
-            while pending and (pending[0][1].done() or len(pending) > MAX_AHEAD):
+            while pending and (pending[0][1].done() or len(pending) > MAX_PENDING_WINDOWS):
                 yield decided()
     except LogError as error:
         fault = error
@@ -190,12 +209,25 @@ def _windows(intake: Intake, log: Path, progress: Callable[[int, float], None] |
 
 
 def fed(intake: Intake, log: Path, progress: Callable[[int, float], None] | None = None) -> Iterator[float]:
-    """Feeds the frames of a log to an intake.
+    """Feed the frames of a log to an intake.
 
-    Yields the time [s] when a window has ended (once, whether it is taken or not), every second of the recording, and
-    at its end.
+    Parameters
+    ----------
+    intake
+        Takes the frames.
+    log
+        The file.
+    progress
+        Called with the number of frames read and the time in the recording [s].
 
-    Raises LogError as read_log(), where the last frame is not whole, and where no frame is of a mapped message.
+    Yields
+    ------
+    The time [s] when a window has ended (once, taken or not), every second of the recording, and at its end.
+
+    Raises
+    ------
+    LogError
+        As read_log(); where the last frame is not whole; where no frame is of a mapped message.
     """
     admission, counts = intake.admission, intake.admission.counts
     feed = admission.feed
@@ -210,13 +242,13 @@ def fed(intake: Intake, log: Path, progress: Callable[[int, float], None] | None
             continue
         feed(t, identifier, extended, data, remote)
         if not due - 2.0 <= t < due:
-            yield _believed(admission, t)
+            yield _plausible_time(admission, t)
             due = min(intake.next_end, t + 1.0) if intake.next_end > t else t + 1.0
             if progress is not None:
                 first = t if math.isnan(first) else first
                 progress(n, t - first)
     t, identifier, extended, data, remote, error = frame
-    yield _believed(admission, t)
+    yield _plausible_time(admission, t)
     if counts.unknown + counts.error_frames == unheard + n:
         raise LogError(f"{log}: none of its {n} frames is in the DBC: a log of another bus?")
     message = None if remote or error else admission.cut_short(identifier, extended, data)
@@ -224,8 +256,8 @@ def fed(intake: Intake, log: Path, progress: Callable[[int, float], None] | None
         raise LogError(f"{log}: cut off in its last frame ({len(data)} of {message.length} bytes of {message.name})")
 
 
-def _believed(admission: Admission, t: float) -> float:
-    """A frame's stamp [s]; that of the latest mapped frame where it is far from it, for then it is no time."""
+def _plausible_time(admission: Admission, t: float) -> float:
+    """A frame's stamp [s]; the stamp of the latest mapped frame where the two are more than LONGEST_GAP apart."""
     newest = admission.newest
     return t if newest <= t <= newest + LONGEST_GAP else newest
 
@@ -281,7 +313,7 @@ def _channels(path: Path) -> set[str]:
         return set()
     try:
         with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as text:
-            words = [line.split(maxsplit=2) for line in islice(text, FIRST_LINES)]
+            words = [line.split(maxsplit=2) for line in islice(text, CHANNEL_SCAN_LINES)]
     except (OSError, EOFError, ValueError):
         return set()
     return {word[1] for word in words if len(word) == 3 and word[0].startswith("(")}

@@ -1,8 +1,9 @@
-"""Tables of a test rig: rows of steady states, read as what the estimator and the diagnosis work with.
+"""Tables of a test rig: rows of steady states, read as windows for the estimator and the diagnosis.
 
-A table holds slip, not speeds.  So the wheel turns at a rim speed of our own choice and the
-ground speed follows from the slip: all of the slip's error is in the ground speed.  Nothing
-that depends on the true speed can be identified then; see `candidates`.
+    rim speed v_r = constant,    ground speed v = v_r (1 - slip),    var(v) = v_r^2 var(slip)
+
+A table holds slip, not speeds, so the rim speed is chosen and the whole error of the slip is in the ground speed.
+Effects that depend on the true speed cannot be identified from such a table; `candidates` leaves them out.
 """
 
 from __future__ import annotations
@@ -38,15 +39,18 @@ from soilbus.words import one_line
 
 Columns = Mapping[str, Sequence[Any]]
 
-ROW = 1.0
-"""Time [s] from one row to the next where the table has none."""
-RIM_SPEED = 100.0
-"""Rim speed of the stand-in, in units of the least speed at which slip is judged: no slip is a standstill."""
-MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
+ROW_PERIOD = 1.0
+"""Time [s] from one row to the next where the table has no times."""
+RIM_SPEED_RATIO = 100.0
+"""Rim speed of the stand-in over the least speed at which slip is judged, so that no slip counts as a standstill."""
+MISSING_CELLS = frozenset({"", "nan", "na", "n/a", "null", "none"})
 """Texts, in small letters, of a cell without a value."""
 OF_TRUE_SPEED = frozenset({"rate_stiffening", "inertia"})
+"""Effects that depend on the true speed, which a table does not hold."""
 OF_TIME = frozenset({"torque_lag", "channel_lag", "soil_drift", "grade"})
+"""Effects that depend on time."""
 OF_SEVERAL_WHEELS = frozenset({"multipass"})
+"""Effects that need another wheel."""
 
 
 class TableError(LogError):
@@ -63,11 +67,24 @@ class Run:
 
 
 def runs_of(config: Config, path: Path) -> list[Run]:
-    """The runs of a CSV or Parquet file in the order of their first rows.
+    """The runs of a CSV or Parquet file, in the order of their first rows.
 
-    A cell that is empty or says so (nan, NA, null) is missing; without a load or a slip a
-    row is left out, and counted.  TableError for a file that cannot be read, a column that
-    is not there, a cell that is no number, or where no row is left.
+    Parameters
+    ----------
+    config
+        Its [table] maps the columns.
+    path
+        The file.
+
+    Returns
+    -------
+    One run for each soil bed. A cell that is empty or says nan, NA or null is missing; a row without load or slip is
+    left out and counted.
+
+    Raises
+    ------
+    TableError
+        The file cannot be read, a column is missing, a cell is no number, or no row is left.
     """
     table = config.table
     if table is None:
@@ -141,10 +158,10 @@ def recordings_of_tables(config: Config, paths: Sequence[Path]) -> Recordings:
 
 
 def candidates(config: Config, records: Sequence[Record]) -> list[Effect]:
-    """The effects that a table can tell, and the wheel can have, with priors for one of this size and load.
+    """The effects that a table can identify and the wheel can have, with priors for a wheel of this size and load.
 
-    Not those of the true speed, of other wheels, nor, without a column of times, those
-    that run along with time: the order of rows is that of slip or load as often as not.
+    Effects of the true speed and of other wheels are left out; without a column of times those of time are too, because
+    rows are often ordered by slip or load.
     """
     unknown = OF_TRUE_SPEED | OF_SEVERAL_WHEELS
     if config.table is None or config.table.t is None:
@@ -156,7 +173,7 @@ def candidates(config: Config, records: Sequence[Record]) -> list[Effect]:
 
 def _run(name: str, values: Mapping[str, Array], rig: Rig, config: Config) -> Run:
     n = len(values["slip"])
-    t = np.asarray(values.get("t", np.arange(n) * ROW), np.float64)
+    t = np.asarray(values.get("t", np.arange(n) * ROW_PERIOD), np.float64)
     load, slip = values["wheel_load"], values["slip"]
     with np.errstate(invalid="ignore"):
         faults = {
@@ -170,15 +187,24 @@ def _run(name: str, values: Mapping[str, Array], rig: Rig, config: Config) -> Ru
     kept = np.flatnonzero([not reason for reason in reasons])
     kept = kept[np.argsort(t[kept], kind="stable")]
     rejected = Counter(reason for reason in reasons if reason)
-    rim_speed = RIM_SPEED * config.estimator.min_speed
+    rim_speed = RIM_SPEED_RATIO * config.estimator.min_speed
     window = window_of_rows(rig, t[kept], {role: v[kept] for role, v in values.items()}, rim_speed)
     return Run(name, window, dict(sorted(rejected.items())))
 
 
 def window_of_rows(rig: Rig, t: Array, values: Mapping[str, Array], rim_speed: float = 1.0) -> Window:
-    """A window of rows at times t [s] (N,) with quantities (N,) by the roles of a table, in SI; nan is missing.
+    """A window of rows.
 
-    The wheel turns at rim_speed [m/s] exactly, and the ground speed has the slip's variance.
+    Parameters
+    ----------
+    rig
+        One wheel.
+    t
+        Times [s] (N,).
+    values
+        Quantities (N,) in SI by the roles of a table; nan is missing.
+    rim_speed
+        Rim speed of the stand-in [m/s], exact; the ground speed gets the slip's variance.
     """
     wheel, slip, noise = rig.wheels[0], values["slip"], rig.noise["ground_speed"]
     samples = {
@@ -271,7 +297,7 @@ def _numbers(path: Path, columns: Columns, column: Column, rows: Sequence[int]) 
 
 
 def _number(path: Path, column: str, row: int, cell: Any) -> float:
-    if cell is None or str(cell).strip().lower() in MISSING:
+    if cell is None or str(cell).strip().lower() in MISSING_CELLS:
         return math.nan
     try:
         value = math.inf if isinstance(cell, bool) else float(cell)

@@ -1,4 +1,8 @@
-"""Why windows did not give a valid estimate, and what to do about it, in words computed from the data."""
+"""Advice: why windows gave no valid estimate, and what to do about it, in one line with figures of the data.
+
+A status and reason is a sentence; where the load varied too little, the sentence gives the mean and the standard
+deviation of draft and slip within a window, beside those of the valid windows.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,19 @@ DIAGNOSE = "record it and run soilbus diagnose"
 
 
 def advice(windows: Sequence[WindowResult], valid: Sequence[WindowResult]) -> str | None:
-    """One line for windows of one status and reason, beside the valid ones; None where there is nothing to say."""
+    """One line on windows of one status and reason.
+
+    Parameters
+    ----------
+    windows
+        Windows that all have this status and reason.
+    valid
+        The valid windows of the same run, to compare with.
+
+    Returns
+    -------
+    The line; None where nothing is to be done.
+    """
     kind, *names = windows[0].reason.split()
     what = ", ".join(names)
     match kind:
@@ -42,7 +58,7 @@ def advice(windows: Sequence[WindowResult], valid: Sequence[WindowResult]) -> st
 
 
 def _vary(windows: Sequence[WindowResult], valid: Sequence[WindowResult]) -> str:
-    """What moved too little in these windows, beside the valid ones."""
+    """What varied too little in these windows, beside the valid ones."""
     here, there = _draft(windows), _draft(valid)
     if here is None or there is None:
         return f"vary the load more: {_moved(windows)}"

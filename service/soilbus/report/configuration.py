@@ -1,4 +1,8 @@
-"""What `soilbus check` prints: mapped signals, what they can tell, settings in force."""
+"""What `soilbus check` prints: mapped signals, what these sensors determine of the soil, settings in force.
+
+Three tables: one row for each mapped signal (unit, factor, range, cycle time), one line for each soil parameter, one
+line for each setting. With a recording a fourth one compares each signal with what was received.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +24,13 @@ from soilbus.sensors.survey import Seen, Survey
 
 
 def configuration_report(config: Config) -> str:
-    """The whole report as text; ConfigError lists every fault."""
+    """The whole report.
+
+    Raises
+    ------
+    ConfigError
+        With one line for each fault.
+    """
     effects_and_parameters_of(config)
     if config.table is not None:
         columns = [(role, c.column, f"{c.factor:g}") for role, c in config.table.columns.items()]
@@ -36,7 +46,7 @@ def configuration_report(config: Config) -> str:
 
 
 def configuration_warnings(config: Config) -> list[str]:
-    """Lines on what is assumed, or cannot be estimated, for want of a word in the configuration."""
+    """Lines on what is assumed, or cannot be estimated, because the configuration does not say it."""
     lines = []
     quantities = [q for q in _measured(config) if q not in config.noise.model_fields_set]
     if "noise" not in config.model_fields_set:
@@ -51,13 +61,13 @@ def configuration_warnings(config: Config) -> list[str]:
     elif config.table is None and config.signals.ground_speed is None:
         lines.append("signals.ground_speed is not mapped: without slip nothing can be estimated")
     c = config.soil.c
-    if 0.0 < c.value < LEAST_COHESION and c.std > 0.0:
+    if 0.0 < c.value < MIN_COHESION and c.std > 0.0:
         lines.append(f"soil.c.value = {c.value:g} Pa is next to nothing; is it in kPa?")
     return lines
 
 
-LEAST_COHESION = 70.0
-"""Pa: the stiffest clay of Wong's table has 69 kPa, the loosest sand 1 kPa."""
+MIN_COHESION = 70.0
+"""Cohesion [Pa] below which kPa were probably meant: Wong's table has 69 kPa for stiff clay, 1 kPa for loose sand."""
 
 
 def _measured(config: Config) -> Iterator[str]:
@@ -73,7 +83,7 @@ def _measured(config: Config) -> Iterator[str]:
 
 
 def survey_report(found: Survey) -> str:
-    """What was heard of every mapped signal, and what the recording cannot show."""
+    """Received values of every mapped signal beside the configuration, and what the recording cannot show."""
     rows = [_heard_row(seen, found) for seen in found.seen]
     text = "\n" + table(("role", "values", "every", "from", "to", "refused", "beside the configuration"), rows)
     return text + "".join(f"cannot be decided: {line}\n" for line in found.open)
@@ -102,7 +112,7 @@ def _report(config: Config, parts: list[str]) -> str:
         parts.append("\nEffects in the model:\n" + "".join(f"{line}\n" for line in effects))
     parts.append("\nWhat is assumed of the soil before any data:\n" + prior_text(config) + "\n")
     parts.append("\nSettings in force (defaults included):\n" + defaults_text(config) + "\n")
-    return "\n".join(parts[:1]) + "\nWhat these sensors can tell of the soil:\n" + "".join(parts[1:])
+    return "\n".join(parts[:1]) + "\nWhat these sensors determine of the soil:\n" + "".join(parts[1:])
 
 
 def defaults_text(config: Config) -> str:
@@ -164,11 +174,16 @@ def _row(channel: Channel, database: Database, unit_assumed: bool, checked: bool
 
 
 def identifiable(config: Config) -> list[tuple[str, str]]:
-    """(parameter, verdict) for each soil parameter: determined by which sensors, or why not."""
+    """For each soil parameter which sensors determine it, or why none does.
+
+    Returns
+    -------
+    Pairs of parameter name and verdict.
+    """
     rig = rig_of(config)
     held = {name for name, prior in config.soil_prior.items() if prior.std == 0.0}
     if config.table is not None:
-        verdicts = _told_by(config.table)
+        verdicts = _verdicts_of_table(config.table)
     elif not rig.wheels or config.signals.ground_speed is None:
         verdicts = dict.fromkeys(config.soil_prior, "no: needs torque, speed and load of a wheel and a ground speed")
     else:
@@ -176,7 +191,7 @@ def identifiable(config: Config) -> list[tuple[str, str]]:
         widths = len({float(b) for b in rig.width}) > 1
         sinkage = any(w.sinkage for w in config.wheel if w.name in rig.wheels)
         both = "yes: torque and draft over varied load and slip"
-        alone = "weakly: torque alone; a draft signal would tell more"
+        alone = "weakly: torque alone; a draft signal would help"
         verdicts = {
             "k_c": "weakly: two tyre widths" if widths else "no: needs two tyre widths (prior kept)",
             "k_phi": (both if draft else alone) + (", and sinkage" if sinkage else ""),
@@ -188,10 +203,10 @@ def identifiable(config: Config) -> list[tuple[str, str]]:
     return [(name, "held by the configuration" if name in held else text) for name, text in verdicts.items()]
 
 
-def _told_by(columns: Table) -> dict[str, str]:
-    """What the columns of a test rig tell of each soil parameter."""
+def _verdicts_of_table(columns: Table) -> dict[str, str]:
+    """What the columns of a test rig determine of each soil parameter."""
     forces = " and ".join(role.replace("_", " ") for role in ("torque", "drawbar_pull") if role in columns.columns)
-    depth = "yes: sinkage over varied load" if columns.sinkage else f"weakly: {forces} alone; sinkage would tell more"
+    depth = "yes: sinkage over varied load" if columns.sinkage else f"weakly: {forces} alone; sinkage would help"
     strength = f"{forces} over varied" if forces else "no: needs torque or drawbar pull (prior kept)"
     return {
         "k_c": "no: needs two tyre widths (prior kept)",

@@ -1,6 +1,7 @@
-"""A live terminal dashboard that knows the tractor only by our frames, as any dashboard ECU would.
+"""A live terminal dashboard that reads only our frames, as any dashboard ECU would.
 
-Grey is what soilbus guesses but does not vouch for (Status other than valid); - is what nobody knows.
+Grey figures have a Status other than valid: they are guesses that must not be acted on. "-" is a value that is not
+available or too old.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from rich.text import Text
 from soilbus.can.bus import LiveBus, open_bus
 from soilbus.can.dbc_files import filters_of, output_database
 from soilbus.config.model import Config
-from soilbus.report.received_frames import Readings
+from soilbus.report.received_frames import ReceivedFrames
 
 COLOURS = {"go": "green", "caution": "yellow", "no_go": "red", "unknown": "white"}
 PARAMETERS = {
@@ -30,10 +31,10 @@ PARAMETERS = {
     "K": ("SoilShearModulus", "mm"),
 }
 LIMITS = {
-    # what: messages of draft and of slope
     "on the level": ("DraftCapability", "GradeCapability"),
     "here and now": ("TractionLimits", "TractionLimits"),
 }
+"""Messages of draft and of slope, by what they hold for."""
 ADVICE = {"efficiency": "SlipForEfficiency", "pull": "SlipForPull"}
 FAULTS_OF_BUS = {
     "Overruns": "overruns",
@@ -43,13 +44,22 @@ FAULTS_OF_BUS = {
     "Reopened": "reopened",
 }
 WIDTH = 78
+"""Characters of the dashboard."""
 
 
-def panel(known: Readings, fault: str = "") -> Panel:
-    """What a driver sees; `fault` is what keeps the bus away."""
-    way = str(known.value("Traversability", "State"))
-    way = way if way in COLOURS else "unknown"
-    head = Text(f" {way.upper().replace('_', '-')} ", style=f"bold black on {COLOURS[way]}")
+def panel(known: ReceivedFrames, fault: str = "") -> Panel:
+    """The dashboard's picture.
+
+    Parameters
+    ----------
+    known
+        The received frames.
+    fault
+        Why the bus is away; empty while it is there.
+    """
+    decision = str(known.value("Traversability", "State"))
+    decision = decision if decision in COLOURS else "unknown"
+    head = Text(f" {decision.upper().replace('_', '-')} ", style=f"bold black on {COLOURS[decision]}")
     ground, task = (Table.grid(padding=(0, 4)) for _ in range(2))
     ground.add_row(_soil(known), _wheels(known))
     task.add_row(_limits(known), _advice(known))
@@ -60,7 +70,7 @@ def panel(known: Readings, fault: str = "") -> Panel:
     return Panel(Group(*parts, ground, *last), title="soilbus", width=WIDTH)
 
 
-def _detail(known: Readings) -> Iterator[str]:
+def _detail(known: ReceivedFrames) -> Iterator[str]:
     """Of the verdict."""
     yield from _measured(known, "Traversability", "Probability", "p = {:.2f}")
     yield from _said(known, "Traversability", "LimitingCause", "limit: {}")
@@ -68,14 +78,14 @@ def _detail(known: Readings) -> Iterator[str]:
     yield from _measured(known, "Traversability", "SinceValid", "valid {:.1f} s ago")
 
 
-def _kind(known: Readings) -> Iterator[str]:
+def _kind(known: ReceivedFrames) -> Iterator[str]:
     yield from _said(known, "SoilClass", "Kind", "soil: {}")
     yield from _measured(known, "SoilClass", "Probability", "({:.2f})")
     yield from _measured(known, "SoilClass", "UnknownProbability", "none of the known {:.2f}")
 
 
-def _demand(known: Readings) -> Iterator[str]:
-    """What the present task asks for, and what comes of it."""
+def _demand(known: ReceivedFrames) -> Iterator[str]:
+    """Torque that the present demand needs, and the slip and sinkage predicted for it."""
     needed, there = (known.number("TorqueDemand", f"Torque{what}") for what in ("Required", "Available"))
     if needed is not None or there is not None:
         yield "torque {} of {} N m".format(*("-" if x is None else f"{x:.0f}" for x in (needed, there)))
@@ -83,7 +93,7 @@ def _demand(known: Readings) -> Iterator[str]:
     yield from _measured(known, "DemandForecast", "Sinkage", "sinkage {:.0f} mm")
 
 
-def _service(known: Readings) -> Iterator[str]:
+def _service(known: ReceivedFrames) -> Iterator[str]:
     version = [known.number("SoilbusIdentity", f"Version{part}") for part in ("Major", "Minor", "Patch")]
     if None not in version:
         yield "soilbus " + ".".join(f"{part:.0f}" for part in version)
@@ -94,7 +104,7 @@ def _service(known: Readings) -> Iterator[str]:
         yield f"bad frames {known.bad_frames}"
 
 
-def _bus(known: Readings) -> Iterator[str]:
+def _bus(known: ReceivedFrames) -> Iterator[str]:
     """How the bus does, by what the service counted on it."""
     yield from _said(known, "BusHealth", "BusState", "bus: {}")
     for signal, what in FAULTS_OF_BUS.items():
@@ -102,7 +112,7 @@ def _bus(known: Readings) -> Iterator[str]:
             yield f"{what} {count:.0f}"
 
 
-def _soil(known: Readings) -> Table:
+def _soil(known: ReceivedFrames) -> Table:
     soil = _table("soil", "value ± std", "unit")
     soil.add_row("bearing pressure", _pair(known, "SoilStrength", "BearingPressure"), "kPa")
     for name, (message, unit) in PARAMETERS.items():
@@ -111,14 +121,14 @@ def _soil(known: Readings) -> Table:
     return soil
 
 
-def _limits(known: Readings) -> Table:
+def _limits(known: ReceivedFrames) -> Table:
     limits = _table("largest", "draft, N", "slope, rad")
     for name, (of_draft, of_slope) in LIMITS.items():
         limits.add_row(name, _pair(known, of_draft, "MaxDraft"), _pair(known, of_slope, "MaxGrade"))
     return limits
 
 
-def _advice(known: Readings) -> Table:
+def _advice(known: ReceivedFrames) -> Table:
     advice = _table("best slip for", "front", "rear")
     for name, signal in ADVICE.items():
         axles = [_one(known, "TractionAdvice", f"{signal}{axle}", "{:.2f}") for axle in ("Front", "Rear")]
@@ -126,8 +136,8 @@ def _advice(known: Readings) -> Table:
     return advice
 
 
-def _wheels(known: Readings) -> Table:
-    """Wheels 5 to 8 where there are that many."""
+def _wheels(known: ReceivedFrames) -> Table:
+    """One row for each wheel; wheels 5 to 8 only where they have a value."""
     wheels = _table("wheel", "slip", "sinkage, mm")
     for i in range(1, 9):
         more = "2" if i > 4 else ""
@@ -138,7 +148,7 @@ def _wheels(known: Readings) -> Table:
     return wheels
 
 
-def _warning(known: Readings) -> Text:
+def _warning(known: ReceivedFrames) -> Text:
     if known.value("DemandForecast", "Warning") != "immobilisation":
         return Text("")
     left = "".join(_measured(known, "DemandForecast", "TimeLeft", " in {:.0f} s"))
@@ -152,26 +162,26 @@ def _table(*titles: str) -> Table:
     return table
 
 
-def _said(known: Readings, message: str, signal: str, form: str) -> Iterator[str]:
+def _said(known: ReceivedFrames, message: str, signal: str, form: str) -> Iterator[str]:
     """A named value in words, nothing where it is not known."""
     value = known.value(message, signal)
     if value is not None and value != "none":
         yield form.format(value)
 
 
-def _measured(known: Readings, message: str, signal: str, form: str) -> Iterator[str]:
+def _measured(known: ReceivedFrames, message: str, signal: str, form: str) -> Iterator[str]:
     """A number in words, nothing where it is not known."""
     value = known.number(message, signal)
     if value is not None:
         yield form.format(value)
 
 
-def _one(known: Readings, message: str, signal: str, form: str) -> Text:
+def _one(known: ReceivedFrames, message: str, signal: str, form: str) -> Text:
     value = known.number(message, signal)
     return Text("-" if value is None else form.format(value), style="" if known.is_valid(message) else "dim")
 
 
-def _pair(known: Readings, message: str, signal: str, std: str | None = None) -> Text:
+def _pair(known: ReceivedFrames, message: str, signal: str, std: str | None = None) -> Text:
     value, spread = known.number(message, signal), known.number(message, std or f"{signal}Std")
     figure = "-" if value is None or spread is None else f"{_figures(value, spread)}"
     return Text(figure, style="" if known.is_valid(message) else "dim")
@@ -184,25 +194,42 @@ def _figures(value: float, spread: float) -> str:
 
 
 def watch(config: Config, seconds: float | None = None) -> None:
-    """Show the dashboard of the configured bus until interrupted, or for some seconds.
+    """Show the dashboard of the configured bus until interrupted or for some seconds; wait for a bus that goes away.
 
-    A bus that goes away is waited for.  Raises BusError where it cannot be opened to begin with.
+    Raises
+    ------
+    BusError
+        The bus cannot be opened at the start.
     """
     database = output_database(config)
     settings, filters = config.bus.model_dump(), filters_of(database)
     with closing(LiveBus(lambda: open_bus(settings, filters), time.monotonic, time.sleep)) as bus:
         bus.open()
-        show(Readings(database), bus, Console(), until=None if seconds is None else time.monotonic() + seconds)
+        show(ReceivedFrames(database), bus, Console(), until=None if seconds is None else time.monotonic() + seconds)
 
 
 def show(
-    known: Readings,
+    known: ReceivedFrames,
     bus: LiveBus,
     console: Console,
     until: float | None = None,
     done: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Feed readings from a bus and redraw them five times a second until `until` (monotonic) or `done`."""
+    """Feed received frames from a bus and redraw five times a second.
+
+    Parameters
+    ----------
+    known
+        Takes the frames.
+    bus
+        The open bus.
+    console
+        Where to draw.
+    until
+        Monotonic time [s] at which to stop; None for never.
+    done
+        Whether to stop, asked in every round.
+    """
     with Live(panel(known), console=console, auto_refresh=False, screen=False) as live:
         redraw = time.monotonic()
         while not done() and (until is None or time.monotonic() < until):

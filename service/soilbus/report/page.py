@@ -1,4 +1,7 @@
-"""What all our HTML pages share: the frame of a page, tables, pictures inside the file."""
+"""The frame that all HTML pages share: head and style, tables, pictures inside the file.
+
+A page needs nothing but itself: pictures are PNG in base64, no script and no font is loaded.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,15 @@ STYLE = (
 
 
 def page(title: str, heading: str, *parts: str) -> str:
-    """A page that needs nothing but itself; `parts` are HTML, title and heading are text."""
+    """One page.
+
+    Parameters
+    ----------
+    title, heading
+        Plain text.
+    parts
+        HTML.
+    """
     return (
         f"<!doctype html><html lang=en><meta charset=utf-8><title>{html.escape(title)}</title>"
         f"<style>{STYLE}</style><h1>{html.escape(heading)}</h1>{''.join(parts)}</html>\n"

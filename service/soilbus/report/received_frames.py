@@ -1,4 +1,10 @@
-"""What a dashboard ECU knows: the last good frame of each message of ours, and how old it is."""
+"""Received frames: the last good frame of each message, and whether it is fresh.
+
+    stale  if  age > 3 cycle times + 0.2 s
+
+The rules are those of dbc/README.md: a frame with a wrong checksum, a repeated counter or no layout counts as not
+received; a value outside the signal's range, not available or an error is None.
+"""
 
 from __future__ import annotations
 
@@ -17,12 +23,21 @@ from soilbus.can.inbox import checksum_byte_of
 from soilbus.can.wire import Received
 
 CYCLES_UNTIL_STALE = 3
-GRACE = 0.2
+"""Cycle times of the message after which its last frame is stale."""
+BUS_DELAY = 0.2
 """Time [s] beyond these cycles that a bus may take."""
 
 
-class Readings:
-    """The last good frame of each message, by the rules of dbc/README.md."""
+class ReceivedFrames:
+    """The last good frame of each message of a database.
+
+    Parameters
+    ----------
+    database
+        Our output DBC.
+    clock
+        Monotonic time [s].
+    """
 
     def __init__(self, database: Database, clock: Callable[[], float] = time.monotonic) -> None:
         self._messages = {m.frame_id: m for m in database.messages}
@@ -34,7 +49,7 @@ class Readings:
         self.bad_frames = 0
 
     def receive(self, message: Received | can.Message) -> None:
-        """Take one frame; a bad one (checksum, counter of the one before, not decodable) counts as not received."""
+        """Take one frame; a bad one (wrong checksum, repeated counter, not decodable) is counted and not used."""
         layout = self._messages.get(message.arbitration_id) if message.is_extended_id else None
         if layout is None or message.is_remote_frame or len(message.data) != layout.length:
             return
@@ -55,9 +70,14 @@ class Readings:
         self._seen[layout.name] = self._clock()
 
     def value(self, message: str, signal: str) -> float | str | None:
-        """A signal's value or name; None where the frame is stale, or the value not available or reserved."""
+        """A signal's value, or its name in the value table.
+
+        Returns
+        -------
+        None where the frame is stale, or the value not available, an error or reserved.
+        """
         age = self._clock() - self._seen.get(message, -1e9)
-        if age > CYCLES_UNTIL_STALE * self._cycle[message] + GRACE:
+        if age > CYCLES_UNTIL_STALE * self._cycle[message] + BUS_DELAY:
             return None
         value = self._values[message].get(signal)
         if isinstance(value, NamedSignalValue):

@@ -1,7 +1,6 @@
-"""Soil along the way as GeoJSON (RFC 7946): one point for each window, in the middle of its data.
+"""Soil along the route as GeoJSON (RFC 7946): one point for each window, in the middle of its data.
 
-Coordinates are WGS84 in degrees, longitude first.  Every property has its unit in its
-name; what is not known is null, never a nan.
+Coordinates are WGS84 in degrees, longitude first. Every property has its unit in its name; an unknown value is null.
 """
 
 from __future__ import annotations
@@ -17,8 +16,8 @@ from soilbus.estimation.posterior import Estimate
 from soilbus.pipeline.outputs import known
 from soilbus.pipeline.result import WindowResult
 
-DECIMALS = 7
-"""Of a degree: a centimetre."""
+DEGREE_DECIMALS = 7
+"""Decimals of a degree: the seventh is a centimetre."""
 
 
 def check_position_is_mapped(config: Config) -> None:
@@ -28,7 +27,12 @@ def check_position_is_mapped(config: Config) -> None:
 
 
 def soil_map(results: Iterable[WindowResult]) -> tuple[str, int]:
-    """A FeatureCollection as text, a feature a line, and how many windows have no position and are left out."""
+    """A FeatureCollection, one feature a line.
+
+    Returns
+    -------
+    The text, and the number of windows without a position, which it leaves out.
+    """
     features: list[str] = []
     left_out = 0
     for result in results:
@@ -42,7 +46,7 @@ def soil_map(results: Iterable[WindowResult]) -> tuple[str, int]:
 
 def _feature(result: WindowResult) -> dict[str, Any]:
     assert result.position is not None
-    latitude, longitude = (round(math.degrees(angle), DECIMALS) for angle in result.position)
+    latitude, longitude = (round(math.degrees(angle), DEGREE_DECIMALS) for angle in result.position)
     return {
         "type": "Feature",
         "id": result.index,
@@ -52,7 +56,7 @@ def _feature(result: WindowResult) -> dict[str, Any]:
 
 
 def _properties(result: WindowResult) -> dict[str, Any]:
-    way, parameters = result.traversability, {} if result.posterior is None else result.posterior.parameters()
+    decision, parameters = result.traversability, {} if result.posterior is None else result.posterior.parameters()
     likeliest = max(result.soil_class.items(), key=lambda item: item[1]) if result.soil_class else (None, None)
     return {
         "log": result.log,
@@ -65,10 +69,10 @@ def _properties(result: WindowResult) -> dict[str, Any]:
         **_value_std("phi", "deg", parameters.get("phi"), math.pi / 180.0),
         "soil_class": likeliest[0],
         "soil_class_probability": likeliest[1],
-        "state": str(way.state),
-        "probability": way.probability,
-        **_value_std("max_draft", "n", way.max_draft, 1.0),
-        "limit": way.limit,
+        "state": str(decision.state),
+        "probability": decision.probability,
+        **_value_std("max_draft", "n", decision.max_draft, 1.0),
+        "limit": decision.limit,
     }
 
 

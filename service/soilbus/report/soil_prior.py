@@ -1,4 +1,9 @@
-"""What the configuration takes for granted of the soil, beside the soils that are known."""
+"""The soil prior as a table: 95 % interval of each parameter, and the table's soils outside it.
+
+    low, high = median exp(-+1.96 log_std)
+
+A soil outside an interval is where a badly determined parameter would stay near the prior, with too small an sd.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +17,12 @@ from soilbus.report.table import table
 from soilbus.terra.soils import KINDS, SOILS
 
 SHOWN = {
-    # unit, and its value in SI
     "k_c": ("kN/m^(n+1)", 1e3), "k_phi": ("kN/m^(n+2)", 1e3), "n": ("", 1.0), "phi": ("deg", math.pi / 180.0),
     "c": ("kPa", 1e3), "K": ("mm", 1e-3),
 }  # fmt: skip
-MOST_NAMED = 3
+"""Unit of each parameter, and its value in SI."""
+MAX_SOILS_NAMED = 3
+"""Soils outside an interval that are named; the others are counted."""
 
 
 def prior_text(config: Config) -> str:
@@ -24,8 +30,8 @@ def prior_text(config: Config) -> str:
     head = ("parameter", "assumed", "95 % from", "to", "unit", "known soils outside")
     return (
         table(head, list(_rows(config)))
-        + "\nOn a soil outside, what the sensors tell badly stays near what is assumed, with a deviation too small; set"
-        "\n[soil] there.  Bearing pressure, drafts and slopes follow from what the sensors tell well."
+        + "\nOn a soil outside, a badly determined parameter stays near the prior, with a deviation too small; set"
+        "\n[soil] there.  Bearing pressure, drafts and slopes depend on what the sensors determine well."
     )
 
 
@@ -39,6 +45,6 @@ def _rows(config: Config) -> Iterator[tuple[str, ...]]:
             continue
         values = {kind: getattr(SOILS[kind], name) for kind in KINDS}
         outside = sorted((kind for kind, v in values.items() if not low <= v <= high), key=lambda kind: -values[kind])
-        named = ", ".join(f"{kind} ({values[kind] / size:.3g})" for kind in outside[:MOST_NAMED])
-        more = f" and {len(outside) - MOST_NAMED} more" if len(outside) > MOST_NAMED else ""
+        named = ", ".join(f"{kind} ({values[kind] / size:.3g})" for kind in outside[:MAX_SOILS_NAMED])
+        more = f" and {len(outside) - MAX_SOILS_NAMED} more" if len(outside) > MAX_SOILS_NAMED else ""
         yield name, f"{median / size:.3g}", f"{low / size:.3g}", f"{high / size:.3g}", unit, named + more or "none"

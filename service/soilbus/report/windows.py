@@ -1,4 +1,8 @@
-"""The windows of a replay as a short summary and as an HTML report."""
+"""Windows of a replay as a short summary and as an HTML report with plots over time.
+
+The summary counts windows by status and reason, with advice for each reason, then gives medians of the bearing
+pressure, decisions, failed solves, and samples used and refused.
+"""
 
 from __future__ import annotations
 
@@ -18,19 +22,39 @@ from soilbus.pipeline.result import WindowResult
 from soilbus.report.advice import advice, of_use
 from soilbus.report.page import html_table, page, picture
 
-SEAM = 5.0
-"""Room [s] between two recordings in a plot."""
+RECORDING_GAP = 5.0
+"""Space [s] between two recordings in a plot."""
 
 
 def summary(results: Sequence[WindowResult], pipeline: Pipeline) -> str:
-    """A few lines: windows by log and by status, why and what to do, soil, decisions, failed solves, samples."""
+    """Summary of a replay of logs.
+
+    Parameters
+    ----------
+    results
+        Every window.
+    pipeline
+        Counted frames and refusals while it made them.
+    """
     counts, refusals = pipeline.admission.counts, pipeline.intake.refusals
     heard = f"{sum(counts.received.values())} mapped frames ({counts.unknown} of other identifiers)"
     return summary_of(results, heard, refusals.used, refusals.total)
 
 
 def summary_of(results: Sequence[WindowResult], heard: str, used: int | None, refused: Counter[str]) -> str:
-    """The same of windows from anything that `heard` tells of, with samples used, and refused by reason."""
+    """Summary of windows from any source.
+
+    Parameters
+    ----------
+    results
+        Every window.
+    heard
+        What they were made from, such as "5000 mapped frames".
+    used
+        Samples used; None where that was not counted.
+    refused
+        Samples refused by reason.
+    """
     good = [r for r in results if r.status is Status.VALID]
     estimated = len(of_use(results)) - len(good)
     lines = [f"{len(results)} windows from {heard}"]
@@ -56,12 +80,20 @@ def summary_of(results: Sequence[WindowResult], heard: str, used: int | None, re
 
 
 def unused(results: Sequence[WindowResult]) -> int:
-    """How many windows say nothing of the soil."""
+    """Number of windows without an estimate of the soil."""
     return len(results) - len(of_use(results))
 
 
 def why_of_no_use(results: Sequence[WindowResult], window: float) -> str:
-    """One line on windows of which none is of use; `window` is their length [s]."""
+    """One line on windows of which none has an estimate.
+
+    Parameters
+    ----------
+    results
+        Every window.
+    window
+        Length of a window [s].
+    """
     if not results:
         return f"no window could be made: no recording lasts the {window:g} s of a window"
     (status, reason), group = _groups(results)[0]
@@ -97,7 +129,7 @@ def counted(counts: Counter[str]) -> str:
 
 
 def html_report(results: Sequence[WindowResult], text: str, logs: Sequence[Path]) -> str:
-    """A self-contained page with plots over time under a summary; needs matplotlib (extra: plots)."""
+    """A self-contained page: summary, plots over time, one row for each window; needs matplotlib (extra: plots)."""
     rows = [
         (
             r.log or "-",
@@ -134,7 +166,7 @@ def _plots(results: Sequence[WindowResult]) -> Any:
                 axis.axvline(begin, color="0.8", linewidth=0.8)
         if several:
             axes[0].annotate(stretch[0].log, (begin, 1.0), xycoords=("data", "axes fraction"), fontsize=7, rotation=20)
-        begin = stretch[-1].t + shift + SEAM
+        begin = stretch[-1].t + shift + RECORDING_GAP
     labels = ("bearing pressure, kPa", "friction angle, °", "max. draft, kN", "slip")
     for axis, label in zip(axes, labels, strict=True):
         axis.set_ylabel(label)

@@ -1,7 +1,9 @@
-"""Where on the earth the simulated tractor drives: along one straight line, or up and down field rows.
+"""Where on the earth the simulated tractor drives: along a straight line, or up and down the rows of a field.
 
-Only the receiver of positions knows of it.  The wheels do not feel the turns at the
-headland, and soils follow one another along the way driven, not across the field.
+    row number = distance // (row + pi spacing / 2),   a half circle of diameter `spacing` at each row's end
+
+Only the positions that the receiver reports depend on the course. The wheels do not feel the turns, and soils follow
+one another along the distance driven, not across the field.
 """
 
 from __future__ import annotations
@@ -18,9 +20,18 @@ from soilbus.terra.earth import moved
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """Start and heading (clockwise from north) [rad]; rows `row` [m] long, each `spacing` [m] right of the one before.
+    """A start, a heading and rows.
 
-    A row ends in a half circle into the next one.
+    Attributes
+    ----------
+    latitude, longitude
+        Start [rad].
+    heading
+        Of the first row [rad], clockwise from north.
+    row
+        Length of a row [m]; inf for a straight line.
+    spacing
+        Distance [m] of each row to the right of the one before.
     """
 
     latitude: float = math.radians(52.43)
@@ -30,7 +41,7 @@ class Course:
     spacing: float = 3.0
 
     def __post_init__(self) -> None:
-        """ValueError for a course that cannot be driven."""
+        """Raise ValueError for a course that cannot be driven."""
         if not (abs(self.latitude) <= math.radians(80.0) and abs(self.longitude) <= math.pi):
             raise ValueError("start: latitude must be within 80 degrees, longitude within 180")
         if not math.isfinite(self.heading):
@@ -40,7 +51,22 @@ class Course:
 
 
 def course(start: Sequence[float] | None = None, heading: float = 0.0, rows: Sequence[float] | None = None) -> Course:
-    """A course from degrees: start (latitude, longitude), heading, rows (length, spacing) [m]; ValueError as Course."""
+    """A course from degrees.
+
+    Parameters
+    ----------
+    start
+        Latitude and longitude [deg].
+    heading
+        [deg], clockwise from north.
+    rows
+        Length and spacing of the rows [m].
+
+    Raises
+    ------
+    ValueError
+        It cannot be driven.
+    """
     from_start = {} if start is None else dict(zip(("latitude", "longitude"), map(math.radians, start), strict=True))
     in_rows = {} if rows is None else dict(zip(("row", "spacing"), rows, strict=True))
     return Course(**from_start, heading=math.radians(heading), **in_rows)
@@ -51,7 +77,19 @@ NORTHWARD = Course()
 
 
 def positions(course: Course, distance: Array) -> tuple[Array, Array]:
-    """Latitudes and longitudes [rad] (N,) after driving these distances [m] (N,)."""
+    """Positions on a course.
+
+    Parameters
+    ----------
+    course
+        The course.
+    distance
+        Distance driven [m] (N,).
+
+    Returns
+    -------
+    Latitudes and longitudes [rad] (N,).
+    """
     ahead, right = _in_field(course, distance)
     sine, cosine = math.sin(course.heading), math.cos(course.heading)
     north, east = cosine * ahead - sine * right, sine * ahead + cosine * right

@@ -1,10 +1,11 @@
-"""The simulated tractor: what truly happens at every instant of a scenario.
+"""The simulated tractor: the true values of every quantity at every instant of a scenario.
 
-Quasi-static: at 50 samples a second, ground speed and its rate of change are given, and
-slip, draft, loads, sinkages and torques are those at which the wheel-soil model balances
-exactly.  Straight ahead: turning is not modelled, a side slope only shifts load.  Effects
-at the wheels and forces that no sensor sees take part in the balance; what effects do to
-sensors is the sensors' part.
+    sum of drawbar pulls = draft + m g sin(pitch) + m dv/dt + forces of effects
+    load of wheel i      = its vertical force
+
+Quasi-static at 50 samples a second: ground speed and its rate are given, and slip, draft, loads, sinkages and torques
+solve these balances with the wheel-soil model (simulator/equilibrium.py). Turning is not modelled; a side slope only
+shifts load. Effects on forces take part in the balance; effects on sensors belong to simulator/sensors.py.
 """
 
 from __future__ import annotations
@@ -33,13 +34,20 @@ class SimulationError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """Truth of a drive: columns (N,) by name, in SI.
+    """True values of a drive.
 
-    t, distance, ground_speed, acceleration, pitch, latitude, longitude [rad], draft, demand (nan
-    where slip was prescribed), soil (names); and for each wheel W slip.W, entry_angle.W, sinkage.W, load.W,
-    torque.W (at the wheel), drawbar_pull.W, speed.W [rad/s], torque_limit.W (nan: unknown).
-    The drive ends early, at `bogged_at` [s], where no slip lets the tractor go on.
-    `effects` are those it was driven with, `surroundings` what these may depend on (N, W).
+    Attributes
+    ----------
+    columns
+        By name, each (N,), in SI: t, distance, ground_speed, acceleration, pitch, latitude, longitude [rad], draft,
+        demand (nan where slip was prescribed), soil (names); and for each wheel W slip.W, entry_angle.W, sinkage.W,
+        load.W, torque.W (at the wheel), drawbar_pull.W, speed.W [rad/s], torque_limit.W (nan: unknown).
+    bogged_at
+        Time [s] at which no slip lets the tractor go on and the drive ends; None without.
+    effects
+        Effects that acted.
+    surroundings
+        What these may depend on (N, W).
     """
 
     columns: dict[str, NDArray[Any]]
@@ -58,11 +66,27 @@ class _Motion:
 
 
 def drive(config: Config, scenario: Scenario, seed: int, effects: Sequence[Active] = ()) -> Drive:
-    """Drive the configured vehicle through one realisation of the scenario.
+    """Drive the configured vehicle through one realisation of a scenario.
 
-    With the effects of config.model.effects and `effects` besides.  Raises SimulationError
-    without a vehicle and where the tractor cannot even start; KeyError for an unknown
-    soil; ConfigError for effects that cannot be.
+    Parameters
+    ----------
+    config
+        The vehicle, with the effects of config.model.effects.
+    scenario
+        Speed, soils, and draft or slip.
+    seed
+        Picks the realisation.
+    effects
+        Further effects.
+
+    Raises
+    ------
+    SimulationError
+        There is no vehicle, or it cannot even start.
+    KeyError
+        A soil is unknown.
+    ConfigError
+        An effect cannot be.
     """
     chassis = _chassis(config)
     present = (*effects_of(config), *effects)
@@ -76,7 +100,7 @@ def drive(config: Config, scenario: Scenario, seed: int, effects: Sequence[Activ
     rear = np.array([wheel.axle == "rear" for wheel in config.wheel])
     model = WheelModel(shear_law=config.model.shear_law)
     mechanics = Mechanics(model, rear, chassis.mass, scenario.duration, float(motion.distance[-1]), present)
-    result = solve(_held_back(situation, mechanics), mechanics)
+    result = solve(_with_resisting_effects(situation, mechanics), mechanics)
     stuck = np.flatnonzero(~result.found)
     end = int(stuck[0]) if len(stuck) else len(t)
     if end < 2:
@@ -92,8 +116,8 @@ def drive(config: Config, scenario: Scenario, seed: int, effects: Sequence[Activ
     )
 
 
-def _held_back(situation: Situation, mechanics: Mechanics) -> Situation:
-    """The situation with the forces of effects that hold the vehicle back, as if it pulled no draft."""
+def _with_resisting_effects(situation: Situation, mechanics: Mechanics) -> Situation:
+    """The situation with the forces of resisting effects added to the resistance, at zero draft."""
     resistance, nothing = situation.resistance, np.zeros(len(situation.t))
     around = surroundings(situation, mechanics, nothing, nothing)
     for effect, values in mechanics.effects:

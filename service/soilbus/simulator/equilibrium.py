@@ -1,14 +1,13 @@
-"""Slip, draft and entry angles at which the wheels carry and pull what they must.
+"""Equilibrium of the simulated vehicle: slip, draft and entry angles at which loads and pulls balance.
 
-At each instant the unknowns are the common slip s, the draft D and an entry angle for each
-wheel.  Wheel loads and the draft balance tie them together; a driver's rule closes the
-system: s is the smallest of the slips at which the demanded draft is met, the slip limit
-is reached (which may be passed as long as no draft at all is held), and a motor is at its
-torque limit.  Draft and torque grow with slip, so the smallest Newton step towards any of
-these is the step towards the one that holds.
+    for each wheel   W(theta_i, s + deviation_i) = level load_i + load per draft_i D
+    once             sum of DP(theta_i, s + deviation_i) = D + resistance
+    the driver       s = min(s where D meets the demand, slip limit, s where a motor is at its torque limit)
 
-Effects take part as they are, by differences in place of derivatives, and start from the
-equilibrium without them.
+Unknown at each instant are the common slip s, the draft D and an entry angle theta_i for each wheel. Newton's method
+solves the three conditions of the driver at once: draft and torque grow with slip, so the smallest of the three steps
+leads to the condition that holds. The slip limit may be passed as long as the draft would be below its least value.
+Effects take part by finite differences, starting from the equilibrium without effects.
 """
 
 from __future__ import annotations
@@ -36,22 +35,41 @@ from soilbus.terra.wheel import (
 MAX_SLIP = 0.95
 """Beyond this common slip the tractor counts as bogged down."""
 _MIN_SLIP = -0.5
-_TOLERANCE = 1e-10
-_MAX_STEPS = 60
-_DIFFERENCE = 1e-6  # relative; Newton's steps need not be exact
-_STRIDE = 10  # every tenth instant first: its neighbours then start next to their solution
+"""Least common slip: a wheel that is braked."""
+_RESIDUAL_TOLERANCE = 1e-10
+"""Residual over the vehicle's weight, plus step of slip, that ends the iteration."""
+_MAX_NEWTON_STEPS = 60
+_RELATIVE_DIFFERENCE = 1e-6
+"""Step of the finite differences; Newton's steps need not be exact."""
+_COARSE_STRIDE = 10
+"""Every tenth instant is solved first; its neighbours then start next to their solution."""
 
 
 class Situation(NamedTuple):
     """What is given at N instants for M wheels; all arrays end in N.
 
-    `t` [s], `distance` [m], `ground_speed` [m/s] and `acceleration` [m/s^2] (N,) are the
-    motion, `resistance` [N] (N,) is the pull that slope and inertia take, `level_load` [N] (M, N)
-    the wheel loads without draft, `load_per_draft` (M, N) their change with it,
-    `deviation` (M, N) each wheel's slip beyond the common one, `soil` (6, M, N) in the
-    order of wheel.Soil, `demand` [N] (N,) the draft asked for (inf: as much as goes),
-    `slip_limit` (N,), `torque_limit` [N m] (M, N), `least_draft` [N] (N,): below it the slip
-    limit gives way.
+    Attributes
+    ----------
+    t, distance, ground_speed, acceleration
+        Motion (N,) [s], [m], [m/s], [m/s^2].
+    resistance
+        Pull that slope and inertia take [N] (N,).
+    level_load, load_per_draft
+        Wheel loads without draft [N] (M, N), and their change with draft (M, N).
+    deviation
+        Each wheel's slip beyond the common one (M, N).
+    radius, width
+        Of the wheels [m] (M, N).
+    soil
+        Parameters (6, M, N) in the order of wheel.Soil.
+    demand
+        Draft asked for [N] (N,); inf for as much as possible.
+    slip_limit
+        (N,).
+    torque_limit
+        [N m] (M, N).
+    least_draft
+        Draft [N] (N,) below which the slip limit is passed.
     """
 
     t: Array
@@ -72,9 +90,14 @@ class Situation(NamedTuple):
 
 
 class Mechanics(NamedTuple):
-    """The wheel-soil model, effects on it, and what of the record they may depend on (see Surroundings).
+    """The wheel-soil model, effects on it, and what they may depend on (see Surroundings).
 
-    rear (M,) tells which wheels run in the rut of another; mass [kg], duration [s], length [m].
+    Attributes
+    ----------
+    rear
+        Which wheels run in the rut of another (M,).
+    mass, duration, length
+        Of the vehicle [kg], of the drive [s] and [m].
     """
 
     model: WheelModel
@@ -103,8 +126,19 @@ _Forces = Callable[[Situation, Array, Array, Array], _Slopes]
 
 
 class Equilibrium(NamedTuple):
-    """Common slip (N,), draft [N] (N,), entry angle [rad] (M, N), forces (3, M, N) by
-    wheel.FORCES, and whether an equilibrium was found (N,)."""
+    """Solution at N instants.
+
+    Attributes
+    ----------
+    slip, draft
+        Common slip and draft [N] (N,).
+    entry_angle
+        [rad] (M, N).
+    forces
+        (3, M, N) by wheel.FORCES.
+    found
+        Whether an equilibrium was found (N,).
+    """
 
     slip: Array
     draft: Array
@@ -114,9 +148,25 @@ class Equilibrium(NamedTuple):
 
 
 def solve(situation: Situation, mechanics: Mechanics) -> Equilibrium:
-    """The equilibrium at each instant, residuals below 1e-10 of the weight where found."""
+    """The equilibrium at each instant.
+
+    Parameters
+    ----------
+    situation
+        N instants of M wheels.
+    mechanics
+        Model and effects.
+
+    Returns
+    -------
+    Residuals are below 1e-10 of the vehicle's weight where `found`.
+
+    Notes
+    -----
+    Every tenth instant is solved first; the others start from values interpolated between them.
+    """
     n_instants = len(situation.demand)
-    coarse = np.unique(np.append(np.arange(0, n_instants, _STRIDE), n_instants - 1))
+    coarse = np.unique(np.append(np.arange(0, n_instants, _COARSE_STRIDE), n_instants - 1))
     knots = _from_scratch(_at(situation, coarse), mechanics)
     good = coarse[knots.found]
     if not len(good):
@@ -136,7 +186,19 @@ def solve(situation: Situation, mechanics: Mechanics) -> Equilibrium:
 
 
 def surroundings(situation: Situation, mechanics: Mechanics, slip: Array, draft: Array) -> Surroundings:
-    """What effects may depend on, instants first, at a common slip (N,) and draft [N] (N,)."""
+    """What effects may depend on.
+
+    Parameters
+    ----------
+    slip
+        Common slip (N,).
+    draft
+        [N] (N,).
+
+    Returns
+    -------
+    Arrays with instants first, (N, M) or (N, 1).
+    """
     column = slip + situation.deviation
     return Surroundings(
         t=situation.t[:, None],
@@ -154,7 +216,7 @@ def surroundings(situation: Situation, mechanics: Mechanics, slip: Array, draft:
 
 
 def sinkages(situation: Situation, mechanics: Mechanics, at: Equilibrium) -> Array:
-    """Sinkages [m] (M, N), of the circles that effects make of the wheels."""
+    """Sinkages [m] (M, N), for the wheel radii that effects leave."""
     state, around = (
         _transposed(situation, at.slip, at.entry_angle),
         surroundings(situation, mechanics, at.slip, at.draft),
@@ -217,11 +279,11 @@ def _by_differences(mechanics: Mechanics) -> _Forces:
 
     def slopes(situation: Situation, slip: Array, draft: Array, angle: Array) -> _Slopes:
         here = forces(situation, slip, draft, angle)
-        turn, pull = _DIFFERENCE * angle, _DIFFERENCE * situation.level_load.sum(axis=0)
+        turn, pull = _RELATIVE_DIFFERENCE * angle, _RELATIVE_DIFFERENCE * situation.level_load.sum(axis=0)
         return _Slopes(
             here,
             (forces(situation, slip, draft, angle + turn) - here) / turn,
-            (forces(situation, slip + _DIFFERENCE, draft, angle) - here) / _DIFFERENCE,
+            (forces(situation, slip + _RELATIVE_DIFFERENCE, draft, angle) - here) / _RELATIVE_DIFFERENCE,
             (forces(situation, slip, draft + pull, angle) - here) / pull,
         )
 
@@ -233,12 +295,12 @@ def _newton(situation: Situation, guess: tuple[Array, Array, Array], slopes: _Fo
     forces = np.empty((3, *angle.shape))
     found = np.zeros(len(slip), bool)
     todo = np.arange(len(slip))
-    for _ in range(_MAX_STEPS):
+    for _ in range(_MAX_NEWTON_STEPS):
         part = _at(situation, todo)
         at = slopes(part, slip[todo], draft[todo], angle[..., todo])
         step, miss = _step(part, slip[todo], draft[todo], at)
         forces[..., todo] = at.forces
-        at_rest = miss + np.abs(step[0]) < _TOLERANCE
+        at_rest = miss + np.abs(step[0]) < _RESIDUAL_TOLERANCE
         found[todo] = at_rest
         todo, d_slip, d_draft, d_angle = todo[~at_rest], *(a[..., ~at_rest] for a in step)
         if not len(todo):

@@ -1,4 +1,10 @@
-"""Sensor series -> CAN frames of the vehicle's own DBC, to a log or a bus."""
+"""Simulated sensor series -> CAN frames of the vehicle's own DBC, to a log or a bus.
+
+    raw code = round((value - offset) / scale),    stamp = start + sample time + phase of the message + jitter
+
+Each message is sent at the rate of its fastest mapped channel. Its signals that nothing is mapped to are "not
+available", save those that follow from the drive. Frames of all messages come in the order of their stamps.
+"""
 
 from __future__ import annotations
 
@@ -26,10 +32,12 @@ from soilbus.files import placed
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.sensors import channel_rng
 
-START = 1_700_000_000.0
-"""Time stamp [s] of a recording's first instant: logs hold wall clock time."""
-_JITTER = 1e-3
-_PHASE = 0.9e-3
+START_TIME = 1_700_000_000.0
+"""Stamp [s, Unix] of a recording's first instant: logs hold wall clock time."""
+_MAX_JITTER = 1e-3
+"""Greatest jitter of a stamp [s]."""
+_PHASE_STEP = 0.9e-3
+"""Phase [s] between one message and the next, which begins again after _PHASES messages."""
 _PHASES = 12
 
 _WRITERS: dict[str, Callable[[Any], Any]] = {
@@ -44,15 +52,31 @@ Payload = NDArray[np.uint8]
 
 
 def frames(
-    recording: Recording, config: Config, database: Database | None = None, start: float = START
+    recording: Recording, config: Config, database: Database | None = None, start: float = START_TIME
 ) -> Iterator[can.Message]:
-    """The recording's frames in the order of their time stamps.
+    """The recording's frames in the order of their stamps.
 
-    Every message that carries a mapped channel is sent at the rate of its fastest channel,
-    each with a phase of its own and up to 1 ms of jitter; a slower channel repeats its last
-    value.  `database` defaults to the configured DBC files.  Signals that nothing is mapped
-    to are not available, save those that follow from the drive (see `_beside`).  Raises
-    ConfigError as `channels_of`, ValueError for a mapped message that cannot be encoded.
+    Parameters
+    ----------
+    recording
+        Sensor series.
+    config
+        Maps channels to messages.
+    database
+        DBC files of the configuration by default.
+    start
+        Stamp of the first instant [s].
+
+    Raises
+    ------
+    ConfigError
+        As `channels_of`.
+    ValueError
+        A mapped message cannot be encoded.
+
+    Notes
+    -----
+    Each message has a phase of its own and up to 1 ms of jitter; a slower channel of it repeats its last value.
     """
     database = database if database is not None else load_databases(config)
     times: list[Array] = []
@@ -61,9 +85,9 @@ def frames(
     for number, (name, channels) in enumerate(_by_message(channels_of(config, database)).items()):
         message = database.get_message_by_name(name)
         t, values = _sampled(recording, channels)
-        values |= _beside(recording, config.wheel, message, channels, t)
-        jitter = channel_rng(recording.seed, name).uniform(0.0, _JITTER, len(t))
-        times.append(start + t + _PHASE * (number % _PHASES) + jitter)
+        values |= _unmapped_signals(recording, config.wheel, message, channels, t)
+        jitter = channel_rng(recording.seed, name).uniform(0.0, _MAX_JITTER, len(t))
+        times.append(start + t + _PHASE_STEP * (number % _PHASES) + jitter)
         payloads.append(encoded(message, _raw_codes(message, channels, values, len(t))))
         messages.append(message)
     if times:
@@ -71,10 +95,14 @@ def frames(
 
 
 def write_log(messages: Iterable[can.Message], path: Path) -> None:
-    """Write a log in the format of the file's suffix (.log, .asc, .blf, .log.gz ...).
+    """Write a log in the format of the file's suffix (.log, .asc, .blf, .log.gz ...); it appears only when complete.
 
-    The file appears only when it is complete.  Raises ValueError for an unknown suffix,
-    OSError where it cannot be written.
+    Raises
+    ------
+    ValueError
+        The suffix is unknown.
+    OSError
+        The file cannot be written.
     """
     *_, kind, last = ("", "", *(suffix.lower() for suffix in path.suffixes))
     is_packed = last == ".gz"
@@ -103,9 +131,18 @@ def _write_by_name(messages: Iterable[can.Message], path: Path, suffix: str) -> 
 
 
 def encoded(message: Message, codes: Mapping[str, NDArray[np.int64]]) -> Payload:
-    """Payloads (N, length) from raw codes (N,) by signal name.
+    """Payloads from raw codes.
 
-    Bits of no signal are ones; Checksum, where the message has one, is computed last.
+    Parameters
+    ----------
+    message
+        Layout.
+    codes
+        Raw codes (N,) by signal name.
+
+    Returns
+    -------
+    Bytes (N, length). Bits of no signal are ones; Checksum, where the message has one, is computed last.
     """
     length = message.length
     n_frames = len(next(iter(codes.values())))
@@ -149,10 +186,10 @@ def _sampled(recording: Recording, channels: list[Channel]) -> tuple[Array, dict
     return t, values
 
 
-def _beside(
+def _unmapped_signals(
     recording: Recording, wheels: list[Wheel], message: Message, channels: list[Channel], t: Array
 ) -> dict[str, Array]:
-    """What a real vehicle sends beside the mapped signals, where the signal's name tells it."""
+    """Values of unmapped signals that follow from the drive, found by their names in the DBC."""
     truth, mapped = recording.truth, {channel.signal for channel in channels}
     gears = {wheel.name: wheel.gear_ratio for wheel in wheels}
     motor = next((c.wheel for c in channels if c.quantity == "torque"), None)

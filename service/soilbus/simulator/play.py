@@ -1,4 +1,4 @@
-"""A recording onto a bus in real time, or into a log."""
+"""Play a recording: onto a bus in real time, or into a log."""
 
 from __future__ import annotations
 
@@ -17,18 +17,22 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.words import did_you_mean
 
-_MEAN_SPEED = 1.4
+_ASSUMED_SPEED = 1.4
+"""Ground speed [m/s] by which time becomes distance: the middle of a scenario's default speeds."""
 
 
 def scenario_over(soils: Sequence[str], duration: float, course: Course = NORTHWARD) -> Scenario:
-    """The soils one after the other in equal parts of the time, with all the excitation they bear.
+    """A scenario over several soils, each for an equal part of the time, with slip swept from 0.05 to 0.40.
 
-    KeyError for a name that is not known.
+    Raises
+    ------
+    KeyError
+        A soil is unknown.
     """
     for name in soils:
         if name not in SOILS:
             raise KeyError(f"no soil is named {name}{did_you_mean(name, SOILS)}; known: {', '.join(SOILS)}")
-    length = duration * _MEAN_SPEED / len(soils)
+    length = duration * _ASSUMED_SPEED / len(soils)
     patches = tuple(Patch(i * length, name) for i, name in enumerate(soils))
     return Scenario(duration, patches, slip=Swing(0.05, 0.40), course=course)
 
@@ -36,8 +40,14 @@ def scenario_over(soils: Sequence[str], duration: float, course: Course = NORTHW
 def play(recording: Recording, config: Config, log: Path | None) -> None:
     """Write the recording's frames to a log, or send them to the configured bus in real time.
 
-    Raises BusError where the bus cannot be opened or goes away, OSError for a log that cannot be written, and
-    ValueError for a log format that is not known.
+    Raises
+    ------
+    BusError
+        The bus cannot be opened, or goes away.
+    OSError
+        The log cannot be written.
+    ValueError
+        The log's format is unknown.
     """
     messages = frames(recording, config)
     if log is not None:
@@ -58,7 +68,19 @@ def send_in_time(
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> None:
-    """Send messages spaced as their time stamps are, `speed` times as fast."""
+    """Send messages spaced as their stamps are.
+
+    Parameters
+    ----------
+    messages
+        In the order of their stamps.
+    send
+        Sends one.
+    speed
+        Seconds of the recording per second.
+    clock, sleep
+        Monotonic time [s] and waiting by it.
+    """
     first: float | None = None
     begin = clock()
     for message in messages:

@@ -1,4 +1,4 @@
-"""A simulated drive: the truth and what the sensors saw of it."""
+"""A recording: a simulated drive with its true values and what the sensors made of them."""
 
 from __future__ import annotations
 
@@ -20,9 +20,18 @@ __all__ = ["Recording", "simulate"]
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """Truth by column name (see drive.Drive) and noisy channels by channel name, all in SI.
+    """A simulated drive.
 
-    `bogged_at` [s] is when the tractor got stuck and the recording ends, None if it did not.
+    Attributes
+    ----------
+    truth
+        True values (N,) by column name, SI (see drive.Drive).
+    channels
+        Noisy samples by channel name, SI.
+    seed
+        Of the realisation.
+    bogged_at
+        Time [s] at which the tractor got stuck and the recording ends; None where it did not.
     """
 
     truth: dict[str, NDArray[Any]]
@@ -32,10 +41,23 @@ class Recording:
 
 
 def simulate(config: Config, scenario: Scenario, seed: int, effects: Sequence[Active] = ()) -> Recording:
-    """Drive the configured vehicle through the scenario; the same seed gives the same recording.
+    """Drive the configured vehicle through a scenario and measure it; the same seed gives the same recording.
 
-    With the effects of config.model.effects and `effects` besides.  Raises SimulationError,
-    KeyError and ConfigError as `drive.drive`.
+    Parameters
+    ----------
+    config
+        The vehicle, with the effects of config.model.effects.
+    scenario
+        What to drive.
+    seed
+        Picks slips, loads, noise and gain errors.
+    effects
+        Further effects.
+
+    Raises
+    ------
+    SimulationError, KeyError, ConfigError
+        As `drive.drive`.
     """
     done = drive(config, scenario, seed, effects)
     return Recording(done.columns, measure(done, config, seed), seed, done.bogged_at)

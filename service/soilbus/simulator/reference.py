@@ -1,4 +1,4 @@
-"""Our reference tractor, for the demo and wherever no configuration is given."""
+"""Our reference tractor (tractor.toml): for the demo, and for commands without a configuration."""
 
 from __future__ import annotations
 

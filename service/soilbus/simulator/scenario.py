@@ -1,6 +1,8 @@
-"""What the simulated tractor is asked to do: soils along its way, speed, draft or slip.
+"""Scenarios: what the simulated tractor is asked to do. Soils along the route, speed, and draft or slip.
 
-A scenario is plain data; the seed given to the simulation picks one realisation of it.
+    swing(t) = base + gain sum_k sin(omega_k t + phi_k),   k = 1..4,  scaled into low..high
+
+A scenario is plain data; the seed of the simulation picks one realisation of its random waves.
 """
 
 from __future__ import annotations
@@ -31,17 +33,23 @@ __all__ = [
 ]
 
 SAMPLE_RATE = 50.0
-"""Samples of the truth a second [Hz]."""
+"""Samples of the true values a second [Hz]."""
 _N_SINES = 4
-_REFERENCE_TIME = 60.0  # s; a shorter scenario shows a part of such a wave, not a steeper one
+_REFERENCE_TIME = 60.0
+"""Time [s] in which a wave touches its bounds; a shorter scenario shows a part of the wave, not a steeper one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Swing:
-    """A quantity that wanders between low and high as a sum of slow sines.
+    """A quantity that moves between low and high as a sum of four slow sines.
 
-    Slow (0.05 to 0.12 Hz by default), so that what the tractor does between two samples
-    is nothing, and many states of the wheels are seen within one estimation window.
+    Attributes
+    ----------
+    low, high
+        Bounds, which it touches in a drive of a minute.
+    slowest, fastest
+        Frequencies [Hz]. By default 0.05 to 0.12: next to nothing happens between two samples, and one window of 10 s
+        still sees many states of the wheels.
     """
 
     low: float
@@ -72,7 +80,17 @@ class Wave(NamedTuple):
 
 
 def realise(swing: Swing | Profile, t: Array, rng: np.random.Generator) -> Wave:
-    """A random wave at the times t [s] (N,), ascending from 0; it never leaves low..high.  Profiles are as given."""
+    """A random wave.
+
+    Parameters
+    ----------
+    swing
+        Its bounds and frequencies, or given values, which are returned as they are.
+    t
+        Times [s] (N,), ascending from 0.
+    rng
+        Picks frequencies and phases.
+    """
     if isinstance(swing, Profile):
         value = np.interp(t, swing.t, swing.value)
         area = np.cumsum((value[1:] + value[:-1]) / 2.0 * np.diff(t))
@@ -114,14 +132,28 @@ class Patch:
 class Scenario:
     """One drive.
 
-    `speed` is the ground speed [m/s].  Exactly one of `draft` (what the implement asks for
-    [N]) and `slip` (common slip ratio of all wheels) is given.  With `draft`, the driver
-    lifts the implement as far as it takes to keep slip below `lift_slip`, and never pushes.
-    `slip_spread` is how far single wheels leave the common slip, `side_shift` the share of
-    an axle's load that a side slope moves to its left wheel (negative: to the right),
-    `slope` knots (distance [m], pitch [rad]) with straight lines between them,
-    `transition` the length [m] over which one soil turns into the next, `course` where on
-    the earth all this happens.
+    Attributes
+    ----------
+    duration
+        [s].
+    soils
+        Patches at ascending distances.
+    speed
+        Ground speed [m/s].
+    draft, slip
+        Exactly one is given: the draft that the implement asks for [N], or the common slip of all wheels.
+    lift_slip
+        With `draft`: the driver lifts the implement as far as needed to keep slip below this, and never pushes.
+    slip_spread
+        Greatest deviation of a single wheel from the common slip.
+    side_shift
+        Share of an axle's load that a side slope moves to its left wheel; negative to the right.
+    slope
+        Knots (distance [m], pitch [rad]), straight lines between them.
+    transition
+        Length [m] over which one soil turns into the next.
+    course
+        Where on the earth.
     """
 
     duration: float
@@ -137,7 +169,7 @@ class Scenario:
     course: Course = NORTHWARD
 
     def __post_init__(self) -> None:
-        """ValueError for a scenario that cannot be driven."""
+        """Raise ValueError for a scenario that cannot be driven."""
         starts = [patch.start for patch in self.soils]
         if not starts or starts != sorted(set(starts)):
             raise ValueError("soils: at least one, at ascending distances")
@@ -166,7 +198,7 @@ def soil_names(patches: Sequence[Patch], position: Array) -> list[str]:
 
 
 def excited(soil: str = "loam", duration: float = 120.0) -> Scenario:
-    """One soil, slip swept from 0.05 to 0.4: the drive that tells most of the soil."""
+    """One soil, slip swept from 0.05 to 0.4: the drive whose window determines the soil best."""
     return Scenario(duration, (Patch(0.0, soil),), slip=Swing(0.05, 0.40))
 
 

@@ -18,6 +18,15 @@ def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolera
     is tried first.  state.entry_angle is the first guess where it is finite and positive.
     A load that MAX_ENTRY_ANGLE does not carry (wheel buried), or that is not a positive
     number, gives nan.
+
+    Examples
+    --------
+    >>> from soilbus.terra.soils import soil_named
+    >>> from soilbus.terra.wheel import sinkage, state_on
+    >>> guess = state_on(soil_named("loam"), entry_angle=0.3, slip=0.1, radius=0.5, width=0.3)
+    >>> angle = entry_angle_for_load(6000.0, guess, WheelModel())
+    >>> round(1e3 * float(sinkage(angle, 0.5)))  # mm
+    45
     """
     load, *fields = (np.asarray(a, float) for a in np.broadcast_arrays(load, *state))
     shape = load.shape

@@ -57,7 +57,21 @@ UNKNOWN = "unknown"
 
 
 def soil_named(name: str) -> Soil:
-    """The soil of that name; KeyError with the known names otherwise."""
+    """The soil of that name.
+
+    Raises
+    ------
+    KeyError
+        With the known names, where it is none of them.
+
+    Examples
+    --------
+    >>> loam = soil_named("loam")
+    >>> loam.n
+    0.7
+    >>> round(loam.bearing_pressure(z_ref=0.02, b_ref=0.3) / 1e3)  # kPa
+    99
+    """
     if name not in SOILS:
         raise KeyError(f"no soil is named {name}; known: {', '.join(SOILS)}")
     return SOILS[name]

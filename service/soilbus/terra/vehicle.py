@@ -31,7 +31,15 @@ class Chassis:
 def slip_ratio(radius: Any, wheel_speed: Any, ground_speed: Any) -> Any:
     """1 - V/(r omega) (eq. 13 of Xi et al. 2024); nan where the wheel does not turn forward.
 
-    radius [m], wheel_speed [rad/s], ground_speed [m/s].
+    Parameters
+    ----------
+    radius, wheel_speed, ground_speed
+        r [m], omega [rad/s] and V [m/s], of shapes that broadcast.
+
+    Examples
+    --------
+    >>> round(float(slip_ratio(radius=0.5, wheel_speed=4.0, ground_speed=1.6)), 3)
+    0.2
     """
     rim = np.asarray(radius * wheel_speed, float)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -39,9 +47,20 @@ def slip_ratio(radius: Any, wheel_speed: Any, ground_speed: Any) -> Any:
 
 
 def pull_required(chassis: Chassis, draft: Any, pitch: Any, acceleration: Any) -> Any:
-    """Drawbar pull [N] that all wheels together must give: draft, slope and inertia.
+    """Drawbar pull [N] that all wheels together must give: draft + m (g sin(pitch) + dv/dt).
 
-    draft [N], pitch [rad], acceleration along the ground [m/s^2].
+    Parameters
+    ----------
+    chassis
+        Its mass counts.
+    draft, pitch, acceleration
+        [N], [rad] and along the ground [m/s^2], of shapes that broadcast.
+
+    Examples
+    --------
+    >>> tractor = Chassis(mass=2000.0, wheelbase=2.0, cg_ahead_of_rear_axle=0.9, cg_height=0.7, hitch_height=0.5)
+    >>> round(float(pull_required(tractor, draft=3000.0, pitch=0.05, acceleration=0.0)))
+    3980
     """
     return draft + chassis.mass * (GRAVITY * np.sin(pitch) + acceleration)
 

@@ -1,11 +1,13 @@
-"""The least error of any estimate of a window's soil, by the Cramér-Rao bounds of all soils that the window allows.
+"""Bayes-risk bound: the least error of any estimate of a window's soil, from posterior samples.
 
-At any one soil an estimate may be as good as one likes, by always saying this soil.  But an error in
-units of the bound of the soil that is the true one, squared and averaged over soils by any weights that do not
-depend on the window, is least for the mean of these soils by their posterior probability times
-the weight over the squared bound (Berger, Statistical Decision Theory and Bayesian Analysis, 1985,
-sect. 4.4.2).  And what no estimate goes below on average, none goes below on all these soils: the greatest of
-these averages is closest to what the best estimate must allow somewhere (ibid., sect. 5.3).
+    loss  L(x, theta) = (x - theta)^2 / b(theta)^2                      b: Cramer-Rao bound at theta
+    best  x* = E[theta w / b^2] / E[w / b^2],    w = b^(-p)             p: WEIGHT_POWERS
+    risk  E[w L(x*, theta)] / E[w]
+
+At one soil alone an estimate can be arbitrarily good, by always returning that soil. Averaged over soils with weights
+that do not depend on the window, the posterior mean above has the least risk (Berger, Statistical Decision Theory and
+Bayesian Analysis, 1985, sect. 4.4.2). What no estimate goes below on average, none goes below on all these soils, so
+the greatest of these averages is the bound (ibid., sect. 5.3).
 """
 
 from __future__ import annotations
@@ -16,19 +18,25 @@ import numpy as np
 
 from soilbus.arrays import Array
 
-TILTS = (-1.0, 0.0, 1.0, 2.0)
-"""Powers of the bound that soils are weighed down by: the greater, the more those count that are told well."""
-ALIKE = TILTS.index(0.0)
-FEW = 0.5
-"""Greatest weight that a few samples may have, squared and summed, for the error about their mean to be known."""
+WEIGHT_POWERS = (-1.0, 0.0, 1.0, 2.0)
+"""Powers p of the weights b^(-p): the greater, the more the soils with small Cramer-Rao bounds count."""
+UNWEIGHTED = WEIGHT_POWERS.index(0.0)
+"""Index of the power 0, at which all soils count alike."""
+MAX_SUM_OF_SQUARED_SHARES = 0.5
+"""Greatest sum of squared shares that the correction for few samples, 1 / (1 - sum), assumes."""
 
 
-class Attainable(NamedTuple):
-    """What a posterior's samples say of quantities (Q,), of which `effective` many are independent.
+class BayesRisk(NamedTuple):
+    """Bayes risk of one window for quantities (Q,).
 
-    error (Q,): of the estimate with the least mean square error in units of the bounds; risk and weight
-    (TILTS, Q): that error's mean square times the weight of the soils, and this weight, whose sums over windows
-    give the average.
+    Attributes
+    ----------
+    error
+        Error (Q,) of the estimate with the least mean square error in units of the bounds.
+    risk, weight
+        (WEIGHT_POWERS, Q): weighted mean square error and weight; the ratio of their sums over windows is the risk.
+    effective
+        Number of independent samples with the same information.
     """
 
     error: Array
@@ -37,14 +45,26 @@ class Attainable(NamedTuple):
     effective: float
 
 
-def attainable(value: Array, share: Array, bound: Array, truth: Array) -> Attainable:
-    """From samples' logarithms (M, Q), their shares (M,) of the probability and bounds (M, Q), and the truth (Q,)."""
+def bayes_risk(value: Array, share: Array, bound: Array, truth: Array) -> BayesRisk:
+    """Bayes risk from posterior samples.
+
+    Parameters
+    ----------
+    value
+        Logarithms (M, Q).
+    share
+        Posterior probabilities (M,).
+    bound
+        Cramer-Rao bounds at the samples (M, Q), as standard deviations.
+    truth
+        Logarithms (Q,).
+    """
     bound = np.where(bound > 0.0, bound, 1.0)  # of what is held
-    tilt = np.array(TILTS)[:, None, None]
+    tilt = np.array(WEIGHT_POWERS)[:, None, None]
     weight = share[:, None] * bound**-tilt
     counted = weight / bound**2
     part = counted / counted.sum(axis=1, keepdims=True)
     best = (part * value).sum(axis=1)
-    own = np.minimum((part**2).sum(axis=1), FEW)  # the mean is theirs, too
+    own = np.minimum((part**2).sum(axis=1), MAX_SUM_OF_SQUARED_SHARES)  # the mean is theirs, too
     risk = (counted * (value - best[:, None]) ** 2).sum(axis=1) / (1.0 - own)
-    return Attainable(best[ALIKE] - truth, risk, weight.sum(axis=1), float(1.0 / (share @ share)))
+    return BayesRisk(best[UNWEIGHTED] - truth, risk, weight.sum(axis=1), float(1.0 / (share @ share)))

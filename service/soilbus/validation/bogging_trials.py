@@ -1,4 +1,12 @@
-"""Simulated boggings and firm ground: how long before slip passes its limit soilbus warns, and how often in vain."""
+"""Trials of the immobilisation warning on simulated drives: how early it comes, and how often it is false.
+
+    lead = time at which slip passes its limit - time at which the last warning began
+
+A drive into trouble (validation/boggings.py) counts as predictable if MIN_LEAD_TIME + REACTION_TIME pass, or the
+distance that belongs to them is driven, between the first perceptible loss of draft and the moment when slip passes
+its limit. On firm ground
+(validation/firm_drives.py) every warning is false. Drives with even seeds are reported; thresholds are set on odd ones.
+"""
 
 from __future__ import annotations
 
@@ -22,22 +30,23 @@ from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import drive
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Swing
-from soilbus.validation.boggings import KINDS, Trouble, bogging
-from soilbus.validation.firm_drives import EASY, FIRM_DRIVE, FIRM_KINDS, HARD, firm_ground
+from soilbus.validation.boggings import KINDS, BoggingDrive, bogging
+from soilbus.validation.firm_drives import DRIVE_TIME, EASY, FIRM_KINDS, HARD, firm_ground
 from soilbus.validation.monte_carlo import Each
 from soilbus.validation.windows import task_of
 
 HALVES = ("report", "tune")
-LOOK = 0.1
-"""Time [s] between two looks, as in the service."""
-ENOUGH_TIME, ENOUGH_WAY = 3.0, 3.0
-"""Warning ahead that is enough: [s] or [m]."""
-REACTION = 1.0
-"""Time [s] without which no change is told from noise."""
-FELT = 0.05
-"""Loss, as a share of the largest draft, that slip and pull can tell from their noise."""
-EARLIEST = 5.0
-"""Slip that passes within this time [s] of the first window cannot be foreseen: no drive to judge by."""
+"""Drives by the parity of their seeds: even ones are reported, odd ones serve to set thresholds."""
+LOOK_PERIOD = 0.1
+"""Time [s] between two looks of the watch, as in the service."""
+MIN_LEAD_TIME, MIN_LEAD_DISTANCE = 3.0, 3.0
+"""Lead of a warning that is early enough: [s], or [m] for the second one."""
+REACTION_TIME = 1.0
+"""Time [s] that a change needs to rise out of the noise."""
+PERCEPTIBLE_DRAFT_LOSS = 0.05
+"""Loss, as a share of the largest draft, that slip and pull show above their noise."""
+MIN_DRIVE_TIME = 5.0
+"""Time [s] after the first window within which slip may pass with no time for a warning: no such drive counts."""
 
 
 class Task(NamedTuple):
@@ -50,40 +59,59 @@ class Task(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class WarningTrial:
-    """One drive: seconds watched, warnings begun before slip passed, and where it did the lead of the last one.
+    """One drive.
 
-    lead [s] and way [m] are nan where slip never passed, or at once (EARLIEST), and 0 where
-    it passed unwarned.  possible and possible_way are what went by from when the ground could be felt
-    to give way (FELT), or the first window, until slip passed: nobody can warn earlier.
+    Attributes
+    ----------
+    kind
+        Of boggings.KINDS or firm_drives.FIRM_KINDS.
+    seconds
+        Time watched [s].
+    warnings
+        Warnings begun before slip passed its limit.
+    lead, distance
+        Of the last warning [s], [m]; nan where slip never passed, or passed before MIN_DRIVE_TIME; 0 without a warning.
+    possible, possible_distance
+        Time [s] and distance [m] from the first perceptible loss of draft, or the first window, until slip passed.
     """
 
     kind: str
     seconds: float
     warnings: int
     lead: float
-    way: float
+    distance: float
     possible: float = np.inf
-    possible_way: float = np.inf
+    possible_distance: float = np.inf
 
     @property
     def in_time(self) -> bool:
         """Whether the warning was early enough."""
-        return self.lead >= ENOUGH_TIME or self.way >= ENOUGH_WAY
+        return self.lead >= MIN_LEAD_TIME or self.distance >= MIN_LEAD_DISTANCE
 
     @property
     def sudden(self) -> bool:
         """Whether slip passed too soon after the first sign for any warning to be early enough."""
-        speed = self.possible_way / self.possible if 0.0 < self.possible < np.inf else 0.0
-        return self.possible < ENOUGH_TIME + REACTION and self.possible_way < ENOUGH_WAY + REACTION * speed
+        speed = self.possible_distance / self.possible if 0.0 < self.possible < np.inf else 0.0
+        return (
+            self.possible < MIN_LEAD_TIME + REACTION_TIME
+            and self.possible_distance < MIN_LEAD_DISTANCE + REACTION_TIME * speed
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class WarningFigures:
-    """One kind.
+    """Figures of one kind.
 
-    Boggings: how many that could be foreseen in time, how many of these were, median and
-    least lead [s]; how many were too sudden, and the median delay [s] of their warnings behind
-    the first sign.  Firm ground: hours and false warnings.
+    Attributes
+    ----------
+    boggings, warned
+        Predictable boggings, and those warned of early enough.
+    lead, least
+        Median and least lead [s].
+    sudden, delay
+        Boggings that were too sudden, and the median delay [s] of their warnings behind the first perceptible loss.
+    hours, false
+        On firm ground: hours and false warnings.
     """
 
     kind: str
@@ -98,10 +126,20 @@ class WarningFigures:
 
 
 class Observation(NamedTuple):
-    """One drive as the watch sees it: moments, and pull over slip from the times [s] on at which it is known.
+    """One drive as the watch sees it.
 
-    end [s] is when slip passed its limit (passed) or the drive ended, felt [s] when the ground could first
-    be felt to give way; way is the distance [m] driven at times t [s] (both (N,)).
+    Attributes
+    ----------
+    moments
+        What the watch reads at each look.
+    curves
+        Times [s] from which on a curve of pull over slip is known, and the curve.
+    start, end
+        Of the watched time [s]; it ends when slip passes its limit (`passed`), or with the drive.
+    t, distance
+        Times [s] and distances driven [m] (N,).
+    felt
+        Time [s] of the first perceptible loss of draft.
     """
 
     moments: list[Moment]
@@ -110,21 +148,21 @@ class Observation(NamedTuple):
     end: float
     passed: bool
     t: Array
-    way: Array
+    distance: Array
     felt: float
 
 
 def trial(task: Task) -> WarningTrial:
-    """Drive, estimate every hop as the service does, and watch."""
+    """Simulate one drive, estimate every hop as the service does, and watch."""
     return judged(task.kind, observed(task))
 
 
 def observed(task: Task) -> Observation:
-    """Drive and estimate."""
+    """Simulate one drive and estimate every hop."""
     config, rig = task.config, rig_of(task.config)
     rng = np.random.default_rng([task.seed, 3])
     if task.kind in FIRM_KINDS:
-        trouble = Trouble(firm_ground(config, task.kind, rng))
+        trouble = BoggingDrive(firm_ground(config, task.kind, rng))
     else:
         trouble = bogging(config, task.kind, rng)
     recording = simulate(config, trouble.scenario, task.seed, trouble.effects)
@@ -133,15 +171,15 @@ def observed(task: Task) -> Observation:
     start = config.estimator.window
     passed = truth["t"][(slip > config.traversability.max_slip) & (truth["t"] > start)]
     end = float(passed[0]) if len(passed) else float(truth["t"][-1])
-    looks, curves = _looks(recording, config, end)
-    felt = _felt(task, trouble, end) if len(passed) else end
+    looks, curves = _moments_and_curves(recording, config, end)
+    felt = _first_perceptible(task, trouble, end) if len(passed) else end
     return Observation(
         looks, curves, start, end, len(passed) > 0, truth["t"], truth["distance"], felt
     )  # fmt: skip
 
 
-def _felt(task: Task, trouble: Trouble, end: float) -> float:
-    """From when on, until the end [s], the largest draft that the way truly holds is less by FELT than at the start.
+def _first_perceptible(task: Task, trouble: BoggingDrive, end: float) -> float:
+    """Time [s] of the first perceptible loss: the ground's largest draft has fallen by PERCEPTIBLE_DRAFT_LOSS for good.
 
     0 where it is not: then the demand is what grows.
     """
@@ -150,33 +188,36 @@ def _felt(task: Task, trouble: Trouble, end: float) -> float:
     truth = drive(task.config, even, task.seed, trouble.effects).columns
     mass = task.config.vehicle.mass if task.config.vehicle else 0.0
     held, t = truth["draft"] + mass * truth["acceleration"], truth["t"]
-    firm = t[(held >= (1.0 - FELT) * held[0]) & (t <= end)]
+    firm = t[(held >= (1.0 - PERCEPTIBLE_DRAFT_LOSS) * held[0]) & (t <= end)]
     return float(firm[-1]) if len(firm) and firm[-1] < t[t <= end][-1] else 0.0
 
 
-def judged(kind: str, seen: Observation) -> WarningTrial:
-    """What the watch makes of a drive."""
-    t, warned = watch(seen)
+def judged(kind: str, observation: Observation) -> WarningTrial:
+    """The trial's result from what the watch saw."""
+    t, warned = watch(observation)
     begins = t[1:][warned[1:] & ~warned[:-1]]
-    seconds = seen.end - seen.start
-    if not seen.passed or seconds <= EARLIEST:
+    seconds = observation.end - observation.start
+    if not observation.passed or seconds <= MIN_DRIVE_TIME:
         return WarningTrial(kind, seconds, len(begins), np.nan, np.nan)
-    lead = seen.end - float(begins[-1]) if len(begins) and warned[-1] else 0.0
-    possible = seen.end - min(max(seen.felt, seen.start), seen.end)
-    way, possible_way = (_way(seen, seen.end - s) for s in (lead, possible))
-    return WarningTrial(kind, seconds, len(begins), lead, way, possible, possible_way)
+    lead = observation.end - float(begins[-1]) if len(begins) and warned[-1] else 0.0
+    possible = observation.end - min(max(observation.felt, observation.start), observation.end)
+    distance, possible_distance = (_distance_since(observation, observation.end - s) for s in (lead, possible))
+    return WarningTrial(kind, seconds, len(begins), lead, distance, possible, possible_distance)
 
 
-def _way(seen: Observation, since: float) -> float:
+def _distance_since(observation: Observation, since: float) -> float:
     """Distance [m] driven from a time [s] until the end."""
-    return float(np.interp(seen.end, seen.t, seen.way) - np.interp(since, seen.t, seen.way))
+    return float(
+        np.interp(observation.end, observation.t, observation.distance)
+        - np.interp(since, observation.t, observation.distance)
+    )
 
 
-def watch(seen: Observation) -> tuple[Array, NDArray[np.bool_]]:
+def watch(observation: Observation) -> tuple[Array, NDArray[np.bool_]]:
     """Times [s] (N,) of the looks, and whether each warned."""
-    state, curve, curves, out = Watch(), None, iter(seen.curves), []
+    state, curve, curves, out = Watch(), None, iter(observation.curves), []
     due = next(curves, None)
-    for moment in seen.moments:
+    for moment in observation.moments:
         while due is not None and moment.t >= due[0]:
             curve, due = due[1], next(curves, None)
         state = watched(state, moment.t, moment.slip, moment.pull, curve, moment.inertia)
@@ -185,11 +226,13 @@ def watch(seen: Observation) -> tuple[Array, NDArray[np.bool_]]:
     return t, warned > 0.5
 
 
-def _looks(recording: Recording, config: Config, end: float) -> tuple[list[Moment], list[tuple[float, OverSlip]]]:
+def _moments_and_curves(
+    recording: Recording, config: Config, end: float
+) -> tuple[list[Moment], list[tuple[float, OverSlip]]]:
     """The moments until the end [s], and from their times on the curves of windows that the service calls valid."""
     rig, settings = rig_of(config), config.estimator
     estimator, no_limit = WindowEstimator(config), np.full(len(rig.radius), np.nan)
-    store = Bins(rig, LOOK, 0.0)
+    store = Bins(rig, LOOK_PERIOD, 0.0)
     store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
     curves = []
     for due in np.arange(settings.window, end, settings.hop).tolist():
@@ -209,14 +252,33 @@ def half_of(seed: int) -> str:
 def warning_trials(
     config: Config, boggings: int, hours: float, seed: int, each: Each = map, half: str = "report"
 ) -> tuple[WarningFigures, ...]:
-    """Figures of so many boggings, evenly of all kinds, and of so many hours without one, half of them hard.
+    """Figures of simulated boggings and of hours without one.
 
-    All drives are of one half (half_of).  The same seed gives the same drives.  Raises SimulationError where the
-    vehicle cannot be driven, ValueError for another half.
+    Parameters
+    ----------
+    config
+        The vehicle.
+    boggings
+        Number of drives into trouble, evenly of all kinds.
+    hours
+        Hours on firm ground, half of them on hard drives.
+    seed
+        The same seed gives the same drives.
+    each
+        The built-in map, or that of monte_carlo.processes.
+    half
+        The half of all drives that these belong to (half_of).
+
+    Raises
+    ------
+    SimulationError
+        The vehicle cannot be driven.
+    ValueError
+        Another half.
     """
     if half not in HALVES:
         raise ValueError(f"no half of the drives is called {half}; known: {', '.join(HALVES)}")
-    firm = math.ceil(3600.0 * hours / (FIRM_DRIVE - config.estimator.window))
+    firm = math.ceil(3600.0 * hours / (DRIVE_TIME - config.estimator.window))
     kinds = [KINDS[i % len(KINDS)] for i in range(boggings)] + [
         HARD[i // 2 % len(HARD)] if i % 2 else EASY for i in range(firm)
     ]
@@ -231,7 +293,7 @@ def warning_trials(
 
 
 def figures(kind: str, trials: Sequence[WarningTrial]) -> WarningFigures:
-    """The figures of some trials of one kind: boggings are those whose slip passed."""
+    """Figures of trials of one kind; those whose slip passed are boggings."""
     bogged = [t for t in trials if np.isfinite(t.lead)]
     asked = [t for t in bogged if not t.sudden]
     rest = [t for t in trials if t.kind in FIRM_KINDS]

@@ -1,15 +1,13 @@
-"""The Cramér-Rao bound of a window: how well its soil can be known at all.
+"""Cramer-Rao bound of a window: the least covariance of an unbiased estimate of its soil.
 
-What is measured: the readings (truth times one plus the sensor's gain error, plus noise);
-gain errors, once each, as zero with their std; and the free soil parameters, once each, as
-the prior's median with its spread (so a prior is a measurement like any other, and the bound
-holds where its median is off by as much as it says).  What is unknown: the logarithms of
-the free parameters, the gains, and at each instant the loads and speeds.  The bound is the
-part of the inverse information of all that, taken at the truth, that belongs to the soil:
-no unbiased estimator has a smaller covariance (Kay, Fundamentals of Statistical Signal
-Processing, vol. I, 1993, sect. 3.7).  A biased one may, for instance where the prior keeps
-a parameter from going astray; and where the window tells so little that the bound spans
-soils of which the truth is not typical, none may reach it.
+    I = J' R^-1 J + diag(1 / prior var),      cov(log soil) >= [I^-1] of the soil,      all at the true soil
+
+Measured are the samples (truth times one plus a gain error, plus noise); each gain error counts as one measurement of
+zero with its sd, each free soil parameter as one measurement by its prior. Unknown are the logarithms of the free
+parameters, the gains, and at each instant the loads and speeds, which are eliminated. No unbiased estimator has a
+smaller covariance (Kay, Fundamentals of Statistical Signal Processing, vol. I, 1993, sect. 3.7). A biased one may; and
+where a window leaves soils far from the true one possible, no estimator may reach the bound
+(validation/bayes_risk_bound.py).
 """
 
 from __future__ import annotations
@@ -26,11 +24,25 @@ _ROUNDS = 3
 
 
 def cramer_rao(noiseless: ObservationModel, prior: SoilPrior, soil: Soil) -> Posterior:
-    """The true soil with the least covariance of the logarithms that an unbiased estimate can have.
+    """The Cramer-Rao bound at a soil.
 
-    `noiseless` holds what perfect sensors would have read in the window, with the variances
-    of the real ones.  Only the spread of the prior counts, not its median.  Raises
-    numpy.linalg.LinAlgError where the information is not finite.
+    Parameters
+    ----------
+    noiseless
+        The window as perfect sensors would have measured it, with the variances of the real ones.
+    prior
+        Only its spread counts.
+    soil
+        The true soil.
+
+    Returns
+    -------
+    The true soil with the least covariance of the logarithms.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        The information is not finite.
     """
     no_gains = np.zeros(len(noiseless.gain_std))
     latents = noiseless.start(soil)

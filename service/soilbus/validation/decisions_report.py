@@ -1,4 +1,4 @@
-"""Figures of the decision beside their targets, a section for each question."""
+"""Report of `soilbus decisions`: figures of the decision beside their targets, a section for each question."""
 
 from __future__ import annotations
 
@@ -9,15 +9,23 @@ from typing import NamedTuple
 from scipy.special import gammaincinv
 
 from soilbus.report.table import table
-from soilbus.validation.bogging_trials import ENOUGH_TIME, ENOUGH_WAY, FELT, REACTION, WarningFigures
-from soilbus.validation.draft_trials import SPREAD, DraftFigures
+from soilbus.validation.bogging_trials import (
+    MIN_LEAD_DISTANCE,
+    MIN_LEAD_TIME,
+    PERCEPTIBLE_DRAFT_LOSS,
+    REACTION_TIME,
+    WarningFigures,
+)
+from soilbus.validation.draft_trials import SOIL_LOG_SD, DraftFigures
 from soilbus.validation.firm_drives import EASY, HARD
 from soilbus.validation.verdict_trials import Bin, Reliability
 
 SHARED = """The drives are simulated with the estimator's own wheel-soil model, noise and priors about the true soil:
 the figures show that numbers and intervals follow from the model, not that the model is the field's."""
 MAX_ERROR = 0.05
+"""Target of the median relative error of the largest draft."""
 COVERAGE = (0.90, 0.98)
+"""Target of the share of 95 % intervals that hold the truth."""
 
 
 def decisions_report(drafts: Sequence[DraftFigures], calls: Reliability, warnings: Sequence[WarningFigures]) -> str:
@@ -52,13 +60,15 @@ def _call_row(of_bin: Bin) -> tuple[str, ...]:
 
 
 def _warning_section(warnings: Sequence[WarningFigures]) -> Iterator[str]:
-    yield f"Warning of immobilisation at least {ENOUGH_TIME:g} s or {ENOUGH_WAY:g} m before slip passes its limit"
+    least = f"{MIN_LEAD_TIME:g} s or {MIN_LEAD_DISTANCE:g} m"
+    yield f"Warning of immobilisation at least {least} before slip passes its limit"
     yield ""
     boggings = [found for found in warnings if found.boggings or found.sudden]
     head = ("boggings", "foreseeable", "in time", "median lead", "least", "too sudden", "warned after")
     yield table(head, [_bogging_row(found) for found in boggings])
-    yield "Target: all that can be foreseen in time.  Too sudden: from where the ground has lost"
-    yield f"{100.0 * FELT:.0f} % of the largest draft, slip passes in less than that and {REACTION:g} s to react."
+    yield "Target: all that can be predicted in time.  Too sudden: from where the ground has lost"
+    lost = f"{100.0 * PERCEPTIBLE_DRAFT_LOSS:.0f} % of the largest draft"
+    yield f"{lost}, slip passes in less than that and {REACTION_TIME:g} s to react."
     yield ""
     firm = [found for found in warnings if found.hours]
     yield table(
@@ -96,7 +106,7 @@ def _pooled(firm: Sequence[WarningFigures]) -> dict[str, _Pooled]:
 
 
 def poisson_interval(count: int) -> tuple[float, float]:
-    """Exact 95 % interval of the expectation of a Poisson count (Garwood 1936, Biometrika 28:437)."""
+    """95 % interval of the expectation of a Poisson count (Garwood 1936, Biometrika 28:437)."""
     least = float(gammaincinv(count, 0.025)) if count else 0.0
     return least, float(gammaincinv(count + 1, 0.975))
 
@@ -114,12 +124,12 @@ def _seconds(value: float) -> str:
 
 def _draft_section(drafts: Sequence[DraftFigures]) -> Iterator[str]:
     low, high = (100.0 * share for share in COVERAGE)
-    yield "Largest draft on the level, foretold from one window"
+    yield "Largest draft on the level, predicted from one window"
     yield ""
     head = ("soil", "drives", "failed", "true", "|error|", "bias", "in 95 %")
     yield table(head, [_draft_row(of_soil) for of_soil in drafts])
     yield f"Medians; targets: error at most {100.0 * MAX_ERROR:.0f} %, {low:.0f} to {high:.0f} % of 95 % intervals hold"
-    yield f"the truth.  Each drive's soil leaves the named one by {100.0 * SPREAD:.0f} % in every parameter."
+    yield f"the truth.  Each drive's soil leaves the named one by {100.0 * SOIL_LOG_SD:.0f} % in every parameter."
 
 
 def _draft_row(of_soil: DraftFigures) -> tuple[str, ...]:

@@ -1,8 +1,9 @@
-"""Simulated drives: the largest draft foretold from one window, beside the one that the soil truly holds.
+"""Trials of the largest draft: predicted from one window, beside the true one, on simulated drives.
 
-Each drive has a soil of its own about one of a few, works at moderate slips, and is
-estimated from one window alone, cold.  The truth is solved by the simulator's own
-equilibrium, slip by slip.
+    relative error = predicted / true - 1,    covered if |predicted - true| < 1.96 std
+
+Each drive has a soil of its own near a named one, works at moderate slips, and is estimated from one window without
+any earlier one. The true largest draft is solved by the simulator's equilibrium at 50 slips.
 """
 
 from __future__ import annotations
@@ -29,15 +30,15 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import soil_named
 from soilbus.terra.vehicle import axle_loads
 from soilbus.terra.wheel import Soil, WheelModel, sinkage
-from soilbus.validation.monte_carlo import Each, missed
+from soilbus.validation.monte_carlo import Each, prior_about
 
 SOILS = ("rubicon_sandy_loam_43", "north_gower_clayey_loam_46", "upland_sandy_loam_51")
-SPREAD = 0.1
-"""Sd of the logarithms by which a drive's soil parameters leave those of the named soil."""
+SOIL_LOG_SD = 0.1
+"""Standard deviation of the logarithms of a drive's soil parameters about the named soil."""
 LOW_SLIP, HIGH_SLIP = (0.04, 0.10), (0.20, 0.40)
-"""Between which the lowest and the highest slip of a drive lie."""
-SLIPS = np.linspace(0.02, 1.0, 50)
-"""At which the truth is solved, in units of the greatest slip allowed."""
+"""Ranges of the lowest and of the highest slip of a drive."""
+SLIP_SHARES = np.linspace(0.02, 1.0, 50)
+"""Slips at which the true draft is solved, over the greatest slip allowed."""
 
 
 class Task(NamedTuple):
@@ -50,10 +51,10 @@ class Task(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class DraftTrial:
-    """Largest draft on the level [N]: foretold with its std, and true; nan where the fit failed."""
+    """Largest draft on the level [N]: predicted with its std, and true; nan where the fit failed."""
 
     soil: str
-    foretold: float
+    predicted: float
     std: float
     true: float
 
@@ -74,10 +75,27 @@ class DraftFigures:
 def draft_trials(
     config: Config, drives: int, seed: int, soils: Sequence[str] = SOILS, each: Each = map
 ) -> Iterator[DraftFigures]:
-    """Figures of each soil from so many drives, then of all soils; the same seed gives the same drives.
+    """Figures of each soil, then of all soils.
 
-    `each` is the built-in map or that of monte_carlo.processes.  Raises KeyError for an
-    unknown soil, SimulationError where the tractor cannot drive on one.
+    Parameters
+    ----------
+    config
+        The vehicle.
+    drives
+        Number on each soil.
+    seed
+        The same seed gives the same drives.
+    soils
+        Names of the table.
+    each
+        The built-in map, or that of monte_carlo.processes.
+
+    Raises
+    ------
+    KeyError
+        A soil is unknown.
+    SimulationError
+        The tractor cannot drive on one.
     """
     everything: list[DraftTrial] = []
     for name in soils:
@@ -89,17 +107,17 @@ def draft_trials(
 
 
 def trial(task: Task) -> DraftTrial:
-    """Simulate, estimate, foretell, and solve for the truth."""
+    """Simulate one drive, estimate, predict, and solve for the true draft."""
     config, name, seed = task
     rng = np.random.default_rng([seed, 2])
-    soil = Soil(*(np.asarray(soil_named(name)) * np.exp(SPREAD * rng.standard_normal(6))).tolist())
+    soil = Soil(*(np.asarray(soil_named(name)) * np.exp(SOIL_LOG_SD * rng.standard_normal(6))).tolist())
     slip = Swing(rng.uniform(*LOW_SLIP), rng.uniform(*HIGH_SLIP))
     duration = config.estimator.window
     recording = simulate(config, Scenario(duration, (Patch(0.0, name, soil),), slip=slip), seed)
     rig, model, settings = rig_of(config), model_of(config), config.traversability
     store = Bins(rig, config.estimator.bin, 0.0)
     store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
-    prior = missed(prior_of(config), soil, np.random.default_rng([seed, 1]))
+    prior = prior_about(prior_of(config), soil, np.random.default_rng([seed, 1]))
     fit = cold_fit(ObservationModel(store.window(0.0, duration), rig, model, config.estimator.min_speed), prior)
     limit = np.array([wheel.max_torque or np.nan for wheel in config.wheel])
     truth = true_largest_draft(soil, rig, limit, settings.max_slip, WheelModel(shear_law=config.model.shear_law))
@@ -114,14 +132,29 @@ def trial(task: Task) -> DraftTrial:
 def true_largest_draft(
     soil: Soil, rig: Rig, torque_limit: Array, max_slip: float, model: WheelModel, max_sinkage: float = np.inf
 ) -> float:
-    """Largest draft [N] held steadily on level ground at any slip up to max_slip; nan where there is none.
+    """Largest draft [N] held steadily on level ground; nan where there is none.
 
-    torque_limit (W,) [N m], nan where there is none; no wheel may sink below max_sinkage [m].
-    Raises ValueError for a rig without a chassis.
+    Parameters
+    ----------
+    soil, rig
+        Ground and vehicle.
+    torque_limit
+        (W,) [N m]; nan for none.
+    max_slip
+        Greatest slip.
+    model
+        Wheel-soil model.
+    max_sinkage
+        Greatest sinkage of a wheel [m].
+
+    Raises
+    ------
+    ValueError
+        The rig has no chassis.
     """
     if rig.chassis is None:
         raise ValueError("a draft needs the vehicle's mass and geometry")
-    slips = max_slip * SLIPS
+    slips = max_slip * SLIP_SHARES
     shape = (len(rig.radius), len(slips))
     share = 1.0 / np.where(rig.front, rig.front.sum(), (~rig.front).sum())
     free, drawn = (np.where(rig.front, *axle_loads(rig.chassis, draft, 0.0, 0.0)) * share for draft in (0.0, 1.0))
@@ -156,17 +189,17 @@ def true_largest_draft(
 
 def figures(soil: str, trials: Sequence[DraftTrial]) -> DraftFigures:
     """The figures of some trials; nan where all failed."""
-    good = [t for t in trials if np.isfinite(t.foretold)]
-    foretold, std, true = (np.array([getattr(t, of) for t in good]) for of in ("foretold", "std", "true"))
+    good = [t for t in trials if np.isfinite(t.predicted)]
+    predicted, std, true = (np.array([getattr(t, of) for t in good]) for of in ("predicted", "std", "true"))
     if not good:
         return DraftFigures(soil, len(trials), len(trials), *[float("nan")] * 4)
-    error = foretold / true - 1.0
+    error = predicted / true - 1.0
     return DraftFigures(
         soil=soil,
         drives=len(trials),
         failed=len(trials) - len(good),
         error=float(np.median(np.abs(error))),
         bias=float(np.median(error)),
-        coverage=float(np.mean(np.abs(foretold - true) < NORMAL_95 * std)),
+        coverage=float(np.mean(np.abs(predicted - true) < NORMAL_95 * std)),
         true=float(np.median(true)),
     )

@@ -1,4 +1,8 @@
-"""Drives on ground that holds: easy work, and work that is hard on every trend, in the ways in which fields are."""
+"""Simulated drives on ground that holds, one function for each kind of work; every warning on them is false.
+
+The easy kind is steady work. The hard kinds have fast changes that could look like a loss of traction: uneven ground,
+an implement lifted at headlands, stop and go, short hills, clods, and soil that is soft all over.
+"""
 
 from __future__ import annotations
 
@@ -10,23 +14,24 @@ from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.simulator.scenario import Patch, Profile, Scenario, Swing, realise
 from soilbus.terra.vehicle import GRAVITY
-from soilbus.validation.boggings import FAST, FIRM, NO_LIFT, SOFT, largest_draft
+from soilbus.validation.boggings import FAST_SWING_BAND, FIRM_SOILS, LIFT_SLIP, SOFT_SOILS, largest_draft
 
-FIRM_DRIVE = 300.0
+DRIVE_TIME = 300.0
 """Length of a drive [s]."""
 EASY = "firm"
 HARD = ("harsh", "headland", "stop_and_go", "hills", "clods", "soft")
 """Fast, uneven, up and down; rows with the implement lifted at their ends; a queue's or a loader's speed; short steep
 hills; stones and clods in the implement's way; a light draft on soil that is soft all over."""
 FIRM_KINDS = (EASY, *HARD)
-SPEED = Swing(1.0, 1.8)
-"""Ground speed [m/s], where a drive is not about it."""
-_STEP = 0.1  # s, between the knots of a draft
+GROUND_SPEED = Swing(1.0, 1.8)
+"""Ground speed [m/s], where a kind of drive does not set its own."""
+_KNOT_PERIOD = 0.1
+"""Time [s] between the knots of a draft."""
 
 
 def firm_ground(config: Config, kind: str, rng: np.random.Generator) -> Scenario:
     """A drive of one of FIRM_KINDS, with a draft that the ground holds all along."""
-    soil = str(rng.choice(SOFT if kind == "soft" else FIRM))
+    soil = str(rng.choice(SOFT_SOILS if kind == "soft" else FIRM_SOILS))
     return _DRIVES[kind](config, soil, largest_draft(config, soil), rng)
 
 
@@ -35,11 +40,11 @@ def _easy(config: Config, soil: str, most: float, rng: np.random.Generator) -> S
 
 
 def _harsh(config: Config, soil: str, most: float, rng: np.random.Generator) -> Scenario:
-    knots = np.arange(0.0, 3.0 * FIRM_DRIVE, 25.0)
+    knots = np.arange(0.0, 3.0 * DRIVE_TIME, 25.0)
     slope = tuple(zip(knots.tolist(), rng.uniform(-0.04, 0.04, len(knots)).tolist(), strict=True))
     return Scenario(
-        FIRM_DRIVE, (Patch(0.0, soil),), speed=Swing(0.8, 2.5), draft=Swing(0.1 * most, 0.65 * most, *FAST),
-        lift_slip=NO_LIFT, side_shift=Swing(-0.4, 0.4), slip_spread=0.03, slope=slope,
+        DRIVE_TIME, (Patch(0.0, soil),), speed=Swing(0.8, 2.5), draft=Swing(0.1 * most, 0.65 * most, *FAST_SWING_BAND),
+        lift_slip=LIFT_SLIP, side_shift=Swing(-0.4, 0.4), slip_spread=0.03, slope=slope,
     )  # fmt: skip
 
 
@@ -47,7 +52,7 @@ def _headland(config: Config, soil: str, most: float, rng: np.random.Generator) 
     """Half a minute in work, lifted in 1 to 2 s for the turn, lowered in 1 to 3 s."""
     t = _times()
     lowered = _steps(t, rng, (25.0, 45.0), (6.0, 12.0), (1.0, 2.0), (1.0, 3.0))
-    work = realise(Swing(0.4 * most, 0.65 * most, *FAST), t, rng).value
+    work = realise(Swing(0.4 * most, 0.65 * most, *FAST_SWING_BAND), t, rng).value
     speed = 1.0 + 0.6 * lowered
     return _scenario(soil, _profile(t, 0.05 * most + lowered * (work - 0.05 * most)), _profile(t, speed))
 
@@ -90,14 +95,14 @@ _DRIVES: dict[str, Callable[[Config, str, float, np.random.Generator], Scenario]
 
 
 def _scenario(
-    soil: str, draft: Swing | Profile, speed: Swing | Profile = SPEED,
+    soil: str, draft: Swing | Profile, speed: Swing | Profile = GROUND_SPEED,
     slope: tuple[tuple[float, float], ...] = ((0.0, 0.0),),
 ) -> Scenario:  # fmt: skip
-    return Scenario(FIRM_DRIVE, (Patch(0.0, soil),), speed, draft=draft, lift_slip=NO_LIFT, slope=slope)
+    return Scenario(DRIVE_TIME, (Patch(0.0, soil),), speed, draft=draft, lift_slip=LIFT_SLIP, slope=slope)
 
 
 def _times() -> Array:
-    return np.arange(0.0, FIRM_DRIVE + _STEP, _STEP)
+    return np.arange(0.0, DRIVE_TIME + _KNOT_PERIOD, _KNOT_PERIOD)
 
 
 def _profile(t: Array, value: Array) -> Profile:
@@ -109,7 +114,7 @@ def _steps(t: Array, rng: np.random.Generator, *ranges: tuple[float, float]) -> 
 
     def knots() -> Iterator[tuple[float, float]]:
         now = 0.0
-        while now <= FIRM_DRIVE:
+        while now <= DRIVE_TIME:
             high, low, fall, rise = (rng.uniform(*r) for r in ranges)
             yield now, 1.0
             yield now + high, 1.0

@@ -1,10 +1,11 @@
-"""The posterior of a window by importance sampling: no assumption about its shape, only patience.
+"""Importance sampling of a window's posterior: no assumption about its shape.
 
-Soils are drawn from a mixture along n as `marginal` averages it, made wider and with heavier tails,
-and each is weighed by the whole nonlinear model (e.g. Robert & Casella 2004, Monte Carlo
-Statistical Methods, sect. 3.3).  The mean of such a posterior has the least mean square error that any
-estimate can have, on average over the soils that what was known and the window allow.  It
-takes hundreds of evaluations: for judging the estimator, not for the service.
+    share_i = p(soil_i | window) / q(soil_i), normalised;     q: mixture of Student's t along n
+
+The proposal q takes the nodes in n of the nested Laplace approximation (estimation/laplace.py), with a wider covariance
+and heavier tails; each draw is weighed by the whole nonlinear model (Robert & Casella 2004, Monte Carlo Statistical
+Methods, sect. 3.3). The mean of such a posterior has the least mean square error of any estimate, averaged over the
+soils that prior and window allow. It takes hundreds of evaluations, so it serves to judge the estimator only.
 """
 
 from __future__ import annotations
@@ -26,21 +27,28 @@ from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective, QuadraticModel
 from soilbus.terra.wheel import Soil
 
-TAILS = 5.0
-"""Degrees of freedom of Student's t that the draws follow given n."""
-WIDER = 1.2
-"""Their covariance over that of the fit with this n."""
-SINGULAR = 1e-9
-"""Least eigenvalue of a matrix of correlations up to which it is singular."""
-FLATTER = 0.5
+PROPOSAL_DOF = 5.0
+"""Degrees of freedom of the Student's t that the draws follow at a given n."""
+COVARIANCE_RATIO = 1.2
+"""Covariance of the draws over that of the fit at the same n."""
+MIN_EIGENVALUE = 1e-9
+"""Least eigenvalue of a correlation matrix that is not singular."""
+PROPOSAL_DENSITY_POWER = 0.5
 """Power of the density of n that n is drawn from."""
 _K_C, _K_PHI, _N, _PHI = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "phi"))
 
 
-class Samples(NamedTuple):
-    """Logarithms (M, 6) of soils and their shares (M,) of the posterior probability.
+class PosteriorSamples(NamedTuple):
+    """Weighted samples of the posterior.
 
-    bound (M, 6, 6) is the Cramér-Rao bound of the logarithms where the window is of that soil.
+    Attributes
+    ----------
+    logs
+        Logarithms of the soils (M, 6).
+    share
+        Posterior probabilities (M,).
+    bound
+        Cramer-Rao bounds of the logarithms at each soil (M, 6, 6).
     """
 
     logs: Array
@@ -49,23 +57,37 @@ class Samples(NamedTuple):
 
     @property
     def effective(self) -> float:
-        """How many equally likely samples would tell as much (Kong)."""
+        """Number of equally likely samples with the same information (Kong)."""
         return float(1.0 / (self.share @ self.share))
 
 
-def samples(
-    problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, found: Fit, count: int, rng: np.random.Generator
-) -> Samples | None:
-    """So many soils of the posterior; None where k_c, k_phi and n are not all free and told apart by the tyres."""
+def sample_posterior(
+    problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, fit: Fit, count: int, rng: np.random.Generator
+) -> PosteriorSamples | None:
+    """Samples of the posterior of a window.
+
+    Parameters
+    ----------
+    problem, prior, joint_prior, fit
+        The window, its priors and its fit.
+    count
+        Number of draws.
+    rng
+        Random numbers.
+
+    Returns
+    -------
+    None where k_c, k_phi and n are not all free, or the tyres do not separate k_c from k_phi.
+    """
     with np.errstate(all="ignore"):
-        along = profile_over_n(problem, prior, joint_prior, found)
+        along = profile_over_n(problem, prior, joint_prior, fit)
         if along is None or len(along.nodes) < 3:
             return None
         coordinates = Coordinates(prior, float(problem.rig.width.mean()))
-        drawn = _drawn(along.nodes, coordinates, count, rng)
-        position = drawn.position
+        draws = _draws(along.nodes, coordinates, count, rng)
+        position = draws.position
         u, nodes = np.array([node.u for node in along.nodes]), along.nodes
-        fitting = Objective(along.problem, prior, joint_prior)
+        objective = Objective(along.problem, prior, joint_prior)
         log_share = np.full(count, -np.inf)
         logs = np.empty((count, len(PARAMETERS)))
         bound = np.zeros((count, len(PARAMETERS), len(PARAMETERS)))
@@ -74,33 +96,33 @@ def samples(
             logs[i] = np.log(soil)
             if soil[_K_PHI] > 0.0 and soil[_PHI] < MAX_PHI:
                 near = nodes[int(np.argmin(np.abs(u - logs[i, _N])))]
-                place, point = _point_at(fitting, soil, near)
-                if point is None:
+                iterate, quadratic = _quadratic_at(objective, soil, near)
+                if quadratic is None:
                     continue
                 jacobian = np.linalg.slogdet(coordinates.log_directions(soil)[coordinates.free])[1]
-                log_share[i] = jacobian - 0.5 * _unlikelihood(fitting, point) - drawn.log_density[i]
-                covariance = np.asarray(np.linalg.inv(point.information))
-                bound[i] = fitting.gaussian_with(place, covariance).posterior.log_covariance
+                log_share[i] = jacobian - 0.5 * _neg2_log_density(objective, quadratic) - draws.log_density[i]
+                covariance = np.asarray(np.linalg.inv(quadratic.information))
+                bound[i] = objective.gaussian_with(iterate, covariance).posterior.log_covariance
     share = softmax(np.where(np.isfinite(log_share), log_share, -np.inf))
     kept = share > 0.0
-    return Samples(logs[kept], share[kept], bound[kept])
+    return PosteriorSamples(logs[kept], share[kept], bound[kept])
 
 
-class _Drawn(NamedTuple):
+class _Draws(NamedTuple):
     """Positions (M, F) and the logarithms (M,) of the densities that they were drawn from."""
 
     position: Array
     log_density: Array
 
 
-def _drawn(nodes: list[Node], coordinates: Coordinates, count: int, rng: np.random.Generator) -> _Drawn:
-    """Positions about the nodes and what lies between them."""
+def _draws(nodes: list[Node], coordinates: Coordinates, count: int, rng: np.random.Generator) -> _Draws:
+    """Positions drawn from the proposal: n from its flattened density, the other coordinates given n."""
     free = coordinates.free
     i = int(np.searchsorted(free, _N))
     others = np.delete(np.arange(len(free)), i)
     u = np.array([node.u for node in nodes])
     fine = np.linspace(u[0], u[-1], GRID_POINTS)
-    weight = density(u, FLATTER * np.array([node.neg2_log_density for node in nodes]), fine)
+    weight = density(u, PROPOSAL_DENSITY_POWER * np.array([node.neg2_log_density for node in nodes]), fine)
     normals = [_normal(node, coordinates, others) for node in nodes]
     centre, roots = np.array([normal[0] for normal in normals]), np.array([normal[1] for normal in normals])
     cell = rng.choice(GRID_POINTS, count, p=weight)
@@ -108,13 +130,15 @@ def _drawn(nodes: list[Node], coordinates: Coordinates, count: int, rng: np.rand
     below = np.clip(np.searchsorted(u, log_n) - 1, 0, len(u) - 2)
     share = (log_n - u[below]) / (u[below + 1] - u[below])
     roots = roots[below] * (1.0 - share)[:, None, None] + roots[below + 1] * share[:, None, None]
-    normal = rng.standard_normal((count, len(others))) * np.sqrt(TAILS / rng.chisquare(TAILS, count))[:, None]
+    normal = (
+        rng.standard_normal((count, len(others))) * np.sqrt(PROPOSAL_DOF / rng.chisquare(PROPOSAL_DOF, count))[:, None]
+    )
     position = np.empty((count, len(free)))
     position[:, i] = log_n
     position[:, others] = centre[below] * (1.0 - share)[:, None] + centre[below + 1] * share[:, None]
     position[:, others] += np.einsum("mij,mj->mi", roots, normal)
-    tails = -0.5 * (TAILS + len(others)) * np.log1p((normal**2).sum(1) / TAILS)
-    return _Drawn(position, np.log(weight[cell]) + tails - np.log(np.einsum("mii->mi", roots)).sum(1))
+    tails = -0.5 * (PROPOSAL_DOF + len(others)) * np.log1p((normal**2).sum(1) / PROPOSAL_DOF)
+    return _Draws(position, np.log(weight[cell]) + tails - np.log(np.einsum("mii->mi", roots)).sum(1))
 
 
 def _normal(node: Node, coordinates: Coordinates, others: NDArray[np.intp]) -> tuple[Array, Array]:
@@ -127,9 +151,9 @@ def _normal(node: Node, coordinates: Coordinates, others: NDArray[np.intp]) -> t
         back = np.linalg.inv(coordinates.log_directions(gaussian.soil)[free])
         covariance = (back @ gaussian.covariance[np.ix_(free, free)] @ back.T)[np.ix_(others, others)]
         std = np.sqrt(covariance.diagonal())
-        if np.linalg.eigvalsh(covariance / std / std[:, None])[0] > SINGULAR:
+        if np.linalg.eigvalsh(covariance / std / std[:, None])[0] > MIN_EIGENVALUE:
             break
-    return coordinates.position(gaussian.soil)[others], np.asarray(np.linalg.cholesky(WIDER * covariance))
+    return coordinates.position(gaussian.soil)[others], np.asarray(np.linalg.cholesky(COVARIANCE_RATIO * covariance))
 
 
 def _soil_at(position: Array, coordinates: Coordinates) -> Array:
@@ -142,20 +166,20 @@ def _soil_at(position: Array, coordinates: Coordinates) -> Array:
     return soil if inside else np.where(np.arange(len(soil)) == _K_PHI, 0.0, soil)
 
 
-def _point_at(fitting: Objective, soil: Array, near: Node) -> tuple[Iterate, QuadraticModel | None]:
-    """The window at a soil (6,), with the latents that are likeliest there."""
-    problem, optimum = fitting.problem, near.fit.optimum
+def _quadratic_at(objective: Objective, soil: Array, near: Node) -> tuple[Iterate, QuadraticModel | None]:
+    """The quadratic model at a soil (6,), with the likeliest latents there."""
+    problem, optimum = objective.problem, near.fit.optimum
     latents = problem.with_entry_angles(optimum.latents, Soil(*soil.tolist()), optimum.gains)
-    place = Iterate(soil, optimum.gains, latents, np.inf, 1)
-    at = problem.linearise(place.as_soil(), place.gains, latents)
-    latents = problem.updated(at, latents, np.zeros(len(PARAMETERS)), np.zeros(len(place.gains)))
-    place = replace(place, latents=latents)
-    return place, fitting.quadratic_model(place)
+    iterate = Iterate(soil, optimum.gains, latents, np.inf, 1)
+    at = problem.linearise(iterate.as_soil(), iterate.gains, latents)
+    latents = problem.updated(at, latents, np.zeros(len(PARAMETERS)), np.zeros(len(iterate.gains)))
+    iterate = replace(iterate, latents=latents)
+    return iterate, objective.quadratic_model(iterate)
 
 
-def _unlikelihood(fitting: Objective, point: QuadraticModel) -> float:
-    """-2 log posterior density of a soil's logarithms up to a constant, whatever the gains (Laplace, all but exact)."""
-    gains = slice(len(fitting.free), None)
-    information, gradient = point.information[gains, gains], point.gradient[gains]
+def _neg2_log_density(objective: Objective, quadratic: QuadraticModel) -> float:
+    """-2 log posterior density of a soil's logarithms up to a constant, gains integrated out (Laplace)."""
+    gains = slice(len(objective.free), None)
+    information, gradient = quadratic.information[gains, gains], quadratic.gradient[gains]
     fall = float(gradient @ np.linalg.solve(information, gradient))
-    return point.neg2_log_posterior - fall + float(np.linalg.slogdet(information)[1])
+    return quadratic.neg2_log_posterior - fall + float(np.linalg.slogdet(information)[1])

@@ -1,16 +1,12 @@
-"""Windows of simulated drives, estimated one by one, beside the Cramér-Rao bound.
+"""Monte Carlo of the estimator: simulated windows, estimated one by one, beside the Cramer-Rao bound.
 
-Each window is a drive of its own: its own slips and loads, noise and gain errors, and a
-prior whose medians miss the truth by as much as it says (log-normal about the true soil,
-for every free parameter), so that all is as the estimator believes it to be.  It is
-estimated from nothing else, as the first window after a start is.  Errors, standard
-deviations and bounds are those of logarithms.
+    RMS ratio = sqrt(mean((error / Cramer-Rao bound)^2)),    coverage = share of |error| < 1.96 std
 
-The bound is local: it knows how the window would change with a soil next to the true one.
-Where the soils that the window allows are not next to it, an estimate may miss it: what is at least
-missed follows from the bounds of all these soils and how probable they are (`exact`, see `attainable`).
-For the same reason no interval holds each single soil 95 times in 100, but soils
-that lie about it as they may (`around`).
+Each window is a drive of its own: its own slips, loads, noise and gain errors, and a prior whose medians miss the truth
+by as much as its sd says, so that the model holds. It is estimated without an earlier window. Errors, standard
+deviations and bounds are those of logarithms. The Cramer-Rao bound is local; where a window leaves far soils possible,
+posterior samples give a Bayes-risk bound beside it. An interval cannot cover 95 % at each single soil, but it can for
+soils drawn around the named one (`around`).
 """
 
 from __future__ import annotations
@@ -44,42 +40,43 @@ from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import soil_named
 from soilbus.terra.wheel import Soil
-from soilbus.validation.bayes_risk_bound import Attainable, attainable
+from soilbus.validation.bayes_risk_bound import BayesRisk, bayes_risk
 from soilbus.validation.cramer_rao import cramer_rao
-from soilbus.validation.importance_sampling import samples
+from soilbus.validation.importance_sampling import sample_posterior
 from soilbus.workers import workers
 
 SOILS = ("loam", "wet_clay", "dry_sand")
-DURATIONS = (2.0, 10.0, 60.0)
-SLIP = Swing(0.05, 0.40)
+WINDOW_LENGTHS = (2.0, 10.0, 60.0)
+"""Lengths of the windows [s]."""
+SLIP_RANGE = Swing(0.05, 0.40)
+"""Slip of every drive."""
 ROUGHLY_KNOWN = ("soil.c.value=3000", "soil.c.std=750", "soil.K.value=0.02", "soil.K.std=0.005")
 """Settings with which cohesion and shear modulus are known to 25 %."""
-MAX_DRAWN = 20
-"""Soils around a named one that are tried until the tractor gets on."""
+MAX_SOIL_DRAWS = 20
+"""Soils around a named one that are tried until the tractor can drive."""
 _PHI = PARAMETERS.index("phi")
 
 
 class Task(NamedTuple):
     """One drive to be simulated and estimated, with and without sinkage sensors.
 
-    exact is how many samples of the exact posterior are drawn beside each fit, around the std of the
-    free parameters' logarithms about the named soil's (0: that soil).
+    posterior_samples is the number of samples of the posterior beside each fit; around the sd of the free
+    parameters' logarithms about the named soil (0: that soil).
     """
 
     config: Config
     soil: str
     duration: float
     seed: int
-    exact: int = 0
+    posterior_samples: int = 0
     around: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One window: error, std and bound (6 + 1,) of the parameters' logarithms and the bearing pressure's.
+    """One window: error, std and Cramer-Rao bound (6 + 1,) of the logarithms of parameters and bearing pressure.
 
-    What is held has no error and no bound.  All of it is nan where the fit failed.  exact is None
-    where no exact posterior was drawn from.
+    Held parameters have zeros. All are nan where the fit failed. bayes_risk is None where no posterior was sampled.
     """
 
     error: Array
@@ -88,19 +85,31 @@ class Trial:
     chi2: float
     converged: bool
     seconds: float
-    exact: Attainable | None = None
+    bayes_risk: BayesRisk | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """All windows of one soil, duration [s] and fit of sensors.
+    """All windows of one soil, duration [s] and set of sensors.
 
-    quantities names the free parameters and the bearing pressure; for each (Q,) rms is the
-    root mean square of errors over their windows' bounds, bias their mean, coverage the
-    share of 95 % intervals that hold the truth, bound the root mean square of the bounds.
-    These and chi2, the mean of the reduced chi-squares, are of the windows that converged;
-    failed and not_converged count the others.  seconds is the median processor time of a fit.
-    exact is None without samples of exact posteriors.
+    Attributes
+    ----------
+    quantities
+        Names (Q,) of the free parameters and the bearing pressure.
+    rms, bias
+        Root mean square and mean (Q,) of error over bound.
+    coverage
+        Share (Q,) of 95 % intervals that hold the truth.
+    bound
+        Root mean square (Q,) of the bounds.
+    chi2
+        Mean of the reduced chi-squares. These figures are of the windows that converged.
+    failed, not_converged
+        Number of the other windows.
+    seconds
+        Median processor time [s] of a fit.
+    bayes_risk
+        None without posterior samples.
     """
 
     soil: str
@@ -116,18 +125,25 @@ class Cell:
     bound: Array
     chi2: float
     seconds: float
-    exact: Exact | None = None
+    bayes_risk: BayesRiskFigures | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Exact:
-    """What could be attained in some windows, in units of the bounds, of each quantity (Q,).
+class BayesRiskFigures:
+    """Bayes-risk bound of a cell's windows, in units of the Cramer-Rao bounds, for each quantity (Q,).
 
-    least: no estimate has a root mean square error below this on all soils that the windows allow, and
-    its standard deviation by chance.  best: that of the estimate with the least one on average over these soils,
-    at the true one.  ours: that of ours; share is ours over best and scatter its standard deviation by
-    chance, for the windows are the same.  effective is the median of how many independent samples a
-    posterior is told by.
+    Attributes
+    ----------
+    windows
+        Windows with posterior samples.
+    least, least_scatter
+        RMS error below which no estimate is on all soils that the windows allow, and its standard error.
+    best, ours
+        RMS error at the true soil of the estimate with the least average one, and of ours.
+    share, scatter
+        ours / best, and its standard error (the windows are the same).
+    effective
+        Median effective number of posterior samples.
     """
 
     windows: int
@@ -156,22 +172,41 @@ def monte_carlo(
     windows: int,
     seed: int,
     soils: Sequence[str] = SOILS,
-    durations: Sequence[float] = DURATIONS,
+    durations: Sequence[float] = WINDOW_LENGTHS,
     each: Each = map,
-    exact: int = 0,
+    posterior_samples: int = 0,
     around: float = 0.0,
 ) -> Iterator[Cell]:
-    """Cells of all soils and durations, each with and without sinkage sensors (the same drives).
+    """Cells of all soils and durations, each with and without sinkage sensors on the same drives.
 
-    With so many samples of the exact posterior of each window; with a soil of its
-    own for each drive, log-normal `around` the named one.  `each` is the built-in map, or that
-    of `processes`.  The same seed gives the same windows.  Raises KeyError for an unknown soil
-    and SimulationError where the tractor cannot drive on one.
+    Parameters
+    ----------
+    config
+        The vehicle.
+    windows
+        Drives in a cell.
+    seed
+        The same seed gives the same windows.
+    soils, durations
+        Names, and lengths [s].
+    each
+        The built-in map, or that of `processes`.
+    posterior_samples
+        Samples of each window's posterior; 0 for none.
+    around
+        Standard deviation of the logarithms of each drive's soil about the named one.
+
+    Raises
+    ------
+    KeyError
+        A soil is unknown.
+    SimulationError
+        The tractor cannot drive on one.
     """
     for name in soils:
         soil_named(name)
     places = list(product(soils, durations))
-    tasks = [task for place in places for task in tasks_of(config, *place, windows, seed, exact, around)]
+    tasks = [task for place in places for task in tasks_of(config, *place, windows, seed, posterior_samples, around)]
     results = iter(each(trials, tasks))
     for soil, duration in places:
         pairs = [next(results) for _ in range(windows)]
@@ -181,7 +216,7 @@ def monte_carlo(
 
 @contextmanager
 def processes(count: int) -> Iterator[Each]:
-    """A map over so many processes, each with one thread; the built-in one for less than two."""
+    """A map over `count` processes of one thread each; the built-in map for fewer than two."""
     if count < 2:
         keep_freed_memory()
         yield map
@@ -191,16 +226,16 @@ def processes(count: int) -> Iterator[Each]:
 
 
 def tasks_of(
-    config: Config, soil: str, duration: float, windows: int, seed: int, exact: int = 0, around: float = 0.0
+    config: Config, soil: str, duration: float, windows: int, seed: int, posterior_samples: int = 0, around: float = 0.0
 ) -> list[Task]:
-    """Independent drives on a soil, the same ones whatever else is asked for."""
+    """Independent drives on a soil; they do not depend on the other soils asked for."""
     # The simulator's of_mean noise and the estimator's refer to the same window.
     hop = min(config.estimator.hop, duration)
     of_window = config.estimator.model_copy(update={"window": duration, "hop": hop})
     of_cell = config.model_copy(update={"estimator": of_window})
     key = [seed, zlib.crc32(soil.encode()), round(1e3 * duration)]
     seeds = np.random.SeedSequence(key).generate_state(windows)
-    return [Task(of_cell, soil, duration, int(s), exact, around) for s in seeds]
+    return [Task(of_cell, soil, duration, int(s), posterior_samples, around) for s in seeds]
 
 
 def trials(task: Task) -> tuple[Trial, Trial]:
@@ -209,7 +244,7 @@ def trials(task: Task) -> tuple[Trial, Trial]:
     Raises SimulationError where the tractor cannot drive on, KeyError for an unknown soil.
     """
     recording, soil = _driven(task)
-    prior = missed(prior_of(task.config), soil, np.random.default_rng([task.seed, 1]))
+    prior = prior_about(prior_of(task.config), soil, np.random.default_rng([task.seed, 1]))
     with_sinkage, without = (_trial(recording, task, prior, soil, fitted) for fitted in (True, False))
     return with_sinkage, without
 
@@ -219,18 +254,18 @@ def _driven(task: Task) -> tuple[Recording, Soil]:
     config, name, duration, seed, _, around = task
     rng, named = np.random.default_rng([seed, 3]), soil_named(name)
     spread = np.where(prior_of(config).log_std > 0.0, around, 0.0)
-    for _ in range(MAX_DRAWN if around else 1):
-        soil = missed(SoilPrior(np.asarray(named), spread), named, rng).median if around else np.asarray(named)
+    for _ in range(MAX_SOIL_DRAWS if around else 1):
+        soil = prior_about(SoilPrior(np.asarray(named), spread), named, rng).median if around else np.asarray(named)
         of_drive = Soil(*soil.tolist())
         with suppress(SimulationError) if around else nullcontext():
-            recording = simulate(config, Scenario(duration, (Patch(0.0, name, of_drive),), slip=SLIP), seed)
+            recording = simulate(config, Scenario(duration, (Patch(0.0, name, of_drive),), slip=SLIP_RANGE), seed)
             if recording.bogged_at is None:
                 return recording, of_drive
     raise SimulationError(f"the tractor gets stuck on {name}")
 
 
-def missed(prior: SoilPrior, soil: Soil, rng: np.random.Generator) -> SoilPrior:
-    """A prior of the same spread that was told of this soil: medians log-normal about it, held ones right."""
+def prior_about(prior: SoilPrior, soil: Soil, rng: np.random.Generator) -> SoilPrior:
+    """A prior of the same spread whose medians are log-normal about this soil; held parameters are right."""
     while True:
         median = np.asarray(soil) * np.exp(prior.log_std * rng.standard_normal(len(soil)))
         if median[_PHI] < MAX_PHI:
@@ -253,13 +288,13 @@ def _trial(recording: Recording, task: Task, prior: SoilPrior, soil: Soil, sinka
     trial = Trial(value - truth, std, least, fit.chi2, fit.converged, seconds)
     if not drawn or not fit.converged:
         return trial
-    posterior = samples(noisy, prior, joint_prior, found, drawn, np.random.default_rng([seed, 2]))
+    posterior = sample_posterior(noisy, prior, joint_prior, found, drawn, np.random.default_rng([seed, 2]))
     if posterior is None:
         return trial
     soils = zip(np.exp(posterior.logs).tolist(), posterior.bound, strict=True)
-    told = [_logarithms(Posterior(Soil(*soil), covariance), config) for soil, covariance in soils]
-    value, bound_of_each = (np.array(column) for column in zip(*told, strict=True))
-    return replace(trial, exact=attainable(value, posterior.share, bound_of_each, truth))
+    logarithms = [_logarithms(Posterior(Soil(*soil), covariance), config) for soil, covariance in soils]
+    value, bound_of_each = (np.array(column) for column in zip(*logarithms, strict=True))
+    return replace(trial, bayes_risk=bayes_risk(value, posterior.share, bound_of_each, truth))
 
 
 def _problem(
@@ -312,23 +347,25 @@ def summary(soil: str, duration: float, sinkage: bool, windows: Sequence[Trial])
             bound=np.sqrt((bound**2).sum(axis=0) / count),
             chi2=float(sum(trial.chi2 for trial in good) / count),
             seconds=float(np.median([trial.seconds for trial in windows])),
-            exact=_exact([trial for trial in good if trial.exact is not None], np.asarray(free)),
+            bayes_risk=_bayes_risk_figures([trial for trial in good if trial.bayes_risk is not None], np.asarray(free)),
         )
 
 
-def _exact(windows: Sequence[Trial], free: NDArray[np.bool_]) -> Exact | None:
+def _bayes_risk_figures(windows: Sequence[Trial], free: NDArray[np.bool_]) -> BayesRiskFigures | None:
     """The figures of windows whose exact posteriors are known; None without any."""
-    known = [(trial, trial.exact) for trial in windows if trial.exact is not None]
+    known = [(trial, trial.bayes_risk) for trial in windows if trial.bayes_risk is not None]
     if not known:
         return None
     ours = np.array([trial.error / trial.bound for trial, _ in known])[:, free] ** 2
-    best = np.array([exact.error / trial.bound for trial, exact in known])[:, free] ** 2
-    risk, weight = (np.array([getattr(exact, of) for _, exact in known])[..., free] for of in ("risk", "weight"))
+    best = np.array([bayes_risk.error / trial.bound for trial, bayes_risk in known])[:, free] ** 2
+    risk, weight = (
+        np.array([getattr(bayes_risk, of) for _, bayes_risk in known])[..., free] for of in ("risk", "weight")
+    )
     average = risk.sum(axis=0) / weight.sum(axis=0)
     off = np.sqrt(((risk - average * weight) ** 2).sum(axis=0)) / weight.sum(axis=0)
     tilt = average.argmax(axis=0), np.arange(average.shape[1])
     square = ours.sum(0) / best.sum(0)
-    return Exact(
+    return BayesRiskFigures(
         windows=len(known),
         least=np.sqrt(average[tilt]),
         least_scatter=0.5 * off[tilt] / np.sqrt(average[tilt]),
@@ -336,7 +373,7 @@ def _exact(windows: Sequence[Trial], free: NDArray[np.bool_]) -> Exact | None:
         ours=np.sqrt(ours.mean(0)),
         share=np.sqrt(square),
         scatter=0.5 * np.sqrt(square) * np.sqrt(((ours - square * best) ** 2).sum(0)) / ours.sum(0),
-        effective=float(np.median([exact.effective for _, exact in known])),
+        effective=float(np.median([bayes_risk.effective for _, bayes_risk in known])),
     )
 
 
@@ -347,9 +384,9 @@ def as_json(cell: Cell) -> dict[str, Any]:
         return value if math.isfinite(value) else None
 
     columns = {"rms": cell.rms, "bias": cell.bias, "coverage": cell.coverage, "bound": cell.bound}
-    if cell.exact is not None:
-        columns |= {"least": cell.exact.least, "least_scatter": cell.exact.least_scatter}
-        columns |= {"best": cell.exact.best, "rms_beside_best": cell.exact.ours}
+    if cell.bayes_risk is not None:
+        columns |= {"least": cell.bayes_risk.least, "least_scatter": cell.bayes_risk.least_scatter}
+        columns |= {"best": cell.bayes_risk.best, "rms_beside_best": cell.bayes_risk.ours}
     return {
         "soil": cell.soil, "duration": cell.duration, "sinkage": cell.sinkage, "windows": cell.windows,
         "failed": cell.failed, "not_converged": cell.not_converged, "chi2": number(cell.chi2), "seconds": cell.seconds,

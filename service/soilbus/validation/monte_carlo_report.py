@@ -1,4 +1,7 @@
-"""Table of the Monte Carlo figures beside their targets."""
+"""Report of `soilbus montecarlo`: one row a cell, each figure beside its target.
+
+~ marks a target missed by less than two standard errors, * one missed by more
+"""
 
 from __future__ import annotations
 
@@ -7,19 +10,22 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 
 from soilbus.report.table import table
-from soilbus.validation.monte_carlo import DURATIONS, SOILS, Cell, Exact
+from soilbus.validation.monte_carlo import SOILS, WINDOW_LENGTHS, BayesRiskFigures, Cell
 
-MAX_RMS = 1.15
+MAX_RMS_RATIO = 1.15
+"""Target of the RMS error over the Cramer-Rao bound."""
 COVERAGE = (0.93, 0.97)
+"""Target of the share of 95 % intervals that hold the truth."""
 MAX_CHI2_OFF = 0.03
-ATTAINABLE = """Each quantity, in root mean square errors over the bound: what any estimate must allow on some of the
-soils that the windows and what was known allow, by the information that a window would hold on each of these; what
-the estimate that has the least on average over them attains here; and ours over that.  Where the first is
-above {most}, none can be within the target on all of them.  samples: median number of effective ones.
+"""Target of the distance of the mean reduced chi-square from 1."""
+BAYES_RISK_NOTE = """Bayes-risk bound of each quantity, in root mean square errors over the Cramer-Rao bound: the least
+error of any estimate, averaged over the soils that prior and window allow; the error here of the estimate that attains
+it; ours over that.  Where the first is above {most}, no estimate is within the target on all of these soils.
+samples: median number of effective ones.
 """
 SHARED = """Windows are simulated with the estimator's own wheel-soil model, noise and priors: the figures show how much
 of what such a window holds the estimate gets out, and that its intervals are right if the model is."""
-_TOLD = "{:.2f}+-{:.2f} {:.2f} {:.2f}+-{:.2f}"
+_BAYES_RISK_CELL = "{:.2f}+-{:.2f} {:.2f} {:.2f}+-{:.2f}"
 
 
 def with_progress(cells: Iterable[Cell]) -> Iterator[Cell]:
@@ -30,29 +36,36 @@ def with_progress(cells: Iterable[Cell]) -> Iterator[Cell]:
     from rich.console import Console
     from rich.progress import track
 
-    n_cells = 2 * len(SOILS) * len(DURATIONS)
+    n_cells = 2 * len(SOILS) * len(WINDOW_LENGTHS)
     yield from track(cells, "montecarlo", n_cells, console=Console(stderr=True), transient=True)
 
 
 def monte_carlo_report(cells: Sequence[Cell]) -> str:
-    """One line a cell: RMS error over the bound and coverage of each quantity, with marks where targets are missed."""
+    """RMS ratio and coverage of each quantity, one line a cell, with marks where targets are missed."""
     names = list(dict.fromkeys(name for cell in cells for name in cell.quantities))
     head = ("soil", "window", "sinkage", *names, "chi2", "failed", "open", "fit")
     text = "\n".join([table(head, [_row(cell, names) for cell in cells]), *_notes(cells), SHARED]) + "\n"
-    exact = [(cell, cell.exact) for cell in cells if cell.exact is not None]
-    if not exact:
+    bayes_risk = [(cell, cell.bayes_risk) for cell in cells if cell.bayes_risk is not None]
+    if not bayes_risk:
         return text
     head = ("soil", "window", "sinkage", *names, "windows", "samples")
-    rows = [_attainable(*pair, names) for pair in exact]
-    return text + "\n" + table(head, rows) + "\n" + ATTAINABLE.format(most=MAX_RMS)
+    rows = [_bayes_risk_row(*pair, names) for pair in bayes_risk]
+    return text + "\n" + table(head, rows) + "\n" + BAYES_RISK_NOTE.format(most=MAX_RMS_RATIO)
 
 
-def _attainable(cell: Cell, exact: Exact, names: Sequence[str]) -> tuple[str, ...]:
-    told_of = exact.least, exact.least_scatter, exact.best, exact.share, exact.scatter
-    figures = dict(zip(cell.quantities, zip(*(column.tolist() for column in told_of), strict=True), strict=True))
-    told = [_TOLD.format(*figures[name]) if name in figures else "held" for name in names]
+def _bayes_risk_row(cell: Cell, bayes_risk: BayesRiskFigures, names: Sequence[str]) -> tuple[str, ...]:
+    columns = bayes_risk.least, bayes_risk.least_scatter, bayes_risk.best, bayes_risk.share, bayes_risk.scatter
+    figures = dict(zip(cell.quantities, zip(*(column.tolist() for column in columns), strict=True), strict=True))
+    cells_of_row = [_BAYES_RISK_CELL.format(*figures[name]) if name in figures else "held" for name in names]
     fitted = "measured" if cell.sinkage else "none"
-    return (cell.soil, f"{cell.duration:g} s", fitted, *told, str(exact.windows), f"{exact.effective:.0f}")
+    return (
+        cell.soil,
+        f"{cell.duration:g} s",
+        fitted,
+        *cells_of_row,
+        str(bayes_risk.windows),
+        f"{bayes_risk.effective:.0f}",
+    )
 
 
 def _row(cell: Cell, names: Sequence[str]) -> tuple[str, ...]:
@@ -68,7 +81,7 @@ def _row(cell: Cell, names: Sequence[str]) -> tuple[str, ...]:
 def _figure(rms: float, coverage: float, n: int) -> str:
     """Such as "1.02 95.0" of n windows."""
     low, high = COVERAGE
-    too_large = _mark(rms - MAX_RMS, _rms_scatter(n))
+    too_large = _mark(rms - MAX_RMS_RATIO, _rms_scatter(n))
     astray = _mark(max(low - coverage, coverage - high), _coverage_scatter(n))
     return f"{rms:.2f}{too_large} {100.0 * coverage:.1f}{astray}"
 
@@ -94,7 +107,7 @@ def _notes(cells: Sequence[Cell]) -> Iterator[str]:
     n = min(cell.windows for cell in cells)
     low, high = (100.0 * share for share in COVERAGE)
     yield "Each quantity: RMS error over the Cramér-Rao bound, and share of 95 % intervals that hold the truth [%]."
-    yield f"Targets: at most {MAX_RMS}; {low:.0f} to {high:.0f} %; chi2 1 +- {MAX_CHI2_OFF}."
+    yield f"Targets: at most {MAX_RMS_RATIO}; {low:.0f} to {high:.0f} %; chi2 1 +- {MAX_CHI2_OFF}."
     scatter = f"{_rms_scatter(n):.3f} and the other by {100.0 * _coverage_scatter(n):.1f} points"
     yield f"{n} windows scatter the one by {scatter}"
     yield "by chance: ~ marks a target missed by less than twice that, * one missed by more."

@@ -1,12 +1,12 @@
 """The method of Xi et al. 2024 (World Electr. Veh. J. 15:217): one operating point, three equations.
 
-Load, drawbar pull and torque at a known sinkage and slip are solved for K_L, phi and n
-by Newton's method (eqs. 34-42).  Its integrals are Simpson sums over three angles of
-each branch (eqs. 23-33).  Equations are corrected as report/paper_corrections.py lists;
-`Equations` selects what is printed where that makes a difference.
+    F = r b theta1 [K_L (normal(n) + tan(phi) rubbed(n)) + c stuck]      F = W, DP, T / r
+    Newton: x <- x - J^-1 (F(x) - F measured),   x = (K_L, phi, n)       (eqs. 34-42)
 
-The method is here to be compared with: one operating point hardly tells K_L from n
-(estimation/paper_noise.py).
+Load, drawbar pull and torque at a known sinkage and slip are solved for K_L, phi and n. The integrals are Simpson sums
+over three angles of each branch (eqs. 23-33). Misprints are corrected as validation/paper_corrections.py lists;
+`Equations` selects what is printed where that makes a difference. The method is here to be compared with: one
+operating point hardly separates K_L from n (validation/paper_noise.py).
 """
 
 from __future__ import annotations
@@ -26,14 +26,15 @@ from soilbus.terra.wheel import EXACT_NODES
 Three = tuple[float, float, float]
 
 MAX_ITERATIONS = 50
-TOLERANCE = 1e-8
+"""Steps after which an iteration counts as not converged."""
+RELATIVE_STEP_TOLERANCE = 1e-8
 """Relative step of every unknown that ends the iteration; the paper does not print its own."""
-LAST_STEP = 1e-4
+N_STEP_TOLERANCE = 1e-4
 """Step of n that ends the elimination: Newton squares it, so n is then right to 1e-9 and K_L to 1e-7 of itself."""
-STRAIGHTENED = 1.5
-"""The forces under small angles go as 1/(n + 3/2), so in that variable they are nearly straight."""
-LARGEST_N = 20.0
-"""Beyond this Newton has gone astray, and powers of the sinkage would overflow."""
+N_OFFSET = 1.5
+"""The forces at small angles go as 1/(n + 3/2), so Newton steps in that variable are nearly exact."""
+MAX_N = 20.0
+"""Exponent beyond which Newton has diverged, and powers of the sinkage would overflow."""
 
 
 class OperatingPoint(NamedTuple):
@@ -168,7 +169,17 @@ class WheelEquations:
         return np.array(self.forces_and_columns(x)[1]).T
 
     def newton(self, measured: Forces, start: Unknowns, most: int = MAX_ITERATIONS) -> Solution:
-        """The paper's iteration: Newton's method on all three unknowns (eq. 41), neither damped nor bounded."""
+        """The paper's iteration: Newton's method on all three unknowns (eq. 41), neither damped nor bounded.
+
+        Parameters
+        ----------
+        measured
+            Forces.
+        start
+            First K_L, phi and n.
+        most
+            Greatest number of steps.
+        """
         x = start
         for done in range(most):
             (W, DP, T), (u, v, w) = self.forces_and_columns(x)
@@ -178,22 +189,31 @@ class WheelEquations:
                 return Solution(x, done, False)
             step = _triple(miss, v, w) / volume, _triple(u, miss, w) / volume, _triple(u, v, miss) / volume
             new = Unknowns(x.K_L - step[0], x.phi - step[1], x.n - step[2])
-            if not (math.isfinite(new.K_L) and math.isfinite(new.phi) and abs(new.n) < LARGEST_N):
+            if not (math.isfinite(new.K_L) and math.isfinite(new.phi) and abs(new.n) < MAX_N):
                 return Solution(x, done, False)
             x = new
-            if all(abs(s) <= TOLERANCE * abs(value) for s, value in zip(step, x, strict=True)):
+            if all(abs(s) <= RELATIVE_STEP_TOLERANCE * abs(value) for s, value in zip(step, x, strict=True)):
                 return Solution(x, done + 1, True)
         return Solution(x, most, False)
 
     def solve(self, measured: Forces, n: float) -> Solution:
-        """Ours for the same equations: Newton's method on 1/(n + 3/2) alone, from a start of n.
+        """Ours for the same equations: Newton's method on 1/(n + 3/2) alone.
 
-        For a given n the forces are linear in K_L and in s = K_L tan(phi), so T gives s and
-        W then K_L; what this leaves of the drawbar pull must be zero.
+        Parameters
+        ----------
+        measured
+            Forces.
+        n
+            Start.
+
+        Notes
+        -----
+        For a given n the forces are linear in K_L and in s = K_L tan(phi), so T gives s and W then K_L; the remaining
+        residual of the drawbar pull must be zero.
         """
         W, DP, T = self._from_normal_stress(measured)
         done, converged, K_L, s = 0, False, math.nan, math.nan
-        while done < MAX_ITERATIONS and not converged and abs(n) < LARGEST_N:
+        while done < MAX_ITERATIONS and not converged and abs(n) < MAX_N:
             b, a, w, d, t, b_n, a_n, w_n, d_n, t_n = (self._rows @ self._z**n).tolist()
             try:
                 s = T / t
@@ -201,18 +221,20 @@ class WheelEquations:
                 K_L = (W - s * w) / a
                 K_L_n = -(s_n * w + s * w_n + K_L * a_n) / a
                 step = (K_L * b + s * d - DP) / (K_L_n * b + K_L * b_n + s_n * d + s * d_n)
-                from_pole = n + STRAIGHTENED
+                from_pole = n + N_OFFSET
                 change = from_pole / max(1.0 + step / from_pole, 0.1) - from_pole
             except ZeroDivisionError:  # no shear at all, or forces of cohesion alone: n does not matter
                 break
             K_L, s, n = K_L + K_L_n * change, s + s_n * change, n + change
-            done, converged = done + 1, abs(change) <= LAST_STEP
+            done, converged = done + 1, abs(change) <= N_STEP_TOLERANCE
         return Solution(Unknowns(K_L, math.atan2(s, K_L), n), done, converged)
 
     def all_solutions(self, measured: Forces, largest_n: float = 3.0, steps: int = 100) -> list[Unknowns]:
-        """Every soil with n up to largest_n that solves the equations, wherever an iteration might start.
+        """Every soil with n up to largest_n that solves the equations, from no particular start.
 
-        They are where the drawbar pull left over by solve() changes sign on `steps` equal steps.
+        Notes
+        -----
+        They are where the residual of the drawbar pull changes sign on `steps` equal steps of n.
         """
         n = np.linspace(largest_n / steps, largest_n, steps)
         b, a, w, d, t = self._rows[:5] @ self._z[:, None] ** n

@@ -1,4 +1,4 @@
-"""Misprints of Xi et al. 2024, each with a number that shows what it does."""
+"""Misprints of Xi et al. 2024, each with what it should be and a number that shows its effect."""
 
 from __future__ import annotations
 

@@ -1,7 +1,9 @@
-"""What sensor noise does to the paper's one operating point, beside a window of them.
+"""What sensor noise does to the paper's one operating point, beside a window of many.
 
-The same wheel, soil, equations and noise: once at one instant, as Xi et al. 2024 have
-it, once over instants with varied load and slip, by our own estimator.
+    one instant: cov(K_L, phi, n) = J^-1 cov(W, DP, T) J^-T
+
+The same wheel, soil, equations and noise, once at one instant as Xi et al. 2024 have it, once over instants with varied
+load and slip by our own estimator.
 """
 
 from __future__ import annotations
@@ -40,6 +42,7 @@ LEVELS = {
     "0.1 %": Noise(0.001, 0.001, 0.001, 0.0001, 0.001),
     "1 %": Noise(0.01, 0.01, 0.02, 0.003, 0.01),
 }
+"""Levels of noise by name."""
 
 
 def cramer_rao(point: OperatingPoint, x: Unknowns, noise: Noise, equations: Equations = EXACT) -> Array:

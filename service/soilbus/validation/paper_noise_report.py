@@ -1,4 +1,4 @@
-"""How the paper's one operating point stands noise, beside a window: the rows that `soilbus paper` prints."""
+"""The noise rows of `soilbus paper`: one operating point beside a window of them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ from soilbus.validation.paper_noise import (
 from soilbus.validation.paper_tables import SANDY_LOAM, WET_CLAY, Trial
 
 DRAWS = 500
+"""Noise draws of one instant."""
 WINDOWS = 20
+"""Windows of 100 instants."""
 FEWEST = 20
 """Solutions below which no statistics of them are shown."""
 HEAD = ("soil", "noise", "what", "solved %", "K_L %", "phi %", "n %", "p %", "K_L between")
@@ -46,8 +48,8 @@ def noise_text(sinkage: float, seed: int) -> str:
         f"One instant: {DRAWS} draws, seed {seed}, solutions with n from 0.03 to 3; medians and the 5th and 95th "
         f"percentile of K_L are of the draws that have a solution; Cramer-Rao bounds from the 3x3 Jacobian, linear "
         f"however large. 100 instants: load +-30 %, slip 0.05 to 0.4, {WINDOWS} windows through the estimator of "
-        f"soilbus; K_L between least and greatest. p: bearing pressure K_L z^n at the depth where one instant tells "
-        f"it best ({depths})."
+        f"soilbus; K_L between least and greatest. p: bearing pressure K_L z^n at the depth where one instant "
+        f"determines it best ({depths})."
     )
 
 
@@ -66,7 +68,7 @@ def noise_summary(sinkage: float) -> str:
 
 
 def pressure_depth(trial: Trial, sinkage: float) -> float:
-    """Depth [m] of the bearing pressure that one instant at a sinkage [m] tells best."""
+    """Depth [m] of the bearing pressure that one instant at a sinkage [m] determines best."""
     return best_depth(cramer_rao(trial.at(sinkage), trial.truth, LEVELS["0.1 %"]), trial.truth.n)
 
 

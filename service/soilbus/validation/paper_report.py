@@ -1,4 +1,4 @@
-"""`soilbus paper`: the tables of Xi et al. 2024 beside ours, and what holds of the method."""
+"""`soilbus paper`: the tables of Xi et al. 2024 beside ours, and which of its conclusions hold."""
 
 from __future__ import annotations
 
@@ -43,11 +43,14 @@ from soilbus.validation.paper_tables import (
 )
 
 WIDTH = 118
+"""Characters of a line."""
 PARAMETERS = ("phi [deg]", "K_L", "n")
 DECIMALS = (4, 3, 5)
+"""Decimals of phi, K_L and n."""
 REPEATS = 20
-MICROMETRE = 1e-6
-"""[m] How near to none, and to the radius, a sinkage is looked for."""
+"""Timed runs, of which the shortest counts."""
+SINKAGE_MARGIN = 1e-6
+"""Distance [m] from zero and from the radius within which no sinkage is looked for."""
 
 
 def paper_report(sinkage: float, seed: int) -> str:
@@ -102,8 +105,8 @@ def what_holds(sinkage: float) -> list[str]:
     seconds = max(_seconds(partial(_newton, run, sinkage)) for run in RUNS)
     fastest = min(run.seconds for run in RUNS)
     return [
-        f"Convergence {_verdict(len(steps) == len(RUNS) and max(errors) < SOLVED)} for its start values: eq. 41 ends "
-        f"at a soil from {len(steps)} of the {len(RUNS)}, after "
+        f"Convergence {_verdict(len(steps) == len(RUNS) and max(errors) < MAX_SOLUTION_ERROR)} for its start values: "
+        f"eq. 41 ends at a soil from {len(steps)} of the {len(RUNS)}, after "
         f"at most {max(steps, default=0)} steps and within {max(errors, default=0.0):.0e} % of the true one (the "
         f"paper: six steps from 20 % off). From 50 % above the truth, which it does not try, eq. 41 gets there for "
         f"{sum(newton for newton, _ in above)} of {len(above)} wheels; eliminating K_L and phi first (ours) for "
@@ -114,16 +117,16 @@ def what_holds(sinkage: float) -> list[str]:
         f"The accuracy {_verdict(off <= before)} where data and solver do not share three angles of each branch: "
         f"forces of the exact integrals give {K_L} instead of {truth.K_L / 1e3:.0f} on wet clay.",
         f"Robustness to noise (conclusion 3) {_verdict(bound <= before)}: noise of 0.1 % leaves K_L of wet clay a "
-        f"standard deviation of at least {bound:.0f} %. A window with varied load and slip tells it.",
+        f"standard deviation of at least {bound:.0f} %. A window with varied load and slip determines it.",
         f"Figure 13's torques on the two soils fit {_what_fits()} of tractor 1 at slip 0.2.",
         f"Real time {_verdict(seconds < fastest)}: ours takes at most {seconds:.1e} s, the paper's at least "
         f"{fastest:g} s; see the last two columns of the tables.",
     ]
 
 
-SOLVED = 1e-3
+MAX_SOLUTION_ERROR = 1e-3
 """Error [%] up to which a solution is the true soil."""
-ALIKE = 0.05
+READING_TOLERANCE = 0.05
 """Share by which loads, or sinkages, may differ and still be read off a figure as one."""
 
 
@@ -134,7 +137,11 @@ def _verdict(it_is: bool) -> str:
 def _what_fits() -> str:
     """What both torques of figure 13 may share."""
     clay, loam = _place(TORQUE_ON_CLAY, WET_CLAY), _place(TORQUE_ON_LOAM, SANDY_LOAM)
-    one = [f"one {name}" for name, a, b in zip(("sinkage", "load"), clay, loam, strict=True) if abs(a / b - 1) < ALIKE]
+    one = [
+        f"one {name}"
+        for name, a, b in zip(("sinkage", "load"), clay, loam, strict=True)
+        if abs(a / b - 1) < READING_TOLERANCE
+    ]
     return " and ".join(one) or "neither one load nor one sinkage"
 
 
@@ -275,8 +282,8 @@ def _other_data(sinkage: float) -> str:
     return (
         _title("Other data, same method")
         + _text(
-            "All solutions (phi, K_L, n) with n up to 3 of the three equations, whatever the start. The solver has "
-            "Simpson's rule and the rational law where nothing else is said."
+            "All solutions (phi, K_L, n) with n up to 3 of the three equations, from no particular start. The solver "
+            "has Simpson's rule and the rational law where nothing else is said."
         )
         + table(("data", *TRIALS), rows)
     )
@@ -330,7 +337,7 @@ def _sinkage_where(force: str, value: float, trial: Trial, equations: Equations)
     def beyond(z: float) -> float:
         return float(getattr(WheelEquations(trial.at(z), equations).forces(trial.truth), force)) - value
 
-    return float(brentq(beyond, MICROMETRE, trial.radius - MICROMETRE))
+    return float(brentq(beyond, SINKAGE_MARGIN, trial.radius - SINKAGE_MARGIN))
 
 
 def _corrected(sinkage: float) -> str:

@@ -1,7 +1,6 @@
 """What Xi et al. 2024 (World Electr. Veh. J. 15:217) print: Tables 2-7 and section 5.
 
-Soils of Tables 2 and 5 are in terra/soils.py.  Units here are the paper's: degrees,
-kN/m^(n+2), per cent, seconds.
+Soils of Tables 2 and 5 are in terra/soils.py. Units are the paper's: degrees, kN/m^(n+2), per cent, seconds.
 """
 
 from __future__ import annotations
@@ -65,6 +64,7 @@ RUNS = (
     Run(7, "tractor 1", WET_CLAY, (7.0, 322.45, 0.425), (14.13, 635.522, 0.8498), (0.9, 1.8, 0.024), 0.44),
     Run(7, "tractor 2", TRACTOR_2, (14.5, 766.35, 0.35), (29.004, 1533.9, 0.705), (0.014, 0.0783, 0.714), 0.57),
 )
+"""Tables 3, 4, 6 and 7 as printed."""
 START_ERRORS = {3: 20, 4: 50, 6: 20, 7: 50}
 """What each table says the start values are off by [%]."""
 

@@ -1,14 +1,13 @@
-"""Simulated drives: the probability that the present demand can be met, beside whether it truly can.
+"""Trials of the decision: the probability that the present demand can be met, beside whether it truly can.
 
-Each drive has a soil of its own about one of the table's, harder and softer, works at
-slips and a draft of its own, and ends in one call: a probability and a state from one
-window, cold, by the service's own estimator: what it does not call valid is never called
-go.  The truth is solved by the simulator's own equilibrium for the demand that the sensors
-saw with noise.  Torque and sinkage limits are drawn too, so that every cause comes to its
-turn.  Most demands are far from the limit, where any call is easy; so three drives in four
-ask for a margin that is drawn from the estimate to make all probabilities alike frequent.
-It depends on the measurements alone: whoever knows them and no more must still find calls
-of p come true with frequency p.
+    Brier score = mean((probability - outcome)^2)
+    expected    = mean(p (1 - p))  if calls of p come true with frequency p
+
+Each drive has its own soil near one of the table, its own slips, draft, torque and sinkage limits, and ends in one
+call: a probability and a state from one window by the service's own estimator. The truth is solved by the simulator's
+equilibrium for the demand without noise. Most demands are far from the limit, where any call is easy, so three drives
+in four ask for a margin drawn from the estimate, which makes all probabilities about equally frequent. The margin
+depends on the measurements alone, so a calibrated estimator still finds calls of p come true with frequency p.
 """
 
 from __future__ import annotations
@@ -42,19 +41,21 @@ from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import KINDS, soil_named
 from soilbus.terra.wheel import Soil, WheelModel
 from soilbus.validation.draft_trials import true_largest_draft
-from soilbus.validation.monte_carlo import Each, missed
+from soilbus.validation.monte_carlo import Each, prior_about
 from soilbus.validation.windows import task_of
 
-SPREAD = 0.2
-"""Sd of the logarithms by which a drive's soil parameters leave those of the table's soil."""
+SOIL_LOG_SD = 0.2
+"""Standard deviation of the logarithms of a drive's soil parameters about the table's soil."""
 LOW_SLIP, HIGH_SLIP = (0.03, 0.12), (0.15, 0.55)
 """Between which the lowest and the highest slip of a drive lie."""
-TORQUE, SINKAGE = (400.0, 1600.0), (0.02, 0.15)
-"""Between which a motor's torque limit at the wheel [N m] and a sinkage limit [m] are drawn."""
-NEAR = 0.75
+TORQUE_LIMIT_RANGE, SINKAGE_LIMIT_RANGE = (400.0, 1600.0), (0.02, 0.15)
+"""Ranges of a motor's torque limit at the wheel [N m] and of a sinkage limit [m]."""
+NEAR_LIMIT_SHARE = 0.75
 """Share of drives that ask for a margin near the limit."""
-LEAST = 1e-3
+MIN_PROBABILITY = 1e-3
+"""Least and, from 1, greatest probability that a margin near the limit is drawn for."""
 BINS = 10
+"""Equal intervals of probability."""
 MAX_DRAWS = 100
 
 
@@ -76,7 +77,7 @@ class Ground(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """One call: probability that the demand can be met (nan: none), state, what limits, and whether it truly can."""
+    """One call: probability that the demand can be met (nan: none), state, limiting cause, and whether it truly can."""
 
     soil: str
     probability: float
@@ -102,10 +103,16 @@ class Bin:
 class Reliability:
     """All calls.
 
-    Brier is the mean square of probability less outcome; brier_expected and brier_std are
-    its mean and sd if calls of p come true with frequency p.  excess is the outcomes'
-    count less the probabilities' sum, over its sd.  wrong_go counts the drives called go that
-    cannot; wrong_go_expected the sum of what their probabilities left open.
+    Attributes
+    ----------
+    brier
+        Mean square of probability less outcome.
+    brier_expected, brier_std
+        Its mean and sd if calls of p come true with frequency p.
+    excess
+        Outcomes less the sum of the probabilities, over its sd.
+    wrong_go, wrong_go_expected
+        Drives called go that cannot meet the demand, and their number expected from the probabilities.
     """
 
     drives: int
@@ -121,25 +128,38 @@ class Reliability:
 
 
 def verdict_trials(config: Config, drives: int, seed: int, each: Each = map) -> Reliability:
-    """Figures of so many drives; the same seed gives the same drives.
+    """Figures of simulated calls.
 
-    `each` is the built-in map or that of monte_carlo.processes.  Raises SimulationError
-    where the vehicle cannot be driven.
+    Parameters
+    ----------
+    config
+        The vehicle.
+    drives
+        Number of calls.
+    seed
+        The same seed gives the same drives.
+    each
+        The built-in map, or that of monte_carlo.processes.
+
+    Raises
+    ------
+    SimulationError
+        The vehicle cannot be driven.
     """
     key = np.random.SeedSequence([seed, zlib.crc32(b"verdicts")])
     return reliability(list(each(trial, [Task(config, int(s)) for s in key.generate_state(drives)])))
 
 
 def trial(task: Task) -> Call:
-    """Simulate, estimate, call, and solve for the truth."""
+    """Simulate one drive, estimate, call, and solve for the truth."""
     config, seed = task
     rig, rng = rig_of(config), np.random.default_rng([seed, 4])
     ground, recording = _driven(config, seed, rng)
     settings = config.traversability.model_copy(update={"max_sinkage": ground.max_sinkage})
     measured, exact = (_window(recording, config, rig, of_truth) for of_truth in (False, True))
-    told = _told(config, missed(prior_of(config), ground.soil, np.random.default_rng([seed, 1])))
-    task_of_window = task_of(measured, config.estimator.window, told, ground.torque_limit, fresh=True)
-    estimate = WindowEstimator(told).estimate(task_of_window)
+    with_prior = _with_prior(config, prior_about(prior_of(config), ground.soil, np.random.default_rng([seed, 1])))
+    task_of_window = task_of(measured, config.estimator.window, with_prior, ground.torque_limit, fresh=True)
+    estimate = WindowEstimator(with_prior).estimate(task_of_window)
     posterior, status, demand = estimate.result.posterior, estimate.result.status, estimate.demand
     asked = present_demand(exact, rig.chassis, config.estimator.hop)
     if posterior is None or asked is None or demand is None:
@@ -148,15 +168,15 @@ def trial(task: Task) -> Call:
     def judged(by: Settings) -> Traversability:
         return judge(posterior, status, demand, rig, estimate.model, ground.torque_limit, by)[0]
 
-    way = judged(settings)
-    if rng.random() < NEAR and (margin := _margin(way, demand, rng)) is not None:
+    decision = judged(settings)
+    if rng.random() < NEAR_LIMIT_SHARE and (margin := _margin(decision, demand, rng)) is not None:
         settings = settings.model_copy(update={"margin": margin})
-        way = judged(settings)
-    probability = math.nan if way.probability is None else way.probability
-    return Call(ground.name, probability, way.state, way.limit, _can(config, ground, settings, asked.pull))
+        decision = judged(settings)
+    probability = math.nan if decision.probability is None else decision.probability
+    return Call(ground.name, probability, decision.state, decision.limit, _can(config, ground, settings, asked.pull))
 
 
-def _told(config: Config, prior: SoilPrior) -> Config:
+def _with_prior(config: Config, prior: SoilPrior) -> Config:
     """The configuration with another prior of the soil."""
     std = prior.median * np.sqrt(np.expm1(prior.log_std**2))
     pairs = zip(PARAMETERS, prior.median.tolist(), std.tolist(), strict=True)
@@ -164,11 +184,11 @@ def _told(config: Config, prior: SoilPrior) -> Config:
     return config.model_copy(update={"soil": soil})
 
 
-def _margin(way: Traversability, demand: Demand, rng: np.random.Generator) -> float | None:
+def _margin(decision: Traversability, demand: Demand, rng: np.random.Generator) -> float | None:
     """A margin with which the pull suffices with a probability drawn from all; None where no pull does."""
-    if way.capability is None or (most := way.capability.likely_pull) is None or demand.pull <= 0.0:
+    if decision.capability is None or (most := decision.capability.likely_pull) is None or demand.pull <= 0.0:
         return None
-    sure = float(ndtri(rng.uniform(LEAST, 1.0 - LEAST)))
+    sure = float(ndtri(rng.uniform(MIN_PROBABILITY, 1.0 - MIN_PROBABILITY)))
     return (most.value - sure * math.hypot(most.std, demand.std)) / demand.pull - 1.0
 
 
@@ -199,15 +219,15 @@ def _driven(config: Config, seed: int, rng: np.random.Generator) -> tuple[Ground
 def _ground(config: Config, rng: np.random.Generator) -> Ground:
     name = str(rng.choice(KINDS))
     while True:
-        soil = Soil(*(np.asarray(soil_named(name)) * np.exp(SPREAD * rng.standard_normal(6))).tolist())
+        soil = Soil(*(np.asarray(soil_named(name)) * np.exp(SOIL_LOG_SD * rng.standard_normal(6))).tolist())
         if soil.phi < MAX_PHI:
             break
     torque_limit = np.array([wheel.max_torque or np.nan for wheel in config.wheel])
     max_sinkage, kind = config.traversability.max_sinkage, rng.integers(3)
     if kind == 1:
-        torque_limit = np.full(len(torque_limit), rng.uniform(*TORQUE))
+        torque_limit = np.full(len(torque_limit), rng.uniform(*TORQUE_LIMIT_RANGE))
     if kind == 2:
-        max_sinkage = rng.uniform(*SINKAGE)
+        max_sinkage = rng.uniform(*SINKAGE_LIMIT_RANGE)
     return Ground(name, soil, torque_limit, max_sinkage)
 
 

@@ -1,4 +1,4 @@
-"""Windows of simulated channels as the service's own estimator takes them."""
+"""Windows of simulated channels as tasks for the service's own estimator."""
 
 from __future__ import annotations
 
@@ -12,7 +12,21 @@ from soilbus.pipeline.positions import PositionTrack
 
 
 def task_of(window: Window, end: float, config: Config, torque_limit: NDArray[np.float64], fresh: bool) -> WindowTask:
-    """A window that ends at `end` [s] of which nothing is missing; torque_limit (W,) [N m], nan where unknown."""
+    """A window task without missing inputs.
+
+    Parameters
+    ----------
+    window
+        The data.
+    end
+        End of the window [s].
+    config
+        Window and hop.
+    torque_limit
+        (W,) [N m]; nan where unknown.
+    fresh
+        Whether nothing of the window before is carried over.
+    """
     return WindowTask(
         index=0 if fresh else round((end - config.estimator.window) / config.estimator.hop),
         start=end - config.estimator.window,

@@ -11,7 +11,7 @@ from soilbus.daemon import health
 from soilbus.daemon.service import Service
 from soilbus.pipeline.estimator import WindowEstimator
 
-health.LONGEST_SOLVE = health.LONGEST_MUTE = 3.0
+health.MAX_SOLVE_TIME = health.MAX_TIME_WITHOUT_SEND = 3.0
 step, estimate, send = Service.step, WindowEstimator.estimate, LiveBus.send
 
 

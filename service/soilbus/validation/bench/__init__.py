@@ -1,4 +1,9 @@
-"""`soilbus bench`: every performance figure beside its peer, both measured in one run."""
+"""`soilbus bench`: every performance figure beside its peer, both measured in one run.
+
+    speed-up = time of the peer / our time
+
+Times are the least of several rounds, taken in turn, so that a busy machine slows both alike.
+"""
 
 from __future__ import annotations
 
@@ -21,15 +26,17 @@ from soilbus.simulator.scenario import excited
 from soilbus.validation.bench import decode, growth, paper, replay, service, window
 from soilbus.validation.bench.figure import Figure
 
-RECORDING = 120.0
+RECORDING_TIME = 120.0
+"""Length of the simulated log [s]."""
 THREADS = 1
+"""Threads of linear algebra."""
 
 Measurement = Callable[[Path], Mapping[str, Figure]]
 """Figures by name, from a recorded log that they may use."""
 
 MEASUREMENTS: tuple[Measurement, ...] = (
     lambda log: {"decode_speedup": decode.decode_speedup(log)},
-    lambda log: {"replay_realtime_factor": replay.replay_realtime_factor(log, RECORDING)},
+    lambda log: {"replay_realtime_factor": replay.replay_realtime_factor(log, RECORDING_TIME)},
     lambda _: {"paper_solve_speedup": paper.paper_solve_speedup()},
     lambda _: {"window_solve_speedup": window.window_solve_speedup()},
     service.window_times,
@@ -38,11 +45,23 @@ MEASUREMENTS: tuple[Measurement, ...] = (
 
 
 def run_bench() -> dict[str, Any]:
-    """Measure; value by figure's name, beside "details" of each and the "machine".
+    """Measure everything.
 
-    With one thread for linear algebra, as the service has by its unit: with two, both wait for each other
-    all the time, and both are counted.  ModuleNotFoundError, with a line for the user, where
-    threadpoolctl is not installed; AssertionError where ours and a peer come to different results.
+    Returns
+    -------
+    Value by figure's name, beside "details" of each and the "machine".
+
+    Raises
+    ------
+    ModuleNotFoundError
+        threadpoolctl is not installed; one line for the user.
+    AssertionError
+        Ours and a peer come to different results.
+
+    Notes
+    -----
+    Linear algebra runs with one thread, as the service's unit sets it: two threads would wait for each other, and both
+    would be counted.
     """
     try:
         from threadpoolctl import threadpool_limits
@@ -58,7 +77,9 @@ def _figures() -> dict[str, Figure]:
     figures: dict[str, Figure] = {}
     with TemporaryDirectory() as folder:
         log = Path(folder) / "bench.log"
-        write_log(frames(simulate(config, excited("loam", RECORDING), seed=1), config, load_databases(config)), log)
+        write_log(
+            frames(simulate(config, excited("loam", RECORDING_TIME), seed=1), config, load_databases(config)), log
+        )
         for measure in _with_progress(MEASUREMENTS):
             figures |= measure(log)
     return figures

@@ -1,6 +1,9 @@
-"""The daemon itself on a fully loaded bus of the kernel: losses, latency, processor, memory, start.
+"""The daemon on a fully loaded bus of the kernel: losses, latency, processor, memory, start.
 
-The channel must be one of our own, such as a vcan: it is filled to the brim.
+    lost = frames sent - frames that the daemon says it received
+    processor ratio = processor time of the daemon / that of a bare python-can loop in the same seconds
+
+The channel must be one of our own, such as a vcan, because it is filled up.
 """
 
 from __future__ import annotations
@@ -25,14 +28,15 @@ from soilbus.arrays import Array
 from soilbus.can.bus import open_bus
 from soilbus.simulator.reference import TRACTOR
 from soilbus.validation.bench.bus_ear import Ear
-from soilbus.validation.bench.bus_load import FULL, Traffic, others
+from soilbus.validation.bench.bus_load import FULL_BUS_RATE, Traffic, others
 from soilbus.validation.bench.figure import Figure
 
-STARTS, CALLS = 3, 1000
+N_STARTS, N_SYSTEM_CALLS = 3, 1000
 """How often a start and a system call are timed."""
-QUIET = 1.0
-SETTLED = 2.5
-"""Seconds after the last frame until its count is on the bus; where the daemon lags behind the count goes on."""
+QUIET_TIME = 1.0
+"""Time [s] without a frame after which the channel counts as unused."""
+COUNT_TIME = 2.5
+"""Time [s] after the last frame until its count is on the bus."""
 
 _BARE = """
 import socket, sys
@@ -47,6 +51,7 @@ with can.Bus(interface="socketcan", channel=sys.argv[1]) as bus:
     except KeyboardInterrupt:
         print(n, flush=True)
 """
+"""A loop that receives the whole bus with python-can and does nothing else."""
 
 
 _LIBRARIES = """
@@ -55,7 +60,7 @@ from pydantic import BaseModel
 class Anything(BaseModel):
     number: float = 0.0
 """
-"""What the daemon cannot start without, whatever it does with it; pydantic loads most of itself for a first model."""
+"""The libraries that the daemon cannot start without; pydantic loads most of itself for a first model."""
 
 
 class NotMeasured(Exception):
@@ -63,14 +68,29 @@ class NotMeasured(Exception):
 
 
 def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
-    """All figures, from `seconds` of a full bus and half as many with a bare python-can loop beside.
+    """All figures of the daemon on a full bus.
 
-    A window whose result never came counts as late as the run is long.  Raises NotMeasured;
-    BusError for a channel that cannot be opened.
+    Parameters
+    ----------
+    channel
+        A vcan.
+    seconds
+        Time on a full bus [s]; half as long again with a bare python-can loop beside.
+
+    Raises
+    ------
+    NotMeasured
+        The bus is not ours alone, or the daemon did not do its work.
+    BusError
+        The channel cannot be opened.
+
+    Notes
+    -----
+    A window whose result never came counts as late as the run is long.
     """
     _check_quiet(channel)
     ready, libraries, bare = zip(
-        *((_time_to_ready(channel), _time_of(_LIBRARIES), _time_of("")) for _ in range(STARTS)), strict=True
+        *((_time_to_ready(channel), _time_of(_LIBRARIES), _time_of("")) for _ in range(N_STARTS)), strict=True
     )
     with TemporaryDirectory() as folder, _daemon(channel, Path(folder)) as daemon:
         ear, traffic = Ear(channel), Traffic(channel, 1.5 * seconds)
@@ -90,7 +110,8 @@ def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
     return {
         "bus_lost": Figure(
             traffic.sent - received, 0.0, f"kernel's drop counter: {overruns}",
-            f"of {traffic.sent} frames at our filters, {traffic.sent / (1.5 * seconds):.0f} of {FULL:.0f} a second",
+            f"of {traffic.sent} frames at our filters, "
+            f"{traffic.sent / (1.5 * seconds):.0f} of {FULL_BUS_RATE:.0f} a second",
             at_most=True, digits=0,
         ),
         "bus_latency_ms": _latency(np.minimum(late, seconds), ear.longest_pause()),
@@ -99,7 +120,7 @@ def bus_figures(channel: str, seconds: float) -> dict[str, Figure]:
         "bus_ready_s": Figure(
             float(np.median([wall for wall, _ in ready])), 1.5,
             f"python with its libraries: {np.median(libraries):.2f} s, without: {np.median(bare):.2f} s",
-            f"from start to READY=1, median of {STARTS}: " + ", ".join(f"{wall:.2f}" for wall, _ in ready) + " s",
+            f"from start to READY=1, median of {N_STARTS}: " + ", ".join(f"{wall:.2f}" for wall, _ in ready) + " s",
             at_most=True, digits=2,
             more=("Processor time to READY=1: " + ", ".join(f"{used:.2f}" for _, used in ready) + " s.",),
         ),
@@ -121,24 +142,24 @@ def _latency(late: Array, pause: float) -> Figure:
 
 
 def _time_of_a_call() -> float:
-    """Time [s] that the kernel takes for next to nothing."""
+    """Time [s] of one cheap system call."""
     begin = time.perf_counter()
-    for _ in range(CALLS):
+    for _ in range(N_SYSTEM_CALLS):
         os.getppid()
-    return (time.perf_counter() - begin) / CALLS
+    return (time.perf_counter() - begin) / N_SYSTEM_CALLS
 
 
 def _wait_until_counted(ear: Ear) -> None:
-    """Until the daemon's count of frames goes on no more."""
+    """Wait until the daemon's count of frames stays the same."""
     before = -1
     while (count := ear.books()[0]) != before:
         before = count
-        time.sleep(SETTLED)
+        time.sleep(COUNT_TIME)
 
 
 def _check_quiet(channel: str) -> None:
     with open_bus({"interface": "socketcan", "channel": channel}) as bus:
-        if bus.recv(QUIET) is not None:
+        if bus.recv(QUIET_TIME) is not None:
             raise NotMeasured(f"{channel}: others are on this bus; the bench would fill it up")
 
 
@@ -183,7 +204,7 @@ def _time_to_ready(channel: str) -> tuple[float, float]:
 
 
 def _time_of(program: str) -> float:
-    """Wall time [s] of a process of its own."""
+    """Wall time [s] of a program in a new process."""
     begin = time.perf_counter()
     subprocess.run([sys.executable, "-c", program], check=True)
     return time.perf_counter() - begin

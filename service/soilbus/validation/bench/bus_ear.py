@@ -1,4 +1,7 @@
-"""What an onlooker hears of a daemon at work: when each window's result came, how many frames it took."""
+"""A listener beside the daemon: when each window's result came, and how many frames the daemon received.
+
+latency = time of the frame SoilStrength - time of the window's last mapped frame    (kernel time stamps)
+"""
 
 from __future__ import annotations
 
@@ -17,15 +20,15 @@ from soilbus.pipeline.intake import EDGE_LEAD, Intake
 from soilbus.pipeline.outputs import WINDOW_MODULUS
 from soilbus.simulator.reference import reference_configuration
 
-LITTLE_ROOM = 0.05
-"""Longest time [s] between two looks where the kernel does not keep the frames of seconds for us."""
+MAX_PAUSE_SMALL_BUFFER = 0.05
+"""Longest time [s] between two looks where the kernel's buffer does not hold seconds of frames."""
 
 
 class Ear:
-    """Hears the mapped messages and the daemon's on a channel, with the kernel's time stamps.
+    """Receives the mapped messages and the daemon's on a channel, with the kernel's time stamps.
 
-    To be made while the channel is quiet: a socket hears all frames until it has its filters, and one
-    of others would pass for the first mapped one.
+    It must be made while the channel is quiet: a socket receives all frames until its filters are set, and a foreign
+    one would pass for the first mapped one.
     """
 
     def __init__(self, channel: str) -> None:
@@ -44,7 +47,7 @@ class Ear:
         self._thread.start()
 
     def stop(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         self._on = False
         self._thread.join()
         self._wire.shutdown()
@@ -63,12 +66,12 @@ class Ear:
     def _pause(self) -> float:
         """Time [s] for which frames may gather: the kernel stamps them, and listening takes the daemon time."""
         if not self._mapped:
-            return LITTLE_ROOM
+            return MAX_PAUSE_SMALL_BUFFER
         pause = until_middle(time.time(), self._mapped[0], self._config.estimator.window, self._config.estimator.hop)
-        return pause if self._wire.room >= RECEIVE_BUFFER else min(pause, LITTLE_ROOM)
+        return pause if self._wire.room >= RECEIVE_BUFFER else min(pause, MAX_PAUSE_SMALL_BUFFER)
 
     def latencies(self) -> Array:
-        """Time [s] from the last mapped frame of each window so far to the frame SoilStrength that tells of it."""
+        """Time [s] from the last mapped frame of each window so far to its frame SoilStrength."""
         said = self._of("SoilStrength", "Window")
         settings = self._config.estimator
         return latencies(np.array(self._mapped), np.array(said), settings.window, settings.hop)

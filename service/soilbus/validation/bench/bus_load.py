@@ -1,4 +1,7 @@
-"""A fully loaded bus: a tractor that drives, and everybody else on the wire."""
+"""A fully loaded bus: a simulated tractor's frames, and unmapped frames for the rest of the load.
+
+frames a second = 1 Mbit/s / 136 bits, of which a tenth is mapped
+"""
 
 from __future__ import annotations
 
@@ -18,28 +21,29 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 
-FULL = 7350.0
+FULL_BUS_RATE = 7350.0
 """Frames a second of 8 bytes with 29-bit identifiers that 1 Mbit/s carries, at 136 bits each with their stuff bits."""
-OURS = 0.1
-"""Share of them that is mapped."""
+MAPPED_SHARE = 0.1
+"""Share of the frames that is mapped."""
 
 _POSITION = 0xFEF3
+"""PGN of the vehicle position."""
 _OTHERS_PERIOD = 0.01
+"""Period [s] of each unmapped message."""
 _OTHERS = 0x18EE0000  # address claims, which nothing is mapped to
 
 
 class Traffic:
-    """Plays a simulated drive onto a channel in real time, from `start` on; `sent` counts its frames.
+    """Plays a simulated drive onto a channel in real time; `sent` counts its frames, all of them mapped.
 
-    All of them are mapped.  The drive alone is less than a tenth of a full bus, so its position
-    is said more often: that tells the estimate nothing.
+    The drive alone is less than a tenth of a full bus, so its position is sent more often, which adds no information.
     """
 
     def __init__(self, channel: str, seconds: float) -> None:
         self.sent = 0
         config = reference_configuration()
         drive = list(frames(simulate(config, excited("loam", seconds), seed=1), config))
-        self._played = _thickened(drive, FULL * OURS)
+        self._played = _thickened(drive, FULL_BUS_RATE * MAPPED_SHARE)
         self._channel = channel
         self._thread = threading.Thread(target=self._play, daemon=True)
 
@@ -81,7 +85,7 @@ def others(channel: str) -> Iterator[None]:
     with can.Bus(interface="socketcan", channel=channel, can_filters=[]) as bus:
         tasks = [
             bus.send_periodic(can.Message(arbitration_id=_OTHERS + i, data=bytes(8)), _OTHERS_PERIOD)
-            for i in range(round(FULL * (1.0 - OURS) * _OTHERS_PERIOD))
+            for i in range(round(FULL_BUS_RATE * (1.0 - MAPPED_SHARE) * _OTHERS_PERIOD))
         ]
         try:
             yield

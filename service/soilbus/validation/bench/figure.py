@@ -1,4 +1,7 @@
-"""One figure of the bench, and how times are taken on a machine that does other things too."""
+"""One figure of the bench, and how times are taken on a machine that does other things too.
+
+time = least of several runs: other load only adds
+"""
 
 from __future__ import annotations
 

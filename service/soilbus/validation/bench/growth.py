@@ -1,4 +1,8 @@
-"""How the cost of a fit grows with samples and wheels."""
+"""Bench of growth: how the time of a Gauss-Newton step grows with samples and wheels.
+
+exponent = log2(time at the largest size / time at half of it)
+time = fixed + each (wheels x instants)
+"""
 
 from __future__ import annotations
 
@@ -22,18 +26,21 @@ from soilbus.simulator.scenario import excited
 from soilbus.validation.bench.figure import Figure, in_turn
 
 WHEELS = (1, 2, 4, 8)
-LENGTHS = (5.0, 10.0, 20.0, 40.0)
+WINDOW_LENGTHS = (5.0, 10.0, 20.0, 40.0)
+"""Lengths of the windows [s]."""
 ROUNDS = 12
+"""Timed runs, of which the shortest counts."""
 STEPS = 5
 """Gauss-Newton steps that are timed in a row."""
-TARGET = 1.1
+MAX_EXPONENT = 1.1
+"""Target: all but linear."""
 
 
 def exponents() -> dict[str, Figure]:
-    """How a Gauss-Newton step's time grows where it grows most: at the most wheels, at the longest window.
+    """The exponents for wheels and for samples.
 
-    The exponents are those of doubling wheels or window to the largest size, where the
-    fixed cost hides least.  A fit takes about a dozen steps whatever the size.
+    They are those of doubling to the largest size, where the fixed time hides least. A fit takes about a dozen steps at
+    any size.
     """
     sizes, works, iterations = [], [], []
     for wheels in WHEELS:
@@ -47,7 +54,7 @@ def exponents() -> dict[str, Figure]:
     size, times = np.array(sizes, float), in_turn(works, ROUNDS) / STEPS
     fixed, each = line(size, times)
     off = float(np.max(np.abs((fixed + each * size) / times - 1.0)))
-    grid = times.reshape(len(WHEELS), len(LENGTHS))
+    grid = times.reshape(len(WHEELS), len(WINDOW_LENGTHS))
     what = "exponent of one Gauss-Newton step's time"
     more = (
         f"A Gauss-Newton step takes {1e3 * fixed:.1f} ms + {1e6 * each:.1f} us each wheel-instant, to "
@@ -56,13 +63,14 @@ def exponents() -> dict[str, Figure]:
     )
     return {
         "wheels_exponent": Figure(
-            float(np.log2(grid[-1, -1] / grid[-2, -1])), TARGET,
+            float(np.log2(grid[-1, -1] / grid[-2, -1])), MAX_EXPONENT,
             f"{WHEELS[-2]} wheels {1e3 * grid[-2, -1]:.1f} ms, {WHEELS[-1]} wheels {1e3 * grid[-1, -1]:.1f} ms",
-            f"{what}, {LENGTHS[-1]:g} s window", at_most=True, digits=2,
+            f"{what}, {WINDOW_LENGTHS[-1]:g} s window", at_most=True, digits=2,
         ),
         "samples_exponent": Figure(
-            float(np.log2(grid[-1, -1] / grid[-1, -2])), TARGET,
-            f"{LENGTHS[-2]:g} s {1e3 * grid[-1, -2]:.1f} ms, {LENGTHS[-1]:g} s {1e3 * grid[-1, -1]:.1f} ms",
+            float(np.log2(grid[-1, -1] / grid[-1, -2])), MAX_EXPONENT,
+            f"{WINDOW_LENGTHS[-2]:g} s {1e3 * grid[-1, -2]:.1f} ms, "
+            f"{WINDOW_LENGTHS[-1]:g} s {1e3 * grid[-1, -1]:.1f} ms",
             f"{what}, {WHEELS[-1]} wheels", at_most=True, digits=2, more=more,
         ),
     }  # fmt: skip
@@ -76,29 +84,29 @@ def line(size: Array, times: Array) -> tuple[float, float]:
 
 def _steps(problem: ObservationModel, prior: SoilPrior, soil: Array) -> Callable[[], Any]:
     """Some Gauss-Newton steps at the optimum."""
-    fitting = Objective(problem, prior, Gaussian.of(prior, problem.gain_std))
+    objective = Objective(problem, prior, Gaussian.of(prior, problem.gain_std))
 
-    def moved(place: Iterate) -> Iterate:
-        point = fitting.quadratic_model(place)
-        step = None if point is None else point.step()
-        if point is None or step is None:
+    def next_iterate(iterate: Iterate) -> Iterate:
+        quadratic = objective.quadratic_model(iterate)
+        step = None if quadratic is None else quadratic.step()
+        if quadratic is None or step is None:
             raise AssertionError("a Gauss-Newton step failed at the optimum")
-        return fitting.stepped(place, point, step)
+        return objective.stepped(iterate, quadratic, step)
 
-    start = moved(moved(fitting.start(soil)))
+    start = next_iterate(next_iterate(objective.start(soil)))
 
     def work() -> None:
-        place = start
+        iterate = start
         for _ in range(STEPS):
-            place = moved(place)
+            iterate = next_iterate(iterate)
 
     return work
 
 
 def _problems(wheels: int) -> Iterator[tuple[ObservationModel, SoilPrior]]:
-    """Windows of all lengths of a tractor with so many wheels, half of them on each axle; one: a test rig."""
+    """Windows of all lengths of a tractor with this number of wheels, half of them on each axle; one: a test rig."""
     config = _configuration(max(wheels, 2))
-    recording = simulate(config, excited("loam", max(LENGTHS)), seed=1)
+    recording = simulate(config, excited("loam", max(WINDOW_LENGTHS)), seed=1)
     samples = {name: (column.t, column.value) for name, column in recording.channels.items()}
     if wheels == 1:
         config = config.model_copy(update={"wheel": config.wheel[:1], "vehicle": None})
@@ -108,7 +116,7 @@ def _problems(wheels: int) -> Iterator[tuple[ObservationModel, SoilPrior]]:
     rig, settings = rig_of(config), config.estimator
     store = Bins(rig, settings.bin, 0.0)
     store.add({name: samples[name] for name in rig.channels if name in samples})
-    for length in LENGTHS:
+    for length in WINDOW_LENGTHS:
         yield ObservationModel(store.window(0.0, length), rig, model_of(config), settings.min_speed), prior_of(config)
 
 
@@ -126,6 +134,6 @@ def _configuration(wheels: int) -> Config:
 def _rows(times: Array, each: Array, iterations: Sequence[int]) -> list[str]:
     """A line for each number of wheels."""
     cells = [f"{t:8.1f}{e:6.1f}{i:4d}" for t, e, i in zip(times, each, iterations, strict=True)]
-    rows = [cells[i : i + len(LENGTHS)] for i in range(0, len(cells), len(LENGTHS))]
-    head = "wheels" + "".join(f"{f'{length:g} s':>18}" for length in LENGTHS)
+    rows = [cells[i : i + len(WINDOW_LENGTHS)] for i in range(0, len(cells), len(WINDOW_LENGTHS))]
+    head = "wheels" + "".join(f"{f'{length:g} s':>18}" for length in WINDOW_LENGTHS)
     return [head, *(f"{wheels:6d}" + "".join(row) for wheels, row in zip(WHEELS, rows, strict=True))]

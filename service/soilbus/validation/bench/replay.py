@@ -1,4 +1,7 @@
-"""A recorded log through the daemon's pipeline, beside reading it alone."""
+"""Bench of replay: a recorded log through the daemon's pipeline, beside python-can reading it without any pipeline.
+
+real-time factor = length of the recording / time of its replay
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from soilbus.validation.bench.figure import Figure, wall_time
 
 
 def replay_realtime_factor(log: Path, seconds: float) -> Figure:
-    """A recording of so many seconds, 1 s hop, against reading it with python-can alone."""
+    """Replay of a log of `seconds` [s] with a hop of 1 s, beside reading it with python-can."""
     config = reference_configuration()
 
     def whole() -> None:

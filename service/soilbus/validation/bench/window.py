@@ -1,8 +1,9 @@
-"""A window's fit: ours beside scipy.optimize.least_squares with finite differences.
+"""Bench of a window's fit: ours beside scipy.optimize.least_squares with finite differences.
 
-Both have the same window, prior, wheel model, noise and unknowns: five soil parameters,
-each as logarithm, gains known, loads and speeds of every instant eliminated.  Both start
-at the prior's median; ours then also tries other soils, least_squares does not.
+    minimise |whitened residuals(log soil)|^2 + |(log soil - prior median) / prior sd|^2
+
+Both have the same window, prior, wheel model, noise and unknowns: five soil parameters as logarithms, gains known,
+loads and speeds of every instant eliminated. Both start at the prior's median; ours then also tries other soils.
 """
 
 from __future__ import annotations
@@ -28,20 +29,21 @@ from soilbus.terra.wheel import Soil, sinkage, state_on, wheel_forces
 from soilbus.validation.bench.figure import Figure, in_turn
 
 SOILS = ("loam", "wet_clay", "dry_sand")
-KNOWN = (("c", "K"), ("K", "c"))
-"""Which of two parameters is known exactly, and which to a quarter (and told too large by as much)."""
-LENGTH = 10.0
+EXACT_AND_ROUGH = (("c", "K"), ("K", "c"))
+"""Pairs: the parameter known exactly, and the one known to a quarter, whose prior median is a quarter too large."""
+WINDOW_LENGTH = 10.0
+"""[s]."""
 ROUNDS = 4
-AGREEMENT = 0.05
-"""Posterior standard deviations that the two ends may be apart in any parameter."""
-PASSES = (1e-2, 1e-3, 1e-4, 1e-8)
+"""Timed runs, of which the shortest counts."""
+MAX_DISTANCE_SD = 0.05
+"""Greatest distance of the two ends in any parameter, in posterior standard deviations."""
+PASS_TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-8)
 """Relative fall of the cost that ends each pass of least_squares (its ftol; the last is its default).
 
-Each pass has its weights and eliminated loads and speeds from where the one before ended;
-an exact end of all but the last would be wasted.  Four is the least that brings all six
-windows to the same end as ours."""
-DIFFERENCE = 1e-5
-"""Relative step of the finite differences.  The default, 1.5e-8, takes more steps: entry angles are solved to 1e-12."""
+Each pass has the weights and the eliminated loads and speeds of the end of the one before, so an exact end of all but
+the last would be wasted. Four passes are the least that bring all six windows to the same end as ours."""
+RELATIVE_DIFFERENCE = 1e-5
+"""Relative step of the finite differences. The default, 1.5e-8, takes more steps: entry angles are solved to 1e-12."""
 
 
 class Window(NamedTuple):
@@ -58,11 +60,11 @@ class Window(NamedTuple):
 
 def window_solve_speedup() -> Figure:
     """10 s, four wheels, five free parameters, cold; AssertionError where the two come to different ends."""
-    windows = [_window(soil, *known) for known in KNOWN for soil in SOILS]
+    windows = [_window(soil, *known) for known in EXACT_AND_ROUGH for soil in SOILS]
     apart, times = [], []
     for window in windows:
         apart.append(distance(window, fit_window(*window), by_finite_differences(window)))
-        if not apart[-1] < AGREEMENT:
+        if not apart[-1] < MAX_DISTANCE_SD:
             raise AssertionError(f"ours and least_squares end {apart[-1]:.2g} standard deviations apart")
         times.append(in_turn(_works(window), ROUNDS))
     ours, alone, peer = np.array(times).T
@@ -107,7 +109,7 @@ def by_finite_differences(window: Window) -> Soil:
     x = np.zeros(len(free))
     latents = problem.start(soil_at(x))
     at = problem.linearise(soil_at(x), gains, latents)
-    for turn, ftol in enumerate(PASSES):
+    for turn, ftol in enumerate(PASS_TOLERANCES):
         if turn:
             soil = soil_at(x)
             at = problem.linearise(soil, gains, latents)
@@ -116,16 +118,16 @@ def by_finite_differences(window: Window) -> Soil:
         residuals = _whitened(problem, at, latents)
         x = least_squares(
             lambda x, residuals=residuals: np.concatenate([residuals(soil_at(x)), x]), x,
-            jac="2-point", diff_step=DIFFERENCE, ftol=ftol,
+            jac="2-point", diff_step=RELATIVE_DIFFERENCE, ftol=ftol,
         ).x  # fmt: skip
     return soil_at(x)
 
 
 def _whitened(problem: ObservationModel, at: Linearisation, latents: Latents) -> Callable[[Soil], Array]:
-    """Readings less model of torques, draft balance and sinkages, whitened, by soil.
+    """Measured less predicted torques, draft balance and sinkages, whitened, as a function of the soil.
 
-    Loads and speeds are eliminated as in ours: they are measured with noise that travels
-    through the model, linear about `latents`, into every residual.
+    Loads and speeds are eliminated as in ours: they are measured with noise that goes through the model, linear about
+    `latents`, into every residual.
     """
     own = np.concatenate([problem.torque_var, problem.demand_var[:, None], problem.sinkage_var], axis=1)
     covariance = at.by_latents * at.variance[:, None] @ at.by_latents.swapaxes(1, 2)
@@ -160,15 +162,15 @@ def _works(window: Window) -> tuple[Callable[[], object], ...]:
 def _window(name: str, exact: str, rough: str) -> Window:
     """A simulated drive with slip swept from 0.05 to 0.4."""
     soil = soil_named(name)
-    told = 1.25 * getattr(soil, rough)
+    median = 1.25 * getattr(soil, rough)
     config = reference_configuration([
         f"soil.{exact}.value={getattr(soil, exact)}", f"soil.{exact}.std=0",
-        f"soil.{rough}.value={told}", f"soil.{rough}.std={0.25 * told}",
+        f"soil.{rough}.value={median}", f"soil.{rough}.std={0.25 * median}",
         *(f"noise.{quantity}.gain=0" for quantity in ("torque", "load", "speed", "ground_speed", "draft")),
     ])  # fmt: skip
     rig, settings = rig_of(config), config.estimator
-    channels = simulate(config, excited(name, LENGTH), seed=1).channels
+    channels = simulate(config, excited(name, WINDOW_LENGTH), seed=1).channels
     store = Bins(rig, settings.bin, 0.0)
     store.add({n: (channels[n].t, channels[n].value) for n in rig.channels if n in channels})
-    problem = ObservationModel(store.window(0.0, LENGTH), rig, model_of(config), settings.min_speed)
+    problem = ObservationModel(store.window(0.0, WINDOW_LENGTH), rig, model_of(config), settings.min_speed)
     return Window(problem, prior_of(config))

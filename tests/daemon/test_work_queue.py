@@ -9,7 +9,7 @@ from time import perf_counter, sleep
 import pytest
 
 from fakes import FakeClock, InlineExecutor
-from soilbus.daemon.work_queue import MAX_PENDING, TIDIED, WorkQueue
+from soilbus.daemon.work_queue import MAX_PENDING_WINDOWS, WINDOWS_PER_MEMORY_RELEASE, WorkQueue
 
 
 class Later(Executor):
@@ -30,29 +30,29 @@ class Later(Executor):
 
 def test_results_come_in_their_order_with_their_ends():
     worker = Later()
-    backlog = WorkQueue(worker, lambda task: f"result of {task}", 5.0)
-    assert [backlog.add(task, 10.0 + task, 7, 10.5 + task) for task in (0, 1)] == [0, 0]
-    assert list(backlog.results(12.0)) == []
-    assert backlog.solving_since == 10.5
+    queue = WorkQueue(worker, lambda task: f"result of {task}", 5.0)
+    assert [queue.add(task, 10.0 + task, 7, 10.5 + task) for task in (0, 1)] == [0, 0]
+    assert list(queue.results(12.0)) == []
+    assert queue.solving_since == 10.5
     worker.do_next()
-    assert backlog.has_result
-    ((result, pending),) = backlog.results(13.0)
+    assert queue.has_result
+    ((result, pending),) = queue.results(13.0)
     assert (result, pending.at, pending.epoch) == ("result of 0", 10.0, 7)
-    assert backlog.solving_since == 13.0
+    assert queue.solving_since == 13.0
     worker.do_next()
-    assert [result for result, _ in backlog.results(14.0)] == ["result of 1"]
-    assert not backlog
-    assert backlog.solving_since is None
-    assert backlog.solved == 2
+    assert [result for result, _ in queue.results(14.0)] == ["result of 1"]
+    assert not queue
+    assert queue.solving_since is None
+    assert queue.solved == 2
 
 
 def test_what_the_worker_cannot_keep_up_with_is_dropped_but_for_the_newest_and_the_one_it_has():
     worker = Later()
-    backlog = WorkQueue(worker, lambda task: task, 0.0)
-    worker_has = backlog.add(0, 0.0, 0, 0.0)
+    queue = WorkQueue(worker, lambda task: task, 0.0)
+    worker_has = queue.add(0, 0.0, 0, 0.0)
     worker.jobs[0][0].set_running_or_notify_cancel()
-    dropped = [backlog.add(task, 0.0, 0, 0.0) for task in range(1, 6)]
-    assert [worker_has, *dropped] == [0] * MAX_PENDING + [1] * (6 - MAX_PENDING)
+    dropped = [queue.add(task, 0.0, 0, 0.0) for task in range(1, 6)]
+    assert [worker_has, *dropped] == [0] * MAX_PENDING_WINDOWS + [1] * (6 - MAX_PENDING_WINDOWS)
     worker.jobs[0][0].set_result(0)
     del worker.jobs[0]
     while worker.jobs:
@@ -60,40 +60,43 @@ def test_what_the_worker_cannot_keep_up_with_is_dropped_but_for_the_newest_and_t
             del worker.jobs[0]
         else:
             worker.do_next()
-    assert [result for result, _ in backlog.results(1.0)] == [0, 4, 5]
+    assert [result for result, _ in queue.results(1.0)] == [0, 4, 5]
 
 
 @pytest.mark.parametrize(("solved", "waited"), [(False, 0.04), (True, 0.0)])
 def test_the_loop_waits_for_a_result_and_no_longer(solved, waited):
     clock, worker = FakeClock(), Later()
-    backlog = WorkQueue(worker, lambda task: task, clock(), clock.wait_for)
-    backlog.wait(0.04)
+    queue = WorkQueue(worker, lambda task: task, clock(), clock.wait_for)
+    queue.wait(0.04)
     assert clock() == 1000.0  # for nothing
-    backlog.add(0, clock(), 0, clock())
+    queue.add(0, clock(), 0, clock())
     if solved:
         worker.do_next()
-    backlog.wait(0.04)
-    backlog.wait(-0.01)
+    queue.wait(0.04)
+    queue.wait(-0.01)
     assert clock() - 1000.0 == pytest.approx(waited)
 
 
 def test_a_real_result_ends_the_wait():
     with ThreadPoolExecutor(max_workers=1) as worker:
-        backlog = WorkQueue(worker, lambda task: sleep(0.01), 0.0)
-        backlog.add(0, 0.0, 0, 0.0)
+        queue = WorkQueue(worker, lambda task: sleep(0.01), 0.0)
+        queue.add(0, 0.0, 0, 0.0)
         begin = perf_counter()
-        backlog.wait(60.0)
+        queue.wait(60.0)
         assert perf_counter() - begin < 30.0
-        assert backlog.has_result
+        assert queue.has_result
 
 
 def test_free_memory_is_given_back_once_in_a_while_and_after_the_result_is_out(monkeypatch):
     done: list[str] = []
     monkeypatch.setattr("soilbus.daemon.work_queue.give_back_freed_memory", partial(done.append, "tidy"))
-    backlog = WorkQueue(InlineExecutor(), lambda task: task, 0.0)
-    for task in range(2 * TIDIED + 1):
-        backlog.add(task, 0.0, 0, 0.0)
-        for result, _ in backlog.results(0.0):
+    queue = WorkQueue(InlineExecutor(), lambda task: task, 0.0)
+    for task in range(2 * WINDOWS_PER_MEMORY_RELEASE + 1):
+        queue.add(task, 0.0, 0, 0.0)
+        for result, _ in queue.results(0.0):
             done.append(f"window {result} out")
     tidied = [i for i, what in enumerate(done) if what == "tidy"]
-    assert [done[i - 1] for i in tidied] == [f"window {TIDIED - 1} out", f"window {2 * TIDIED - 1} out"]
+    assert [done[i - 1] for i in tidied] == [
+        f"window {WINDOWS_PER_MEMORY_RELEASE - 1} out",
+        f"window {2 * WINDOWS_PER_MEMORY_RELEASE - 1} out",
+    ]

@@ -258,7 +258,7 @@ def test_what_is_no_file_is_refused_and_nothing_is_nothing(tmp_path: Path):
     assert read(path, OWNER) == loaded(CONTENT, OWNER)
     (tmp_path / "link").symlink_to(path)
     os.mkfifo(tmp_path / "fifo")
-    (tmp_path / "large").write_bytes(CONTENT + b" " * store.LARGEST)
+    (tmp_path / "large").write_bytes(CONTENT + b" " * store.MAX_FILE_BYTES)
     for name in ("link", "fifo", "large", ".", "state.json/x"):
         with pytest.raises(StateError):
             read(tmp_path / name, OWNER)

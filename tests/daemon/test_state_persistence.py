@@ -17,7 +17,7 @@ from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.service import TICK, Service
-from soilbus.daemon.state_persistence import FILE, PERIOD, StatePersistence
+from soilbus.daemon.state_persistence import FILE, STORE_PERIOD, StatePersistence
 from soilbus.daemon.state_store import Owner, read
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.tracker import GAIN_CORRELATION_TIME
@@ -50,7 +50,7 @@ class Hung(Executor):
         return Future()
 
 
-def keeper_in(folder: Path, clock, writer: Executor | None = None) -> StatePersistence:
+def persistence_in(folder: Path, clock, writer: Executor | None = None) -> StatePersistence:
     return StatePersistence(folder, OWNER, writer or InlineExecutor(), lambda: 1.7e9 + clock())
 
 
@@ -60,13 +60,13 @@ def stored(folder: Path):
     return state
 
 
-def service_with(keeper: StatePersistence | None, clock: FakeClock, messages=()) -> tuple[Service, ScriptedBus]:
+def service_with(persistence: StatePersistence | None, clock: FakeClock, messages=()) -> tuple[Service, ScriptedBus]:
     wire = ScriptedBus(clock, messages)
     bus = LiveBus(lambda: wire, clock, clock.sleep)
     pipeline = Pipeline(CONFIG, DATABASE)
     publisher = Publisher(output_database(CONFIG))
     return Service(
-        CONFIG, pipeline, bus, publisher, Notifier(), InlineExecutor(), clock, opened_keeper=lambda: keeper
+        CONFIG, pipeline, bus, publisher, Notifier(), InlineExecutor(), clock, open_persistence=lambda: persistence
     ), wire
 
 
@@ -78,20 +78,20 @@ def run(service: Service, clock: FakeClock, seconds: float) -> None:
 
 def test_whenever_it_is_killed_the_state_is_no_older_than_a_minute(tmp_path: Path):
     clock = FakeClock()
-    service, _ = service_with(keeper_in(tmp_path, clock), clock)
+    service, _ = service_with(persistence_in(tmp_path, clock), clock)
     oldest, writings = 0.0, set()
     for _ in range(1900):  # a killed service leaves what is there now
         run(service, clock, TICK)
         at = stored(tmp_path).at
         writings.add(at)
         oldest = max(oldest, 1.7e9 + clock() - at)
-    assert oldest <= PERIOD + 2.0 * TICK
+    assert oldest <= STORE_PERIOD + 2.0 * TICK
     assert len(writings) == 4  # once a minute and not oftener
 
 
 def test_a_disk_that_hangs_costs_the_loop_nothing(tmp_path: Path):
     clock, writer = FakeClock(), Hung()
-    service, _ = service_with(keeper_in(tmp_path, clock, writer), clock)
+    service, _ = service_with(persistence_in(tmp_path, clock, writer), clock)
     run(service, clock, 300.0)
     assert service.deadline_misses == 0
     assert writer.asked == 1
@@ -107,23 +107,23 @@ def test_a_state_that_cannot_be_used_is_one_warning_and_a_fresh_start(content, w
         (tmp_path / FILE).write_bytes(content)
     clock = FakeClock()
     with caplog.at_level(logging.INFO):
-        keeper = keeper_in(tmp_path, clock)
-    assert keeper.recalled is None
+        persistence = persistence_in(tmp_path, clock)
+    assert persistence.stored_prior is None
     assert [r.levelname for r in caplog.records] == ["WARNING"]
     if content is not None:
         assert why in caplog.text
-        keeper.tick(clock(), None, dict)
+        persistence.tick(clock(), None, dict)
         assert stored(tmp_path).starts == 1
 
 
 def test_a_folder_that_cannot_be_written_is_one_warning_until_it_can(tmp_path: Path, caplog):
     clock, folder = FakeClock(), tmp_path / "gone"
-    keeper = keeper_in(folder, clock)
+    persistence = persistence_in(folder, clock)
 
     def minutes(n: int) -> None:
         for _ in range(n):
-            keeper.tick(clock(), BELIEF, dict)
-            clock.now += PERIOD
+            persistence.tick(clock(), BELIEF, dict)
+            clock.now += STORE_PERIOD
 
     minutes(10)
     assert [r.levelname for r in caplog.records] == ["WARNING"]
@@ -141,9 +141,9 @@ def test_a_folder_that_cannot_be_written_is_one_warning_until_it_can(tmp_path: P
 def test_counters_add_up_over_the_runs(tmp_path: Path):
     clock = FakeClock()
     for number in range(1, 4):
-        keeper = keeper_in(tmp_path, clock)
-        keeper.tick(clock(), None, lambda: {"windows": 7})
-        keeper.close(None, {"windows": 10, f"failed.{number}": 1})
+        persistence = persistence_in(tmp_path, clock)
+        persistence.tick(clock(), None, lambda: {"windows": 7})
+        persistence.close(None, {"windows": 10, f"failed.{number}": 1})
         state = stored(tmp_path)
         assert state.starts == number
         assert state.totals == Counter({"windows": 10 * number} | {f"failed.{i}": 1 for i in range(1, number + 1)})
@@ -151,39 +151,39 @@ def test_counters_add_up_over_the_runs(tmp_path: Path):
 
 def test_a_belief_keeps_its_age_until_there_is_a_new_one(tmp_path: Path):
     clock = FakeClock()
-    first = keeper_in(tmp_path, clock)
+    first = persistence_in(tmp_path, clock)
     first.close(BELIEF, {})
     began = stored(tmp_path).gaussian.at
     clock.now += 500.0
-    second = keeper_in(tmp_path, clock)
-    assert second.recalled.elapsed == 500.0
-    assert np.array_equal(second.recalled.gaussian.covariance, BELIEF.covariance)
+    second = persistence_in(tmp_path, clock)
+    assert second.stored_prior.elapsed == 500.0
+    assert np.array_equal(second.stored_prior.gaussian.covariance, BELIEF.covariance)
     second.tick(clock(), None, dict)
     assert stored(tmp_path).gaussian.at == began
     other = Gaussian(BELIEF.soil, BELIEF.gains + 1e-3, BELIEF.covariance)
     for _ in range(3):
-        clock.now += PERIOD
+        clock.now += STORE_PERIOD
         second.tick(clock(), other, dict)
         assert stored(tmp_path).gaussian.at == began + 560.0
     clock.now -= 1e6
-    assert keeper_in(tmp_path, clock).recalled.elapsed == GAIN_CORRELATION_TIME
+    assert persistence_in(tmp_path, clock).stored_prior.elapsed == GAIN_CORRELATION_TIME
 
 
 def test_a_belief_that_cannot_be_is_not_stored(tmp_path: Path):
     clock = FakeClock()
-    keeper = keeper_in(tmp_path, clock)
-    keeper.tick(clock(), BELIEF, dict)
+    persistence = persistence_in(tmp_path, clock)
+    persistence.tick(clock(), BELIEF, dict)
     known = stored(tmp_path).gaussian
-    keeper.close(Gaussian(BELIEF.soil * np.nan, BELIEF.gains, BELIEF.covariance), {"windows": 3})
+    persistence.close(Gaussian(BELIEF.soil * np.nan, BELIEF.gains, BELIEF.covariance), {"windows": 3})
     assert stored(tmp_path).gaussian == known
     assert stored(tmp_path).totals == {"windows": 3}
 
 
 def test_a_run_leaves_what_it_learnt_and_the_next_one_knows_the_sensors(recording, tmp_path: Path):
     clock = FakeClock()
-    service, _ = service_with(keeper_in(tmp_path, clock), clock, recording)
+    service, _ = service_with(persistence_in(tmp_path, clock), clock, recording)
     run(service, clock, DURATION)
-    learnt = service._solver.estimator.tracker.newest_posterior
+    learnt = service._guarded_estimator.estimator.tracker.newest_posterior
     service.stop()
     service.run()
     state = stored(tmp_path)
@@ -192,11 +192,11 @@ def test_a_run_leaves_what_it_learnt_and_the_next_one_knows_the_sensors(recordin
     assert state.totals["frames"] == sum(service.intake.admission.counts.received.values()) > 1000
     assert state.totals["bus.sent"] == service.bus.counts.sent
 
-    for kept in (None, keeper_in(tmp_path, clock)):
+    for kept in (None, persistence_in(tmp_path, clock)):
         service, wire = service_with(kept, clock, recording)
         run(service, clock, DURATION)
         assert first_verdict(wire) >= CONFIG.estimator.window  # what is known of sensors is no window
-        gains = service._solver.estimator.tracker.newest_posterior.gains
+        gains = service._guarded_estimator.estimator.tracker.newest_posterior.gains
     assert not np.array_equal(gains, learnt.gains)
 
 
@@ -210,7 +210,7 @@ def first_verdict(wire: ScriptedBus) -> float:
 
 
 def test_the_file_can_be_read_by_people(tmp_path: Path):
-    keeper_in(tmp_path, FakeClock()).close(BELIEF, {"windows": 3})
+    persistence_in(tmp_path, FakeClock()).close(BELIEF, {"windows": 3})
     state = json.loads((tmp_path / FILE).read_text())["state"]
     assert list(state["gaussian"]["soil"]) == ["k_c", "k_phi", "n", "phi", "c", "K"]
     assert state["gaussian"]["gains"]["torque.FL"] == 0.0
