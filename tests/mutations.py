@@ -67,7 +67,7 @@ MUTATIONS = (
     ),
     Mutation(
         "wheels that spin leave go as it was", "decision/judgement.py",
-        "if loss.spinning and way.state is not State.NO_GO:", "if False:",
+        "if loss.spinning and decision.state is not State.NO_GO:", "if False:",
         (f"{DECISION}::test_a_wheel_that_spins_is_caution_at_best_and_at_least",),
     ),
     Mutation(
@@ -87,13 +87,13 @@ MUTATIONS = (
     ),
     Mutation(
         "hysteresis without a past", "pipeline/estimator.py",
-        "settled(self._held, way", "settled(Held(), way",
+        "settled(self._held, decision", "settled(Held(), decision",
         (f"{DECISION}::test_a_better_state_needs_two_windows_in_a_row",),
     ),
     Mutation(
         "a new ground does not end what was held", "pipeline/estimator.py",
         "self._held, self._valid_at = Held(), None", "self._valid_at = None",
-        (f"{DECISION}::test_what_begins_anew_is_held_back_by_nothing",),
+        (f"{DECISION}::test_a_fresh_window_is_not_held_back_by_hysteresis",),
     ),
     Mutation(
         "a fit that leaves more than noise is as sure as any", "pipeline/estimator.py",

@@ -15,7 +15,15 @@ from drawn import by_draws, figures
 from soilbus.decision import capability as assessment
 from soilbus.decision.balance import LEVEL, Duty, balance
 from soilbus.decision.capability import Demand, assess, slip_grid
-from soilbus.decision.sigma_points import DRAWS, LEADING, SigmaPoints, estimates, likely, mean_and_std, normals
+from soilbus.decision.sigma_points import (
+    DRAWS,
+    LEADING_DIRECTIONS,
+    SigmaPoints,
+    estimates,
+    likely,
+    mean_and_std,
+    normals,
+)
 from soilbus.decision.wheels import WheelTable, wheel_table
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import fit_window
@@ -259,7 +267,7 @@ def test_torque_over_slip_is_that_of_equation_22():
 
 @pytest.mark.parametrize("n", range(10))
 def test_draws_have_the_moments_of_standard_normals(n):
-    leading = min(n, LEADING)
+    leading = min(n, LEADING_DIRECTIONS)
     z = normals(n, leading)
     assert z.shape == (DRAWS, n)
     assert np.allclose(z[1::2], -z[::2])
@@ -272,7 +280,7 @@ def test_draws_have_the_moments_of_standard_normals(n):
     assert np.abs(z).max(initial=0.0) < 4.0
 
 
-@pytest.mark.parametrize("leading", range(1, LEADING + 1))
+@pytest.mark.parametrize("leading", range(1, LEADING_DIRECTIONS + 1))
 def test_the_surface_is_exact_for_polynomials(leading):
     root = np.diag([0.3, 0.2, 0.1, 0.0, 0.0, 0.0][:leading] + [0.0] * (6 - leading))
     points = SigmaPoints.of(Posterior(SOILS["loam"], root @ root))

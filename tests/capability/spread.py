@@ -52,7 +52,7 @@ def posterior_of(case: Case, seed: int) -> Posterior | None:
     channels = [n for n in RIG.channels if n in recording.channels and (case.sinkage or not n.startswith("sinkage"))]
     store.add({n: (recording.channels[n].t, recording.channels[n].value) for n in channels})
     fit = cold_fit(ObservationModel(store.window(0.0, 10.0), RIG, MODEL, CONFIG.estimator.min_speed), prior_of(config))
-    return None if fit is None or not fit.converged else fit.whole.posterior
+    return None if fit is None or not fit.converged else fit.reported.posterior
 
 
 def limits_of(posterior: Posterior) -> dict[str, tuple[float, float]]:

@@ -1,4 +1,4 @@
-"""Windows in, states out: the decision as the service makes it, with a tracker that says what it is told to."""
+"""Windows in, states out: the decision as the service makes it, with a tracker that returns given outputs."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ def firm() -> TrackerOutput:
     return good_tracked()
 
 
-def decided(tasks, told):
-    """Results of the windows, of which the tracker says what is told."""
+def decided(tasks, outputs):
+    """Results of the windows, for which the tracker returns these outputs."""
     estimator = WindowEstimator(CONFIG)
     found = []
-    for task, tracked in zip(tasks, told, strict=False):
+    for task, tracked in zip(tasks, outputs, strict=False):
         estimator.tracker.estimate = lambda window, end, tracked=tracked: tracked_at(
             tracked, window, since=end - CONFIG.estimator.window * tracked.since
         )
@@ -53,12 +53,12 @@ def decided(tasks, told):
 
 
 def of(tracked: TrackerOutput, share: float = 1.0, **changed) -> TrackerOutput:
-    """What is said of windows of which the soil fills such a share."""
+    """The output for a window of which the soil fills this share."""
     return replace(tracked, since=share, **changed)
 
 
-def states(tasks, told):
-    return [result.traversability.state for result in decided(tasks, told)]
+def states(tasks, outputs):
+    return [result.traversability.state for result in decided(tasks, outputs)]
 
 
 def test_a_better_state_needs_two_windows_in_a_row(tasks, firm):
@@ -70,20 +70,20 @@ def test_a_better_state_needs_two_windows_in_a_row(tasks, firm):
     assert found[4] is State.GO
 
 
-def test_what_begins_anew_is_held_back_by_nothing(tasks, firm):
-    anew = [tasks[0], replace(tasks[1], fresh=True)]
-    assert states(anew, [of(of_soft_ground(firm)), of(firm)]) == [State.NO_GO, State.GO]
+def test_a_fresh_window_is_not_held_back_by_hysteresis(tasks, firm):
+    restarted = [tasks[0], replace(tasks[1], fresh=True)]
+    assert states(restarted, [of(of_soft_ground(firm)), of(firm)]) == [State.NO_GO, State.GO]
 
 
 def test_a_window_that_does_not_fit_is_the_less_sure(tasks, firm):
-    """A reduced chi-square of 4 leaves a quarter of what the data told, and all that was known before."""
+    """A reduced chi-square of 4 leaves a quarter of the information of the data, and all of the prior."""
     fit = replace(firm.fit, form=None)
     fits = decided(tasks[:1], [of(firm, fit=fit)])[0]
     misfits = decided(tasks[:1], [of(firm, fit=replace(fit, neg2_log_posterior=4.0 * fit.rows), mismatch=True)])[0]
     assert (misfits.status, misfits.reason) == (Status.DEGRADED, "model_mismatch")
-    known = np.diag(prior_of(CONFIG).log_std ** -2)
-    told = np.linalg.inv(fits.posterior.log_covariance) - known
-    expected = np.linalg.inv(known + told / 4.0)
+    of_prior = np.diag(prior_of(CONFIG).log_std ** -2)
+    of_data = np.linalg.inv(fits.posterior.log_covariance) - of_prior
+    expected = np.linalg.inv(of_prior + of_data / 4.0)
     assert np.diag(misfits.posterior.log_covariance) == pytest.approx(np.diag(expected), rel=0.02)
     assert misfits.bearing.std > 1.5 * fits.bearing.std
 

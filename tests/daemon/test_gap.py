@@ -37,15 +37,15 @@ def results(effects):
         )  # fmt: skip
 
 
-def test_a_missing_effect_is_told_after_a_minute_by_its_channels():
-    told = list(results(["inertia=0.5"]))
-    first = next(r for r in told if r.gaps)
-    assert LEAST_SPAN <= first.t - told[0].t < LEAST_SPAN + 3.0
-    assert next(iter(told[-1].gaps)) == "draft"
-    assert told[-1].gaps["draft"] > 1.5
+def test_a_missing_effect_is_reported_after_a_minute_by_its_channels():
+    found = list(results(["inertia=0.5"]))
+    first = next(r for r in found if r.gaps)
+    assert LEAST_SPAN <= first.t - found[0].t < LEAST_SPAN + 3.0
+    assert next(iter(found[-1].gaps)) == "draft"
+    assert found[-1].gaps["draft"] > 1.5
 
 
-def test_where_nothing_is_missing_no_gap_is_told():
+def test_where_nothing_is_missing_no_gap_is_reported():
     assert not any(r.gaps for r in results([]))
 
 
@@ -63,17 +63,17 @@ def test_a_channel_counts_by_its_own_residuals_and_is_forgotten():
 
 def test_noise_alone_is_no_gap_however_few_residuals_there_are():
     """One residual a second, in windows of ten seconds each second: each counts ten times and is still one."""
-    window, told = 10, []
+    window, gaps = 10, []
     for seed in range(100):
         square = np.random.default_rng(seed).standard_normal(300) ** 2
         watch = GapWatch(window=float(window), hop=1.0)
         for end in range(window, len(square)):
             watch.take(float(end), {"draft": Square(float(square[end - window : end].sum()), window)})
-            told += watch.gaps().values()
-    assert told == []
+            gaps += watch.gaps().values()
+    assert gaps == []
 
 
-def test_a_gap_beyond_noise_is_told_of_few_residuals_too():
+def test_a_gap_beyond_noise_is_reported_of_few_residuals_too():
     square = 2.5 * np.random.default_rng(1).standard_normal(300) ** 2
     watch = GapWatch(window=10.0, hop=1.0)
     for end in range(10, len(square)):

@@ -1,6 +1,12 @@
-"""The vehicle over slip under a duty: draft, slope, or both, with the load transfer they bring.
+"""The vehicle over slip under a duty: steady states, the largest pull within the limits, and the best slips.
 
-How far a balance may go: torque, sinkage and slip limits, the largest pull, and the best slips.
+    pull balance      sum(P_w(s, N_w)) = draft + weight * sine        P_w: drawbar pull of a wheel [N], s: slip
+    load transfer     N_w = level_w * cosine + tilt_w * sine + lever_w * draft
+    largest pull      max over s of the pull, subject to T_w <= T_max, entry angle <= its limit, s <= s_max
+
+A duty is a draft, a slope, or both.  The wheels' table (`wheels.wheel_table`) holds the steady states on the level at a
+few slips, with their derivatives by load and slip.  Other duties follow by Newton steps on the pull; the slips between
+by cubic Hermite interpolation.  Everything is computed for all soils of a posterior's sigma points at once.
 """
 
 from __future__ import annotations
@@ -16,24 +22,25 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.decision.sigma_points import SigmaPoints
 from soilbus.decision.uncertain_model import ModelOfRows
-from soilbus.decision.wheels import Axles, WheelTable
+from soilbus.decision.wheels import DRAWBAR, MAX_SINE, Axles, WheelTable
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE
 
-PARTS = 5
-"""Points into which each step of the slip grid is divided."""
-STEPS = 3
-"""Of Newton's method with the slope of the start, which is nearly that of the end."""
-MAX_SINE = 0.99
+SUBDIVISIONS = 5
+"""Parts into which each step of the slip grid is divided."""
+NEWTON_STEPS = 3
+"""Newton steps on the pull, all with the slope at the start, which is nearly that at the end."""
+Cause = Literal["torque", "traction", "sinkage", "slip"]
+"""What ends the pull: a motor, the soil's strength, the sinkage limit, the slip limit."""
 
 
 class Duty(NamedTuple):
-    """What the pull is for: a draft [N] and a slope (its sine).  The one that is None takes all that is left."""
+    """What the pull is used for: a draft [N] and a slope (its sine); the one that is None uses the rest of it."""
 
     draft: Any = None
     sine: float | None = 0.0
 
     def split(self, pull: Any, weight: float) -> tuple[Any, Any]:
-        """Draft [N] and sine of the slope that take this pull [N]."""
+        """Draft [N] and sine of the slope that use this pull [N] of a vehicle of this weight [N]."""
         if self.draft is None:
             return pull - weight * (self.sine or 0.0), self.sine
         return self.draft, (pull - self.draft) / weight
@@ -42,12 +49,33 @@ class Duty(NamedTuple):
 LEVEL = Duty()
 
 
+class Columns(NamedTuple):
+    """Places of a balance's columns: the vehicle's pull, then three quantities for each kind of wheel."""
+
+    pull: int
+    drawbar: slice
+    torque: slice
+    angle: slice
+
+    @classmethod
+    def of(cls, kinds: int) -> Columns:
+        """The columns for this number of kinds of wheels."""
+        return cls(0, *(slice(1 + i * kinds, 1 + (i + 1) * kinds) for i in range(3)))
+
+
 @dataclass(frozen=True, slots=True)
 class Balance:
-    """The steady states of D soils at F slips, known (D, F) where there is one.
+    """The steady states of D soils at F slips, for A kinds of wheels.
 
-    columns (D, 1 + 3 A, F): pull [N] of the vehicle, then by kind of wheel drawbar pull [N], torque [N m]
-    and entry angle [rad] of one.
+    Attributes
+    ----------
+    slip
+        (F,).
+    known
+        (D, F), where a steady state exists.
+    columns
+        (D, 1 + 3 A, F): pull of the vehicle [N], then drawbar pull [N], torque [N m] and entry angle [rad] of one wheel
+        of each kind.  Read them by the properties.
     """
 
     slip: Array
@@ -55,135 +83,59 @@ class Balance:
     columns: Array
 
     @property
+    def at(self) -> Columns:
+        """Places of the columns."""
+        return Columns.of(self.columns.shape[1] // 3)
+
+    @property
     def pull(self) -> Array:
-        """Of the vehicle [N] (D, F)."""
-        return self.columns[:, 0]
+        """Pull of the vehicle [N] (D, F)."""
+        return self.columns[:, self.at.pull]
 
     @property
     def drawbar(self) -> Array:
-        """Pull of one wheel [N] (D, A, F)."""
-        return self._of_wheels(0)
+        """Drawbar pull of one wheel [N] (D, A, F)."""
+        return self.columns[:, self.at.drawbar]
 
     @property
     def torque(self) -> Array:
-        """Of one wheel [N m] (D, A, F)."""
-        return self._of_wheels(1)
+        """Torque of one wheel [N m] (D, A, F)."""
+        return self.columns[:, self.at.torque]
 
     @property
     def angle(self) -> Array:
         """Entry angle [rad] (D, A, F)."""
-        return self._of_wheels(2)
+        return self.columns[:, self.at.angle]
 
     def drawn(self, points: SigmaPoints) -> Balance:
-        """The same of a posterior's mode and draws (1 + N in the place of D), from that of its points."""
+        """The balance of a posterior's mode and draws (1 + N instead of D), from the balance of its sigma points."""
         known = np.broadcast_to(self.known[0], (len(points.share), len(self.slip)))
         if not self.known.all():
             known = known & (points.drawn(self.known.astype(float)) > 0.5)
         return Balance(self.slip, known, points.drawn(self.columns, self.known[:, None]))
 
-    def _of_wheels(self, quantity: int) -> Array:
-        kinds = self.columns.shape[1] // 3
-        return self.columns[:, 1 + quantity * kinds : 1 + (quantity + 1) * kinds]
-
-
-def balance(table: WheelTable, duty: Duty = LEVEL, level: Balance | None = None) -> Balance:
-    """Steady states under a duty between the slips of the table, on PARTS times as many slips.
-
-    Cubic Hermite interpolation: the table knows how everything changes with slip.  `level` is
-    the table's balance on the level, where that is at hand.
-    """
-    slip, cell, of_values, of_slopes, of_changes = _refinement(tuple(table.slip.tolist()))
-    if level is None:
-        columns = _times(_columns(table.pull, table.at), of_values) + _times(_by_slip(table), of_slopes)
-        level = Balance(slip, _between(table.balanced, cell), columns)
-    if duty == LEVEL:
-        return level
-    change, balanced = _under(table, duty)
-    return Balance(slip, _between(balanced, cell), level.columns + _times(change, of_changes))
-
-
-def climbing(table: WheelTable, drafts: Sequence[float], level: Balance) -> list[Balance]:
-    """As `balance` with each of the drafts [N] and the slope that takes what is left, all worked out together."""
-    slip, cell, _, _, of_changes = _refinement(tuple(table.slip.tolist()))
-    changes, balanced = _under(table, Duty(np.array(drafts)[:, None, None], None))
-    columns = level.columns + _times(changes, of_changes)
-    return [Balance(slip, _between(known, cell), of) for known, of in zip(balanced, columns, strict=True)]
-
-
-def _times(columns: Array, matrix: Array) -> Array:
-    """Columns (..., C, S), those not known as zero, times a matrix (S, F): (..., C, F)."""
-    known = np.where(np.isfinite(columns), columns, 0.0)
-    return np.asarray(known.reshape(-1, len(matrix)) @ matrix).reshape(*columns.shape[:-1], -1)
-
-
-def _between(balanced: NDArray[np.bool_], cell: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Where both ends of a step of the grid are balanced (D, F)."""
-    return np.asarray((balanced[:, :-1] & balanced[:, 1:])[:, cell])
-
-
-def _columns(pull: Array, at: Iterable[Array]) -> Array:
-    """Pull (..., D, S), then pulls, torques and entry angles by kind, each (..., D, A, S): (..., D, 1 + 3 A, S)."""
-    return np.concatenate([pull[..., None, :], *at], axis=-2)
-
-
-def _by_slip(table: WheelTable) -> Array:
-    """Derivatives by slip of the columns of the level table, with the loads following."""
-    axles = table.axles
-    loss = 1.0 - (axles.count * table.by_load[0] * axles.lever).sum(axis=1)
-    pull_by_slip = (axles.count * table.by_slip[0]).sum(axis=1) / loss
-    by_slip = table.by_slip + table.by_load * (axles.lever * pull_by_slip[:, None])
-    return _columns(pull_by_slip, by_slip)
-
-
-def _under(table: WheelTable, duty: Duty) -> tuple[Array, NDArray[np.bool_]]:
-    """Change of the table's columns under another duty, and where they are a steady state (D, S).
-
-    A duty of several drafts (Q, 1, 1) gives each for all of them, (Q, D, ...).
-    """
-    axles, weight = table.axles, table.axles.weight
-    level = pull = np.where(table.balanced, table.pull, 0.0)
-    by_pull = axles.lever if duty.draft is None else axles.tilt / weight
-    slope = (axles.count * table.by_load[0] * by_pull).sum(axis=1) - 1.0
-    for _ in range(STEPS):
-        load = axles.loads(*duty.split(pull, weight))
-        pull = pull - (table.pull_at(load) - pull) / slope
-    _, sine = duty.split(pull, weight)
-    balanced = table.balanced & (load > 0.0).all(axis=-2) & (np.abs(sine) < MAX_SINE)
-    change = _columns(pull - level, table.change_at(load))
-    return np.where(balanced[..., None, :], change, np.nan), balanced
-
-
-@cache
-def _refinement(slips: tuple[float, ...]) -> tuple[Array, NDArray[np.intp], Array, Array, Array]:
-    """Finer slips (F,), the grid's step in which each lies, and what values, slopes and values whose
-    slopes are not known, so taken from differences of second order, (S, F) add to it."""
-    slip = np.array(slips)
-    step, part = np.divmod(np.arange(PARTS * (len(slip) - 1) + 1), PARTS)
-    part = np.where(step == len(slip) - 1, PARTS, part) / PARTS
-    cell = np.minimum(step, len(slip) - 2)
-    width = np.diff(slip)[cell]
-    of_values, of_slopes = np.zeros((2, len(slip), len(cell)))
-    column = np.arange(len(cell))
-    of_values[cell, column] = (1.0 + 2.0 * part) * (1.0 - part) ** 2
-    of_values[cell + 1, column] = part**2 * (3.0 - 2.0 * part)
-    of_slopes[cell, column] = width * part * (1.0 - part) ** 2
-    of_slopes[cell + 1, column] = width * part**2 * (part - 1.0)
-    differences = np.gradient(np.eye(len(slip)), slip, axis=1)
-    return slip[cell] + width * part, cell, of_values, of_slopes, of_values + differences @ of_slopes
-
-
-Cause = Literal["torque", "traction", "sinkage", "slip"]
-
 
 class Limits(NamedTuple):
-    """Of each kind of wheel the greatest torque [N m] (A,), and for each soil the greatest entry angle [rad] (D, A)."""
+    """Limits of each kind of wheel: torque [N m] (A,), and entry angle [rad] on each soil (D, A)."""
 
     torque: Array
     angle: Array
 
     @classmethod
     def of(cls, axles: Axles, torque_limit: Array, max_sinkage: float, model: ModelOfRows) -> Limits:
-        """From the wheels' torque limits (W,) [N m], nan where not known, and a sinkage [m] of wheels on the level."""
+        """The limits of each kind of wheel.
+
+        Parameters
+        ----------
+        axles
+            The kinds of wheels.
+        torque_limit
+            (W,) [N m], nan where not known.
+        max_sinkage
+            [m], converted to an entry angle at the wheels' loads on the level.
+        model
+            The wheel-soil models of the D soils.
+        """
         torque = np.full(len(axles.count), np.inf)
         np.fmin.at(torque, axles.of_wheel, torque_limit)
         torque[~axles.driven[:, 0]] = np.inf  # they roll
@@ -192,35 +144,93 @@ class Limits(NamedTuple):
 
 
 class Largest(NamedTuple):
-    """The largest pull [N] and its slip for each soil (D,), nan where no slip is within the limits; what ends it."""
+    """Largest pull [N] and its slip for each soil (D,), nan where no slip is within the limits, and what limits it."""
 
     pull: Array
     slip: Array
     cause: Cause
 
 
-def within(balance: Balance, limits: Limits) -> NDArray[np.bool_]:
-    """Steady states within the limits (D, F)."""
-    usable = balance.known.copy()
-    for kind, torque in enumerate(limits.torque):
-        usable &= balance.torque[:, kind] <= torque
-        usable &= balance.angle[:, kind] <= limits.angle[..., kind, None]
-    return usable
+class BetweenSlips(NamedTuple):
+    """A point between two slips of a balance, for each soil (D,).
+
+    before: index of the slip before it; share: of the step to the next slip, nan where there is no such point.
+    """
+
+    before: NDArray[np.intp]
+    share: Array
+
+    def on(self, values: Array) -> Array:
+        """Values (D, ..., F) linearly interpolated at the point: (D, ...)."""
+        row = np.arange(len(values))
+        here, there = values[row, ..., self.before], values[row, ..., self.before + 1]
+        share = self.share.reshape(-1, *(1,) * (here.ndim - 1))
+        return np.asarray(here + share * (there - here))
+
+
+def balance(table: WheelTable, duty: Duty = LEVEL, level: Balance | None = None) -> Balance:
+    """Steady states under a duty, on a slip grid SUBDIVISIONS times as fine as the table's.
+
+    Parameters
+    ----------
+    table
+        Wheels at the loads of the steady level pull.
+    duty
+        Draft and slope.
+    level
+        The table's balance on the level, where it is already computed.
+
+    Notes
+    -----
+    Cubic Hermite interpolation between the table's slips, with the table's derivatives by slip.
+    """
+    slip, cell, of_values, of_slopes, of_changes = _refinement(tuple(table.slip.tolist()))
+    if level is None:
+        columns = _interpolated(_columns(table.pull, table.at), of_values) + _interpolated(
+            _derivatives_by_slip(table), of_slopes
+        )
+        level = Balance(slip, _between(table.balanced, cell), columns)
+    if duty == LEVEL:
+        return level
+    change, balanced = _change_under(table, duty)
+    return Balance(slip, _between(balanced, cell), level.columns + _interpolated(change, of_changes))
+
+
+def climbing(table: WheelTable, drafts: Sequence[float], level: Balance) -> list[Balance]:
+    """The `balance` with each of the drafts [N] and the slope that uses the rest of the pull; all solved together."""
+    slip, cell, _, _, of_changes = _refinement(tuple(table.slip.tolist()))
+    changes, balanced = _change_under(table, Duty(np.array(drafts)[:, None, None], None))
+    columns = level.columns + _interpolated(changes, of_changes)
+    return [Balance(slip, _between(known, cell), of) for known, of in zip(balanced, columns, strict=True)]
 
 
 def largest_pull(balance: Balance, limits: Limits) -> Largest:
-    """Largest pull over slip; the cause is that of the first soil."""
+    """Largest pull over slip within the limits.
+
+    Parameters
+    ----------
+    balance
+        Steady states of D soils.
+    limits
+        Of torque and entry angle.
+
+    Returns
+    -------
+    Largest
+        Linearly interpolated to where a limit is met; its cause is that of the first soil.
+    """
     usable = within(balance, limits)
     row, last = np.arange(len(usable)), usable.shape[1] - 1
     best = np.where(usable, balance.pull, -np.inf).argmax(axis=1)
     after = np.minimum(best + 1, last)
     here, there = balance.columns[row, :, best], balance.columns[row, :, after]
-    pull, slip = here[:, 0], balance.slip[best]
-    more = balance.known[row, after] & (there[:, 0] > pull)
-    kinds = len(limits.torque)
-    by_limit = _shares(here[:, 1 + kinds :], there[:, 1 + kinds :], limits)
+    at, kinds = balance.at, len(limits.torque)
+    pull, next_pull, slip = here[:, at.pull], there[:, at.pull], balance.slip[best]
+    more = balance.known[row, after] & (next_pull > pull)
+    limited = slice(at.torque.start, at.angle.stop)
+    by_limit = _shares_to_limits(here[:, limited], there[:, limited], limits)
     share = np.where(more, by_limit.min(axis=1), 0.0)
-    pull = pull + share * (there[:, 0] - pull)
+    pull = pull + share * (next_pull - pull)
     slip = slip + share * (balance.slip[after] - slip)
     none = ~usable[row, best]
     cause: Cause = "traction"
@@ -231,36 +241,17 @@ def largest_pull(balance: Balance, limits: Limits) -> Largest:
     return Largest(np.where(none, np.nan, pull), np.where(none, np.nan, slip), cause)
 
 
-def _shares(here: Array, there: Array, limits: Limits) -> Array:
-    """Shares of the way from here to there at which each limit is met, 1 where it is not.
-
-    All (D, 2 A): of the torques by kind of wheel, then of the entry angles.
-    """
-    limit = np.empty(here.shape)
-    limit[:, : len(limits.torque)], limit[:, len(limits.torque) :] = limits.torque, limits.angle
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(there > limit, (limit - here) / (there - here), 1.0)
+def within(balance: Balance, limits: Limits) -> NDArray[np.bool_]:
+    """Which steady states (D, F) are within the limits."""
+    usable = balance.known.copy()
+    for kind, torque in enumerate(limits.torque):
+        usable &= balance.torque[:, kind] <= torque
+        usable &= balance.angle[:, kind] <= limits.angle[..., kind, None]
+    return usable
 
 
-class Place(NamedTuple):
-    """A place between the slips of a balance for each soil (D,): the point before it and the share beyond.
-
-    share is nan where there is none.
-    """
-
-    before: NDArray[np.intp]
-    share: Array
-
-    def on(self, values: Array) -> Array:
-        """Values (D, ..., F) at the place: (D, ...)."""
-        row = np.arange(len(values))
-        here, there = values[row, ..., self.before], values[row, ..., self.before + 1]
-        share = self.share.reshape(-1, *(1,) * (here.ndim - 1))
-        return np.asarray(here + share * (there - here))
-
-
-def place_of_pull(balance: Balance, pull: float) -> Place:
-    """Where each soil gives this pull [N]: at the least slip if less would do, nowhere if no slip gives it."""
+def point_of_pull(balance: Balance, pull: float) -> BetweenSlips:
+    """The least slip at which each soil gives this pull [N]; the first slip if it gives more, none if no slip does."""
     enough = balance.known & (balance.pull >= pull)
     first = enough.argmax(axis=1)
     before = np.maximum(first - 1, 0)
@@ -269,13 +260,26 @@ def place_of_pull(balance: Balance, pull: float) -> Place:
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.clip((pull - low) / (high - low), 0.0, 1.0)
     share = np.where(balance.known[row, before], share, 1.0)
-    return Place(before, np.where(enough.any(axis=1), share, np.nan))
+    return BetweenSlips(before, np.where(enough.any(axis=1), share, np.nan))
 
 
 def slips_of_most(values: Array, balance: Balance, limits: Limits, top: Array) -> Array:
-    """Slips (Q, D) at which values (Q, D, F) are largest within the limits; nan where none is above zero.
+    """Slips at which quantities are largest within the limits.
 
-    top (D,) is the slip at which the limits end.
+    Parameters
+    ----------
+    values
+        (Q, D, F), Q quantities over slip.
+    balance, limits
+        Steady states of D soils, and what is allowed.
+    top
+        (D,), slip at which the limits end.
+
+    Returns
+    -------
+    Array
+        (Q, D), at the vertex of the parabola through the largest value and its neighbours; nan where no value within
+        the limits is above zero.
     """
     slip, last = balance.slip, len(balance.slip) - 1
     usable = within(balance, limits) & (values > 0.0)
@@ -296,6 +300,82 @@ def slips_of_most(values: Array, balance: Balance, limits: Limits, top: Array) -
 
 
 def axle_sum(values: Array, axles: Axles, kinds: NDArray[np.bool_], each: Array | float = 1.0) -> Array:
-    """Sum over the wheels of some kinds (A,), (D, A, F) to (D, F), each wheel's times a factor (A, 1)."""
+    """Sum over all wheels of some kinds (mask (A,)): values (D, A, F) to (D, F), each times a factor (A, 1)."""
     share = (axles.count * each)[:, 0].tolist()
     return reduce(np.add, (share[kind] * values[:, kind] for kind in np.flatnonzero(kinds).tolist()))
+
+
+def _columns(pull: Array, at: Iterable[Array]) -> Array:
+    """Pull (..., D, S), then pulls, torques and entry angles by kind, each (..., D, A, S): (..., D, 1 + 3 A, S)."""
+    return np.concatenate([pull[..., None, :], *at], axis=-2)
+
+
+def _derivatives_by_slip(table: WheelTable) -> Array:
+    """Derivatives by slip of the columns of the level table, with the loads following."""
+    axles = table.axles
+    loss = 1.0 - (axles.count * table.by_load[DRAWBAR] * axles.lever).sum(axis=1)
+    pull_by_slip = (axles.count * table.by_slip[DRAWBAR]).sum(axis=1) / loss
+    by_slip = table.by_slip + table.by_load * (axles.lever * pull_by_slip[:, None])
+    return _columns(pull_by_slip, by_slip)
+
+
+def _change_under(table: WheelTable, duty: Duty) -> tuple[Array, NDArray[np.bool_]]:
+    """Change of the table's columns under another duty, and where there is a steady state (D, S).
+
+    With several drafts (Q, 1, 1) both results have a leading axis Q.
+    """
+    axles, weight = table.axles, table.axles.weight
+    level = pull = np.where(table.balanced, table.pull, 0.0)
+    by_pull = axles.lever if duty.draft is None else axles.tilt / weight
+    slope = (axles.count * table.by_load[DRAWBAR] * by_pull).sum(axis=1) - 1.0
+    for _ in range(NEWTON_STEPS):
+        load = axles.loads(*duty.split(pull, weight))
+        pull = pull - (table.pull_at(load) - pull) / slope
+    _, sine = duty.split(pull, weight)
+    balanced = table.balanced & (load > 0.0).all(axis=-2) & (np.abs(sine) < MAX_SINE)
+    change = _columns(pull - level, table.change_at(load))
+    return np.where(balanced[..., None, :], change, np.nan), balanced
+
+
+@cache
+def _refinement(slips: tuple[float, ...]) -> tuple[Array, NDArray[np.intp], Array, Array, Array]:
+    """The fine grid, and the matrices of cubic Hermite interpolation onto it.
+
+    Returns the fine slips (F,), the step of the coarse grid in which each lies (F,), and matrices (S, F): of values, of
+    slopes, and of values whose slopes are second-order differences.
+    """
+    slip = np.array(slips)
+    step, part = np.divmod(np.arange(SUBDIVISIONS * (len(slip) - 1) + 1), SUBDIVISIONS)
+    part = np.where(step == len(slip) - 1, SUBDIVISIONS, part) / SUBDIVISIONS
+    cell = np.minimum(step, len(slip) - 2)
+    width = np.diff(slip)[cell]
+    of_values, of_slopes = np.zeros((2, len(slip), len(cell)))
+    column = np.arange(len(cell))
+    of_values[cell, column] = (1.0 + 2.0 * part) * (1.0 - part) ** 2
+    of_values[cell + 1, column] = part**2 * (3.0 - 2.0 * part)
+    of_slopes[cell, column] = width * part * (1.0 - part) ** 2
+    of_slopes[cell + 1, column] = width * part**2 * (part - 1.0)
+    differences = np.gradient(np.eye(len(slip)), slip, axis=1)
+    return slip[cell] + width * part, cell, of_values, of_slopes, of_values + differences @ of_slopes
+
+
+def _interpolated(columns: Array, matrix: Array) -> Array:
+    """Columns (..., C, S), zero where not known, times an interpolation matrix (S, F): (..., C, F)."""
+    known = np.where(np.isfinite(columns), columns, 0.0)
+    return np.asarray(known.reshape(-1, len(matrix)) @ matrix).reshape(*columns.shape[:-1], -1)
+
+
+def _between(balanced: NDArray[np.bool_], cell: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Where both ends of a step of the grid are balanced (D, F)."""
+    return np.asarray((balanced[:, :-1] & balanced[:, 1:])[:, cell])
+
+
+def _shares_to_limits(here: Array, there: Array, limits: Limits) -> Array:
+    """Shares of the step from here to there at which each limit is met, 1 where it is not.
+
+    All (D, 2 A): of the torques by kind of wheel, then of the entry angles.
+    """
+    limit = np.empty(here.shape)
+    limit[:, : len(limits.torque)], limit[:, len(limits.torque) :] = limits.torque, limits.angle
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(there > limit, (limit - here) / (there - here), 1.0)

@@ -1,4 +1,13 @@
-"""Posterior, vehicle and present demand -> what the vehicle can do here, each figure with its standard deviation."""
+"""What the vehicle can do on a soil: draft, grade, slip, sinkage, torque, each with its standard deviation.
+
+    max draft        max over s of sum(P_w(s))            within torque, sinkage and slip limits, on the level
+    max grade        sine = (max pull - draft) / weight   without draft and with the present one
+    forecast         the least slip with pull(s) = demand, its sinkage and torque
+    efficiency       eta(s) = P (1 - s) / (T / r)         drawbar power over axle power, the set point of each axle
+
+`assess` takes the posterior's sigma points, computes the wheels over slip on each of them (`wheels`, `balance`), maps
+the results to the posterior's mode and draws, and finds each quantity draw by draw: `sigma_points` gives mean and std.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +19,7 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.decision.balance import (
-    PARTS,
+    SUBDIVISIONS,
     Balance,
     Cause,
     Duty,
@@ -20,7 +29,7 @@ from soilbus.decision.balance import (
     balance,
     climbing,
     largest_pull,
-    place_of_pull,
+    point_of_pull,
     slips_of_most,
     within,
 )
@@ -35,18 +44,22 @@ from soilbus.terra.wheel import WheelModel
 __all__ = ["Capability", "Demand", "Forecast", "OverSlip", "SetPoint", "assess", "slip_grid"]
 
 MIN_SLIP = 0.02
-GRID = 9
+"""Least slip of the grid.  No evidence recorded."""
+GRID_SLIPS = 9
+"""Number of slips of the grid of driving wheels."""
 MAX_SKID = 0.3
-SKID_GRID = 9
-TOLERANCE = 3e-3
-"""Last Newton step over the weight: it leaves less than interpolation between slips, some 5e-5 of the weight."""
+"""Largest skid (minus slip) of the grid of wheels that are pushed.  No evidence recorded."""
+SKID_GRID_SLIPS = 9
+"""Number of slips of that grid."""
+NEWTON_TOLERANCE = 3e-3
+"""Last Newton step as a share of the weight: its error is below that of interpolation between slips, some 5e-5."""
 LEVEL_SINE = 1e-3
-"""Slopes below this sine change no load worth computing."""
+"""Sine of a slope below which the ground counts as level."""
 
 
 @dataclass(frozen=True, slots=True)
 class Demand:
-    """Pull [N] asked of the wheels now, draft and slope together, with its uncertainty; sine is that of the slope."""
+    """Pull [N] asked by draft and slope together, its standard deviation [N], and the slope's sine, positive uphill."""
 
     pull: float
     std: float
@@ -69,10 +82,10 @@ class OverSlip:
 
 @dataclass(frozen=True, slots=True)
 class SetPoint:
-    """Slips of one axle within the limits: of best traction efficiency, and of most pull.
+    """Slips of one axle within the limits: of best traction efficiency, and of largest pull.
 
-    None where the axle most likely gives no pull.  Where pull over slip has two tops about as high, the
-    mean lies between them: its std says so.
+    None where the axle most likely gives no pull.  Where pull over slip has two maxima of about the same height, the
+    mean lies between them and the std is large.
     """
 
     efficiency: Estimate | None
@@ -81,10 +94,18 @@ class SetPoint:
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """The present demand met in steady driving: slip, sinkage [m] by wheel, the deepest, summed torque [N m].
+    """Steady driving under the present demand, on the soils on which some slip gives it.
 
-    likely_depth is the deepest to first order, for probabilities.  All on the condition that the demand can
-    be met: soils where no slip does are left out.
+    Attributes
+    ----------
+    slip
+        Of the driven wheels.
+    sinkage, deepest
+        [m], by wheel, and of the deepest wheel.
+    torque
+        [N m], sum over the wheels.
+    likely_depth
+        [m], the deepest sinkage to first order, for probabilities.
     """
 
     slip: Estimate
@@ -96,12 +117,28 @@ class Forecast:
 
 @dataclass(frozen=True, slots=True)
 class Capability:
-    """What the vehicle can do on this soil; None where nothing can be said.
+    """What the vehicle can do on this soil; None where a quantity is not known.
 
-    max_draft [N] on the level; grades [rad], without draft and with the present one;
-    max_pull [N] on the present slope, of draft and slope together, and max_draft_here of the
-    draft alone; likely_pull is max_pull to first order, for probabilities; limit is what ends max_draft.
-    forecast is None where most likely no slip meets the demand.
+    Attributes
+    ----------
+    max_draft
+        [N], on the level.
+    max_draft_here
+        [N], on the present slope.
+    max_grade, max_grade_with_draft
+        [rad], without draft and with the present one.
+    max_pull
+        [N], on the present slope, draft and slope together.
+    likely_pull
+        [N], max_pull to first order, for probabilities.
+    limit
+        What ends max_draft.
+    set_points
+        By axle.
+    forecast
+        None where most likely no slip gives the demand.
+    over_slip
+        Steady level driving over slip.
     """
 
     max_draft: Estimate
@@ -118,9 +155,9 @@ class Capability:
 
 @cache
 def slip_grid(max_slip: float) -> Array:
-    """Slips at which the wheels are computed, closer where forces change fast."""
+    """Slips (GRID_SLIPS,) at which the wheels are computed, quadratically spaced: closer at small slips."""
     least = min(MIN_SLIP, max_slip / 2.0)
-    return np.asarray(np.linspace(np.sqrt(least), np.sqrt(max_slip), GRID) ** 2)
+    return np.asarray(np.linspace(np.sqrt(least), np.sqrt(max_slip), GRID_SLIPS) ** 2)
 
 
 def assess(
@@ -133,18 +170,43 @@ def assess(
     max_sinkage: float,
     last: WheelTable | None = None,
 ) -> tuple[Capability | None, WheelTable]:
-    """Capability on one soil, and the wheels' table to start the next window's from.
+    """Capability on one soil.
 
-    torque_limit (W,) [N m] holds nan where a motor's limit is not known; a wheel whose limit is 0 rolls freely.
-    max_sinkage [m].  None where no steady driving within slip and sinkage limits exists.  Raises ValueError
-    for a rig without a chassis.
+    Parameters
+    ----------
+    posterior
+        Of the soil.
+    rig
+        With a chassis.
+    model
+        The wheel-soil model.
+    demand
+        Present draft and slope; None where not known.
+    torque_limit
+        (W,) [N m], nan where not known; a wheel with limit 0 rolls freely.
+    max_slip, max_sinkage
+        Limits of slip and of sinkage [m].
+    last
+        The table of the window before, to start from.
+
+    Returns
+    -------
+    capability
+        None where no steady driving is within the slip and sinkage limits.
+    table
+        To start the next window's from.
+
+    Raises
+    ------
+    ValueError
+        For a rig without a chassis.
     """
     uncertain = UncertainModel.over(model)
     points = SigmaPoints.of(posterior, uncertain.shifts)
     driven = ~(torque_limit <= 0.0)
     completed = uncertain.of_rows(len(points.soils))
-    table = wheel_table(points.soils, rig, uncertain, slip_grid(max_slip), last, TOLERANCE, driven)
-    skids = np.linspace(-MAX_SKID, table.slip[0], SKID_GRID)
+    table = wheel_table(points.soils, rig, uncertain, slip_grid(max_slip), last, NEWTON_TOLERANCE, driven)
+    skids = np.linspace(-MAX_SKID, table.slip[0], SKID_GRID_SLIPS)
     skid = cache(lambda: wheel_table(points.soils, rig, uncertain, skids, driven=driven))
     of_points = balance(table)
     level = of_points.drawn(points)
@@ -189,7 +251,7 @@ def assess(
 
 @dataclass(frozen=True, slots=True)
 class _Vehicle:
-    """The wheels where they drive and, asked for seldom, where they skid: of the points; limits are of their draws."""
+    """Tables of driving wheels and (lazily) of skidding ones, of the sigma points; the limits are of the draws."""
 
     table: WheelTable
     level: Balance
@@ -198,10 +260,10 @@ class _Vehicle:
     skid: Callable[[], WheelTable]
 
     def largest(self, duty: Duty, driving: Balance) -> Largest | None:
-        """Each draw's largest pull under a duty; None where nothing is within the limits.
+        """Largest pull of each draw under a duty; None where nothing is within the limits.
 
-        Where even the least slip asks for more torque than there is, the pull is that of
-        wheels that skid: below zero, as only a push or a slope moves the vehicle.
+        Where the least slip already needs more torque than the limit, the wheels skid: the pull is negative, and only
+        a push or a slope moves the vehicle.
         """
         found = largest_pull(driving, self.limits)
         if not self.table.axles.driven.any():
@@ -220,7 +282,7 @@ class _Vehicle:
         return Largest(pull, slip, "torque" if weak[0] else found.cause)
 
     def _skidding(self, duty: Duty) -> Largest:
-        """Largest pull of wheels that skid; the least where even that asks for too much torque."""
+        """Largest pull of skidding wheels; the least pull where every skid needs too much torque."""
         skidding = balance(self.skid(), duty).drawn(self.points)
         found = largest_pull(skidding, self.limits)
         least = np.where(skidding.known, skidding.pull, np.inf).argmin(axis=1)
@@ -239,7 +301,7 @@ class _Vehicle:
 
 
 def _set_points(axles: Axles, level: Balance, limits: Limits, draft: Largest) -> dict[str, SetPoint]:
-    """Efficiency is drawbar power over the wheels' power, DP V/(T omega); an axle that is not driven has none."""
+    """Slips of best efficiency P V / (T omega) and of largest pull, by axle; None for an axle that is not driven."""
     of_axles = {"front": axles.front[:, 0], "rear": ~axles.front[:, 0]}
     names = {name: driven for name, kinds in of_axles.items() if (driven := kinds & axles.driven[:, 0]).any()}
     none = {name: SetPoint(None, None) for name, kinds in of_axles.items() if kinds.any()}
@@ -257,12 +319,13 @@ def _set_points(axles: Axles, level: Balance, limits: Limits, draft: Largest) ->
 def _forecast(
     demand: Demand, here: Balance, present: Balance, axles: Axles, rig: Rig, model: ModelOfRows, points: SigmaPoints
 ) -> Forecast | None:
-    place = place_of_pull(present, demand.pull)
-    torque = (place.on(present.torque) * axles.count[:, 0]).sum(axis=1)
-    slip = place.on(np.broadcast_to(present.slip, present.pull.shape))
+    """Slip, sinkage and torque at the least slip that gives the demand; None where most likely no slip does."""
+    point = point_of_pull(present, demand.pull)
+    torque = (point.on(present.torque) * axles.count[:, 0]).sum(axis=1)
+    slip = point.on(np.broadcast_to(present.slip, present.pull.shape))
     load = axles.loads(*Duty(None, demand.sine).split(here.pull, axles.weight))
     depth = model.sinkage(here.angle, Wheel(axles.radius, axles.width, ~axles.front, load))
-    depth = place.on(points.drawn(depth, here.known[:, None]))
+    depth = point.on(points.drawn(depth, here.known[:, None]))
     slip_needed, required, *depths = estimates(slip, torque, *depth.T)
     likely_depth = likely(depth[:, int(np.argmax(depth[0]))])
     if slip_needed is None or required is None or likely_depth is None:
@@ -273,9 +336,10 @@ def _forecast(
 
 
 def _over_slip(level: Balance, table: WheelTable) -> OverSlip:
-    known = level.known[:, ::PARTS].copy()
-    known[:, 1:] |= level.known[:, PARTS - 1 :: PARTS]
-    torque = (level.torque[..., ::PARTS] * table.axles.count).sum(axis=1)
-    both = np.where(known[:, None], np.stack([level.pull[:, ::PARTS], torque], axis=1), np.nan)
+    """Mean and std of pull and torque at the slips of the coarse grid."""
+    known = level.known[:, ::SUBDIVISIONS].copy()
+    known[:, 1:] |= level.known[:, SUBDIVISIONS - 1 :: SUBDIVISIONS]
+    torque = (level.torque[..., ::SUBDIVISIONS] * table.axles.count).sum(axis=1)
+    both = np.where(known[:, None], np.stack([level.pull[:, ::SUBDIVISIONS], torque], axis=1), np.nan)
     (pull, torque), (pull_std, torque_std) = mean_and_std(both)
     return OverSlip(table.slip, pull, pull_std, torque, torque_std)

@@ -1,4 +1,9 @@
-"""What the present task asks of the wheels, from the window's own measurements."""
+"""The pull that draft and slope ask of the wheels now, from the window's own measurements.
+
+    pull = mean(draft) / (1 + gain) + mean(weight * sine(pitch))          over the last hop or the whole window
+
+The larger of the two means counts: a driver who has just lifted the implement still wants it down.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +16,30 @@ from soilbus.estimation.posterior import Estimate
 from soilbus.estimation.window import Window, pull_asked
 from soilbus.terra.vehicle import GRAVITY, Chassis
 
-EXACT = Estimate(0.0, 0.0)
+NO_GAIN_ERROR = Estimate(0.0, 0.0)
 
 
-def present_demand(window: Window, chassis: Chassis | None, hop: float, gain: Estimate = EXACT) -> Demand | None:
-    """Draft and slope, over the last hop [s] or the whole window, whichever asks for more.
+def present_demand(
+    window: Window, chassis: Chassis | None, hop: float, gain: Estimate = NO_GAIN_ERROR
+) -> Demand | None:
+    """Draft and slope over the last hop or the whole window, whichever mean is larger.
 
-    A driver who has just lifted the implement because it was too much still wants it
-    down.  The std is that of the sensors, noise and the draft's `gain` error: what the demand will
-    do next is the margin's business.  None where the draft of the last hop is not known.
+    Parameters
+    ----------
+    window
+        A forward window.
+    chassis
+        Mass and geometry; None gives no demand.
+    hop
+        [s].
+    gain
+        Relative gain error of the draft sensor.
+
+    Returns
+    -------
+    Demand
+        None where the draft of the last hop is not known.  Its std is of sensor noise and gain error; later changes of
+        the demand are covered by the configured margin.
     """
     if chassis is None or not len(window.t):
         return None

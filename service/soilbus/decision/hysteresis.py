@@ -1,4 +1,11 @@
-"""Hysteresis of the state: worse at once, better only when the ground has surely become so."""
+"""Hysteresis of the state: a worse state at once, a better one after several windows beyond a raised threshold.
+
+    raised threshold    p_raised = Phi(Phi^-1(p) + h)        h: `hysteresis` [standard deviations of the margin]
+    better state        the last `hold` windows each pass its raised threshold
+
+`Held` is the state in force with the states of the last windows by the raised thresholds.  `settled` updates it by one
+window; `doubted` replaces it while the ground changes, when no estimate of the new ground exists.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +17,12 @@ from soilbus.config.model import Traversability as Settings
 from soilbus.decision.traversability import State, Status, state_of
 
 ORDER = (State.NO_GO, State.CAUTION, State.GO)
-"""From the worst to the best."""
+"""States from the worst to the best."""
 
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """The state in force, and the states for which the last windows surely spoke."""
+    """The state in force, and the states of the last windows by the raised thresholds."""
 
     state: State = State.UNKNOWN
     recent: tuple[State, ...] = ()
@@ -24,14 +31,25 @@ class Held:
 def settled(last: Held, probability: float | None, status: Status, settings: Settings) -> Held:
     """The state in force after one more window.
 
-    Unknown (probability None) and a worse state take effect at once.  A better one does
-    when `hold` windows in a row pass its threshold by `hysteresis` standard deviations of
-    the margin.  Unknown holds nothing back: what follows it counts as a first window does.
+    Parameters
+    ----------
+    last
+        The state before.
+    probability
+        Of the window's decision; None is unknown.
+    status
+        Of the window.
+    settings
+        Thresholds, `hold` and `hysteresis`.
+
+    Notes
+    -----
+    Unknown and worse states take effect at once.  After unknown, any state does.
     """
     if probability is None:
         return Held()
-    now, surely = (state_of(probability, status, by) for by in (settings, _raised(settings)))
-    recent = (*last.recent, surely)[-settings.hold :]
+    now, raised = (state_of(probability, status, by) for by in (settings, _raised(settings)))
+    recent = (*last.recent, raised)[-settings.hold :]
     if last.state is State.UNKNOWN or _rank(now) <= _rank(last.state):
         return Held(now, recent)
     risen = min(recent, key=_rank) if len(recent) == settings.hold else last.state
@@ -39,7 +57,7 @@ def settled(last: Held, probability: float | None, status: Status, settings: Set
 
 
 def doubted(last: Held) -> Held:
-    """The state in force while the ground changes, and nothing is known of the new one: at most caution."""
+    """The state in force while the ground changes and the new soil is not known: caution, or no_go if it was no_go."""
     state = min(last.state, State.CAUTION, key=_rank) if last.state is not State.UNKNOWN else State.CAUTION
     return Held(state, (state,))
 
@@ -50,7 +68,7 @@ def _rank(state: State) -> int:
 
 @lru_cache(maxsize=8)
 def _raised(settings: Settings) -> Settings:
-    """The settings with thresholds that lie `hysteresis` standard deviations higher."""
+    """The settings with thresholds raised by `hysteresis` standard deviations of the margin."""
     normal = NormalDist()
     go, no_go = (normal.cdf(normal.inv_cdf(p) + settings.hysteresis) for p in (settings.go, settings.no_go))
     return settings.model_copy(update={"go": go, "no_go": no_go})

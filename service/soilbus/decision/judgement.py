@@ -1,4 +1,12 @@
-"""Posterior -> traversability: what the vehicle can do here, against what is asked of it."""
+"""Traversability: the probability that the vehicle can do what is asked of it, and the state that follows.
+
+    P(pull)     = Phi((max_pull - demand - margin * max(demand, 0)) / sd)
+    P(depth)    = Phi((max_sinkage - sinkage of the deepest wheel) / sd)
+    P           = min(P(pull), P(depth)) -> go, caution or no_go by the configured thresholds
+
+`judge` decides when a window ends.  `at_present` says what remains of that decision later, when its data have aged, the
+vehicle has moved on, or the wheels show less pull than predicted.
+"""
 
 from __future__ import annotations
 
@@ -32,64 +40,81 @@ def judge(
     settings: Settings,
     last: WheelTable | None = None,
 ) -> tuple[Traversability, WheelTable | None]:
-    """Traversability of the ground of one window, and the wheels' table to start the next one from.
+    """Traversability of the ground of one window.
 
-    torque_limit (W,) [N m] holds nan where a motor's limit is not known.  Only a valid
-    posterior and a known demand can lead to go.
+    Parameters
+    ----------
+    posterior, status
+        Of the window's soil; None where there is no estimate.
+    demand
+        Draft and slope; None where not known.  Only a valid status and a known demand can give go.
+    rig, model
+        The vehicle and its wheel-soil model.
+    torque_limit
+        (W,) [N m], nan where not known.
+    settings
+        Limits of slip and sinkage, margin, thresholds.
+    last
+        The table of the window before, to start from.
+
+    Returns
+    -------
+    decision, table
+        The decision, and the table to start the next window from (None where there is none).
     """
     available = float(torque_limit.sum()) if np.isfinite(torque_limit).all() and len(torque_limit) else None
     if posterior is None or status is Status.INVALID or rig.chassis is None:
         return Traversability(torque_available=available), None
-    able, table = assess(
+    capability, table = assess(
         posterior, rig, model, demand, torque_limit, settings.max_slip, settings.max_sinkage, last
     )  # fmt: skip
-    if able is None:
+    if capability is None:
         return Traversability(State.NO_GO, 0.0, torque_available=available, limit="sinkage"), None
-    way = Traversability(
+    decision = Traversability(
         torque_available=available,
-        max_draft=able.max_draft,
-        max_grade=able.max_grade,
-        limit=able.limit,
-        capability=able,
+        max_draft=capability.max_draft,
+        max_grade=capability.max_grade,
+        limit=capability.limit,
+        capability=capability,
     )
     if demand is None:
-        return way, table
-    spare = spare_pull(able, demand, settings)
+        return decision, table
+    spare = spare_pull(capability, demand, settings)
     pull = 0.0 if spare is None else _above(spare.value, spare.std)
-    depth = probability_of_depth(able, settings)
-    forecast = able.forecast
+    depth = probability_of_depth(capability, settings)
+    forecast = capability.forecast
     return replace(
-        way,
+        decision,
         state=state_of(min(pull, depth), status, settings),
         probability=min(pull, depth),
         torque_required=None if forecast is None else forecast.torque.value,
         slip_needed=None if forecast is None else forecast.slip.value,
-        limit=able.limit if pull <= depth else "sinkage",
+        limit=capability.limit if pull <= depth else "sinkage",
         spare=spare,
     ), table
 
 
-def spare_pull(able: Capability, demand: Demand, settings: Settings) -> Estimate | None:
-    """Pull [N] on the present slope beyond the demand and its margin; None where there is no steady driving."""
-    if able.likely_pull is None:
+def spare_pull(capability: Capability, demand: Demand, settings: Settings) -> Estimate | None:
+    """Pull [N] on the present slope less the demand and its margin; None where no steady driving exists."""
+    if capability.likely_pull is None:
         return None
     needed = demand.pull + settings.margin * max(demand.pull, 0.0)
-    return Estimate(able.likely_pull.value - needed, math.hypot(able.likely_pull.std, demand.std))
+    return Estimate(capability.likely_pull.value - needed, math.hypot(capability.likely_pull.std, demand.std))
 
 
-def probability_of_depth(able: Capability, settings: Settings) -> float:
-    """That the deepest wheel stays within the sinkage limit under the demand; 1 where no slip gives the demand."""
-    if able.forecast is None:
+def probability_of_depth(capability: Capability, settings: Settings) -> float:
+    """Probability that the deepest wheel stays within the sinkage limit; 1 where no slip gives the demand."""
+    if capability.forecast is None:
         return 1.0
-    deepest = able.forecast.likely_depth
+    deepest = capability.forecast.likely_depth
     return _above(settings.max_sinkage - deepest.value, deepest.std)
 
 
 class Basis(NamedTuple):
-    """What a decision rests on: the instants (N,) [s] that were fitted, each so long [s], and the ground left behind.
+    """The data that a decision rests on.
 
-    unseen [m]: way driven since the last of them, until the window's end; late [s]: by so much what they tell is older
-    than its stamps, where channels wait for one that is late.
+    instants (N,) [s]: times that were fitted; each [s]: length of a bin; unseen [m]: distance driven from the last of
+    them to the window's end; late [s]: age of the data beyond their stamps, where channels wait for a delayed one.
     """
 
     instants: NDArray[np.float64] = np.empty(0)
@@ -103,15 +128,17 @@ class Basis(NamedTuple):
         return float(self.instants[-1]) - self.late if len(self.instants) else -math.inf
 
 
-def at_present(way: Traversability, basis: Basis, loss: TractionLoss, now: float, config: Config) -> Traversability:
-    """What is left of a window's decision at a later time.
+def at_present(
+    decision: Traversability, basis: Basis, loss: TractionLoss, now: float, config: Config
+) -> Traversability:
+    """What remains of a window's decision at a later time.
 
-    A decision has the time and the place of the data that it rests on, and none against what the wheels show:
+    A decision is valid for the time and place of its data, and is overruled by what the wheels show:
 
-    - stuck: no_go, and nothing of what the estimate promises;
+    - stuck: no_go, and no figure of the estimate;
     - with a wheel that spins: no better than caution;
-    - resting on data older than `max_age`, or on ground that lies further back than the vehicle is long: unknown;
-    - where the wheels pull less at their present slip than the estimate predicts: only what is left of the spare pull;
+    - data older than `max_age`, or on ground further back than the wheelbase: unknown;
+    - wheels that pull less at their present slip than the estimate predicts: the spare pull is reduced by the miss;
     - with less than `min_share` of a window measured since a wheel last spun: no better than caution.
 
     Parameters
@@ -119,7 +146,7 @@ def at_present(way: Traversability, basis: Basis, loss: TractionLoss, now: float
     way
         The decision when the window ended.
     basis
-        What it rests on.
+        Its data.
     loss
         Loss of traction as of now.
     now
@@ -131,23 +158,23 @@ def at_present(way: Traversability, basis: Basis, loss: TractionLoss, now: float
     settings, length = config.traversability, 0.0 if config.vehicle is None else config.vehicle.wheelbase
     if loss.stuck:
         return Traversability(
-            State.NO_GO, 0.0, torque_available=way.torque_available, limit="slip", since_valid=way.since_valid
+            State.NO_GO, 0.0, torque_available=decision.torque_available, limit="slip", since_valid=decision.since_valid
         )
-    if loss.spinning and way.state is not State.NO_GO:
-        return replace(way, state=State.CAUTION, probability=None)
-    if way.state is State.UNKNOWN:
-        return way
+    if loss.spinning and decision.state is not State.NO_GO:
+        return replace(decision, state=State.CAUTION, probability=None)
+    if decision.state is State.UNKNOWN:
+        return decision
     if not (now - basis.end <= settings.max_age and basis.unseen <= length):  # nor nan
-        return replace(way, state=State.UNKNOWN, probability=None)
-    if way.state is State.GO and way.capability is not None and way.spare is not None:
-        missing = missing_pull(loss, way.capability.over_slip, config.noise, settings.contradiction)
-        left = _above(way.spare.value - missing, way.spare.std)
+        return replace(decision, state=State.UNKNOWN, probability=None)
+    if decision.state is State.GO and decision.capability is not None and decision.spare is not None:
+        missing = missing_pull(loss, decision.capability.over_slip, config.noise, settings.contradiction)
+        left = _above(decision.spare.value - missing, decision.spare.std)
         if left < settings.go:
-            return replace(way, state=State.CAUTION, probability=left)
+            return replace(decision, state=State.CAUTION, probability=left)
     measured = np.count_nonzero(basis.instants > loss.last) * basis.each
-    if way.state is State.GO and measured < settings.min_share * config.estimator.window:
-        return replace(way, state=State.CAUTION, probability=None)
-    return way
+    if decision.state is State.GO and measured < settings.min_share * config.estimator.window:
+        return replace(decision, state=State.CAUTION, probability=None)
+    return decision
 
 
 def _above(margin: float, std: float) -> float:

@@ -1,16 +1,14 @@
-"""Draws of standard normals, and what quantities that are found draw by draw amount to.
+"""A posterior of the soil as a few sigma points, and mean and standard deviation of what follows from them.
 
-A posterior as a few soils, and what its draws have, as predicted from what these soils have.
+    log soil_d = log mode + L x_d                   x_d: points of `design` along principal directions, d = 1..D
+    f(draw) = sum_d share(draw, d) f(soil_d)        response surface (Box & Wilson 1951): polynomial through them
+    mean, std of g(f)                               over 256 draws of standard normals with exact low moments
 
-A polynomial through what the soils have predicts each draw's (response surface, Box & Wilson
-1951), along the leading principal directions of the logarithms' covariance.  The first of these
-is the ridge on which k_c, k_phi and n replace each other, sd 0.3 to 1.6: along it forces bend
-to and fro, so it has points of its own and a higher degree.  What the leading directions
-leave is so well known that everything is linear in it: one point for each direction.
-
-Forces over slip are smooth in the soil.  What the vehicle can do is not: a torque limit ends
-the pull before the ground does, and the best slip jumps from one top to another.  So it is
-found draw by draw.
+The leading principal directions of the logarithms' covariance have a polynomial.  The first is the ridge on which k_c,
+k_phi and n replace each other (sd 0.3 to 1.6): forces are strongly nonlinear along it, so it has points of its own and
+degree 6.  The other directions are known so well that everything is linear in them: one point each.  Forces over slip
+(f) are smooth in the soil.  What the vehicle can do (g) is not: a torque limit ends the pull before the ground does,
+and the best slip jumps from one maximum to another.  So g is evaluated draw by draw.
 """
 
 from __future__ import annotations
@@ -31,57 +29,107 @@ from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.terra.wheel import Soil
 
 DRAWS = 256
+"""Number of draws: half of them and their mirror images."""
 SEED = 12
-"""Of sixty the one with the least error in the std of random quadratics of six normals that a limit cuts: 2.5 % rms."""
-MOMENTS = (1.0, 0.0, 1.0, 0.0, 3.0, 0.0, 15.0)
-"""Of a standard normal, by degree."""
-ROUNDS = 30
-EXACT = 1e-10
+"""Seed of the draws: of sixty, the one with the least error of the std of random quadratics of six normals that a
+limit cuts (2.5 % rms)."""
+NORMAL_MOMENTS = (1.0, 0.0, 1.0, 0.0, 3.0, 0.0, 15.0)
+"""Moments of a standard normal, by degree."""
+MAX_ITERATIONS = 30
+"""Of the Gauss-Newton steps that make the draws' moments exact."""
+MOMENT_TOLERANCE = 1e-10
+"""Largest error of a moment of the draws that ends these steps."""
+LEADING_DIRECTIONS = 3
+"""Number of principal directions in which the response surface is a polynomial."""
+FIRST_AXIS_POINTS = (1.2, 3.2)
+"""Distances of the first direction's own points from the mode, on both sides, in standard deviations."""
+FIRST_AXIS_DEGREE = 6
+"""Degree of the polynomial along the first direction."""
+_HELD_VARIANCE_RATIO = 1e-14
+"""Variance of a direction over the largest one, below which the direction counts as known exactly."""
+_PHI = Soil._fields.index("phi")
 
 
-@cache
-def normals(n: int, leading: int) -> Array:
-    """Standard normals (DRAWS, n), each beside its mirror image, whose covariance is the identity.
+@dataclass(frozen=True, slots=True)
+class SigmaPoints:
+    """Sigma points of a posterior and the linear map from values at them to values at its mode and draws.
 
-    They are random ones, moved as little as gives the leading columns all moments of standard
-    normals to degree five, and the first one to degree seven: so polynomials have nearly the
-    variance that they should have.
+    Attributes
+    ----------
+    soils
+        (D, 6), the mode first.  The last points are one standard deviation away along directions that are independent
+        of all others.
+    share
+        (1 + N, D), weight of each point in the value of the mode (first row) and of each of N draws.
+    mirror
+        (D,), index of the point on the other side of the mode; its own index where there is none.
     """
-    if n == 0:
-        return np.zeros((DRAWS, 0))
-    z = np.random.default_rng(SEED).standard_normal((DRAWS // 2, n))
-    degrees = _degrees(n, leading)
-    wanted = np.prod(np.array(MOMENTS)[degrees], axis=1)
-    for _ in range(ROUNDS):
-        value, slopes = _monomials(z, degrees)
-        off = value.mean(axis=1) - wanted
-        if np.abs(off).max() < EXACT:
-            break
-        by_all = slopes.reshape(len(slopes), -1) / len(z)
-        z = z - (by_all.T @ np.linalg.solve(by_all @ by_all.T, off)).reshape(z.shape)
-    return np.stack([z, -z], axis=1).reshape(DRAWS, n)
 
+    soils: Array
+    share: Array
+    mirror: NDArray[np.intp]
 
-def _degrees(n: int, leading: int) -> NDArray[np.intp]:
-    """Of each of n columns in the monomials whose mean is exact (Q, n); those of odd degree are so by symmetry."""
-    factors = [*combinations_with_replacement(range(n), 2), *combinations_with_replacement(range(leading), 4)]
-    return np.array([np.bincount(each, minlength=n) for each in [*factors, *[(0,) * 6][:leading]]])
+    @classmethod
+    def of(cls, posterior: Posterior, shifts: Array | None = None) -> SigmaPoints:
+        """The points of a posterior; similar posteriors have similar points in the same order.
 
+        Parameters
+        ----------
+        posterior
+            Soil and covariance of its logarithms.
+        shifts
+            (Q, 6), changes of the logarithms that go with one standard deviation of Q other uncertain quantities.
+            Their outer products are part of the posterior's covariance.  They are the last points.
+        """
+        along = np.zeros((0, len(posterior.soil))) if shifts is None else shifts
+        variance, directions = np.linalg.eigh(posterior.log_covariance - along.T @ along)
+        free = np.flatnonzero(variance > _HELD_VARIANCE_RATIO * max(variance[-1], 0.0))[::-1]
+        axes = directions[:, free] * np.sqrt(variance[free])
+        axes = axes * np.sign(axes[np.abs(axes).argmax(axis=0), np.arange(len(free))])
+        leading = min(len(free), LEADING_DIRECTIONS)
+        points = design(leading)
+        steps = np.concatenate([points @ axes[:, :LEADING_DIRECTIONS].T, axes[:, LEADING_DIRECTIONS:].T, along])
+        soils = np.asarray(posterior.soil) * np.exp(steps)
+        soils[1:, _PHI] = np.minimum(soils[1:, _PHI], max(MAX_PHI, posterior.soil.phi))
+        return cls(soils, *_shares(leading, len(soils) - len(points)))
 
-def _monomials(z: Array, degrees: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Monomials (Q, P) of these degrees at points (P, n), and their derivatives (Q, P, n)."""
-    powers = z ** np.arange(len(MOMENTS))[:, None, None]
-    column = np.arange(z.shape[1])
-    value = powers[degrees, :, column].prod(axis=1)
-    lower = np.maximum(degrees[:, None] - np.eye(len(column), dtype=int), 0)
-    slopes = degrees[..., None] * powers[lower, :, column].prod(axis=2)
-    return value, slopes.transpose(0, 2, 1)
+    def drawn(self, samples: Array, known: NDArray[np.bool_] | None = None) -> Array:
+        """Values at the mode and the draws from values at the points.
+
+        Parameters
+        ----------
+        samples
+            (D, ..., F), values at the points.
+        known
+            Broadcastable to samples; None if all are known.  A value that is not known is mirrored about the mode's
+            from the point on the other side; where that is not known either, it is the mode's.
+
+        Returns
+        -------
+        Array
+            (1 + N, ..., F).  Of a result with three axes the second varies slowest in memory.
+        """
+        if known is not None and not known.all():
+            known = np.broadcast_to(known, samples.shape)
+            mirrored = np.where(known[self.mirror], 2.0 * samples[0] - samples[self.mirror], samples[0])
+            samples = np.where(known, samples, mirrored)
+        if samples.ndim == 3:
+            return np.asarray((self.share @ samples.swapaxes(0, 1)).swapaxes(0, 1))
+        return np.asarray(self.share @ samples.reshape(len(samples), -1)).reshape(-1, *samples.shape[1:])
 
 
 def mean_and_std(samples: Array) -> tuple[Array, Array]:
-    """Of samples (1 + N, ...), the mode's and then the draws', over those draws that have a value (not nan).
+    """Mean and standard deviation over the draws.
 
-    The mean is nan where the mode or most draws have none.
+    Parameters
+    ----------
+    samples
+        (1 + N, ...), the value at the mode, then at the draws; nan where a draw has no value.
+
+    Returns
+    -------
+    mean, std
+        (...,) each, over the draws that have a value.  The mean is nan where the mode or most draws have none.
     """
     change = samples[1:] - samples[0]
     known = np.isfinite(change)
@@ -96,9 +144,9 @@ def mean_and_std(samples: Array) -> tuple[Array, Array]:
 
 
 def estimates(*samples: Array | None) -> list[Estimate | None]:
-    """Scalars from their samples (1 + N,) each, as `mean_and_std`; None where there are none or the mean is nan.
+    """Mean and std of scalars from their samples (1 + N,) each; None where there are no samples or the mean is nan.
 
-    What befalls fewer than one soil in a hundred is hardly in a std.
+    With 256 draws, what happens on fewer than one soil in a hundred hardly enters the std.
     """
     known = [each for each in samples if each is not None]
     if not known:
@@ -108,12 +156,23 @@ def estimates(*samples: Array | None) -> list[Estimate | None]:
 
 
 def likely(samples: Array | None) -> Estimate | None:
-    """A scalar's value at the mode and the std of what changes sign with the soil, from its samples (1 + N,).
+    """First-order estimate of a scalar: its value at the mode and the std of its odd part.
 
-    Mean-value first-order reliability (Cornell 1969).  It knows no curvature, and so gives the
-    median of what bends only.  The mean does not: what is hardly known lies along a curved valley
-    of the likelihood, which straight directions leave, and what bends there looks certain to grow.
-    A draw without a value has its mirror image's, mirrored about the mode's.
+    Parameters
+    ----------
+    samples
+        (1 + N,), the value at the mode, then at pairs of a draw and its mirror image; nan where there is no value (then
+        the mirror image's is mirrored about the mode's).  None without samples.
+
+    Notes
+    -----
+    Mean-value first-order reliability.  It has no second-order term, so it gives the median of a monotonic function.
+    The mean would not do for probabilities: poorly determined soils lie along a curved valley of the likelihood, which
+    straight principal directions leave, and the second-order term there looks like a certain increase.
+
+    References
+    ----------
+    Cornell 1969, A probability-based structural code, ACI Journal 66:974.
     """
     if samples is None:
         return None
@@ -124,69 +183,72 @@ def likely(samples: Array | None) -> Estimate | None:
     return _known(float(samples[0]), math.sqrt(float((known**2).sum()) / max(len(known), 1)))
 
 
-def _known(value: float, std: float) -> Estimate | None:
-    return Estimate(value, std) if math.isfinite(value) else None
+@cache
+def design(n: int) -> Array:
+    """Design points (P, n) for n independent standard normals, the origin first.
 
+    Notes
+    -----
+    The vertices of a regular simplex, their mirror images and the middles of its edges, all projected on one sphere;
+    then the points of the first axis, on which one vertex also lies.
 
-LEADING = 3
-"""Directions under the polynomial."""
-AXIS = (1.2, 3.2)
-"""Of the first direction's own points, in standard deviations on both sides of the mode."""
-AXIS_DEGREE = 6
-_LEAST = 1e-14
-"""Variance of a direction, over the largest, below which it counts as held."""
-_PHI = Soil._fields.index("phi")
-
-
-@dataclass(frozen=True, slots=True)
-class SigmaPoints:
-    """Soils (D, 6), the mode first, and the share (1 + N, D) of each in what the mode and each of N draws have.
-
-    mirror (D,) is the point on the other side of the mode, the point itself where there is none.  The last
-    points are one standard deviation away along directions that are independent of all others.
+    References
+    ----------
+    Lu & Darmofal 2004, SIAM J. Sci. Comput. 26:613 (the cubature).
     """
+    if n == 0:
+        return np.zeros((1, 0))
+    vertices = np.zeros((n + 1, n))
+    for k in range(n):
+        vertices[k, k] = math.sqrt((n + 1) * (n - k) / (n * (n - k + 1)))
+        vertices[k + 1 :, k] = -math.sqrt((n + 1) / (n * (n - k + 1) * (n - k)))
+    i, j = np.triu_indices(n + 1, 1)
+    middles = vertices[i] + vertices[j] if n > 1 else np.zeros((0, 1))  # of one edge, the origin
+    middles = middles / np.linalg.norm(middles, axis=1, keepdims=True)
+    on_axis = np.outer([*FIRST_AXIS_POINTS, *np.negative(FIRST_AXIS_POINTS)], np.eye(1, n))
+    sphere = math.sqrt(n + 2.0) * np.concatenate([vertices, -vertices, middles])
+    return np.concatenate([np.zeros((1, n)), sphere, on_axis])
 
-    soils: Array
-    share: Array
-    mirror: NDArray[np.intp]
 
-    @classmethod
-    def of(cls, posterior: Posterior, shifts: Array | None = None) -> SigmaPoints:
-        """The points of a posterior; similar posteriors have similar ones, in the same order.
+@cache
+def normals(n: int, leading: int) -> Array:
+    """Draws of n standard normals with exact low moments.
 
-        Each of the shifts (Q, 6), of the logarithms, is part of the posterior's covariance and goes with
-        something else that is uncertain, one standard deviation of it: they are the last points.
-        """
-        along = np.zeros((0, len(posterior.soil))) if shifts is None else shifts
-        variance, directions = np.linalg.eigh(posterior.log_covariance - along.T @ along)
-        free = np.flatnonzero(variance > _LEAST * max(variance[-1], 0.0))[::-1]
-        axes = directions[:, free] * np.sqrt(variance[free])
-        axes = axes * np.sign(axes[np.abs(axes).argmax(axis=0), np.arange(len(free))])
-        leading = min(len(free), LEADING)
-        points = design(leading)
-        steps = np.concatenate([points @ axes[:, :LEADING].T, axes[:, LEADING:].T, along])
-        soils = np.asarray(posterior.soil) * np.exp(steps)
-        soils[1:, _PHI] = np.minimum(soils[1:, _PHI], max(MAX_PHI, posterior.soil.phi))
-        return cls(soils, *_shares(leading, len(soils) - len(points)))
+    Parameters
+    ----------
+    n
+        Number of columns.
+    leading
+        Number of columns that have all moments of standard normals up to degree five; the first one up to seven.
 
-    def drawn(self, samples: Array, known: NDArray[np.bool_] | None = None) -> Array:
-        """Samples (D, ..., F) at the points, known or not, to the mode and the draws (1 + N, ..., F).
+    Returns
+    -------
+    Array
+        (DRAWS, n), each draw next to its mirror image; the covariance is the identity.
 
-        What is not known at a point is as at its mirror, mirrored about the mode's; where neither is
-        known, it is the mode's.  What has one index between the first and the last lies in memory index by index.
-        """
-        if known is not None and not known.all():
-            known = np.broadcast_to(known, samples.shape)
-            mirrored = np.where(known[self.mirror], 2.0 * samples[0] - samples[self.mirror], samples[0])
-            samples = np.where(known, samples, mirrored)
-        if samples.ndim == 3:
-            return np.asarray((self.share @ samples.swapaxes(0, 1)).swapaxes(0, 1))
-        return np.asarray(self.share @ samples.reshape(len(samples), -1)).reshape(-1, *samples.shape[1:])
+    Notes
+    -----
+    Pseudo-random draws, moved by least-norm Gauss-Newton steps until the moments hold: so polynomials of them have
+    nearly the right variance.
+    """
+    if n == 0:
+        return np.zeros((DRAWS, 0))
+    z = np.random.default_rng(SEED).standard_normal((DRAWS // 2, n))
+    degrees = _degrees(n, leading)
+    wanted = np.prod(np.array(NORMAL_MOMENTS)[degrees], axis=1)
+    for _ in range(MAX_ITERATIONS):
+        value, slopes = _monomials(z, degrees)
+        off = value.mean(axis=1) - wanted
+        if np.abs(off).max() < MOMENT_TOLERANCE:
+            break
+        by_all = slopes.reshape(len(slopes), -1) / len(z)
+        z = z - (by_all.T @ np.linalg.solve(by_all @ by_all.T, off)).reshape(z.shape)
+    return np.stack([z, -z], axis=1).reshape(DRAWS, n)
 
 
 @cache
 def _shares(leading: int, linear: int) -> tuple[Array, NDArray[np.intp]]:
-    """share and mirror of SigmaPoints with this number of directions under the polynomial and beside it."""
+    """share and mirror of SigmaPoints for these numbers of polynomial (leading) and linear directions."""
     points = design(leading)
     z = normals(leading + linear, leading)
     fit = np.linalg.pinv(_polynomials(points))
@@ -199,38 +261,16 @@ def _shares(leading: int, linear: int) -> tuple[Array, NDArray[np.intp]]:
     return np.concatenate([of_mode, of_draws]), mirror
 
 
-@cache
-def design(n: int) -> Array:
-    """Points (P, n) for n independent standard normals, the origin first.
-
-    The vertices of a regular simplex, their mirror images and the middles of its edges, pushed out to
-    one sphere, as in the cubature of Lu & Darmofal (2004, SIAM J. Sci. Comput. 26:613); then
-    those on the first axis, where a vertex is besides.
-    """
-    if n == 0:
-        return np.zeros((1, 0))
-    vertices = np.zeros((n + 1, n))
-    for k in range(n):
-        vertices[k, k] = math.sqrt((n + 1) * (n - k) / (n * (n - k + 1)))
-        vertices[k + 1 :, k] = -math.sqrt((n + 1) / (n * (n - k + 1) * (n - k)))
-    i, j = np.triu_indices(n + 1, 1)
-    middles = vertices[i] + vertices[j] if n > 1 else np.zeros((0, 1))  # of one edge, the origin
-    middles = middles / np.linalg.norm(middles, axis=1, keepdims=True)
-    on_axis = np.outer([*AXIS, *np.negative(AXIS)], np.eye(1, n))
-    sphere = math.sqrt(n + 2.0) * np.concatenate([vertices, -vertices, middles])
-    return np.concatenate([np.zeros((1, n)), sphere, on_axis])
-
-
 def _polynomials(x: Array) -> Array:
     """Orthonormal polynomials of standard normals (P, n): (P, terms).
 
-    All to degree two, those of the first to AXIS_DEGREE, and its square times each other one, which the
-    points of two directions do not tell from that one itself.
+    All of degree up to two, those of the first column up to FIRST_AXIS_DEGREE, and its square times each other column
+    (not with two columns, where the points cannot separate that product from the other column itself).
     """
     n = x.shape[1]
     degrees = [d for d in itertools.product(range(3), repeat=n) if sum(d) <= 2]
     if n:
-        degrees += [(d, *(0,) * (n - 1)) for d in range(3, AXIS_DEGREE + 1)]
+        degrees += [(d, *(0,) * (n - 1)) for d in range(3, FIRST_AXIS_DEGREE + 1)]
         degrees += [(2, *(int(i == k) for i in range(1, n))) for k in range(1, n) if n > 2]
     terms = [math.prod((_hermite(column, d) for column, d in zip(x.T, of, strict=True)), start=1.0) for of in degrees]
     return np.stack([np.broadcast_to(term, len(x)) for term in terms], axis=1)
@@ -239,3 +279,23 @@ def _polynomials(x: Array) -> Array:
 def _hermite(x: Array, degree: int) -> Array:
     """Hermite polynomial with variance one under a standard normal."""
     return np.asarray(hermeval(x, np.eye(degree + 1)[degree]) / math.sqrt(math.factorial(degree)))
+
+
+def _degrees(n: int, leading: int) -> NDArray[np.intp]:
+    """Degrees (Q, n) of the monomials whose mean is made exact; odd degrees are exact by symmetry."""
+    factors = [*combinations_with_replacement(range(n), 2), *combinations_with_replacement(range(leading), 4)]
+    return np.array([np.bincount(each, minlength=n) for each in [*factors, *[(0,) * 6][:leading]]])
+
+
+def _monomials(z: Array, degrees: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Monomials (Q, P) of these degrees at points (P, n), and their derivatives (Q, P, n)."""
+    powers = z ** np.arange(len(NORMAL_MOMENTS))[:, None, None]
+    column = np.arange(z.shape[1])
+    value = powers[degrees, :, column].prod(axis=1)
+    lower = np.maximum(degrees[:, None] - np.eye(len(column), dtype=int), 0)
+    slopes = degrees[..., None] * powers[lower, :, column].prod(axis=2)
+    return value, slopes.transpose(0, 2, 1)
+
+
+def _known(value: float, std: float) -> Estimate | None:
+    return Estimate(value, std) if math.isfinite(value) else None

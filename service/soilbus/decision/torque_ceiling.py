@@ -1,4 +1,4 @@
-"""Saturation: the greatest torque that a motor gives, as its torque shows it, whatever limit is reported for it.
+"""Saturation: the greatest torque that a motor gives, from its torque alone, independent of any reported limit.
 
 Torque T of a wheel below its motor's ceiling C follows the pull Q that is asked of the vehicle; at the ceiling it does
 not.  Nor does it follow the wheel's load N there.  Over one span of bins, with means T', Q', N':
@@ -27,12 +27,12 @@ from soilbus.estimation.window import Rig, Window, inertia_of, pull_asked
 from soilbus.terra.vehicle import GRAVITY
 
 LEAST_BINS = 4
-"""Bins of a span from which scatter and trend are told apart: one mean, one slope, two degrees of freedom."""
+"""Bins of a span from which scatter and trend can be separated: one mean, one slope, two degrees of freedom."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TorqueCeiling:
-    """What one recording has shown of each wheel's (W,) ceiling; `after` takes the next window.
+    """Each wheel's (W,) ceiling, as measured in one recording; `after` takes the next window.
 
     t [s]: end of the last span.  highest [N m]: largest mean of a span.  level [N m]: of the plateau on which the
     wheel was saturated, nan without one; weight [1/(N m)^2]: the inverse variance of level.  lasts: the torque has not
@@ -50,17 +50,17 @@ class TorqueCeiling:
 
     @classmethod
     def unknown(cls, wheels: int) -> TorqueCeiling:
-        """Before any measurement."""
+        """The state before any measurement."""
         no = np.zeros(wheels, bool)
         return cls(-math.inf, np.full(wheels, -np.inf), np.full(wheels, np.nan), np.zeros(wheels), no, no, no)
 
     @property
     def limit(self) -> Array:
-        """Greatest torque (W,) [N m] that may be counted on; nan where no ceiling shows."""
+        """Greatest available torque (W,) [N m]; nan where no ceiling was found."""
         return np.where((self.lasts & self.unmet) | self.returned, self.level, np.nan)
 
     def after(self, window: Window, rig: Rig, span: float, deviations: float) -> TorqueCeiling:
-        """With the spans of a window that come after the last one.
+        """The state after the spans of a window that come after the last one.
 
         Parameters
         ----------
@@ -69,9 +69,9 @@ class TorqueCeiling:
         rig
             With a chassis, else nothing is known of the pull.
         span
-            [s], of a plateau, and between two looks.
+            [s], length of a plateau, and time between two evaluations.
         deviations
-            Standard deviations from which a difference is none of noise.
+            Standard deviations from which a difference is significant.
         """
         if rig.chassis is None or not len(window.t):
             return self
@@ -138,7 +138,7 @@ def _saturated(window: Window, rig: Rig, deviations: float) -> Mask:
 
 
 def _speed_gained(window: Window, deviations: float) -> tuple[float, float]:
-    """Ground speed gained over the window, as its regression on time, and what noise gains; in one unit."""
+    """Ground speed gained over the window (regression on time), and its significance limit; both in m/s * s."""
     since = window.t - window.t.mean()
     noise = deviations * math.sqrt(float(since**2 @ window.variance["ground_speed"]))
     return float(since @ window.ground_speed), noise

@@ -1,13 +1,13 @@
-"""Wheels that spin and a vehicle that does not move, as the sensors show them, whatever soil was estimated.
+"""Loss of traction from the sensors alone: wheels that spin, and a vehicle that does not move.
 
     slip velocity of a wheel   v_s = r omega - V
     it spins where             v_s > max(v_min, s_max r omega)
     the vehicle stalls where   V < v_min and no wheel turns, while the wheels' thrust sum(T / r) exceeds what draft,
-                               slope and inertia ask by `stall_resistance`, or all motors give all they can
+                               slope and inertia ask by `stall_resistance`, or all motors are at their limits
 
 Slip 1 - V/(r omega) is not defined at standstill, its velocity is: so one rule holds from standstill to full speed.
-What lasts for `spin_time` takes the word from any estimate that says go; a vehicle that spins or stalls without making
-way for `stuck_time` is stuck.  It stays stuck until it has moved, for the ground is the same.
+Either one that lasts for `spin_time` overrules a go of the estimate.  A vehicle that spins or stalls without moving for
+`stuck_time` is stuck.  It stays stuck until it has moved, for the ground is the same.
 """
 
 from __future__ import annotations
@@ -30,15 +30,26 @@ if TYPE_CHECKING:
     from soilbus.decision.capability import OverSlip
 
 LONGEST_GAP = 1.0
-"""Silence [s] after which nothing is known of what lasts."""
+"""Silence [s] after which durations are counted from zero."""
 
 
 class Motion(NamedTuple):
-    """One moment: time [s], ground speed [m/s], rim speeds [m/s] of the wheels, and whether thrust moves nothing.
+    """One moment of wheels and vehicle; nan where not known.
 
-    nan is what is not known.  slip: mean of the driving wheels, by their torques; pull [N]: of draft, slope and
-    inertia, nan where the acceleration is not measured.  resistance: thrust beyond what these three ask, as a share of
-    the weight.  at_limit: every motor whose limit is known gives all it can, and at least one is known.
+    Attributes
+    ----------
+    t
+        [s].
+    ground, rim
+        [m/s], ground speed, and rim speed of each wheel.
+    resistance
+        Thrust less draft, slope and inertia, as a share of the weight.
+    at_limit
+        Every motor whose limit is known is at its limit, and at least one limit is known.
+    slip
+        Torque-weighted mean of the driving wheels.
+    pull
+        [N], of draft, slope and inertia; nan where the acceleration is not measured.
     """
 
     t: float
@@ -52,12 +63,21 @@ class Motion(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class TractionLoss:
-    """What is remembered from one moment to the next; `observed` makes the next one.  All times in s.
+    """State carried from one moment to the next by `observed`.  All times in s.
 
-    t: the last moment.  spins, sticks, moves: since when a wheel spins or the vehicle stalls, it makes no way under
-    thrust, it moves without spinning; inf where it does not.  stuck: it was, and has not moved since.  last: when any
-    of it was last seen to last; what was measured before then says nothing of the ground under the wheels.
-    slip, pull: of late, with `spin_time` as time constant; nan where not known.
+    Attributes
+    ----------
+    t
+        The last moment.
+    spins, sticks, moves
+        Since when a wheel spins or the vehicle stalls; it does not move under thrust; it moves without spinning.  inf
+        where it does not.
+    spinning, stuck
+        Spinning or stalling has lasted for `spin_time`; the vehicle is stuck and has not moved since.
+    last
+        The last moment that was spinning or stuck: older data do not describe the ground under the wheels.
+    slip, pull
+        Slip, and pull [N], low-pass filtered with the time constant `spin_time`; nan where not known.
     """
 
     t: float = -math.inf
@@ -80,12 +100,12 @@ NO_LOSS = TractionLoss()
 
 
 def observed(before: TractionLoss, motion: Motion, min_speed: float, settings: Settings) -> TractionLoss:
-    """What is lost after one more moment; moments in their order, at any rate.
+    """The loss of traction after one more moment; moments in their order, at any rate.
 
     Parameters
     ----------
     before
-        What the moment before left; nothing of it counts after LONGEST_GAP, or when time goes back.
+        The state after the moment before; reset after LONGEST_GAP, or when time goes back.
     motion
         The wheels and the vehicle now.
     min_speed
@@ -124,10 +144,23 @@ def observed(before: TractionLoss, motion: Motion, min_speed: float, settings: S
 
 
 def missing_pull(loss: TractionLoss, curve: OverSlip, noise: NoiseOfChannels, deviations: float) -> float:
-    """Pull [N] that the estimate predicts at the present slip and the wheels surely do not give; 0 where nothing is.
+    """Pull [N] that the estimate predicts at the present slip and the wheels significantly do not give; else 0.
 
-    The innovation P(s) - P, less these standard deviations of it: of the curve, of the slip by the gain errors of
-    both speeds, and of the draft's gain error.
+    Parameters
+    ----------
+    loss
+        With the present slip and pull.
+    curve
+        Predicted pull over slip.
+    noise
+        Gain errors of the speed, ground speed and draft sensors.
+    deviations
+        Standard deviations of the innovation that are subtracted.
+
+    Notes
+    -----
+    The innovation is P(s) - P.  Its variance is that of the curve, of the slip (gain errors of both speeds) and of the
+    draft's gain error.
     """
     known = np.isfinite(curve.pull)
     if not known.any() or not math.isfinite(loss.slip + loss.pull) or loss.slip < curve.slip[0]:
@@ -141,10 +174,23 @@ def missing_pull(loss: TractionLoss, curve: OverSlip, noise: NoiseOfChannels, de
 
 
 def idle(window: Window, rig: Rig, since: float, before: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which wheels (W,) do not drive: without torque while another one pulls, for most of the time after `since` [s].
+    """Which wheels do not drive: without torque while another one pulls, for most of the time after `since`.
 
-    Whatever limit is reported for its motor, such a wheel rolls.  Where no wheel pulls, or a torque is not known, it is
-    as `before` (W,).
+    Parameters
+    ----------
+    window
+        A forward window.
+    rig
+        Radius of each wheel.
+    since
+        [s].
+    before
+        (W,), the result before, kept where no wheel pulls or a torque is not known.
+
+    Returns
+    -------
+    NDArray
+        (W,).  Such a wheel rolls, even if its motor reports a torque limit.
     """
     recent = window.t > since
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -158,9 +204,18 @@ def idle(window: Window, rig: Rig, since: float, before: NDArray[np.bool_]) -> N
 
 
 def motion_of(window: Window, rig: Rig, torque_limit: NDArray[np.float64], settings: Settings) -> Motion | None:
-    """The mean motion over the few bins of a forward window; None without a bin, or for a rig without a chassis.
+    """The mean motion over a short forward window.
 
-    torque_limit (W,) [N m] is nan where a motor's is not known.
+    Parameters
+    ----------
+    window
+        A few bins; None is returned without any.
+    rig
+        With a chassis, else None is returned.
+    torque_limit
+        (W,) [N m], nan where not known.
+    settings
+        `full_torque`, share of the limit from which a motor is at its limit.
     """
     if not len(window.t) or rig.chassis is None:
         return None

@@ -1,4 +1,11 @@
-"""May the vehicle go on: go, caution, no_go or unknown, with a probability and the limiting cause."""
+"""Traversability: may the vehicle go on, with which probability, and what limits it.
+
+    P < no_go                         no_go
+    P >= go and a valid estimate      go
+    otherwise                         caution; unknown without a probability
+
+P is the probability that pull and sinkage stay within their limits (`judgement`); go and no_go are configured.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +32,7 @@ class State(StrEnum):
 
 
 class Status(StrEnum):
-    """What a window's estimate is worth."""
+    """Quality of a window's estimate."""
 
     VALID = "valid"
     DEGRADED = "degraded"
@@ -35,12 +42,28 @@ class Status(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Traversability:
-    """The decision and what it rests on; None where nothing can be said.
+    """The decision, with its main figures; None where not known.
 
-    Torques are sums over the wheels [N m]; max_draft [N] on the level; max_grade [rad]
-    without draft; slip_needed gives the present demand; since_valid is the time [s] since the
-    end of the last valid window; capability has all the rest; spare is the pull [N] on the present slope beyond
-    the demand and its margin.
+    Attributes
+    ----------
+    state, probability
+        The decision, and the probability that pull and sinkage stay within their limits.
+    torque_required, torque_available
+        [N m], sums over the wheels.
+    max_draft
+        [N], on the level.
+    max_grade
+        [rad], without draft.
+    slip_needed
+        Slip at which the present demand is met.
+    limit
+        What limits the vehicle.
+    since_valid
+        [s], time since the end of the last valid window.
+    capability
+        All other figures.
+    spare
+        [N], pull on the present slope less the demand and its margin.
     """
 
     state: State = State.UNKNOWN
@@ -57,7 +80,7 @@ class Traversability:
 
 
 def state_of(probability: float, status: Status, settings: Settings) -> State:
-    """The state that a probability and a status allow."""
+    """The state by a probability and a status, with the thresholds of the settings."""
     if probability < settings.no_go:
         return State.NO_GO
     if probability >= settings.go and status is Status.VALID:

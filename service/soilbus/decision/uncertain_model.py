@@ -1,9 +1,11 @@
-"""A wheel-soil model whose effects are known to within a covariance, beside that of the soil.
+"""A wheel-soil model with uncertain effects: its mean, and one perturbed model for each principal direction.
 
-What a window determines of the soil and of the effects belongs together: a soil that looks
-stronger goes with lugs that look shorter.  So each principal direction of the effects'
-covariance, one standard deviation long, is a model of its own, and brings the soil along by
-its regression on the effects; what is left of the soil's covariance is independent of them.
+    effects      e_i = e + sqrt(lambda_i) v_i             lambda_i, v_i: eigenpairs of the effects' covariance C_ee
+    soil         log p_i = log p + C_pe v_i / sqrt(lambda_i)     regression of the soil's logarithms on the effects
+
+A window determines soil and effects jointly: a stronger soil goes with shorter lugs.  So each principal direction of
+the effects' covariance, one standard deviation long, is a model of its own, with the soil that goes with it.  The rest
+of the soil's covariance is independent of the effects.  The model's form (its open structure) is treated alike.
 """
 
 from __future__ import annotations
@@ -28,17 +30,17 @@ from soilbus.terra.wheel import WheelModel, WheelState
 _Rows = slice | NDArray[np.intp]
 
 _SOIL = len(PARAMETERS)
-FORMS = 2
-"""Directions of the model's form that have a model of their own in decisions.  Pull at loads and slips that were
-driven is measured: soil and form cancel there, and with two directions the std of the largest draft is within 7 % of
-that with all four (loam, wet clay, dry sand); a soil as badly known as by the form, on a model that is not, has 5 to 15
-times as much."""
-_LEAST = 1e-8
-"""Variance, in units of a parameter's prior, below which its direction counts as held."""
+FORM_DIRECTIONS = 2
+"""Number of directions of the model's form that have a perturbed model in decisions.  At loads and slips that were
+driven the pull is measured, and errors of soil and form cancel.  Evidence: with two directions the std of the largest
+draft is within 7 % of that with all four (loam, wet clay, dry sand).  The form's covariance of the soil alone, with the
+form held, would give 5 to 15 times that std."""
+_HELD_VARIANCE = 1e-8
+"""Variance, in units of a parameter's prior, below which its direction counts as known exactly."""
 
 
-class Doubt(NamedTuple):
-    """The model one standard deviation away along one direction, and the change (6,) of the soil's logarithms there."""
+class PerturbedModel(NamedTuple):
+    """The model one standard deviation away along one direction, and the soil's change (6,), in logarithms, with it."""
 
     model: CompletedModel
     shift: Array
@@ -46,18 +48,18 @@ class Doubt(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class UncertainModel:
-    """The model as it most likely is, and one for each direction in which it may be otherwise; independent.
+    """The mean model, and one perturbed model for each independent direction of its uncertainty.
 
-    The last `of_form` doubts are of the model's form.
+    The last `of_form` of the perturbed models are of the model's form.
     """
 
     mean: CompletedModel
-    doubts: tuple[Doubt, ...] = ()
+    perturbed: tuple[PerturbedModel, ...] = ()
     of_form: int = 0
 
     @classmethod
     def over(cls, model: WheelModel | CompletedModel | UncertainModel) -> UncertainModel:
-        """A model that is known as one without doubts."""
+        """An exactly known model as an UncertainModel; an uncertain one as it is."""
         return model if isinstance(model, UncertainModel) else cls(CompletedModel.over(model))
 
     @classmethod
@@ -65,67 +67,83 @@ class UncertainModel:
         cls, model: WheelModel, effects: Sequence[Effect], free: Sequence[Free], gaussian: Gaussian, n_wheels: int,
         ground_speed: float, widening: float = 1.0, form: FormLeft | None = None,
     ) -> UncertainModel:  # fmt: skip
-        """With what a window has left of the effects' parameters, at a ground speed [m/s].
+        """The model with the effects' parameters as a window's posterior has them.
 
-        Their places are the last of the belief's gains, in prior standard deviations.  Only
-        effects that count in steady driving do so here.  widening is that of `Posterior.widened`.
+        Parameters
+        ----------
+        model
+            Wheel-soil model without effects.
+        effects, free
+            The effects, and their free parameters.
+        gaussian
+            Posterior of soil and gains; the last len(free) gains are the free parameters in prior standard deviations.
+        n_wheels
+            Number of wheels.
+        ground_speed
+            [m/s], at which effects are evaluated; only those that act in steady driving have a perturbed model.
+        widening
+            Factor of the covariance, as of `Posterior.widened`.
+        form
+            Posterior of the model's form; None where it is not uncertain.
         """
 
-        def at(pulls: Array, model: WheelModel = model) -> CompletedModel:
-            return CompletedModel.of(model, active_at(effects, free, pulls, n_wheels), ground_speed)
+        def at(standardised: Array, model: WheelModel = model) -> CompletedModel:
+            return CompletedModel.of(model, active_at(effects, free, standardised, n_wheels), ground_speed)
 
         first = len(gaussian.gains) - len(free)
-        pulls = gaussian.gains[first:]
-        mean = at(pulls)
+        standardised = gaussian.gains[first:]
+        mean = at(standardised)
         names = {active.effect.name for active in mean.effects}
         places = np.flatnonzero([f.effect in names and f.std > 0.0 for f in free])
-        of_form = [] if form is None else _of_form(form, lambda step: at(pulls, formed(model, step)))
+        of_form = [] if form is None else _perturbed_by_form(form, lambda step: at(standardised, formed(model, step)))
         if not len(places):
             return cls(mean, tuple(of_form), len(of_form))
         of_effects = _SOIL + first + places
         variance, axes = np.linalg.eigh(gaussian.covariance[np.ix_(of_effects, of_effects)])
-        doubts = []
+        perturbed = []
         for size, axis in zip(variance.tolist(), axes.T, strict=True):
-            if size <= _LEAST:
+            if size <= _HELD_VARIANCE:
                 continue
             step = np.zeros(len(free))
             step[places] = axis * np.sqrt(size)
             shift = gaussian.covariance[:_SOIL, of_effects] @ axis / np.sqrt(size)
-            way = _way_inside(free, pulls, step)
-            scale = way * np.sqrt(widening / (1.0 + (widening - 1.0) * min(size, 1.0)))
-            doubts.append(Doubt(at(pulls + scale * step), scale * shift))
-        return cls(mean, tuple(doubts + of_form), len(of_form))
+            sign = _sign_inside(free, standardised, step)
+            scale = sign * np.sqrt(widening / (1.0 + (widening - 1.0) * min(size, 1.0)))
+            perturbed.append(PerturbedModel(at(standardised + scale * step), scale * shift))
+        return cls(mean, tuple(perturbed + of_form), len(of_form))
 
     @property
     def shifts(self) -> Array:
-        """Of the soil's logarithms, one row for each doubt (Q, 6)."""
-        return np.array([doubt.shift for doubt in self.doubts]).reshape(-1, _SOIL)
+        """Changes of the soil's logarithms (Q, 6), one row for each perturbed model."""
+        return np.array([one.shift for one in self.perturbed]).reshape(-1, _SOIL)
 
     def with_form(self, log_covariance: Array) -> Array:
-        """A fit's own covariance (6, 6) of the soil's logarithms, and what the doubts of the form bring along."""
-        along = self.shifts[len(self.doubts) - self.of_form :]
+        """Covariance (6, 6) of the soil's logarithms: a fit's own plus that due to the model's form."""
+        along = self.shifts[len(self.perturbed) - self.of_form :]
         return np.asarray(log_covariance + along.T @ along)
 
     def of_rows(self, n: int) -> ModelOfRows:
-        """The models of n rows of soils, of which the doubts' are the last."""
-        known = n - len(self.doubts)
-        row = np.concatenate([np.zeros(known, int), 1 + np.arange(len(self.doubts))])
-        return ModelOfRows((self.mean, *(doubt.model for doubt in self.doubts)), row)
+        """The models of n rows of soils; the last rows belong to the perturbed models."""
+        known = n - len(self.perturbed)
+        row = np.concatenate([np.zeros(known, int), 1 + np.arange(len(self.perturbed))])
+        return ModelOfRows((self.mean, *(one.model for one in self.perturbed)), row)
 
 
-def _of_form(form: FormLeft, at: Callable[[Array], CompletedModel]) -> list[Doubt]:
-    """A doubt for each of the leading directions of what the form leaves open, each to the side that its mean is on."""
+def _perturbed_by_form(form: FormLeft, at: Callable[[Array], CompletedModel]) -> list[PerturbedModel]:
+    """A perturbed model for each leading direction of the form's second moment, on the side on which its mean lies."""
     variance, axes = np.linalg.eigh(form.moment)
     axes = axes * np.where(form.mean @ axes < 0.0, -1.0, 1.0)
-    steps = (axes * np.sqrt(np.maximum(variance, 0.0))).T[-FORMS:][variance[-FORMS:] > _LEAST]
-    return [Doubt(at(step), form.by_form[:_SOIL] @ step) for step in steps]
+    steps = (axes * np.sqrt(np.maximum(variance, 0.0))).T[-FORM_DIRECTIONS:][
+        variance[-FORM_DIRECTIONS:] > _HELD_VARIANCE
+    ]
+    return [PerturbedModel(at(step), form.by_form[:_SOIL] @ step) for step in steps]
 
 
-def _way_inside(free: Sequence[Free], pulls: Array, step: Array) -> float:
-    """1 or -1: the way along a step (P,) that leaves the parameters' ranges less; there they are held back."""
+def _sign_inside(free: Sequence[Free], standardised: Array, step: Array) -> float:
+    """Sign (1 or -1) of a step (P,) with which the parameters exceed their ranges less; beyond they are clipped."""
 
-    def lost(way: float) -> float:
-        there = (pulls + way * step).tolist()
+    def lost(sign: float) -> float:
+        there = (standardised + sign * step).tolist()
         return math.fsum(abs(f.allowed(u) - u) for f, u in zip(free, there, strict=True))
 
     return 1.0 if lost(1.0) <= lost(-1.0) else -1.0
@@ -133,22 +151,22 @@ def _way_inside(free: Sequence[Free], pulls: Array, step: Array) -> float:
 
 @dataclass(frozen=True, slots=True)
 class ModelOfRows:
-    """Models for arrays (D, ...) whose row i belongs to models[row[i]]; interface and units as CompletedModel."""
+    """Models for arrays (D, ...): row i belongs to models[row[i]].  Interface and units as CompletedModel."""
 
     models: tuple[CompletedModel, ...]
     row: NDArray[np.intp]
 
     @property
     def first(self) -> CompletedModel:
-        """That of the first row."""
+        """The model of the first row."""
         return self.models[int(self.row[0])]
 
     def of(self, rows: NDArray[np.intp]) -> ModelOfRows:
-        """The same of some of the rows."""
+        """The models of some of the rows."""
         return ModelOfRows(self.models, self.row[rows])
 
     def forces_and_slopes(self, state: WheelState, rear: Any, load: Array) -> tuple[Array, Slopes]:
-        """Forces (3, D, ...) and slopes of states and loads (D, ...)."""
+        """Forces (3, D, ...) [N, N, N m] and their derivatives at states and loads [N] (D, ...)."""
 
         def rows(model: CompletedModel, at: _Rows) -> Array:
             forces, slopes = model.forces_and_slopes(WheelState(*(a[at] for a in state)), rear, load[at])
@@ -164,7 +182,7 @@ class ModelOfRows:
         )
 
     def angle_of_sinkage(self, depth: float, wheel: Wheel) -> Array:
-        """Entry angle [rad] (D, A) at which wheels (A,) have sunk so deep [m]."""
+        """Entry angle [rad] (D, A) at which wheels (A,) have this sinkage [m]."""
         shape = (len(self.row), *np.shape(wheel.radius))
         return self._by_model(
             lambda model, at: np.broadcast_to(
@@ -173,7 +191,7 @@ class ModelOfRows:
         )  # fmt: skip
 
     def _by_model(self, rows: Callable[[CompletedModel, _Rows], Array], shape: tuple[int, ...], axis: int = 0) -> Array:
-        """An array of this shape from what each model says of its rows, which are along an axis."""
+        """An array of this shape, filled by each model for its rows, which lie along `axis`."""
         if len(self.models) == 1:
             return np.asarray(rows(self.models[0], slice(None)))
         out = np.empty(shape)

@@ -1,8 +1,11 @@
-"""The wheels over slip on many soils at once, on the level: forces, and how they change with load and slip.
+"""The wheels over slip on many soils at once, on the level: forces and their derivatives by load and slip.
 
-All driven wheels turn at the same slip; the others roll at the slip that takes no torque.
-Loads follow the pull (load transfer) and entry angles follow the loads; both are solved
-together by Newton.
+    vertical force    F_z(theta, s, N) = N            solved for the entry angle theta of each wheel
+    load transfer     N = level + lever * P           solved together with
+    pull balance      P = sum of the drawbar pulls    by Newton's method, for all soils and slips at once
+
+All driven wheels have the same slip s.  The others roll at the slip at which their torque is zero, which is solved for
+in the same step.  The result is the table from which `balance` interpolates.
 """
 
 from __future__ import annotations
@@ -23,23 +26,40 @@ from soilbus.terra.soil_laws import lumped_modulus
 from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE, WheelModel, WheelState
 
-TOLERANCE = 1e-3
-"""Newton step of pull and load, over the weight, that is the last: it leaves some 1e-6 of the weight."""
-RIDGE = 1e-6
-"""Share of the soils' spread below which a direction tells nothing of how pull and angles change."""
-LEAST = 1e-12
-MAX_ITERATIONS = 12
-TEST_LOAD = 0.9
-ROLLING_SLIP, MAX_ROLLING_SLIP = -0.05, 0.5
-"""Slip from which that of a wheel without torque is looked for, and the skid that it never passes."""
+NEWTON_TOLERANCE = 1e-3
+"""Step of pull and load, as a share of the weight, below which Newton's method stops; it leaves some 1e-6."""
+RELATIVE_REGULARISATION = 1e-6
+"""Ridge term of the regression on the soils' logarithms, as a share of their total sum of squares: directions with a
+smaller spread do not determine how pull and angles change."""
+LEAST_POSITIVE = 1e-12
+"""Lower bound of a soil parameter before its logarithm is taken, and of the ridge term."""
+MAX_NEWTON_STEPS = 12
+DRAWBAR, TORQUE, ANGLE = range(3)
+"""Places of drawbar pull [N], torque [N m] and entry angle [rad] of a wheel in a table's `at`, `by_load`, `by_slip`."""
+MAX_SINE = 0.99
+"""Sine of the steepest slope that is computed."""
+LOAD_RATIO = 0.9
+"""Load, as a share of a wheel's own, of the second evaluation from which the second derivative by load follows."""
+ROLLING_SLIP, MAX_ROLLING_SKID = -0.05, 0.5
+"""Start of Newton's method for the slip of a wheel without torque, and the largest skid (minus slip) it may have."""
 
 
 @dataclass(frozen=True, slots=True)
 class Axles:
-    """Wheels alike in axle, radius, width and whether they are driven count as one of A kinds.
+    """The A kinds of wheels: those alike in axle, radius, width and whether they are driven.
 
-    radius, width [m], front, driven and count have shape (A, 1).  A wheel's load is level cos + tilt sin of
-    the slope + lever times the draft, (A, 1) each; of_wheel (W,) is each wheel's kind.
+    Attributes
+    ----------
+    chassis
+        Mass and geometry of the vehicle.
+    radius, width
+        (A, 1) [m].
+    front, driven, count
+        (A, 1), whether on the front axle, whether driven, and how many.
+    level, tilt, lever
+        (A, 1) [N], [N] and [1]: load of a wheel = level * cosine + tilt * sine of the slope + lever * draft.
+    of_wheel
+        (W,), kind of each wheel.
     """
 
     chassis: Chassis
@@ -55,7 +75,20 @@ class Axles:
 
     @classmethod
     def of(cls, rig: Rig, driven: NDArray[np.bool_] | None = None) -> Axles:
-        """The kinds of a rig's wheels, all driven or those of `driven` (W,); ValueError for a rig without a chassis."""
+        """The kinds of a rig's wheels.
+
+        Parameters
+        ----------
+        rig
+            The vehicle's wheels and chassis.
+        driven
+            (W,), which wheels are driven; None for all.
+
+        Raises
+        ------
+        ValueError
+            For a rig without a chassis.
+        """
         if rig.chassis is None:
             raise ValueError("a capability needs the vehicle's mass and geometry")
         drives = [True] * len(rig.wheels) if driven is None else driven.tolist()
@@ -77,25 +110,40 @@ class Axles:
 
     @property
     def weight(self) -> float:
-        """Of the vehicle [N]."""
+        """Weight of the vehicle [N]."""
         return self.chassis.mass * GRAVITY
 
     def loads(self, draft: Any, sine: Any) -> Array:
         """Load on each wheel [N] (..., A, S) for a draft [N] and a slope's sine, each (..., S)."""
         draft = np.atleast_1d(draft)[..., None, :]
-        sine = np.atleast_1d(np.minimum(np.maximum(sine, -0.99), 0.99))[..., None, :]
+        sine = np.atleast_1d(np.minimum(np.maximum(sine, -MAX_SINE), MAX_SINE))[..., None, :]
         return np.asarray(self.level * np.sqrt(1.0 - sine * sine) + self.tilt * sine + self.lever * draft)
 
 
 @dataclass(frozen=True, slots=True)
 class WheelTable:
-    """D soils (D, 6), A kinds of wheels, S slips: wheels at the loads of the steady level pull.
+    """Steady states on the level of D soils, A kinds of wheels, S slips.
 
-    pull [N] (D, S) is the whole vehicle's; load [N] (D, A, S); at (3, D, A, S) are drawbar pull [N],
-    torque [N m] and entry angle [rad] of one wheel, by_load and by_slip their derivatives
-    by its load at constant slip and by slip at constant load; bend (3, 1, A, S) is half the second
-    derivative by load, that of the first soil for all.  balanced (D, S) tells where a
-    steady state was found; elsewhere pull is nan.
+    Attributes
+    ----------
+    axles
+        The kinds of wheels.
+    soils
+        (D, 6).
+    slip
+        (S,), of the driven wheels.
+    pull
+        (D, S) [N], of the vehicle; nan where not balanced.
+    load
+        (D, A, S) [N], of one wheel.
+    at
+        (3, D, A, S), drawbar pull [N], torque [N m] and entry angle [rad] of one wheel.
+    by_load, by_slip
+        (3, D, A, S), derivatives of `at` by its load at constant slip and by slip at constant load.
+    half_second_derivative
+        (3, 1, A, S), half the second derivative of `at` by load, of the first soil and used for all.
+    balanced
+        (D, S), whether a steady state was found.
     """
 
     axles: Axles
@@ -106,19 +154,20 @@ class WheelTable:
     at: Array
     by_load: Array
     by_slip: Array
-    bend: Array
+    half_second_derivative: Array
     balanced: NDArray[np.bool_]
 
     def pull_at(self, load: Array) -> Array:
         """Pull of the vehicle [N] (..., D, S) with its wheels at other loads (..., D, A, S)."""
         change = load - self.load
-        drawbar = self.at[0] + change * (self.by_load[0] + self.bend[0] * change)
+        drawbar = self.at[DRAWBAR] + change * (self.by_load[DRAWBAR] + self.half_second_derivative[DRAWBAR] * change)
         return np.asarray((self.axles.count * drawbar).sum(axis=-2))
 
     def change_at(self, load: Array) -> list[Array]:
         """Changes of drawbar pull, torque and entry angle (..., D, A, S) at other loads (..., D, A, S)."""
         change = load - self.load
-        return [change * (slope + bend * change) for slope, bend in zip(self.by_load, self.bend, strict=True)]
+        derivatives = zip(self.by_load, self.half_second_derivative, strict=True)
+        return [change * (first + half_second * change) for first, half_second in derivatives]
 
 
 def wheel_table(
@@ -127,17 +176,32 @@ def wheel_table(
     model: WheelModel | CompletedModel | UncertainModel,
     slip: Array,
     start: WheelTable | None = None,
-    tolerance: float = TOLERANCE,
+    tolerance: float = NEWTON_TOLERANCE,
     driven: NDArray[np.bool_] | None = None,
 ) -> WheelTable:
-    """Wheels on soils (D, 6) at slips (S,) of the driven ones (W,), all by default.
+    """Steady level driving on D soils at S slips.
 
-    `start` is the same rig's table of similar soils.
+    Parameters
+    ----------
+    soils
+        (D, 6).  The last of them belong to the perturbed models of an uncertain model.
+    rig
+        With a chassis.
+    model
+        The wheel-soil model.
+    slip
+        (S,), of the driven wheels.
+    start
+        Table of the same rig on similar soils, to start Newton's method from.
+    tolerance
+        Step of pull and load, as a share of the weight, below which Newton's method stops.
+    driven
+        (W,), which wheels are driven; None for all.
 
-    The last of the soils are those of the model's doubts, where it has any.  tolerance: the Newton
-    step of pull and load, over the weight, that is the last.
-
-    Raises ValueError for a rig without a chassis.
+    Raises
+    ------
+    ValueError
+        For a rig without a chassis.
     """
     n_soils, n_slips = len(soils), len(slip)
     completed = UncertainModel.over(model).of_rows(n_soils)
@@ -150,7 +214,7 @@ def wheel_table(
         start = None
     slips = np.where(axles.driven, np.broadcast_to(slip, (n_soils, len(axles.count), n_slips)), ROLLING_SLIP)
     if start is not None:
-        pull, angle = _foreseen(start, soils)
+        pull, angle = _extrapolated(start, soils)
         pull = np.where(start.balanced, pull, 0.0)
         angle = np.where(start.balanced[:, None], angle, np.nan).clip(max=MAX_ENTRY_ANGLE)
     else:
@@ -163,11 +227,11 @@ def wheel_table(
     last_step = tolerance * axles.weight
     with np.errstate(all="ignore"):
         now = _newton_step(soils, axles, completed, slips, pull, load, angle)
-        for _ in range(MAX_ITERATIONS - 1):
-            rows = np.flatnonzero((now.miss > last_step).any(axis=1))
+        for _ in range(MAX_NEWTON_STEPS - 1):
+            rows = np.flatnonzero((now.step_size > last_step).any(axis=1))
             if not len(rows):
                 break
-            angle[rows] = np.clip(now.at[2, rows], 0.5 * angle[rows], 2.0 * angle[rows]).clip(max=MAX_ENTRY_ANGLE)
+            angle[rows] = np.clip(now.at[ANGLE, rows], 0.5 * angle[rows], 2.0 * angle[rows]).clip(max=MAX_ENTRY_ANGLE)
             of_rows = (
                 soils[rows],
                 axles,
@@ -179,28 +243,31 @@ def wheel_table(
             )
             for whole, part in zip(now, _newton_step(*of_rows), strict=True):
                 whole[(slice(None),) * (part.ndim == 4) + (rows,)] = part
-    pull, load, at, by_load, by_slip, slips, miss = now
-    balanced = np.isfinite(at[2]).all(axis=1) & (load > 0.0).all(axis=1) & (miss <= last_step)
-    bend = _bend(soils[:1], axles, completed.first, slips[:1], load[:1], at[:, :1], by_load[:, :1])
-    return WheelTable(axles, soils, slip, np.where(balanced, pull, np.nan), load, at, by_load, by_slip, bend, balanced)
+    pull, load, at, by_load, by_slip, slips, step_size = now
+    balanced = np.isfinite(at[ANGLE]).all(axis=1) & (load > 0.0).all(axis=1) & (step_size <= last_step)
+    of_first = soils[:1], axles, completed.first, slips[:1], load[:1], at[:, :1], by_load[:, :1]
+    half_second = _half_second_derivative(*of_first)
+    return WheelTable(
+        axles, soils, slip, np.where(balanced, pull, np.nan), load, at, by_load, by_slip, half_second, balanced
+    )
 
 
-def _foreseen(start: WheelTable, soils: Array) -> tuple[Array, Array]:
-    """Pull (D, S) and entry angle (D, A, S) on other soils, as those of a table change from its first to the rest."""
+def _extrapolated(start: WheelTable, soils: Array) -> tuple[Array, Array]:
+    """Pull (D, S) and entry angle (D, A, S) on other soils, by ridge regression on the soils' logarithms."""
     n_soils, n_slips = start.pull.shape
-    logs, other = (np.log(np.maximum(each, LEAST)) for each in (start.soils, soils))
+    logs, other = (np.log(np.maximum(each, LEAST_POSITIVE)) for each in (start.soils, soils))
     with np.errstate(all="ignore"):
-        values = np.concatenate([start.pull, np.log(start.at[2]).reshape(n_soils, -1)], axis=1)
+        values = np.concatenate([start.pull, np.log(start.at[ANGLE]).reshape(n_soils, -1)], axis=1)
     apart, change = logs - logs[0], values - values[0]
     spread = apart.T @ apart
-    ridge = RIDGE * np.trace(spread) + LEAST
+    ridge = RELATIVE_REGULARISATION * np.trace(spread) + LEAST_POSITIVE
     slopes = np.linalg.solve(spread + ridge * np.eye(len(spread)), apart.T @ np.where(np.isfinite(change), change, 0.0))
     values = values + (other - logs) @ slopes
     return values[:, :n_slips], np.exp(values[:, n_slips:]).reshape(start.load.shape)
 
 
 class _Step(NamedTuple):
-    """As in WheelTable after a step, with the slips (D, A, S), and how far it went [N] (D, S)."""
+    """Result of a Newton step: as in WheelTable, with the slips (D, A, S) and the size of the step [N] (D, S)."""
 
     pull: Array
     load: Array
@@ -208,15 +275,15 @@ class _Step(NamedTuple):
     by_load: Array
     by_slip: Array
     slip: Array
-    miss: Array
+    step_size: Array
 
 
 def _newton_step(
     soils: Array, axles: Axles, model: ModelOfRows, slip: Array, pull: Array, load: Array, angle: Array
 ) -> _Step:
-    """One step towards wheels that carry their loads and a level pull that balances itself.
+    """One Newton step of entry angles, loads and pull.
 
-    A wheel that is not driven takes no torque: T = 0 is solved for its slip, which so follows its load.
+    A wheel that is not driven has torque T = 0, which is solved for its slip; so its slip follows its load.
     """
     forces, d = model.forces_and_slopes(_state(soils, axles, slip, angle), ~axles.front, load)
     by_carried = np.stack([d.by_angle[1], d.by_angle[2], np.ones_like(d.by_angle[0])]) / d.by_angle[0]
@@ -224,40 +291,42 @@ def _newton_step(
     by_load[:2] += d.by_load[1:]
     by_slip = -by_carried * d.by_slip[0]
     by_slip[:2] += d.by_slip[1:]
-    off = load - forces[0]
-    by_torque = np.where(axles.driven, 0.0, -by_slip / by_slip[1])  # of the slip that takes a torque away
-    rolled = forces[2] + by_carried[1] * off
-    rolled_by_load = by_load[1].copy()
+    carried, drawbar, torque = forces
+    off = load - carried
+    by_torque = np.where(axles.driven, 0.0, -by_slip / by_slip[TORQUE])  # of the slip change that makes the torque zero
+    rolled = torque + by_carried[TORQUE] * off
+    rolled_by_load = by_load[TORQUE].copy()
     by_load += by_torque * rolled_by_load
-    gain = (axles.count * axles.lever * by_load[0]).sum(axis=1) - 1.0
-    change = -((axles.count * (forces[1] + by_carried[0] * off + by_torque[0] * rolled)).sum(axis=1) - pull) / gain
+    gain = (axles.count * axles.lever * by_load[DRAWBAR]).sum(axis=1) - 1.0
+    next_drawbar = drawbar + by_carried[DRAWBAR] * off + by_torque[DRAWBAR] * rolled
+    change = -((axles.count * next_drawbar).sum(axis=1) - pull) / gain
     shift = axles.lever * change[:, None]
     step = off + shift
-    slower = np.where(axles.driven, 0.0, (rolled + rolled_by_load * shift) / by_slip[1])
+    slower = np.where(axles.driven, 0.0, (rolled + rolled_by_load * shift) / by_slip[TORQUE])
     at = by_carried * off + by_load * shift + by_torque * rolled
     at[:2] += forces[1:]
-    at[2] += angle
-    miss = np.maximum(np.abs(change), np.abs(step).max(axis=1))
-    slip = np.clip(slip - slower, -MAX_ROLLING_SLIP, None)
-    return _Step(pull + change, load + shift, at, by_load, by_slip * axles.driven, slip, miss)
+    at[ANGLE] += angle
+    step_size = np.maximum(np.abs(change), np.abs(step).max(axis=1))
+    slip = np.clip(slip - slower, -MAX_ROLLING_SKID, None)
+    return _Step(pull + change, load + shift, at, by_load, by_slip * axles.driven, slip, step_size)
 
 
-def _bend(
+def _half_second_derivative(
     soil: Array, axles: Axles, model: CompletedModel, slip: Array, load: Array, at: Array, by_load: Array
 ) -> Array:
-    """Half the second derivative by load, from the wheels under TEST_LOAD times their load."""
-    change = (TEST_LOAD - 1.0) * load
+    """Half the second derivative by load, from a second evaluation at LOAD_RATIO times the load."""
+    change = (LOAD_RATIO - 1.0) * load
     linear = at + change * by_load
     with np.errstate(all="ignore"):
         forces = model.forces(
-            _state(soil, axles, slip, np.clip(linear[2], 0.0, MAX_ENTRY_ANGLE)), ~axles.front, load + change
+            _state(soil, axles, slip, np.clip(linear[ANGLE], 0.0, MAX_ENTRY_ANGLE)), ~axles.front, load + change
         )
-        exact = np.stack([forces[1], forces[2], linear[2]]) + by_load * (load + change - forces[0])
+        exact = np.stack([forces[1], forces[2], linear[ANGLE]]) + by_load * (load + change - forces[0])
         return np.asarray((exact - linear) / change**2 * axles.driven)
 
 
 def _state(soils: Array, axles: Axles, slip: Array, angle: Array) -> WheelState:
-    """Every soil under every kind of wheel at its slips (D, A, S), each field of the whole shape."""
+    """State of every kind of wheel on every soil at every slip; each field has the shape (D, A, S)."""
     k_c, k_phi, n, phi, c, K = soils.T[:, :, None, None]
     modulus = lumped_modulus(k_c, k_phi, axles.width)
     state = WheelState(angle, slip, axles.radius, axles.width, modulus, n, np.tan(phi), c, K)

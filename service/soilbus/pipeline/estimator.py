@@ -1,4 +1,11 @@
-"""Windows of measured data in, results out: soil, capability, decision."""
+"""One window's data in, its result out: soil estimate, status, capability, decision, warning.
+
+    WindowTask -> Tracker (posterior of the soil) -> status -> judge (capability, probability) -> hysteresis -> watch
+
+`estimate` needs the estimation only and may run in another process; it returns an `Undecided`: the window's result so
+far and what the decision needs.  `decide` takes these in order and holds the state from window to window: hysteresis,
+loss of traction, immobilisation watch.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +20,7 @@ from soilbus.config.model import Config
 from soilbus.decision.capability import Demand, OverSlip
 from soilbus.decision.demand import present_demand
 from soilbus.decision.hysteresis import Held, doubted, settled
-from soilbus.decision.immobilisation import SPAN, Watch, moments, watched, with_loss
+from soilbus.decision.immobilisation import BINS_OF_A_MOMENT, Watch, moments, watched, with_loss
 from soilbus.decision.judgement import Basis, judge
 from soilbus.decision.torque_ceiling import TorqueCeiling
 from soilbus.decision.traction_loss import NO_LOSS, idle, motion_of, observed
@@ -36,18 +43,33 @@ from soilbus.terra.effects.effect import Active, Surroundings, true_draft
 from soilbus.terra.effects.steady import CompletedModel
 from soilbus.terra.wheel import sinkage
 
-AMBIGUOUS = 2.0
-"""Standard deviations of bearing pressure or tan phi by which another optimum makes a window ambiguous."""
+AMBIGUITY_SD = 2.0
+"""Difference of bearing pressure or tan phi at a second mode, in standard deviations, from which a window is
+ambiguous.  No evidence recorded."""
 
 
 @dataclass(frozen=True, slots=True)
 class Undecided:
-    """A window's estimate with what the decision needs besides; its traversability is still unknown.
+    """A window's estimate, and the inputs of its decision, which is still to be made.
 
-    posterior belongs to model, which knows what of the soil goes with its form.  demand is None where the draft
-    is not known; torque_limit (W,) [N m]; driven: the window's data with the true draft; fresh: nothing of the
-    window before may be carried over; model: with what the window leaves known of the effects' parameters and of the
-    form; here: whether the estimate is of the present ground.
+    Attributes
+    ----------
+    result
+        With an unknown traversability.
+    posterior
+        Of the soil, with the covariance due to the model's form that `model` has; None where there is no estimate.
+    demand
+        None where the draft is not known.
+    torque_limit
+        (W,) [N m], nan where not known.
+    driven
+        The window's data, its draft corrected by the fitted effects of the draft sensor.
+    fresh
+        Nothing may be carried over from the window before.
+    model
+        With the uncertainty that the window leaves of the effects' parameters and of the form.
+    here
+        Whether the estimate is of the present ground.
     """
 
     result: WindowResult
@@ -61,12 +83,18 @@ class Undecided:
 
 
 class WindowEstimator:
-    """Solves one window after the other: the tracker's soil, its status, the decision."""
+    """Solves one window after the other: soil, status, decision, warning.
+
+    Parameters
+    ----------
+    config
+        Vehicle, prior, model, settings.
+    """
 
     def __init__(self, config: Config) -> None:
         self.config = config
         self.rig, self.prior, self.model = rig_of(config), prior_of(config), model_of(config)
-        self._completion = effects_and_parameters_of(config)
+        self._effects_and_parameters = effects_and_parameters_of(config)
         self._settings = config.estimator
         self._wheels: WheelTable | None = None
         self._gap = GapWatch(config.estimator.window, config.estimator.hop)
@@ -78,7 +106,7 @@ class WindowEstimator:
         self._idle = np.zeros(len(self.rig.wheels), bool)
         self._ceiling = TorqueCeiling.unknown(len(self.rig.wheels))
         self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
-        self._guess = guessed(self.prior, prior_of(Config()))
+        self._class_prior = guessed(self.prior, prior_of(Config()))
         settings = config.estimator
         least = MIN_ROWS if config.table is None else 1  # a table's rows are chosen with care, and few
         self._tracker = Tracker(
@@ -87,30 +115,30 @@ class WindowEstimator:
                 settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift, least,
                 form_of(config), settings.search_rate, settings.search_burst,
             ),
-            *self._completion,
+            *self._effects_and_parameters,
         )  # fmt: skip
 
     @property
     def tracker(self) -> Tracker:
-        """What carries soil and gains from window to window."""
+        """The tracker, which carries soil and gains from window to window."""
         return self._tracker
 
     def solve(self, task: WindowTask) -> WindowResult:
-        """Estimate, decision and watch of one window."""
+        """Result of one window, with decision and watch; windows in their order."""
         return self.decide(self.estimate(task))
 
     def solve_unwatched(self, task: WindowTask) -> WindowResult:
-        """Estimate and decision, for those who watch more often themselves; the result's watch stays unknown."""
+        """Result of one window without a watch (it stays unknown), for callers that watch more often themselves."""
         return self._decided(self.estimate(task))
 
     def estimate(self, task: WindowTask) -> Undecided:
-        """Soil and status of one window."""
+        """Soil and status of one window; windows in their order."""
         if task.fresh:
             self._tracker.reset()
         tracked = self._tracker.estimate(task.window, task.end)
         fit = tracked.fit
         status, reason = self._status(task, tracked)
-        own = None if fit is None or status is Status.INVALID else self._honest(tracked, fit)
+        own = None if fit is None or status is Status.INVALID else self._widened_posterior(tracked, fit)
         posterior = None if own is None or fit is None else _with_form(own, fit, self.prior)
         basis = self._basis(task, fit)
         if status is Status.VALID and task.end - basis.end > self.config.traversability.max_age:
@@ -132,10 +160,10 @@ class WindowEstimator:
             soil_class=self._soil_class(posterior),
             position=task.track.at((tracked.since + task.end) / 2.0),
             failure=self._failure(tracked),
-            gaps=self._watched_gaps(task, fit),
+            gaps=self._model_gaps(task, fit),
             excitation=excitation_of(task.window, self.rig, self._settings.min_speed),
             basis=basis,
-            z_driven=None if fit is None or posterior is None else self._driven(fit),
+            z_driven=None if fit is None or posterior is None else self._sinkage_range(fit),
             search_ended=tracked.search_ended,
         )
         effects = self._effects(fit)
@@ -148,40 +176,40 @@ class WindowEstimator:
         return Undecided(result, known, demand, limit, window, task.fresh, model, here)
 
     def decide(self, window: Undecided) -> WindowResult:
-        """The result with its traversability and watch; windows in their order, here or in another process."""
+        """The result with traversability and watch; windows in their order, here or in another process."""
         result = self._decided(window)
-        self._look(window)
-        able = result.traversability.capability
-        if able is not None and result.status is Status.VALID:
-            self._curve = able.over_slip
+        self._update_watch(window)
+        capability = result.traversability.capability
+        if capability is not None and result.status is Status.VALID:
+            self._curve = capability.over_slip
         now = as_of(result, self._loss, result.t, self.config)
         return replace(now, watch=with_loss(self._watch, self._loss))
 
     def _decided(self, window: Undecided) -> WindowResult:
         """The result with its traversability."""
-        way, self._wheels = judge(
+        decision, self._wheels = judge(
             window.posterior, window.result.status, window.demand, self.rig, window.model, window.torque_limit,
             self.config.traversability, None if window.fresh else self._wheels,
         )  # fmt: skip
-        return replace(window.result, traversability=self._settle(way, window))
+        return replace(window.result, traversability=self._with_state(decision, window))
 
-    def _settle(self, way: Traversability, window: Undecided) -> Traversability:
-        """The state that the windows before allow, and how old the last valid one is."""
+    def _with_state(self, decision: Traversability, window: Undecided) -> Traversability:
+        """The decision with the state after hysteresis, and the time since the last valid window."""
         if window.fresh:
             self._held, self._valid_at = Held(), None
         result = window.result
         if result.status is Status.VALID:
             self._valid_at = result.t
         if window.here:
-            self._held = settled(self._held, way.probability, result.status, self.config.traversability)
-        else:  # the estimate is of the ground before
-            self._held, way = doubted(self._held), Traversability(torque_available=way.torque_available)
+            self._held = settled(self._held, decision.probability, result.status, self.config.traversability)
+        else:  # the estimate is of the previous ground
+            self._held, decision = doubted(self._held), Traversability(torque_available=decision.torque_available)
         return replace(
-            way, state=self._held.state, since_valid=None if self._valid_at is None else result.t - self._valid_at
+            decision, state=self._held.state, since_valid=None if self._valid_at is None else result.t - self._valid_at
         )
 
     def _torque_limit(self, task: WindowTask, window: Window) -> NDArray[np.float64]:
-        """Greatest torque (W,) [N m] that may be counted on: none of an idle wheel, no more than a ceiling that shows.
+        """Greatest available torque (W,) [N m]: 0 of an idle wheel, at most a torque ceiling that was measured.
 
         window: the task's, with the true draft.
         """
@@ -195,32 +223,32 @@ class WindowEstimator:
         self._ceiling = self._ceiling.after(window, self.rig, hop, deviations)
         return np.where(self._idle, 0.0, np.fmin(task.torque_limit, self._ceiling.limit))
 
-    def _watched_gaps(self, task: WindowTask, fit: Fit | None) -> Mapping[str, float]:
-        """The channels that have not fitted for minutes; windows with poor inputs have no say."""
+    def _model_gaps(self, task: WindowTask, fit: Fit | None) -> Mapping[str, float]:
+        """The channels that have not fitted for minutes; windows with missing or poor inputs do not count."""
         if task.fresh:
             self._gap.forget()
         if fit is not None and not task.missing and not task.poor:
             self._gap.take(task.end, squares(fit.optimum.at, len(self.rig.wheels)))
         return self._gap.gaps()
 
-    def _look(self, window: Undecided) -> None:
-        """Watch the last hop with what was known of the soil before it."""
+    def _update_watch(self, window: Undecided) -> None:
+        """Update loss of traction and watch by the last hop, with the curve of the window before."""
         if window.fresh:
             self._watch, self._curve, self._loss = Watch(), None, NO_LOSS
         since = window.result.t - self._settings.hop
         driven = window.driven
         for i in np.flatnonzero(driven.t > since).tolist():
-            few = driven.rows(np.arange(max(i + 1 - SPAN, 0), i + 1))
+            few = driven.rows(np.arange(max(i + 1 - BINS_OF_A_MOMENT, 0), i + 1))
             if (motion := motion_of(few, self.rig, window.torque_limit, self.config.traversability)) is not None:
                 self._loss = observed(self._loss, motion, self._settings.min_speed, self.config.traversability)
         for moment in moments(window.driven, self.rig, since, self._settings.min_speed):
             self._watch = watched(self._watch, moment.t, moment.slip, moment.pull, self._curve, moment.inertia)
 
     def _effects(self, fit: Fit | None) -> list[Active]:
-        """The effects with their parameters as a fit leaves them, else as configured."""
-        effects, free = self._completion
-        pulls = np.zeros(len(free)) if fit is None else fit.gains[len(fit.gains) - len(free) :]
-        return active_at(effects, free, pulls, len(self.rig.wheels))
+        """The effects with their fitted parameters, or without a fit as configured."""
+        effects, free = self._effects_and_parameters
+        standardised = np.zeros(len(free)) if fit is None else fit.gains[len(fit.gains) - len(free) :]
+        return active_at(effects, free, standardised, len(self.rig.wheels))
 
     def _present_model(self, window: Window, tracked: TrackerOutput, effects: Sequence[Active]) -> UncertainModel:
         """The model for the decision, at the window's usual speed."""
@@ -229,15 +257,15 @@ class WindowEstimator:
             return UncertainModel.over(CompletedModel.of(self.model, effects, speed))
         widening = _widening(tracked, fit)
         return UncertainModel.of(
-            self.model, *self._completion, fit.reported, len(self.rig.wheels), speed, widening, fit.form
+            self.model, *self._effects_and_parameters, fit.reported, len(self.rig.wheels), speed, widening, fit.form
         )
 
-    def _honest(self, tracked: TrackerOutput, fit: Fit) -> Posterior:
-        """Posterior, of both optima where there are two, widened where the residuals are larger than the noise."""
+    def _widened_posterior(self, tracked: TrackerOutput, fit: Fit) -> Posterior:
+        """The reported posterior (of both modes), widened by chi-square where the window does not fit."""
         return fit.reported.posterior.widened(_widening(tracked, fit), self.prior)
 
     def _draft_gain(self, tracked: TrackerOutput) -> Estimate:
-        """Gain error of the load cell at the hitch: as fitted, else what is known of it beforehand."""
+        """Gain error of the draft sensor: posterior of the fit, else the prior."""
         if tracked.fit is None or tracked.mismatch:
             return Estimate(0.0, self.rig.noise["draft"].gain)
         return tracked.fit.reported.gain(gain_names(self.rig).index("draft"))
@@ -245,8 +273,8 @@ class WindowEstimator:
     def _bearing(self, posterior: Posterior) -> Estimate:
         return posterior.bearing_pressure(self._settings.z_ref, self._settings.b_ref)
 
-    def _driven(self, fit: Fit) -> tuple[float, float] | None:
-        """Sinkages [m] that nine tenths of the wheels' instants lie between."""
+    def _sinkage_range(self, fit: Fit) -> tuple[float, float] | None:
+        """The 5 % and 95 % quantiles of the sinkage [m] over wheels and instants."""
         depth = sinkage(fit.optimum.latents.entry_angle, self.rig.radius)
         known = depth[np.isfinite(depth)]
         if not len(known):
@@ -257,8 +285,8 @@ class WindowEstimator:
     def _soil_class(self, posterior: Posterior | None) -> dict[str, float] | None:
         if posterior is None or self._classes is None:
             return None
-        here = self._tracker.soil_prior
-        return self._classes.probabilities(posterior, self._guess if here is self.prior else here)
+        soil_prior = self._tracker.soil_prior
+        return self._classes.probabilities(posterior, self._class_prior if soil_prior is self.prior else soil_prior)
 
     def _sinkage(self, fit: Fit | None) -> dict[str, float | None]:
         if fit is None:
@@ -267,12 +295,12 @@ class WindowEstimator:
         return {wheel: z if math.isfinite(z) else None for wheel, z in known}
 
     def _usual_speed(self, window: Window) -> float:
-        """Mean ground speed [m/s] while the vehicle moves, the least one where it does not."""
+        """Mean ground speed [m/s] while the vehicle moves; min_speed where it does not."""
         moving = window.ground_speed[window.ground_speed > self._settings.min_speed]
         return float(moving.mean()) if len(moving) else self._settings.min_speed
 
     def _basis(self, task: WindowTask, fit: Fit | None) -> Basis:
-        """The instants that a fit rests on, and how far the vehicle has driven since the last of them."""
+        """The instants of a fit, and the distance driven since the last of them."""
         instants = np.empty(0) if fit is None else fit.optimum.t
         end = instants[-1] + self._settings.bin / 2.0 if len(instants) else -math.inf
         since = task.window.ground_speed[task.window.t > end]
@@ -281,12 +309,12 @@ class WindowEstimator:
         return Basis(instants, self._settings.bin, unseen, task.late)
 
     def _status(self, task: WindowTask, tracked: TrackerOutput) -> tuple[Status, str]:
-        """Status and its reason; a sensor that lies is the reason of all that may follow from it."""
-        status, reason = self._status_of_the_rest(task, tracked)
+        """Status and reason; an implausible sensor replaces the reasons that it may have caused."""
+        status, reason = self._status_without_plausibility(task, tracked)
         follows = reason.split()[0] in ("none", "input_stale", "model_mismatch", "no_convergence")
         return status, " ".join(["implausible", *task.implausible]) if task.implausible and follows else reason
 
-    def _status_of_the_rest(self, task: WindowTask, tracked: TrackerOutput) -> tuple[Status, str]:
+    def _status_without_plausibility(self, task: WindowTask, tracked: TrackerOutput) -> tuple[Status, str]:
         fit = tracked.fit
         if task.missing:
             return Status.INVALID, "input_missing " + " ".join(task.missing)
@@ -300,7 +328,7 @@ class WindowEstimator:
             return status, "model_mismatch" if failure == "model_mismatch" else "no_convergence"
         if task.poor:
             return Status.DEGRADED, "input_stale " + " ".join(task.poor)
-        if self._hardly_new(tracked, task.end):
+        if self._too_little_of_new_soil(tracked, task.end):
             return Status.NOT_EXCITED, "not_excited new_soil"
         if fit.off_scale:
             return Status.DEGRADED, "model_mismatch"
@@ -313,17 +341,19 @@ class WindowEstimator:
             "slip_range": tan_phi.std > self._settings.max_tan_phi_std * tan_phi.value,
         }
         if any(lacking.values()):
-            return Status.NOT_EXCITED, " ".join(["not_excited", *(name for name, it_is in lacking.items() if it_is)])
+            return Status.NOT_EXCITED, " ".join(
+                ["not_excited", *(name for name, is_lacking in lacking.items() if is_lacking)]
+            )
         return Status.VALID, "none"
 
-    def _hardly_new(self, tracked: TrackerOutput, end: float) -> bool:
-        """Whether the window has too little of the soil that has just begun."""
+    def _too_little_of_new_soil(self, tracked: TrackerOutput, end: float) -> bool:
+        """Whether too little of the window is on the new soil."""
         if tracked.state in (TrackerState.SUSPECT, TrackerState.TRANSITION):
             return True
         return tracked.since > end - self.config.traversability.min_share * self._settings.window
 
     def _failure(self, tracked: TrackerOutput) -> str | None:
-        """In what way a solve failed: not_finite, model_mismatch or no_convergence; None where it did not."""
+        """Kind of failure of a solve: not_finite, model_mismatch or no_convergence; None for none."""
         fit = tracked.fit
         if not tracked.mismatch:
             return None
@@ -332,38 +362,38 @@ class WindowEstimator:
         return "model_mismatch" if fit.chi2 > self._tracker.chi2_limit(fit) else "no_convergence"
 
     def _ambiguous(self, fit: Fit) -> bool:
-        """Whether another soil, about as likely, has a bearing pressure or tan phi that the fit excludes."""
+        """Whether a second mode has a bearing pressure or tan phi more than AMBIGUITY_SD from the first."""
         if fit.second_mode is None:
             return False
         one, other = fit.posterior, fit.second_mode.gaussian.posterior
         pairs = ((self._bearing(one), self._bearing(other)), (one.tan_phi(), other.tan_phi()))
-        return any(abs(a.value - b.value) > AMBIGUOUS * a.std for a, b in pairs)
+        return any(abs(a.value - b.value) > AMBIGUITY_SD * a.std for a, b in pairs)
 
 
 def _gated(tracked: TrackerOutput) -> str:
-    """Why most of the instants were left out that were."""
+    """Reason for which most instants were left out: standstill or turning."""
     return "standstill" if tracked.standstill >= tracked.turning else "turning"
 
 
 def _widening(tracked: TrackerOutput, fit: Fit) -> float:
-    """Factor of the covariance of a fit that leaves more than noise."""
+    """Factor of a fit's covariance: its reduced chi-square where the window does not fit, else 1."""
     return max(fit.chi2, 1.0) if tracked.mismatch else 1.0
 
 
 def _with_form(own: Posterior, fit: Fit, prior: SoilPrior) -> Posterior:
-    """A posterior with what the form of the model leaves open besides: second moments about the same soil."""
+    """A posterior with the second moments due to the model's form added, about the same soil."""
     return own if fit.form is None else own.with_added_covariance(fit.form.log_covariance, prior, fit.form.log_shift)
 
 
 def _with_true_draft(window: Window, effects: Sequence[Active], rig: Rig) -> Window:
-    """The window without the errors of its load cell at the hitch."""
+    """The window with its draft corrected by the effects of the draft sensor."""
     if not any(active.effect.draft for active in effects) or not len(window.t):
         return window
     return replace(window, draft=true_draft(effects, window.draft, _surroundings(window, rig)))
 
 
 def _surroundings(window: Window, rig: Rig) -> Surroundings:
-    """What effects may depend on, as measured."""
+    """The measured quantities on which effects may depend."""
     t = (window.t - window.t[0])[:, None]
     return Surroundings(
         t=t,

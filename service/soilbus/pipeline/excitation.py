@@ -1,4 +1,9 @@
-"""How much draft and slip varied in a window: what an estimate of the soil lives on."""
+"""Excitation: how much draft and slip varied in a window.
+
+    sd = sqrt(max(sample variance - mean noise variance, 0))
+
+An estimate of the soil needs variation of both: load determines the bearing modulus, slip the shear strength.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +17,9 @@ from soilbus.terra.vehicle import slip_ratio
 
 
 class Excitation(NamedTuple):
-    """Mean and standard deviation over a window's bins, without the sensors' noise; None where unknown.
+    """Mean and standard deviation of draft [N] and of the wheels' mean slip over a window, less the sensors' noise.
 
-    draft [N]; slip is that of the wheels' mean.
+    None where not known.
     """
 
     draft: float | None = None
@@ -24,7 +29,7 @@ class Excitation(NamedTuple):
 
 
 def excitation_of(window: Window, rig: Rig, min_speed: float) -> Excitation:
-    """Of a forward window, its slip where the vehicle is faster than min_speed [m/s]."""
+    """Excitation of a forward window; slip only where the ground speed exceeds min_speed [m/s]."""
     ground = np.where(window.ground_speed > min_speed, window.ground_speed, np.nan)[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
         slip = slip_ratio(rig.radius, window.speed, ground)

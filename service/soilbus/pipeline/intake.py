@@ -1,7 +1,10 @@
 """Frames in, windows of measured data out.
 
-Time is what the frames' stamps say.  Windows are counted from the first sample of a
-mapped channel, so the same frames always give the same windows.
+    CAN frames -> Admission (decode, refuse) -> Bins (outliers, means) -> SensorConsistency -> WindowTask
+    window k covers [t0 + k hop, t0 + k hop + window)          t0: just before the first sample of a mapped channel
+
+All times are the frames' stamps, so the same frames always give the same windows.  Delayed channels are aligned: all
+others wait for the latest one.
 """
 
 from __future__ import annotations
@@ -32,11 +35,15 @@ from soilbus.sensors.rates import resolved_window
 from soilbus.terra.vehicle import slip_ratio
 
 DEFAULT_TIMEOUT = 1.0
+"""Age [s] from which a channel without a configured time-out is stale.  No evidence recorded."""
 LIMIT_SAMPLES = 3
-"""Reported torque limits of which the median is in force: one outlier moves nothing."""
+"""Number of reported torque limits whose median is in force: one outlier does not change it."""
 COVERAGE_BLOCK = 0.5
+"""Time [s] of a block that counts as covered if it has a sample.  No evidence recorded."""
 MIN_COVERAGE = 0.95
+"""Share of a window's blocks that a needed channel must cover.  No evidence recorded."""
 SLIP_SPAN = 0.3
+"""Time [s] over which the present slip and pull are averaged.  No evidence recorded."""
 EDGE_LEAD = 0.005
 """Bins begin this long before the first sample [s]: else each frame of its message would fall on
 an edge, and a microsecond would decide on which side."""
@@ -44,14 +51,29 @@ an edge, and a microsecond would decide on which side."""
 
 @dataclass(frozen=True, slots=True)
 class WindowTask:
-    """One window's data and what is known of its inputs; everything an estimate needs.
+    """One window's data and the quality of its inputs: everything an estimate needs.
 
-    index counts windows since the start; epoch counts how often time began again; start and end [s];
-    missing are needed channels never seen, poor those that are stale at the end or covered the window badly;
-    implausible are channels that lie, and are not in the window;
-    torque_limit (W,) [N m], nan where unknown; track knows the positions from the window's
-    middle on; fresh: nothing of the window before may be carried over; late: by so much [s] the latest channel is late,
-    and all wait for it.
+    Attributes
+    ----------
+    index, epoch
+        Number of the window since the start, and number of restarts of the clock.
+    start, end
+        [s].
+    window, slip
+        The forward data, and mean slip by wheel (None where not known).
+    missing, poor, implausible
+        Needed channels never received; needed channels that are stale at the end or cover the window badly; channels
+        that contradict the others and were removed from the window.
+    torque_limit
+        (W,) [N m], nan where not known.
+    track
+        Positions from the window's middle on.
+    rejected
+        Refused samples by reason.
+    fresh
+        Nothing may be carried over from the window before.
+    late
+        [s], delay of the latest channel, for which all others wait.
     """
 
     index: int
@@ -71,9 +93,9 @@ class WindowTask:
 
 
 class Latest(NamedTuple):
-    """Slip ratio by wheel, pull [N] (draft, slope, inertia) of the last moments, the inertia in it, and the motion.
+    """Means over the last SLIP_SPAN: slip by wheel, pull [N] (draft, slope, inertia), its inertia [N], motion.
 
-    None where unknown.
+    None where not known.
     """
 
     slip: dict[str, float | None]
@@ -84,14 +106,14 @@ class Latest(NamedTuple):
 
 @dataclass(slots=True)
 class Refusals:
-    """Refused samples by reason, kept as long as a window may ask for them; `used` counts the samples not refused."""
+    """Refused samples by reason, kept while a window may contain them; `used` counts the accepted samples."""
 
     entries: list[tuple[str, Array]] = field(default_factory=list)
     total: Counter[str] = field(default_factory=Counter)
     used: int = 0
 
     def add(self, decoded: Decoded) -> None:
-        """Take note of what one batch of frames used and refused."""
+        """Count what was used and refused of one batch of frames."""
         self.used += sum(len(column.t) for column in decoded.columns.values())
         for (_, reason), times in decoded.refused.items():
             self.note(str(reason), times)
@@ -99,18 +121,18 @@ class Refusals:
             self.total[str(reason)] += n
 
     def note_outliers(self, times: Array) -> None:
-        """Take note of samples that were used until they were found to be outliers."""
+        """Count samples as refused that were used until they were found to be outliers."""
         self.note(OUTLIER, times)
         self.used -= len(times)
 
     def note(self, reason: str, times: Array) -> None:
-        """Take note of samples refused for one reason at these times [s], ascending."""
+        """Count samples refused for one reason at these times [s], ascending."""
         if len(times):
             self.entries.append((reason, times))
             self.total[reason] += len(times)
 
     def within(self, start: float, end: float) -> dict[str, int]:
-        """Counts by reason from start to end [s]; what is older is forgotten."""
+        """Counts by reason from start to end [s]; older ones are dropped."""
         self.entries = [(r, t) for r, t in self.entries if t[-1] >= start]
         counts: Counter[str] = Counter()
         for reason, t in self.entries:
@@ -119,10 +141,15 @@ class Refusals:
 
 
 class ReportedLimits:
-    """Greatest torque [N m] that each motor has reported, else the configured one (W,), nan where neither is known.
+    """Torque limit [N m] of each motor (W,): as reported, else as configured, else nan.
 
-    What a motor has reported holds until it reports another limit, however long it is silent and whatever becomes of
-    the clock.  The median of the last few samples is not moved by an outlier.
+    A reported limit holds until another one is reported, also through silence and a set clock.  It is the median of the
+    last LIMIT_SAMPLES samples.
+
+    Parameters
+    ----------
+    wheels, configured
+        Names of the wheels, and their configured limits [N m], nan where none.
     """
 
     def __init__(self, wheels: Sequence[str], configured: Sequence[float]) -> None:
@@ -130,7 +157,7 @@ class ReportedLimits:
         self._reported: dict[str, tuple[Array, Array]] = {}
 
     def add(self, wheel: str, t: Array, value: Array) -> None:
-        """Samples (N,) of one wheel at the times t [s]."""
+        """Add samples [N m] (N,) of one wheel at the times t [s]."""
         if wheel in self._configured:
             old_t, old = self._reported.get(wheel, (t[:0], value[:0]))
             self._reported[wheel] = np.append(old_t, t), np.append(old, value)
@@ -145,24 +172,35 @@ class ReportedLimits:
         return float(np.median(last)) if len(last) else self._configured[wheel]
 
     def drop_before(self, end: float) -> None:
-        """Forget what is no longer among the last samples at the time `end` [s]."""
+        """Forget samples that are no longer among the last ones at the time `end` [s]."""
         for wheel, (t, value) in self._reported.items():
             first = max(int(np.count_nonzero(t <= end)) - LIMIT_SAMPLES, 0)
             self._reported[wheel] = t[first:], value[first:]
 
     def forget_times(self) -> None:
-        """The clock was set: what was reported was reported before all that follows."""
+        """The clock was set: what was reported counts as earlier than all that follows."""
         self._reported = {wheel: (np.full(len(t), -math.inf), value) for wheel, (t, value) in self._reported.items()}
 
 
 class Intake:
-    """Admission, bins and freshness of one vehicle's channels.
+    """Decoding, bins and freshness of one vehicle's channels.
 
-    Channels that are late by their `delay` and by `delays` [s] by quantity (those of the
-    configuration's effects where none are given) are put beside what was true with them: all
-    others wait for the latest one.  So each window is whole, and is of as long before its
-    end; whether a channel is fresh goes by the stamps of its frames.  Raises ConfigError where
-    configuration and database do not fit.
+    Parameters
+    ----------
+    config, database
+        The configuration and the messages of the vehicle's bus.
+    delays
+        [s] by quantity, added to each channel's `delay`; None takes those of the configured effects.
+
+    Raises
+    ------
+    ConfigError
+        Where configuration and database do not fit.
+
+    Notes
+    -----
+    Channels are aligned by delaying all others to the latest one.  So a window is complete, and its data are older than
+    its end by that delay.  Freshness goes by the stamps of the frames.
     """
 
     def __init__(self, config: Config, database: Database, delays: Mapping[str, float] | None = None) -> None:
@@ -193,7 +231,7 @@ class Intake:
         self.admission.at_break = self.begin_recording
 
     def of_another_recording(self) -> Intake:
-        """An intake that knows nothing of what this one heard; both count windows, frames and refusals together."""
+        """A new intake without any data, which continues the counts of windows, frames and refusals."""
         other = Intake(self._config, self._database, self._delays)
         other.admission.counts, other._index = self.admission.counts, self._index
         other.refusals.total, other.refusals.used = self.refusals.total, self.refusals.used
@@ -205,35 +243,35 @@ class Intake:
         return channel.quantity not in OPTIONAL_ROLES
 
     def begin_recording(self) -> None:
-        """What comes next is a recording of its own: its clock was set, or the bus was silent for long."""
+        """Begin another recording: the clock was set, or the bus was silent for long."""
         ready = self.finish(self.admission.newest)
         self._restart()
         self._ready = ready
 
     def _restart(self) -> None:
-        self.epoch += 1  # nothing of the one before may be carried over
+        self.epoch += 1  # nothing of the previous epoch may be carried over
         self._bins = None
         self._fresh = True
         self._positions.forget()
         self._consistency.forget()
         self._limits.forget_times()
-        self._lying: tuple[str, ...] = ()
+        self._implausible: tuple[str, ...] = ()
         self.next_end = math.inf
         self.last_seen: dict[str, float] = {}
         self._newest = -math.inf  # stamp of the latest sample, admitted or refused
 
     def _screen_the_rest(self) -> None:
-        """Count the outliers that came after the last window too."""
+        """Count the outliers after the last window."""
         if self._bins is not None:
             self._bins.window(self._newest, self._newest + self._bins.bin_length)
             self.refusals.note_outliers(self._bins.new_outliers())
 
     def ingest(self, until: float = math.inf) -> None:
-        """Decode the frames filed so far that are older than `until` [s] and put them into bins."""
+        """Decode the received frames that are older than `until` [s] and put them into bins."""
         self.add(self.admission.take(until))
 
     def add(self, decoded: Decoded) -> None:
-        """Put decoded samples into bins; `ingest` does so with the frames that were filed."""
+        """Put decoded samples into bins; `ingest` calls it with the received frames."""
         self.refusals.add(decoded)
         if (times := _times(decoded)) is not None:
             first, last = times
@@ -255,7 +293,7 @@ class Intake:
             self._bins.add({name: samples for name, samples in heard.items() if name in self._binned})
 
     def due(self, now: float) -> list[WindowTask]:
-        """Every window that ended at or before `now` [s] and was not handed out yet."""
+        """All windows that ended at or before `now` [s] and were not returned yet."""
         tasks, self._ready = self._ready, []
         if self._bins is None:
             self.ingest(now)
@@ -278,10 +316,10 @@ class Intake:
         return tasks
 
     def taken_whole(self) -> Window | None:
-        """All that was ingested since the clock was last set, as one window; what comes later is another recording.
+        """All data since the clock was last set, as one window; later data are another recording.
 
-        Its bins are as short as the recording's spectrum asks for (see `resolution`); the one
-        that has just begun is left out.  None where there is no sample.
+        The bins are as short as the recording's spectrum asks for (see `sensors.rates`); the unfinished one is left
+        out.  None without samples.
         """
         bins, end = self._bins, max(self.last_seen.values(), default=-math.inf)
         window = None
@@ -294,7 +332,7 @@ class Intake:
 
     def _task(self, bins: Bins, end: float) -> WindowTask:
         start = end - self._settings.window
-        window, self._lying = self._consistency.checked(forward(bins.window(start, end)))
+        window, self._implausible = self._consistency.checked(forward(bins.window(start, end)))
         self.refusals.note_outliers(bins.new_outliers())
         missing = tuple(c.name for c in self.needed if c.name not in self.last_seen)
         covered = dict(zip(self.rig.channels, coverage(window).tolist(), strict=True))
@@ -313,7 +351,7 @@ class Intake:
             rejected=self.refusals.within(start, end),
             fresh=self._fresh,
             late=self._latest,
-            implausible=self._lying,
+            implausible=self._implausible,
             epoch=self.epoch,
         )
         self._fresh = False
@@ -325,7 +363,7 @@ class Intake:
         return task
 
     def stale(self, now: float) -> list[str]:
-        """Needed channels without an admitted sample within their time-out before `now` [s]."""
+        """Names of needed channels without an accepted sample within their time-out before `now` [s]."""
         return [
             c.name
             for c in self.needed
@@ -333,11 +371,11 @@ class Intake:
         ]
 
     def latest(self, now: float) -> Latest:
-        """Slip and pull over the last moments before `now` [s]."""
+        """Slip, pull and motion over the last SLIP_SPAN before `now` [s]."""
         if self._bins is None or not abs(now - self._newest) <= LONGEST_GAP:  # nor nan: no bins for years of silence
             return Latest(dict.fromkeys(self.rig.wheels), None)
         last = math.floor((now - self._bins.origin) / self._settings.bin) * self._settings.bin + self._bins.origin
-        window = without(self._bins.glimpse(last - SLIP_SPAN, last), self.rig, set(self._lying))
+        window = without(self._bins.glimpse(last - SLIP_SPAN, last), self.rig, set(self._implausible))
         if self.rig.chassis is None:
             return Latest(self._slip(window), None)
         pull, inertia = pull_given(window, self.rig.chassis), inertia_of(window, self.rig.chassis)
@@ -355,7 +393,7 @@ class Intake:
 
 
 def _times(decoded: Decoded) -> tuple[float, float] | None:
-    """Times of the earliest and of the latest sample, admitted or refused; None where there is none."""
+    """Times [s] of the earliest and the latest sample, accepted or refused; None without samples."""
     ends = [(c.t[0], c.t[-1]) for c in decoded.columns.values() if len(c.t)]
     ends += [(known.min(), known.max()) for t in decoded.refused.values() if len(known := t[np.isfinite(t)])]
     return (float(min(first for first, _ in ends)), float(max(last for _, last in ends))) if ends else None

@@ -1,8 +1,10 @@
-"""The daemon's own watch on the gap between model and data: chi-square by channel over minutes.
+"""Gap between model and data: reduced chi-square of each channel over minutes.
 
-A window that does not fit is a window; a channel that does not fit for minutes is a missing
-effect.  Of a residual r whose instant has the inverse covariance M, r (M r) is 1 in the mean
-where model and noise are right, so chi-square divides among the channels.
+    chi2(channel) = sum over its rows of r (M r) / number of rows   r: residual, M: inverse covariance of the instant
+    gap           chi2 > max(1.15, 1 + 5 sqrt(2 overlap / rows))         overlap = window / hop
+
+r (M r) has mean 1 where model and noise are right, so chi-square can be split by channel.  One window that does not fit
+means little; a channel that does not fit for minutes means a missing effect.
 """
 
 from __future__ import annotations
@@ -17,24 +19,32 @@ import numpy as np
 from soilbus.estimation.observation_model import Linearisation
 
 SPAN = 120.0
-"""Seconds over which chi-square is averaged."""
+"""Time [s] over which chi-square is averaged."""
 LEAST_SPAN = 60.0
-"""Seconds of windows that there must be."""
+"""Time [s] of windows below which no gap is reported."""
 LIMIT = 1.15
 """Reduced chi-square of a channel from which a gap is reported."""
 DEVIATIONS = 5.0
-"""Standard deviations of it beyond 1 that it must be besides."""
+"""Standard deviations by which the reduced chi-square must exceed 1 as well."""
 
 
 class Square(NamedTuple):
-    """Sum of a channel's squared residuals, in units of the noise, and how many there are."""
+    """Sum of a channel's squared normalised residuals, and their number."""
 
     total: float
     rows: int
 
 
 def squares(at: Linearisation, n_wheels: int) -> dict[str, Square]:
-    """Those of torque, draft and, where it is measured, sinkage in one fitted window."""
+    """Squares of torque, draft and, where measured, sinkage in one fitted window.
+
+    Parameters
+    ----------
+    at
+        Linearisation of the window at its optimum.
+    n_wheels
+        Number of wheels, whose torques are the first residuals of an instant.
+    """
     per_instant = at.by_latents.shape[1]
     square = (at.rows[:, 0] * at.weighed[:, 0]).reshape(-1, per_instant)
     known = at.weighed.any(axis=1).reshape(-1, per_instant)
@@ -44,7 +54,7 @@ def squares(at: Linearisation, n_wheels: int) -> dict[str, Square]:
 
 
 class GapWatch:
-    """Chi-square of each channel over the last minutes of windows that overlap (window and hop in s)."""
+    """Chi-square of each channel over the last SPAN of overlapping windows (window and hop in s)."""
 
     def __init__(self, window: float, hop: float) -> None:
         self._overlap = window / hop
@@ -55,7 +65,7 @@ class GapWatch:
         self._seen.clear()
 
     def take(self, end: float, found: Mapping[str, Square]) -> None:
-        """One window that ended at `end` [s]."""
+        """Add one window that ended at `end` [s]."""
         self._seen.append((end, found))
         while self._seen[0][0] < end - SPAN:
             self._seen.popleft()

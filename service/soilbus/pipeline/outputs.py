@@ -1,4 +1,11 @@
-"""One window's result as a JSON line and as values of our frames."""
+"""One window's result as a JSON line and as values of the CAN frames that soilbus sends.
+
+    WindowResult -> json_line                       one object per window, SI units, keys in DESIGN.md
+    WindowResult -> hop_frames                      frames sent once per window
+    WindowResult, Watch -> forecast_frame           frame sent every TICK
+
+The frames' values are in the units of output.dbc; None is sent as the signal's code for "not available".
+"""
 
 from __future__ import annotations
 
@@ -23,14 +30,14 @@ WINDOW_MODULUS = 251
 """The frames' 8-bit window number counts 0..250."""
 
 TICK = 0.1
-"""Cycle [s] of the frames that others act on."""
+"""Cycle [s] of the fast frames, on which other devices act."""
 FAST_FRAMES = ("WheelSlip", "WheelSlip2", "Traversability", "TorqueDemand", "DemandForecast")
 
-LONG = 1e6
-"""A time [s] that is longer than any signal holds."""
+LONGEST_TIME = 1e6
+"""Time left [s] that stands for no end: above the range of any signal."""
 
-MOST_CLASSES = 3
-"""Known soils that a window names."""
+MAX_CLASSES = 3
+"""Number of known soils that a window names."""
 
 PARAMETER_FRAMES = {
     # JSON name: (message, SI value of one unit of the DBC)
@@ -47,13 +54,18 @@ HOP_FRAMES = (
     "SoilStrength", "SoilClass", *(message for message, _ in PARAMETER_FRAMES.values()), "DraftCapability",
     "GradeCapability", "TractionAdvice", "TractionLimits", "WheelSinkage", "WheelSinkage2",
 )  # fmt: skip
-"""Go out once each window."""
+"""Names of the frames that are sent once per window."""
 
 
 def check_cycle_times(config: Config, database: Database) -> None:
-    """Raises ConfigError where frames would come less often than the DBC promises their readers (GenMsgCycleTime).
+    """Check that frames come at least as often as the DBC promises (GenMsgCycleTime).
 
-    Readers judge silence by it, and would take each pause for the end of soilbus.
+    Readers detect a silent sender by it: with a longer cycle each pause would look like the end of soilbus.
+
+    Raises
+    ------
+    ConfigError
+        Where a frame would come less often.
     """
     promised = {m.name: (m.cycle_time or math.inf) / 1e3 for m in database.messages}
     faults = []
@@ -69,8 +81,8 @@ def check_cycle_times(config: Config, database: Database) -> None:
 
 
 def json_line(result: WindowResult, config: Config) -> str:
-    """The result as one JSON object (keys: DESIGN.md), SI throughout, null for the unknown."""
-    way = result.traversability
+    """The result as one line of JSON (keys: DESIGN.md), in SI units, null where not known."""
+    decision = result.traversability
     bearing = {
         "z_ref": config.estimator.z_ref,
         "b_ref": config.estimator.b_ref,
@@ -92,19 +104,19 @@ def json_line(result: WindowResult, config: Config) -> str:
         "slip": result.slip,
         "sinkage": result.sinkage,
         "traversability": {
-            "state": str(way.state),
-            "probability": way.probability,
-            "torque_required": way.torque_required,
-            "torque_available": way.torque_available,
-            "max_draft": _value_std(way.max_draft),
-            "max_grade": _value_std(way.max_grade),
-            "limit": way.limit,
+            "state": str(decision.state),
+            "probability": decision.probability,
+            "torque_required": decision.torque_required,
+            "torque_available": decision.torque_available,
+            "max_draft": _value_std(decision.max_draft),
+            "max_grade": _value_std(decision.max_grade),
+            "limit": decision.limit,
             "age": result.t - result.basis.end,
-            "since_valid": way.since_valid,
+            "since_valid": decision.since_valid,
         },
         "gaps": dict(result.gaps),
         "warning": {"state": str(result.watch.warning), "time_left": result.watch.time_left},
-        "capability": None if way.capability is None else _capability(way.capability),
+        "capability": None if decision.capability is None else _capability(decision.capability),
         "chi2": result.chi2,
         "search_ended": result.search_ended,
         "samples": result.samples,
@@ -114,22 +126,22 @@ def json_line(result: WindowResult, config: Config) -> str:
 
 
 def _extrapolates(result: WindowResult, z_ref: float) -> bool | None:
-    """Whether the bearing pressure is of a depth [m] that the wheels hardly had; None where it is not known."""
+    """Whether the depth z_ref [m] of the bearing pressure lies outside the wheels' sinkages; None where not known."""
     if result.bearing is None or result.z_driven is None:
         return None
     low, high = result.z_driven
     return not low <= z_ref <= high
 
 
-def _capability(able: Capability) -> dict[str, Any]:
-    """What traversability does not say already."""
-    forecast = able.forecast
+def _capability(capability: Capability) -> dict[str, Any]:
+    """The parts of the capability that `traversability` does not hold."""
+    forecast = capability.forecast
     return {
-        "max_draft_here": _value_std(able.max_draft_here),
-        "max_grade_with_draft": _value_std(able.max_grade_with_draft),
+        "max_draft_here": _value_std(capability.max_draft_here),
+        "max_grade_with_draft": _value_std(capability.max_grade_with_draft),
         "set_points": {
             axle: {"efficiency": _value_std(point.efficiency), "pull": _value_std(point.pull)}
-            for axle, point in able.set_points.items()
+            for axle, point in capability.set_points.items()
         },
         "forecast": None
         if forecast is None
@@ -139,15 +151,15 @@ def _capability(able: Capability) -> dict[str, Any]:
             "sinkage": {wheel: _value_std(depth) for wheel, depth in forecast.sinkage.items()},
         },
         "over_slip": {
-            column: getattr(able.over_slip, column).tolist()
+            column: getattr(capability.over_slip, column).tolist()
             for column in ("slip", "pull", "pull_std", "torque", "torque_std")
         },
     }
 
 
 def likeliest(soil_class: Mapping[str, float]) -> dict[str, float]:
-    """The few most likely known soils and `unknown`, likeliest first."""
-    known = [name for name in soil_class if name != UNKNOWN][:MOST_CLASSES]
+    """The MAX_CLASSES most likely known soils and `unknown`, likeliest first."""
+    known = [name for name in soil_class if name != UNKNOWN][:MAX_CLASSES]
     return {name: p for name, p in soil_class.items() if name in known or name == UNKNOWN}
 
 
@@ -156,40 +168,40 @@ def _value_std(estimate: Estimate | None) -> dict[str, float | None]:
 
 
 def hop_frames(result: WindowResult) -> Iterator[tuple[str, dict[str, Any]]]:
-    """(message, values in the DBC's units) of the frames that go out once each window."""
+    """Yield (message, values in the DBC's units) of the frames that are sent once per window."""
     common = {"Window": result.index % WINDOW_MODULUS, "Status": str(result.status)}
-    bearing, way = result.bearing, result.traversability
+    bearing, decision = result.bearing, result.traversability
     yield (
         "SoilStrength",
-        common | {"Chi2": result.chi2} | _pair("BearingPressure", "BearingPressureStd", bearing, 1e3),
+        common | {"Chi2": result.chi2} | _value_and_std("BearingPressure", "BearingPressureStd", bearing, 1e3),
     )
-    yield "SoilClass", common | _kind(result.soil_class)
+    yield "SoilClass", common | _soil_class(result.soil_class)
     parameters = {} if result.posterior is None else result.posterior.parameters()
     for name, (message, unit) in PARAMETER_FRAMES.items():
-        yield message, common | _pair("Value", "Std", parameters.get(name), unit)
-    yield "DraftCapability", common | _pair("MaxDraft", "MaxDraftStd", way.max_draft, 1.0)
-    yield "GradeCapability", common | _pair("MaxGrade", "MaxGradeStd", way.max_grade, 1.0)
-    yield "TractionAdvice", common | _advice(way.capability)
-    yield "TractionLimits", common | {"LimitingCause": way.limit} | _limits(way.capability)
+        yield message, common | _value_and_std("Value", "Std", parameters.get(name), unit)
+    yield "DraftCapability", common | _value_and_std("MaxDraft", "MaxDraftStd", decision.max_draft, 1.0)
+    yield "GradeCapability", common | _value_and_std("MaxGrade", "MaxGradeStd", decision.max_grade, 1.0)
+    yield "TractionAdvice", common | _advice(decision.capability)
+    yield "TractionLimits", common | {"LimitingCause": decision.limit} | _limits(decision.capability)
     for message, values in _by_wheel("WheelSinkage", "SinkageWheel", result.sinkage, 1e-3):
         yield message, common | values
 
 
-def _pair(value: str, std: str, estimate: Estimate | None, unit: float) -> dict[str, float | None]:
+def _value_and_std(value: str, std: str, estimate: Estimate | None, unit: float) -> dict[str, float | None]:
     if estimate is None:
         return {value: None, std: None}
     return {value: estimate.value / unit, std: estimate.std / unit}
 
 
-def _kind(soil_class: Mapping[str, float] | None) -> dict[str, str | float | None]:
+def _soil_class(soil_class: Mapping[str, float] | None) -> dict[str, str | float | None]:
     if soil_class is None:
         return {"Kind": None, "Probability": None, "UnknownProbability": None}
     kind, probability = next(iter(soil_class.items()))
     return {"Kind": kind, "Probability": probability, "UnknownProbability": soil_class[UNKNOWN]}
 
 
-def _advice(able: Capability | None) -> dict[str, float | None]:
-    points = {} if able is None else able.set_points
+def _advice(capability: Capability | None) -> dict[str, float | None]:
+    points = {} if capability is None else capability.set_points
     values = {}
     for axle, name in (("front", "Front"), ("rear", "Rear")):
         point = points.get(axle)
@@ -198,20 +210,20 @@ def _advice(able: Capability | None) -> dict[str, float | None]:
     return values
 
 
-def _limits(able: Capability | None) -> dict[str, float | None]:
-    draft, grade = (None, None) if able is None else (able.max_draft_here, able.max_grade_with_draft)
-    return _pair("MaxDraft", "MaxDraftStd", draft, 1.0) | _pair("MaxGrade", "MaxGradeStd", grade, 1.0)
+def _limits(capability: Capability | None) -> dict[str, float | None]:
+    draft, grade = (None, None) if capability is None else (capability.max_draft_here, capability.max_grade_with_draft)
+    return _value_and_std("MaxDraft", "MaxDraftStd", draft, 1.0) | _value_and_std("MaxGrade", "MaxGradeStd", grade, 1.0)
 
 
 def forecast_frame(result: WindowResult | None, watch: Watch) -> tuple[str, dict[str, Any]]:
-    """(message, values) of the forecast, from a result that may still be trusted (else None), and of the warning."""
-    able = None if result is None else result.traversability.capability
-    forecast = None if able is None else able.forecast
+    """(message, values in the DBC's units) of forecast and warning; result is None where none is valid any more."""
+    capability = None if result is None else result.traversability.capability
+    forecast = None if capability is None else capability.forecast
     return "DemandForecast", {
         "Slip": None if forecast is None else forecast.slip.value,
         "SlipStd": None if forecast is None else forecast.slip.std,
         "Sinkage": None if forecast is None else forecast.deepest.value * 1e3,
-        "TimeLeft": None if watch.time_left is None else min(watch.time_left, LONG),
+        "TimeLeft": None if watch.time_left is None else min(watch.time_left, LONGEST_TIME),
         "Warning": str(watch.warning),
         "Window": None if result is None else result.index % WINDOW_MODULUS,
         "Status": None if result is None else str(result.status),
@@ -219,7 +231,7 @@ def forecast_frame(result: WindowResult | None, watch: Watch) -> tuple[str, dict
 
 
 def known(value: Any) -> Any:
-    """What JSON can say of nested dicts, lists and numbers: null for every number that is not finite."""
+    """Nested dicts, lists and numbers for JSON: None instead of every number that is not finite."""
     if isinstance(value, Mapping):
         return {key: known(each) for key, each in value.items()}
     if isinstance(value, list):
@@ -232,7 +244,7 @@ def _value(estimate: Estimate | None) -> float | None:
 
 
 def slip_frames(slip: Mapping[str, float | None]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """(message, values) of the wheel slips, wheels in the order of the configuration."""
+    """Yield (message, values) of the wheel slips, wheels in the order of the configuration."""
     return _by_wheel("WheelSlip", "SlipWheel", slip, 1.0)
 
 

@@ -1,6 +1,8 @@
-"""Frames in, window results out: the same code for the live bus, a replay and a test.
+"""The application core: frames in, window results out.
 
-No bus and no clock in here.
+    CAN frames -> Intake (decode, bins, windows) -> WindowEstimator (soil, decision) -> WindowResult
+
+The live bus, a replay and a test use the same code.  It has no bus and no clock: time is the frames' stamps.
 """
 
 from __future__ import annotations
@@ -22,46 +24,55 @@ if TYPE_CHECKING:
 class Pipeline:
     """Intake and estimator of one vehicle.
 
-    Feed frames in the order of their stamps, call `advance` with the present time (or
-    `finish` at the end of a log) and take the windows that have ended.  A live service
-    may instead take `intake.due` and have `estimator.solve_unwatched` work elsewhere.  Raises
-    ConfigError where configuration and database do not fit.
+    Feed frames in the order of their stamps, call `advance` with the present time (or `finish` at the end of a log)
+    and take the results of the windows that have ended.  A live service may call `intake.due` instead and run
+    `estimator.solve_unwatched` in a worker.
+
+    Parameters
+    ----------
+    config, database
+        The configuration and the messages of the vehicle's bus.
+
+    Raises
+    ------
+    ConfigError
+        Where configuration and database do not fit.
     """
 
     def __init__(self, config: Config, database: Database) -> None:
         self.config, self.database = config, database
-        self._hear_with(Intake(config, database))
+        self._use(Intake(config, database))
         effects_and_parameters_of(config)  # its faults are raised now, and not when the estimator is made
 
-    def _hear_with(self, intake: Intake) -> None:
+    def _use(self, intake: Intake) -> None:
         self.intake, self.admission, self.feed = intake, intake.admission, intake.admission.feed
 
     def begin_recording(self) -> None:
-        """What is fed from now on is of another recording: nothing is carried over to it but the counts."""
-        self._hear_with(self.intake.of_another_recording())
+        """Begin another recording: nothing is carried over but the counts of windows, frames and refusals."""
+        self._use(self.intake.of_another_recording())
 
     @cached_property
     def estimator(self) -> WindowEstimator:
-        """Made when it is first asked for, by the worker that uses it."""
+        """The estimator, made at its first use by the worker that uses it."""
         return self.new_estimator()
 
     def new_estimator(self) -> WindowEstimator:
-        """Another one, that knows nothing."""
+        """A new estimator without any state."""
         from soilbus.pipeline.estimator import WindowEstimator
 
         return WindowEstimator(self.config)
 
     @property
     def next_end(self) -> float:
-        """When the next window ends [s]; infinite before the first sample."""
+        """End of the next window [s]; infinite before the first sample."""
         return self.intake.next_end
 
     def advance(self, now: float) -> list[WindowResult]:
-        """Results of every window that ended at or before `now` [s]."""
+        """Results of all windows that ended at or before `now` [s]."""
         return [self.estimator.solve(task) for task in self.intake.due(now)]
 
     def finish(self, now: float) -> list[WindowResult]:
-        """Windows still open at the end of a recording that lasts until `now` [s]."""
+        """Results of the windows still open at the end of a recording that lasts until `now` [s]."""
         return [self.estimator.solve(task) for task in self.intake.finish(now)]
 
 

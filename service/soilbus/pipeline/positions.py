@@ -1,4 +1,9 @@
-"""Where the vehicle was: fixes of a satellite receiver -> its position at any time."""
+"""Position of the vehicle at any time, from the fixes of a satellite receiver.
+
+    coordinate(t) = a, from the least-squares line a + b (t_i - t) through the fixes within SMOOTHING of t
+
+Longitude is taken relative to a fix, so the antimeridian needs no special case.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +16,7 @@ from soilbus.arrays import Array
 from soilbus.terra.earth import wrapped
 
 SMOOTHING = 1.0
-"""Fixes up to this number of seconds before and after share in a position: receivers are noisy."""
+"""Time [s] before and after, within which fixes are averaged: receivers are noisy.  No evidence recorded."""
 NO_FIX = 1e-9
 """Angle [rad] below which a coordinate is zero: what receivers send before they have a fix."""
 
@@ -24,10 +29,12 @@ class Position(NamedTuple):
 
 
 class PositionTrack:
-    """The fixes of the last while; `timeout` [s] by channel name, empty where no position is mapped.
+    """The recent fixes; latitude and longitude may come in different frames.
 
-    Latitude and longitude may come in different frames.  Longitudes are compared across the
-    antimeridian.
+    Parameters
+    ----------
+    timeout
+        [s], longest gap between two fixes, by channel name; empty where no position is mapped.
     """
 
     def __init__(self, timeout: Mapping[str, float]) -> None:
@@ -39,13 +46,13 @@ class PositionTrack:
         self._fixes: dict[str, tuple[Array, Array]] = dict.fromkeys(self._timeout, (np.zeros(0), np.zeros(0)))
 
     def copy(self) -> PositionTrack:
-        """The same fixes, for keeps."""
+        """A copy that later fixes do not change."""
         track = PositionTrack(self._timeout)
         track._fixes = dict(self._fixes)
         return track
 
     def add(self, samples: Mapping[str, tuple[Array, Array]]) -> None:
-        """Take in times [s] and values [rad], both (N,), by channel name; other channels are passed over."""
+        """Add times [s] and values [rad], both (N,), by channel name; other channels are ignored."""
         for name in self._timeout.keys() & samples.keys():
             t, value = samples[name]
             fixed = np.abs(value) > NO_FIX
@@ -53,7 +60,7 @@ class PositionTrack:
             self._fixes[name] = np.append(old_t, t[fixed]), np.append(old_value, value[fixed])
 
     def at(self, t: float) -> Position | None:
-        """The position at t [s]; None where no fixes before and after it are within the timeout of each other."""
+        """The position at t [s]; None where the fixes before and after it are further apart than the timeout."""
         if not self._timeout:
             return None
         latitude, longitude = (self._coordinate(name, t) for name in Position._fields)
@@ -68,7 +75,7 @@ class PositionTrack:
             self._fixes[name] = times[first:], value[first:]
 
     def _coordinate(self, name: str, t: float) -> float | None:
-        """On the straight line in time that fits the fixes about t [s] best."""
+        """The coordinate [rad] at t [s] on the least-squares line in time; None where no position is known."""
         times, value = self._fixes[name]
         after = int(np.searchsorted(times, t))
         if not 0 < after < len(times) or times[after] - times[after - 1] > self._timeout[name]:

@@ -1,4 +1,8 @@
-"""What one window says."""
+"""The result of one window, and the same result some time later.
+
+WindowResult          estimate, status, decision and warning at the window's end
+as_of(result, now)    the decision overruled by age, distance and loss of traction since then
+"""
 
 from __future__ import annotations
 
@@ -20,19 +24,42 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class WindowResult:
-    """What one window says; t is its end [s], index counts windows since the start.
+    """Result of one window.
 
-    slip and sinkage [m] are means over the window by wheel name, None where unknown.
-    rejected counts refused samples of the window by reason.  posterior is None where
-    status is invalid.  soil_class is the probability of each known soil and of `unknown`,
-    the largest first.  position is in the middle of the data that count: of the window, or
-    of its part on a new soil.  failure is the kind of a solve that failed, None where none did.
-    watch warns of immobilisation; unknown where the loop watches ten times a second itself.  gaps: reduced
-    chi-square of the channels that have not fitted for minutes, the worst first.  z_driven: sinkages [m] between
-    which nine tenths of the wheels' instants lie.  search_ended: the budget of
-    evaluations (estimator.search_rate, search_burst) ended the search for a soil that describes the data.
-    log names the recording that the window is of; None for the live bus.  excitation: how much draft and slip
-    varied.  basis: what the decision rests on.
+    Attributes
+    ----------
+    t, index
+        End [s], and number of the window since the start.
+    status, reason
+        Whether the estimate may be used, and why not.
+    posterior, bearing
+        Of the soil, and its bearing pressure [Pa]; None where status is invalid.
+    slip, sinkage
+        Means over the window by wheel, sinkage in m; None where not known.
+    traversability
+        The decision.
+    chi2, samples, rejected, iterations
+        Reduced chi-square, number of samples, refused samples by reason, solver iterations.
+    soil_class
+        Probability of each known soil and of `unknown`, the largest first.
+    position
+        In the middle of the data used: of the window, or of its part on a new soil.
+    failure
+        Kind of failure of the solve; None for none.
+    gaps
+        Reduced chi-square of channels that have not fitted for minutes, the worst first.
+    z_driven
+        5 % and 95 % quantiles of the sinkage [m].
+    search_ended
+        The budget of evaluations (estimator.search_rate, search_burst) ended the search for a soil.
+    watch
+        Immobilisation warning; unknown where the live loop computes it ten times a second.
+    log
+        Name of the recording; None for the live bus.
+    excitation
+        How much draft and slip varied.
+    basis
+        The data that the decision rests on.
     """
 
     t: float
@@ -61,8 +88,20 @@ class WindowResult:
 
 
 def as_of(result: WindowResult, loss: TractionLoss, now: float, config: Config) -> WindowResult:
-    """The result with what is left of its decision at the time `now` [s]; of a stuck vehicle none is valid."""
-    way = at_present(result.traversability, result.basis, loss, now, config)
+    """The result at a later time.
+
+    Parameters
+    ----------
+    result
+        Of a window that has ended.
+    loss
+        Loss of traction as of now; a stuck vehicle has no valid result.
+    now
+        [s], the time of the data.
+    config
+        Limits of age and distance.
+    """
+    decision = at_present(result.traversability, result.basis, loss, now, config)
     if loss.stuck and result.status is Status.VALID:
-        return replace(result, traversability=way, status=Status.NOT_EXCITED, reason="standstill")
-    return replace(result, traversability=way)
+        return replace(result, traversability=decision, status=Status.NOT_EXCITED, reason="standstill")
+    return replace(result, traversability=decision)

@@ -1,4 +1,7 @@
-"""What the service says it is doing; on the bus, in systemd's STATUS line and in each JSON line."""
+"""State of the service, as sent on the bus, in systemd's STATUS line and in each JSON line.
+
+starting -> waiting -> listening -> estimating -> valid or degraded; fault at any time
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,7 @@ class ServiceState(StrEnum):
 
 
 def state_after(result: WindowResult) -> ServiceState:
-    """State that a window's result puts the service in while its inputs keep coming."""
+    """State of the service after a window's result, while its inputs keep coming."""
     match result.status:
         case Status.VALID:
             return ServiceState.VALID

@@ -1,6 +1,10 @@
-"""Samples -> bins: sums over short spans of time, without single outliers.
+"""Samples to bins: means over short spans of time, without single outliers.
 
-Each sample is added once, however many windows it ends up in; a bin without one holds nan.
+    value(c) = mean(y) + slope * (c - mean(t))       c: centre of the bin, slope: between neighbouring bins
+    variance = noise / (n w),  w = 1 / (1 + d^2 / 2)     n: samples, d: shift in bins, w: worth of a sample
+
+Sums and counts are kept by bin and channel.  Each sample is added once, however many windows contain it.  A bin without
+a sample is nan.
 """
 
 from __future__ import annotations
@@ -15,15 +19,23 @@ from soilbus.estimation.window import NoiseTable, Rig, Window, made_window
 from soilbus.sensors.outliers import SIDE, Samples, joined, outlier_test
 
 GLIMPSE_BACK = 1.0
-"""Seconds before a glimpse whose samples help to judge those in it."""
+"""Time [s] before a glimpse whose samples enter the outlier test of those in it."""
 
 
 class Bins:
     """Sums and counts of samples by bin and channel, over a sliding span of time.
 
-    Bins are counted from `origin`; each sample is added once, however many windows it
-    ends up in.  Outliers (see `outliers`) are left out; one that looks like an outlier among the
-    last four of its channel is judged again when more is known.
+    Outliers (see `outliers`) are left out.  One found among the last four samples of its channel is tested again when
+    later samples are known.
+
+    Parameters
+    ----------
+    rig
+        Its channels and their noise.
+    bin_length
+        [s].
+    origin
+        [s], where the first bin begins.
     """
 
     def __init__(self, rig: Rig, bin_length: float, origin: float) -> None:
@@ -38,7 +50,7 @@ class Bins:
         self._outliers: list[Array] = []
 
     def add(self, samples: Mapping[str, tuple[Array, Array]]) -> None:
-        """Add samples (t [s], value in SI; both (N,)) by channel; those before the span are dropped."""
+        """Add samples (t [s] and value in SI, both (N,)) by channel; samples before the span are dropped."""
         if not samples:
             return
         rows = np.array([self._index[name] for name in samples], np.int16)
@@ -61,7 +73,7 @@ class Bins:
         return self._made(self._totals, low, high)
 
     def glimpse(self, start: float, end: float) -> Window:
-        """As `window`, but nothing is decided: later windows are the same as without it."""
+        """As `window`, but without changing the state: later windows are the same as without it."""
         low, high = self._span(start, end)
         recent = list(self._recent)
         samples = self._taken(high)
@@ -72,14 +84,14 @@ class Bins:
         return self._made(totals, low, high)
 
     def screened(self, end: float) -> Samples:
-        """The samples before `end` [s] but outliers, their times [s] counted from `origin`; nothing is decided."""
+        """The samples before `end` [s] without outliers, times [s] from `origin`; the state does not change."""
         recent = list(self._recent)
         samples, outlier, _ = outlier_test(self._taken(round((end - self.origin) / self.bin_length)), self._noise.sd)
         self._recent = recent
         return samples.pick(~outlier)
 
     def new_outliers(self) -> Array:
-        """Times [s] of the samples found to be outliers for good since the last call, ascending."""
+        """Times [s], ascending, of the samples finally found to be outliers since the last call."""
         found = np.sort(np.concatenate([np.zeros(0), *self._outliers]))
         self._outliers.clear()
         return found
@@ -100,7 +112,7 @@ class Bins:
         return np.floor(samples.t / self.bin_length + 1e-9).astype(np.intp) - self._first
 
     def _taken(self, high: int) -> Samples:
-        """Takes the recent samples before bin `high` out of the store; those before the span are dropped."""
+        """Take the recent samples before bin `high` out of the store; those before the span are dropped."""
         recent = joined(self._recent)
         bins = self._bins(recent)
         self._recent = []
@@ -110,7 +122,7 @@ class Bins:
         return recent
 
     def _with(self, totals: Array, samples: Samples, high: int) -> Array:
-        """Totals with these samples added, at least up to the bin `high`; the array is changed if it is long enough."""
+        """Totals with these samples added, at least up to the bin `high`; changed in place if long enough."""
         short = high - totals.shape[1]
         if short > 0:
             totals = np.concatenate([totals, np.zeros((3, max(short, 64), totals.shape[2]))], axis=1)
@@ -136,11 +148,22 @@ class Bins:
 def _at_centres(mean: Array, since: Array, centre: Array) -> tuple[Array, Array]:
     """Bin means moved to the bins' centres along the slope between neighbouring bins.
 
-    mean and since (mean sample time) are (N, channels), centre is (N,).  Messages of
-    different phase have different mean times in a bin; a few ms matter where slip
-    changes within a second.  Second, what share of its samples a moved mean is worth:
-    moved by a share d of the bin, it has 1 + d^2 / 2 times the variance, that of a slope
-    between two neighbours as noisy as itself.
+    Parameters
+    ----------
+    mean, since
+        (N, channels), mean value and mean sample time [s] of each bin.
+    centre
+        (N,) [s].
+
+    Returns
+    -------
+    mean, worth
+        (N, channels), the value at the centre, and the share of its samples that it is worth.
+
+    Notes
+    -----
+    Messages of different phase have different mean times in a bin; a few ms matter where slip changes within a second.
+    A shift by d bins multiplies the variance by 1 + d^2 / 2: the slope is between two neighbours with the same noise.
     """
     if len(mean) < 3:
         return mean, np.ones(mean.shape)

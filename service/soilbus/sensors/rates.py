@@ -1,15 +1,16 @@
-"""A whole recording at the resolution that its own rates and spectrum give.
+"""A whole recording in bins whose length follows from its own sample rates and spectrum.
 
     x(c) = mean_j (y_j - s(t_j)) + s(c)
 
-is the value at the centre c of a bin by the samples y_j in it, with s the channel's curve (see `local_cubics`): not
-a mean over the bin but the value of one instant, whatever the phases of the messages.  So a nonlinear model needs no
-second-order term.  It is a weighted sum of samples, and its variance that of the sum: it is worth fewer than n.
+x(c) is the value at the centre c of a bin, from its samples y_j and the channel's curve s (see `local_cubics`).  It is
+the value at one instant, not a mean over the bin, and does not depend on the phases of the messages; so a nonlinear
+model needs no second-order term.  It is a weighted sum of samples with the variance of that sum: it is worth fewer than
+n samples.
 
-The bin is the longest at which this loses at most MOST_LOST of what the n samples are worth, in each channel that
-the model needs; none shorter than the slowest of these channels' periods, at which every bin still has a sample.
-Then a bin is short beside the span of samples through which a cubic goes within noise, and a cubic between bins, as
-delays need it, errs by less than noise: by at most 3/128 of the fourth difference.
+The bin is the longest at which this loses at most MAX_LOSS of the n samples in each channel that the model needs, and
+not shorter than the slowest of these channels' periods, at which every bin still has a sample.  Then a bin is short
+compared with the span over which a cubic fits within noise, and cubic interpolation between bins (for delays) has an
+error below the noise: at most 3/128 of the fourth difference.
 """
 
 from __future__ import annotations
@@ -27,14 +28,17 @@ from soilbus.estimation.window import NoiseTable, Window, made_window
 from soilbus.sensors.bins import Bins
 from soilbus.sensors.outliers import Samples
 
-MOST_LOST = 0.1
-"""Share of a bin's samples that its value at one instant may cost: less than the noise itself is known to."""
+MAX_LOSS = 0.1
+"""Share of a bin's samples that its value at one instant may cost: less than the uncertainty of the noise itself."""
 NEEDED = ("torque", "load", "speed", "ground_speed", "draft")
-MOST_PARTS = 10
-"""Into how many parts the configured bin is divided at most."""
+"""Quantities without which the model has no residual."""
+MAX_PARTS = 10
+"""Largest number of parts into which the configured bin is divided."""
 
 
 class _Channel(NamedTuple):
+    """Samples of one channel (column of the rig), its curve, and whether the model needs it."""
+
     column: int
     t: Array
     value: Array
@@ -42,12 +46,12 @@ class _Channel(NamedTuple):
     needed: bool
 
     def series(self) -> Series:
-        """The curve, and a faithful one."""
+        """The smoothing curve, and one through half as many samples (less bias)."""
         return Series(self.curve, faithful(self.curve, self.value))
 
 
 class _Binned(NamedTuple):
-    """Each bin (B,) with samples: its number, how many, the value at the centre, how many samples that is worth."""
+    """Bins (B,) with samples: number of the bin and of its samples, value at the centre, samples it is worth."""
 
     bins: NDArray[np.intp]
     samples: Array
@@ -56,7 +60,20 @@ class _Binned(NamedTuple):
 
 
 def resolved_window(store: Bins, end: float) -> Window:
-    """All samples of a store from its origin to `end` [s]; its own window where longer bins lose nothing."""
+    """All samples of a store from its origin to `end`, in bins as short as its spectrum asks for.
+
+    Parameters
+    ----------
+    store
+        Samples and configured bin length, which is the longest.
+    end
+        [s].
+
+    Returns
+    -------
+    Window
+        With the channels' curves.
+    """
     samples = store.screened(end)
     whole = store.window(store.origin, end)  # which decides what is an outlier
     noise = NoiseTable.of(store.rig)
@@ -88,21 +105,21 @@ def _channels(samples: Samples, store: Bins, noise: NoiseTable) -> Iterator[_Cha
 
 
 def _bin_length(channels: Iterable[_Channel], longest: float, span: float) -> float:
-    """Length of the bins [s]: the longest part of the longest one at which no needed channel loses too much."""
+    """Length of the bins [s]: the longest / k, k = 1, 2, ..., at which no needed channel loses more than MAX_LOSS."""
     needed = [c for c in channels if c.needed and c.curve.step > 0.0]
     slowest = max((c.curve.step for c in needed), default=longest)
-    counted = [c for c in needed if 2.0 / len(c.t) < MOST_LOST**2]  # mean squares of fewer are not known so well
-    for parts in range(1, MOST_PARTS + 1):
+    counted = [c for c in needed if 2.0 / len(c.t) < MAX_LOSS**2]  # the loss of fewer samples is too uncertain
+    for parts in range(1, MAX_PARTS + 1):
         length = longest / parts
         if length <= slowest:
             break
-        if all(_lost(c, length, int(span / length)) <= MOST_LOST for c in counted):
+        if all(_lost(c, length, int(span / length)) <= MAX_LOSS for c in counted):
             return length
     return min(longest, slowest)
 
 
 def _lost(channel: _Channel, length: float, n: int) -> float:
-    """Share of the samples that values at the centres cost."""
+    """Share of the samples lost by taking values at the centres."""
     found = _binned(channel, length, n)
     return 1.0 - float(found.worth.sum() / found.samples.sum()) if len(found.bins) else 0.0
 
@@ -119,12 +136,12 @@ def _binned(channel: _Channel, length: float, n: int) -> _Binned:
     def mean(values: Array) -> Array:
         return np.asarray(np.bincount(which, values, len(bins)) / count)
 
-    left = mean(channel.value[kept] - channel.curve.at(t)[0])
+    rest = mean(channel.value[kept] - channel.curve.at(t)[0])
     step = channel.curve.step or length
     phase = np.rint((centre - mean(t)) / step * PHASE_PARTS).astype(int)
-    worth = np.ones(len(bins))  # of straight lines from sample to sample
+    worth = np.ones(len(bins))  # where the curve is straight lines from sample to sample
     if channel.curve.half_width:
         kinds, which = np.unique(np.stack([count.astype(int), phase]), axis=1, return_inverse=True)
         of_kind = [1.0 / variance_of_one(channel.curve.half_width, *kind) for kind in kinds.T.tolist()]
         worth = np.minimum(np.array(of_kind)[which.ravel()], count)
-    return _Binned(bins, count, left + channel.curve.at(centre)[0], worth)
+    return _Binned(bins, count, rest + channel.curve.at(centre)[0], worth)

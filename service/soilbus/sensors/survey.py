@@ -1,18 +1,15 @@
-"""A recording beside the configuration: what is heard of each mapped signal, and what contradicts the vehicle.
-
-Mistakes of mapping are gross and last: a wrong sign, unit, gear ratio, byte order, wheel.  So each
-check compares means over a whole recording with what the vehicle is said to be:
+"""Check of a configuration against a recording: each mapped signal, and what contradicts the configured vehicle.
 
     weight      sum of the wheel loads = m g cos(pitch), and its share on each axle by moments
     gear        motor speed = gear ratio * wheel speed
-    slip        1 - v / (r omega) within what driven wheels do
-    balance     changes of sum(torque / r) = 0.7 to 1.0 * changes of draft, and so of slope + inertia
-    sides       torque of the left less the right wheel grows with the load of the left less the
-                right, and with its slip: the signs of a regression tell loads, speeds or torques
-                that are swapped.  All three swapped at once are the same vehicle in a mirror.
+    slip        1 - v / (r omega), within the range of driven wheels
+    balance     changes of sum(torque / r) = 0.7 to 1.0 * changes of draft, and of slope + inertia
+    sides       left less right: torque = a * load + b * slip + constant, with a > 0 and b > 0
 
-Where a recording does not vary enough to tell, the survey says so.  Nothing tells the loads of a
-front and a rear wheel apart that carry alike.
+Mistakes of mapping (sign, unit, gear ratio, byte order, wheel) are large and constant, so each check compares means
+over the whole recording.  A wrong sign of a or b shows that loads, speeds or torques of left and right are swapped; all
+three swapped at once are the mirrored vehicle.  Where the recording varies too little, the survey says that it cannot
+decide.  Loads of a front and a rear wheel that carry the same load cannot be separated.
 """
 
 from __future__ import annotations
@@ -41,59 +38,59 @@ from soilbus.terra.vehicle import GRAVITY, axle_loads, slip_ratio
 
 Frame = tuple[float, int, bool, bytes | bytearray, bool, bool]
 
-BATCH = 5000
-"""Frames that are decoded at a time."""
-SILENCE = 60.0
-"""Seconds without a frame, or set back, after which another recording begins; the longest part is compared."""
+BATCH_SIZE = 5000
+"""Number of frames that are decoded at a time."""
+LONGEST_SILENCE = 60.0
+"""Time [s] without a frame, or jump back, after which another part begins; the part with most samples is compared."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """From where a recording contradicts its configuration.
+    """Thresholds from which a recording contradicts its configuration.
 
-    Evidence, where not said: three recordings of the field vehicle and simulated drives on loam, wet clay, heavy clay
+    Evidence, where not given: three recordings of the field vehicle and simulated drives on loam, wet clay, heavy clay
     and sand gave loads of 0.997 to 1.002 of the weight, axles within 0.004 of it, slopes of the balance of 0.72 to
     1.01, slips of 5 % of the time of 0.06 to 0.14, and slips of wheels within 0.04 of each other.
     """
 
     least_seconds: float = 10.0
-    """Of driving straight on, to compare anything [s]."""
+    """Least time [s] of straight driving for any comparison."""
     refused: float = 0.05
-    """Share of refused values that is a warning; four times as many are a fault."""
+    """Share of refused values from which a warning is given; four times this share is a fault."""
     rate: float = 0.8
-    """Share of the rate that the DBC gives, below which a signal is slow."""
+    """Share of the DBC's rate below which a signal is too slow."""
     least_rate: float = 5.0
-    """Values a second that windows of 0.1 s bins live on."""
+    """Least rate [1/s] for windows of 0.1 s bins."""
     weight: float = 0.15
-    """Share of the weight by which loads may be off: fuel, driver, what is carried; half of it is a warning."""
+    """Share of the weight by which the loads may differ (fuel, driver, freight); half of it is a warning."""
     axle: float = 0.12
-    """The same of one axle: centre of gravity and height of the hitch are known that well."""
+    """The same for one axle: centre of gravity and hitch height are known to this accuracy."""
     gear: float = 0.03
-    """Relative difference of motor and wheel speed: resolution and phase; any other gear step is larger."""
+    """Relative difference of motor and wheel speed, due to resolution and phase; any other gear step is larger."""
     pushed: float = -0.2
-    """Slip of a wheel that drives, below which no wheel is."""
+    """Least median slip of driving wheels."""
     never_less: float = 0.45
-    """Slip that 95 % of a drive exceeds: a vehicle that only digs."""
+    """Slip exceeded in 95 % of a drive, from which the speeds are implausible."""
     wheel_apart: float = 0.15
     """Difference of one wheel's median slip from the median of all."""
     scale: tuple[float, float] = (0.6, 1.3)
-    """Slope of the balance."""
+    """Range of the regression slope of thrust on draft."""
     excited: float = 0.008
-    """Sd of the draft's changes within 1 s, as share of the weight, from which the balance tells anything."""
+    """Sd of the draft's changes within 1 s, as a share of the weight, below which the balance cannot be decided."""
     pull: float = 0.02
-    """Median pull, as share of the weight, from which its size counts."""
+    """Median pull, as a share of the weight, from which thrust and pull are compared."""
     less_thrust: float = 0.9
-    """Thrust over pull, at least: rolling resistance, never less than a hundredth of the weight, is in the thrust."""
+    """Least thrust over pull: the thrust includes rolling resistance, at least a hundredth of the weight."""
     most_thrust: float = 0.9
-    """Median thrust over weight: no soil bears more for long."""
+    """Largest median thrust over weight that soil can bear for long."""
     side_sd: float = 4.0
-    """Standard deviations by which a regression's factor must have the wrong sign, or be beyond the scale."""
+    """Standard deviations by which a regression coefficient must have the wrong sign, or lie outside `scale`."""
     side_offset: float = 0.3
-    """Constant difference of the torques of an axle, as share of their mean."""
+    """Constant difference of the torques of an axle, as a share of their mean."""
     jump: float = 0.3
-    """Median change from value to value, as share of the median value: bodies of tonnes have inertia."""
+    """Median change from value to value, as a share of the median value; a vehicle's inertia keeps it lower."""
     jump_sd: float = 10.0
-    """The same in standard deviations of the configured noise."""
+    """The same, in standard deviations of the configured noise."""
     windows: float = 0.2
     """Share of windows in which a sensor contradicts the others."""
 
@@ -102,7 +99,7 @@ LIMITS = Limits()
 
 
 class Finding(NamedTuple):
-    """What is wrong, in one line; `fatal` where estimates would be wrong; the channels (by name) in question."""
+    """One line of text; `fatal` if estimates would be wrong; names of the channels concerned."""
 
     text: str
     fatal: bool
@@ -111,7 +108,7 @@ class Finding(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What was heard of one mapped signal: values, rate [1/s] or nan, range (SI) or nan, refused by reason."""
+    """One mapped signal: number of values, rate [1/s], range (SI), refused values by reason; nan without values."""
 
     channel: Channel
     count: int
@@ -123,7 +120,7 @@ class Seen:
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """Every mapped signal, what is wrong, and what this recording cannot show."""
+    """Result of a survey: every mapped signal, the findings, and what this recording cannot decide (open)."""
 
     seen: tuple[Seen, ...]
     findings: tuple[Finding, ...]
@@ -131,22 +128,24 @@ class Survey:
 
     @property
     def faults(self) -> list[str]:
-        """Lines on what makes estimates wrong."""
+        """Texts of the findings that make estimates wrong."""
         return [f.text for f in self.findings if f.fatal]
 
     @property
     def warnings(self) -> list[str]:
-        """Lines on what is odd."""
+        """Texts of all other findings."""
         return [f.text for f in self.findings if not f.fatal]
 
 
 class UndecidableError(Exception):
-    """The recording cannot show this; the text says what and why."""
+    """The recording cannot decide a check; the text says which and why."""
 
 
 class Facts(NamedTuple):
-    """A recording's bins: as measured (`raw`) and forward; where it drives straight on (N,); motor speeds
-    (N, W); the names of the mapped channels.
+    """A recording in N bins.
+
+    raw, window: as measured, and turned forward; straight (N,): where the vehicle drives straight on; motor (N, W):
+    motor speeds [rad/s]; mapped: names of the mapped channels.
     """
 
     config: Config
@@ -169,7 +168,7 @@ class Facts(NamedTuple):
         return np.where(self.straight[:, None], self.window.torque / self.rig.radius, np.nan)
 
     def less(self, channels: Iterable[str]) -> Facts:
-        """Without these channels."""
+        """The same without these channels."""
         gone = set(channels)
         motor = np.where([f"motor_speed.{w}" in gone for w in self.rig.wheels], np.nan, self.motor)
         return self._replace(
@@ -178,9 +177,26 @@ class Facts(NamedTuple):
 
 
 def survey(config: Config, database: Database, frames: Iterable[Frame], limits: Limits = LIMITS) -> Survey:
-    """Compares the frames of one recording (time [s], identifier, extended, data, remote, error) with a configuration.
+    """Compare a recording with a configuration.
 
-    Raises ConfigError where configuration and database do not fit.
+    Parameters
+    ----------
+    config, database
+        The configuration and the messages of the vehicle's bus.
+    frames
+        Of one recording: (time [s], identifier, extended, data, remote, error).
+    limits
+        Thresholds of the checks.
+
+    Returns
+    -------
+    Survey
+        Signals, findings, open questions.
+
+    Raises
+    ------
+    ConfigError
+        Where configuration and database do not fit.
     """
     with_motors = config.model_copy(update={"wheel": _with_motor_speeds(config, database)})
     mapped = {c.name for c in channels_of(config, database)}
@@ -189,7 +205,7 @@ def survey(config: Config, database: Database, frames: Iterable[Frame], limits: 
     except ConfigError:  # of a speed that nobody mapped
         with_motors, channels = config, channels_of(config, database)
     admission = Admission(channels, database, checked_messages(config))
-    parts, refused, n = _heard(admission, frames)
+    parts, refused, n = _decoded(admission, frames)
     longest = max(parts, key=lambda part: sum(len(t) for t, _ in part.values()))
     seen = tuple(_seen(c, longest, refused) for c in channels if c.name in mapped)
     if not sum(admission.counts.received.values()):
@@ -206,11 +222,11 @@ def survey(config: Config, database: Database, frames: Iterable[Frame], limits: 
     return Survey(seen, tuple(findings), tuple(open_questions))
 
 
-# --- hearing ---
+# --- decoding ---
 
 
 def _with_motor_speeds(config: Config, database: Database) -> list[object]:
-    """The wheels, with a motor's speed where the message of its torque has one and none is mapped."""
+    """The wheels, with an unmapped motor speed added where the torque's message has exactly one."""
     wheels: list[object] = []
     for wheel in config.wheel:
         if wheel.torque is not None and wheel.motor_speed is None and wheel.torque.at != "wheel":
@@ -236,8 +252,8 @@ def _rotation(text: str | None) -> bool:
 Columns = dict[str, tuple[Array, Array]]
 
 
-def _heard(admission: Admission, frames: Iterable[Frame]) -> tuple[list[Columns], Counter[tuple[str, Reason]], int]:
-    """Samples by channel of each part of the recording that has one clock, refusals, and the number of frames."""
+def _decoded(admission: Admission, frames: Iterable[Frame]) -> tuple[list[Columns], Counter[tuple[str, Reason]], int]:
+    """Samples by channel for each part of the recording with one clock, refusals, and the number of frames."""
     pieces: list[list[Columns]] = [[]]
     refused: Counter[tuple[str, Reason]] = Counter()
     last, n, steps = math.nan, 0, 0
@@ -251,12 +267,12 @@ def _heard(admission: Admission, frames: Iterable[Frame]) -> tuple[list[Columns]
         n += 1
         if error:
             continue
-        if abs(t - last) > SILENCE:
+        if abs(t - last) > LONGEST_SILENCE:
             take()
             pieces.append([])
         last = t
         admission.feed(t, identifier, extended, data, remote)
-        if n % BATCH == 0:
+        if n % BATCH_SIZE == 0:
             if admission.counts.clock_steps != steps:
                 steps = admission.counts.clock_steps
                 pieces.append([])
@@ -329,7 +345,7 @@ def _is_optional(seen: Seen) -> bool:
     return seen.channel.quantity in {*OPTIONAL_ROLES, "sinkage", "torque_limit", "motor_speed"}
 
 
-_WHY: Mapping[Reason, str] = {
+_REFUSAL: Mapping[Reason, str] = {
     Reason.NOT_AVAILABLE: "the sender says that it is not available",
     Reason.ERROR: "the sender reports an error",
     Reason.RESERVED: "codes that the DBC reserves",
@@ -359,7 +375,7 @@ def _absent(seen: Iterable[Seen], database: Database) -> Iterator[Finding]:
 
 
 def _of_one(seen: Seen, database: Database, limits: Limits) -> Iterator[Finding]:
-    """Whether a signal comes often enough and with values that count."""
+    """Whether a signal comes often enough and its values are accepted."""
     channel, key = seen.channel, _key(seen.channel)
     message = database.get_message_by_name(channel.message)
     refused = sum(seen.refused.values())
@@ -369,7 +385,7 @@ def _of_one(seen: Seen, database: Database, limits: Limits) -> Iterator[Finding]
     if share > limits.refused:
         reason, n = max(seen.refused.items(), key=lambda item: item[1])
         unit = SI.get(_dimension(channel), "")
-        why = _WHY.get(reason, str(reason).replace("_", " ")).format(low=channel.low, high=channel.high, unit=unit)
+        why = _REFUSAL.get(reason, str(reason).replace("_", " ")).format(low=channel.low, high=channel.high, unit=unit)
         text = f"{key}: {n} of {refused + seen.count} values of {channel.message}.{channel.signal} do not count: {why}"
         yield Finding(text, share > 4.0 * limits.refused, (channel.name,) if share > 4.0 * limits.refused else ())
     if math.isfinite(seen.rate) and channel.quantity not in POSITION_ROLES:
@@ -390,7 +406,7 @@ def _dimension(channel: Channel) -> str:
 
 
 def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config, limits: Limits) -> Iterator[Finding]:
-    """Values that never change although the vehicle drives, and values that jump as no vehicle does."""
+    """Values that never change while the vehicle drives, and values that jump more than a vehicle can."""
     ground = heard.get("ground_speed", (np.empty(0), np.empty(0)))
     moving = ground[0][np.abs(ground[1]) > config.estimator.min_speed]
     drives = float(np.ptp(moving)) if len(moving) else 0.0
@@ -410,7 +426,7 @@ def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config, limi
         sd = math.sqrt(noise.absolute**2 + (noise.relative**2 + noise.of_mean**2) * size**2)
         jumps = np.abs(np.diff(value))
         typical = float(np.median(jumps))
-        alike = float((np.diff(value) ** 2).mean() / (2.0 * value.var()))  # 1 for values without any memory
+        alike = float((np.diff(value) ** 2).mean() / (2.0 * value.var()))  # 1 for uncorrelated values
         if typical > max(limits.jump_sd * sd, limits.jump * size) and alike > 0.5:
             yield Finding(
                 f"{_key(s.channel)}: jumps by {typical:.3g} {unit} from one value to the next, {typical / sd:.0f} times"
@@ -421,7 +437,7 @@ def _stuck_and_jagged(seen: Iterable[Seen], heard: Columns, config: Config, limi
             )
 
 
-# --- signals beside each other ---
+# --- signals compared with each other ---
 
 Check = Callable[[Facts, Limits], Iterator[Finding]]
 
@@ -429,7 +445,7 @@ Check = Callable[[Facts, Limits], Iterator[Finding]]
 def _compared(
     facts: Facts, before: Iterable[Finding], channels: Iterable[Channel], database: Database, limits: Limits
 ) -> tuple[list[Finding], list[str]]:
-    """Findings of all checks, each without the channels that an earlier one has named; and what cannot be decided."""
+    """Findings of all checks, each without the channels that an earlier check has named, and open questions."""
     facts = facts.less(name for f in before for name in f.channels)
     if facts.straight.sum() * facts.config.estimator.bin < limits.least_seconds:
         return [], [
@@ -438,11 +454,11 @@ def _compared(
         ]
     findings: list[Finding] = []
     questions: list[str] = []
-    for check in (_weight, _ways, _gears, _slips, _balance, _levels, _sides, _yaw):
+    for check in (_weight, _directions, _gears, _slips, _balance, _levels, _sides, _yaw):
         try:
             found = list(check(facts, limits))
         except UndecidableError as reason:
-            if not any(f.fatal for f in (*before, *findings)):  # else for want of what is at fault
+            if not any(f.fatal for f in (*before, *findings)):  # else undecided because of the fault
                 questions.append(str(reason))
             continue
         findings += found
@@ -453,7 +469,7 @@ def _compared(
 
 
 def _weight(facts: Facts, limits: Limits) -> Iterator[Finding]:
-    """The loads' sum beside the mass, and each axle's beside the geometry."""
+    """Sum of the loads against the mass, and each axle's load against the geometry."""
     window, rig, chassis = facts.window, facts.rig, facts.rig.chassis
     if chassis is None:
         return
@@ -493,7 +509,7 @@ def _weight(facts: Facts, limits: Limits) -> Iterator[Finding]:
 
 
 def _why_weight(ratio: float) -> str:
-    """What makes the loads this multiple of the weight."""
+    """The likely mistake if the loads are this multiple of the weight."""
     for factor, why in (
         (0.45359237, "is the mass in lb?"),
         (GRAVITY, "is the mass a weight, or are the loads taken for kg?"),
@@ -508,15 +524,15 @@ def _why_weight(ratio: float) -> str:
     return "which of them is wrong? (ballast, unit or scale of the loads)"
 
 
-def _ways(facts: Facts, limits: Limits) -> Iterator[Finding]:
-    """Wheels that turn, or drive, against all others."""
+def _directions(facts: Facts, limits: Limits) -> Iterator[Finding]:
+    """Wheels that turn or drive in the opposite direction to most."""
     rig, raw = facts.rig, facts.raw
     moving = facts.straight
     with np.errstate(invalid="ignore"):
         turns = [median(np.sign(raw.speed[moving, i])) for i in range(len(rig.wheels))]
-    way = np.sign(np.nansum(turns))
+    forward_sign = np.sign(np.nansum(turns))
     for wheel, turn in zip(rig.wheels, turns, strict=True):
-        if turn * way < 0.0:
+        if turn * forward_sign < 0.0:
             text = f"wheel.{wheel}.speed: turns backward while most wheels turn forward: sign = -1?"
             yield Finding(text, True, (f"speed.{wheel}", f"torque.{wheel}"))
     thrust = [median(facts.thrust[:, i]) for i in range(len(rig.wheels))]
@@ -528,12 +544,12 @@ def _ways(facts: Facts, limits: Limits) -> Iterator[Finding]:
                 f"wheel.{wheel}.torque: brakes while most wheels drive: sign = -1?", True, (f"torque.{wheel}",)
             )
     ground = median(np.sign(raw.ground_speed[moving]))
-    if ground < 0.0 and way > 0.0:
+    if ground < 0.0 and forward_sign > 0.0:
         yield Finding("signals.ground_speed: backward while the wheels turn forward: sign = -1?", True)
 
 
 def _gears(facts: Facts, limits: Limits) -> Iterator[Finding]:
-    """The motors' speeds beside the wheels'; one that nobody mapped may be at the wheel itself."""
+    """Motor speeds against wheel speeds; an unmapped motor speed may also be the wheel's own."""
     for i, wheel in enumerate(facts.rig.wheels):
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = median(np.abs(facts.motor[:, i] / facts.raw.speed[:, i])[facts.straight])
@@ -552,7 +568,7 @@ def _gears(facts: Facts, limits: Limits) -> Iterator[Finding]:
 
 
 def _slips(facts: Facts, limits: Limits) -> Iterator[Finding]:
-    """Rim speeds beside the ground speed, and beside each other."""
+    """Rim speeds against the ground speed and against each other."""
     slip, rig = facts.slip, facts.rig
     drives = np.where(facts.thrust > 0.0, slip, np.nan)
     usual = np.array([median(drives[:, i]) for i in range(len(rig.wheels))])
@@ -588,7 +604,7 @@ def _slips(facts: Facts, limits: Limits) -> Iterator[Finding]:
 
 
 def _why_fast(factor: float) -> str:
-    """What makes rims this many times as fast as the ground, beside a slip of up to 0.4."""
+    """The likely mistake if rims are this many times as fast as the ground (slip of up to 0.4 included)."""
     for known, why in (
         (30.0 / math.pi, "are the wheel speeds in rpm where the DBC says rad/s, "),
         (3.6, "is the ground speed in m/s where the DBC says km/h, "),
@@ -602,7 +618,7 @@ def _why_fast(factor: float) -> str:
 
 
 def _balance(facts: Facts, limits: Limits) -> Iterator[Finding]:
-    """Changes of the wheels' thrust beside those of the pull that draft, slope and inertia ask for."""
+    """Changes of the wheels' thrust against changes of draft and of slope and inertia."""
     window, rig, chassis = facts.window, facts.rig, facts.rig.chassis
     if chassis is None:
         return
@@ -675,7 +691,7 @@ def _balance(facts: Facts, limits: Limits) -> Iterator[Finding]:
 
 
 def _levels(facts: Facts, limits: Limits) -> Iterator[Finding]:
-    """Thrust beside pull all along: the wheels give the pull and what the soil resists besides."""
+    """Mean thrust against mean pull: the thrust must exceed the pull by the rolling resistance."""
     window, rig, chassis = facts.window, facts.rig, facts.rig.chassis
     if chassis is None:
         return
@@ -694,11 +710,11 @@ def _levels(facts: Facts, limits: Limits) -> Iterator[Finding]:
 
 
 def _regression(y: Array, x: Array) -> tuple[Array, Array]:
-    """Factors (K,) of the columns of x (N, K) in y (N,) by least squares, and their standard deviations."""
+    """Least-squares coefficients (K,) of y (N,) on the columns of x (N, K), and their standard deviations."""
     inverse = np.linalg.pinv(x.T @ x)
     factors = inverse @ x.T @ y
-    left = float(((y - x @ factors) ** 2).sum()) / max(len(y) - x.shape[1], 1)
-    return factors, np.sqrt(left * np.diag(inverse))
+    residual_variance = float(((y - x @ factors) ** 2).sum()) / max(len(y) - x.shape[1], 1)
+    return factors, np.sqrt(residual_variance * np.diag(inverse))
 
 
 def _sides(facts: Facts, limits: Limits) -> Iterator[Finding]:
@@ -740,7 +756,7 @@ def _blocks(values: Array, n: int) -> Array:
 
 
 def _yaw(facts: Facts, limits: Limits) -> Iterator[Finding]:
-    """The yaw rate beside the wheels' speeds in turns: positive to the left, where the right wheels go faster."""
+    """Yaw rate against wheel speeds in turns: positive to the left, where the right wheels go faster."""
     window, rig = facts.window, facts.rig
     if not np.isfinite(window.yaw_rate).any() or not pairs(rig).size:
         return
@@ -760,7 +776,7 @@ def _yaw(facts: Facts, limits: Limits) -> Iterator[Finding]:
 
 
 def _contradictions(facts: Facts, channels: Iterable[Channel], database: Database, limits: Limits) -> Iterator[Finding]:
-    """Sensors that contradict the others in many windows, by the service's own checks."""
+    """Sensors that contradict the others in many windows, by the checks of `consistency`."""
     s, rig = facts.config.estimator, facts.rig
     resolution = {c.name: resolution_of(c, database) for c in channels}
     n = max(round(s.window / s.bin), 1)

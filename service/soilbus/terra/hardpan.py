@@ -17,7 +17,7 @@ from soilbus.terra.wheel_state import WheelModel, WheelState
 
 POWER, FEWER = 2, 2
 """Nodes cluster where the rim reaches the pan, as a shallow one's pressure bends most there; errors are as small as
-those of the soil alone with so many fewer of them."""
+those of the soil alone, with FEWER nodes less."""
 
 
 def reaching(state: WheelState, model: WheelModel) -> NDArray[np.bool_]:

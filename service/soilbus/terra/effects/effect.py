@@ -1,4 +1,4 @@
-"""What an effect is: a small change of the wheel-soil model, of a force, or of what a sensor tells.
+"""What an effect is: a small change of the wheel-soil model, of a force, or of what a sensor reads.
 
 An effect has parameters, each with a value at which the effect is absent and a prior
 range, and up to five hooks, all pure functions.  `wheel` and `forces` are elementwise, for
@@ -33,7 +33,7 @@ class Surroundings(NamedTuple):
     """What effects may depend on besides the wheel state; (N, W), (N, 1) or (W,), broadcasting with it.
 
     t [s] and distance [m] since the start of the record; load of the wheel [N];
-    ground_speed [m/s]; wheel_speed [rad/s]; rear tells which wheels run in the rut of
+    ground_speed [m/s]; wheel_speed [rad/s]; rear says which wheels run in the rut of
     another; draft [N] and acceleration [m/s^2] of the vehicle, mass [kg] of it; duration
     [s] and length [m] of the whole record (length 0: unknown).  Slips are those of the
     nominal radius, 1 - V/(r omega).
@@ -112,7 +112,7 @@ class Effect:
     wheel has parameters of its own.
 
     wheel: state and model before the stresses are integrated.  forces: load, drawbar pull
-    and torque (3, ...) between wheel and ground, after it.  torque: what the sensors tell
+    and torque (3, ...) between wheel and ground, after it.  torque: what the sensors read
     (N, W) of the torques at the wheels.  draft: error [N] (N,) of the load cell at the
     hitch, reading less truth, of true drafts (N,).  load: errors [N] (N, W) of the wheel
     load cells.  resistance: force [N] (N,) that holds the vehicle back and is in no reading.

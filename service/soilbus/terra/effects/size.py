@@ -18,7 +18,7 @@ def for_wheel(effect: Effect, load: float, radius: float) -> Effect:
     Load cells are chosen by the load, lugs and the depth that a wheel feels grow with the
     radius, the drag of seals with circumference times arm.  Everything else of an effect is
     the soil's or a share, and stays.  Without this a load cell's zero with a prior sd of
-    300 N could never be told on a wheel that carries 80 N.
+    300 N could never be identified on a wheel that carries 80 N.
     """
     force, length = load / LOAD, radius / RADIUS
     of_unit = {"N": force, "N/s": force, "N m": length**2, "m": length, "m/N": length / force}

@@ -63,7 +63,7 @@ class CompletedModel:
     def forces(self, state: WheelState, rear: Any, load: Array) -> Array:
         """Load, drawbar pull and the motor's torque at the wheel (3, ...).
 
-        rear tells which wheels are on the rear axle, load [N] what they carry.
+        rear says which wheels are on the rear axle, load [N] what they carry.
         """
         if not self.effects:
             return wheel_forces(state, self.model)
