@@ -11,7 +11,6 @@ from pathlib import Path
 import can
 import pytest
 
-from fakes import FakeClock, ScriptedBus
 from soilbus.can.bus import (
     LONGEST_BACK_OFF,
     RECEIVE_BUFFER,
@@ -24,6 +23,7 @@ from soilbus.can.bus import (
 )
 from soilbus.can.publish import Frame
 from soilbus.daemon.bus_health import health_text
+from soilbus.validation.fakes import FakeClock, ScriptedBus
 
 FRAME = Frame(0x18FF609A, True, bytes(8))
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import can
 
-from fakes import FakeClock, InlineExecutor
 from soilbus.can.bus import LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
@@ -16,6 +15,7 @@ from soilbus.daemon.notify import Notifier
 from soilbus.daemon.service import Service
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.reference import reference_configuration
+from soilbus.validation.fakes import FakeClock, InlineExecutor
 
 FULL_BUS = 7500.0
 PAGE = 4096

@@ -13,7 +13,6 @@ import can
 import numpy as np
 import pytest
 
-from fakes import FakeClock, InlineExecutor, ScriptedBus
 from feeding import feed_message
 from in_vain import (
     STANDS,
@@ -40,6 +39,7 @@ from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.sensors import measure
+from soilbus.validation.fakes import FakeClock, InlineExecutor, ScriptedBus
 
 CONFIG = reference_configuration()
 IN, OUT = load_databases(CONFIG), output_database(CONFIG)

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 import can
 import pytest
 
-from fakes import FakeClock, InlineExecutor, ScriptedBus
 from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
@@ -24,6 +23,7 @@ from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
+from soilbus.validation.fakes import FakeClock, InlineExecutor, ScriptedBus
 
 WINDOW = 8.0
 CONFIG = reference_configuration([f"estimator.window={WINDOW}"])

@@ -12,7 +12,6 @@ from dataclasses import replace
 import can
 import pytest
 
-from fakes import FakeClock, InlineExecutor, ScriptedBus
 from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
@@ -26,6 +25,7 @@ from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
+from soilbus.validation.fakes import FakeClock, InlineExecutor, ScriptedBus
 
 DURATION = 16.0
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fakes import FakeClock, InlineExecutor, ScriptedBus
 from soilbus.can.bus import LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
@@ -26,6 +25,7 @@ from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
+from soilbus.validation.fakes import FakeClock, InlineExecutor, ScriptedBus
 
 CONFIG = reference_configuration()
 DATABASE = load_databases(CONFIG)

@@ -8,8 +8,8 @@ from time import perf_counter, sleep
 
 import pytest
 
-from fakes import FakeClock, InlineExecutor
 from soilbus.daemon.work_queue import MAX_PENDING_WINDOWS, WINDOWS_PER_MEMORY_RELEASE, WorkQueue
+from soilbus.validation.fakes import FakeClock, InlineExecutor
 
 
 class Later(Executor):

@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 import can
 import numpy as np
 
-from fakes import FakeClock, InlineExecutor
 from feeding import feed_message
 from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.checksum import frame_checksum
@@ -42,6 +41,7 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.soils import SOILS
+from soilbus.validation.fakes import FakeClock, InlineExecutor
 
 CONFIG = reference_configuration(["estimator.window=4.0", "traversability.max_age=2.0"])
 OUT = output_database(CONFIG)

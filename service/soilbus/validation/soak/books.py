@@ -80,10 +80,12 @@ class Beat:
         self.off += abs(self.late) > self.slack
 
 
-def unaccounted(received: Counter, admitted: Counter, refused: Counter[tuple[str, Reason]], delivered: Counter) -> dict:
+def unaccounted(
+    received: Counter[str], admitted: Counter[str], refused: Counter[tuple[str, Reason]], delivered: Counter[str]
+) -> dict[str, int]:
     """Frames by message name that were handed over and are neither admitted nor refused for a reason."""
     names = set(received) | set(delivered)
-    by_name: Counter = Counter()
+    by_name: Counter[str] = Counter()
     for (name, _), n in refused.items():
         by_name[name] += n
     lost = {name: delivered[name] - admitted[name] - by_name[name] for name in sorted(names)}

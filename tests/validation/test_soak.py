@@ -1,4 +1,4 @@
-"""A few minutes of the soak run; the whole day is `python -m tests.soak`."""
+"""A few minutes of the soak run; the whole day is `python -m soilbus.validation.soak`."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ from collections import Counter
 import pytest
 
 from soilbus.pipeline.outputs import TICK
-
-from . import wire
-from .books import Hour
-from .run import Soak, soak
-from .verdict import GROWTH, demands
+from soilbus.validation.soak import wire
+from soilbus.validation.soak.books import Hour
+from soilbus.validation.soak.run import Soak, soak
+from soilbus.validation.soak.verdict import GROWTH, demands
 
 
 @pytest.fixture(scope="module")

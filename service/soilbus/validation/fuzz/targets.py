@@ -8,6 +8,7 @@ import json
 import math
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +17,6 @@ import can
 import numpy as np
 from cantools.database import Database
 
-from fakes import FakeClock, InlineExecutor, ScriptedBus
 from soilbus.can.bus import LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
@@ -36,8 +36,8 @@ from soilbus.simulator.reference import TRACTOR, reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Effect
-
-from .stream import RECORD, Fed, Known, frames_of
+from soilbus.validation.fakes import FakeClock, InlineExecutor, ScriptedBus
+from soilbus.validation.fuzz.stream import RECORD, Fed, Known, frames_of
 
 MOTORS = [f"wheel.{w}.motor_speed=Motor{w}.ShaftSpeed" for w in ("FL", "FR", "RL", "RR")]
 MOST_WINDOWS = 62
@@ -86,8 +86,8 @@ def good_stream() -> list[bytes]:
     n, messages = len(known()), len(known()) // ROUNDS
     rows = [bytes([0, i % n, 2 if i % messages else 5, 0, *bytes(8)]) for i in range(20 * n)]
     rng = np.random.default_rng(1)
-    bent = [row[:3] + b"\1" + (rng.bytes(8) if rng.random() < 0.2 else bytes(8)) for row in rows]
-    return [b"".join(some) for some in (rows[: 5 * n], bent[: 5 * n], rows, bent)]
+    harmed = [row[:3] + b"\1" + (rng.bytes(8) if rng.random() < 0.2 else bytes(8)) for row in rows]
+    return [b"".join(some) for some in (rows[: 5 * n], harmed[: 5 * n], rows, harmed)]
 
 
 # --- frames: decoding, admission, binning
@@ -182,8 +182,9 @@ def check_service(data: bytes) -> int:
         assert rounds < 200 + 400 * (end - 1000.0), "the loop does not wait"
     verdict = database.get_message_by_name("Traversability").frame_id
     for _, message in wire.sent:
-        told = database.decode_message(message.arbitration_id, bytes(message.data))
-        assert message.arbitration_id != verdict or str(told["State"]) != "go"
+        sent = database.decode_message(message.arbitration_id, bytes(message.data))
+        assert isinstance(sent, dict)
+        assert message.arbitration_id != verdict or str(sent["State"]) != "go"
     return len(messages)
 
 
@@ -212,7 +213,7 @@ def check_dbc(data: bytes) -> int:
             config = load_config(folder / "f.toml")
             intake = Intake(config, load_databases(config))
         except ConfigError as error:
-            return _told(error.faults)
+            return _refused(error.faults)
         return _admitted(intake, frames_of(_some_frames(), known()))
 
 
@@ -224,7 +225,7 @@ def check_config(data: bytes) -> int:
             config = load_config(folder / "f.toml")
             pipeline = Pipeline(config, load_databases(config))
         except ConfigError as error:
-            return _told(error.faults)
+            return _refused(error.faults)
         return _admitted(pipeline.intake, frames_of(_some_frames(), known()))
 
 
@@ -236,7 +237,7 @@ def check_model(data: bytes) -> int:
             config = load_config(folder / "f.toml")
             active, (effects, free) = effects_of(config), effects_and_parameters_of(config)
         except ConfigError as error:
-            return _told(error.faults)
+            return _refused(error.faults)
         for one in active:
             assert all(np.isfinite(value).all() for value in one.values.values())
         assert all(math.isfinite(f.value) and f.std >= 0.0 for f in free)
@@ -245,12 +246,12 @@ def check_model(data: bytes) -> int:
 
 
 def check_state(data: bytes) -> int:
-    """A stored state is refused with one line, as it is and sealed anew, or its belief is finite and bounded."""
+    """A stored state is refused with one line, as it is and sealed anew, or its Gaussian is finite and bounded."""
     for content in (data, _sealed(data)):
         try:
             state = loaded(content, owner())
         except StateError as error:
-            _told([str(error)])
+            _refused([str(error)])
             continue
         if state.gaussian is not None:
             gaussian = gaussian_of(state.gaussian, owner())
@@ -281,7 +282,7 @@ def _state_seeds() -> list[bytes]:
     return [dumped(State(at=1.7e9, starts=2, gaussian=b, totals={"windows": 7}), owner()) for b in states]
 
 
-def _told(faults: list[str], where: str = "") -> int:
+def _refused(faults: list[str], where: str = "") -> int:
     """No frame, but what is wrong, each fault on a line of its own."""
     assert faults
     assert all(fault.strip() and "\n" not in fault and where in fault for fault in faults), faults
@@ -302,7 +303,7 @@ def _log(suffix: str) -> Callable[[bytes], int]:
                     if n >= MOST_FRAMES:
                         break
             except LogError as error:
-                _told([str(error)], str(path))
+                _refused([str(error)], str(path))
             intake.ingest(1.7e9 + 10.0)
             return n
 
@@ -337,17 +338,10 @@ def _some_frames() -> bytes:
     return good_stream()[1]
 
 
-def _folder():
-    context = tempfile.TemporaryDirectory(prefix="soilbus-fuzz-")
-
-    class Folder:
-        def __enter__(self) -> Path:
-            return Path(context.__enter__())
-
-        def __exit__(self, *what: object) -> None:
-            context.__exit__(*what)
-
-    return Folder()
+@contextmanager
+def _folder() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="soilbus-fuzz-") as path:
+        yield Path(path)
 
 
 def _dbc_seeds() -> list[bytes]:

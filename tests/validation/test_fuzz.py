@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 
 from soilbus.can.dbc_files import load_databases
 from soilbus.pipeline.intake import Intake
-
-from .mutation import mutated
-from .stream import RECORD, STEPS, frames_of
-from .targets import ROUNDS, TARGETS, known, reference
+from soilbus.validation.fuzz.mutation import mutated
+from soilbus.validation.fuzz.stream import RECORD, STEPS, frames_of
+from soilbus.validation.fuzz.targets import ROUNDS, TARGETS, known, reference
 
 INPUTS = 6
 

@@ -1,20 +1,19 @@
-"""`PYTHONPATH=service:tests/support python -m tests.soak [--hours 24] [--seed 1]`: a day through the daemon's loop."""
+"""`python -m soilbus.validation.soak [--hours 24] [--seed 1]`: a day through the daemon's loop."""
 
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Sequence
 
-from .books import Hour
-from .run import HOUR, soak
-from .verdict import demands
+from soilbus.validation.soak.books import Hour
+from soilbus.validation.soak.run import HOUR, soak
+from soilbus.validation.soak.verdict import demands
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run, print an hour a line, then the books and what was asked of them; 1 where a demand is missed."""
-    parser = argparse.ArgumentParser(prog="python -m tests.soak", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m soilbus.validation.soak", description=__doc__)
     parser.add_argument("--hours", type=float, default=24.0, help="simulated (24)")
     parser.add_argument("--seed", type=int, default=1, help="picks noise and faults (1)")
     chosen = parser.parse_args(arguments)
@@ -39,7 +38,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for asked, found, met in results:
         print(f"{'too short to tell' if met is None else 'holds' if met else 'MISSED'}: {asked}: {found}")
     return int(not all(met is not False for _, _, met in results))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,6 +1,6 @@
 """A bus on which things go wrong: frames lost, spoilt, doubled, late; strangers; outages; clock steps.
 
-It keeps the books: every frame that it hands over is one that the service must account for.
+It counts: every frame that it hands over is one that the service must account for.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 import can
 import numpy as np
+
+from soilbus.validation.fakes import FakeClock
 
 FAULTS = (  # in turns, each round in another order
     "silent", "spoilt", "stuck", "doubled", "late", "short", "remote", "stranger", "error_frames", "no_bus",
@@ -41,10 +43,10 @@ class Wire:
     """Hands out the traffic when the clock has reached it, spoilt as the seed will have it.
 
     `clock` is a FakeClock, moved by waiting.  `delivered` counts what was handed over by identifier;
-    `error_frames` the bus's own; `gone` tells faults by kind.  `on_send` hears of frames that had room.
+    `error_frames` the bus's own; `gone` has the number of faults by kind.  `on_send` hears of frames that had room.
     """
 
-    def __init__(self, clock, messages: Iterator[can.Message], seed: int) -> None:
+    def __init__(self, clock: FakeClock, messages: Iterator[can.Message], seed: int) -> None:
         self.clock = clock
         self.delivered: Counter[int] = Counter()
         self.error_frames = 0

@@ -1,4 +1,4 @@
-"""`PYTHONPATH=service:tests/support python -m tests.fuzz --target NAME --seconds N --seed S`.
+"""`python -m soilbus.validation.fuzz --target NAME --seconds N --seed S`.
 
 Coverage-guided by atheris (extra `fuzz`) where it is installed; with --plain by seeded mutations
 alone.  Either way a crash, an input that takes longer than LONGEST, or memory beyond LARGEST ends
@@ -17,13 +17,16 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .mutation import mutated
+from soilbus.validation.fuzz.mutation import mutated
+
+if TYPE_CHECKING:
+    from soilbus.validation.fuzz.targets import Target
 
 LONGEST = 30
 """Seconds for one input."""
@@ -35,8 +38,8 @@ PACKAGES = ["soilbus", "cantools"]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse, fuzz, tell."""
-    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
+    """Parse, fuzz, report."""
+    parser = argparse.ArgumentParser(prog="python -m soilbus.validation.fuzz", description=__doc__)
     parser.add_argument(
         "--target", required=True, help="frames, windows, service, dbc, config, model, state, logs, log-..."
     )
@@ -48,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     guided = not chosen.plain and find_spec("atheris") is not None
     if guided and chosen.seconds > ROUND:
         return _in_rounds(chosen.target, chosen.seconds, chosen.seed, chosen.corpus)
-    targets = _instrumented() if guided else import_module("tests.fuzz.targets").TARGETS
+    targets = _instrumented() if guided else _targets()
     if chosen.target not in targets:
         parser.error(f"no target is named {chosen.target}; known: {', '.join(targets)}")
     target = targets[chosen.target]
@@ -62,22 +65,29 @@ def _in_rounds(name: str, seconds: int, seed: int, corpus: Path | None) -> int:
     folder = corpus or Path(tempfile.mkdtemp(prefix=f"soilbus-fuzz-{name}-"))
     for i, begin in enumerate(range(0, seconds, ROUND)):
         of_round = ["--seconds", str(min(ROUND, seconds - begin)), "--seed", str(seed + i), "--corpus", str(folder)]
-        code = subprocess.run([sys.executable, "-m", "tests.fuzz", "--target", name, *of_round]).returncode
+        code = subprocess.run([sys.executable, "-m", "soilbus.validation.fuzz", "--target", name, *of_round]).returncode
         print(f"{name}: round {i + 1} ended with {code}", flush=True)
         if code:
             return code
     return 0
 
 
-def _instrumented():
+def _instrumented() -> dict[str, Target]:
     """The targets with everything that they import watched for coverage."""
     import atheris
 
     with atheris.instrument_imports(include=PACKAGES):
-        return import_module("tests.fuzz.targets").TARGETS
+        return _targets()
 
 
-def _guided(name, target, seconds: int, seed: int, corpus: Path | None) -> int:
+def _targets() -> dict[str, Target]:
+    """Imported here, so that atheris can watch what they import."""
+    from soilbus.validation.fuzz.targets import TARGETS
+
+    return TARGETS
+
+
+def _guided(name: str, target: Target, seconds: int, seed: int, corpus: Path | None) -> int:
     """libFuzzer's loop, which ends the process itself and leaves its corpus in a temporary folder.
 
     Its own limit of time counts what other processes take too.
@@ -104,7 +114,7 @@ def _guided(name, target, seconds: int, seed: int, corpus: Path | None) -> int:
     return 0
 
 
-def _plain(name, target, seconds: float, seed: int) -> int:
+def _plain(name: str, target: Target, seconds: float, seed: int) -> int:
     seeds, rng = target.seeds(), np.random.default_rng(seed)
     for data in seeds:
         target.one(data)
@@ -135,7 +145,3 @@ def _plain(name, target, seconds: float, seed: int) -> int:
 
 def _too_long(signum: int, frame: object) -> None:
     raise TimeoutError(f"longer than {LONGEST} s")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

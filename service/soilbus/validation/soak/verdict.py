@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from soilbus.pipeline.outputs import TICK
-
-from .run import SLACK, Soak
+from soilbus.validation.soak.run import SLACK, Soak
 
 GROWTH = 1e6
 """Of resident memory [bytes] after the first hour that is allowed."""

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 from cantools.database import Database
 
-from fakes import FakeClock, InlineExecutor
 from soilbus.can.bus import LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
@@ -21,10 +20,10 @@ from soilbus.pipeline.outputs import TICK
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import soil_named
-
-from .books import Beat, Estimates, Hour, resident_memory, unaccounted
-from .traffic import SOIL, traffic_beside
-from .wire import Wire
+from soilbus.validation.fakes import FakeClock, InlineExecutor
+from soilbus.validation.soak.books import Beat, Estimates, Hour, resident_memory, unaccounted
+from soilbus.validation.soak.traffic import SOIL, traffic_beside
+from soilbus.validation.soak.wire import Wire
 
 HOUR = 3600.0
 SLACK = 0.03

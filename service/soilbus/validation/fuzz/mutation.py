@@ -14,7 +14,7 @@ TOKENS = (
 
 def mutated(seeds: Sequence[bytes], rng: np.random.Generator) -> bytes:
     """One of the seeds with one to eight changes."""
-    data = bytearray(seeds[rng.integers(len(seeds))])
+    data = bytearray(seeds[int(rng.integers(len(seeds)))])
     for _ in range(int(rng.integers(1, 9))):
         place = int(rng.integers(len(data) + 1))
         length = int(min(rng.geometric(0.05), len(data) - place))
@@ -32,7 +32,7 @@ def mutated(seeds: Sequence[bytes], rng: np.random.Generator) -> bytes:
             case 5:
                 data[place : place + length] = rng.bytes(length)
             case 6:
-                other = seeds[rng.integers(len(seeds))]
+                other = seeds[int(rng.integers(len(seeds)))]
                 start = int(rng.integers(len(other) + 1))
                 data[place : place + length] = other[start : start + length]
     return bytes(data)
