@@ -8,13 +8,13 @@ import pytest
 
 from soilbus.pipeline.outputs import TICK
 from soilbus.validation.soak import wire
-from soilbus.validation.soak.books import Hour
+from soilbus.validation.soak.figures import Hour
 from soilbus.validation.soak.run import Soak, soak
 from soilbus.validation.soak.verdict import GROWTH, demands
 
 
 @pytest.fixture(scope="module")
-def told():
+def shown():
     patch = pytest.MonkeyPatch()
     patch.setattr(wire, "MEAN_CALM", 6.0)
     patch.setattr(wire, "MEAN_FAULT", 2.0)
@@ -22,28 +22,28 @@ def told():
     patch.undo()
 
 
-def test_every_frame_is_accounted_for(told):
-    assert told.lost == {}
-    assert told.received == told.admitted + told.refused.total()
-    assert told.unknown > 0
-    assert {"bad_checksum", "bad_counter", "time_backwards", "wrong_length", "remote_frame"} <= set(told.refused)
+def test_every_frame_is_accounted_for(shown):
+    assert shown.lost == {}
+    assert shown.received == shown.admitted + shown.refused.total()
+    assert shown.unknown > 0
+    assert {"bad_checksum", "bad_counter", "time_backwards", "wrong_length", "remote_frame"} <= set(shown.refused)
 
 
-def test_all_faults_came(told):
-    assert set(wire.FAULTS) <= set(told.faults)
+def test_all_faults_came(shown):
+    assert set(wire.FAULTS) <= set(shown.faults)
 
 
-def test_frames_keep_their_beat(told):
-    assert told.deadline_misses == 0
-    assert told.off_beat <= told.faults["full"]  # once each: the newest frame goes out as soon as there is room
-    assert told.sent > 0.8 * 3000
-    assert abs(told.drift) < TICK / 2 * told.epochs
+def test_frames_keep_their_beat(shown):
+    assert shown.deadline_misses == 0
+    assert shown.off_beat <= shown.faults["full"]  # once each: the newest frame goes out as soon as there is room
+    assert shown.sent > 0.8 * 3000
+    assert abs(shown.drift) < TICK / 2 * shown.epochs
 
 
-def test_valid_windows_stay_right(told):
-    valid = sum(hour.valid for hour in told.hours)
+def test_valid_windows_stay_right(shown):
+    valid = sum(hour.valid for hour in shown.hours)
     assert valid > 20
-    assert max(hour.worst_z for hour in told.hours if hour.valid) < 4.0
+    assert max(hour.worst_z for hour in shown.hours if hour.valid) < 4.0
 
 
 def test_a_lost_frame_is_noticed(monkeypatch):
@@ -62,8 +62,8 @@ def _forgetful(usual):
 
 def _fine(**changed) -> Soak:
     hours = [Hour(3600, 3500, 0.0045, 0.6, 2.0, 80_000_000 + 1000 * i) for i in range(8)]
-    told = Soak(hours, 10, 9, Counter(stuck=1), 3, {}, Counter(), 0, 100, 0, 0.04, 1)
-    return told._replace(**changed)
+    shown = Soak(hours, 10, 9, Counter(stuck=1), 3, {}, Counter(), 0, 100, 0, 0.04, 1)
+    return shown._replace(**changed)
 
 
 def test_a_good_run_meets_every_demand():
@@ -89,5 +89,5 @@ def test_each_demand_can_be_missed(changed, asked):
     assert missed[0].startswith(asked)
 
 
-def test_a_short_run_cannot_tell_of_memory():
+def test_a_short_run_shows_nothing_of_memory():
     assert [demand.met for demand in demands(_fine(hours=_fine().hours[:1]))].count(None) == 2

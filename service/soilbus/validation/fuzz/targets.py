@@ -39,6 +39,26 @@ from soilbus.terra.effects.effect import Effect
 from soilbus.validation.fakes import FakeClock, InlineExecutor, ScriptedBus
 from soilbus.validation.fuzz.stream import RECORD, Fed, Known, frames_of
 
+__all__ = [
+    "ROUNDS",
+    "TARGETS",
+    "Target",
+    "check_config",
+    "check_dbc",
+    "check_frames",
+    "check_logs",
+    "check_model",
+    "check_service",
+    "check_state",
+    "check_windows",
+    "drive",
+    "good_stream",
+    "known",
+    "owner",
+    "reference",
+    "vehicle",
+]
+
 MOTORS = [f"wheel.{w}.motor_speed=Motor{w}.ShaftSpeed" for w in ("FL", "FR", "RL", "RR")]
 MOST_WINDOWS = 62
 """Per frame: a clock that is set ahead by hours costs a minute of empty windows."""
@@ -246,7 +266,7 @@ def check_model(data: bytes) -> int:
 
 
 def check_state(data: bytes) -> int:
-    """A stored state is refused with one line, as it is and sealed anew, or its Gaussian is finite and bounded."""
+    """A stored state, as it is and with a fresh checksum, is refused in one line, or its Gaussian is finite."""
     for content in (data, _sealed(data)):
         try:
             state = loaded(content, owner())

@@ -6,13 +6,13 @@ import argparse
 import time
 from collections.abc import Sequence
 
-from soilbus.validation.soak.books import Hour
+from soilbus.validation.soak.figures import Hour
 from soilbus.validation.soak.run import HOUR, soak
 from soilbus.validation.soak.verdict import demands
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run, print an hour a line, then the books and what was asked of them; 1 where a demand is missed."""
+    """Run, print an hour a line, then the counts and what was asked of them; 1 where a demand is missed."""
     parser = argparse.ArgumentParser(prog="python -m soilbus.validation.soak", description=__doc__)
     parser.add_argument("--hours", type=float, default=24.0, help="simulated (24)")
     parser.add_argument("--seed", type=int, default=1, help="picks noise and faults (1)")
@@ -29,12 +29,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"  {hour.worst_z:5.1f}  {hour.memory / 1e6:8.2f} MB", flush=True,
         )  # fmt: skip
 
-    told = soak(chosen.hours * HOUR, chosen.seed, show)
-    print(f"{told.received} frames received = {told.admitted} admitted + {dict(told.refused)} refused;")
+    found = soak(chosen.hours * HOUR, chosen.seed, show)
+    print(f"{found.received} frames received = {found.admitted} admitted + {dict(found.refused)} refused;")
     print(
-        f"{told.unknown} of other identifiers; faults {dict(told.faults)}; {time.perf_counter() - begin:.0f} s in all"
+        f"{found.unknown} of other identifiers; faults {dict(found.faults)}; {time.perf_counter() - begin:.0f} s in all"
     )
-    results = demands(told)
-    for asked, found, met in results:
-        print(f"{'too short to tell' if met is None else 'holds' if met else 'MISSED'}: {asked}: {found}")
+    results = demands(found)
+    for asked, result, met in results:
+        print(f"{'too short' if met is None else 'holds' if met else 'MISSED'}: {asked}: {result}")
     return int(not all(met is not False for _, _, met in results))

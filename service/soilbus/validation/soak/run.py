@@ -21,7 +21,7 @@ from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import soil_named
 from soilbus.validation.fakes import FakeClock, InlineExecutor
-from soilbus.validation.soak.books import Beat, Estimates, Hour, resident_memory, unaccounted
+from soilbus.validation.soak.figures import Beat, Estimates, Hour, resident_memory, unaccounted
 from soilbus.validation.soak.traffic import SOIL, traffic_beside
 from soilbus.validation.soak.wire import Wire
 
@@ -36,7 +36,7 @@ memory goes back once a minute and what one window needs comes and goes."""
 class Soak(NamedTuple):
     """What a run showed: hours (the last may be short), frames received, admitted, refused by reason, unknown,
     lost (by message), faults by kind, deadline misses, ten-hertz frames sent and how many left their beat,
-    how far [s] that shifted altogether, and how often windows were counted anew, to which it is brought into step."""
+    how far [s] that shifted altogether, and how often the numbering of windows restarted, which the beat follows."""
 
     hours: list[Hour]
     received: int
@@ -81,10 +81,10 @@ def soak(duration: float, seed: int, each_hour: Callable[[Hour], None] = lambda 
         hours.append(estimates.hour(int(kept)))
         each_hour(hours[-1])
     service.intake.ingest()
-    return _told(service, wire, database, hours, beat)
+    return _shown(service, wire, database, hours, beat)
 
 
-def _told(service: Service, wire: Wire, database: Database, hours: list[Hour], beat: Beat) -> Soak:
+def _shown(service: Service, wire: Wire, database: Database, hours: list[Hour], beat: Beat) -> Soak:
     counts = service.intake.admission.counts
     names = {m.frame_id: m.name for m in database.messages}
     delivered: Counter[str] = Counter()

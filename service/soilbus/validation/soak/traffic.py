@@ -54,9 +54,9 @@ def traffic(config: Config, seed: int) -> Iterator[can.Message]:
     Each sensor has one gain error for good and new noise in each lap.
     """
     scenario = Scenario(LAP, (Patch(0.0, SOIL),), draft=Swing(1500.0, 5000.0))
-    told = _with_gains(drive(config, scenario, seed), config, seed)
+    driven = _with_gains(drive(config, scenario, seed), config, seed)
     for lap in _laps():
-        recording = Recording(told.columns, measure(told, _without_gains(config), _seed(seed, lap)), seed)
+        recording = Recording(driven.columns, measure(driven, _without_gains(config), _seed(seed, lap)), seed)
         yield from frames(recording, config, start=START_TIME + lap * LAP)
 
 

@@ -14,35 +14,35 @@ WORSE = 1.3
 FARTHEST = 5.0
 """Standard deviations that no valid window may be off, of some thousands an hour."""
 LEAST_HOURS = 2
-"""Fewer tell nothing of what grows or drifts."""
+"""Fewer do not show what grows or drifts."""
 
 
 class Demand(NamedTuple):
-    """What was asked, what was found, and whether that will do; None where the run was too short to tell."""
+    """What was asked, what was found, and whether that will do; None where the run was too short."""
 
     asked: str
     found: str
     met: bool | None
 
 
-def demands(told: Soak) -> list[Demand]:
+def demands(shown: Soak) -> list[Demand]:
     """All of them, with what a run showed."""
-    hours = [hour for hour in told.hours if hour.valid]
-    long_enough = len(told.hours) >= LEAST_HOURS and len(hours) >= LEAST_HOURS
-    growth = max(hour.memory for hour in told.hours) - told.hours[0].memory
+    hours = [hour for hour in shown.hours if hour.valid]
+    long_enough = len(shown.hours) >= LEAST_HOURS and len(hours) >= LEAST_HOURS
+    growth = max(hour.memory for hour in shown.hours) - shown.hours[0].memory
     part = max(len(hours) // 4, 1)
     first, last = (sum(hour.error for hour in some) / part for some in (hours[:part], hours[-part:]))
     farthest = max((hour.worst_z for hour in hours), default=float("inf"))
     return [
         Demand(
-            "every frame accounted for", f"lost {told.lost or 'none'} of {told.received}",
-            not told.lost and told.received == told.admitted + told.refused.total(),
+            "every frame accounted for", f"lost {shown.lost or 'none'} of {shown.received}",
+            not shown.lost and shown.received == shown.admitted + shown.refused.total(),
         ),
-        Demand("no deadline missed", f"{told.deadline_misses} missed", told.deadline_misses == 0),
-        Demand("every frame on its beat", f"{told.off_beat} of {told.sent} off it", told.off_beat == 0 < told.sent),
+        Demand("no deadline missed", f"{shown.deadline_misses} missed", shown.deadline_misses == 0),
+        Demand("every frame on its beat", f"{shown.off_beat} of {shown.sent} off it", shown.off_beat == 0 < shown.sent),
         Demand(
-            "the beat drifts with the windows' ends only", f"{told.drift:+.3f} s in {told.epochs} beginnings",
-            abs(told.drift) <= TICK / 2 * told.epochs + SLACK,
+            "the beat drifts with the windows' ends only", f"{shown.drift:+.3f} s in {shown.epochs} beginnings",
+            abs(shown.drift) <= TICK / 2 * shown.epochs + SLACK,
         ),
         Demand(
             f"memory grows by at most {GROWTH / 1e6:g} MB after the first hour", f"{growth / 1e6:+.2f} MB",
