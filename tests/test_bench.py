@@ -99,7 +99,7 @@ def test_a_missed_target_says_so(value, at_most, aim, met):
 @pytest.mark.parametrize("known", window.EXACT_AND_ROUGH)
 def test_least_squares_has_the_same_problem_and_our_fit_its_optimum(name, known):
     """The peer's residuals are written out on their own; here with scipy's exact end instead of a quick one."""
-    problem = window._window(name, *known)
+    problem = window.window_of(name, *known)
     exact, rough = known
     assert [*np.array(["k_c", "k_phi", "n", "phi", "c", "K"])[problem.prior.free]] == [
         x for x in ("k_c", "k_phi", "n", "phi", "c", "K") if x != exact
@@ -151,7 +151,7 @@ def test_an_unwritable_place_is_told_before_the_long_work(tmp_path, monkeypatch,
 
 def test_windows_grow_as_they_are_said_to():
     for wheels in (1, 2, 8):
-        for (problem, _), length in zip(growth._problems(wheels), growth.WINDOW_LENGTHS, strict=True):
+        for (problem, _), length in zip(growth.problems(wheels), growth.WINDOW_LENGTHS, strict=True):
             assert (problem.n, problem.n_wheels) == (10 * length, wheels)
             assert problem.n_rows == problem.n * (2 * wheels + 1)  # torque and sinkage of each wheel, one balance
 

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 
 from soilbus.cli.main import main
-from soilbus.pipeline.intake import EDGE_LEAD
 from soilbus.validation.bench.bus_ear import latencies, until_middle
-from soilbus.validation.bench.bus_load import FULL_BUS_RATE, MAPPED_SHARE, Traffic
+from soilbus.validation.bench.bus_load import Traffic
 
 
 def test_latency_is_from_the_last_mapped_frame_of_the_window():
     mapped = 5.0 + np.arange(0.0, 14.0, 0.3)
-    end = 5.0 - EDGE_LEAD + 10.0 + np.arange(4.0)
-    last = [mapped[mapped < e][-1] for e in end]
+    end = 5.0 + 10.0 + np.arange(4.0)
+    last = [mapped[mapped < e - 0.001][-1] for e in end]  # a frame at the very end is of the next window
     told = np.array([0.01, 0.2, 0.03, 0.04])
     results = np.column_stack([last + told, np.arange(4.0)])
     assert latencies(mapped, results, 10.0, 1.0) == pytest.approx(told)
@@ -25,14 +24,14 @@ def test_latency_is_from_the_last_mapped_frame_of_the_window():
 @pytest.mark.parametrize("now", [5.0, 14.2, 14.4951, 15.0, 222.7])
 def test_an_onlooker_listens_between_two_windows(now):
     looks = now + until_middle(now, 5.0, 10.0, 1.0)
-    ends = 5.0 - EDGE_LEAD + 10.0 + np.arange(-20.0, 300.0)
+    ends = 5.0 + 10.0 + np.arange(-20.0, 300.0)
     assert now <= looks < now + 1.0
-    assert np.abs(ends - looks).min() == pytest.approx(0.5)
+    assert np.abs(ends - looks).min() == pytest.approx(0.5, abs=0.01)
 
 
 def test_window_numbers_go_round():
     mapped = np.arange(0.0, 270.0, 0.01)
-    end = -EDGE_LEAD + 10.0 + np.arange(255.0)
+    end = 10.0 + np.arange(255.0)
     results = np.column_stack([end + 0.5, np.arange(255) % 251])
     late = latencies(mapped, results, 10.0, 1.0)
     assert len(late) == 255
@@ -40,10 +39,9 @@ def test_window_numbers_go_round():
 
 
 def test_a_tenth_of_a_full_bus_is_ours():
-    played = Traffic("nowhere", 4.0)._played
-    assert len(played) / 4.0 == pytest.approx(FULL_BUS_RATE * MAPPED_SHARE, rel=0.03)
+    played = Traffic("nowhere", 4.0).played
+    bits = 0.1 * 1e6 / (len(played) / 4.0)  # of a frame, if these are a tenth of 1 Mbit/s
     assert [t for t, _ in played] == sorted(t for t, _ in played)
-    bits = 1e6 / FULL_BUS_RATE
     assert 131.0 < bits < 131.0 * 1.2  # an extended frame of 8 bytes, its least with some stuff bits
 
 

@@ -13,17 +13,9 @@ from scipy.optimize import brentq, minimize_scalar
 from drawn import assessed as assessed_within
 from drawn import by_draws, figures
 from soilbus.decision import capability as assessment
-from soilbus.decision.balance import LEVEL, Duty, balance
+from soilbus.decision.balance import Duty, balance
 from soilbus.decision.capability import Demand, assess, slip_grid
-from soilbus.decision.sigma_points import (
-    DRAWS,
-    LEADING_DIRECTIONS,
-    SigmaPoints,
-    estimates,
-    likely,
-    mean_and_std,
-    normals,
-)
+from soilbus.decision.sigma_points import SigmaPoints, estimates, likely, mean_and_std, normals
 from soilbus.decision.wheels import WheelTable, wheel_table
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import fit_window
@@ -43,7 +35,7 @@ NO_LIMIT = np.full(4, np.nan)
 GRID = slip_grid(0.6)
 NAMES = ("loam", "wet_clay", "clayey_soil_38", "dry_sand", "sandy_loam_22")
 DUTIES = {
-    "level": LEVEL,
+    "level": Duty(),
     "grade": Duty(0.0, None),
     "grade with draft": Duty(1500.0, None),
     "on a slope": Duty(None, 0.08),
@@ -80,7 +72,7 @@ def test_the_balance_equals_brute_force(name, duty):
 def test_a_draft_at_the_height_of_the_centre_of_gravity_is_like_a_grade():
     high = dataclasses.replace(RIG, chassis=dataclasses.replace(RIG.chassis, hitch_height=0.75))
     table = wheel_table(np.array([SOILS["loam"]]), high, MODEL, GRID)
-    level, graded = (balance(table, duty).pull[0] for duty in (LEVEL, Duty(0.0, None)))
+    level, graded = (balance(table, duty).pull[0] for duty in (Duty(), Duty(0.0, None)))
     second_order = (level / WEIGHT) ** 2 / 2.0  # the slope presses a little less on the ground
     assert np.all(np.abs(graded - level) < 2.0 * second_order * WEIGHT + 1.0)
     low = balance(table_of(SOILS["loam"])).pull[0]
@@ -155,7 +147,7 @@ def test_a_vehicle_whose_wheels_all_roll_must_be_pulled():
 
 
 @pytest.mark.parametrize("name", ["loam", "wet_clay", "sandy_loam_22"])
-@pytest.mark.parametrize("duty", [LEVEL, Duty(0.0, None)], ids=["level", "grade"])
+@pytest.mark.parametrize("duty", [Duty(), Duty(0.0, None)], ids=["level", "grade"])
 def test_torque_limit_is_met_exactly(name, duty):
     soil = SOILS[name]
     low, high = (brute(soil, s, *duty)[1][2, WHEELS] for s in (0.02, 0.6))
@@ -170,7 +162,7 @@ def test_torque_limit_is_met_exactly(name, duty):
             return (brute(soil, slip, *duty)[1][2, WHEELS] / limit)[known].max() - 1.0
 
         pull = brute(soil, brentq(usage, 0.02, 0.6, xtol=1e-5), *duty)[0]
-        found = able.max_draft.value if duty == LEVEL else WEIGHT * math.sin(able.max_grade.value)
+        found = able.max_draft.value if duty == Duty() else WEIGHT * math.sin(able.max_grade.value)
         assert found == pytest.approx(pull, abs=2e-4 * WEIGHT)
 
 
@@ -267,11 +259,12 @@ def test_torque_over_slip_is_that_of_equation_22():
 
 @pytest.mark.parametrize("n", range(10))
 def test_draws_have_the_moments_of_standard_normals(n):
-    leading = min(n, LEADING_DIRECTIONS)
+    leading = min(n, 3)
     z = normals(n, leading)
-    assert z.shape == (DRAWS, n)
+    assert z.shape[1] == n
+    assert 100 <= len(z) <= 500
     assert np.allclose(z[1::2], -z[::2])
-    assert np.allclose(z.T @ z / DRAWS, np.eye(n))
+    assert np.allclose(z.T @ z / len(z), np.eye(n))
     expected = {0: 1.0, 1: 0.0, 2: 1.0, 3: 0.0, 4: 3.0, 5: 0.0}
     for powers in itertools.product(range(6), repeat=leading):
         if sum(powers) <= 5:
@@ -280,7 +273,7 @@ def test_draws_have_the_moments_of_standard_normals(n):
     assert np.abs(z).max(initial=0.0) < 4.0
 
 
-@pytest.mark.parametrize("leading", range(1, LEADING_DIRECTIONS + 1))
+@pytest.mark.parametrize("leading", range(1, 4))
 def test_the_surface_is_exact_for_polynomials(leading):
     root = np.diag([0.3, 0.2, 0.1, 0.0, 0.0, 0.0][:leading] + [0.0] * (6 - leading))
     points = SigmaPoints.of(Posterior(SOILS["loam"], root @ root))

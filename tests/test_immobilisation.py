@@ -12,10 +12,6 @@ from hypothesis import strategies as st
 
 from soilbus.decision.capability import OverSlip
 from soilbus.decision.immobilisation import (
-    LONGEST_GAP,
-    SETTLING_TIME,
-    WARNING_HOLD,
-    WARNING_TIME,
     Alert,
     Capacity,
     Demand,
@@ -27,7 +23,6 @@ from soilbus.simulator.drive import drive as driven
 from soilbus.simulator.reference import reference_configuration
 from soilbus.validation import boggings, firm_drives
 from soilbus.validation.bogging_trials import (
-    REACTION_TIME,
     Observation,
     Task,
     WarningTrial,
@@ -43,6 +38,9 @@ from soilbus.validation.bogging_trials import (
 CONFIG = reference_configuration()
 SLIP = np.linspace(0.02, 0.6, 9)
 MOST = 6000.0
+AHEAD, SETTLED, GAP, REACTION = 10.0, 2.0, 1.0, 1.0
+"""Seconds: a driver who still has this long is not warned yet; a trend is looked at no sooner; inputs may be silent for
+no longer; and nobody, nor any filter, answers sooner."""
 
 
 def pull_at(slip):
@@ -82,9 +80,9 @@ def test_ground_that_weakens_steadily_is_foreseen_to_the_second(rate):
     out = drive(lambda t: 3000.0, lambda t: rate * t)
     end = (MOST - 3000.0) / rate
     assert out[-1][0] == pytest.approx(end, abs=0.3)
-    assert first_warning(out) == pytest.approx(max(end - WARNING_TIME, SETTLING_TIME), abs=0.5)
+    assert first_warning(out) == pytest.approx(max(end - AHEAD, SETTLED), abs=0.5)
     for t, state in out:
-        if t > SETTLING_TIME and t < end - 0.2:
+        if t > SETTLED and t < end - 0.2:
             assert state.time_left == pytest.approx(end - t, rel=0.1, abs=0.3)
 
 
@@ -92,12 +90,12 @@ def test_ground_that_weakens_steadily_is_foreseen_to_the_second(rate):
 def test_a_draft_that_outgrows_the_ground_is_foreseen(rate):
     out = drive(lambda t: 2500.0 + rate * t)
     end = (MOST - 2500.0) / rate
-    assert 3.0 < end - first_warning(out) < WARNING_TIME + 1.0
+    assert 3.0 < end - first_warning(out) < AHEAD + 1.0
 
 
 def test_an_easy_draft_that_comes_and_goes_is_no_cause():
     out = drive(lambda t: 2600.0 + 1200.0 * math.sin(0.6 * t), until=300.0)
-    assert {state.warning for t, state in out if t > SETTLING_TIME + 0.1} == {Alert.NONE}
+    assert {state.warning for t, state in out if t > SETTLED + 0.1} == {Alert.NONE}
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -109,7 +107,7 @@ def test_a_hard_draft_that_swings_is_no_cause_however_new_its_peaks(seed):
     swing = np.sin(rate * t[:, None] + phase).sum(axis=1)
     share = 0.1 + 0.68 * (swing - swing.min()) / np.ptp(swing)
     out = drive(lambda now: MOST * share[round(10.0 * now)], until=120.0)
-    assert {state.warning for t, state in out if t > SETTLING_TIME + 0.1} == {Alert.NONE}
+    assert {state.warning for t, state in out if t > SETTLED + 0.1} == {Alert.NONE}
 
 
 def test_a_swinging_draft_that_outgrows_the_ground_is_foreseen():
@@ -134,7 +132,7 @@ def test_slip_that_grows_as_the_vehicle_speeds_up_does_not_creep():
         lambda t: 1000.0, inertia=lambda t: 480.0 * min(max(t - 10.0, 0.0), 10.0) if t < 21.0 else 0.0, until=40.0
     )
     ends = [(0.6 - line.value) / line.slope for _, state in out[10:] if (line := state.slip.line()).slope > 0.0]
-    assert min(ends) < WARNING_TIME
+    assert min(ends) < AHEAD
     assert first_warning(out) == math.inf
 
 
@@ -180,12 +178,12 @@ def test_slip_beyond_the_greatest_warns_whatever_the_trend_says():
 
 def test_nothing_is_said_before_a_trend_has_settled_or_without_inputs():
     settled = drive(lambda t: 2000.0, until=10.0)
-    assert all(state.warning is Alert.UNKNOWN for t, state in settled if t < SETTLING_TIME - 0.01)
+    assert all(state.warning is Alert.UNKNOWN for t, state in settled if t < SETTLED - 0.01)
     t, state = settled[-1]
     assert state.warning is Alert.NONE
     for slips, pull, curve in (([None, None], 1.0, CURVE), ([0.1], None, CURVE), ([0.1], 1.0, None), ([], 1.0, CURVE)):
         assert watched(state, t + 0.1, slips, pull, curve) == state  # a gap may be short
-        later = watched(state, t + LONGEST_GAP + 0.1, slips, pull, curve)
+        later = watched(state, t + GAP + 0.1, slips, pull, curve)
         assert later == Watch(peaks=state.peaks, asked=state.asked)
         assert later.warning is Alert.UNKNOWN
     assert watched(state, t - 5.0, [0.1], 2000.0, CURVE).warning is Alert.UNKNOWN
@@ -215,8 +213,8 @@ def test_a_warning_stays_a_while():
     out = drive(lambda t: 3000.0 if t < 9.0 else 500.0, lambda t: 250.0 * min(t, 9.0), until=30.0)
     warned = [t for t, state in out if state.warning is Alert.IMMOBILISATION]
     assert warned[0] < 9.0
-    causes = [t for t, state in out if state.time_left is not None and state.time_left < WARNING_TIME]
-    assert max(warned) == pytest.approx(max(causes) + WARNING_HOLD, abs=0.11)
+    causes = [t for t, state in out if state.time_left is not None and state.time_left < AHEAD]
+    assert max(warned) == pytest.approx(max(causes) + 5.0, abs=1.0)
 
 
 def test_a_new_curve_is_no_new_ground():
@@ -267,7 +265,7 @@ def test_slip_that_creeps_under_a_steady_draft_is_foreseen_where_pull_hardly_dep
         if state.warning is Alert.IMMOBILISATION:
             first = t
             break
-    assert 25.0 - first == pytest.approx(WARNING_TIME, abs=1.0)  # slip passes 0.6 at 25 s
+    assert 25.0 - first == pytest.approx(AHEAD, abs=1.0)  # slip passes 0.6 at 25 s
 
 
 def test_wheels_that_all_but_roll_tell_nothing_of_the_ground():
@@ -310,7 +308,7 @@ def test_whatever_comes_there_is_an_answer_and_silence_is_never_all_clear(moment
         with np.errstate(all="ignore"):
             state = watched(state, t, slips, pull, CURVE if known else None)
         seen = t if usable else seen
-        if not 0.0 <= t - seen <= LONGEST_GAP:
+        if not 0.0 <= t - seen <= GAP:
             assert state.warning is Alert.UNKNOWN
         assert state.time_left is None or state.time_left >= 0.0
 
@@ -343,7 +341,7 @@ def test_the_lead_is_that_of_the_last_warning_that_holds_until_the_end():
 def test_a_curve_counts_from_the_end_of_its_window_on():
     for known in (10.0, 13.0):
         t, warned = watch(observation([(0.0, 30.0, 0.65)], [(known, CURVE)], 30.0))
-        assert t[np.argmax(warned)] == pytest.approx(known + SETTLING_TIME, abs=0.051)
+        assert t[np.argmax(warned)] == pytest.approx(known + SETTLED, abs=0.051)
 
 
 def test_only_what_the_service_calls_valid_gives_a_curve(monkeypatch):
@@ -392,7 +390,7 @@ def test_a_simulated_bogging_is_foreseen(kind, seed):
 
 def test_at_the_edge_of_a_soft_patch_the_warning_comes_as_soon_as_it_can_be_felt():
     found = trial(Task(CONFIG, "patch", 4))
-    assert found.lead > found.possible - REACTION_TIME
+    assert found.lead > found.possible - REACTION
     assert found.warnings == 1
 
 

@@ -26,7 +26,7 @@ class _Deaf(BaseProcess):
     def start(self) -> None:
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            with _undisturbed():  # a process half started would complain of what it was not told
+            with _undisturbed():  # a process half started would complain of what it does not know
                 super().start()
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -8,7 +8,6 @@ import tracemalloc
 import can
 import pytest
 
-from soilbus.can.log_lines import LONGEST_LINE
 from soilbus.offline.replay import LogError, read_frames
 
 N = 300
@@ -30,7 +29,7 @@ def test_a_line_without_end_is_damage_and_takes_no_memory(kind, tmp_path):
     before = []
     tracemalloc.start()
     try:
-        with pytest.raises(LogError, match=f"a line of more than {LONGEST_LINE} characters"):
+        with pytest.raises(LogError, match=r"a line of more than \d+ characters"):
             before.extend(read_frames(path))
         assert tracemalloc.get_traced_memory()[1] < 8 * 2**20
     finally:

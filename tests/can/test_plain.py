@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from hypothesis import strategies as st
 
 from soilbus.can.admission import Admission
 from soilbus.can.channels import Channel, Decoded
+from soilbus.can.inbox import Inbox, inbox_of
 
 LENGTH = 8
 
@@ -29,14 +32,18 @@ def channel(name: str, **more: Any) -> Channel:
     return Channel(quantity=name, wheel="", message="M", signal=name, **limits)
 
 
-def admission(signals: list[Signal], channels: list[Channel]) -> Admission:
-    return Admission(channels, Database([Message(1, "M", LENGTH, signals)]))
+def message(signals: list[Signal]) -> Message:
+    return Message(1, "M", LENGTH, signals)
 
 
-def taken(a: Admission, payloads: list[bytes], detailed: bool = False) -> Decoded:
-    for inbox in a._inboxes:
-        if detailed:
-            inbox.plain = None
+def inbox(signals: list[Signal], channels: list[Channel]) -> Inbox:
+    return inbox_of(message(signals), channels, is_open=False, checked=False)
+
+
+def taken(signals: list[Signal], channels: list[Channel], payloads: list[bytes], detailed: bool = False) -> Decoded:
+    """What an admission makes of the payloads; detailed: without the short way."""
+    with mock.patch("soilbus.can.inbox.plain_plan", return_value=None) if detailed else nullcontext():
+        a = Admission(channels, Database([message(signals)]))
     for i, payload in enumerate(payloads):
         a.feed(0.01 * i, 1, False, payload)
     return a.take()
@@ -96,7 +103,7 @@ def test_samples_equal_those_judged_one_channel_at_a_time(
     # few different codes, so that whole batches of good ones occur
     byte = st.sampled_from(data.draw(st.lists(st.integers(0, 255), min_size=1, max_size=4)))
     payloads = data.draw(st.lists(st.lists(byte, min_size=LENGTH, max_size=LENGTH).map(bytes), min_size=1, max_size=6))
-    assert_same(taken(admission(*case), payloads), taken(admission(*case), payloads, detailed=True))
+    assert_same(taken(*case, payloads), taken(*case, payloads, detailed=True))
 
 
 @pytest.mark.parametrize(
@@ -112,11 +119,11 @@ def test_samples_equal_those_judged_one_channel_at_a_time(
 def test_plain_codes_are_the_longest_run_of_admitted_ones(
     length: int, more: dict[str, Any], limits: dict[str, float]
 ) -> None:
-    a = admission([signal("S", 0, length, **more)], [channel("S", **limits)])
-    plan, decoder = a._inboxes[0].plain, a._inboxes[0].decoder
+    case = [signal("S", 0, length, **more)], [channel("S", **limits)]
+    plan, decoder = inbox(*case).plain, inbox(*case).decoder
     payloads = [code.to_bytes(LENGTH, "little") for code in range(1 << length)]
     raw = decoder.raw(np.frombuffer(b"".join(payloads), np.uint8).reshape(-1, LENGTH))["S"]
-    admitted = set(raw[np.round(taken(a, payloads, detailed=True).columns["S"].t * 100).astype(int)].tolist())
+    admitted = set(raw[np.round(taken(*case, payloads, detailed=True).columns["S"].t * 100).astype(int)].tolist())
     runs = [[c] for c in admitted if c - 1 not in admitted]
     for run in runs:
         while run[-1] + 1 in admitted:
@@ -129,19 +136,19 @@ def test_plain_codes_are_the_longest_run_of_admitted_ones(
 
 
 def test_good_batches_take_the_short_way() -> None:
-    a = admission([signal("S", 0, 16), signal("T", 32, 16)], [channel("S"), channel("T", factor=2.0)])
-    plan = a._inboxes[0].plain
+    box = inbox([signal("S", 0, 16), signal("T", 32, 16)], [channel("S"), channel("T", factor=2.0)])
+    plan = box.plain
     assert plan is not None
-    blocks = a._inboxes[0].decoder.blocks(np.array([[1, 0, 0xFF, 0xFF, 2, 0, 0xFF, 0xFF]], np.uint8))
+    blocks = box.decoder.blocks(np.array([[1, 0, 0xFF, 0xFF, 2, 0, 0xFF, 0xFF]], np.uint8))
     samples = plan.samples(blocks)
     assert samples is not None
     assert {name: v.tolist() for name, v in samples.items()} == {"S": [1.0], "T": [4.0]}
-    assert plan.samples(a._inboxes[0].decoder.blocks(np.full((1, LENGTH), 0xFF, np.uint8))) is None
+    assert plan.samples(box.decoder.blocks(np.full((1, LENGTH), 0xFF, np.uint8))) is None
 
 
 def test_floats_and_multiplexed_signals_have_no_short_way() -> None:
     real = signal("F", 0, 32, is_float=True, is_signed=True)
-    assert admission([real], [channel("F")])._inboxes[0].plain is None
+    assert inbox([real], [channel("F")]).plain is None
     selector = Signal("Mux", 0, 8, is_multiplexer=True)
     child = Signal("Child", 8, 8, multiplexer_ids=[1], multiplexer_signal="Mux")
-    assert admission([selector, child], [channel("Child")])._inboxes[0].plain is None
+    assert inbox([selector, child], [channel("Child")]).plain is None

@@ -7,8 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from soilbus.can.wire import STAMPED
-from soilbus.daemon.bus_time import CLOSE_DELAY, TAKING_DELAY, BusTime
+from soilbus.daemon.bus_time import BusTime
 
 STAMP, NOW = 1.7e9, 500.0
 END = STAMP + 0.5
@@ -47,9 +46,12 @@ def test_the_monotonic_clock_goes_on_where_the_stamps_end(of_bus):
 
 
 def test_a_bus_that_cannot_tell_has_grace(of_bus):
-    assert of_bus.heard(END, NOW + 0.5) == pytest.approx(STAMP + 0.3 - CLOSE_DELAY)
-    of_bus.took_nothing(NOW + 0.5 + CLOSE_DELAY)
-    assert of_bus.heard(END, NOW + 0.5 + CLOSE_DELAY) >= END
+    """Frames may come a tenth of a second late; a quarter after its end a window is closed."""
+    assert STAMP < of_bus.heard(END, NOW + 0.5) < STAMP + 0.3
+    of_bus.took_nothing(NOW + 0.6)
+    assert of_bus.heard(END, NOW + 0.6) < END
+    of_bus.took_nothing(NOW + 0.75)
+    assert of_bus.heard(END, NOW + 0.75) >= END
 
 
 def test_a_bus_that_can_tell_has_none(of_bus, bus):
@@ -64,13 +66,13 @@ def test_a_clock_that_was_set_ends_no_window_that_has_not(of_bus, bus, step):
     bus.until = STAMP + 0.4 + step
     for now in (0.4, 0.48):
         assert of_bus.heard(END, NOW + now) < END
-    assert of_bus.heard(END, NOW + 0.495) <= END - 0.005 + TAKING_DELAY
+    assert of_bus.heard(END, NOW + 0.495) <= END + 0.01
 
 
 def test_nobody_sleeps_past_an_end_that_the_bus_can_tell(of_bus, bus):
     assert of_bus.wait(END, NOW + 0.49, 0.02) == 0.02
     bus.present = END - 0.007
-    assert of_bus.wait(END, NOW + 0.49, 0.02) == pytest.approx(0.007 + STAMPED, abs=1e-6)
+    assert 0.007 < of_bus.wait(END, NOW + 0.49, 0.02) < 0.009  # a frame needs up to a millisecond to the socket
     assert of_bus.wait(END, NOW + 0.49, 0.003) == 0.003
     assert of_bus.wait(END, NOW + 0.40, 0.02) == 0.02  # far off: the bus is not even asked
     bus.present = END + 3600.0

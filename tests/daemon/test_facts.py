@@ -13,7 +13,6 @@ import can
 import numpy as np
 import pytest
 
-from feeding import feed_message
 from in_vain import (
     STANDS,
     TRIES,
@@ -27,11 +26,7 @@ from in_vain import (
     with_a_soft_side,
     with_weak_motors,
 )
-from soilbus.can.bus import LiveBus
-from soilbus.can.dbc_files import load_databases, output_database
-from soilbus.can.publish import Publisher
-from soilbus.daemon.notify import Notifier
-from soilbus.daemon.service import Service
+from soilbus.can.dbc_files import load_databases
 from soilbus.decision.traversability import State, Status
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
@@ -39,10 +34,10 @@ from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.sensors import measure
-from soilbus.validation.fakes import FakeClock, InlineExecutor, ScriptedBus
+from soilbus.validation.fakes import Bench, ScriptedBus, feed_message
 
 CONFIG = reference_configuration()
-IN, OUT = load_databases(CONFIG), output_database(CONFIG)
+IN = load_databases(CONFIG)
 
 
 def replayed(messages: Iterable[can.Message], config=CONFIG, database=IN) -> list[WindowResult]:
@@ -58,22 +53,15 @@ def replayed(messages: Iterable[can.Message], config=CONFIG, database=IN) -> lis
 
 def live(messages: list[can.Message]) -> list[tuple[float, str, dict]]:
     """(time of the drive [s], name, signals) of what the service sends."""
-    clock = FakeClock()
-    start = messages[0].timestamp
-    wire = ScriptedBus(clock, messages, start=start)
-    bus = LiveBus(lambda: wire, clock, clock.sleep)
-    service = Service(
-        CONFIG, Pipeline(CONFIG, IN), bus, Publisher(OUT), Notifier(), InlineExecutor(), clock, waiting=clock.wait_for
-    )  # fmt: skip
-    end = 1000.0 + messages[-1].timestamp - start
-    while clock.now < end:
-        service.step()
-    sent = []
-    for at, message in wire.sent:
-        name = OUT.get_message_by_frame_id(message.arbitration_id).name
-        if name in ("Traversability", "DemandForecast", "DraftCapability"):
-            sent.append((at - 1000.0 + start, name, OUT.decode_message(message.arbitration_id, bytes(message.data))))
-    return sent
+    bench, start = Bench(config=CONFIG, pipeline=Pipeline(CONFIG, IN)), messages[0].timestamp
+    bench.wire = ScriptedBus(bench.clock, messages, start)
+    began = bench.run(messages[-1].timestamp - start)
+    sent = [
+        (frame["at"] - began + start, name, frame)
+        for name in ("Traversability", "DemandForecast", "DraftCapability")
+        for frame in bench.sent(name)
+    ]
+    return sorted(sent, key=lambda frame: frame[0])
 
 
 def states(sent, name="Traversability", signal="State"):

@@ -6,30 +6,32 @@ import errno
 import itertools
 import logging
 import re
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 
 import can
 import pytest
 
-from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
-from soilbus.can.publish import Publisher
-from soilbus.daemon.exception_guard import FAILURES_TO_FAULT
-from soilbus.daemon.health import MAX_SOLVE_TIME, MAX_TIME_WITHOUT_SEND, Health
-from soilbus.daemon.service import Service
+from soilbus.daemon.health import Health
+from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.pipeline import Pipeline
-from soilbus.simulator.frames import frames
-from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
-from soilbus.simulator.scenario import excited
-from soilbus.validation.fakes import FakeClock, InlineExecutor, ScriptedBus
+from soilbus.validation.fakes import Bench, FakeClock, HeldExecutor, drive_messages
 
 WINDOW = 8.0
 CONFIG = reference_configuration([f"estimator.window={WINDOW}"])
 DATABASE = load_databases(CONFIG)
 OUT = output_database(CONFIG)
 WATCHDOG = 10.0
+HARD_WINDOW = 18.0
+"""Seconds that a window may take: a slow machine's hardest take a few."""
+FULL_BUS = 28.0
+"""Seconds for which nothing of ours may find room on a bus that is full."""
+AT_LEAST = 4.0
+"""Seconds beyond these and systemd's patience within which what hangs is restarted."""
+SEVERAL = 3
+"""Windows in a row that fail by a defect before the service reports a fault: one may be of bad luck."""
 
 
 @dataclass
@@ -53,19 +55,10 @@ class Systemd:
         return max(b - a for a, b in itertools.pairwise(fed)) > WATCHDOG
 
 
-class Worker(InlineExecutor):
-    """Does the work at once, or never."""
-
-    hangs = False
-
-    def submit(self, fn, /, *args, **kwargs):
-        return Future() if self.hangs else super().submit(fn, *args, **kwargs)
-
-
 @pytest.fixture(scope="module")
 def drive():
     """Frames of a good drive."""
-    return list(frames(simulate(CONFIG, excited("loam", 16.0), seed=3), CONFIG))
+    return drive_messages(CONFIG, 16.0)
 
 
 @pytest.fixture(scope="module")
@@ -74,40 +67,25 @@ def moments(drive):
     return [m for m in drive if m.timestamp < drive[0].timestamp + 4.0]
 
 
-class Bench:
-    """A service with these frames, or with them over and over for so many seconds."""
+class WatchedBench(Bench):
+    """A service that systemd watches, with these frames, or with them over and over for so many seconds."""
 
     def __init__(self, moments, seconds: float = 0.0, worker: Executor | None = None) -> None:
-        self.clock, self.away = FakeClock(), False
-        self.systemd = Systemd(self.clock)
-        self.wire = ScriptedBus(self.clock, list(over_and_over(moments, seconds)) if seconds else moments)
-        pipeline = Pipeline(CONFIG, DATABASE)
-        self.estimator = pipeline.estimator
-        bus = LiveBus(self.open, self.clock, self.clock.sleep)
-        self.service = Service(
-            CONFIG, pipeline, bus, Publisher(OUT), self.systemd, worker or InlineExecutor(), self.clock,
-            waiting=self.clock.wait_for,
-        )  # fmt: skip
+        clock, pipeline = FakeClock(), Pipeline(CONFIG, DATABASE)
+        self.systemd, self.estimator = Systemd(clock), pipeline.estimator
+        self.made = 0
+        """Estimators in place of the first one."""
+        self.replacement: WindowEstimator | None = None
+        """What is taken in its place; None: one that knows nothing."""
+        usual = pipeline.new_estimator
 
-    def open(self):
-        if self.away:
-            raise BusError("bus can0: no such device", may_come=True)
-        return self.wire
+        def new_estimator() -> WindowEstimator:
+            self.made += 1
+            return self.replacement or usual()
 
-    def run(self, seconds: float) -> float:
-        """Works on; the time at which that began."""
-        began = self.clock.now
-        while self.clock.now < began + seconds:
-            self.service.step()
-        return began
-
-    def sent(self, name: str, since: float = 0.0) -> list[dict]:
-        wanted = OUT.get_message_by_name(name)
-        return [
-            wanted.decode(bytes(m.data))
-            for t, m in self.wire.sent
-            if m.arbitration_id == wanted.frame_id and t >= since
-        ]
+        pipeline.new_estimator = new_estimator
+        messages = over_and_over(moments, seconds) if seconds else moments
+        super().__init__(messages, CONFIG, worker, self.systemd, pipeline=pipeline, clock=clock)
 
 
 def over_and_over(moments, seconds: float):
@@ -122,13 +100,13 @@ def over_and_over(moments, seconds: float):
 
 
 def test_a_good_service_is_left_alone(moments):
-    bench = Bench(moments, 20.0)
+    bench = WatchedBench(moments, 20.0)
     began = bench.run(20.0)
     assert not bench.systemd.would_restart(began)
 
 
 def test_silence_is_no_reason_to_restart(moments):
-    bench = Bench(moments, 5.0)
+    bench = WatchedBench(moments, 5.0)
     began = bench.run(120.0)
     assert not bench.systemd.would_restart(began)
     assert bench.systemd.texts[-1].startswith("listening: no_frames")
@@ -136,7 +114,7 @@ def test_silence_is_no_reason_to_restart(moments):
 
 @pytest.mark.parametrize("at_start", [True, False])
 def test_nor_is_a_bus_that_is_down(moments, at_start):
-    bench = Bench(moments, 5.0)
+    bench = WatchedBench(moments, 5.0)
     bench.away = at_start
     began = bench.run(5.0)
     bench.away = True
@@ -148,7 +126,7 @@ def test_nor_is_a_bus_that_is_down(moments, at_start):
 
 def test_nor_is_a_bus_on_which_nobody_else_is(moments, caplog):
     """Without anybody to acknowledge them, our frames fill the queue."""
-    bench = Bench([])
+    bench = WatchedBench([])
     bench.wire.fail_send += [can.CanOperationError("No buffer space", errno.ENOBUFS)] * 100_000
     began = bench.run(120.0)
     assert bench.service.bus.counts.sent == 0
@@ -156,14 +134,14 @@ def test_nor_is_a_bus_on_which_nobody_else_is(moments, caplog):
 
 
 def test_an_estimator_that_hangs_is_restarted(moments, caplog):
-    worker = Worker()
-    bench = Bench(moments, 60.0, worker)
+    worker = HeldExecutor(holds=False)
+    bench = WatchedBench(moments, 60.0, worker)
     began = bench.run(6.0)
     assert not bench.systemd.would_restart(began)
-    worker.hangs = True
-    hung = bench.run(MAX_SOLVE_TIME - 2.0)
+    worker.holds = True
+    hung = bench.run(HARD_WINDOW)
     assert not bench.systemd.would_restart(hung)
-    bench.run(WATCHDOG + 4.0)
+    bench.run(WATCHDOG + AT_LEAST)
     assert bench.systemd.would_restart(hung)
     assert bench.service.deadline_misses > 3  # windows that found no worker
     last = bench.sent("SoilbusStatus")[-1]
@@ -176,12 +154,12 @@ def test_an_estimator_that_hangs_is_restarted(moments, caplog):
 
 
 def test_a_sender_that_hangs_on_a_living_bus_is_restarted(moments, caplog):
-    bench = Bench(moments, 60.0)
+    bench = WatchedBench(moments, 60.0)
     bench.run(5.0)
     bench.wire.fail_send += [can.CanOperationError("No buffer space", errno.ENOBUFS)] * 100_000
-    mute = bench.run(MAX_TIME_WITHOUT_SEND - 2.0)
+    mute = bench.run(FULL_BUS)
     assert not bench.systemd.would_restart(mute)
-    bench.run(WATCHDOG + 4.0)
+    bench.run(WATCHDOG + AT_LEAST)
     assert bench.systemd.would_restart(mute)
     assert bench.systemd.texts[-1].startswith("fault: internal nothing can be sent")
     assert sum(r.levelname == "ERROR" for r in caplog.records) == 1
@@ -193,12 +171,14 @@ def test_a_sender_that_hangs_on_a_living_bus_is_restarted(moments, caplog):
 
 def test_health_by_the_second():
     health = Health(0.0)
-    assert health.fault(MAX_SOLVE_TIME, 0.0, True, 1) is None
-    assert health.fault(MAX_SOLVE_TIME + 0.1, 0.0, True, 1).startswith("overload")
-    assert health.fault(MAX_SOLVE_TIME + MAX_TIME_WITHOUT_SEND, None, True, 1) is None
-    assert health.fault(MAX_SOLVE_TIME + MAX_TIME_WITHOUT_SEND + 0.1, None, True, 1).startswith("internal")
-    assert health.fault(MAX_SOLVE_TIME + MAX_TIME_WITHOUT_SEND + 0.2, None, False, 1) is None
-    assert health.fault(MAX_SOLVE_TIME + 2 * MAX_TIME_WITHOUT_SEND, None, True, 1) is None
+    assert health.fault(HARD_WINDOW, 0.0, True, 1) is None
+    assert health.fault(HARD_WINDOW + AT_LEAST, 0.0, True, 1).startswith("overload")
+    sent = HARD_WINDOW  # when `sent` has grown last
+    assert health.fault(sent + FULL_BUS, None, True, 1) is None
+    assert health.fault(sent + FULL_BUS + AT_LEAST, None, True, 1).startswith("internal")
+    silent = sent + FULL_BUS + AT_LEAST + 0.1
+    assert health.fault(silent, None, False, 1) is None
+    assert health.fault(silent + FULL_BUS, None, True, 1) is None
 
 
 def broken(estimator, windows: range):
@@ -214,7 +194,7 @@ def broken(estimator, windows: range):
 
 
 def test_one_defect_costs_one_window(drive, caplog):
-    bench = Bench(drive)
+    bench = WatchedBench(drive)
     broken(bench.estimator, range(6, 7))
     bench.run(WINDOW + 5.5)
     known = bench.estimator.tracker.newest_posterior
@@ -238,26 +218,26 @@ def test_one_defect_costs_one_window(drive, caplog):
 
 
 def test_a_defect_in_every_window_is_a_fault_until_an_estimator_that_knows_nothing_heals_it(drive, caplog):
-    bench = Bench(drive)
+    bench = WatchedBench(drive)
     broken(bench.estimator, range(1, 100))
-    bench.run(WINDOW + FAILURES_TO_FAULT)
+    bench.run(WINDOW + SEVERAL)
     assert "fault" not in {str(f["State"]) for f in bench.sent("SoilbusStatus")}
     bench.run(0.9)  # until just before the next window ends
     last = bench.sent("SoilbusStatus")[-1]
     assert (str(last["State"]), str(last["Reason"])) == ("fault", "internal")
-    assert bench.service._guarded_estimator.estimator is not bench.estimator
+    assert bench.made == 1
     bench.run(2.2)
     assert bench.sent("SoilbusStatus")[-1]["State"] == "valid"
-    assert bench.service.failures["internal"] == FAILURES_TO_FAULT
-    assert len([r for r in caplog.records if r.levelno >= logging.ERROR]) == FAILURES_TO_FAULT
+    assert bench.service.failures["internal"] == SEVERAL
+    assert len([r for r in caplog.records if r.levelno >= logging.ERROR]) == SEVERAL
 
 
 def test_a_fault_that_stays_is_not_logged_window_by_window(drive, caplog):
-    bench = Bench(drive)
-    bench.service._guarded_estimator._again = lambda: bench.estimator
+    bench = WatchedBench(drive)
+    bench.replacement = bench.estimator
     broken(bench.estimator, range(100))
     bench.run(16.0)
-    assert bench.service.failures["internal"] > 2 * FAILURES_TO_FAULT
-    assert len([r for r in caplog.records if r.levelno >= logging.ERROR]) == FAILURES_TO_FAULT
+    assert bench.service.failures["internal"] > 2 * SEVERAL
+    assert len([r for r in caplog.records if r.levelno >= logging.ERROR]) == SEVERAL
     assert bench.sent("SoilbusStatus")[-1]["State"] == "fault"
     assert {str(f["State"]) for f in bench.sent("Traversability")} == {"unknown"}

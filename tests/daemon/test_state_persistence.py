@@ -5,49 +5,32 @@ from __future__ import annotations
 import json
 import logging
 from collections import Counter
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from soilbus.can.bus import LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
-from soilbus.can.publish import Publisher
-from soilbus.daemon.notify import Notifier
-from soilbus.daemon.service import TICK, Service
-from soilbus.daemon.state_persistence import FILE, STORE_PERIOD, StatePersistence
+from soilbus.daemon.state_persistence import StatePersistence
 from soilbus.daemon.state_store import Owner, read
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.tracker import GAIN_CORRELATION_TIME
 from soilbus.pipeline.pipeline import Pipeline
-from soilbus.simulator.frames import frames
-from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
-from soilbus.simulator.scenario import excited
-from soilbus.validation.fakes import FakeClock, InlineExecutor, ScriptedBus
+from soilbus.validation.fakes import Bench, FakeClock, HeldExecutor, InlineExecutor, ScriptedBus, drive_messages
 
 CONFIG = reference_configuration()
 DATABASE = load_databases(CONFIG)
 OWNER = Owner.of(CONFIG, Pipeline(CONFIG, DATABASE).intake.channels, DATABASE)
 BELIEF = Gaussian(OWNER.median[:6], OWNER.median[6:], np.diag(OWNER.std**2))
 DURATION = 14.0
+MINUTE, DAY = 60.0, 86400.0
+"""Seconds: what a power cut may take, and what a clock that was set back makes of an age."""
 
 
 @pytest.fixture(scope="module")
 def recording():
-    return list(frames(simulate(CONFIG, excited("loam", DURATION), seed=3), CONFIG))
-
-
-class Hung(Executor):
-    """A disk that never answers."""
-
-    def __init__(self) -> None:
-        self.asked = 0
-
-    def submit(self, fn, /, *args, **kwargs):
-        self.asked += 1
-        return Future()
+    return drive_messages(CONFIG, DURATION)
 
 
 def persistence_in(folder: Path, clock, writer: Executor | None = None) -> StatePersistence:
@@ -55,46 +38,34 @@ def persistence_in(folder: Path, clock, writer: Executor | None = None) -> State
 
 
 def stored(folder: Path):
-    state = read(folder / FILE, OWNER)
+    state = read(folder / "state.json", OWNER)
     assert state is not None
     return state
 
 
-def service_with(persistence: StatePersistence | None, clock: FakeClock, messages=()) -> tuple[Service, ScriptedBus]:
-    wire = ScriptedBus(clock, messages)
-    bus = LiveBus(lambda: wire, clock, clock.sleep)
-    pipeline = Pipeline(CONFIG, DATABASE)
-    publisher = Publisher(output_database(CONFIG))
-    return Service(
-        CONFIG, pipeline, bus, publisher, Notifier(), InlineExecutor(), clock, open_persistence=lambda: persistence
-    ), wire
-
-
-def run(service: Service, clock: FakeClock, seconds: float) -> None:
-    end = clock.now + seconds
-    while clock.now < end:
-        service.step()
+def service_with(keeper: StatePersistence | None, clock: FakeClock, messages=()) -> Bench:
+    return Bench(messages, CONFIG, keeper=keeper, pipeline=Pipeline(CONFIG, DATABASE), clock=clock)
 
 
 def test_whenever_it_is_killed_the_state_is_no_older_than_a_minute(tmp_path: Path):
     clock = FakeClock()
-    service, _ = service_with(persistence_in(tmp_path, clock), clock)
+    bench = service_with(persistence_in(tmp_path, clock), clock)
     oldest, writings = 0.0, set()
     for _ in range(1900):  # a killed service leaves what is there now
-        run(service, clock, TICK)
+        bench.run(0.1)
         at = stored(tmp_path).at
         writings.add(at)
         oldest = max(oldest, 1.7e9 + clock() - at)
-    assert oldest <= STORE_PERIOD + 2.0 * TICK
+    assert oldest <= MINUTE + 0.2
     assert len(writings) == 4  # once a minute and not oftener
 
 
 def test_a_disk_that_hangs_costs_the_loop_nothing(tmp_path: Path):
-    clock, writer = FakeClock(), Hung()
-    service, _ = service_with(persistence_in(tmp_path, clock, writer), clock)
-    run(service, clock, 300.0)
-    assert service.deadline_misses == 0
-    assert writer.asked == 1
+    clock, writer = FakeClock(), HeldExecutor()  # a disk that never answers
+    bench = service_with(persistence_in(tmp_path, clock, writer), clock)
+    bench.run(300.0)
+    assert bench.service.deadline_misses == 0
+    assert len(writer.held) == 1
 
 
 @pytest.mark.parametrize(
@@ -102,9 +73,9 @@ def test_a_disk_that_hangs_costs_the_loop_nothing(tmp_path: Path):
 )
 def test_a_state_that_cannot_be_used_is_one_warning_and_a_fresh_start(content, why, tmp_path: Path, caplog):
     if content is None:
-        (tmp_path / FILE).mkdir()
+        (tmp_path / "state.json").mkdir()
     else:
-        (tmp_path / FILE).write_bytes(content)
+        (tmp_path / "state.json").write_bytes(content)
     clock = FakeClock()
     with caplog.at_level(logging.INFO):
         persistence = persistence_in(tmp_path, clock)
@@ -123,7 +94,7 @@ def test_a_folder_that_cannot_be_written_is_one_warning_until_it_can(tmp_path: P
     def minutes(n: int) -> None:
         for _ in range(n):
             persistence.tick(clock(), BELIEF, dict)
-            clock.now += STORE_PERIOD
+            clock.now += MINUTE
 
     minutes(10)
     assert [r.levelname for r in caplog.records] == ["WARNING"]
@@ -132,7 +103,7 @@ def test_a_folder_that_cannot_be_written_is_one_warning_until_it_can(tmp_path: P
     minutes(2)
     assert len(caplog.records) == 1
     assert stored(folder).gaussian is not None
-    (folder / FILE).unlink()
+    (folder / "state.json").unlink()
     folder.rmdir()
     minutes(3)
     assert len(caplog.records) == 2
@@ -162,11 +133,11 @@ def test_a_belief_keeps_its_age_until_there_is_a_new_one(tmp_path: Path):
     assert stored(tmp_path).gaussian.at == began
     other = Gaussian(BELIEF.soil, BELIEF.gains + 1e-3, BELIEF.covariance)
     for _ in range(3):
-        clock.now += STORE_PERIOD
+        clock.now += MINUTE
         second.tick(clock(), other, dict)
         assert stored(tmp_path).gaussian.at == began + 560.0
     clock.now -= 1e6
-    assert persistence_in(tmp_path, clock).stored_prior.elapsed == GAIN_CORRELATION_TIME
+    assert persistence_in(tmp_path, clock).stored_prior.elapsed == DAY
 
 
 def test_a_belief_that_cannot_be_is_not_stored(tmp_path: Path):
@@ -181,9 +152,10 @@ def test_a_belief_that_cannot_be_is_not_stored(tmp_path: Path):
 
 def test_a_run_leaves_what_it_learnt_and_the_next_one_knows_the_sensors(recording, tmp_path: Path):
     clock = FakeClock()
-    service, _ = service_with(persistence_in(tmp_path, clock), clock, recording)
-    run(service, clock, DURATION)
-    learnt = service._guarded_estimator.estimator.tracker.newest_posterior
+    bench = service_with(persistence_in(tmp_path, clock), clock, recording)
+    service = bench.service
+    bench.run(DURATION)
+    learnt = service.newest_posterior
     service.stop()
     service.run()
     state = stored(tmp_path)
@@ -193,10 +165,10 @@ def test_a_run_leaves_what_it_learnt_and_the_next_one_knows_the_sensors(recordin
     assert state.totals["bus.sent"] == service.bus.counts.sent
 
     for kept in (None, persistence_in(tmp_path, clock)):
-        service, wire = service_with(kept, clock, recording)
-        run(service, clock, DURATION)
-        assert first_verdict(wire) >= CONFIG.estimator.window  # what is known of sensors is no window
-        gains = service._guarded_estimator.estimator.tracker.newest_posterior.gains
+        bench = service_with(kept, clock, recording)
+        bench.run(DURATION)
+        assert first_verdict(bench.wire) >= CONFIG.estimator.window  # what is known of sensors is no window
+        gains = bench.service.newest_posterior.gains
     assert not np.array_equal(gains, learnt.gains)
 
 
@@ -211,7 +183,7 @@ def first_verdict(wire: ScriptedBus) -> float:
 
 def test_the_file_can_be_read_by_people(tmp_path: Path):
     persistence_in(tmp_path, FakeClock()).close(BELIEF, {"windows": 3})
-    state = json.loads((tmp_path / FILE).read_text())["state"]
+    state = json.loads((tmp_path / "state.json").read_text())["state"]
     assert list(state["gaussian"]["soil"]) == ["k_c", "k_phi", "n", "phi", "c", "K"]
     assert state["gaussian"]["gains"]["torque.FL"] == 0.0
     assert state["totals"] == {"windows": 3}

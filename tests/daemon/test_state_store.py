@@ -72,7 +72,7 @@ def sealed(change) -> bytes:
     """The file with its content changed by somebody who knows how to seal it."""
     raw = json.loads(CONTENT)
     change(raw["state"])
-    raw["checksum"] = store._digest(raw["state"])
+    raw["checksum"] = store.digest(raw["state"])
     return json.dumps(raw).encode()
 
 

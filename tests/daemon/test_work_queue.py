@@ -2,34 +2,19 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from time import perf_counter, sleep
 
+import numpy as np
 import pytest
 
-from soilbus.daemon.work_queue import MAX_PENDING_WINDOWS, WINDOWS_PER_MEMORY_RELEASE, WorkQueue
-from soilbus.validation.fakes import FakeClock, InlineExecutor
-
-
-class Later(Executor):
-    """Keeps what it is given until asked to do the next."""
-
-    def __init__(self) -> None:
-        self.jobs = []
-
-    def submit(self, fn, /, *args, **kwargs):
-        self.jobs.append((Future(), fn, args))
-        return self.jobs[-1][0]
-
-    def do_next(self) -> None:
-        future, fn, args = self.jobs.pop(0)
-        assert future.set_running_or_notify_cancel()
-        future.set_result(fn(*args))
+from soilbus.daemon.work_queue import WorkQueue
+from soilbus.validation.fakes import FakeClock, HeldExecutor, InlineExecutor
 
 
 def test_results_come_in_their_order_with_their_ends():
-    worker = Later()
+    worker = HeldExecutor()
     queue = WorkQueue(worker, lambda task: f"result of {task}", 5.0)
     assert [queue.add(task, 10.0 + task, 7, 10.5 + task) for task in (0, 1)] == [0, 0]
     assert list(queue.results(12.0)) == []
@@ -47,25 +32,27 @@ def test_results_come_in_their_order_with_their_ends():
 
 
 def test_what_the_worker_cannot_keep_up_with_is_dropped_but_for_the_newest_and_the_one_it_has():
-    worker = Later()
+    worker = HeldExecutor()
     queue = WorkQueue(worker, lambda task: task, 0.0)
     worker_has = queue.add(0, 0.0, 0, 0.0)
-    worker.jobs[0][0].set_running_or_notify_cancel()
-    dropped = [queue.add(task, 0.0, 0, 0.0) for task in range(1, 6)]
-    assert [worker_has, *dropped] == [0] * MAX_PENDING_WINDOWS + [1] * (6 - MAX_PENDING_WINDOWS)
-    worker.jobs[0][0].set_result(0)
-    del worker.jobs[0]
-    while worker.jobs:
-        if worker.jobs[0][0].cancelled():
-            del worker.jobs[0]
+    worker.held[0][0].set_running_or_notify_cancel()
+    dropped = [queue.add(task, 0.0, 0, 0.0) for task in range(1, 12)]
+    waiting = 12 - sum(dropped)
+    assert 2 <= waiting <= 4  # a window older than a few hops is of no use any more
+    assert [worker_has, *dropped] == [0] * waiting + [1] * (12 - waiting)
+    worker.held[0][0].set_result(0)
+    del worker.held[0]
+    while worker.held:
+        if worker.held[0][0].cancelled():
+            del worker.held[0]
         else:
             worker.do_next()
-    assert [result for result, _ in queue.results(1.0)] == [0, 4, 5]
+    assert [result for result, _ in queue.results(1.0)] == [0, *range(13 - waiting, 12)]
 
 
 @pytest.mark.parametrize(("solved", "waited"), [(False, 0.04), (True, 0.0)])
 def test_the_loop_waits_for_a_result_and_no_longer(solved, waited):
-    clock, worker = FakeClock(), Later()
+    clock, worker = FakeClock(), HeldExecutor()
     queue = WorkQueue(worker, lambda task: task, clock(), clock.wait_for)
     queue.wait(0.04)
     assert clock() == 1000.0  # for nothing
@@ -91,12 +78,13 @@ def test_free_memory_is_given_back_once_in_a_while_and_after_the_result_is_out(m
     done: list[str] = []
     monkeypatch.setattr("soilbus.daemon.work_queue.give_back_freed_memory", partial(done.append, "tidy"))
     queue = WorkQueue(InlineExecutor(), lambda task: task, 0.0)
-    for task in range(2 * WINDOWS_PER_MEMORY_RELEASE + 1):
+    for task in range(300):
         queue.add(task, 0.0, 0, 0.0)
         for result, _ in queue.results(0.0):
             done.append(f"window {result} out")
     tidied = [i for i, what in enumerate(done) if what == "tidy"]
-    assert [done[i - 1] for i in tidied] == [
-        f"window {WINDOWS_PER_MEMORY_RELEASE - 1} out",
-        f"window {2 * WINDOWS_PER_MEMORY_RELEASE - 1} out",
-    ]
+    after = [int(done[i - 1].split()[1]) for i in tidied]
+    gaps = np.diff([0, *after, 299])
+    assert max(gaps) <= 120  # of windows of a second: every other minute at least
+    assert min(gaps[:-1]) >= 30  # it costs time, too
+    assert [done[i - 1] for i in tidied] == [f"window {window} out" for window in after]

@@ -9,8 +9,9 @@ from pathlib import Path
 import cantools
 import pytest
 
-from soilbus.can.admission import LONGEST_GAP
+from soilbus.can.dbc_files import load_databases
 from soilbus.can.publish import Publisher, value_codes
+from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.reference import reference_configuration
 
 DBC = Path(__file__).resolve().parents[2] / "dbc"
@@ -85,7 +86,6 @@ def test_defaults_in_the_text_are_those_of_the_configuration():
         f"(`estimator.window`, {config.estimator.window:g} s)",
         f"`estimator.min_speed` ({config.estimator.min_speed:g} m/s)",
         f"`traversability.max_age` ({config.traversability.max_age:g} s)",
-        f"after more than {LONGEST_GAP:g} s without any",
     ):
         assert said in TEXT
 
@@ -126,3 +126,16 @@ def sae_j1850(data: bytes) -> int:
         for _ in range(8):
             crc = (crc << 1 ^ 0x1D) & 0xFF if crc & 0x80 else crc << 1
     return crc ^ 0xFF
+
+
+@pytest.mark.parametrize(("beyond", "breaks"), [(-1.0, 0), (1.0, 1)])
+def test_a_recording_ends_with_the_silence_that_the_text_says(beyond, breaks):
+    (said,) = re.findall(r"after more than (\d+) s without any", TEXT)
+    config = reference_configuration()
+    database, seen = load_databases(config), []
+    admission = Pipeline(config, database).admission
+    admission.at_break = lambda: seen.append("break")
+    needed = database.get_message_by_name("MotorFL")
+    for t in (1.7e9, 1.7e9 + float(said) + beyond):
+        admission.feed(t, needed.frame_id, needed.is_extended_frame, bytes(needed.length))
+    assert len(seen) == breaks

@@ -162,7 +162,7 @@ def bulldozed(simulated):
     rig, config = rig_of(case.config), case.config
     plain = ObservationModelWithEffects(case.window, rig, model_of(config), config.estimator.min_speed)
     effect = CATALOGUE["bulldozing"]
-    return plain.completed([effect], parameters_of(effect, plain.n_wheels)), case.prior
+    return plain.with_effects([effect], parameters_of(effect, plain.n_wheels)), case.prior
 
 
 def test_parameters_of_effects_stay_inside_their_ranges(bulldozed):
@@ -184,10 +184,10 @@ def test_solved_entry_angles_carry_the_loads_with_effects(simulated):
     case = simulated(SOILS["loam"], 12)
     plain = ObservationModelWithEffects(case.window, rig_of(case.config), model_of(case.config), 0.2)
     effect = CATALOGUE["multipass"]
-    problem = plain.completed([effect], parameters_of(effect, plain.n_wheels))
+    problem = plain.with_effects([effect], parameters_of(effect, plain.n_wheels))
     gains = np.concatenate([np.zeros(problem.n_sensors), [1.0, 0.5, 0.3, -0.8]])
     objective = Objective(problem, case.prior, Gaussian.of(case.prior, problem.gain_std))
     iterate = objective.start(np.asarray(SOILS["loam"]), gains=gains)
     iterate.latents.entry_angle *= 1.1
     model = objective.quadratic_model(objective.with_entry_angles(iterate))
-    assert np.abs(model.linearisation.off).max() < 1e-3 * problem.load.mean()
+    assert np.abs(model.linearisation.load_residual).max() < 1e-3 * problem.load.mean()

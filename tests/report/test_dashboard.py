@@ -15,10 +15,13 @@ from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import output_database
 from soilbus.can.publish import Publisher
-from soilbus.report.dashboard import WIDTH, panel, show
+from soilbus.report.dashboard import panel, show
 from soilbus.report.received_frames import ReceivedFrames
 from soilbus.simulator.reference import reference_configuration
 from soilbus.validation.fakes import FakeClock, ScriptedBus
+
+WIDTH = 80
+"""Columns of the narrowest terminal."""
 
 
 @pytest.fixture
@@ -33,7 +36,7 @@ def message(frame) -> can.Message:
 
 
 def shown(dashboard) -> str:
-    console = Console(width=WIDTH, record=True, file=io.StringIO())
+    console = Console(width=2 * WIDTH, record=True, file=io.StringIO())
     console.print(panel(dashboard))
     return console.export_text()
 

@@ -11,7 +11,6 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from soilbus.terra.wheel import WheelModel, WheelState
-from soilbus.terra.wheel_state import LONGEST
 
 EXACT = {"epsabs": 0.0, "epsrel": 1e-11, "limit": 200}
 
@@ -42,7 +41,7 @@ def adaptive_forces(
         1.0 - (1.0 - abs(slip)) * model.peak_bend / (1.0 + model.peak_bend)
     )  # eq. 4 without a bend
     theta_m = min(max(ahead, 0.05), 0.8) * theta1
-    theta2 = max((model.exit_ratio + model.exit_slip * max(slip, 0.0)) * theta1 + model.exit_angle, -LONGEST * theta1)
+    theta2 = max((model.exit_ratio + model.exit_slip * max(slip, 0.0)) * theta1 + model.exit_angle, -0.95 * theta1)
     share = mobilised or (exponential if model.shear_law == "exponential" else rational)
 
     def sigma(theta: float) -> float:

@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -20,7 +21,6 @@ from typing import Any, NamedTuple
 import can
 import numpy as np
 
-from feeding import feed_message
 from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import load_databases, output_database
@@ -31,17 +31,15 @@ from soilbus.daemon.service import Service
 from soilbus.daemon.state_persistence import StatePersistence
 from soilbus.daemon.state_store import Owner
 from soilbus.decision.traversability import Status
-from soilbus.estimation.tracker import TrackerOutput
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.tracker import Tracker, TrackerOutput
 from soilbus.estimation.window import Window
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.pipeline import Pipeline
-from soilbus.simulator.frames import frames
-from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
-from soilbus.simulator.scenario import excited
 from soilbus.terra.soils import SOILS
-from soilbus.validation.fakes import FakeClock, InlineExecutor
+from soilbus.validation.fakes import FakeClock, InlineExecutor, drive_messages, feed_message
 
 CONFIG = reference_configuration(["estimator.window=4.0", "traversability.max_age=2.0"])
 OUT = output_database(CONFIG)
@@ -74,7 +72,7 @@ def good_moment(seed: int = 3) -> Moment:
     """The last frames of each message in a good drive."""
     config = reference_configuration()
     found: Moment = {}
-    for message in frames(simulate(config, excited("loam", 10.0), seed), config):
+    for message in drive_messages(config, 10.0, seed):
         found.setdefault(message.arbitration_id, []).append(message)
     return {i: messages[-MOMENTS:] for i, messages in found.items()}
 
@@ -86,7 +84,7 @@ def good_tracked(seed: int = 3) -> TrackerOutput:
     estimator, found = pipeline.estimator, []
     usual = estimator.tracker.estimate
     estimator.tracker.estimate = lambda *given: found.append(usual(*given)) or found[-1]
-    messages = list(frames(simulate(config, excited("loam", 12.0), seed), config))
+    messages = drive_messages(config, 12.0, seed)
     for message in messages:
         feed_message(pipeline.admission, message)
     results = pipeline.finish(messages[-1].timestamp)
@@ -320,6 +318,30 @@ class Handed(NamedTuple):
 NO_WINDOW = Handed(-1, -math.inf, NOTHING, True)
 
 
+class TrueTracker(Tracker):
+    """A tracker that says of each window what a drive knows to be true, and shows the drive what it recalls."""
+
+    def __init__(self, drive: Drive, *args: Any) -> None:
+        self.drive, self.said = drive, None
+        super().__init__(*args)
+
+    @property
+    def newest_posterior(self) -> Gaussian | None:
+        return self.said
+
+    def reset(self) -> None:
+        super().reset()
+        self.said = None
+
+    def start_from_last_run(self, gaussian: Gaussian, elapsed: float) -> None:
+        self.drive.recalled = gaussian, elapsed
+
+    def estimate(self, window: Window, end: float) -> TrackerOutput:
+        tracked = self.drive.truth(window, end)
+        self.said = tracked.fit.reported
+        return tracked
+
+
 class Drive:
     """A service on a wire, and what an onlooker knows of its windows.
 
@@ -339,12 +361,14 @@ class Drive:
         self.go = 0
         self.last: dict[str, Any] = {}
         self.interrupted = self.halted_until = -math.inf
+        self.recalled: tuple[Gaussian, float] | None = None
+        """What the service took over from the one before, and its age [s]."""
         self.start()
 
     def start(self) -> None:
         """A service that begins with the state that the one before has left behind."""
         pipeline = Pipeline(self.config, IN)
-        pipeline.new_estimator = lambda: self.content(WindowEstimator(self.config))
+        pipeline.new_estimator = self.estimator
         owner = Owner.of(self.config, pipeline.intake.channels, IN)
         persistence = StatePersistence(
             Path(self.folder.name), owner, InlineExecutor(), lambda: self.clock.now + self.wire.offset
@@ -364,21 +388,18 @@ class Drive:
         self.service.stop()
         self.service.run()
 
-    def content(self, estimator: WindowEstimator) -> WindowEstimator:
-        """An estimator whose tracker says of each window what is true of the ground at its end."""
+    def estimator(self) -> WindowEstimator:
+        """One whose tracker says of each window what is true of the ground at its end, or a real one."""
+        return WindowEstimator(self.config, Tracker if self.tracked is None else partial(TrueTracker, self))
 
-        def estimate(window, end):
-            known = self.handed[end].known
-            if known.raises:
-                raise ZeroDivisionError
-            tracked = self.of_soft if known.soft else self.tracked
-            assert tracked is not None
-            estimator.tracker._newest_posterior = tracked.fit.reported
-            return tracked_at(tracked, window, since=end - self.config.estimator.window, mismatch=known.blind)
-
-        if self.tracked is not None:
-            estimator.tracker.estimate = estimate
-        return estimator
+    def truth(self, window: Window, end: float) -> TrackerOutput:
+        """What the tracker says of a window."""
+        known = self.handed[end].known
+        if known.raises:
+            raise ZeroDivisionError
+        tracked = self.of_soft if known.soft else self.tracked
+        assert tracked is not None
+        return tracked_at(tracked, window, since=end - self.config.estimator.window, mismatch=known.blind)
 
     def open(self):
         if self.wire.lost:

@@ -18,7 +18,6 @@ from soilbus.terra.wheel import (
     EXACT_NODES,
     FAST_NODES,
     INPUTS,
-    MAX_ENTRY_ANGLE,
     Soil,
     WheelModel,
     WheelState,
@@ -30,6 +29,8 @@ from soilbus.terra.wheel import (
 )
 
 R, B = 0.5, 0.3
+DEEPEST = 1.4
+"""Largest entry angle [rad] of any load that soil carries: a wheel in the ground by 83 % of its radius."""
 
 
 def wheels(seed: int, size: int, slip: tuple[float, float] = (0.0, 0.95), c: float = 70e3) -> WheelState:
@@ -300,7 +301,7 @@ def test_entry_angle_carries_the_load_of_a_driven_wheel(soil, angle, slip, radiu
 def test_entry_angle_carries_the_load_of_a_skidding_wheel(soil, load, slip, guess, model):
     found = entry_angle_for_load(load, state_on(soil, guess, slip, R, B), model)
     if not np.isfinite(found):  # only what nothing carries may be refused
-        every = np.linspace(1e-3, MAX_ENTRY_ANGLE - 1e-6, 400)
+        every = np.linspace(1e-3, DEEPEST - 1e-6, 400)
         assert load > 0.999 * wheel_forces(state_on(soil, every, slip, R, B), model)[0].max()
         return
     carried = wheel_forces(state_on(soil, found, slip, R, B), model)[0]
@@ -318,11 +319,11 @@ def test_impossible_loads_give_nan_and_nothing_is_raised(load, slip, guess, soil
     state = state_on(soil, guess, slip, R, B)
     with np.errstate(all="ignore"):
         found = entry_angle_for_load(load, state, WheelModel())
-        most = wheel_forces(state._replace(entry_angle=MAX_ENTRY_ANGLE), WheelModel())[0]
+        most = wheel_forces(state._replace(entry_angle=DEEPEST), WheelModel())[0]
     if not (math.isfinite(load) and load > 0.0) or (slip >= 0.0 and load > most * (1.0 + 1e-6)):
         assert np.isnan(found)
     else:
-        assert np.isnan(found) or 0.0 < found < MAX_ENTRY_ANGLE
+        assert np.isnan(found) or 0.0 < found < DEEPEST
 
 
 def test_good_loads_among_bad_ones():

@@ -6,10 +6,9 @@ from collections import Counter
 
 import pytest
 
-from soilbus.pipeline.outputs import TICK
 from soilbus.validation.soak import wire
 from soilbus.validation.soak.figures import Hour
-from soilbus.validation.soak.run import Soak, soak
+from soilbus.validation.soak.run import CYCLE, Soak, soak
 from soilbus.validation.soak.verdict import GROWTH, demands
 
 
@@ -37,7 +36,7 @@ def test_frames_keep_their_beat(shown):
     assert shown.deadline_misses == 0
     assert shown.off_beat <= shown.faults["full"]  # once each: the newest frame goes out as soon as there is room
     assert shown.sent > 0.8 * 3000
-    assert abs(shown.drift) < TICK / 2 * shown.epochs
+    assert abs(shown.drift) < CYCLE / 2 * shown.epochs
 
 
 def test_valid_windows_stay_right(shown):
@@ -47,7 +46,7 @@ def test_valid_windows_stay_right(shown):
 
 
 def test_a_lost_frame_is_noticed(monkeypatch):
-    monkeypatch.setattr(wire.Wire, "_hand_over", _forgetful(wire.Wire._hand_over))
+    monkeypatch.setattr(wire.Wire, "hand_over", _forgetful(wire.Wire.hand_over))
     assert soak(12.0, seed=4).lost
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+__all__ = ["STANDARD_PGNS", "SourceLock", "group_mask", "pgn_of", "source_of"]
+
 GROUND_BASED_SPEED = 65097
 STANDARD_PGNS = frozenset({65093, 65094, 65096, GROUND_BASED_SPEED, 65265, 65267, 129025})
 """Groups whose meaning the standards fix (hitch, speed, position), whoever sends them."""

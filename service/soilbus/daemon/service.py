@@ -45,6 +45,7 @@ from soilbus.pipeline.states import ServiceState, state_after
 if TYPE_CHECKING:
     from soilbus.daemon.state_persistence import StatePersistence
     from soilbus.decision.capability import OverSlip
+    from soilbus.estimation.gaussian import Gaussian
     from soilbus.pipeline.estimator import WindowEstimator
 
 log = logging.getLogger(__name__)
@@ -154,6 +155,11 @@ class Service:
         """Windows solved since the start."""
         return self._work_queue.solved
 
+    @property
+    def newest_posterior(self) -> Gaussian | None:
+        """Posterior that the next window's prior comes from, as the state file keeps it; None before there is one."""
+        return self._guarded_estimator.newest
+
     def stop(self) -> None:
         """Let `run` return after the present round; safe to call from a signal handler."""
         self._stopping = True
@@ -169,7 +175,7 @@ class Service:
         self._work_queue.close()
         self.bus.close()
         if self._persistence is not None:
-            self._persistence.close(self._guarded_estimator.newest, self._totals())
+            self._persistence.close(self.newest_posterior, self._totals())
 
     def step(self) -> None:
         """Receive until the next tick, then hand out, collect and publish what is due."""
@@ -274,7 +280,7 @@ class Service:
             self._next_watchdog = now + interval
             self.notifier.watchdog()
         if self._persistence is not None:
-            self._persistence.tick(now, self._guarded_estimator.newest, self._totals)
+            self._persistence.tick(now, self.newest_posterior, self._totals)
 
     def _look_after_health(self, now: float) -> None:
         hears = self.bus.is_open and now - self._time.last_frame <= SILENCE_TIME

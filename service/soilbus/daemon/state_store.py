@@ -104,7 +104,7 @@ class Owner:
         prior = prior_of(config)
         names, gain_std = gain_errors(rig_of(config), model_of(config), effects_and_parameters_of(config)[1])
         return cls(
-            _digest([config.model_dump(mode="json", include=SECTIONS), [_wiring(c, database) for c in channels]]),
+            digest([config.model_dump(mode="json", include=SECTIONS), [_wiring(c, database) for c in channels]]),
             tuple(names),
             np.concatenate([prior.median, np.zeros(len(names))]),
             np.concatenate([new_soil_prior(prior).log_std, gain_std]),
@@ -185,7 +185,7 @@ def _check_covariance(covariance: Array, std: Array) -> None:
 def dumped(state: State, owner: Owner) -> bytes:
     """The file's content."""
     content = state.model_dump()
-    envelope = {"format": FORMAT, "version": VERSION, "key": owner.key, "checksum": _digest(content), "state": content}
+    envelope = {"format": FORMAT, "version": VERSION, "key": owner.key, "checksum": digest(content), "state": content}
     return (json.dumps(envelope, allow_nan=False) + "\n").encode()
 
 
@@ -214,7 +214,7 @@ def loaded(content: bytes, owner: Owner) -> State:
         raise StateError(f"it is of version {str(raw.get('version'))[:20]}, this is {VERSION}")
     try:
         file = _File.model_validate(raw)
-        if file.checksum != _digest(file.state):
+        if file.checksum != digest(file.state):
             raise StateError("it is damaged: wrong checksum")
         if file.key != owner.key:
             raise StateError("it belongs to another configuration")
@@ -273,7 +273,7 @@ def _private(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o600)  # a pipe in its place halts nobody
 
 
-def _digest(content: Any) -> str:
+def digest(content: Any) -> str:
     """SHA-256 of the canonical JSON."""
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 

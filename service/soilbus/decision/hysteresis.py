@@ -16,6 +16,8 @@ from statistics import NormalDist
 from soilbus.config.model import Traversability as Settings
 from soilbus.decision.traversability import State, Status, state_of
 
+__all__ = ["ORDER", "Held", "doubted", "settled"]
+
 ORDER = (State.NO_GO, State.CAUTION, State.GO)
 """States from the worst to the best."""
 

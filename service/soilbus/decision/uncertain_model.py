@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.model_form import FormLeft, formed
+from soilbus.estimation.model_form import FormPosterior, with_form_step
 from soilbus.estimation.nuisance_parameters import Free, active_at
 from soilbus.estimation.posterior import PARAMETERS
 from soilbus.terra.effects.effect import Effect
@@ -65,7 +65,7 @@ class UncertainModel:
     @classmethod
     def of(
         cls, model: WheelModel, effects: Sequence[Effect], free: Sequence[Free], gaussian: Gaussian, n_wheels: int,
-        ground_speed: float, widening: float = 1.0, form: FormLeft | None = None,
+        ground_speed: float, widening: float = 1.0, form: FormPosterior | None = None,
     ) -> UncertainModel:  # fmt: skip
         """The model with the effects' parameters as a window's posterior has them.
 
@@ -95,7 +95,9 @@ class UncertainModel:
         mean = at(standardised)
         names = {active.effect.name for active in mean.effects}
         places = np.flatnonzero([f.effect in names and f.std > 0.0 for f in free])
-        of_form = [] if form is None else _perturbed_by_form(form, lambda step: at(standardised, formed(model, step)))
+        of_form = (
+            [] if form is None else _perturbed_by_form(form, lambda step: at(standardised, with_form_step(model, step)))
+        )
         if not len(places):
             return cls(mean, tuple(of_form), len(of_form))
         of_effects = _SOIL + first + places
@@ -129,7 +131,7 @@ class UncertainModel:
         return ModelOfRows((self.mean, *(one.model for one in self.perturbed)), row)
 
 
-def _perturbed_by_form(form: FormLeft, at: Callable[[Array], CompletedModel]) -> list[PerturbedModel]:
+def _perturbed_by_form(form: FormPosterior, at: Callable[[Array], CompletedModel]) -> list[PerturbedModel]:
     """A perturbed model for each leading direction of the form's second moment, on the side on which its mean lies."""
     variance, axes = np.linalg.eigh(form.moment)
     axes = axes * np.where(form.mean @ axes < 0.0, -1.0, 1.0)

@@ -29,7 +29,7 @@ from soilbus.estimation.posterior import PARAMETERS, Estimate, Posterior, SoilPr
 from soilbus.terra.wheel import Soil
 
 if TYPE_CHECKING:
-    from soilbus.estimation.model_form import FormLeft
+    from soilbus.estimation.model_form import FormPosterior
 
 
 _SOIL = len(PARAMETERS)
@@ -57,7 +57,7 @@ class Gaussian:
         Of the soil's logarithms and the gains; rows of held ones are zero.
     k_c_offset : float, optional
         Only for a likelihood factor: Gaussian in k_c / soil's k_c, with mean 1 + k_c_offset.
-    form : FormLeft, optional
+    form : FormPosterior, optional
         What the model's form leaves open; everything else is of the configured form.
     """
 
@@ -65,7 +65,7 @@ class Gaussian:
     gains: Array
     covariance: Array
     k_c_offset: float | None = None
-    form: FormLeft | None = None
+    form: FormPosterior | None = None
 
     @classmethod
     def of(cls, prior: SoilPrior, gain_std: Array) -> Gaussian:

@@ -60,11 +60,11 @@ def form_prior(farthest: Sequence[float]) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True, slots=True)
-class FormLeft:
-    """What a window, and those before it, leave open by the form.
+class FormPosterior:
+    """The form parameters after a window and those before it, and how soil and gains depend on them.
 
-    by_form (6 + G, 4): derivatives of the soil's logarithms and of the gains by FORM; mean (4,) and covariance (4, 4):
-    what the data tell of these, 0 being the configured form.
+    by_form (6 + G, 4): derivatives of the soil's logarithms and of the gains by FORM; mean (4,) and covariance (4, 4)
+    of the form parameters, 0 being the configured form.
     """
 
     by_form: Array
@@ -72,11 +72,11 @@ class FormLeft:
     covariance: Array
 
     @classmethod
-    def of(cls, farthest: Sequence[float], n_gains: int) -> FormLeft:
+    def of(cls, farthest: Sequence[float], n_gains: int) -> FormPosterior:
         """Before any data: the prior, see `form_prior`."""
         return cls(np.zeros((_SOIL + n_gains, len(FORM))), *form_prior(farthest))
 
-    def drifted(self, farthest: Sequence[float], share: float) -> FormLeft:
+    def drifted(self, farthest: Sequence[float], share: float) -> FormPosterior:
         """Later: the form may have changed by this share of the prior variance, up to all of it."""
         return replace(self, covariance=self.covariance + min(share, 1.0) * form_prior(farthest)[1])
 
@@ -97,8 +97,8 @@ class FormLeft:
         return np.asarray(self.by_form[:_SOIL] @ self.mean)
 
 
-def formed(model: WheelModel, step: Array) -> WheelModel:
-    """The model with the form parameters so far (4,) from its own."""
+def with_form_step(model: WheelModel, step: Array) -> WheelModel:
+    """The model with form parameters that differ from its own by a step (4,)."""
     peak, by_slip, leave, other = step.tolist()
     if model.shear_law == "exponential":  # the same, with a share that can be taken away
         model, other = replace(model, shear_law="rational", exponential_share=1.0), -other
@@ -112,31 +112,43 @@ def formed(model: WheelModel, step: Array) -> WheelModel:
     )
 
 
-def form_left(fitting: Objective, fit: Fit, joint_prior: FormLeft) -> FormLeft:
-    """What a window's fit leaves open, given what was left before it; that where the window tells nothing."""
-    problem, optimum = fitting.problem, fit.optimum
-    approximation = fitting.approximation_at(optimum)
-    open_ = np.flatnonzero(np.diag(joint_prior.covariance) > 0.0)
-    if approximation is None or not len(open_):
-        return joint_prior
-    rows, weighed = problem.by_form(optimum)
-    rows, weighed = rows[:, open_], weighed[:, open_]
-    by_prior, precision, off = fitting.prior_factor.jacobian_by_mean(
-        optimum.soil, optimum.gains, joint_prior.by_form[:, open_]
+def form_posterior(objective: Objective, fit: Fit, prior: FormPosterior) -> FormPosterior:
+    """Posterior of the form parameters after a window's fit.
+
+    Parameters
+    ----------
+    objective, fit
+        Of the window, on the configured form; converged.
+    prior
+        Posterior of the form after the windows before.
+
+    Returns
+    -------
+    FormPosterior
+        The prior itself where every form parameter is held or the normal equations are singular.
+    """
+    problem, optimum = objective.problem, fit.optimum
+    approximation = objective.approximation_at(optimum)
+    free = np.flatnonzero(np.diag(prior.covariance) > 0.0)
+    if approximation is None or not len(free):
+        return prior
+    by_form, weighed = problem.by_form(optimum)
+    by_form, weighed = by_form[:, free], weighed[:, free]
+    prior_by_form, precision, off = objective.prior_factor.jacobian_by_mean(
+        optimum.soil, optimum.gains, prior.by_form[:, free]
     )
-    slopes = fitting.prior_jacobian(optimum)
     columns = weighed.T @ optimum.at.rows
-    mixed = (columns @ approximation.directions) + by_prior.T @ precision @ slopes
-    gradient = columns[:, 0] + by_prior.T @ (precision @ off)
-    information = rows.T @ weighed + by_prior.T @ precision @ by_prior
-    own = solve_with_inverse(joint_prior.covariance[np.ix_(open_, open_)], joint_prior.mean[open_])
+    cross = (columns @ approximation.directions) + prior_by_form.T @ precision @ objective.prior_jacobian(optimum)
+    gradient = columns[:, 0] + prior_by_form.T @ (precision @ off)
+    information = by_form.T @ weighed + prior_by_form.T @ precision @ prior_by_form
+    own = solve_with_inverse(prior.covariance[np.ix_(free, free)], prior.mean[free])
     if own is None:
-        return joint_prior
-    of_gradient, of_information = approximation.explained(mixed)
-    told = solve_with_inverse(information - of_information + own[1], own[0] - gradient + of_gradient)
-    if told is None:
-        return joint_prior
-    by_form, mean, covariance = np.zeros_like(joint_prior.by_form), np.zeros(len(FORM)), np.zeros((len(FORM),) * 2)
-    by_form[:, open_] = -fitting.parameter_jacobian(optimum) @ approximation.covariance @ mixed.T
-    mean[open_], covariance[np.ix_(open_, open_)] = told
-    return FormLeft(by_form, mean, covariance)
+        return prior
+    of_gradient, of_information = approximation.explained(cross)
+    found = solve_with_inverse(information - of_information + own[1], own[0] - gradient + of_gradient)
+    if found is None:
+        return prior
+    sensitivity, mean, covariance = np.zeros_like(prior.by_form), np.zeros(len(FORM)), np.zeros((len(FORM),) * 2)
+    sensitivity[:, free] = -objective.parameter_jacobian(optimum) @ approximation.covariance @ cross.T
+    mean[free], covariance[np.ix_(free, free)] = found
+    return FormPosterior(sensitivity, mean, covariance)

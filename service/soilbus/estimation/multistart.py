@@ -24,7 +24,7 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.model_form import FormLeft
+from soilbus.estimation.model_form import FormPosterior
 from soilbus.estimation.observation_model import (
     CurvedPathFit,
     DenoisedObservationModel,
@@ -224,7 +224,7 @@ class Fit:
     marginalised: Gaussian | None = None
     curved_path: CurvedPathFit | None = None
     off_scale: bool = False
-    form: FormLeft | None = None
+    form: FormPosterior | None = None
 
     @property
     def posterior(self) -> Posterior:

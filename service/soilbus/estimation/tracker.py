@@ -37,7 +37,7 @@ from soilbus.estimation.change_detection import Transition, change_statistic, wi
 from soilbus.estimation.drift_filter import at_window_end
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.laplace import with_nested_laplace
-from soilbus.estimation.model_form import FormLeft, form_left
+from soilbus.estimation.model_form import FormPosterior, form_posterior
 from soilbus.estimation.multistart import Fit, WarmStart, fit_warm, fit_window, refit_denoised, warm_start
 from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.observation_model import RESIDUAL, ObservationModel, ObservationModelWithEffects, Work
@@ -545,16 +545,16 @@ class Tracker:
             off_scale = sinkages_off_scale(objective, fit)
             fit = with_nested_laplace(objective.problem, objective.coordinates.prior, objective.joint_prior, fit)
             fit = replace(fit, off_scale=off_scale)
-        fit = replace(fit, form=self._form_left(objective, fit))
+        fit = replace(fit, form=self._form_posterior(objective, fit))
         return at_window_end(objective, fit, self.settings.window, self.settings.drift)
 
-    def _form_left(self, objective: Objective, fit: Fit) -> FormLeft | None:
+    def _form_posterior(self, objective: Objective, fit: Fit) -> FormPosterior | None:
         """Part of a fit that the form of the model leaves open; None where the form is held."""
         if not any(self.settings.form):
             return None
-        joint_prior = objective.joint_prior.form or FormLeft.of(self.settings.form, len(fit.gains))
+        joint_prior = objective.joint_prior.form or FormPosterior.of(self.settings.form, len(fit.gains))
         with np.errstate(all="ignore"):
-            return form_left(objective, fit, joint_prior)
+            return form_posterior(objective, fit, joint_prior)
 
     def _stored(self, tracked: TrackerOutput, end: float, problem: ObservationModel) -> TrackerOutput:
         """Store the result for later windows and return it; a mismatch does not become a prior."""

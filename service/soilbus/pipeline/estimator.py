@@ -10,7 +10,7 @@ loss of traction, immobilisation watch.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -89,9 +89,11 @@ class WindowEstimator:
     ----------
     config
         Vehicle, prior, model, settings.
+    tracker_of
+        Makes the tracker from the arguments of `Tracker`; a test gives one whose soil is known.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, tracker_of: Callable[..., Tracker] = Tracker) -> None:
         self.config = config
         self.rig, self.prior, self.model = rig_of(config), prior_of(config), model_of(config)
         self._effects_and_parameters = effects_and_parameters_of(config)
@@ -109,7 +111,7 @@ class WindowEstimator:
         self._class_prior = guessed(self.prior, prior_of(Config()))
         settings = config.estimator
         least = MIN_ROWS if config.table is None else 1  # a table's rows are chosen with care, and few
-        self._tracker = Tracker(
+        self._tracker = tracker_of(
             self.rig, self.prior, self.model,
             Settings(
                 settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift, least,

@@ -17,6 +17,8 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.terra.earth import moved
 
+__all__ = ["NORTHWARD", "Course", "course", "positions"]
+
 
 @dataclass(frozen=True, slots=True)
 class Course:

@@ -32,6 +32,8 @@ from soilbus.files import placed
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.sensors import channel_rng
 
+__all__ = ["START_TIME", "Payload", "encoded", "frames", "write_log"]
+
 START_TIME = 1_700_000_000.0
 """Stamp [s, Unix] of a recording's first instant: logs hold wall clock time."""
 _MAX_JITTER = 1e-3

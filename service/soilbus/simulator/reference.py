@@ -8,6 +8,8 @@ from pathlib import Path
 from soilbus.config.file import load_config
 from soilbus.config.model import Config
 
+__all__ = ["TRACTOR", "reference_configuration"]
+
 TRACTOR = Path(__file__).with_name("tractor.toml")
 
 

@@ -52,7 +52,7 @@ __all__ = [
 MIN_ENTRY_ANGLE = 1e-4
 MAX_ENTRY_ANGLE = 1.4
 _CHUNK = 16384
-"""Nodes of a branch that are integrated at once: all fields of so many stay in the processor's cache.  Short
+"""Nodes of a branch that are integrated at once: all fields of this many stay in the processor's cache.  Short
 of it small chunks cost twice as much, given that the allocator keeps its memory (soilbus.allocator)."""
 
 

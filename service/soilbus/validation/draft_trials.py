@@ -32,6 +32,8 @@ from soilbus.terra.vehicle import axle_loads
 from soilbus.terra.wheel import Soil, WheelModel, sinkage
 from soilbus.validation.monte_carlo import Each, prior_about
 
+__all__ = ["SOILS", "DraftFigures", "DraftTrial", "Task", "draft_trials", "figures", "trial", "true_largest_draft"]
+
 SOILS = ("rubicon_sandy_loam_43", "north_gower_clayey_loam_46", "upland_sandy_loam_51")
 SOIL_LOG_SD = 0.1
 """Standard deviation of the logarithms of a drive's soil parameters about the named soil."""

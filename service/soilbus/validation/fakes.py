@@ -1,4 +1,4 @@
-"""A bus, a clock and a worker that tests hold in their hands."""
+"""A bus, a clock, workers and a service on them that tests hold in their hands, and frames of a drive."""
 
 from __future__ import annotations
 
@@ -8,6 +8,33 @@ from concurrent.futures import Executor, Future
 from typing import Any
 
 import can
+
+from soilbus.can.admission import Admission
+from soilbus.can.bus import BusError, LiveBus
+from soilbus.can.dbc_files import load_databases, output_database
+from soilbus.can.publish import Publisher
+from soilbus.config.model import Config
+from soilbus.daemon.notify import Notifier
+from soilbus.daemon.service import Service
+from soilbus.daemon.state_persistence import StatePersistence
+from soilbus.pipeline.pipeline import Pipeline
+from soilbus.pipeline.result import WindowResult
+from soilbus.simulator.frames import frames
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import excited
+
+
+def drive_messages(config: Config, seconds: float, seed: int = 3) -> list[can.Message]:
+    """Frames of a good drive on loam: draft swings, slip is what the soil asks for."""
+    return list(frames(simulate(config, excited("loam", seconds), seed), config))
+
+
+def feed_message(admission: Admission, message: can.Message) -> None:
+    """One data or remote frame of python-can into an admission."""
+    admission.feed(
+        message.timestamp, message.arbitration_id, message.is_extended_id, message.data, message.is_remote_frame
+    )
 
 
 class FakeClock:
@@ -38,6 +65,26 @@ class InlineExecutor(Executor):
         except Exception as error:
             future.set_exception(error)
         return future
+
+
+class HeldExecutor(InlineExecutor):
+    """Does the work at once, or while it `holds` keeps it for `do_next`."""
+
+    def __init__(self, holds: bool = True) -> None:
+        self.holds = holds
+        self.held: list[tuple[Future[Any], Callable[..., Any], tuple[Any, ...]]] = []
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        if not self.holds:
+            return super().submit(fn, *args, **kwargs)
+        self.held.append((Future(), fn, args))
+        return self.held[-1][0]
+
+    def do_next(self) -> None:
+        """The oldest piece of work that is held."""
+        future, fn, args = self.held.pop(0)
+        assert future.set_running_or_notify_cancel()
+        future.set_result(fn(*args))
 
 
 class ScriptedBus:
@@ -76,3 +123,56 @@ class ScriptedBus:
 
     def shutdown(self) -> None:
         self.closed = True
+
+
+class Bench:
+    """A service on a scripted bus, by a clock that may go on from an earlier service.
+
+    `away` takes the bus's interface away.  `keeper` keeps its state; `pipeline` may have been prepared.
+    """
+
+    def __init__(
+        self,
+        messages: Iterable[can.Message] = (),
+        config: Config | None = None,
+        workers: Executor | None = None,
+        notifier: Any = None,
+        keeper: StatePersistence | None = None,
+        pipeline: Pipeline | None = None,
+        clock: FakeClock | None = None,
+    ) -> None:
+        self.config = config or reference_configuration()
+        self.clock = clock or FakeClock()
+        self.wire = ScriptedBus(self.clock, messages)
+        self.away = False
+        self.database = output_database(self.config)
+        own = [(message.frame_id, message.is_extended_frame) for message in self.database.messages]
+        self.bus = LiveBus(self._open, self.clock, self.clock.sleep, own)
+        self.results: list[WindowResult] = []
+        self.service = Service(
+            self.config, pipeline or Pipeline(self.config, load_databases(self.config)), self.bus,
+            Publisher(self.database), notifier or Notifier(), workers or InlineExecutor(), self.clock,
+            self.results.append, lambda: keeper, self.clock.wait_for,
+        )  # fmt: skip
+
+    def _open(self) -> Any:
+        if self.away:
+            raise BusError("bus can0: no such device", may_come=True)
+        self.wire.closed = False
+        return self.wire
+
+    def run(self, seconds: float) -> float:
+        """Works on; the time at which that began."""
+        began = self.clock.now
+        while self.clock.now < began + seconds:
+            self.service.step()
+        return began
+
+    def sent(self, name: str, since: float = 0.0) -> list[dict[str, Any]]:
+        """The frames of a message that went out, decoded, each with the time `at` which it did."""
+        wanted: Any = self.database.get_message_by_name(name)
+        return [
+            {"at": t, **wanted.decode(bytes(m.data))}
+            for t, m in self.wire.sent
+            if m.arbitration_id == wanted.frame_id and t >= since
+        ]

@@ -45,6 +45,23 @@ from soilbus.validation.cramer_rao import cramer_rao
 from soilbus.validation.importance_sampling import sample_posterior
 from soilbus.workers import workers
 
+__all__ = [
+    "ROUGHLY_KNOWN",
+    "BayesRiskFigures",
+    "Cell",
+    "Each",
+    "Task",
+    "Trial",
+    "as_json",
+    "driven",
+    "monte_carlo",
+    "prior_about",
+    "processes",
+    "summary",
+    "tasks_of",
+    "trials",
+]
+
 SOILS = ("loam", "wet_clay", "dry_sand")
 WINDOW_LENGTHS = (2.0, 10.0, 60.0)
 """Lengths of the windows [s]."""
@@ -243,13 +260,13 @@ def trials(task: Task) -> tuple[Trial, Trial]:
 
     Raises SimulationError where the tractor cannot drive on, KeyError for an unknown soil.
     """
-    recording, soil = _driven(task)
+    recording, soil = driven(task)
     prior = prior_about(prior_of(task.config), soil, np.random.default_rng([task.seed, 1]))
     with_sinkage, without = (_trial(recording, task, prior, soil, fitted) for fitted in (True, False))
     return with_sinkage, without
 
 
-def _driven(task: Task) -> tuple[Recording, Soil]:
+def driven(task: Task) -> tuple[Recording, Soil]:
     """The drive and its soil: the named one, or the first drawn around it on which the tractor gets on."""
     config, name, duration, seed, _, around = task
     rng, named = np.random.default_rng([seed, 3]), soil_named(name)

@@ -23,6 +23,22 @@ from soilbus.terra.rim import Quadrature, fixed_shares
 from soilbus.terra.soil_laws import SHEAR_LAWS
 from soilbus.terra.wheel import EXACT_NODES
 
+__all__ = [
+    "AS_PRINTED",
+    "EXACT",
+    "EXACT_EXPONENTIAL",
+    "SIMPSON",
+    "Equations",
+    "Forces",
+    "OperatingPoint",
+    "Solution",
+    "Three",
+    "Unknowns",
+    "WheelEquations",
+    "entry_angle",
+    "moduli_from_two_widths",
+]
+
 Three = tuple[float, float, float]
 
 MAX_ITERATIONS = 50

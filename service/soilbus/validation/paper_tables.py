@@ -13,6 +13,24 @@ from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
 from soilbus.validation.paper import OperatingPoint, Unknowns
 
+__all__ = [
+    "RUNS",
+    "SANDY_LOAM",
+    "SINKAGE",
+    "SLIP",
+    "START_ERRORS",
+    "TORQUE_ON_CLAY",
+    "TORQUE_ON_LOAM",
+    "TRACTOR_2",
+    "TRIALS",
+    "WET_CLAY",
+    "Run",
+    "Trial",
+    "as_print",
+    "errors_in_percent",
+    "from_print",
+]
+
 SLIP = 0.2
 """Section 4.2."""
 SINKAGE = 0.05

@@ -12,7 +12,7 @@ from adaptive import adaptive_forces
 from soilbus.terra.effects.along import share_of_way, through_knots
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active, forces_with, wheel_with
-from soilbus.terra.effects.soil import DRIFT_KNOTS, SLIP_SINKAGE, TYPICAL_PRESSURE
+from soilbus.terra.effects.soil import SLIP_SINKAGE
 from soilbus.terra.effects.steady import CompletedModel, Wheel
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
@@ -29,6 +29,8 @@ from wheels_around import REAR, one_wheel, wheels_around
 
 MODEL = WheelModel("rational")
 STATE, AROUND = wheels_around(seed=7)
+TYRE_PRESSURE = 1e5
+"""Pressure [Pa] at which the stiffness of ruts is what `stiffness` says, whatever n is."""
 
 
 def changed(name: str, state: WheelState = STATE, around=AROUND, **values: float) -> WheelState:
@@ -105,8 +107,8 @@ def test_only_rear_wheels_run_in_ruts():
     effect = Active(CATALOGUE["multipass"], values)
     ours, plain = forces_with([effect], STATE, MODEL, AROUND), wheel_forces(STATE, MODEL)
     n = STATE.n / 1.3
-    depth = (TYPICAL_PRESSURE / STATE.K_L) ** (1.0 / STATE.n)
-    K_L = 2.5 * TYPICAL_PRESSURE / depth**n
+    depth = (TYRE_PRESSURE / STATE.K_L) ** (1.0 / STATE.n)
+    K_L = 2.5 * TYRE_PRESSURE / depth**n
     packed = STATE._replace(n=n, K_L=K_L, c=1.2 * STATE.c, tan_phi=1.2 * STATE.tan_phi, K=STATE.K / 1.6)
     assert np.array_equal(ours[..., ~REAR], plain[..., ~REAR])
     assert ours[..., REAR] == pytest.approx(wheel_forces(packed, MODEL)[..., REAR], rel=1e-10)
@@ -167,8 +169,9 @@ def test_the_soil_drifts_along_the_way():
               "strength_2": 0.15}  # fmt: skip
     soil = changed("soil_drift", **values)
     u = AROUND.distance / AROUND.length
-    knots = np.linspace(0.0, 1.0, DRIFT_KNOTS + 2)
-    rest = [0.0] * (DRIFT_KNOTS - 4)
+    n_knots = sum(p.name.startswith("stiffness_") for p in CATALOGUE["soil_drift"].parameters)
+    knots = np.linspace(0.0, 1.0, n_knots + 2)
+    rest = [0.0] * (n_knots - 4)
     bend = CubicSpline(knots, [0.0, 0.3, -0.2, 0.0, 0.1, *rest, 0.0], bc_type="natural")(u) - 0.1
     assert np.log(soil.K_L / STATE.K_L) == pytest.approx((0.8 * (u - 0.5) + bend) * np.ones(4), rel=1e-10)
     bend = CubicSpline(knots, [0.0, 0.0, 0.15, 0.0, 0.0, *rest, 0.0], bc_type="natural")(u)

@@ -14,7 +14,6 @@ from soilbus.terra.effects.along import stretches, through_low_pass
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active, wheel_with
 from soilbus.terra.effects.sensors import read_late
-from soilbus.terra.effects.vehicle import REFERENCE_RATE
 from soilbus.terra.vehicle import slip_ratio
 from soilbus.terra.wheel import WheelModel
 from wheels_around import RADIUS, REAR, wheels_around
@@ -41,9 +40,9 @@ def test_a_drive_line_takes_torque_driving_and_braking():
 
 
 def test_friction_of_a_drive_line_falls_with_speed():
-    """At the reference rate it is what share and drag say, at four times that 4^-0.5 of it; churning is not touched."""
+    """At 2.5 rad/s it is what share and drag say, at four times that 4^-0.5 of it; churning is not touched."""
     torque = np.array([[500.0, 500.0, -200.0]])
-    around = AROUND._replace(wheel_speed=REFERENCE_RATE * np.array([[1.0, 4.0, -4.0]]))
+    around = AROUND._replace(wheel_speed=2.5 * np.array([[1.0, 4.0, -4.0]]))
     lost = torque_of("drivetrain_loss", torque, around, share=0.1, drag=15.0, viscous=2.0, fading=0.5) - torque
     churned = 2.0 * around.wheel_speed
     assert lost - churned == pytest.approx(np.array([[65.0, 32.5, -17.5]]))

@@ -57,7 +57,7 @@ def _unmeasured_slope(around: Surroundings, values: Values) -> Any:
 
 GRADE = Effect(
     name="grade",
-    physics="The field is not level, and gravity holds back or pushes what no sensor has told of.",
+    physics="The field is not level, and gravity holds back or pushes, and no sensor shows it.",
     source="weight along the slope, m g sin(slope): Wong 2008, ch. 3; natural cubic spline between knots",
     tells="driving both ways on the slope, or a pitch sensor with its zero set on level ground; a slope that never"
     " changes, and is the same on every field, is a draft offset",
@@ -80,7 +80,7 @@ def _pitch_error(around: Surroundings, values: Values) -> Any:
 GRADE_BESIDE_PITCH = replace(
     GRADE,
     physics="The pitch sensor is not at zero on level ground, or leaves out how the field rises and falls: gravity"
-    " holds back or pushes what it has not told of.",
+    " holds back or pushes by the difference.",
     source="weight along the slope, m g sin(slope): Wong 2008, ch. 3; an inclinometer's zero and its mounting are"
     " taken to be right to 0.3 deg, and never off by more than three times that",
     parameters=(

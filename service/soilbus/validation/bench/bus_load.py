@@ -43,7 +43,8 @@ class Traffic:
         self.sent = 0
         config = reference_configuration()
         drive = list(frames(simulate(config, excited("loam", seconds), seed=1), config))
-        self._played = _thickened(drive, FULL_BUS_RATE * MAPPED_SHARE)
+        self.played = _thickened(drive, FULL_BUS_RATE * MAPPED_SHARE)
+        """Each frame with its time [s] since an origin of its own, in their order."""
         self._channel = channel
         self._thread = threading.Thread(target=self._play, daemon=True)
 
@@ -58,8 +59,8 @@ class Traffic:
     def _play(self) -> None:
         bus = open_bus({"interface": "socketcan", "channel": self._channel}, [])
         wire = wire_of(bus)
-        begin = time.monotonic() - self._played[0][0]
-        for t, frame in self._played:
+        begin = time.monotonic() - self.played[0][0]
+        for t, frame in self.played:
             if (ahead := begin + t - time.monotonic()) > 0.0005:
                 time.sleep(ahead)
             wire.send(frame)

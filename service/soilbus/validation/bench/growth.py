@@ -44,7 +44,7 @@ def exponents() -> dict[str, Figure]:
     """
     sizes, works, iterations = [], [], []
     for wheels in WHEELS:
-        for problem, prior in _problems(wheels):
+        for problem, prior in problems(wheels):
             fit = fit_window(problem, prior)
             if fit is None:
                 raise AssertionError(f"no fit of {wheels} wheels and {problem.n} instants")
@@ -103,8 +103,8 @@ def _steps(problem: ObservationModel, prior: SoilPrior, soil: Array) -> Callable
     return work
 
 
-def _problems(wheels: int) -> Iterator[tuple[ObservationModel, SoilPrior]]:
-    """Windows of all lengths of a tractor with this number of wheels, half of them on each axle; one: a test rig."""
+def problems(wheels: int) -> Iterator[tuple[ObservationModel, SoilPrior]]:
+    """Windows of all lengths of a tractor with so many wheels, half of them on each axle; one: a test rig."""
     config = _configuration(max(wheels, 2))
     recording = simulate(config, excited("loam", max(WINDOW_LENGTHS)), seed=1)
     samples = {name: (column.t, column.value) for name, column in recording.channels.items()}

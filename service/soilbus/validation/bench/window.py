@@ -60,7 +60,7 @@ class Window(NamedTuple):
 
 def window_solve_speedup() -> Figure:
     """10 s, four wheels, five free parameters, cold; AssertionError where the two come to different ends."""
-    windows = [_window(soil, *known) for known in EXACT_AND_ROUGH for soil in SOILS]
+    windows = [window_of(soil, *known) for known in EXACT_AND_ROUGH for soil in SOILS]
     apart, times = [], []
     for window in windows:
         apart.append(distance(window, fit_window(*window), by_finite_differences(window)))
@@ -159,7 +159,7 @@ def _works(window: Window) -> tuple[Callable[[], object], ...]:
     )
 
 
-def _window(name: str, exact: str, rough: str) -> Window:
+def window_of(name: str, exact: str, rough: str) -> Window:
     """A simulated drive with slip swept from 0.05 to 0.4."""
     soil = soil_named(name)
     median = 1.25 * getattr(soil, rough)

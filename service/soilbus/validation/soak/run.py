@@ -14,9 +14,7 @@ from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.service import Service
-from soilbus.daemon.tick_phase import MAX_PERIOD_CHANGE
 from soilbus.daemon.warm_up import warm_up
-from soilbus.pipeline.outputs import TICK
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import soil_named
@@ -25,7 +23,17 @@ from soilbus.validation.soak.figures import Beat, Estimates, Hour, resident_memo
 from soilbus.validation.soak.traffic import SOIL, traffic_beside
 from soilbus.validation.soak.wire import Wire
 
+__all__ = [
+    "CYCLE",
+    "HOUR",
+    "SLACK",
+    "Soak",
+    "soak",
+]
+
 HOUR = 3600.0
+CYCLE, JITTER = 0.1, 0.006
+"""Cycle [s] of the frames that others act on, and by how much one may be longer or shorter: 6 %."""
 SLACK = 0.03
 """How much later than its beat [s] a frame may go: the loop waits up to 20 ms for a frame."""
 LOOK = 150.0
@@ -67,7 +75,7 @@ def soak(duration: float, seed: int, each_hour: Callable[[Hour], None] = lambda 
         clock, estimates.add,
     )  # fmt: skip
     verdict = out.get_message_by_name("Traversability").frame_id
-    beat = Beat(TICK, SLACK, MAX_PERIOD_CHANGE)
+    beat = Beat(CYCLE, SLACK, JITTER)
     wire.on_send = lambda t, message: beat.add(t) if message.arbitration_id == verdict else None
     hours: list[Hour] = []
     end = clock.now + duration

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from soilbus.pipeline.outputs import TICK
-from soilbus.validation.soak.run import SLACK, Soak
+from soilbus.validation.soak.run import CYCLE, SLACK, Soak
+
+__all__ = [
+    "GROWTH",
+    "Demand",
+    "demands",
+]
 
 GROWTH = 1e6
 """Of resident memory [bytes] after the first hour that is allowed."""
@@ -42,7 +47,7 @@ def demands(shown: Soak) -> list[Demand]:
         Demand("every frame on its beat", f"{shown.off_beat} of {shown.sent} off it", shown.off_beat == 0 < shown.sent),
         Demand(
             "the beat drifts with the windows' ends only", f"{shown.drift:+.3f} s in {shown.epochs} beginnings",
-            abs(shown.drift) <= TICK / 2 * shown.epochs + SLACK,
+            abs(shown.drift) <= CYCLE / 2 * shown.epochs + SLACK,
         ),
         Demand(
             f"memory grows by at most {GROWTH / 1e6:g} MB after the first hour", f"{growth / 1e6:+.2f} MB",

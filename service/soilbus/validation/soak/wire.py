@@ -70,7 +70,7 @@ class Wire:
         if self._fault.kind == "no_bus" and self._on:
             raise can.CanOperationError("Network is down", errno.ENETDOWN)
         if self._extra:
-            return self._hand_over(self._extra.pop())
+            return self.hand_over(self._extra.pop())
         while True:
             due = self._next.timestamp + self._lag
             if due > self.clock.now + wait:
@@ -84,7 +84,7 @@ class Wire:
             if not (self._on and self._fault.kind == "stuck"):
                 self._last[message.arbitration_id] = message
             if kept is not None:
-                return self._hand_over(kept)
+                return self.hand_over(kept)
 
     def send(self, message: can.Message, timeout: float | None = None) -> None:
         if self._on and self._fault.kind == "no_bus":
@@ -121,7 +121,7 @@ class Wire:
             begin + float(self._rng.exponential(MEAN_FAULT)),
         )
 
-    def _hand_over(self, message: can.Message) -> can.Message:
+    def hand_over(self, message: can.Message) -> can.Message:
         if message.is_error_frame:
             self.error_frames += 1
         else:
