@@ -27,7 +27,7 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
-from statics import MODEL, WEIGHT, WHEELS, brute, brute_with_rolling
+from soilbus.validation.statics import MODEL, WEIGHT, WHEELS, brute, brute_with_rolling
 
 CONFIG = reference_configuration()
 RIG = rig_of(CONFIG)

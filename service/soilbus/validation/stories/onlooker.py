@@ -1,6 +1,6 @@
 """A service on a spoilt wire, and an onlooker who judges each verdict by what he knows of the wire's deliveries.
 
-The wire plays the last moments of a good drive over and over, at 10 Hz, and spoils them as told.  The soil comes
+The wire plays the last moments of a good drive over and over, at 10 Hz, and spoils them as asked.  The soil comes
 from a tracker that says of each window what is true of the ground at its end: GO then hangs on
 what the wire delivers alone, as often as the service lets it.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import errno
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import partial
@@ -32,14 +32,37 @@ from soilbus.daemon.state_persistence import StatePersistence
 from soilbus.daemon.state_store import Owner
 from soilbus.decision.traversability import Status
 from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.multistart import Fit
 from soilbus.estimation.tracker import Tracker, TrackerOutput
 from soilbus.estimation.window import Window
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.pipeline import Pipeline
+from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import SOILS
 from soilbus.validation.fakes import FakeClock, InlineExecutor, drive_messages, feed_message
+
+__all__ = [
+    "CONFIG",
+    "CYCLE",
+    "MOMENTS",
+    "NEEDED",
+    "WEAK",
+    "Drive",
+    "Handed",
+    "Known",
+    "MadePipeline",
+    "NotingTracker",
+    "TrueTracker",
+    "Wire",
+    "Worker",
+    "fit_of",
+    "good_moment",
+    "good_tracked",
+    "of_soft_ground",
+    "tracked_at",
+]
 
 CONFIG = reference_configuration(["estimator.window=4.0", "traversability.max_age=2.0"])
 OUT = output_database(CONFIG)
@@ -63,7 +86,7 @@ HOLD = 2
 WEAK = 0.05
 """Share of their torque that motors have left which cannot pull what is asked."""
 BUS_OFF = 0x040
-"""Class of the error frame that tells of it."""
+"""Class of the error frame that reports it."""
 
 Moment = dict[int, list[can.Message]]
 
@@ -77,13 +100,40 @@ def good_moment(seed: int = 3) -> Moment:
     return {i: messages[-MOMENTS:] for i, messages in found.items()}
 
 
+class MadePipeline(Pipeline):
+    """A pipeline whose estimators are made by the caller."""
+
+    def __init__(self, config: Config, make: Callable[[], WindowEstimator]) -> None:
+        super().__init__(config, IN)
+        self.make = make
+
+    def new_estimator(self) -> WindowEstimator:
+        return self.make()
+
+
+class NotingTracker(Tracker):
+    """A tracker that adds its results to `found`."""
+
+    def __init__(self, found: list[TrackerOutput], *args: Any) -> None:
+        self.found = found
+        super().__init__(*args)
+
+    def estimate(self, window: Window, end: float) -> TrackerOutput:
+        self.found.append(super().estimate(window, end))
+        return self.found[-1]
+
+
+def fit_of(tracked: TrackerOutput) -> Fit:
+    """The fit of a window that has one."""
+    assert tracked.fit is not None
+    return tracked.fit
+
+
 def good_tracked(seed: int = 3) -> TrackerOutput:
     """What the tracker says of a window of a good drive."""
     config = reference_configuration()
-    pipeline = Pipeline(config, load_databases(config))
-    estimator, found = pipeline.estimator, []
-    usual = estimator.tracker.estimate
-    estimator.tracker.estimate = lambda *given: found.append(usual(*given)) or found[-1]
+    found: list[TrackerOutput] = []
+    pipeline = MadePipeline(config, lambda: WindowEstimator(config, partial(NotingTracker, found)))
     messages = drive_messages(config, 12.0, seed)
     for message in messages:
         feed_message(pipeline.admission, message)
@@ -94,17 +144,19 @@ def good_tracked(seed: int = 3) -> TrackerOutput:
 def of_soft_ground(tracked: TrackerOutput) -> TrackerOutput:
     """The same, as sure of it, of a ground that holds nothing."""
     soft = np.array(SOILS["wet_clay"]) * [0.05, 0.05, 1.0, 0.3, 0.2, 1.0]
-    fit = dataclasses.replace(
-        tracked.fit, gaussian=dataclasses.replace(tracked.fit.reported, soil=soft), marginalised=None
+    fit = fit_of(tracked)
+    gaussian = dataclasses.replace(fit.reported, soil=soft)
+    return dataclasses.replace(
+        tracked, fit=dataclasses.replace(fit, gaussian=gaussian, marginalised=None, second_mode=None)
     )
-    return dataclasses.replace(tracked, fit=dataclasses.replace(fit, second_mode=None))
 
 
 def tracked_at(tracked: TrackerOutput, window: Window, **changed: Any) -> TrackerOutput:
     """The same of a window's own instants."""
-    optimum = tracked.fit.optimum
+    fit = fit_of(tracked)
+    optimum = fit.optimum
     optimum = dataclasses.replace(optimum, t=optimum.t - optimum.t[-1] + window.t[-1])
-    return dataclasses.replace(tracked, fit=dataclasses.replace(tracked.fit, optimum=optimum), **changed)
+    return dataclasses.replace(tracked, fit=dataclasses.replace(fit, optimum=optimum), **changed)
 
 
 class Known(NamedTuple):
@@ -130,9 +182,9 @@ class Wire:
     cycle: float = CYCLE
     offset: float = 1.7e9 - 1000.0
     step: float = 0.0
-    """By so much [s] the clock that stamps frames has been set; only the next frame can tell of it."""
-    known_anew: Callable[[], None] = lambda: None
-    """Called when a frame has told that it was set back."""
+    """By so much [s] the clock that stamps frames has been set; only the next frame can show it."""
+    set_back: Callable[[], None] = lambda: None
+    """Called when a frame has shown that it was set back."""
     deaf: frozenset[str] = frozenset()
     spoilt: frozenset[str] = frozenset()
     repeated: frozenset[str] = frozenset()
@@ -155,7 +207,7 @@ class Wire:
     good: dict[str, float] = field(default_factory=dict)
     stamps: dict[str, float] = field(default_factory=dict)
     powers: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Shares of its torque that each motor has told last; one may be wild."""
+    """Shares of its torque that each motor has sent last; one may be wild."""
     heard: list[Known] = field(default_factory=list)
     """What was so at each delivery since the clock was set back last."""
     forged_at: float = -math.inf
@@ -167,15 +219,15 @@ class Wire:
         self.checked = {m.name for m in IN.messages if "Checksum" in {s.name for s in m.signals}}
         self.counter = self.next = self.life = 0
         self.base, self.halted_at, self.newest = self.clock.now, math.nan, -math.inf
-        self.told_off = False
+        self.off_reported = False
         self.counters: dict[str, int] = {}
 
-    def recv(self, timeout=None):
+    def recv(self, timeout: float | None = None) -> can.Message | None:
         if self.lost:
             raise can.CanOperationError("Network is down", errno.ENETDOWN)
         while True:
-            if self.off and not self.told_off:
-                self.told_off = True
+            if self.off and not self.off_reported:
+                self.off_reported = True
                 return can.Message(timestamp=self.stamp(), arbitration_id=BUS_OFF, is_error_frame=True, data=bytes(8))
             cycle, row = divmod(self.next, len(self.known))
             due = self.base + self.cycle * cycle + 0.002 * row
@@ -190,7 +242,7 @@ class Wire:
             self.clock.now = max(self.clock.now, due)
             if self.off:
                 continue
-            self.told_off = False
+            self.off_reported = False
             name, messages = self.known[row]
             if self.forged and row == 0 and self.forged_at < self.clock.now - 0.5 * self.cycle:
                 self.next -= 1
@@ -202,7 +254,7 @@ class Wire:
                 return can.Message(timestamp=self.stamp(), arbitration_id=0x123, is_extended_id=False, data=b"\x5a" * 3)
 
     def stamp(self, listened: bool = False) -> float:
-        """Of the next frame; only one to which the service listens tells that the clock was set back."""
+        """Of the next frame; only one to which the service listens shows that the clock was set back."""
         step, self.step = self.step, 0.0
         self.offset += step
         if self.halted and math.isnan(self.halted_at):
@@ -215,9 +267,9 @@ class Wire:
         if stamp < self.newest - CLOCK_STEP:
             self.life, self.newest = self.life + 1, -math.inf
             self.good, self.stamps, self.heard = {}, {}, []
-            self.known_anew()
+            self.set_back()
         self.newest = max(self.newest, stamp)
-        weak = len(self.powers) == len(MOTORS) and max(max(told) for told in self.powers.values()) <= WEAK
+        weak = len(self.powers) == len(MOTORS) and max(max(sent) for sent in self.powers.values()) <= WEAK
         firm = not (self.soft or weak)
         self.heard.append(Known(stamp, self.clock.now, self.soft, firm, self.blind, self.raises))
         return stamp
@@ -259,9 +311,11 @@ class Wire:
             timestamp=stamp, arbitration_id=message.arbitration_id, is_extended_id=message.is_extended_id, data=data
         )
 
-    def send(self, message, timeout=None) -> None:
+    def send(self, message: can.Message, timeout: float | None = None) -> None:
         if message.arbitration_id == VERDICT:
-            self.verdicts.append((self.clock.now, OUT.decode_message(VERDICT, bytes(message.data))))
+            verdict = OUT.decode_message(VERDICT, bytes(message.data))
+            assert isinstance(verdict, dict)
+            self.verdicts.append((self.clock.now, verdict))
 
     def shutdown(self) -> None:
         pass
@@ -270,17 +324,17 @@ class Wire:
 class Worker(InlineExecutor):
     """One thread: each piece of work takes `takes` [s], for ever while it hangs; all of it in its order.
 
-    `told` is called with what is handed in.
+    `handed_in` is called with what is handed in.
     """
 
-    def __init__(self, clock: FakeClock, told: Callable[..., None]) -> None:
-        self.clock, self.told = clock, told
+    def __init__(self, clock: FakeClock, handed_in: Callable[..., None]) -> None:
+        self.clock, self.handed_in = clock, handed_in
         self.hangs, self.takes = False, 0.0
         self.left: list[tuple[Future[Any], Callable[..., Any], tuple[Any, ...]]] = []
         self.busy_until = -math.inf
 
-    def submit(self, fn, /, *args, **kwargs):
-        self.told(*args)
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        self.handed_in(*args)
         if not self.left:
             self.busy_until = self.clock.now + self.takes
         self.left.append((Future(), fn, args))
@@ -322,7 +376,8 @@ class TrueTracker(Tracker):
     """A tracker that says of each window what a drive knows to be true, and shows the drive what it recalls."""
 
     def __init__(self, drive: Drive, *args: Any) -> None:
-        self.drive, self.said = drive, None
+        self.drive = drive
+        self.said: Gaussian | None = None
         super().__init__(*args)
 
     @property
@@ -338,7 +393,7 @@ class TrueTracker(Tracker):
 
     def estimate(self, window: Window, end: float) -> TrackerOutput:
         tracked = self.drive.truth(window, end)
-        self.said = tracked.fit.reported
+        self.said = fit_of(tracked).reported
         return tracked
 
 
@@ -355,9 +410,10 @@ class Drive:
         self.max_age = config.traversability.max_age
         self.tracked = tracked
         self.of_soft = None if tracked is None else of_soft_ground(tracked)
-        self.wire = Wire(self.clock, moment, cycle, known_anew=self.forget)
+        self.wire = Wire(self.clock, moment, cycle, set_back=self.forget)
         self.folder = TemporaryDirectory()
         self.faults: list[str] = []
+        self.result: WindowResult | None = None
         self.go = 0
         self.last: dict[str, Any] = {}
         self.interrupted = self.halted_until = -math.inf
@@ -367,8 +423,7 @@ class Drive:
 
     def start(self) -> None:
         """A service that begins with the state that the one before has left behind."""
-        pipeline = Pipeline(self.config, IN)
-        pipeline.new_estimator = self.estimator
+        pipeline = MadePipeline(self.config, self.estimator)
         owner = Owner.of(self.config, pipeline.intake.channels, IN)
         persistence = StatePersistence(
             Path(self.folder.name), owner, InlineExecutor(), lambda: self.clock.now + self.wire.offset
@@ -401,7 +456,7 @@ class Drive:
         assert tracked is not None
         return tracked_at(tracked, window, since=end - self.config.estimator.window, mismatch=known.blind)
 
-    def open(self):
+    def open(self) -> Wire:
         if self.wire.lost:
             raise BusError("bus can0: no such device", may_come=True)
         return self.wire
@@ -414,7 +469,8 @@ class Drive:
             self.handed[task.end] = Handed(self.wire.life, ended, known, task.fresh)
             self.lives[task.index % 251] = self.wire.life
 
-    def take(self, result) -> None:
+    def take(self, result: WindowResult) -> None:
+        """The service publishes a window."""
         window = self.handed[result.t]
         if window.fresh or result.traversability.probability is None:
             self.in_a_row = math.inf  # nothing is held back by what is not known
@@ -424,7 +480,7 @@ class Drive:
             self.result, self.window = result, window
 
     def forget(self) -> None:
-        """The service begins anew, or must."""
+        """The service restarts, or must."""
         self.result, self.window, self.in_a_row = None, NO_WINDOW, math.inf
 
     def step_clock(self, by: float) -> None:
@@ -454,7 +510,7 @@ class Drive:
             self.interrupted = now
         self.interrupted = max(self.interrupted, self.wire.forged_at)
 
-    def objections(self, at: float, verdict: dict[str, Any]):
+    def objections(self, at: float, verdict: dict[str, Any]) -> Iterator[str]:
         """Why a verdict must not be."""
         window = verdict["Window"]
         if isinstance(window, int | float) and self.lives.get(int(window)) != self.wire.life:

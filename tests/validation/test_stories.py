@@ -11,9 +11,8 @@ from soilbus.decision.traversability import State as Way
 from soilbus.decision.traversability import Traversability
 from soilbus.pipeline.intake import Intake
 from soilbus.pipeline.states import ServiceState
-
-from .drives import cheap, real
-from .story import TO_ALL, TO_SOME, Event, begin, drawn, end, told
+from soilbus.validation.stories.drives import cheap, real
+from soilbus.validation.stories.story import TO_ALL, TO_SOME, Event, begin, drawn, end, played
 
 AT_A_TIME, HEALED = 25, 10
 SEEDS = [range(first, first + AT_A_TIME) for first in range(0, 125, AT_A_TIME)]
@@ -31,16 +30,16 @@ def quiet():
 def test_go_is_said_where_the_truth_allows_it_and_nowhere_else(seeds):
     go = 0
     for seed in seeds:
-        drive = told(cheap(), drawn(seed), healed=seed % HEALED == 0)
+        drive = played(cheap(), drawn(seed), healed=seed % HEALED == 0)
         assert drive.faults == [], f"story {seed}: {drawn(seed)}"
         go += drive.go
     assert go > 10 * len(seeds)
 
 
-def test_an_estimator_that_is_told_nothing_says_no_more_than_the_truth():
+def test_an_estimator_that_is_given_nothing_says_no_more_than_the_truth():
     go = 0
     for seed in range(4):
-        drive = told(real(seed), drawn(seed, (*TO_SOME, *TO_ALL)))
+        drive = played(real(seed), drawn(seed, (*TO_SOME, *TO_ALL)))
         assert drive.faults == [], f"real story {seed}"
         go += drive.go
     assert go
@@ -75,11 +74,11 @@ def with_the_verdict_of_the_run_before(monkeypatch):
 )
 def test_a_service_without_a_check_is_found_out(mutation, monkeypatch):
     mutation(monkeypatch)
-    assert any(told(cheap(), drawn(seed)).faults for seed in range(60))
+    assert any(played(cheap(), drawn(seed)).faults for seed in range(60))
 
 
 def test_a_window_that_is_solved_when_it_is_too_old_is_no_go():
-    drive = told(cheap(), [])
+    drive = played(cheap(), [])
     drive.worker.takes = 2.6  # longer than a posterior counts
     drive.run(3.0)
     before = drive.go
@@ -90,7 +89,7 @@ def test_a_window_that_is_solved_when_it_is_too_old_is_no_go():
 
 
 def test_go_ends_with_the_age_by_our_own_clock_where_the_stamps_stand():
-    drive = told(cheap(), [])
+    drive = played(cheap(), [])
     assert str(drive.last["State"]) == "go"
     drive.wire.halted = True
     drive.run(3.0)
@@ -103,7 +102,7 @@ def test_go_ends_with_the_age_by_our_own_clock_where_the_stamps_stand():
 
 def test_an_interruption_ends_what_was_known_before_it():
     """Of half a second, so that the window before is still young when the bus is back."""
-    drive = told(cheap(), [])
+    drive = played(cheap(), [])
     drive.wire.off = True
     drive.run(0.5)
     drive.wire.off = False
@@ -115,7 +114,7 @@ def test_an_interruption_ends_what_was_known_before_it():
 
 
 def test_what_the_worker_says_of_the_time_before_the_clock_was_set_is_not_taken():
-    drive = told(cheap(), [])
+    drive = played(cheap(), [])
     drive.run(0.5)
     drive.worker.hangs = True
     drive.run(1.0)
@@ -128,7 +127,7 @@ def test_what_the_worker_says_of_the_time_before_the_clock_was_set_is_not_taken(
 
 
 def test_go_after_soft_ground_needs_two_windows():
-    drive = told(cheap(), [Event({"soft": True}, 1.2), Event({}, 1.0)])
+    drive = played(cheap(), [Event({"soft": True}, 1.2), Event({}, 1.0)])
     assert str(drive.last["State"]) != "go"
     drive.run(1.2)
     assert str(drive.last["State"]) == "go"
@@ -136,8 +135,8 @@ def test_go_after_soft_ground_needs_two_windows():
 
 
 @pytest.mark.parametrize("by", [0.0, -3600.0, 3600.0])
-def test_a_torque_limit_that_is_not_told_any_more_holds(by):
-    drive = told(cheap(), [])
+def test_a_torque_limit_that_is_not_sent_any_more_holds(by):
+    drive = played(cheap(), [])
     begin(drive, {"unsaid": True})
     drive.run(3.0)
     before = drive.go
@@ -152,7 +151,7 @@ def test_a_torque_limit_that_is_not_told_any_more_holds(by):
 
 
 def test_one_wild_torque_limit_moves_nothing():
-    drive = told(cheap(), [Event({"unsaid": True}, 2.0)])
+    drive = played(cheap(), [Event({"unsaid": True}, 2.0)])
     begin(drive, {"unsaid": True})
     drive.run(3.0)
     assert str(drive.last["State"]) == "no_go"

@@ -7,7 +7,18 @@ import random
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from onlooker import NEEDED, WEAK, Drive
+from soilbus.validation.stories.onlooker import NEEDED, WEAK, Drive
+
+__all__ = [
+    "TO_ALL",
+    "TO_GROUND",
+    "TO_SOME",
+    "Event",
+    "begin",
+    "drawn",
+    "end",
+    "played",
+]
 
 LAST = 0.4
 """Seconds of good frames at the end of a story."""
@@ -19,11 +30,11 @@ TO_SOME = ("deaf", "noisy", "spoilt", "repeated")
 """What happens to some of the messages: they do not come, or others in their place; are damaged; do not count on."""
 TO_ALL = ("lost", "off", "halted", "forged", "clock", "restart", "killed", "hangs", "late")
 TO_GROUND = ("blind", "soft", "raises", "weak", "unsaid")
-"""What only a tracker that is told the truth knows of."""
+"""What only a tracker that is given the truth knows of."""
 
 
 class Event(NamedTuple):
-    """What is so, each with its argument, for so many seconds; nothing: all is well."""
+    """Faults with their arguments, and how long they last [s]; no fault: all is well."""
 
     faults: dict[str, Any]
     seconds: float
@@ -47,7 +58,7 @@ def _argument(rng: random.Random, kind: str) -> Any:
     return {"clock": rng.choice(STEPS), "late": rng.uniform(0.2, 2.6)}.get(kind, True)
 
 
-def told(drive: Drive, story: Sequence[Event], healed: bool = False) -> Drive:
+def played(drive: Drive, story: Sequence[Event], healed: bool = False) -> Drive:
     """The drive after a good start and the events; healed: until go is due again, which else is a fault."""
     window, firm = drive.config.estimator.window, not drive.wire.soft
     drive.run(window + 0.4)

@@ -1,7 +1,7 @@
-"""`PYTHONPATH=service:tests/support python -m tests.stories --stories 3000 --seed 1`: random stories, judged.
+"""`python -m soilbus.validation.stories --stories 3000 --seed 1`: random stories, judged.
 
-Of each story the seed is counted on from --seed.  Each is told to a service whose tracker says the truth, the
-first --real of them also to one that must find it out by itself.  Exit code 1 if go was said where the truth forbids
+Of each story the seed is counted on from --seed.  Each is played to a service whose tracker is given the truth, the
+first --real of them also to one that must estimate it.  Exit code 1 if go was said where the truth forbids
 it, or not said again where it was due.
 """
 
@@ -11,16 +11,16 @@ import argparse
 import logging
 from collections.abc import Sequence
 
-from .drives import cheap, real
-from .story import TO_ALL, TO_SOME, drawn, told
+from soilbus.validation.stories.drives import cheap, real
+from soilbus.validation.stories.story import TO_ALL, TO_SOME, drawn, played
 
 HEALED = 10
-"""Of so many stories one goes on until go is due again."""
+"""Every tenth story goes on until go is due again."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse, tell, judge."""
-    parser = argparse.ArgumentParser(prog="python -m tests.stories", description=__doc__)
+    """Parse, play, judge."""
+    parser = argparse.ArgumentParser(prog="python -m soilbus.validation.stories", description=__doc__)
     parser.add_argument("--stories", type=int, default=3000, help="how many (3000)")
     parser.add_argument("--real", type=int, default=30, help="how many with a real estimator (30)")
     parser.add_argument("--seed", type=int, default=1, help="of the first one (1)")
@@ -30,12 +30,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     bad = go = go_of_real = 0
     for seed in seeds[: chosen.stories]:
         story = drawn(seed)
-        drive = told(cheap(), story, healed=seed % HEALED == 0)
+        drive = played(cheap(), story, healed=seed % HEALED == 0)
         go += drive.go
         bad += _wrong(f"story {seed}", story, drive.faults)
     for seed in seeds[: chosen.real]:
         story = drawn(seed, (*TO_SOME, *TO_ALL))
-        drive = told(real(seed), story)
+        drive = played(real(seed), story)
         go_of_real += drive.go
         bad += _wrong(f"real story {seed}", story, drive.faults)
     print(f"{chosen.stories} stories, {go} times go; {chosen.real} with a real estimator, {go_of_real}; {bad} wrong")
@@ -46,7 +46,3 @@ def _wrong(name: str, story: object, faults: Sequence[str]) -> bool:
     if faults:
         print(f"{name}: {story}\n    " + "\n    ".join(faults[:3]))
     return bool(faults)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,4 +1,4 @@
-"""What the stories happen to: a tractor on ground of which the tracker is told the truth, or one that must find out."""
+"""What the stories happen to: a tractor on ground whose tracker is given the truth, or one that must estimate it."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from functools import lru_cache
 
 import numpy as np
 
-from onlooker import CYCLE, Drive, Moment, good_moment, good_tracked
 from soilbus.config.model import Config
+from soilbus.estimation.tracker import TrackerOutput
 from soilbus.simulator.frames import START_TIME, frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
-from statics import brute
+from soilbus.validation.statics import brute
+from soilbus.validation.stories.onlooker import CYCLE, Drive, Moment, good_moment, good_tracked
 
 CHEAP: Config = reference_configuration(["estimator.window=2.0", "traversability.max_age=2.0"])
 REAL: Config = reference_configuration(["estimator.window=6.0"])
@@ -26,7 +27,7 @@ GROUNDS = ("loam", "sandy_loam_15", "wet_clay", "clayey_soil_38")
 
 
 @lru_cache
-def _good():
+def _good() -> tuple[Moment, TrackerOutput]:
     return good_moment(), good_tracked()
 
 
