@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
@@ -227,3 +228,9 @@ def test_the_command_says_what_is_wrong_with_its_options(capsys):
         main(["--windows", "0"])
     assert end.value.code == 2
     assert "at least 1 window" in capsys.readouterr().err
+
+
+def test_without_scikit_learn_one_line_says_which_extra_is_missing(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "sklearn.kernel_ridge", None)
+    assert main(["--windows", "1", "--train", "20"]) == 1
+    assert capsys.readouterr().err == "the learned regressor needs the extra soilbus[peers]\n"
