@@ -14,22 +14,17 @@ from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.score import scores
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.multistart import DescentOptions, _fit_at
-from soilbus.estimation.solver import (
-    MAX_STALLED,
-    Descent,
-    Iterate,
-    Objective,
-    QuadraticModel,
-    StoppingRule,
-    descend_jointly,
-)
+from soilbus.estimation.multistart import DescentOptions, fit_at
+from soilbus.estimation.solver import Descent, Iterate, Objective, QuadraticModel, StoppingRule, descend_jointly
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active
+
+MAX_STALLED = 2
+"""Steps in a row that gain nothing, after which a descent ends."""
 
 CONFIG = reference_configuration()
 PRIOR = prior_of(CONFIG)
@@ -124,7 +119,7 @@ def test_a_damped_descent_ends_at_the_posterior_with_the_latents_at_their_optimu
     place = fitting.start(optimum.soil, gains=optimum.gains)
     point = fitting.quadratic_model(place)
     assert point.neg2_log_posterior < known.neg2_log_posterior - 5.0
-    fast = _fit_at(fitting, Descent(place, place, point, np.inf, 1, converged=False))
+    fast = fit_at(fitting, Descent(place, place, point, np.inf, 1, converged=False))
     slow = descend_damped(fitting, fast, DescentOptions())
     here = Iterate(slow.optimum.soil, slow.optimum.gains, slow.optimum.latents, slow.neg2_log_posterior, 0)
     for _ in range(3):

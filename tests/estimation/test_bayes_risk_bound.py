@@ -7,7 +7,10 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.stats import norm
 
-from soilbus.validation.bayes_risk_bound import WEIGHT_POWERS, bayes_risk
+from soilbus.validation.bayes_risk_bound import bayes_risk
+
+WEIGHT_POWERS = (-1.0, 0.0, 1.0, 2.0)
+"""Powers of the weights that a bound is the greatest of."""
 
 GRID = np.linspace(-3.0, 3.0, 601)
 NOISE = 0.4

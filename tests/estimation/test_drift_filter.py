@@ -10,7 +10,7 @@ from scipy.special import expit
 
 from soilbus.decision.traversability import Status
 from soilbus.estimation.assembly import prior_of
-from soilbus.estimation.drift_filter import PIECES, STEADY_DRIFT_SD, at_window_end
+from soilbus.estimation.drift_filter import at_window_end
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.solver import Iterate, Objective
@@ -22,6 +22,11 @@ from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
 from soilbus.validation import local_optima
 from soilbus.validation.driven_windows import errors, task_of, tracker_of, windows
+
+PIECES = 5
+"""Pieces of constant soil in a window, as the drift filter has them."""
+STEADY_DRIFT_SD = 7.0
+"""Prior sd of a steady change over that of the random walk."""
 
 SPEED, STEP = 1.5, 3.0
 DRIFT = 0.03

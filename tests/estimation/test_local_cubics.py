@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soilbus.estimation.local_cubics import PHASE_PARTS, Series, curve_of, variance_of_one
+from soilbus.estimation.local_cubics import Series, curve_of, variance_of_one
 from soilbus.estimation.window import Rig, SensorNoise
 from soilbus.sensors.bins import Bins
 from soilbus.sensors.rates import resolved_window
 from soilbus.terra.vehicle import Chassis
+
+PHASE_PARTS = 16
+"""Parts of the time between two samples at which a variance is asked for."""
 
 T = np.cumsum(np.random.default_rng(1).uniform(0.019, 0.021, 2000))
 

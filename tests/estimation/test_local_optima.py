@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import fit_from_soil, fit_window
 from soilbus.estimation.observation_model import ObservationModel
-from soilbus.estimation.parametrization import BOUND_SD, MAX_PHI
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
@@ -22,6 +21,11 @@ from soilbus.simulator.scenario import Patch, Scenario
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
 from soilbus.validation import local_optima
+
+BOUND_SD = 4.0
+"""Prior standard deviations to which a free parameter is confined."""
+MAX_PHI = 1.2
+"""Friction angle [rad] beyond any soil's."""
 
 STARTS = 20
 K_C = np.array(PARAMETERS) == "k_c"

@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soilbus.estimation.parametrization import BOUND_SD, Coordinates, moments_along_share
+from soilbus.estimation.parametrization import Coordinates, moments_along_share
 from soilbus.terra.soils import SOILS
+
+BOUND_SD = 4.0
+"""Prior standard deviations to which a free parameter is confined."""
 
 
 def problem(share, share_std, prior_std=1.2, miss=0.0, slope=-1.4, other_std=0.05):

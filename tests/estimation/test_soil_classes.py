@@ -11,11 +11,14 @@ from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.multistart import clip_to_prior, fit_window
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import PARAMETERS, Posterior, SoilPrior
-from soilbus.estimation.soil_classes import PRIOR_UNKNOWN, WITHIN_CLASS_SD, SoilClasses, guessed, ranked_by_likelihood
+from soilbus.estimation.soil_classes import WITHIN_CLASS_SD, SoilClasses, guessed, ranked_by_likelihood
 from soilbus.simulator.reference import reference_configuration
 from soilbus.terra.soils import KINDS, SOILS, UNKNOWN
 from soilbus.terra.wheel import Soil
 from soilbus.validation.class_reliability import WIDE_COHESION, Prediction, driven, shortfall, windows
+
+PRIOR_UNKNOWN = 0.5
+"""Prior probability that a soil is none of the table."""
 
 WIDTH = 0.32
 CLASSES = SoilClasses.of_table(WIDTH)

@@ -18,11 +18,14 @@ from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import DEFAULT_OPTIONS, Start, fit_from, fit_from_soil, fit_window
 from soilbus.estimation.nuisance_parameters import parameters_of
 from soilbus.estimation.observation_model import ObservationModelWithEffects
-from soilbus.estimation.parametrization import BOUND_SD, Coordinates, at_bounds, step_fraction_within
+from soilbus.estimation.parametrization import Coordinates, at_bounds, step_fraction_within
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective, QuadraticModel, StoppingRule, descend_jointly
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.soils import SOILS
+
+BOUND_SD = 4.0
+"""Prior standard deviations to which a free parameter is confined."""
 
 WET_CLAY = SOILS["wet_clay"]
 C = PARAMETERS.index("c")

@@ -10,12 +10,15 @@ import pytest
 
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.tracker import GAIN_CORRELATION_TIME, gain_errors, prior_from_last_run
+from soilbus.estimation.tracker import gain_errors, prior_from_last_run
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.validation.driven_windows import errors, tracker_of, windows
+
+GAIN_CORRELATION_TIME = 86400.0
+"""A gain error forgets all but 1/e in a day [s]."""
 
 CONFIG = reference_configuration()
 PRIOR = prior_of(CONFIG)

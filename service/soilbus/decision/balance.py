@@ -25,6 +25,23 @@ from soilbus.decision.uncertain_model import ModelOfRows
 from soilbus.decision.wheels import DRAWBAR, MAX_SINE, Axles, WheelTable
 from soilbus.terra.wheel import MAX_ENTRY_ANGLE
 
+__all__ = [
+    "LEVEL",
+    "Balance",
+    "BetweenSlips",
+    "Columns",
+    "Duty",
+    "Largest",
+    "Limits",
+    "axle_sum",
+    "balance",
+    "climbing",
+    "largest_pull",
+    "point_of_pull",
+    "slips_of_most",
+    "within",
+]
+
 SUBDIVISIONS = 5
 """Parts into which each step of the slip grid is divided."""
 NEWTON_STEPS = 3

@@ -23,6 +23,8 @@ from soilbus.diagnosis.where import channels
 from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModelWithEffects
 from soilbus.terra.wheel import sinkage
 
+__all__ = ["WARNING", "ResidualTerms", "Term", "residual_terms"]
+
 # A value whose docstring states no source has no evidence recorded.
 MAX_TERMS = 3
 """Terms of a channel."""

@@ -23,6 +23,16 @@ from soilbus.estimation.local_cubics import Series
 from soilbus.estimation.window import Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
 
+__all__ = [
+    "GAIN_QUANTITIES",
+    "Curves",
+    "Measurements",
+    "differentiated_speed",
+    "gain_names",
+    "travelled",
+    "wheel_rotation",
+]
+
 Masked = tuple[Array, Array, NDArray[np.bool_]]
 """Values, their variances, and a mask of which are known; zero where not."""
 

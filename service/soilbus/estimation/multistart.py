@@ -50,7 +50,17 @@ from soilbus.estimation.solver import (
 from soilbus.terra.soils import KINDS, SOILS
 from soilbus.terra.wheel import Soil
 
-__all__ = ["DEFAULT_OPTIONS", "DescentOptions", "Fit", "SecondMode", "Start", "fit_from", "fit_from_soil", "fit_window"]
+__all__ = [
+    "DEFAULT_OPTIONS",
+    "DescentOptions",
+    "Fit",
+    "SecondMode",
+    "Start",
+    "fit_at",
+    "fit_from",
+    "fit_from_soil",
+    "fit_window",
+]
 
 _K_C = PARAMETERS.index("k_c")
 
@@ -350,7 +360,7 @@ def fit_from(
     with np.errstate(all="ignore"):
         if start.near_optimum:
             iterate = objective.start_near(start.soil, gains, start.latents)
-            fit = _fit_at(objective, descend_jointly(objective, iterate, options.stopping_rule(MAX_WARM_ITERATIONS)))
+            fit = fit_at(objective, descend_jointly(objective, iterate, options.stopping_rule(MAX_WARM_ITERATIONS)))
             if fit is not None:
                 return fit
         near = descend_soil(
@@ -363,7 +373,7 @@ def fit_from(
         )
         if near is None:
             return None
-        return _fit_at(objective, descend_jointly(objective, near, options.stopping_rule(options.max_iterations)))
+        return fit_at(objective, descend_jointly(objective, near, options.stopping_rule(options.max_iterations)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -396,13 +406,13 @@ def fit_warm(start: WarmStart) -> Fit | None:
         if model is not None and step is not None:
             iterate = objective.stepped(iterate, model, step)
         decrease = 0.0 if model is None or step is None else model.squared_length(step)
-        return _fit_at(objective, descend_jointly(objective, iterate, rule, decrease))
+        return fit_at(objective, descend_jointly(objective, iterate, rule, decrease))
 
 
 def refine(objective: Objective, start: Iterate) -> Fit | None:
     """Fit from near the optimum; None where the numbers are not finite."""
     rule = StoppingRule(MAX_WARM_ITERATIONS, next_step_tolerance=WARM_NEXT_STEP_TOLERANCE)
-    return _fit_at(objective, descend_jointly(objective, start, rule))
+    return fit_at(objective, descend_jointly(objective, start, rule))
 
 
 def refit_denoised(objective: Objective, fit: Fit) -> Fit:
@@ -426,7 +436,7 @@ def refit_denoised(objective: Objective, fit: Fit) -> Fit:
         again = Objective(denoised, objective.coordinates.prior, objective.joint_prior)
         start = Iterate(optimum.soil, optimum.gains, denoised.latents, np.inf, 1)
         rule = StoppingRule(MAX_ITERATIONS, step_tolerance=WARM_STEP_TOLERANCE)
-        found = _fit_at(again, descend_jointly(again, start, rule))
+        found = fit_at(again, descend_jointly(again, start, rule))
         if found is None or not found.converged:
             return fit
         near = objective.start(found.optimum.soil, optimum.latents.entry_angle, found.optimum.gains)
@@ -565,10 +575,10 @@ def _other_end(
 
 def _cold_fit_at(objective: Objective, start: Iterate, max_iterations: int = MAX_ITERATIONS) -> Fit | None:
     """The fit at the end of a cold joint descent; None where the numbers are not finite."""
-    return _fit_at(objective, descend_jointly(objective, start, StoppingRule(max_iterations)))
+    return fit_at(objective, descend_jointly(objective, start, StoppingRule(max_iterations)))
 
 
-def _fit_at(objective: Objective, end: Descent | None) -> Fit | None:
+def fit_at(objective: Objective, end: Descent | None) -> Fit | None:
     """The fit at the end of a descent; None where the numbers are not finite."""
     gaussians = None if end is None else objective.gaussians_at(end.iterate, end.model, end.previous.soil)
     if end is None or gaussians is None:

@@ -30,6 +30,8 @@ from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import KINDS, SOILS, UNKNOWN
 from soilbus.terra.wheel import Soil, sinkage, state_on, wheel_forces
 
+__all__ = ["WITHIN_CLASS_SD", "SoilClasses", "guessed", "ranked_by_likelihood"]
+
 PRIOR_UNKNOWN = 0.5
 """Probability of `unknown` before any window [1]; the kinds of the table share the rest evenly.
 

@@ -47,6 +47,8 @@ from soilbus.workers import workers
 
 __all__ = [
     "ROUGHLY_KNOWN",
+    "SLIP_RANGE",
+    "SOILS",
     "BayesRiskFigures",
     "Cell",
     "Each",

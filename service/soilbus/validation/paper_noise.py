@@ -24,6 +24,8 @@ from soilbus.terra.wheel import WheelModel, WheelState, sinkage, wheel_forces
 from soilbus.validation.paper import EXACT, Equations, Forces, OperatingPoint, Unknowns, WheelEquations
 from soilbus.validation.paper_tables import Trial
 
+__all__ = ["LEVELS", "Noise", "best_depth", "bounds", "cramer_rao", "one_instant", "relative_errors", "windows_of"]
+
 RIM_SPEED = 1.0
 """Of the window's wheel [m/s]; the ground speed's noise then is that of the slip."""
 
