@@ -1,6 +1,6 @@
 """Every published quantity beside plain Monte Carlo, over posteriors of many soils and drives and over torque limits.
 
-`PYTHONPATH=service:tests/support python tests/capability/spread.py [--seed 5] [--draws 10000] [--soil NAME]...`
+`python -m soilbus.validation.capability_spread [--seed 5] [--draws 10000] [--soil NAME]...`
 prints what is beyond 2 % in the mean or 10 % in the std, and how many quantities were compared.
 """
 
@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drawn import CONFIG, MAX_SLIP, MODEL, RIG, Compared, assessed, by_draws, compared
 from soilbus.decision.balance import balance
 from soilbus.decision.capability import Demand, slip_grid
 from soilbus.decision.wheels import wheel_table
@@ -26,6 +25,7 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import KINDS
+from soilbus.validation.random_soils import CONFIG, MAX_SLIP, MODEL, RIG, Compared, assessed, by_draws, compared
 
 DRIVES = {"wide": Swing(0.05, 0.40), "narrow": Swing(0.08, 0.15)}
 PRIORS = {"usual": (), "rough c and K": ("soil.c={value=5000.0,std=5000.0}", "soil.K={value=0.02,std=0.02}")}
@@ -33,7 +33,7 @@ SLOPE = 0.02
 
 
 class Case(NamedTuple):
-    """One posterior: a drive of 10 s on a soil, with sinkage sensors or without, and what was known beforehand."""
+    """One posterior: a drive of 10 s on a soil, with sinkage sensors or without, and its prior."""
 
     soil: str
     drive: str
@@ -42,7 +42,7 @@ class Case(NamedTuple):
 
 
 def posterior_of(case: Case, seed: int) -> Posterior | None:
-    """What the service would say after the drive; None where there is no fit."""
+    """The posterior of the service after the drive; None where there is no fit."""
     config = reference_configuration(PRIORS[case.prior])
     try:
         recording = simulate(config, Scenario(10.0, (Patch(0.0, case.soil),), slip=DRIVES[case.drive]), seed)
