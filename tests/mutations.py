@@ -32,7 +32,7 @@ class Mutation(NamedTuple):
     tests: tuple[str, ...]
 
 
-STORIES = "tests/stories/test_stories.py"
+STORIES = "tests/validation/test_stories.py"
 DECISION = "tests/daemon/test_decision.py"
 MUTATIONS = (
     Mutation(
@@ -108,13 +108,13 @@ MUTATIONS = (
     Mutation(
         "a torque limit holds for a second", "pipeline/intake.py",
         "value[t <= now][-LIMIT_SAMPLES:]", "value[(t <= now) & (t > now - 1.0)][-LIMIT_SAMPLES:]",
-        (f"{STORIES}::test_a_torque_limit_that_is_not_told_any_more_holds",),
+        (f"{STORIES}::test_a_torque_limit_that_is_not_sent_any_more_holds",),
     ),
     Mutation(
         "a torque limit is forgotten with the clock", "pipeline/intake.py",
         "(np.full(len(t), -math.inf), value) for wheel, (t, value) in self._reported.items()",
         "(t[:0], value[:0]) for wheel, (t, value) in self._reported.items()",
-        (f"{STORIES}::test_a_torque_limit_that_is_not_told_any_more_holds",),
+        (f"{STORIES}::test_a_torque_limit_that_is_not_sent_any_more_holds",),
     ),
     Mutation(
         "a wild torque limit counts", "pipeline/intake.py",

@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq, minimize_scalar
 
-from drawn import assessed as assessed_within
-from drawn import by_draws, figures
 from soilbus.decision import capability as assessment
 from soilbus.decision.balance import Duty, balance
 from soilbus.decision.capability import Demand, assess, slip_grid
@@ -27,7 +25,9 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
-from statics import MODEL, WEIGHT, WHEELS, brute, brute_with_rolling
+from soilbus.validation.random_soils import assessed as assessed_within
+from soilbus.validation.random_soils import by_draws, figures
+from soilbus.validation.statics import MODEL, WEIGHT, WHEELS, brute, brute_with_rolling
 
 CONFIG = reference_configuration()
 RIG = rig_of(CONFIG)

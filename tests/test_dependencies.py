@@ -64,6 +64,16 @@ def test_the_daemon_imports_no_more_than_it_may() -> None:
     assert foreign <= OF_THE_DAEMON
 
 
+def test_no_module_of_the_wheel_needs_an_extra_to_be_imported() -> None:
+    package = REPO / "service" / "soilbus"
+    modules = {".".join(path.relative_to(package.parent).with_suffix("").parts) for path in package.rglob("*.py")}
+    needed = {Requirement(text).name for text in PROJECT["project"]["dependencies"]}
+    foreign = {module: imported(module, set()) - sys.stdlib_module_names for module in sorted(modules)}
+    allowed = needed - {"python-can"} | {"can"}
+    assert {module: found - allowed for module, found in foreign.items() if found - allowed} == {}
+    assert {"soilbus.validation.peers.learned", "soilbus.validation.fuzz.command"} <= modules
+
+
 def test_no_module_that_the_daemon_can_load_imports_scipy_even_inside_a_function() -> None:
     seen: set[str] = set()
     foreign = set().union(*(imported(module, seen, True) for module in ("soilbus.daemon.start", *LOADED_BY_THE_WORKER)))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from spread import Case, posterior_of, quantities
+
+from soilbus.validation.capability_spread import Case, posterior_of, quantities
 
 SEED, DRAWS = 6, 4000
 CASES = (

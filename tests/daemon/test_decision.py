@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fakes import feed_message
-from onlooker import good_tracked, of_soft_ground, tracked_at
 from soilbus.can.dbc_files import load_databases
 from soilbus.decision.judgement import Basis, at_present
 from soilbus.decision.traction_loss import TractionLoss
@@ -22,6 +20,8 @@ from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
+from soilbus.validation.fakes import feed_message
+from soilbus.validation.stories.onlooker import good_tracked, of_soft_ground, tracked_at
 
 CONFIG = reference_configuration()
 

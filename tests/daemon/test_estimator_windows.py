@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "estimation"))
-from drives import tasks
-
 from soilbus.decision.traversability import Status
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
+from soilbus.validation.driven_windows import tasks
 
 FORMLESS = [f"model.form.{name}=0" for name in ("peak", "peak_by_slip", "exit", "shear")]
 

@@ -13,7 +13,6 @@ import can
 import numpy as np
 import pytest
 
-from fakes import Bench, ScriptedBus, feed_message
 from in_vain import (
     STANDS,
     TRIES,
@@ -35,6 +34,7 @@ from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.sensors import measure
+from soilbus.validation.fakes import Bench, ScriptedBus, feed_message
 
 CONFIG = reference_configuration()
 IN = load_databases(CONFIG)

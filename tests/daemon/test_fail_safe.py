@@ -1,6 +1,6 @@
-"""No path to GO: what one drive shows; random ones are in tests/stories.
+"""No path to GO: what one drive shows; random ones are in soilbus.validation.stories.
 
-The wire of `onlooker` plays the last moments of a good drive over and over, at 10 Hz, and spoils them as told.
+The wire of `onlooker` plays the last moments of a good drive over and over, at 10 Hz, and spoils them as asked.
 What it knows of its own deliveries judges every Traversability frame that the service sends.
 """
 
@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import pytest
 
-from onlooker import CONFIG, MOMENTS, NEEDED, Drive, good_moment, good_tracked
 from soilbus.decision.traversability import Status
+from soilbus.validation.stories.onlooker import CONFIG, MOMENTS, NEEDED, Drive, good_moment, good_tracked
 
 LEAD = 6.5
 """Seconds of good frames after which go is due."""

@@ -11,12 +11,12 @@ from dataclasses import replace
 import can
 import pytest
 
-from fakes import Bench, FakeClock, HeldExecutor, ScriptedBus, drive_messages
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
 from soilbus.can.wire import MessageWire
 from soilbus.pipeline.outputs import hop_frames
 from soilbus.simulator.reference import reference_configuration
+from soilbus.validation.fakes import Bench, FakeClock, HeldExecutor, ScriptedBus, drive_messages
 
 DURATION = 16.0
 STAMPED = 0.001

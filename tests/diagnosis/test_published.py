@@ -1,4 +1,4 @@
-"""What published points show in any case: the rest is for `python -m tests.diagnosis.published` to print."""
+"""What published points show in any case: the rest is for `python -m soilbus.validation.published_wheels` to print."""
 
 from __future__ import annotations
 
@@ -16,8 +16,13 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.effects.catalogue import CATALOGUE
-
-from .published import configuration, diagnosed, lugs_beside_a_shifted_peak, records_of, strain
+from soilbus.validation.published_wheels.comparison import (
+    configuration,
+    diagnosed,
+    lugs_beside_a_shifted_peak,
+    records_of,
+    strain,
+)
 
 TEMPERATURE = 6.0
 """What falls of -2 log evidence are divided by where little is explained."""

@@ -12,9 +12,8 @@ from soilbus.diagnosis.diagnose import diagnose
 from soilbus.estimation.assembly import prior_of
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.wheel import Soil
-
-from .blind.cases import cases
-from .blind.trial import record_of_case
+from soilbus.validation.blind.cases import cases
+from soilbus.validation.blind.trial import record_of_case
 
 MOST_LOOKS = 900.0
 """Linearisations of the plain model, some 6 ms each on one quiet core, as which a diagnosis may count: 5 s."""

@@ -5,20 +5,22 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 
-import minima
 import numpy as np
 import pytest
-from drives import tasks
 
 from soilbus.can.dbc_files import load_databases, output_database
 from soilbus.can.publish import Publisher
 from soilbus.decision.traversability import State, Status
+from soilbus.estimation.assembly import prior_of
+from soilbus.estimation.multistart import fit_window
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.states import ServiceState, state_after
 from soilbus.report.windows import summary
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario
+from soilbus.validation import local_optima
+from soilbus.validation.driven_windows import tasks
 
 CONFIG = reference_configuration()
 BAD = 10
@@ -28,7 +30,7 @@ QUANTITIES = ("torque", "load", "speed", "sinkage", "ground_speed", "draft")
 
 @pytest.fixture(scope="module")
 def drive():
-    scenario = Scenario(22.0, (Patch(0.0, "loam"),), slip=minima.EXCITED)
+    scenario = Scenario(22.0, (Patch(0.0, "loam"),), slip=local_optima.EXCITED)
     return list(tasks(CONFIG, scenario, 3))
 
 
@@ -112,25 +114,25 @@ def test_a_replay_counts_failed_solves(drive, undisturbed):
 
 # --- two soils explain a window equally well ---
 
-TWO = minima.two_wheels(CONFIG)
+TWO = local_optima.two_wheels(CONFIG)
 
 
 def results_on(config, soil, seed, seconds=11.0):
-    scenario = Scenario(seconds, (Patch(0.0, soil),), slip=minima.EXCITED)
+    scenario = Scenario(seconds, (Patch(0.0, soil),), slip=local_optima.EXCITED)
     estimator = WindowEstimator(config)
     return [estimator.solve(task) for task in tasks(config, scenario, seed)]
 
 
 def test_an_ambiguous_window_says_so_and_never_go():
     config = TWO
-    problem = minima.window(config, "wet_clay", seed=3)
-    fit = minima.fit_window(problem, minima.prior_of(config))
+    problem = local_optima.window(config, "wet_clay", seed=3)
+    fit = fit_window(problem, prior_of(config))
     one, other = (
         fit.posterior.bearing_pressure(0.02, 0.3),
         fit.second_mode.gaussian.posterior.bearing_pressure(0.02, 0.3),
     )
     assert abs(one.value - other.value) > 2.0 * one.std
-    scenario = Scenario(10.0, (Patch(0.0, "wet_clay"),), slip=minima.EXCITED)
+    scenario = Scenario(10.0, (Patch(0.0, "wet_clay"),), slip=local_optima.EXCITED)
     result = WindowEstimator(config).solve(next(tasks(config, scenario, 3)))
     assert (result.status, result.reason) == (Status.NOT_EXCITED, "ambiguous")
     assert result.traversability.state is not State.GO
@@ -144,14 +146,14 @@ def test_an_ambiguous_window_says_so_and_never_go():
 
 
 def test_excited_windows_of_four_wheels_are_not_ambiguous():
-    for soil in minima.KINDS:
+    for soil in local_optima.KINDS:
         for seed in range(2):
             reasons = Counter(r.reason for r in results_on(CONFIG, soil, seed, 10.0))
             assert "ambiguous" not in reasons
 
 
 def test_one_of_two_optima_becomes_no_prior():
-    scenario = Scenario(12.0, (Patch(0.0, "wet_clay"),), slip=minima.EXCITED)
+    scenario = Scenario(12.0, (Patch(0.0, "wet_clay"),), slip=local_optima.EXCITED)
     estimator = WindowEstimator(TWO)
     n_ambiguous = 0
     for task in tasks(TWO, scenario, 3):

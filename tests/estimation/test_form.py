@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drives import task_of, tasks
 
 from other_wheel import Contact, readings
 from soilbus.decision.traversability import Status
@@ -18,6 +17,7 @@ from soilbus.pipeline.outputs import json_line
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
 from soilbus.terra.soils import soil_named
+from soilbus.validation.driven_windows import task_of, tasks
 
 FORM = ("peak", "peak_by_slip", "exit", "shear")
 CONFIG = reference_configuration()

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drives import tracker_of, windows
 from scipy.stats import lognorm
 
 from soilbus.estimation.assembly import prior_of
@@ -19,6 +18,7 @@ from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.terra.wheel import Soil
+from soilbus.validation.driven_windows import tracker_of, windows
 
 K_C = PARAMETERS.index("k_c")
 CLAY = "clayey_soil_38"

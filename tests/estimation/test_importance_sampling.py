@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import minima
 import numpy as np
 import pytest
 
@@ -17,7 +16,7 @@ from soilbus.estimation.posterior import SoilPrior
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Swing
 from soilbus.terra.wheel import Soil
-from soilbus.validation import importance_sampling
+from soilbus.validation import importance_sampling, local_optima
 from soilbus.validation.cramer_rao import cramer_rao
 from soilbus.validation.importance_sampling import sample_posterior
 
@@ -27,8 +26,10 @@ STILL = Swing(0.0, 1e-9)
 @pytest.fixture(scope="module")
 def uncertain():
     """A window of constant slip and loads on wet clay, which determines k_c and n badly."""
-    config = reference_configuration([*minima.c_and_K_known("wet_clay"), "soil.k_c.value=43680", "soil.k_c.std=20000"])
-    problem = minima.window(config, "wet_clay", 4.0, minima.constant(0.15), True, 5, STILL)
+    config = reference_configuration(
+        [*local_optima.c_and_K_known("wet_clay"), "soil.k_c.value=43680", "soil.k_c.std=20000"]
+    )
+    problem = local_optima.window(config, "wet_clay", 4.0, local_optima.constant(0.15), True, 5, STILL)
     prior = prior_of(config)
     return problem, prior, Gaussian.of(prior, problem.gain_std), fit_window(problem, prior)
 

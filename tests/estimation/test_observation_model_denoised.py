@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import minima
 import numpy as np
 import pytest
 
@@ -14,6 +13,7 @@ from soilbus.estimation.solver import Iterate, Objective
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Swing
 from soilbus.terra.soils import SOILS
+from soilbus.validation import local_optima
 from soilbus.validation.cramer_rao import cramer_rao
 
 
@@ -35,10 +35,12 @@ def test_noise_is_shrunk_to_the_mean_and_a_signal_stays():
 def test_a_window_without_variation_is_no_more_certain_than_the_bound():
     # With the latents as fitted, noise counts as information on n: the sd is a third below the Cramér-Rao bound.
     soil, still = SOILS["wet_clay"], Swing(0.0, 1e-9)
-    config = reference_configuration([*minima.c_and_K_known("wet_clay"), "soil.k_c.value=43680", "soil.k_c.std=20000"])
+    config = reference_configuration(
+        [*local_optima.c_and_K_known("wet_clay"), "soil.k_c.value=43680", "soil.k_c.std=20000"]
+    )
     prior, ratio = prior_of(config), []
     for seed in range(8):
-        problem = minima.window(config, "wet_clay", 10.0, minima.constant(0.1), False, 40 + seed, still)
+        problem = local_optima.window(config, "wet_clay", 10.0, local_optima.constant(0.1), False, 40 + seed, still)
         fit = fit_window(problem, prior)
         calm = DenoisedObservationModel(problem, fit.optimum)
         before = Gaussian.of(prior, problem.gain_std)

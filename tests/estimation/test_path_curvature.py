@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from curves import TRACK, curved, driven
-from drives import errors, tracker_of, windows
 
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.gaussian import Gaussian
@@ -16,6 +14,8 @@ from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
+from soilbus.validation.curved_drives import TRACK, curved, driven
+from soilbus.validation.driven_windows import errors, tracker_of, windows
 
 
 @pytest.mark.parametrize("radius", [75.0, 25.0, -40.0])
@@ -49,11 +49,10 @@ def test_without_that_unknown_a_curve_is_a_mismatch(monkeypatch):
 
 @pytest.mark.parametrize("seed", [100])
 def test_a_curve_that_begins_within_a_window_is_no_soil(seed, monkeypatch):
-    monkeypatch.setattr("curves.END", 19.0)
     config = reference_configuration([f"model.form.{name}=0" for name in ("peak", "peak_by_slip", "exit", "shear")])
 
     def away() -> np.ndarray:
-        output = [w for w in driven(config, "loam", 75.0, seed) if w.t > 0.0]
+        output = [w for w in driven(config, "loam", 75.0, seed, duration=19.0) if w.t > 0.0]
         assert all(w.valid for w in output)
         return np.array([w.away for w in output])
 

@@ -1,14 +1,14 @@
-"""A small version of borders.py: how soon the new soil is estimated, and whether its intervals hold."""
+"""A small version of validation.soil_borders: how soon the new soil is estimated, and whether its intervals hold."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from borders import crossed, drive, first_of_tyres, first_valid, least_sd, wrong, wrong_of_tyres
 from scipy.stats import norm
 
 from soilbus.estimation.laplace import confidence, density, longer_side
 from soilbus.simulator.reference import reference_configuration
+from soilbus.validation.soil_borders import crossed, drive, first_of_tyres, first_valid, least_sd, wrong, wrong_of_tyres
 
 SPEED = 1.5
 

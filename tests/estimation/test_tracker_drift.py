@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from drives import B_REF, Z_REF, tracker_of, windows
 
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.measurements import gain_names
@@ -14,6 +13,7 @@ from soilbus.estimation.window import Window
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
+from soilbus.validation.driven_windows import B_REF, Z_REF, tracker_of, windows
 
 CONFIG = reference_configuration(["estimator.hop=10.0"])
 LENGTH = CONFIG.estimator.window

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drives import tasks
 
 from soilbus.decision.traversability import Status
 from soilbus.estimation.observation_model import ObservationModel
@@ -14,6 +13,7 @@ from soilbus.estimation.tracker import SearchBudget
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
+from soilbus.validation.driven_windows import tasks
 
 CONFIG = reference_configuration()
 UNLIMITED = reference_configuration(["estimator.search_rate=1e9", "estimator.search_burst=1e9"])

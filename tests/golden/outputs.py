@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 import tomlkit
-from tests.diagnosis.blind.cases import Case, cases
 
 from soilbus.cli.main import main
 from soilbus.simulator.frames import frames, write_log
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.reference import TRACTOR
+from soilbus.validation.blind.cases import Case, cases
 
 from .compare import rounded
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from fakes import FakeClock, ScriptedBus
 from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import output_database
@@ -19,6 +18,7 @@ from soilbus.can.publish import Publisher
 from soilbus.report.dashboard import panel, show
 from soilbus.report.received_frames import ReceivedFrames
 from soilbus.simulator.reference import reference_configuration
+from soilbus.validation.fakes import FakeClock, ScriptedBus
 
 WIDTH = 80
 """Columns of the narrowest terminal."""

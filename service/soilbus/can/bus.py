@@ -18,7 +18,7 @@ import can
 from soilbus.can.bus_state import BusState, state_told, tells_overflow
 from soilbus.can.outbox import Outbox
 from soilbus.can.publish import Frame
-from soilbus.can.wire import Received, Wire, error_number, wire_of
+from soilbus.can.wire import MessageBus, Received, Wire, error_number, wire_of
 from soilbus.words import one_line
 
 log = logging.getLogger(__name__)
@@ -145,7 +145,7 @@ class LiveBus:
 
     def __init__(
         self,
-        opener: Callable[[], can.BusABC],
+        opener: Callable[[], MessageBus],
         clock: Callable[[], float],
         sleep: Callable[[float], None],
         own: Collection[tuple[int, bool]] = (),

@@ -50,6 +50,19 @@ class Received(NamedTuple):
     is_rx: bool = True
 
 
+class MessageBus(Protocol):
+    """What is used of an interface of python-can (can.BusABC)."""
+
+    def recv(self, timeout: float | None = None, /) -> can.Message | None:
+        """The next frame, or None after `timeout` [s]."""
+
+    def send(self, message: can.Message, /) -> None:
+        """Hand one frame to the driver."""
+
+    def shutdown(self) -> None:
+        """Let go of it."""
+
+
 class Wire(Protocol):
     """An open bus.  All raise OSError or can.CanError; errno ENOBUFS and EAGAIN mean: no room at present."""
 
@@ -74,7 +87,7 @@ class Wire(Protocol):
         """Let go of it."""
 
 
-def wire_of(bus: can.BusABC) -> Wire:
+def wire_of(bus: MessageBus) -> Wire:
     """The bus that python-can has opened, by its socket where it is the kernel's."""
     own = getattr(bus, "socket", None)
     if isinstance(own, socket.socket) and own.family == socket.AF_CAN:
@@ -85,7 +98,7 @@ def wire_of(bus: can.BusABC) -> Wire:
 class SocketWire:
     """A raw CAN socket of the kernel."""
 
-    def __init__(self, bus: can.BusABC, own: socket.socket) -> None:
+    def __init__(self, bus: MessageBus, own: socket.socket) -> None:
         self.overruns, self.room = 0, float(own.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF))
         self._bus, self._socket = bus, own
         self._dropped = 0  # the kernel's count, modulo 2**32
@@ -150,7 +163,7 @@ class MessageWire:
 
     overruns, room = 0, math.inf  # none of them can tell
 
-    def __init__(self, bus: can.BusABC) -> None:
+    def __init__(self, bus: MessageBus) -> None:
         self._bus = bus
 
     def recv(self, timeout: float) -> can.Message | None:

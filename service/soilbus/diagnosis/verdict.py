@@ -8,7 +8,7 @@ usually, the larger T' with probability q (P_LARGE_FORMULA_ERROR).  An effect is
 required fall, and the verdict is `unknown` if the gap that remains is too large.
 
 The constants were set looking at the blind cases of seeds 1 and 2 and the `tune` half of seed 3
-(`python -m tests.diagnosis.blind`), MAX_UNEXPLAINED_SHARE_OF_LARGE_GAP at the `tune` halves of seeds 107 to 111;
+(`python -m soilbus.validation.blind`), MAX_UNEXPLAINED_SHARE_OF_LARGE_GAP at the `tune` halves of seeds 107 to 111;
 what is reported are `report` halves of seeds from 3 on.
 """
 
