@@ -104,7 +104,7 @@ def _steps(problem: ObservationModel, prior: SoilPrior, soil: Array) -> Callable
 
 
 def problems(wheels: int) -> Iterator[tuple[ObservationModel, SoilPrior]]:
-    """Windows of all lengths of a tractor with so many wheels, half of them on each axle; one: a test rig."""
+    """Windows of all lengths of a tractor with this number of wheels, half of them on each axle; one: a test rig."""
     config = _configuration(max(wheels, 2))
     recording = simulate(config, excited("loam", max(WINDOW_LENGTHS)), seed=1)
     samples = {name: (column.t, column.value) for name, column in recording.channels.items()}

@@ -33,11 +33,11 @@ def estimate(case: Case) -> Answer | None:
     index = [of_phi, of_n]
     x = case.prior.median[index]
     P = np.diag((x * case.prior.log_std[index]) ** 2)
-    foreseen = 1.0
+    predicted = 1.0
     for i in range(case.problem.n):
         P = P + np.diag(WALK**2)
         innovation, H, R = _reading(case.problem, i, case.known, x)
-        x, P, foreseen = _updated(x, P, innovation, H, R, foreseen)
+        x, P, predicted = _updated(x, P, innovation, H, R, predicted)
         x = np.clip(x, LOW, HIGH)
         if not np.isfinite(x).all():
             return None

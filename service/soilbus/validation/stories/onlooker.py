@@ -207,7 +207,7 @@ class Wire:
     good: dict[str, float] = field(default_factory=dict)
     stamps: dict[str, float] = field(default_factory=dict)
     powers: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Shares of its torque that each motor has sent last; one may be wild."""
+    """Shares of its torque that each motor has sent last; one may be an outlier."""
     heard: list[Known] = field(default_factory=list)
     """What was so at each delivery since the clock was set back last."""
     forged_at: float = -math.inf
