@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,7 @@ def below(room: str) -> set[str]:
 ROOMS = {room for arrow in ARROWS for room in arrow}
 
 
+@cache
 def imports() -> list[tuple[str, str, str]]:
     """Each import of one of our modules: room and file that import, and the imported module."""
     found = []
@@ -40,9 +42,6 @@ def imports() -> list[tuple[str, str, str]]:
     return found
 
 
-IMPORTS = imports()
-
-
 def test_the_picture_has_every_room() -> None:
     assert {path.name for path in PACKAGE.iterdir() if path.is_dir() and any(path.glob("*.py"))} == ROOMS
 
@@ -51,7 +50,7 @@ def test_the_picture_has_every_room() -> None:
 def test_a_room_imports_only_from_those_below_it(room: str) -> None:
     wrong = [
         f"{file}: {module}"
-        for importer, file, module in IMPORTS
+        for importer, file, module in imports()
         if importer == room and (part := module.split(".")[1]) in ROOMS and part not in below(room) | {room}
     ]
     assert wrong == []
@@ -74,6 +73,6 @@ def test_the_daemon_knows_neither_simulator_nor_validation() -> None:
 def test_modules_outside_of_the_rooms_know_no_room_but_the_command_line() -> None:
     assert [
         f"{file}: {module}"
-        for room, file, module in IMPORTS
+        for room, file, module in imports()
         if room == "" and module.split(".")[1] in ROOMS and file != "__main__.py"
     ] == []

@@ -13,6 +13,7 @@ import ast
 import inspect
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
@@ -114,6 +115,7 @@ def _toml(value: Any) -> str:
     return f'"{value}"' if isinstance(value, str) else f"{value:g}" if isinstance(value, float) else str(value)
 
 
+@cache
 def _attribute_docs(section: type[BaseModel]) -> dict[str, str]:
     """The text below each attribute of a section, in one line."""
     found: dict[str, str] = {}

@@ -121,7 +121,7 @@ def _saturated(window: Window, rig: Rig, deviations: float) -> Mask:
     of_pull = window.variance["draft"] + (mass * GRAVITY) ** 2 * _known(window, "pitch")
     of_pull = of_pull + mass**2 * _known(window, "acceleration")
     mean, variance = window.torque.mean(axis=0), window.variance["torque"]
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(all="ignore"):  # nan and inf where a sensor sends what no motor gives
         share = mean / np.nansum(mean / rig.radius)
         load = window.load.mean(axis=0)
         of_load = (mean / load) ** 2 * window.variance["load"]
