@@ -48,7 +48,9 @@ for fault in loop sender estimator; do
     within 40 says kPa
     before=$(restarts)
     fault $fault
-    if [ $fault != loop ]; then within 20 says fault && text >"$out/$fault"; fi
+    if [ $fault != loop ]; then within 20 says fault; fi
+    if [ $fault = estimator ]; then within 8 says "deadline misses"; fi # a window later, about when the fault is noticed
+    if [ $fault != loop ]; then text >"$out/$fault"; fi
     within 60 restarted_since "$before"
     rm /run/fault
     echo "$fault $(($(restarts) - before))" >>"$out/restarts"

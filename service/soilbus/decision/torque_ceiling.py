@@ -141,7 +141,8 @@ def _speed_gained(window: Window, deviations: float) -> tuple[float, float]:
     """Ground speed gained over the window (regression on time), and its significance limit; both in m/s * s."""
     since = window.t - window.t.mean()
     noise = deviations * math.sqrt(float(since**2 @ window.variance["ground_speed"]))
-    return float(since @ window.ground_speed), noise
+    with np.errstate(invalid="ignore"):  # a ground speed that is no number
+        return float(since @ window.ground_speed), noise
 
 
 def _known(window: Window, quantity: str) -> Array:
