@@ -12,14 +12,28 @@ from soilbus.can.channels import Channel
 from soilbus.can.dbc_files import checked_messages, load_databases
 from soilbus.can.decode import check_decodable, code_limits
 from soilbus.can.units import SI, STANDARD_GRAVITY, unit_of
-from soilbus.config.model import Config, ConfigError, Wheel
+from soilbus.config.model import Axle, Config, ConfigError, Wheel
 from soilbus.config.model import Signal as Mapped
 from soilbus.words import did_you_mean
 
 WHEEL_ROLES = ("torque", "speed", "load", "sinkage", "torque_limit", "motor_speed")
+AXLE_ROLES = {"torque": "torque", "torque_limit": "torque_limit", "motor_speed": "speed", "load": "load"}
+"""Roles of an axle, and the quantity of the channel: its motor's speed stands for that of its wheels."""
+SHARED_ROLES = ("torque", "speed", "load")
+"""Roles of which one signal may be mapped for several wheels: it is one measurement, with one noise."""
 POSITION_ROLES = ("latitude", "longitude")
-VEHICLE_ROLES = ("ground_speed", "draft", "pitch", "acceleration", "yaw_rate", *POSITION_ROLES)
-OPTIONAL_ROLES = ("yaw_rate", *POSITION_ROLES)
+LOCK = "differential_lock"
+VEHICLE_ROLES = (
+    "ground_speed",
+    "draft",
+    "pitch",
+    "acceleration",
+    "yaw_rate",
+    "roll",
+    "steering_angle",
+    *POSITION_ROLES,
+)
+OPTIONAL_ROLES = ("yaw_rate", "roll", "steering_angle", LOCK, *POSITION_ROLES)
 """Without them a window is as good as before."""
 
 MAX_SPEED = 25.0  # m/s, faster than any field tractor
@@ -39,11 +53,18 @@ _DIMENSIONS: dict[str, tuple[str, ...]] = {
     "pitch": ("angle",),
     "acceleration": ("acceleration",),
     "yaw_rate": ("rotation",),
+    "roll": ("angle",),
+    "steering_angle": ("angle",),
+    LOCK: ("",),
     "latitude": ("angle",),
     "longitude": ("angle",),
 }
 _SHAFT_BY_DEFAULT = frozenset({"torque", "torque_limit", "motor_speed"})
 _HAS_SIDE = _SHAFT_BY_DEFAULT | {"speed"}
+
+
+_CURRENTS = {"A": 1.0, "mA": 1e-3, "kA": 1e3}
+"""Ampere in units of a motor's current."""
 
 
 class _Fault(Exception):
@@ -52,13 +73,10 @@ class _Fault(Exception):
 
 class _Role(NamedTuple):
     quantity: str
-    wheel: Wheel | None
+    part: Wheel | Axle | None
     mapped: Mapped
-
-    @property
-    def where(self) -> str:
-        """The key in the configuration file."""
-        return f"wheel.{self.wheel.name}.{self.quantity}" if self.wheel else f"signals.{self.quantity}"
+    where: str
+    """The key in the configuration file."""
 
 
 def channels_of(config: Config, database: Database) -> list[Channel]:
@@ -70,7 +88,7 @@ def channels_of(config: Config, database: Database) -> list[Channel]:
     """
     faults: list[str] = []
     channels: list[Channel] = []
-    for role in _roles(config):
+    for role in _measured_once(config):
         try:
             channels.append(_channel(config, database, role))
         except _Fault as fault:
@@ -95,19 +113,35 @@ def _roles(config: Config) -> Iterator[_Role]:
     for wheel in config.wheel:
         for quantity in WHEEL_ROLES:
             if (mapped := getattr(wheel, quantity)) is not None:
-                yield _Role(quantity, wheel, mapped)
+                yield _Role(quantity, wheel, mapped, f"wheel.{wheel.name}.{quantity}")
+    for axle in config.axle:
+        for role, quantity in AXLE_ROLES.items():
+            if (mapped := getattr(axle, role)) is not None:
+                yield _Role(quantity, axle, mapped, f"axle.{axle.name}.{role}")
     for quantity in VEHICLE_ROLES:
         if (mapped := getattr(config.signals, quantity)) is not None:
-            yield _Role(quantity, None, mapped)
+            yield _Role(quantity, None, mapped, f"signals.{quantity}")
+    if config.vehicle is not None and config.vehicle.differential_lock is not None:
+        yield _Role(LOCK, None, config.vehicle.differential_lock, f"vehicle.{LOCK}")
+
+
+def _measured_once(config: Config) -> Iterator[_Role]:
+    """The roles without those whose signal is mapped for another wheel, too: its channel is the first wheel's."""
+    seen: set[tuple[str, str]] = set()
+    for role in _roles(config):
+        key = (role.quantity, role.mapped.signal)
+        if not (role.quantity in SHARED_ROLES and isinstance(role.part, Wheel) and key in seen):
+            yield role
+        seen.add(key)
 
 
 def _channel(config: Config, database: Database, role: _Role) -> Channel:
     message, signal = _find(database, role.mapped.signal)
-    low, high = plausible(config, role.quantity, role.wheel)
+    low, high = plausible(config, role.quantity, role.part)
     valid_signal = _valid_signal(message, role.mapped)
     return Channel(
         quantity=role.quantity,
-        wheel=role.wheel.name if role.wheel else "",
+        wheel=role.part.name if role.part else "",
         message=message.name,
         signal=signal.name,
         factor=_factor(role, signal),
@@ -165,29 +199,36 @@ def _valid_signal(message: Message, mapped: Mapped) -> str | None:
 
 def _factor(role: _Role, signal: Signal) -> float:
     """SI value of one unit of the DBC, on the wheel's side of the gear."""
-    quantity, wheel, mapped = role
+    quantity, part, mapped, where = role
     if mapped.at is not None and quantity not in _HAS_SIDE:
         raise _Fault(f"at = {mapped.at} has no meaning for {quantity}")
-    dimension, factor = _unit(quantity, signal)
-    at_shaft = (mapped.at or ("shaft" if quantity in _SHAFT_BY_DEFAULT else "wheel")) == "shaft"
-    if wheel is None:
+    dimension, factor = _unit(quantity, signal, mapped.torque_constant)
+    of_motor = quantity in _SHAFT_BY_DEFAULT or where.endswith("motor_speed")
+    at_shaft = (mapped.at or ("shaft" if of_motor else "wheel")) == "shaft"
+    if part is None:
         return mapped.sign * factor
     if dimension == "mass":
         factor *= STANDARD_GRAVITY
     elif dimension == "speed":
         if at_shaft:
             raise _Fault(f"{mapped.signal} is in {signal.unit}: a shaft has no speed along the ground")
-        factor /= wheel.radius
+        if isinstance(part, Axle):
+            raise _Fault(f"{mapped.signal} is in {signal.unit}: a motor has no speed along the ground")
+        factor /= part.radius
     elif at_shaft and dimension == "torque":
-        factor *= wheel.gear_ratio
+        factor *= part.gear_ratio
     elif at_shaft and dimension == "rotation":
-        factor /= wheel.gear_ratio
+        factor /= part.gear_ratio
     return mapped.sign * factor
 
 
-def _unit(quantity: str, signal: Signal) -> tuple[str, float]:
+def _unit(quantity: str, signal: Signal, torque_constant: float | None = None) -> tuple[str, float]:
     """Dimension and factor to SI of a signal, which must suit the quantity; no unit means SI."""
     fitting = _DIMENSIONS[quantity]
+    if fitting == ("",):
+        return "", 1.0  # a code
+    if torque_constant is not None:
+        return _current(quantity, signal, torque_constant)
     wanted = " or ".join(SI[dimension] for dimension in fitting)
     try:
         unit = unit_of(signal.unit)
@@ -202,10 +243,30 @@ def _unit(quantity: str, signal: Signal) -> tuple[str, float]:
     return unit.dimension, unit.factor
 
 
-def plausible(config: Config, quantity: str, wheel: Wheel | None) -> tuple[float, float]:
+def _current(quantity: str, signal: Signal, torque_constant: float) -> tuple[str, float]:
+    """Torque for a unit of a motor's current."""
+    if quantity not in ("torque", "torque_limit"):
+        raise _Fault(f"torque_constant has no meaning for {quantity}")
+    unit = _CURRENTS.get((signal.unit or "A").strip())
+    if unit is None:
+        raise _Fault(f"{signal.name} is in {signal.unit}; with torque_constant it must be a current in A or mA")
+    return "torque", torque_constant * unit
+
+
+def plausible(config: Config, quantity: str, part: Wheel | Axle | None) -> tuple[float, float]:
     """Least and greatest SI value that a working sensor of this vehicle can give."""
     weight = STANDARD_GRAVITY * (config.vehicle.mass if config.vehicle else _HEAVY)
-    radius = wheel.radius if wheel else 1.0
+    radius = 1.0
+    if isinstance(part, Wheel):
+        radius = part.radius
+    elif part is not None:
+        radii = [w.radius for w in config.wheel if part.name in ("both", w.axle)] or [radius]
+        if part.name == "both":  # its shaft turns faster, with less torque
+            ratios = [a.gear_ratio for a in config.axle if a.name != "both"] or [1.0]
+            if quantity == "speed":
+                return -MAX_SPEED / min(radii) * max(ratios), MAX_SPEED / min(radii) * max(ratios)
+            radii = [r / min(ratios) for r in radii]
+        radius = min(radii) if quantity == "speed" else max(radii)
     match quantity:
         case "torque" | "torque_limit":
             return -2.0 * weight * radius, 2.0 * weight * radius
@@ -223,6 +284,8 @@ def plausible(config: Config, quantity: str, wheel: Wheel | None) -> tuple[float
             return -1.0, 1.0
         case "acceleration":
             return -20.0, 20.0
+        case "roll" | "steering_angle":
+            return -1.6, 1.6
         case "yaw_rate":
             return -4.0, 4.0  # a skid-steered rover on the spot
         case "latitude":
@@ -235,14 +298,16 @@ def plausible(config: Config, quantity: str, wheel: Wheel | None) -> tuple[float
 def _mapped_twice(roles: Iterable[_Role]) -> list[str]:
     """A signal that feeds two roles would count one sensor twice.
 
-    One torque limit may hold for several wheels: a limit is not a measurement.
+    One torque limit may hold for several wheels: a limit is not a measurement.  One torque, speed or load of several
+    wheels is one measurement, and counted as one.
     """
     first: dict[str, _Role] = {}
     faults: list[str] = []
     for role in roles:
         known = first.setdefault(role.mapped.signal, role)
-        shared_limit = known.quantity == role.quantity == "torque_limit"
-        if known is not role and not shared_limit:
+        of_wheels = isinstance(known.part, Wheel) and isinstance(role.part, Wheel)
+        once = role.quantity == "torque_limit" or (of_wheels and role.quantity in SHARED_ROLES)
+        if known is not role and not (once and known.quantity == role.quantity):
             faults.append(f"{role.where}: {role.mapped.signal} is already mapped to {known.where}")
     return faults
 

@@ -7,7 +7,7 @@ unit says so in its name.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -27,6 +27,7 @@ from pydantic import (
 from soilbus.words import did_you_mean
 
 __all__ = [
+    "Axle",
     "Bus",
     "Column",
     "Config",
@@ -108,8 +109,11 @@ CG_AHEAD = Usual(0.02, 8.0, "m", _SHORT)
 HEIGHT = Usual(0.02, 4.0, "m", _SHORT)
 HITCH_HEIGHT = Usual(0.0, 2.5, "m", _SHORT)
 TRACK = Usual(0.15, 5.0, "m", _SHORT)
+MASS_STD = Usual(0.0, 3.0e4, "kg", (("t", 1e3),))
+LENGTH_STD = Usual(0.0, 4.0, "m", _SHORT)
 GEAR_RATIO = Usual(0.1, 1000.0, "")
 WHEEL_TORQUE = Usual(5.0, 2.0e5, "N m", (("kN m", 1e3),))
+AXLE_TORQUE = Usual(10.0, 4.0e5, "N m", (("kN m", 1e3),))
 WINDOW = Usual(0.5, 600.0, "s", (("ms", 1e-3),))
 SHARE = Usual(0.0, 1.0, "", (("%", 1e-2),))
 # Soils: Wong, Theory of Ground Vehicles (2008), table 2.3, has phi of 6 to 38 degrees, n of 0.11 to 1.6, k_phi of
@@ -152,29 +156,6 @@ class Dbc(_Section):
     """Messages of the vehicle's own DBC that are believed only with a right Counter and Checksum (dbc/README.md)."""
 
 
-class Vehicle(_Section):
-    """Longitudinal vehicle; lengths m, mass kg, heights above the ground."""
-
-    mass: Annotated[PositiveFloat, AfterValidator(MASS)]
-    """Of the whole vehicle [kg], ballast included."""
-    wheelbase: Annotated[PositiveFloat, AfterValidator(WHEELBASE)]
-    """Front to rear axle [m]."""
-    cg_ahead_of_rear_axle: Annotated[PositiveFloat, AfterValidator(CG_AHEAD)]
-    """Centre of gravity ahead of the rear axle [m]."""
-    cg_height: Annotated[PositiveFloat, AfterValidator(HEIGHT)]
-    """Centre of gravity above the ground [m]."""
-    hitch_height: Annotated[NonNegativeFloat, AfterValidator(HITCH_HEIGHT)] = 0.5
-    """Line of draft above the ground at the hitch [m]."""
-    track: Annotated[PositiveFloat, AfterValidator(TRACK)] | None = None
-    """Distance between the middles of the left and the right wheels; turns a yaw rate into a difference of speeds."""
-
-    @model_validator(mode="after")
-    def _cg_between_axles(self) -> Vehicle:
-        if self.cg_ahead_of_rear_axle >= self.wheelbase:
-            raise ValueError("cg_ahead_of_rear_axle must be less than wheelbase")
-        return self
-
-
 class Signal(_Section):
     """Where a role's value comes from: "Message.Signal", or a table with more to say.
 
@@ -199,11 +180,103 @@ class Signal(_Section):
     """Age from which the channel is stale [s]."""
     delay: Annotated[float, Field(ge=-1.0, le=2.0)] = 0.0
     """How much earlier what a sample reports was true [s]: a filter, a receiver, a queue."""
+    torque_constant: PositiveFloat | None = None
+    """Torque for a current [N m/A], where a motor's current is mapped to its torque."""
 
     @model_validator(mode="before")
     @classmethod
     def _from_text(cls, value: Any) -> Any:
         return {"signal": value} if isinstance(value, str) else value
+
+
+class Vehicle(_Section):
+    """Longitudinal vehicle; lengths m, mass kg, heights above the ground."""
+
+    mass: Annotated[PositiveFloat, AfterValidator(MASS)]
+    """Of the whole vehicle [kg], ballast included; `{ value, std }` where tanks, driver or load change it."""
+    mass_std: Annotated[NonNegativeFloat, AfterValidator(MASS_STD)] | None = None
+    """Its standard deviation [kg], which `mass = { value, std }` sets; by default 2 % of the mass where a load is not
+    measured (driver, half a tank), else 0."""
+    wheelbase: Annotated[PositiveFloat, AfterValidator(WHEELBASE)]
+    """Front to rear axle [m]."""
+    cg_ahead_of_rear_axle: Annotated[PositiveFloat, AfterValidator(CG_AHEAD)]
+    """Centre of gravity ahead of the rear axle [m]; `{ value, std }` where it is not known well."""
+    cg_std: Annotated[NonNegativeFloat, AfterValidator(LENGTH_STD)] | None = None
+    """Its standard deviation [m], which `cg_ahead_of_rear_axle = { value, std }` sets; by default 2 % of the wheelbase
+    where a load is not measured, else 0."""
+    cg_height: Annotated[PositiveFloat, AfterValidator(HEIGHT)]
+    """Centre of gravity above the ground [m]."""
+    hitch_height: Annotated[NonNegativeFloat, AfterValidator(HITCH_HEIGHT)] = 0.5
+    """Line of draft above the ground at the hitch [m]."""
+    track: Annotated[PositiveFloat, AfterValidator(TRACK)] | None = None
+    """Distance between the middles of the left and the right wheels; turns a yaw rate into a difference of speeds."""
+    towing: Literal["measured", "never", "unknown"] = "measured"
+    """Draft at the hitch: measured where `signals.draft` is mapped, never any, or one that no sensor shows."""
+    steering: Literal["wheels", "skid"] = "wheels"
+    """By turned wheels, or by the speeds of the two sides, which lets the wheels slide sideways in every turn."""
+    differential_lock: Signal | None = None
+    """Above 0.5 while the differentials are locked; optional."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_std(cls, value: Any) -> Any:
+        """`{ value, std }` of a measure as two keys."""
+        if not isinstance(value, Mapping):
+            return value
+        out = dict(value)
+        for key, std in (("mass", "mass_std"), ("cg_ahead_of_rear_axle", "cg_std")):
+            given = out.get(key)
+            if isinstance(given, Mapping):
+                if unknown := [k for k in given if k not in ("value", "std")]:
+                    raise ValueError(f"{key}: unknown key {unknown[0]}; it is a number or {{ value, std }}")
+                out |= {key: given["value"]} if "value" in given else {}
+                if "value" not in given:
+                    del out[key]
+                if "std" in given:
+                    out[std] = given["std"]
+        return out
+
+    @model_validator(mode="after")
+    def _cg_between_axles(self) -> Vehicle:
+        if self.cg_ahead_of_rear_axle >= self.wheelbase:
+            raise ValueError("cg_ahead_of_rear_axle must be less than wheelbase")
+        return self
+
+
+class SignalOfAcceleration(Signal):
+    """An accelerometer along the vehicle; `kind` says what it measures."""
+
+    kind: Literal["kinematic", "specific_force"] = "kinematic"
+    """dv/dt, or the specific force dv/dt + g sin(pitch) that an inertial sensor fixed to the vehicle feels."""
+
+
+class Axle(_Section):
+    """What belongs to an axle and not to a wheel: its motor, its differential, a load cell or air spring.
+
+    `both` is the shaft that drives both axles; its differential is the one between the axles.  Torques are of the axle:
+    the sum over its wheels.
+    """
+
+    name: Literal["front", "rear", "both"]
+    """Axle; `both` for a motor or engine that drives front and rear."""
+    gear_ratio: Annotated[PositiveFloat, AfterValidator(GEAR_RATIO)] = 1.0
+    """Turns of the shaft for one of the axle's wheels; of `both`: of its motor for one of the shafts to the axles,
+    whose own ratios are those of `front` and `rear`."""
+    differential: Literal["open", "locked", "limited"] = "open"
+    """Open: the same torque left and right.  Locked: the same speed.  Limited: in between."""
+    torque_bias: Annotated[NonNegativeFloat, AfterValidator(SHARE)] | None = None
+    """Sd of the difference of the two torques over their sum; by default 0.05 of an open differential (its friction:
+    bias ratio 1.1), 0.25 of one of limited slip (bias ratios of 2 to 3; Wong 2008, sect. 4.4)."""
+    max_torque: Annotated[PositiveFloat, AfterValidator(AXLE_TORQUE)] | None = None
+    """Greatest torque at the axle [N m], where no signal reports it."""
+    torque: Signal | None = None
+    """Torque [N m] or, with `torque_constant`, current [A] of its motor."""
+    torque_limit: Signal | None = None
+    """Greatest torque that the motor reports it can give [N m]; optional."""
+    motor_speed: Signal | None = None
+    """Rotation of its motor [rad/s]: the mean of its wheels' speeds, where these have no sensor."""
+    load: Signal | None = None
+    """Load on the axle [N]: load cell or pressure of the air springs."""
 
 
 class Wheel(_Section):
@@ -223,6 +296,10 @@ class Wheel(_Section):
     """Of the tyre [m]."""
     tyre: Literal["flexible", "rigid"] = "flexible"
     """A rigid wheel has no tyre that could flatten or wear."""
+    driven: bool = True
+    """false: it rolls freely, without any torque but the drag of its bearing."""
+    bearing_drag: Annotated[NonNegativeFloat, AfterValidator(SHARE)] = 0.005
+    """Sd of the torque of a wheel that is not driven, over its load and radius: bearing and seals."""
     gear_ratio: Annotated[PositiveFloat, AfterValidator(GEAR_RATIO)] = 1.0
     """Turns of the motor shaft for one of the wheel."""
     max_torque: Annotated[PositiveFloat, AfterValidator(WHEEL_TORQUE)] | None = None
@@ -242,16 +319,10 @@ class Wheel(_Section):
 
     @model_validator(mode="after")
     def _can_be_used(self) -> Wheel:
-        if self.torque is not None and self.load is None:
-            raise ValueError(f"wheel {self.name} has a torque but no load: map `load` to its load cell")
-        if self.torque is not None and self.speed is None:
-            raise ValueError(f"wheel {self.name} has a torque but no speed: map `speed`, else it has no slip")
+        of_motor = [role for role in ("torque", "torque_limit", "max_torque") if getattr(self, role) is not None]
+        if not self.driven and of_motor:
+            raise ValueError(f"wheel {self.name} has driven = false and a {of_motor[0]}: leave out one of the two")
         return self
-
-    @property
-    def lacking(self) -> list[str]:
-        """The roles that are not mapped of those without which the wheel counts for nothing."""
-        return [role for role in ("torque", "speed", "load") if getattr(self, role) is None]
 
 
 class Signals(_Section):
@@ -263,10 +334,14 @@ class Signals(_Section):
     """Pull at the hitch [N], positive backward."""
     pitch: Signal | None = None
     """Nose-up angle [rad]."""
-    acceleration: Signal | None = None
-    """Along the vehicle [m/s^2], dv/dt."""
+    acceleration: SignalOfAcceleration | None = None
+    """Along the vehicle [m/s^2], dv/dt or specific force."""
     yaw_rate: Signal | None = None
     """Positive to the left [rad/s]; distinguishes turns from wheels that spin on one side."""
+    roll: Signal | None = None
+    """Left side up [rad]; shifts load where no cell measures it."""
+    steering_angle: Signal | None = None
+    """Of the front wheels, positive to the left [rad]; with the wheelbase a yaw rate where none is mapped."""
     latitude: Signal | None = None
     """WGS84, positive north; only for the map."""
     longitude: Signal | None = None
@@ -390,10 +465,18 @@ class NoiseOfChannels(_Section):
     """[m/s^2]."""
     yaw_rate: Noise = Noise(absolute=0.01)
     """[rad/s]."""
+    roll: Noise = Noise(absolute=0.005)
+    """[rad]."""
+    steering_angle: Noise = Noise(absolute=0.02)
+    """[rad]."""
+    computed_load: Noise = Noise(relative=0.08, gain=0.02)
+    """Of a load that no cell measures, beside what mass, centre of gravity, pitch, acceleration and draft leave open:
+    what bouncing, pitching and rolling on uneven ground add in a bin, and the fixed error of the share left and right.
+    Dynamic wheel loads of tractors on fields vary by 5 to 15 % of the static load (rms)."""
     slip: Noise = Noise(absolute=0.005)
     """Of a table that holds slip itself; its gain is the relative error of 1 - slip."""
 
-    @field_validator("sinkage", "pitch", "acceleration", "yaw_rate")
+    @field_validator("sinkage", "pitch", "acceleration", "yaw_rate", "roll", "steering_angle")
     @classmethod
     def _without_gain(cls, noise: Noise) -> Noise:
         if noise.gain:
@@ -595,6 +678,7 @@ class Config(_Section):
     bus: Bus = Bus()
     dbc: Dbc = Dbc()
     vehicle: Vehicle | None = None
+    axle: list[Axle] = Field(default_factory=list, max_length=3)
     wheel: list[Wheel] = Field(default_factory=list, max_length=8)
     signals: Signals = Signals()
     table: Table | None = None
@@ -618,7 +702,40 @@ class Config(_Section):
         for w in self.wheel:
             if w.axle is None and self.table is None:
                 raise ValueError(f"wheel {w.name}: axle: missing")
+        for fault in self._faults_of_axles():
+            raise ValueError(fault)
+        if self.vehicle is not None and self.vehicle.towing == "never" and self.signals.draft is not None:
+            raise ValueError("vehicle.towing = never, but signals.draft is mapped: leave out one of the two")
         return self
+
+    def _faults_of_axles(self) -> Iterator[str]:
+        """A line for each axle that does not go with its wheels, and for each torque that would count twice."""
+        for axle in self.axle:
+            if sum(a.name == axle.name for a in self.axle) > 1:
+                yield f"two axles are named {axle.name}"
+            wheels = [w for w in self.wheel if axle.name in ("both", w.axle)]
+            if not wheels:
+                yield f"axle {axle.name} has no [[wheel]]"
+            if axle.torque is None:
+                continue
+            if not any(w.driven for w in wheels):
+                yield f"axle {axle.name} has a torque, but each of its wheels has driven = false"
+            own = [f"wheel.{w.name}" for w in wheels if w.torque is not None]
+            own += [f"axle.{a.name}" for a in self.axle if axle.name == "both" != a.name and a.torque is not None]
+            if own:
+                yield f"axle.{axle.name}.torque and {own[0]}.torque are the same torque: leave out one of the two"
+
+    def axle_named(self, name: str | None) -> Axle | None:
+        """The [[axle]] of this name; None without."""
+        return next((axle for axle in self.axle if axle.name == name), None)
+
+    def same_signal(self, role: str) -> list[list[Wheel]]:
+        """The wheels that have a role (torque, speed, load), those on one and the same signal together."""
+        groups: dict[str, list[Wheel]] = {}
+        for wheel in self.wheel:
+            if (mapped := getattr(wheel, role)) is not None:
+                groups.setdefault(mapped.signal, []).append(wheel)
+        return list(groups.values())
 
     @property
     def soil_prior(self) -> dict[str, Prior]:

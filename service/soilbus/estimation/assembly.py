@@ -10,12 +10,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import fields, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from soilbus.config.model import Config, ConfigError
+from soilbus.arrays import Array
+from soilbus.config.model import Config, ConfigError, Vehicle
 from soilbus.config.model import Effect as EffectSetting
+from soilbus.estimation.instrumentation import Coupling, Group, Instrumentation, Row, contrast, rows_of, unit
 from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.window import Rig, SensorNoise
@@ -23,6 +28,11 @@ from soilbus.terra.effects.effect import Active, Effect, Parameter
 from soilbus.terra.vehicle import Chassis
 from soilbus.terra.wheel import FAST_NODES, WheelModel
 from soilbus.words import did_you_mean
+
+DIFFERENTIAL_BIAS = {"open": 0.05, "limited": 0.25, "locked": 0.0}
+"""Default of `config.model.Axle.torque_bias`, with its evidence there."""
+UNKNOWN_SHARE = 0.02
+"""Default relative sd of mass, and of the centre of gravity over the wheelbase: `config.model.Vehicle`."""
 
 
 def rig_of(config: Config) -> Rig:
@@ -36,53 +46,186 @@ def rig_of(config: Config) -> Rig:
     Returns
     -------
     Rig
-        Without wheels if none is measured.
+        Without wheels if no torque is measured.
 
     Raises
     ------
     ConfigError
-        With a line for each wheel that is not measured while others are, and for each axle
-        without wheels: its load and rolling resistance would be attributed to the soil under the others.
+        With a line for each wheel whose motor or speed is not measured while others are, and for each axle without
+        wheels: its rolling resistance would be attributed to the soil under the others.
     """
     of_table = config.table is not None
     if faults := [] if of_table else list(_unmeasured(config)):
         raise ConfigError(faults)
-    wheels = [w for w in config.wheel if of_table or not w.lacking]
+    measured = of_table or _torque_is_measured(config)
+    wheels = config.wheel if measured else []
     noise = {q: SensorNoise(**getattr(config.noise, q).model_dump()) for q in type(config.noise).model_fields}
-    slip = noise.pop("slip")
+    slip, computed = noise.pop("slip"), noise.pop("computed_load")
+    noise["differential_lock"] = SensorNoise(absolute=1.0)
     if of_table:  # its speeds are computed from the slip, see tables.py
         noise |= {"speed": SensorNoise(), "ground_speed": slip}
-    return Rig(
+    rig = Rig(
         wheels=tuple(w.name for w in wheels),
         radius=np.array([w.radius for w in wheels]),
         width=np.array([w.width for w in wheels]),
         front=np.array([of_table or w.axle == "front" for w in wheels], dtype=bool),
         chassis=chassis_of(config),
         noise=noise,
-        track=None if config.vehicle is None else config.vehicle.track,
     )
+    if config.vehicle is None:
+        return rig
+    acceleration = config.signals.acceleration
+    rig = replace(
+        rig,
+        track=config.vehicle.track,
+        towing=config.vehicle.towing,
+        specific_force=acceleration is not None and acceleration.kind == "specific_force",
+        skid=config.vehicle.steering == "skid",
+        driven=None if all(w.driven for w in wheels) else np.array([w.driven for w in wheels]),
+    )
+    return _with_instrumentation(rig, config, computed) if measured else rig
+
+
+def _torque_is_measured(config: Config) -> bool:
+    return any(part.torque is not None for part in (*config.wheel, *config.axle))
 
 
 def _unmeasured(config: Config) -> Iterator[str]:
-    """A line for each wheel that carries the vehicle without being measured, where others are."""
-    if all(w.lacking for w in config.wheel):
+    """A line for each wheel of which too little is measured, where others are."""
+    if not _torque_is_measured(config):
         return
     for w in config.wheel:
-        if missing := w.lacking:
-            keys = " and ".join(f"wheel.{w.name}.{role}" for role in missing)
+        axles = [a for a in config.axle if a.name in ("both", w.axle)]
+        if w.driven and w.torque is None and all(a.torque is None for a in axles):
             yield (
-                f"wheel {w.name} has no {' and no '.join(missing)}: map {keys}; without, its rolling resistance"
-                " would be put down to the soil under the other wheels"
+                f"wheel {w.name} has no torque: map wheel.{w.name}.torque or axle.{w.axle}.torque, or say"
+                " driven = false if no motor drives it"
             )
+        if w.driven and w.speed is None and all(a.motor_speed is None for a in axles):
+            yield (
+                f"wheel {w.name} has no speed: map wheel.{w.name}.speed or axle.{w.axle}.motor_speed; without, it has"
+                " no slip"
+            )
+        if w.load is None and config.vehicle is None:
+            yield f"wheel {w.name} has no load: map wheel.{w.name}.load, or give the [vehicle] whose weight it carries"
     if config.vehicle is not None:
         for axle in ("front", "rear"):
             if axle not in {w.axle for w in config.wheel}:
                 yield f"no [[wheel]] is on the {axle} axle, which carries its share of the weight: give all wheels"
 
 
+def _with_instrumentation(rig: Rig, config: Config, computed: SensorNoise) -> Rig:
+    """The rig with what is measured of it, where that is not a torque, a speed and a load of each wheel."""
+    n, vehicle, chassis = len(rig.wheels), config.vehicle, rig.chassis
+    assert vehicle is not None
+    assert chassis is not None
+    place = {name: i for i, name in enumerate(rig.wheels)}
+    of_axle = {
+        name: tuple(i for i, w in enumerate(config.wheel) if name in ("both", w.axle))
+        for name in ("front", "rear", "both")
+    }
+    axle_ratio = {a.name: a.gear_ratio for a in config.axle}
+    ratio = np.array([axle_ratio.get(str(w.axle), 1.0) for w in config.wheel])
+    groups: dict[str, list[Group]] = {}
+    for quantity in ("torque", "speed", "load"):
+        groups[quantity] = [
+            Group(tuple(place[w.name] for w in same), (1.0 / len(same),) * len(same), same[0].name)
+            for same in config.same_signal(quantity)
+        ]
+    for a in config.axle:
+        wheels = tuple(i for i in of_axle[a.name] if rig.drives[i])
+        shaft = ratio[list(wheels)] if a.name == "both" else np.ones(len(wheels))
+        if a.torque is not None:
+            groups["torque"].append(Group(wheels, tuple((1.0 / shaft).tolist()), a.name))
+        if a.motor_speed is not None:
+            groups["speed"].append(Group(wheels, tuple((shaft / len(wheels)).tolist()), a.name))
+        if a.load is not None:
+            groups["load"].append(Group(of_axle[a.name], (1.0,) * len(of_axle[a.name]), a.name))
+    couplings = tuple(_couplings(config, of_axle, rig.drives, groups))
+    torque, speed, load = (
+        rows_of(n, groups[quantity], rig.noise[quantity].gain, rows)
+        for quantity, rows in (
+            ("torque", _torque_rows(rig, couplings, ratio)),
+            ("speed", _speed_rows(rig, couplings, ratio, groups["speed"])),
+            ("load", _load_rows(rig, vehicle, computed)),
+        )
+    )
+    plain = np.eye(n)
+    if all(np.array_equal([row.weight for row in rows], plain) and all(row.kind == "channel" for row in rows)
+           for rows, _ in (torque, speed, load)):  # fmt: skip
+        return rig
+    drag = np.array([w.bearing_drag for w in config.wheel])
+    given = Instrumentation(torque[0], speed[0], load[0], couplings, ratio, drag, computed.relative)
+    return replace(rig, instrumentation=given, names={"torque": torque[1], "speed": speed[1], "load": load[1]})
+
+
+def _couplings(
+    config: Config, of_axle: Mapping[str, tuple[int, ...]], drives: NDArray[np.bool_], groups: Mapping[str, list[Group]]
+) -> Iterator[Coupling]:
+    """The differentials: of each axle, and between the axles; wheels on one signal of speed turn together."""
+    together = [set(group.wheels) for group in groups["speed"] if len(group.wheels) > 1 and group.name not in of_axle]
+    for name in ("front", "rear"):
+        wheels, axle = [i for i in of_axle[name] if drives[i]], config.axle_named(name)
+        kind = "open" if axle is None else axle.differential
+        bias = DIFFERENTIAL_BIAS[kind] if axle is None or axle.torque_bias is None else axle.torque_bias
+        for one, other in pairwise(wheels):
+            rigid = any({one, other} <= wheels_together for wheels_together in together)
+            yield Coupling((one,), (other,), bias, kind == "locked" or rigid)
+    centre = config.axle_named("both")
+    front, rear = (tuple(i for i in of_axle[name] if drives[i]) for name in ("front", "rear"))
+    if front and rear:
+        kind = "locked" if centre is None else centre.differential
+        bias = DIFFERENTIAL_BIAS[kind] if centre is None or centre.torque_bias is None else centre.torque_bias
+        yield Coupling(front, rear, bias, kind == "locked", of_axle=False)
+
+
+def _torque_rows(rig: Rig, couplings: Sequence[Coupling], ratio: Array) -> list[Row]:
+    """Free wheels, differentials; at last what nothing is known of."""
+    n = len(rig.wheels)
+    free = [Row(unit(n, i), "free", i, rig.wheels[i]) for i in np.flatnonzero(~rig.drives).tolist()]
+    sums = [contrast(n, c.one, c.other, np.where(np.isin(np.arange(n), c.one), len(c.one), len(c.other)) / ratio)
+            for c in couplings]  # fmt: skip
+    of_couplings = [Row(weight, "coupling", i, "") for i, weight in enumerate(sums)]
+    return [*free, *of_couplings, *(Row(unit(n, i), "unknown", i, rig.wheels[i]) for i in range(n))]
+
+
+def _speed_rows(rig: Rig, couplings: Sequence[Coupling], ratio: Array, groups: Sequence[Group]) -> list[Row]:
+    """Wheels on one signal, differentials, wheels without a sensor."""
+    n = len(rig.wheels)
+    same = [
+        Row(contrast(n, [one], [other], np.ones(n)), "same", one, "")
+        for group in groups
+        if group.name in rig.wheels
+        for one, other in pairwise(group.wheels)
+    ]
+    of_couplings = [Row(contrast(n, c.one, c.other, ratio), "coupling", i, "") for i, c in enumerate(couplings)]
+    return [*same, *of_couplings, *(Row(unit(n, i), "free", i, rig.wheels[i]) for i in range(n))]
+
+
+def _load_rows(rig: Rig, vehicle: Vehicle, computed: SensorNoise) -> list[Row]:
+    """Weight, its share on the front axle, and the differences left to right on each axle."""
+    n, chassis = len(rig.wheels), rig.chassis
+    assert chassis is not None
+    mass_std = UNKNOWN_SHARE if vehicle.mass_std is None else vehicle.mass_std / vehicle.mass
+    cg_std = UNKNOWN_SHARE * vehicle.wheelbase if vehicle.cg_std is None else vehicle.cg_std
+    share = chassis.cg_ahead_of_rear_axle / chassis.wheelbase
+    transfer = np.where(rig.front, 1.0 - share, -share)
+    rows = [
+        Row((1.0,) * n, "weight", 0, "weight", mass_std),
+        Row(tuple(transfer.tolist()), "transfer", 0, "balance", cg_std / chassis.cg_ahead_of_rear_axle),
+    ]
+    for axle in (rig.front, ~rig.front):
+        for one, other in pairwise(np.flatnonzero(axle).tolist()):
+            name = f"{rig.wheels[one]}-{rig.wheels[other]}"
+            rows.append(Row(contrast(n, [one], [other], np.ones(n)), "side", one, name, computed.gain))
+    return rows
+
+
 def chassis_of(config: Config) -> Chassis | None:
     """Mass and geometry; None for a test rig."""
-    return None if config.vehicle is None else Chassis(**config.vehicle.model_dump(exclude={"track"}))
+    if config.vehicle is None:
+        return None
+    return Chassis(**config.vehicle.model_dump(include={f.name for f in fields(Chassis)}))
 
 
 def prior_of(config: Config) -> SoilPrior:

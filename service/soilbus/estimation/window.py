@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.estimation.local_cubics import Series
 from soilbus.terra.vehicle import Chassis, pull_required
+
+if TYPE_CHECKING:
+    from soilbus.estimation.instrumentation import Instrumentation, Observations
 
 __all__ = [
     "VEHICLE_QUANTITIES",
@@ -36,11 +39,14 @@ __all__ = [
 
 WHEEL_QUANTITIES = ("torque", "load", "speed", "sinkage")
 """Quantities that each wheel has a channel of."""
-VEHICLE_QUANTITIES = ("ground_speed", "draft", "pitch", "acceleration", "yaw_rate")
+VEHICLE_QUANTITIES = (
+    "ground_speed", "draft", "pitch", "acceleration", "yaw_rate", "roll", "steering_angle", "differential_lock",
+)  # fmt: skip
 """Quantities that the vehicle has one channel of."""
 LEAST_LEVEL = {
     "torque": 50.0, "load": 500.0, "speed": 0.4, "sinkage": 0.01,
     "ground_speed": 0.2, "draft": 500.0, "pitch": 0.01, "acceleration": 0.1, "yaw_rate": 0.02,
+    "roll": 0.01, "steering_angle": 0.02, "differential_lock": 1.0,
 }  # fmt: skip
 """Magnitudes (SI) below which relative noise shrinks no further in the outlier test: a sensor at rest still
 has its resolution and its zero error.  No evidence recorded."""
@@ -83,12 +89,32 @@ class Rig:
     noise: Mapping[str, SensorNoise]
     track: float | None = None
     """Distance [m] between the left and the right wheels, where known."""
+    driven: NDArray[np.bool_] | None = None
+    """(W,), which wheels a motor can drive; None for all."""
+    instrumentation: Instrumentation | None = None
+    """What is measured, where that is not a torque, a speed and a load of each wheel."""
+    names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Names (W,) of a quantity's columns in the raw window, where these are not the wheels'."""
+    towing: str = "measured"
+    """As `config.model.Vehicle.towing`."""
+    specific_force: bool = False
+    """Whether the accelerometer measures dv/dt + g sin(pitch)."""
+    skid: bool = False
+    """Whether the vehicle steers by the speeds of its sides."""
 
     @property
     def channels(self) -> tuple[str, ...]:
         """Names of all channels, wheel quantities first."""
-        per_wheel = tuple(f"{q}.{w}" for q in WHEEL_QUANTITIES for w in self.wheels)
+        per_wheel = tuple(
+            f"{q}.{name or w}" for q in WHEEL_QUANTITIES
+            for w, name in zip(self.wheels, self.names.get(q, self.wheels), strict=True)
+        )  # fmt: skip
         return per_wheel + VEHICLE_QUANTITIES
+
+    @property
+    def drives(self) -> NDArray[np.bool_]:
+        """(W,), which wheels a motor can drive."""
+        return np.ones(len(self.wheels), bool) if self.driven is None else self.driven
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,15 +140,32 @@ class Window:
     samples: int
     yaw_rate: Array = field(default_factory=lambda: np.empty(0))
     curves: Mapping[str, Series] = field(default_factory=dict)
+    roll: Array = field(default_factory=lambda: np.empty(0))
+    steering_angle: Array = field(default_factory=lambda: np.empty(0))
+    differential_lock: Array = field(default_factory=lambda: np.empty(0))
+    direction: Array = field(default_factory=lambda: np.empty(0))
+    """(N,), -1 where the vehicle reversed before `forward`; empty where it never did."""
+    observations: Observations | None = None
+    """Of `instrumentation.completed`."""
+    kinematic: bool = False
+    """Whether an acceleration that was a specific force has become dv/dt."""
 
     def __post_init__(self) -> None:
-        if len(self.yaw_rate) != len(self.t):
-            object.__setattr__(self, "yaw_rate", np.full(len(self.t), np.nan))
+        for quantity in ("yaw_rate", "roll", "steering_angle", "differential_lock"):
+            if len(getattr(self, quantity)) != len(self.t):
+                object.__setattr__(self, quantity, np.full(len(self.t), np.nan))
 
     def rows(self, keep: NDArray[np.intp]) -> Window:
         """The window with the given bins only."""
         values: dict[str, Any] = {q: getattr(self, q)[keep] for q in (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)}
-        return replace(self, t=self.t[keep], variance={q: v[keep] for q, v in self.variance.items()}, **values)
+        return replace(
+            self,
+            t=self.t[keep],
+            variance={q: v[keep] for q, v in self.variance.items()},
+            direction=self.direction[keep] if len(self.direction) else self.direction,
+            observations=None if self.observations is None else self.observations.rows(keep),
+            **values,
+        )
 
 
 def forward(window: Window) -> Window:
@@ -167,6 +210,7 @@ def forward(window: Window) -> Window:
         pitch=direction * window.pitch,
         acceleration=direction * window.acceleration,
         yaw_rate=direction * window.yaw_rate,
+        direction=direction,
         curves={},
     )
 

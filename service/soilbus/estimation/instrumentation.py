@@ -1,0 +1,359 @@
+"""Instrumentation: how the torques, speeds and loads of the wheels follow from what is measured.
+
+    M_q x_q = l_q + noise      x_q: torques, speeds or loads of the W wheels; l_q: W independent observations
+
+Each row of M is what one channel measures (a wheel, the sum over an axle, the mean that a motor's speed is) or, where
+no channel is left, what is known without measuring:
+
+    torque    T_left - T_right = 0       open differential, sd: its friction; unknown where it is locked
+              T = 0                      a wheel that is not driven, sd: drag of its bearing
+    speed     omega_left - omega_right   0, sd: SLIP_STD, nothing where the differential is locked
+              omega = V / r (1 - s)      a free wheel without sensor, until its torque row says better
+    load      sum W = m g cos(pitch)     and the shift to the front axle by pitch, acceleration and draft
+              W_left - W_right           from the roll angle; sd: what uneven ground adds
+
+So a channel of two wheels is one noise and one gain error.  Where every wheel has its own torque, speed and load, all M
+are unit matrices and `Rig.instrumentation` is None.  `completed` makes a window of it: values of every wheel, and the
+observations l for the observation model, which propagates their noise through M^-1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soilbus.arrays import Array
+from soilbus.estimation.window import Rig, Window, zero_if_unknown
+from soilbus.terra.vehicle import GRAVITY, axle_loads
+
+if TYPE_CHECKING:
+    pass
+
+__all__ = ["Coupling", "Group", "Instrumentation", "Observations", "Row", "completed"]
+
+ROLLING_SLIP = -0.03
+"""Slip of a free wheel without a speed sensor before its torque row says better: a resistance of 0.05 to 0.1 of the
+load takes a skid of 2 to 5 % on field soils (Wong 2008, fig. 2.60)."""
+SLIP_STD = 0.1
+"""Sd of that slip, and of half the difference of two wheels' slips where only their motor's speed is measured."""
+LOCKED_STD = 1e-3
+"""Relative sd of speeds that a shaft makes equal: backlash and twist."""
+LEAST_TORQUE = 0.05
+"""Torque over load and radius that a differential's friction counts at least, and that of a coasting vehicle."""
+
+
+class Group(NamedTuple):
+    """A channel of one wheel or more: sum(weight x) over these wheels; the raw window has it in the first one's column.
+
+    name: of the wheel or the axle that it is mapped for.
+    """
+
+    wheels: tuple[int, ...]
+    weight: tuple[float, ...]
+    name: str
+
+
+class Coupling(NamedTuple):
+    """Two sets of wheels behind a differential; ratio (W,): turns of the shaft before it for one of the wheel.
+
+    bias: sd of the difference of the torques over their sum; locked: the speeds are equal, and the torques differ by
+    anything; of_axle: the vehicle's differential lock acts on it.
+    """
+
+    one: tuple[int, ...]
+    other: tuple[int, ...]
+    bias: float
+    locked: bool
+    of_axle: bool = True
+
+
+class Row(NamedTuple):
+    """A row of M: weights (W,), what it is, its channel's column or its coupling's index, and the sd of its gain."""
+
+    weight: tuple[float, ...]
+    kind: str
+    at: int
+    name: str
+    gain: float = 0.0
+
+
+class Observations(NamedTuple):
+    """Observations of N instants, in the order of the rows: torque, torque_var (N, W); nan where unknown.
+
+    value, variance (N, 2 W + 1): of loads, speeds and ground speed.  weight (N,) [N] is what the loads carry.
+    """
+
+    torque: Array
+    torque_var: Array
+    value: Array
+    variance: Array
+
+    def rows(self, keep: NDArray[np.intp]) -> Observations:
+        """Those of the given instants."""
+        return Observations(*(a[keep] for a in self))
+
+
+@dataclass(frozen=True, slots=True)
+class Instrumentation:
+    """What is measured of the W wheels of a rig.
+
+    Attributes
+    ----------
+    torque, speed, load
+        W rows of each.
+    couplings
+        Differentials, and the shaft between the axles.
+    ratio, drag
+        (W,), turns of a motor of both axles for one of the wheel; sd of the torque of a free wheel over load and
+        radius.
+    load_noise
+        Relative sd of a load that is not measured.
+    """
+
+    torque: tuple[Row, ...]
+    speed: tuple[Row, ...]
+    load: tuple[Row, ...]
+    couplings: tuple[Coupling, ...]
+    ratio: Array
+    drag: Array
+    load_noise: float
+
+    @property
+    def torque_matrix(self) -> Array:
+        """M of the torques (W, W)."""
+        return np.array([row.weight for row in self.torque])
+
+    @property
+    def latent_matrix(self) -> Array:
+        """M of loads, speeds and ground speed (2 W + 1, 2 W + 1)."""
+        W = len(self.load)
+        M = np.eye(2 * W + 1)
+        M[:W, :W], M[W : 2 * W, W : 2 * W] = ([row.weight for row in rows] for rows in (self.load, self.speed))
+        return M
+
+    def computes(self, quantity: str) -> NDArray[np.bool_]:
+        """Which wheels (W,) have a torque, speed or load that is not wholly measured."""
+        rows = getattr(self, quantity)
+        return np.array([any(r.weight[w] for r in rows if r.kind != "channel") for w in range(len(rows))])
+
+
+def rows_of(
+    n_wheels: int, channels: Sequence[Group], gain: float, otherwise: Sequence[Row]
+) -> tuple[tuple[Row, ...], tuple[str, ...]]:
+    """W independent rows: the channels first, then what else is known; and names (W,) of the raw window's columns.
+
+    A row that the rows before it imply adds nothing and is left out: a motor's speed beside those of its wheels.
+    """
+    rows: list[Row] = []
+    names = [""] * n_wheels
+    for group in channels:
+        weight = np.zeros(n_wheels)
+        weight[list(group.wheels)] = group.weight
+        if _independent(rows, weight):
+            rows.append(Row(tuple(weight.tolist()), "channel", group.wheels[0], group.name, gain))
+            names[group.wheels[0]] = group.name
+    for row in otherwise:
+        if len(rows) < n_wheels and _independent(rows, np.array(row.weight)):
+            rows.append(row)
+    return tuple(rows), tuple(names)
+
+
+def _independent(rows: Sequence[Row], weight: Array) -> bool:
+    return int(np.linalg.matrix_rank(np.array([*(row.weight for row in rows), weight]))) == len(rows) + 1
+
+
+def contrast(n_wheels: int, one: Sequence[int], other: Sequence[int], scale: Array) -> tuple[float, ...]:
+    """Weights (W,) of mean(scale x) over one set of wheels less that over the other."""
+    weight = np.zeros(n_wheels)
+    weight[list(one)] = scale[list(one)] / len(one)
+    weight[list(other)] = -scale[list(other)] / len(other)
+    return tuple(weight.tolist())
+
+
+def unit(n_wheels: int, wheel: int) -> tuple[float, ...]:
+    """Weights (W,) of one wheel alone."""
+    return tuple(float(w == wheel) for w in range(n_wheels))
+
+
+def completed(window: Window, rig: Rig) -> Window:
+    """A forward window with a torque, speed and load of every wheel.
+
+    Parameters
+    ----------
+    window : Window
+        From `forward`: channels as measured, each in the column of its first wheel.
+    rig : Rig
+        With its instrumentation.
+
+    Returns
+    -------
+    Window
+        Its draft is zero where nothing is ever towed, its acceleration dv/dt where specific force was measured, its yaw
+        rate that of the steering angle where none was.  With `observations` where the rig has an instrumentation.
+    """
+    window = _of_vehicle(window, rig)
+    given = rig.instrumentation
+    if given is None or window.observations is not None or not len(window.t):
+        return window
+    load, load_of, load_var = _loads(window, rig, given)
+    speed, speed_of, speed_var = _speeds(window, rig, given)
+    torque, torque_of, torque_var = _torques(window, rig, given, load)
+    observations = Observations(
+        torque_of,
+        torque_var,
+        np.column_stack([load_of, speed_of, window.ground_speed]),
+        np.column_stack([load_var, speed_var, window.variance["ground_speed"]]),
+    )
+    variance = dict(window.variance)
+    for quantity, rows, of_rows in (
+        ("load", given.load, load_var), ("speed", given.speed, speed_var), ("torque", given.torque, torque_var),
+    ):  # fmt: skip
+        inverse = np.linalg.inv(np.array([row.weight for row in rows]))
+        known = np.where(np.isfinite(of_rows), of_rows, np.nan if quantity != "torque" else 0.0)
+        variance[quantity] = known @ (inverse**2).T
+    return replace(window, torque=torque, speed=speed, load=load, variance=variance, observations=observations)
+
+
+def _of_vehicle(window: Window, rig: Rig) -> Window:
+    """Draft, acceleration and yaw rate as the machine has them."""
+    changed: dict[str, Array] = {}
+    variance = dict(window.variance)
+    if rig.towing == "never":
+        changed["draft"] = np.zeros(len(window.t))
+        variance["draft"] = np.zeros(len(window.t))
+    if rig.specific_force and not window.kinematic:
+        changed["acceleration"] = window.acceleration - GRAVITY * np.sin(zero_if_unknown(window.pitch))
+    if rig.chassis is not None and np.isfinite(window.steering_angle).any() and not np.isfinite(window.yaw_rate).any():
+        curvature = np.tan(window.steering_angle) / rig.chassis.wheelbase
+        changed["yaw_rate"] = window.ground_speed * curvature
+        variance["yaw_rate"] = (window.ground_speed / rig.chassis.wheelbase) ** 2 * window.variance["steering_angle"]
+    if not changed:
+        return window
+    return replace(window, variance=variance, kinematic=window.kinematic or rig.specific_force, **changed)
+
+
+def _solved(rows: Sequence[Row], observed: Array) -> Array:
+    """Values of the wheels (N, W) from those of the rows (N, W)."""
+    return np.asarray(np.linalg.solve(np.array([row.weight for row in rows]), observed.T).T)
+
+
+def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Array, Array]:
+    """Loads of the wheels, observations of them and their variances, each (N, W)."""
+    n, W = len(window.t), len(given.load)
+    load, scale, variance = (np.zeros((n, W)) for _ in range(3))
+    chassis = rig.chassis
+    for i, row in enumerate(given.load):
+        if row.kind == "channel":
+            load[:, i] = scale[:, i] = window.load[:, row.at]
+            variance[:, i] = window.variance["load"][:, row.at]
+            continue
+        assert chassis is not None  # `rig_of` sees to it
+        weight = chassis.mass * GRAVITY
+        pitch, roll = zero_if_unknown(window.pitch), zero_if_unknown(window.roll)
+        direction = window.direction if len(window.direction) else np.ones(n)
+        static, _ = axle_loads(chassis, 0.0, 0.0, 0.0)
+        if row.kind == "weight":
+            load[:, i] = weight * np.cos(pitch)
+            scale[:, i], variance[:, i] = load[:, i], (given.load_noise / 2.0 * weight) ** 2
+        elif row.kind == "transfer":
+            along = direction * pitch, direction * zero_if_unknown(window.acceleration)
+            draft, draft_var = _draft_on_hitch(window, rig)
+            front, rear = axle_loads(chassis, direction * draft, *along)
+            share = static / weight
+            load[:, i] = (1.0 - share) * front - share * rear
+            scale[:, i] = static
+            of_pitch, of_acceleration = _known_var(window, "pitch"), _known_var(window, "acceleration")
+            of_along = of_acceleration if rig.specific_force else GRAVITY**2 * of_pitch + of_acceleration
+            variance[:, i] = (
+                (given.load_noise / 2.0 * min(static, weight - static)) ** 2
+                + (chassis.mass * chassis.cg_height / chassis.wheelbase) ** 2 * of_along
+                + (chassis.hitch_height / chassis.wheelbase) ** 2 * draft_var
+            )
+        else:  # left less right
+            axle = static if rig.front[row.at] else weight - static
+            lever = 0.0 if rig.track is None else chassis.cg_height / rig.track
+            load[:, i] = -2.0 * axle * lever * np.sin(roll)
+            scale[:, i] = axle
+            variance[:, i] = (given.load_noise * axle) ** 2 / 2.0 + (2.0 * axle * lever) ** 2 * _known_var(
+                window, "roll"
+            )
+    return _solved(given.load, load), scale, variance
+
+
+def _draft_on_hitch(window: Window, rig: Rig) -> tuple[Array, Array]:
+    """Draft [N] for the loads, and its variance: where none is known, any from 0 to half the weight."""
+    known = np.isfinite(window.draft)
+    most = 0.5 * (0.0 if rig.chassis is None else rig.chassis.mass) * GRAVITY
+    return np.where(known, window.draft, most / 2.0), np.where(known, _known_var(window, "draft"), most**2 / 12.0)
+
+
+def _known_var(window: Window, quantity: str) -> Array:
+    variance = window.variance[quantity]
+    return np.where(np.isfinite(getattr(window, quantity)) & np.isfinite(variance), variance, 0.0)
+
+
+def _speeds(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Array, Array]:
+    """Speeds of the wheels, observations of them and their variances, each (N, W)."""
+    n, W = len(window.t), len(given.speed)
+    speed, variance = np.zeros((n, W)), np.zeros((n, W))
+    rolling = window.ground_speed[:, None] / rig.radius / (1.0 - ROLLING_SLIP)
+    for i, row in enumerate(given.speed):
+        if row.kind == "channel":
+            speed[:, i], variance[:, i] = window.speed[:, row.at], window.variance["speed"][:, row.at]
+        elif row.kind == "coupling":
+            relative = np.where(_locked(window, given.couplings[row.at]), LOCKED_STD, 2.0 * SLIP_STD)
+            size = np.abs(np.array(row.weight)) @ np.nan_to_num(rolling).T / 2.0
+            variance[:, i] = (relative * size) ** 2
+        elif row.kind == "same":
+            variance[:, i] = (LOCKED_STD * np.nan_to_num(rolling[:, row.at])) ** 2
+        else:
+            speed[:, i] = rolling[:, row.at]
+            variance[:, i] = (SLIP_STD * rolling[:, row.at]) ** 2
+    return _solved(given.speed, speed), speed.copy(), variance
+
+
+def _torques(window: Window, rig: Rig, given: Instrumentation, load: Array) -> tuple[Array, Array, Array]:
+    """Torques of the wheels, observations of them and their variances, each (N, W); nan where a row says nothing."""
+    n, W = len(window.t), len(given.torque)
+    torque, variance = np.zeros((n, W)), np.zeros((n, W))
+    grip = zero_if_unknown(load) * rig.radius
+    for i, row in enumerate(given.torque):
+        weight = np.array(row.weight)
+        if row.kind == "channel":
+            torque[:, i], variance[:, i] = window.torque[:, row.at], window.variance["torque"][:, row.at]
+        elif row.kind == "free":
+            variance[:, i] = (given.drag[row.at] * grip[:, row.at]) ** 2
+        elif row.kind == "unknown":
+            variance[:, i] = np.nan
+    shares = _solved(given.torque, torque)
+    for i, row in enumerate(given.torque):
+        if row.kind == "coupling":
+            weight, coupling = np.abs(np.array(row.weight)), given.couplings[row.at]
+            size = np.abs(zero_if_unknown(shares)) @ weight + LEAST_TORQUE * grip @ weight
+            variance[:, i] = np.where(_locked(window, coupling), np.nan, (coupling.bias * size) ** 2)
+    return shares, np.where(np.isfinite(variance), torque, np.nan), variance
+
+
+def _locked(window: Window, coupling: Coupling) -> NDArray[np.bool_]:
+    """At which instants (N,) a differential is locked."""
+    switched = np.zeros(len(window.t), bool)
+    if coupling.of_axle and len(window.differential_lock):
+        switched = zero_if_unknown(window.differential_lock) > 0.5
+    return np.asarray(switched | coupling.locked)
+
+
+def describe(rig: Rig) -> Iterator[str]:
+    """A line for each quantity that is not measured at each wheel: what stands in its place."""
+    given = rig.instrumentation
+    if given is None:
+        return
+    computed = [rig.wheels[w] for w in np.flatnonzero(given.computes("load"))]
+    if computed:
+        yield (
+            f"no load cell for {', '.join(computed)}: computed from mass, centre of gravity, pitch, acceleration and"
+            f" draft, {given.load_noise:.0%} uncertain"
+        )
