@@ -53,6 +53,8 @@ class Channel:
     valid_values: tuple[int, ...] = ()
     timeout: float | None = None
     delay: float = 0.0
+    key: str = ""
+    """Key of the configuration that maps it."""
 
     @property
     def name(self) -> str:

@@ -152,6 +152,7 @@ def _channel(config: Config, database: Database, role: _Role) -> Channel:
         valid_values=tuple(role.mapped.valid_values) if valid_signal else (),
         timeout=role.mapped.timeout or _usual_timeout(role, message),
         delay=role.mapped.delay,
+        key=role.where,
     )
 
 

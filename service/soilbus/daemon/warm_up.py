@@ -19,6 +19,7 @@ from soilbus.can.channels import Channel, Column, Decoded
 from soilbus.can.publish import Publisher
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import delays_of, effects_of, model_of
+from soilbus.estimation.instrumentation import ROLLING_SLIP, channel_value
 from soilbus.estimation.window import Rig, pairs
 from soilbus.pipeline.outputs import hop_frames
 from soilbus.pipeline.pipeline import Pipeline
@@ -59,7 +60,11 @@ def warm_up(config: Config, database: Database, ours: Database) -> list[WindowRe
     settings, intake = config.estimator, pipeline.intake
     t = np.arange(0.0, settings.window + (WINDOWS - 1) * settings.hop, 1.0 / SAMPLE_RATE)
     truth, late = _driven(config, intake.rig, t), delays_of(config)
-    columns = {c.name: _measured(c, t, truth, intake.rig, late) for c in intake.channels if c.quantity in truth}
+    columns = {
+        c.name: _measured(c, t, truth, intake.rig, late)
+        for c in intake.channels
+        if c.quantity in truth and (not c.wheel or c.name in intake.rig.channels or c.wheel in intake.rig.wheels)
+    }
     results: list[WindowResult] = []
     for since in np.arange(0.0, t[-1], settings.hop):
         now = (t >= since) & (t < since + settings.hop)
@@ -77,6 +82,7 @@ def _driven(config: Config, rig: Rig, t: Array) -> dict[str, Array]:
         raise ValueError("a rehearsal needs a [vehicle] with wheels that have torque, speed and load")
     phase = 2.0 * np.pi * t / config.estimator.window
     slip = SLIP_RANGE[0] + (SLIP_RANGE[1] - SLIP_RANGE[0]) * (1.0 - np.cos(phase)) / 2.0
+    slip = np.where(rig.drives[:, None], slip, ROLLING_SLIP)
     radius, width, rear = rig.radius[:, None], rig.width[:, None], ~rig.front[:, None]
     share = np.ones((len(rear), len(t))) / np.where(rear, rear.sum(), (~rear).sum())
     share[pairs(rig)] *= 1.0 + SIDE_LOAD_SHARE * np.stack([np.sin(2.0 * phase), -np.sin(2.0 * phase)])[:, None]
@@ -91,11 +97,13 @@ def _driven(config: Config, rig: Rig, t: Array) -> dict[str, Array]:
         draft, ratio = pull.sum(axis=0), ratio * load / carried
     depth = model.sinkage(state.entry_angle, Wheel(radius, width, rear, load))
     speed, still = GROUND_SPEED / (radius * (1.0 - slip)), np.zeros(len(t))
+    if rig.towing == "never":
+        draft = still
     return {
         "torque": torque, "torque_limit": np.full_like(torque, 2.0 * torque.max()), "load": carried,
         "speed": speed, "motor_speed": speed, "sinkage": depth,
         "ground_speed": np.full(len(t), GROUND_SPEED), "draft": draft, "pitch": still, "acceleration": still,
-        "yaw_rate": still,
+        "yaw_rate": still, "roll": still, "steering_angle": still, "differential_lock": still,
     }  # fmt: skip
 
 
@@ -103,7 +111,7 @@ def _measured(channel: Channel, t: Array, truth: dict[str, Array], rig: Rig, lat
     """Samples of one channel with the noise of its sensor, stamped as late as they come."""
     value = truth[channel.quantity]
     if channel.wheel:
-        value = value[rig.wheels.index(channel.wheel)]
+        value = channel_value(rig, channel.quantity, channel.wheel, value)
     noise = rig.noise.get(channel.quantity, rig.noise["speed"])
     sd = np.sqrt(noise.absolute**2 + (noise.relative * value) ** 2 + (noise.of_mean * np.abs(value).mean()) ** 2)
     rng = np.random.default_rng(zlib.crc32(channel.name.encode()))

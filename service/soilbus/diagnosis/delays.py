@@ -257,7 +257,7 @@ class _RecordProfile:
             raise np.linalg.LinAlgError("the model is not finite where it was fitted")
         self.quadratic, self.directions = quadratic, objective.directions(iterate)
         variance, row_var = self.problem.variances(self.gains)
-        self.inverse = inverse_covariance(quadratic.linearisation.by_latents, variance, row_var, self.problem.n_wheels)
+        self.inverse = inverse_covariance(quadratic.linearisation.by_latents, variance, row_var)
         self.torque = self.problem.torques(optimum.soil, self.gains, optimum.latents)
         self.alone = self.problem.with_effects(
             [e for e in fitted.effects if e.name == self.free[0].effect], _alone(free, at)

@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.window import Rig, SensorNoise
 from soilbus.terra.effects.effect import Active, Effect, Parameter
-from soilbus.terra.vehicle import Chassis
+from soilbus.terra.vehicle import Chassis, axle_loads
 from soilbus.terra.wheel import FAST_NODES, WheelModel
 from soilbus.words import did_you_mean
 
@@ -87,7 +87,7 @@ def rig_of(config: Config) -> Rig:
 
 
 def _torque_is_measured(config: Config) -> bool:
-    return any(part.torque is not None for part in (*config.wheel, *config.axle))
+    return any(w.torque is not None for w in config.wheel) or any(a.torque is not None for a in config.axle)
 
 
 def _unmeasured(config: Config) -> Iterator[str]:
@@ -114,6 +114,44 @@ def _unmeasured(config: Config) -> Iterator[str]:
                 yield f"no [[wheel]] is on the {axle} axle, which carries its share of the weight: give all wheels"
 
 
+class Motor(NamedTuple):
+    """A motor by the name of its wheel or axle: the wheels that it drives, the part of its torque that each gets, and
+
+    max_torque [N m] at the wheel or the axle, nan where not known.  share: torque of each wheel for one unit of the
+    motor's, where all slip alike.
+    """
+
+    name: str
+    wheels: tuple[int, ...]
+    share: tuple[float, ...]
+    max_torque: float
+
+
+class Motors(NamedTuple):
+    """Motors of the wheels, then of the axles, then of both axles; driven (W,)."""
+
+    motors: tuple[Motor, ...]
+    driven: NDArray[np.bool_]
+
+
+def motors_of(config: Config, rig: Rig) -> Motors:
+    """The motors of a rig's vehicle."""
+    if not rig.wheels:
+        return Motors((), np.zeros(0, bool))
+    motors = [Motor(w.name, (i,), (1.0,), w.max_torque or math.nan) for i, w in enumerate(config.wheel)]
+    ratio: dict[str, float] = {a.name: a.gear_ratio for a in config.axle}
+    for axle in sorted(config.axle, key=lambda a: a.name == "both"):
+        wheels = tuple(i for i, w in enumerate(config.wheel) if axle.name in ("both", w.axle) and w.driven)
+        share = np.ones(len(wheels)) / max(len(wheels), 1)
+        if axle.name == "both" and rig.chassis is not None:
+            front, rear = axle_loads(rig.chassis, 0.0, 0.0, 0.0)
+            grip = np.where(rig.front, front / max(rig.front.sum(), 1), rear / max((~rig.front).sum(), 1)) * rig.radius
+            grip, gear = grip[list(wheels)], np.array([ratio.get(str(config.wheel[i].axle), 1.0) for i in wheels])
+            share = grip / float((grip / gear).sum())
+        motors.append(Motor(axle.name, wheels, tuple(share.tolist()), axle.max_torque or math.nan))
+    return Motors(tuple(motors), rig.drives)
+
+
 def _with_instrumentation(rig: Rig, config: Config, computed: SensorNoise) -> Rig:
     """The rig with what is measured of it, where that is not a torque, a speed and a load of each wheel."""
     n, vehicle, chassis = len(rig.wheels), config.vehicle, rig.chassis
@@ -124,7 +162,7 @@ def _with_instrumentation(rig: Rig, config: Config, computed: SensorNoise) -> Ri
         name: tuple(i for i, w in enumerate(config.wheel) if name in ("both", w.axle))
         for name in ("front", "rear", "both")
     }
-    axle_ratio = {a.name: a.gear_ratio for a in config.axle}
+    axle_ratio: dict[str, float] = {a.name: a.gear_ratio for a in config.axle}
     ratio = np.array([axle_ratio.get(str(w.axle), 1.0) for w in config.wheel])
     groups: dict[str, list[Group]] = {}
     for quantity in ("torque", "speed", "load"):

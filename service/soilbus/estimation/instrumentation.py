@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,10 +30,7 @@ from soilbus.arrays import Array
 from soilbus.estimation.window import Rig, Window, zero_if_unknown
 from soilbus.terra.vehicle import GRAVITY, axle_loads
 
-if TYPE_CHECKING:
-    pass
-
-__all__ = ["Coupling", "Group", "Instrumentation", "Observations", "Row", "completed"]
+__all__ = ["Coupling", "Group", "Instrumentation", "Observations", "Row", "completed", "with_speeds"]
 
 ROLLING_SLIP = -0.03
 """Slip of a free wheel without a speed sensor before its torque row says better: a resistance of 0.05 to 0.1 of the
@@ -159,7 +156,18 @@ def rows_of(
     for row in otherwise:
         if len(rows) < n_wheels and _independent(rows, np.array(row.weight)):
             rows.append(row)
-    return tuple(rows), tuple(names)
+    return tuple(_placed(rows)), tuple(names)
+
+
+def _placed(rows: Sequence[Row]) -> list[Row]:
+    """The rows in an order in which each stands at the place of a wheel that it is of, those of one wheel first."""
+    free = list(range(len(rows)))
+    place: dict[int, Row] = {}
+    for row in sorted(rows, key=lambda row: np.count_nonzero(row.weight)):
+        own = [i for i in free if row.weight[i]] or free
+        place[own[0]] = row
+        free.remove(own[0])
+    return [place[i] for i in range(len(rows))]
 
 
 def _independent(rows: Sequence[Row], weight: Array) -> bool:
@@ -218,6 +226,16 @@ def completed(window: Window, rig: Rig) -> Window:
     return replace(window, torque=torque, speed=speed, load=load, variance=variance, observations=observations)
 
 
+def with_speeds(window: Window, rig: Rig, speed: Array) -> Window:
+    """A completed window with other speeds (N, W) of the wheels."""
+    given, observations = rig.instrumentation, window.observations
+    if given is not None and observations is not None:
+        W, value = len(rig.wheels), observations.value.copy()
+        value[:, W : 2 * W] = speed @ np.array([row.weight for row in given.speed]).T
+        observations = observations._replace(value=value)
+    return replace(window, speed=speed, observations=observations)
+
+
 def _of_vehicle(window: Window, rig: Rig) -> Window:
     """Draft, acceleration and yaw rate as the machine has them."""
     changed: dict[str, Array] = {}
@@ -233,7 +251,8 @@ def _of_vehicle(window: Window, rig: Rig) -> Window:
         variance["yaw_rate"] = (window.ground_speed / rig.chassis.wheelbase) ** 2 * window.variance["steering_angle"]
     if not changed:
         return window
-    return replace(window, variance=variance, kinematic=window.kinematic or rig.specific_force, **changed)
+    columns: dict[str, Any] = changed
+    return replace(window, variance=variance, kinematic=window.kinematic or rig.specific_force, **columns)
 
 
 def _solved(rows: Sequence[Row], observed: Array) -> Array:
@@ -344,6 +363,15 @@ def _locked(window: Window, coupling: Coupling) -> NDArray[np.bool_]:
     if coupling.of_axle and len(window.differential_lock):
         switched = zero_if_unknown(window.differential_lock) > 0.5
     return np.asarray(switched | coupling.locked)
+
+
+def channel_value(rig: Rig, quantity: str, name: str, of_wheels: Array) -> Array:
+    """What the channel of a wheel or axle reads (N,) where the wheels have these values (W, N)."""
+    rows: Sequence[Row] = () if rig.instrumentation is None else getattr(rig.instrumentation, quantity, ())
+    for row in rows:
+        if row.kind == "channel" and row.name == name:
+            return np.asarray(np.array(row.weight) @ of_wheels)
+    return np.asarray(of_wheels[rig.wheels.index(name)])
 
 
 def describe(rig: Rig) -> Iterator[str]:

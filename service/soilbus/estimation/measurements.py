@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
+from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.local_cubics import Series
-from soilbus.estimation.window import Rig, Window, forward, turning
+from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
 
 __all__ = [
@@ -53,15 +54,31 @@ _BY_INSTANT = (
     "t", "usable", "torque", "torque_var", "has_torque", "sinkage", "sinkage_var", "has_sinkage", "load", "load_var",
     "speed", "speed_var", "ground_speed", "ground_speed_var", "slip", "draft", "draft_var", "demand", "demand_var",
     "has_balance", "pitch", "since", "distance", "wheel_angle", "acceleration", "acceleration_var",
-    "_measured", "_measured_var", "_row_var", "_known",
+    "_measured", "_measured_var", "_latents_measured", "_row_var", "_known",
 )  # fmt: skip
 """Attributes of `Measurements` with a row for each instant."""
 
 
 def gain_names(rig: Rig) -> list[str]:
     """Names of the sensor gains: torque, load and speed of each wheel, ground speed, draft."""
-    per_wheel = ("torque", "load", "speed")
-    return [n for q in GAIN_QUANTITIES for n in ([f"{q}.{w}" for w in rig.wheels] if q in per_wheel else [q])]
+    return gains_of(rig)[0]
+
+
+def gains_of(rig: Rig) -> tuple[list[str], list[float]]:
+    """Names and prior sd of the sensor gains; those of rows that no sensor measures have the row's name and sd."""
+    names, std, given = [], [], rig.instrumentation
+    for quantity in GAIN_QUANTITIES:
+        if quantity not in WHEEL_QUANTITIES:
+            names.append(quantity)
+            std.append(rig.noise[quantity].gain)
+        elif given is None:
+            names += [f"{quantity}.{wheel}" for wheel in rig.wheels]
+            std += [rig.noise[quantity].gain] * len(rig.wheels)
+        else:
+            rows = getattr(given, quantity)
+            names += [f"{quantity}.{row.name or f'{row.kind}{row.at}'}" for row in rows]
+            std += [row.gain for row in rows]
+    return names, std
 
 
 class Measurements:
@@ -84,7 +101,7 @@ class Measurements:
 
     def __init__(self, window: Window, rig: Rig, min_speed: float, max_turn: float) -> None:
         self.rig = rig
-        self._curves = Curves(forward(window), rig.wheels)
+        self._curves = Curves(completed(forward(window), rig), rig.wheels)
         window = self._curves.window
         n_wheels = len(rig.wheels)
         moving, in_turn = window.ground_speed > min_speed, turning(window, rig, max_turn)
@@ -107,7 +124,14 @@ class Measurements:
             return np.where(known, value, 0.0), np.where(known, variance, 0.0), known
 
         self.torque, self.torque_var, known = take("torque")
+        self._observe()
+        if window.observations is not None and self._torque_matrix is not None:
+            torque, torque_var = window.observations.torque[kept], window.observations.torque_var[kept]
+            known = np.isfinite(torque) & np.isfinite(torque_var)
+            self.torque, self.torque_var = np.where(known, torque, 0.0), np.where(known, torque_var, 0.0)
+            usable = (~usable).astype(float) @ (np.abs(self._torque_matrix) > 0.0).T == 0.0
         self.has_torque = known & usable
+        usable = self.usable
         self.sinkage, self.sinkage_var, known = take("sinkage")
         self.has_sinkage = known & usable
         self.with_sinkage = bool(self.has_sinkage.any())
@@ -122,12 +146,18 @@ class Measurements:
         self.length = float(self.distance[-1]) if len(self.distance) else 0.0
         self.wheel_angle = wheel_rotation(self.t, self.speed)
         self._balance(take, usable)
-        self.gain_names = gain_names(rig)
-        self.gain_std = np.array([rig.noise[name.partition(".")[0]].gain for name in self.gain_names])
+        self.gain_names, gain_std = gains_of(rig)
+        self.gain_std = np.array(gain_std)
         self.n_sensors = len(self.gain_names)
         self.slip = slip[kept]
-        self._measured = np.concatenate([self.load, self.speed, self.ground_speed[:, None]], axis=1)
-        self._measured_var = np.concatenate([self.load_var, self.speed_var, self.ground_speed_var[:, None]], axis=1)
+        self._latents_measured = np.concatenate([self.load, self.speed, self.ground_speed[:, None]], axis=1)
+        if window.observations is None:
+            self._measured = self._latents_measured
+            self._measured_var = np.concatenate([self.load_var, self.speed_var, self.ground_speed_var[:, None]], axis=1)
+        else:
+            value, variance = window.observations.value[kept], window.observations.variance[kept]
+            known = np.isfinite(value) & np.isfinite(variance)
+            self._measured, self._measured_var = np.where(known, value, 1.0), np.where(known, variance, 0.0)
         known_rows = [self.has_torque, self.has_balance[:, None], self.has_sinkage]
         row_var = [self.torque_var, self.demand_var[:, None], self.sinkage_var]
         n_kinds = 3 if self.with_sinkage else 2
@@ -135,6 +165,34 @@ class Measurements:
         self._row_var = np.where(known, np.concatenate(row_var[:n_kinds], axis=1), 1.0)
         self._known = known
         self._count()
+
+    def _observe(self) -> None:
+        """Set the matrices from torques and latents of the wheels to what is observed; None for unit matrices."""
+        given = self.rig.instrumentation
+        self._torque_matrix: Array | None = None
+        self._latent_matrix: Array | None = None
+        self._from_observed: Array | None = None
+        self._mass_gain: int | None = None
+        if given is not None:
+            self._torque_matrix, self._latent_matrix = given.torque_matrix, given.latent_matrix
+            self._from_observed = np.asarray(np.linalg.inv(self._latent_matrix))
+            self._mass_gain = next((i for i, row in enumerate(given.load) if row.kind == "weight"), None)
+
+    def observed(self, latents: Array) -> Array:
+        """Observations (N, 2 W + 1) that latents (N, 2 W + 1) of the wheels would give without noise and gain error."""
+        if self._latent_matrix is None:
+            return latents
+        return np.asarray(self._measured + (latents - self._latents_measured) @ self._latent_matrix.T)
+
+    def from_observed(self, observed: Array) -> Array:
+        """Latents (N, 2 W + 1) of the wheels from observations without noise (N, 2 W + 1)."""
+        if self._from_observed is None:
+            return observed
+        return np.asarray(self._latents_measured + (observed - self._measured) @ self._from_observed.T)
+
+    def torque_rows(self, torque: Array) -> Array:
+        """What is measured of torques (..., W) of the wheels: sums, differences, or themselves."""
+        return torque if self._torque_matrix is None else np.asarray(torque @ self._torque_matrix.T)
 
     def _count(self) -> None:
         """Set the attributes that follow from the number of instants and the masks."""
@@ -154,10 +212,12 @@ class Measurements:
             mass = self.rig.chassis.mass
             pitch, pitch_var, has_pitch = take("pitch")
             self.with_pitch = bool(has_pitch.any())
-            if self.with_pitch:
+            if self.rig.specific_force:  # it holds the slope: pitch is needed for dv/dt only, and its noise cancels
+                pitch_var = np.zeros_like(pitch_var)
+            elif self.with_pitch:
                 known = known & has_pitch
             acceleration, acceleration_var, has_acceleration = take("acceleration")
-            if has_acceleration.any():
+            if has_acceleration.any() or self.rig.specific_force:
                 known = known & has_acceleration
             else:
                 acceleration, acceleration_var = differentiated_speed(self.t, self.ground_speed, self.ground_speed_var)

@@ -191,6 +191,10 @@ class Latents:
             np.concatenate([self.entry_angle[-shared:], new.entry_angle]),
         )
 
+    def joined(self) -> Array:
+        """Loads, speeds and ground speed (N, 2 W + 1)."""
+        return np.concatenate([self.load, self.speed, self.ground_speed[:, None]], axis=1)
+
     def part(self, instants: NDArray[np.intp] | NDArray[np.bool_]) -> Latents:
         """The latents of the given instants, in that order."""
         return Latents(
@@ -212,8 +216,8 @@ class Linearisation:
     rows: Array
     weighed: Array
     normal: Array
-    by_latents: Array  # (N, m, 2 W + 1)
-    corrected: Array  # (N, 2 W + 1) measured latents over 1 + gain
+    by_latents: Array  # (N, m, 2 W + 1) by the observations of the latents
+    corrected: Array  # (N, 2 W + 1) observations of the latents over 1 + gain
     variance: Array  # (N, 2 W + 1) variance of `corrected`
     by_gain: Array  # (N, 2 W + 1) minus the derivative of `corrected` by its own gain
     by_delay: Array  # (P, N, 2 W + 1) derivatives of `corrected` by the effect parameters; P = 0 without delays
@@ -371,30 +375,37 @@ class ObservationModel(Measurements):
         torques, balance, sinkages = layout.torques, layout.balance, layout.sinkages
         self.work.instants += self.n
         at = self._response(soil, gains, latents)
-        A = self._by_latents(at)
+        A = self._by_observed(self._by_latents(at))
+        torque = self.torque_rows(at.value[1])
 
         of_torque, of_latents, of_draft, corrected, variance, row_var = self._corrected(gains)
         delay = self.delay_terms(gains, latents, at.value[1])
         draft, draft_var = self.draft * of_draft, self.draft_var * of_draft**2
+        inertia = self.demand - self.draft
 
         rows = np.zeros((*A.shape[:2], FIRST_GAIN + layout.n_sensors + len(gains) - self.n_sensors))
         residual, by_soil, by_effects = rows[:, :, RESIDUAL], rows[:, :, SOIL], rows[:, :, layout.effect_columns]
-        residual[:, torques] = self.torque * of_torque - at.value[1]
-        residual[:, balance] = self.demand - self.draft + draft + at.extra_pull - at.value[0].sum(1)
-        by_soil[:, torques] = -at.by_soil[1].transpose(1, 2, 0)
+        residual[:, torques] = self.torque * of_torque - torque
+        residual[:, balance] = inertia + draft + at.extra_pull - at.value[0].sum(1)
+        if self._mass_gain is not None:
+            residual[:, balance] += inertia * (of_latents[self._mass_gain] - 1.0)
+        by_soil[:, torques] = self._by_torque_row(-at.by_soil[1])
         by_soil[:, balance] = -at.by_soil[0].sum(2).T
-        by_effects[:, torques] = -at.by_effects[1].transpose(1, 2, 0)
+        by_effects[:, torques] = self._by_torque_row(-at.by_effects[1])
         by_effects[:, balance] = (at.extra_pull_by_effects - at.by_effects[0].sum(2)).T
         if self.with_sinkage:
             residual[:, sinkages] = self.sinkage - at.value[2]
             by_soil[:, sinkages] = -at.by_soil[2].transpose(1, 2, 0)
             by_effects[:, sinkages] = -at.by_effects[2].transpose(1, 2, 0)
-        now = np.concatenate([latents.load, latents.speed, latents.ground_speed[:, None]], axis=1)
+        now = self.observed(latents.joined())
         latent_by_gain = now * of_latents
         if by_sensors:
             by_gain = rows[:, :, layout.sensor_columns]
-            diagonals(by_gain[:, torques, layout.torque_gains])[:] = -of_torque * at.value[1]
+            diagonals(by_gain[:, torques, layout.torque_gains])[:] = -of_torque * torque
             np.multiply(A, -latent_by_gain[:, None, :], out=by_gain[:, :, layout.latent_gains])
+            if self._mass_gain is not None:
+                by_mass = by_gain[:, balance, layout.latent_gains][:, self._mass_gain]
+                by_mass -= inertia * of_latents[self._mass_gain] ** 2
             by_gain[:, balance, layout.draft_gain] = -of_draft * (
                 draft - residual[:, balance] * draft_var / row_var[:, balance]
             )
@@ -411,7 +422,7 @@ class ObservationModel(Measurements):
         if self._missing is not None:
             A[self._missing] = 0.0
             rows[self._missing] = 0.0
-        weighed = inverse_covariance(A, variance, row_var, self.n_wheels) @ rows
+        weighed = inverse_covariance(A, variance, row_var) @ rows
         flat, weighed = rows.reshape(-1, rows.shape[2]), weighed.reshape(-1, rows.shape[2])
         return Linearisation(
             rows=flat,
@@ -490,6 +501,17 @@ class ObservationModel(Measurements):
             wheel_rows[:, :, ground] = by_ground[kind]
         return A
 
+    def _by_observed(self, A: Array) -> Array:
+        """Derivatives (N, m, 2 W + 1) of rows by observations, from those of the wheels' rows by their latents."""
+        if self._torque_matrix is None or self._from_observed is None:
+            return A
+        A[:, self.layout.torques] = self._torque_matrix @ A[:, self.layout.torques]
+        return np.asarray(A @ self._from_observed)
+
+    def _by_torque_row(self, of_wheels: Array) -> Array:
+        """Derivatives of the torque rows (N, W, P) from those of the wheels' torques (P, N, W)."""
+        return self.torque_rows(of_wheels).transpose(1, 2, 0)
+
     def _corrected(self, gains: Array) -> tuple[Array, Array, float, Array, Array, Array]:
         """Factors 1 / (1 + gain) of torques, latents and draft; corrected latents; their variances; variances of rows.
 
@@ -550,6 +572,7 @@ class ObservationModel(Measurements):
         new = at.corrected - at.variance * (weighed @ at.by_latents)[:, 0] - at.by_gain * gain_step[layout.latent_gains]
         if len(at.by_delay):
             new += np.tensordot(gain_step[layout.effects], at.by_delay, 1)
+        new = self.from_observed(new)
         load, speed, ground = new[:, layout.loads], new[:, layout.speeds], new[:, layout.ground_speed]
         slip_change = (latents.ground_speed[:, None] / latents.speed - ground[:, None] / speed) / self.rig.radius
         more = load - latents.load - at.load_by_slip * slip_change
@@ -609,7 +632,7 @@ class ObservationModel(Measurements):
             (N, m, 6 + G).
         """
         variance, row_var = self.variances(gains)
-        inverse = inverse_covariance(at.by_latents, variance, row_var, self.n_wheels)
+        inverse = inverse_covariance(at.by_latents, variance, row_var)
         root = np.sqrt(diagonals(inverse))
         weighed = at.weighed.reshape(*root.shape, -1) / root[:, :, None]
         weighed[~self._known] = np.nan
@@ -625,13 +648,13 @@ class ObservationModel(Measurements):
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
         pull, torque, depth = np.concatenate([by_form[:, :1], by_form[:, :1] * slip, by_form[:, 1:]], axis=1)
         rows = np.zeros((n, m, len(pull)))
-        rows[:, layout.torques] = -torque.transpose(1, 2, 0)
+        rows[:, layout.torques] = self._by_torque_row(-torque)
         rows[:, layout.balance] = -pull.sum(2).T
         if self.with_sinkage:
             rows[:, layout.sinkages] = -depth.transpose(1, 2, 0)
         rows[~self._known] = 0.0
         variance, row_var = self._corrected(gains)[4:]
-        weighed = inverse_covariance(at.by_latents, variance, row_var, self.n_wheels) @ rows
+        weighed = inverse_covariance(at.by_latents, variance, row_var) @ rows
         return rows.reshape(n * m, -1), weighed.reshape(n * m, -1)
 
     def _contact_by_form(self, soil: Soil, gains: Array, latents: Latents) -> Array:
@@ -971,15 +994,17 @@ class ObservationModelWithEffects(ObservationModel):
         measured[:, loads], measured[:, speed] = load[0] * self.usable, ground[0][:, 0]
         by_measured[:, :, loads], by_measured[:, :, speed] = load[1] * self.usable, ground[1][:, :, 0]
         weight = 0.0 if self.rig.chassis is None else self.rig.chassis.mass * GRAVITY * np.cos(self.pitch)
+        if self._latent_matrix is not None:
+            measured, by_measured = measured @ self._latent_matrix.T, by_measured @ self._latent_matrix.T
         return DelayTerms(
-            torque=torques[0],
+            torque=self.torque_rows(torques[0]),
             measured=measured,
             demand=draft[0][:, 0] + weight * pitch[0][:, 0],
-            predicted=predicted,
-            by_torque=torques[1],
+            predicted=self.torque_rows(predicted),
+            by_torque=self.torque_rows(torques[1]),
             by_measured=by_measured,
             by_demand=draft[1][:, :, 0] + weight * pitch[1][:, :, 0],
-            by_predicted=by_predicted,
+            by_predicted=self.torque_rows(by_predicted),
         )
 
     def _low_pass_terms(self, tau: float, latents: Latents, torque: Array) -> tuple[Array, Array, Array]:
@@ -1123,17 +1148,16 @@ class DenoisedObservationModel(ObservationModel):
         self.__dict__.update(vars(problem))
         self._base = problem
         layout, fitted = problem.layout, optimum.latents
-        latents = np.concatenate([fitted.load, fitted.speed, fitted.ground_speed[:, None]], axis=1)
-        self._shrunk = shrunk_latents(latents, optimum.at.variance)
-        load, speed = self._shrunk[:, layout.loads], self._shrunk[:, layout.speeds]
-        ground_speed = self._shrunk[:, layout.ground_speed]
+        self._shrunk = shrunk_latents(problem.observed(fitted.joined()), optimum.at.variance)
+        latents = problem.from_observed(self._shrunk)
+        load, speed, ground_speed = latents[:, layout.loads], latents[:, layout.speeds], latents[:, layout.ground_speed]
         soil = Soil(*optimum.soil.tolist())
         self.latents = self.with_entry_angles(
             Latents(load, speed, ground_speed, fitted.entry_angle), soil, optimum.gains
         )
         self._by_latents_at_optimum = problem.linearise(soil, optimum.gains, self.latents).by_latents
         *_, variance, row_var = self._corrected(optimum.gains)
-        self._inverse = inverse_covariance(self._by_latents_at_optimum, variance, row_var, self.n_wheels)
+        self._inverse = inverse_covariance(self._by_latents_at_optimum, variance, row_var)
 
     def allowed(self, gains: Array) -> Array:
         """Gains (G,) clipped to their ranges."""
@@ -1198,68 +1222,25 @@ def shrunk_latents(fitted: Array, variance: Array) -> Array:
     return shrunk
 
 
-def inverse_covariance(A: Array, latent_var: Array, row_var: Array, n_wheels: int) -> Array:
+def inverse_covariance(A: Array, variance: Array, row_var: Array) -> Array:
     """Inverse covariance (A V A' + R)^-1 (N, m, m) of the residuals of every instant.
 
     Parameters
     ----------
     A : Array
-        Derivatives of the residuals by the latents (N, m, 2 W + 1).
-    latent_var, row_var : Array
-        Diagonals of V (N, 2 W + 1) and R (N, m): variances of latents and rows.
-    n_wheels : int
-        W.
+        Derivatives of the residuals by the observations (N, m, 2 W + 1).
+    variance, row_var : Array
+        Diagonals of V (N, 2 W + 1) and R (N, m): variances of observations and rows.
 
     Notes
     -----
-    A wheel's rows depend on its own load and speed, the balance on those of all wheels, and
-    every row on the ground speed.  So the covariance is 2 x 2 blocks by wheel bordered by
-    the balance, plus a matrix of rank one; two updates of rank one invert it.
+    Rows are in N m, N and m; they are scaled by their sd before the inversion.
     """
-    layout = Layout(n_wheels)
-    torques, balance_row, z = layout.torques, layout.balance, layout.sinkages
-    by_load, by_speed, by_ground = A[:, :, layout.loads], A[:, :, layout.speeds], A[:, :, layout.ground_speed]
-    # copies: contiguous arrays are several times as fast
-    load_var, speed_var = latent_var[:, layout.loads].copy(), latent_var[:, layout.speeds].copy()
-    ground_var = latent_var[:, layout.ground_speed]
-    balance_load, balance_speed = by_load[:, balance_row].copy(), by_speed[:, balance_row].copy()
-
-    def own(rows: slice) -> tuple[Array, Array]:
-        """Derivatives (N, W) of each wheel's row by its own load and speed."""
-        return diagonals(by_load[:, rows]).copy(), diagonals(by_speed[:, rows]).copy()
-
-    load, speed = own(torques)
-    load_weighed, speed_weighed = load * load_var, speed * speed_var
-    torque = load * load_weighed + speed * speed_weighed + row_var[:, torques]
-    torque_balance = load_weighed * balance_load + speed_weighed * balance_speed
-    balance = (balance_load**2 * load_var + balance_speed**2 * speed_var).sum(1) + row_var[:, balance_row]
-
-    inverse = np.zeros((*row_var.shape, row_var.shape[1]))
-    border = np.empty(row_var.shape)
-    border[:, balance_row] = -1.0
-    if row_var.shape[1] > n_wheels + 1:
-        z_load, z_speed = own(z)
-        cross = load_weighed * z_load + speed_weighed * z_speed
-        sinkage = z_load**2 * load_var + z_speed**2 * speed_var + row_var[:, z]
-        sinkage_balance = z_load * load_var * balance_load + z_speed * speed_var * balance_speed
-        determinant = torque * sinkage - cross**2
-        torque_part, cross_part, sinkage_part = sinkage / determinant, -cross / determinant, torque / determinant
-        border[:, torques] = torque_part * torque_balance + cross_part * sinkage_balance
-        border[:, z] = sinkage_part * sinkage_balance + cross_part * torque_balance
-        balance -= (sinkage_balance * border[:, z]).sum(1)
-        diagonals(inverse[:, z, z])[:] = sinkage_part
-        diagonals(inverse[:, torques, z])[:] = cross_part
-        diagonals(inverse[:, z, torques])[:] = cross_part
-    else:
-        torque_part = 1.0 / torque
-        border[:, torques] = torque_part * torque_balance
-    balance -= (torque_balance * border[:, torques]).sum(1)
-    diagonals(inverse[:, torques, torques])[:] = torque_part
-    inverse += np.einsum("ni,nj->nij", border, border / balance[:, None])
-    common = (inverse @ by_ground[:, :, None])[:, :, 0]
-    share = ground_var / (1.0 + ground_var * np.einsum("ni,ni->n", by_ground, common))
-    inverse -= np.einsum("ni,nj->nij", common, common * share[:, None])
-    return inverse
+    S = (A * variance[:, None, :]) @ A.swapaxes(1, 2)
+    diagonals(S)[:] += row_var
+    scale = 1.0 / np.sqrt(diagonals(S))
+    S *= scale[:, :, None] * scale[:, None, :]
+    return np.asarray(np.linalg.inv(S) * (scale[:, :, None] * scale[:, None, :]))
 
 
 def diagonals(blocks: Array) -> Array:

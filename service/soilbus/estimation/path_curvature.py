@@ -20,9 +20,11 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.instrumentation import with_speeds
 from soilbus.estimation.measurements import Measurements
 from soilbus.estimation.multistart import Fit, fit_window, refine
 from soilbus.estimation.observation_model import FIRST_GAIN, RESIDUAL, CurvedPathFit, ObservationModel
@@ -64,8 +66,7 @@ class CurvedPath(NamedTuple):
 def curvature_of(measurements: Measurements) -> PathCurvature:
     """Prior of the path curvature of a window, by its rim speeds."""
     side = np.zeros(_SOIL + len(measurements.gain_std))
-    first = measurements.gain_names.index(f"speed.{measurements.rig.wheels[0]}")
-    side[_SOIL + first : _SOIL + first + measurements.n_wheels] = sides(measurements.rig)
+    side[_SOIL + speed_gains(measurements)] = sides_of_sensors(measurements.rig)
     of_mean = side[_SOIL:] * measurements.gain_std / max(np.count_nonzero(side), 1)
     return PathCurvature(side, rim_difference(measurements), float(of_mean @ of_mean))
 
@@ -134,7 +135,7 @@ def detected_curvature(objective: Objective, fit: Fit | None) -> CurvedPath | No
 def straightened(window: Window, rig: Rig, path: CurvedPath) -> Window:
     """The window with the wheel speeds that it would have without the curvature at knots."""
     relative = np.interp(window.t, path.knots, path.relative)
-    return replace(window, speed=window.speed / (1.0 + relative[:, None] * sides(rig)))
+    return with_speeds(window, rig, window.speed / (1.0 + relative[:, None] * sides(rig)))
 
 
 def fit_on_curved_path(
@@ -179,8 +180,8 @@ def fit_on_curved_path(
 def by_curvature(objective: Objective, fit: Fit) -> tuple[Array, Array]:
     """Derivatives (N, m) of the residuals by the curvature s of their own instant, and these weighed."""
     problem, at = objective.problem, fit.optimum.at
-    columns = [FIRST_GAIN + problem.gain_names.index(f"speed.{wheel}") for wheel in problem.rig.wheels]
-    shape, side = at.by_latents.shape[:2], sides(problem.rig)
+    columns = FIRST_GAIN + speed_gains(problem)
+    shape, side = at.by_latents.shape[:2], sides_of_sensors(problem.rig)
     return (at.rows[:, columns] @ side).reshape(shape), (at.weighed[:, columns] @ side).reshape(shape)
 
 
@@ -206,6 +207,20 @@ def sides(rig: Rig) -> Array:
     side = np.zeros(len(rig.wheels))
     side[pairs(rig)] = [[-1.0], [1.0]]
     return side
+
+
+def sides_of_sensors(rig: Rig) -> Array:
+    """As `sides`, of the speed sensors: 0 for one of several wheels, whose mean speed a curve leaves."""
+    side = sides(rig)
+    if rig.instrumentation is not None:
+        own = [row.kind == "channel" and np.count_nonzero(row.weight) == 1 for row in rig.instrumentation.speed]
+        side = np.where(own, side, 0.0)
+    return side
+
+
+def speed_gains(measurements: Measurements) -> NDArray[np.intp]:
+    """Places (W,) of the gains of the wheel speeds: after those of torques and loads."""
+    return np.arange(2 * measurements.n_wheels, 3 * measurements.n_wheels)
 
 
 def rim_differences(measurements: Measurements) -> Array:

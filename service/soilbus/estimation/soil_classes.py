@@ -193,7 +193,7 @@ def ranked_by_likelihood(problem: ObservationModel, soils: Sequence[Soil]) -> li
     _, pull, torque = wheel_forces(state._replace(entry_angle=angle), few.model)
     depth = sinkage(angle, radius)
     typical = np.abs(few.torque).sum() / max(np.count_nonzero(few.has_torque), 1) + 1.0
-    by_torque = np.where(few.has_torque, torque - few.torque, 0.0) / (RANKING_RELATIVE_SD * typical)
+    by_torque = np.where(few.has_torque, few.torque_rows(torque) - few.torque, 0.0) / (RANKING_RELATIVE_SD * typical)
     by_pull = np.where(few.has_balance, pull.sum(axis=2) - few.demand, 0.0) / (
         RANKING_RELATIVE_SD * typical * (1.0 / radius).sum()
     )

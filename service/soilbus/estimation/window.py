@@ -293,7 +293,7 @@ class NoiseTable(NamedTuple):
     @classmethod
     def of(cls, rig: Rig) -> NoiseTable:
         """The noise of a rig's channels."""
-        noise = [rig.noise[name.partition(".")[0]] for name in rig.channels]
+        noise = [rig.noise.get(name.partition(".")[0], SensorNoise()) for name in rig.channels]
         return cls(
             len(rig.wheels),
             np.array([n.absolute**2 for n in noise]),
@@ -346,7 +346,8 @@ def made_window(noise: NoiseTable, t: Array, mean: Array, worth: Array, count: A
     """
     variance = _variance_of_means(mean, np.where(count > 0.0, worth, 0.0), noise)
     values, variances = _by_quantity(mean, noise.n_wheels), _by_quantity(variance, noise.n_wheels)
-    return Window(t=t, variance=variances, samples=int(count.sum()), curves={}, **values)
+    columns: dict[str, Any] = values
+    return Window(t=t, variance=variances, samples=int(count.sum()), curves={}, **columns)
 
 
 def _by_quantity(table: Array, n_wheels: int) -> dict[str, Array]:

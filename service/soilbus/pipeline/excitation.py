@@ -32,7 +32,7 @@ def excitation_of(window: Window, rig: Rig, min_speed: float) -> Excitation:
     """Excitation of a forward window; slip only where the ground speed exceeds min_speed [m/s]."""
     ground = np.where(window.ground_speed > min_speed, window.ground_speed, np.nan)[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
-        slip = slip_ratio(rig.radius, window.speed, ground)
+        slip = np.where(rig.drives, slip_ratio(rig.radius, window.speed, ground), np.nan)
         noise = window.variance["speed"] / window.speed**2 + window.variance["ground_speed"][:, None] / ground**2
         noise *= (1.0 - slip) ** 2
         wheels = np.isfinite(slip + noise).sum(axis=1)

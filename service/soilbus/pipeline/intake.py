@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -25,7 +25,8 @@ from soilbus.can.dbc_files import checked_messages
 from soilbus.can.mapping import OPTIONAL_ROLES, POSITION_ROLES, channels_of
 from soilbus.config.model import Config
 from soilbus.decision.traction_loss import Motion, motion_of
-from soilbus.estimation.assembly import delays_of, rig_of
+from soilbus.estimation.assembly import Motor, Motors, delays_of, motors_of, rig_of
+from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, Window, forward, inertia_of, pull_given
 from soilbus.pipeline.positions import PositionTrack
 from soilbus.sensors.bins import Bins
@@ -146,30 +147,38 @@ class ReportedLimits:
     A reported limit holds until another one is reported, also through silence and a set clock.  It is the median of the
     last LIMIT_SAMPLES samples.
 
+    A motor of several wheels gives each the share that `Motor.share` says; a wheel that is not driven has the limit 0.
+
     Parameters
     ----------
-    wheels, configured
-        Names of the wheels, and their configured limits [N m], nan where none.
+    motors
+        Of the vehicle; a wheel's limit is that of the last motor with one that drives it.
     """
 
-    def __init__(self, wheels: Sequence[str], configured: Sequence[float]) -> None:
-        self._configured = dict(zip(wheels, configured, strict=True))
+    def __init__(self, motors: Motors) -> None:
+        self._motors = motors
+        self._names = {motor.name for motor in motors.motors}
         self._reported: dict[str, tuple[Array, Array]] = {}
 
-    def add(self, wheel: str, t: Array, value: Array) -> None:
-        """Add samples [N m] (N,) of one wheel at the times t [s]."""
-        if wheel in self._configured:
-            old_t, old = self._reported.get(wheel, (t[:0], value[:0]))
-            self._reported[wheel] = np.append(old_t, t), np.append(old, value)
+    def add(self, name: str, t: Array, value: Array) -> None:
+        """Add samples [N m] (N,) of the motor of a wheel or axle at the times t [s]."""
+        if name in self._names:
+            old_t, old = self._reported.get(name, (t[:0], value[:0]))
+            self._reported[name] = np.append(old_t, t), np.append(old, value)
 
     def at(self, t: float) -> Array:
         """The limits (W,) in force at the time t [s]."""
-        return np.array([self._of(wheel, t) for wheel in self._configured])
+        out = np.where(self._motors.driven, np.nan, 0.0)
+        for motor in self._motors.motors:
+            limit = self._of(motor, t)
+            if math.isfinite(limit):
+                out[list(motor.wheels)] = limit * np.array(motor.share)
+        return out
 
-    def _of(self, wheel: str, now: float) -> float:
-        t, value = self._reported.get(wheel, (np.empty(0), np.empty(0)))
+    def _of(self, motor: Motor, now: float) -> float:
+        t, value = self._reported.get(motor.name, (np.empty(0), np.empty(0)))
         last = value[t <= now][-LIMIT_SAMPLES:]
-        return float(np.median(last)) if len(last) else self._configured[wheel]
+        return float(np.median(last)) if len(last) else motor.max_torque
 
     def drop_before(self, end: float) -> None:
         """Forget samples that are no longer among the last ones at the time `end` [s]."""
@@ -208,6 +217,7 @@ class Intake:
         self.channels = channels_of(config, database)
         self.admission = Admission(self.channels, database, checked_messages(config))
         self.rig = rig_of(config)
+        self._binned = frozenset(self.rig.channels)
         self.refusals = Refusals()
         self.needed = tuple(c for c in self.channels if self._is_needed(c))
         self._positions = PositionTrack(
@@ -219,10 +229,8 @@ class Intake:
         self._latest = max([0.0, *late.values()])
         self._waits = {name: self._latest - delay for name, delay in late.items() if self._latest != delay}
         self._settings = config.estimator
-        self._binned = frozenset(self.rig.channels)
-        limits = {w.name: w.max_torque for w in config.wheel}
         self._decision = config.traversability
-        self._limits = ReportedLimits(self.rig.wheels, [limits[name] or math.nan for name in self.rig.wheels])
+        self._limits = ReportedLimits(motors_of(config, self.rig))
         self._index = 0
         self.epoch = 0
         self._ready: list[WindowTask] = []
@@ -239,7 +247,7 @@ class Intake:
 
     def _is_needed(self, channel: Channel) -> bool:
         if channel.wheel:
-            return channel.wheel in self.rig.wheels and channel.quantity in ("torque", "speed", "load")
+            return channel.name in self._binned and channel.quantity in ("torque", "speed", "load")
         return channel.quantity not in OPTIONAL_ROLES
 
     def begin_recording(self) -> None:
@@ -332,10 +340,11 @@ class Intake:
 
     def _task(self, bins: Bins, end: float) -> WindowTask:
         start = end - self._settings.window
-        window, self._implausible = self._consistency.checked(forward(bins.window(start, end)))
+        raw, self._implausible = self._consistency.checked(forward(bins.window(start, end)))
+        window = completed(raw, self.rig)
         self.refusals.note_outliers(bins.new_outliers())
         missing = tuple(c.name for c in self.needed if c.name not in self.last_seen)
-        covered = dict(zip(self.rig.channels, coverage(window).tolist(), strict=True))
+        covered = dict(zip(self.rig.channels, coverage(raw).tolist(), strict=True))
         badly_covered = [c.name for c in self.needed if covered[c.name] < MIN_COVERAGE]
         poor = tuple(dict.fromkeys(self.stale(end) + badly_covered))
         task = WindowTask(
@@ -375,17 +384,17 @@ class Intake:
         if self._bins is None or not abs(now - self._newest) <= LONGEST_GAP:  # nor nan: no bins for years of silence
             return Latest(dict.fromkeys(self.rig.wheels), None)
         last = math.floor((now - self._bins.origin) / self._settings.bin) * self._settings.bin + self._bins.origin
-        window = without(self._bins.glimpse(last - SLIP_SPAN, last), self.rig, set(self._implausible))
+        raw = without(self._bins.glimpse(last - SLIP_SPAN, last), self.rig, set(self._implausible))
+        window = completed(forward(raw), self.rig)
         if self.rig.chassis is None:
             return Latest(self._slip(window), None)
         pull, inertia = pull_given(window, self.rig.chassis), inertia_of(window, self.rig.chassis)
         given = column_means(pull[:, None])[0]
-        motion = motion_of(forward(window), self.rig, self._limits.at(now), self._decision)
+        motion = motion_of(window, self.rig, self._limits.at(now), self._decision)
         part = 0.0 if given is None else float(inertia[np.isfinite(pull)].mean())
         return Latest(self._slip(window), given, part, motion)
 
     def _slip(self, window: Window) -> dict[str, float | None]:
-        window = forward(window)
         ground = window.ground_speed[:, None]
         slip = slip_ratio(self.rig.radius, window.speed, ground)
         slip = np.where((ground > self._settings.min_speed) & (slip > -1.0), slip, np.nan)

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array, Mask
 from soilbus.can.channels import Channel
 from soilbus.config.model import Estimator
+from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.window import (
     VEHICLE_QUANTITIES,
     WHEEL_QUANTITIES,
@@ -101,11 +102,14 @@ class Resolution(NamedTuple):
 class ConsistencyInput(NamedTuple):
     """One window as the checks see it: bins of length `bin` [s]; driving (N,), slip and traction (N, W).
 
+    window has values of every wheel (`instrumentation.completed`), raw the channels alone.
+
     traction is torque over load and radius; both are nan where unknown, slip also where the vehicle
     does not drive straight on.  motor_speed [rad/s] (N, W) is at the wheel's side of the gear.
     """
 
     window: Window
+    raw: Window
     rig: Rig
     bin: float
     driving: Mask
@@ -209,7 +213,7 @@ def implausible(
         return ()
     named: set[str] = set()
     for check in CHECKS:
-        if found := set(check(data)):
+        if found := set(channels_behind(rig, check(data))):
             named |= found
             window = without(window, rig, found)
             motor = np.where([f"motor_speed.{w}" in found for w in rig.wheels], np.nan, motor)
@@ -221,12 +225,26 @@ def implausible(
 def without(window: Window, rig: Rig, channels: set[str]) -> Window:
     """The window without any reading of these channels."""
     values: dict[str, Array] = {}
-    for name in channels & set(rig.channels):
-        quantity, _, wheel = name.partition(".")
-        values.setdefault(quantity, getattr(window, quantity).copy())
-        values[quantity][..., rig.wheels.index(wheel) if wheel else slice(None)] = np.nan
+    for i, name in enumerate(rig.channels):
+        if name in channels:
+            quantity, _, wheel = name.partition(".")
+            values.setdefault(quantity, getattr(window, quantity).copy())
+            values[quantity][..., i % len(rig.wheels) if wheel else slice(None)] = np.nan
     changed: dict[str, Any] = values
     return replace(window, **changed) if changed else window
+
+
+def channels_behind(rig: Rig, names: Iterable[str]) -> Iterator[str]:
+    """The channels that values of wheels rest on; none for a value that is computed."""
+    for name in names:
+        quantity, _, wheel = name.partition(".")
+        if rig.instrumentation is None or quantity not in ("torque", "speed", "load") or wheel not in rig.wheels:
+            yield name
+            continue
+        place = rig.wheels.index(wheel)
+        for row in getattr(rig.instrumentation, quantity):
+            if row.kind == "channel" and row.weight[place]:
+                yield f"{quantity}.{row.name}"
 
 
 def consistency_input(
@@ -239,17 +257,18 @@ def consistency_input(
     motor_speed: Array,
 ) -> ConsistencyInput:
     """What the checks need of a window."""
+    raw, window = window, completed(window, rig)
     driving = (window.ground_speed > min_speed) & ~turning(window, rig, max_turn)
     ground = np.where(driving, window.ground_speed, np.nan)[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
         traction = np.where(window.load > 0.0, window.torque / (rig.radius * window.load), np.nan)
     slip = slip_ratio(rig.radius, window.speed, ground)
-    return ConsistencyInput(window, rig, bin_length, driving, slip, traction, motor_speed, resolution)
+    return ConsistencyInput(window, raw, rig, bin_length, driving, slip, traction, motor_speed, resolution)
 
 
 def frozen(data: ConsistencyInput) -> Iterator[str]:
     """Channels that read the very same for longer than their noise allows, while the vehicle drives."""
-    window, rig = data.window, data.rig
+    window, rig = data.raw, data.rig
     quantities = (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)
     value = np.column_stack([getattr(window, q) for q in quantities])
     with np.errstate(invalid="ignore"):

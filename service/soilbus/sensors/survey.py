@@ -31,6 +31,7 @@ from soilbus.can.mapping import OPTIONAL_ROLES, POSITION_ROLES, channels_of
 from soilbus.can.units import SI, unit_of
 from soilbus.config.model import Config, ConfigError, Signal
 from soilbus.estimation.assembly import rig_of
+from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.window import Rig, Window, forward, pairs, pull_given, turning
 from soilbus.sensors.bins import Bins
 from soilbus.sensors.consistency import change, implausible, median, resolution_of, without
@@ -311,7 +312,7 @@ def _facts(config: Config, mapped: Iterable[str], heard: Columns) -> Facts | Non
     raw = store.window(start, end)
     if not len(raw.t):
         return None
-    window = forward(raw)
+    window = completed(forward(raw), rig)
     motor = np.full(raw.speed.shape, np.nan)
     for i, wheel in enumerate(rig.wheels):
         if f"motor_speed.{wheel}" in heard:
@@ -334,7 +335,7 @@ def _binned(t: Array, value: Array, start: float, bin_length: float, n: int) -> 
 
 def _key(channel: Channel) -> str:
     """The key of the configuration that maps this channel."""
-    return f"wheel.{channel.wheel}.{channel.quantity}" if channel.wheel else f"signals.{channel.quantity}"
+    return channel.key
 
 
 def _is_absent(seen: Seen) -> bool:
