@@ -173,9 +173,11 @@ class Measurements:
         self._latent_matrix: Array | None = None
         self._from_observed: Array | None = None
         self._mass_gain: int | None = None
+        self._prior_only = np.zeros(2 * len(self.rig.wheels) + 1, bool)
         if given is not None:
             self._torque_matrix, self._latent_matrix = given.torque_matrix, given.latent_matrix
             self._from_observed = np.asarray(np.linalg.inv(self._latent_matrix))
+            self._prior_only[: len(given.load)] = [row.kind != "channel" for row in given.load]
             self._mass_gain = next((i for i, row in enumerate(given.load) if row.kind == "weight"), None)
 
     def observed(self, latents: Array) -> Array:

@@ -569,7 +569,8 @@ class ObservationModel(Measurements):
         weighed = (at.weighed @ np.concatenate([[1.0], soil_step, gain_step])).reshape(
             self.n, 1, at.by_latents.shape[1]
         )
-        new = at.corrected - at.variance * (weighed @ at.by_latents)[:, 0] - at.by_gain * gain_step[layout.latent_gains]
+        own_noise = np.where(self._prior_only, 0.0, at.variance)
+        new = at.corrected - own_noise * (weighed @ at.by_latents)[:, 0] - at.by_gain * gain_step[layout.latent_gains]
         if len(at.by_delay):
             new += np.tensordot(gain_step[layout.effects], at.by_delay, 1)
         new = self.from_observed(new)
