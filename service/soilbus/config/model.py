@@ -472,7 +472,7 @@ class NoiseOfChannels(_Section):
     computed_load: Noise = Noise(relative=0.12, gain=0.02)
     """Of a load that no cell measures, beside what mass, centre of gravity, pitch, acceleration and draft leave open:
     what bouncing, pitching and rolling on uneven ground add in a bin, and the fixed error of the share left and right.
-    Dynamic wheel loads of tractors on fields vary by 5 to 15 % of the static load (rms); those of the field vehicle by 12 %."""
+    Dynamic wheel loads of tractors on fields vary by 5 to 15 % of the static load (rms), the field vehicle's by 12 %."""
     slip: Noise = Noise(absolute=0.005)
     """Of a table that holds slip itself; its gain is the relative error of 1 - slip."""
 

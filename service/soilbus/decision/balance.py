@@ -133,10 +133,15 @@ class Balance:
 
 
 class Limits(NamedTuple):
-    """Limits of each kind of wheel: torque [N m] (A,), and entry angle [rad] on each soil (D, A)."""
+    """Limits: torque [N m] (G,) of each motor, and entry angle [rad] on each soil (D, A) of each kind of wheel.
+
+    motors (G, A): torque of a motor for one unit of each kind of wheel's; where each wheel has its own, G = A and it is
+    the unit matrix.
+    """
 
     torque: Array
     angle: Array
+    motors: Array
 
     @classmethod
     def of(cls, axles: Axles, torque_limit: Array, max_sinkage: float, model: ModelOfRows) -> Limits:
@@ -153,11 +158,22 @@ class Limits(NamedTuple):
         model
             The wheel-soil models of the D soils.
         """
-        torque = np.full(len(axles.count), np.inf)
+        A = len(axles.count)
+        torque, motors = np.full(A, np.inf), np.eye(A)
         np.fmin.at(torque, axles.of_wheel, torque_limit)
         torque[~axles.driven[:, 0]] = np.inf  # they roll
+        for group in axles.shared_motors:
+            of_kind = np.zeros(A)
+            np.add.at(of_kind, axles.of_wheel[list(group.wheels)], group.weight)
+            limit = float(np.array(group.weight) @ torque_limit[list(group.wheels)])
+            torque[of_kind > 0.0] = np.inf
+            motors, torque = np.vstack([motors, of_kind]), np.append(torque, np.inf if np.isnan(limit) else limit)
         deepest = model.angle_of_sinkage(max_sinkage, axles.wheel(axles.level[:, 0]))
-        return cls(torque, np.minimum(deepest, MAX_ENTRY_ANGLE))
+        return cls(torque, np.minimum(deepest, MAX_ENTRY_ANGLE), motors)
+
+    def of_motors(self, torque: Array) -> Array:
+        """Torques of the motors (D, G, ...) from those of one wheel of each kind (D, A, ...)."""
+        return torque if len(self.motors) == self.motors.shape[1] else np.einsum("ga,da...->dg...", self.motors, torque)
 
 
 class Largest(NamedTuple):
@@ -241,11 +257,11 @@ def largest_pull(balance: Balance, limits: Limits) -> Largest:
     best = np.where(usable, balance.pull, -np.inf).argmax(axis=1)
     after = np.minimum(best + 1, last)
     here, there = balance.columns[row, :, best], balance.columns[row, :, after]
-    at, kinds = balance.at, len(limits.torque)
+    at, n_motors = balance.at, len(limits.torque)
     pull, next_pull, slip = here[:, at.pull], there[:, at.pull], balance.slip[best]
     more = balance.known[row, after] & (next_pull > pull)
-    limited = slice(at.torque.start, at.angle.stop)
-    by_limit = _shares_to_limits(here[:, limited], there[:, limited], limits)
+    ends = [np.concatenate([limits.of_motors(end[:, at.torque]), end[:, at.angle]], axis=1) for end in (here, there)]
+    by_limit = _shares_to_limits(ends[0], ends[1], limits)
     share = np.where(more, by_limit.min(axis=1), 0.0)
     pull = pull + share * (next_pull - pull)
     slip = slip + share * (balance.slip[after] - slip)
@@ -254,15 +270,17 @@ def largest_pull(balance: Balance, limits: Limits) -> Largest:
     if best[0] == last:
         cause = "slip"
     elif more[0]:
-        cause = "torque" if by_limit[0, :kinds].min() <= by_limit[0, kinds:].min() else "sinkage"
+        cause = "torque" if by_limit[0, :n_motors].min() <= by_limit[0, n_motors:].min() else "sinkage"
     return Largest(np.where(none, np.nan, pull), np.where(none, np.nan, slip), cause)
 
 
 def within(balance: Balance, limits: Limits) -> NDArray[np.bool_]:
     """Which steady states (D, F) are within the limits."""
     usable = balance.known.copy()
-    for kind, torque in enumerate(limits.torque):
-        usable &= balance.torque[:, kind] <= torque
+    of_motors = limits.of_motors(balance.torque)
+    for motor, torque in enumerate(limits.torque):
+        usable &= of_motors[:, motor] <= torque
+    for kind in range(balance.angle.shape[1]):
         usable &= balance.angle[:, kind] <= limits.angle[..., kind, None]
     return usable
 
@@ -390,7 +408,7 @@ def _between(balanced: NDArray[np.bool_], cell: NDArray[np.intp]) -> NDArray[np.
 def _shares_to_limits(here: Array, there: Array, limits: Limits) -> Array:
     """Shares of the step from here to there at which each limit is met, 1 where it is not.
 
-    All (D, 2 A): of the torques by kind of wheel, then of the entry angles.
+    All (D, G + A): of the torques by motor, then of the entry angles by kind of wheel.
     """
     limit = np.empty(here.shape)
     limit[:, : len(limits.torque)], limit[:, len(limits.torque) :] = limits.torque, limits.angle

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.decision.uncertain_model import ModelOfRows, UncertainModel
+from soilbus.estimation.instrumentation import Group
 from soilbus.estimation.window import Rig
 from soilbus.terra.effects.steady import CompletedModel, Wheel
 from soilbus.terra.entry_angle import entry_angle_for_load
@@ -60,6 +61,8 @@ class Axles:
         (A, 1) [N], [N] and [1]: load of a wheel = level * cosine + tilt * sine of the slope + lever * draft.
     of_wheel
         (W,), kind of each wheel.
+    shared_motors
+        Of several wheels.
     """
 
     chassis: Chassis
@@ -72,6 +75,7 @@ class Axles:
     tilt: Array
     lever: Array
     of_wheel: NDArray[np.intp]
+    shared_motors: tuple[Group, ...] = ()
 
     @classmethod
     def of(cls, rig: Rig, driven: NDArray[np.bool_] | None = None) -> Axles:
@@ -102,7 +106,8 @@ class Axles:
             share * np.where(front, *axle_loads(rig.chassis, draft, slope, 0.0)) for draft, slope in cases
         )
         of_wheel = np.array([unlike.index(kind) for kind in kinds])
-        return cls(rig.chassis, radius, width, front, drive, count, level, tilt, drawn - level, of_wheel)
+        shared = () if rig.instrumentation is None else rig.instrumentation.motors
+        return cls(rig.chassis, radius, width, front, drive, count, level, tilt, drawn - level, of_wheel, shared)
 
     def wheel(self, load: Array) -> Wheel:
         """One wheel of each kind under a load [N] (..., A)."""

@@ -19,7 +19,6 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.where import channels
 from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModelWithEffects
 from soilbus.terra.wheel import sinkage
 
@@ -67,7 +66,7 @@ class ResidualTerms:
 def residual_terms(records: Sequence[Record], fitted: FittedModel) -> list[ResidualTerms]:
     """Descriptions of what a fitted model leaves, one a channel, the one that explains most first."""
     found = []
-    names = channels(records[0].training.rig.wheels, records[0].training.with_sinkage)
+    names = records[0].training.row_channels
     for column, (channel, wheel) in enumerate(names):
         training, held_out = (_joined(list(part)) for part in zip(*_samples(records, fitted, column), strict=True))
         if not len(training.z) or not len(held_out.z):  # a channel that is not there

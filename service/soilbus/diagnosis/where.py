@@ -11,7 +11,7 @@ soil, gains and effects.  Each region is one test; the significance reported is 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -84,12 +84,6 @@ def disagreements(fitted: FittedModel) -> list[Disagreement]:
     return found
 
 
-def channels(wheels: Sequence[str], with_sinkage: bool) -> list[tuple[str, str]]:
-    """Channel and wheel of each residual of an instant."""
-    names = [("torque", w) for w in wheels] + [("draft", "")]
-    return names + ([("sinkage", w) for w in wheels] if with_sinkage else [])
-
-
 def _tests(check: HeldOutCheck, fitted: FittedModel, record: int) -> Iterator[_Test]:
     """The tests of one recording: mean by region, and scatter, of each channel."""
     problem, gaussian = check.problem, fitted.fits[record].mode
@@ -98,7 +92,7 @@ def _tests(check: HeldOutCheck, fitted: FittedModel, record: int) -> Iterator[_T
     raw = check.at.rows[:, 0].reshape(z.shape)
     W = problem.n_wheels
     slip = 1.0 - check.latents.ground_speed[:, None] / (problem.rig.radius * check.latents.speed)
-    for i, (channel, wheel) in enumerate(channels(problem.rig.wheels, problem.with_sinkage)):
+    for i, (channel, wheel) in enumerate(problem.row_channels):
         own = i % (W + 1) if i != W else None
         regressors = {
             "slip": slip.mean(1) if own is None else slip[:, own],

@@ -193,7 +193,8 @@ def _with_instrumentation(rig: Rig, config: Config, computed: SensorNoise) -> Ri
            for rows, _ in (torque, speed, load)):  # fmt: skip
         return rig
     drag = np.array([w.bearing_drag for w in config.wheel])
-    given = Instrumentation(torque[0], speed[0], load[0], couplings, ratio, drag, computed.relative)
+    motors = tuple(group for group in groups["torque"] if len(group.wheels) > 1)
+    given = Instrumentation(torque[0], speed[0], load[0], couplings, ratio, drag, computed.relative, motors)
     return replace(rig, instrumentation=given, names={"torque": torque[1], "speed": speed[1], "load": load[1]})
 
 
@@ -223,7 +224,10 @@ def _torque_rows(rig: Rig, couplings: Sequence[Coupling], ratio: Array) -> list[
     free = [Row(unit(n, i), "free", i, rig.wheels[i]) for i in np.flatnonzero(~rig.drives).tolist()]
     sums = [contrast(n, c.one, c.other, np.where(np.isin(np.arange(n), c.one), len(c.one), len(c.other)) / ratio)
             for c in couplings]  # fmt: skip
-    of_couplings = [Row(weight, "coupling", i, "") for i, weight in enumerate(sums)]
+    of_couplings = [
+        Row(weight, "coupling", i, "-".join("".join(rig.wheels[w] for w in part) for part in (c.one, c.other)))
+        for i, (weight, c) in enumerate(zip(sums, couplings, strict=True))
+    ]
     return [*free, *of_couplings, *(Row(unit(n, i), "unknown", i, rig.wheels[i]) for i in range(n))]
 
 
@@ -333,10 +337,21 @@ def effects_of(config: Config, wheels: Sequence[str] | None = None) -> tuple[Act
 
 
 def possible_effects(config: Config) -> list[Effect]:
-    """The effects of the catalogue that the machine can have; those of tyres only with flexible tyres."""
+    """The effects of the catalogue that the machine can have: its tyres, its sensors."""
     from soilbus.terra.effects.catalogue import CATALOGUE
 
-    return [effect for effect in CATALOGUE.values() if _has_tyres(config) or not effect.of_tyre]
+    return [
+        effect for effect in CATALOGUE.values() if (_has_tyres(config) or not effect.of_tyre) and _read(config, effect)
+    ]
+
+
+def _read(config: Config, effect: Effect) -> bool:
+    """Whether the machine has the sensors that an effect is an error of."""
+    if config.table is not None:
+        return True
+    has_cells = any(w.load is not None for w in config.wheel) or any(a.load is not None for a in config.axle)
+    has_draft = config.signals.draft is not None
+    return (effect.load is None or has_cells) and (effect.draft is None or has_draft)
 
 
 def _has_tyres(config: Config) -> bool:

@@ -109,6 +109,8 @@ class Instrumentation:
         radius.
     load_noise
         Relative sd of a load that is not measured.
+    motors
+        Those that drive several wheels.
     """
 
     torque: tuple[Row, ...]
@@ -118,6 +120,7 @@ class Instrumentation:
     ratio: Array
     drag: Array
     load_noise: float
+    motors: tuple[Group, ...] = ()
 
     @property
     def torque_matrix(self) -> Array:

@@ -232,6 +232,14 @@ class Measurements:
         self.has_balance = known & usable.all(axis=1)
 
     @property
+    def row_channels(self) -> list[tuple[str, str]]:
+        """Quantity, and wheel or axle, of each residual of an instant."""
+        given = self.rig.instrumentation
+        torques = list(self.rig.wheels) if given is None else [row.name for row in given.torque]
+        names = [("torque", name) for name in torques] + [("draft", "")]
+        return names + ([("sinkage", wheel) for wheel in self.rig.wheels] if self.with_sinkage else [])
+
+    @property
     def _n_residuals(self) -> int:
         """Number m of residuals of an instant."""
         return int(self._row_var.shape[1])

@@ -11,7 +11,6 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.verdict import FALL_REQUIRED_ALONE, FALL_REQUIRED_BESIDE
-from soilbus.diagnosis.where import channels
 from soilbus.offline.diagnose import Findings
 from soilbus.report.findings import (
     admission_line,
@@ -149,7 +148,7 @@ def _clouds(fitted: FittedModel) -> dict[str, dict[str, Array]]:
         z, _ = problem.standardised(check.at, fit.gains)
         slip = 1.0 - latents.ground_speed[:, None] / (problem.rig.radius * latents.speed)
         wheels = list(problem.rig.wheels)
-        for i, (channel, wheel) in enumerate(channels(wheels, problem.with_sinkage)):
+        for i, (channel, wheel) in enumerate(problem.row_channels):
             one = wheels.index(wheel) if wheel else None
             of_slip, of_load = (
                 (slip.mean(1), latents.load.mean(1)) if one is None else (slip[:, one], latents.load[:, one])
