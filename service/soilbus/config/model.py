@@ -472,7 +472,7 @@ class NoiseOfChannels(_Section):
     computed_load: Noise = Noise(relative=0.12, gain=0.02)
     """Of a load that no cell measures, beside what mass, centre of gravity, pitch, acceleration and draft leave open:
     what bouncing, pitching and rolling on uneven ground add in a bin, and the fixed error of the share left and right.
-    Dynamic wheel loads of tractors on fields vary by 5 to 15 % of the static load (rms), the field vehicle's by 12 %."""
+    Dynamic wheel loads of tractors vary by 5 to 15 % of the static load on fields (rms); the field vehicle's: 12 %."""
     slip: Noise = Noise(absolute=0.005)
     """Of a table that holds slip itself; its gain is the relative error of 1 - slip."""
 
@@ -563,6 +563,9 @@ class Estimator(_Section):
     """Below it slip is not judged (standstill gate)."""
     max_turn: PositiveFloat = 0.15
     """Relative difference of speeds left and right in a turn above which slip is not judged (turn gate)."""
+    max_lateral: PositiveFloat = 0.3
+    """Of a vehicle that steers by skidding: lateral over longitudinal sliding speed of its wheels above which slip is
+    not judged; at 0.3 the shear along the wheel is 4 % less than all of it."""
     z_ref: PositiveFloat = 0.02
     """Depth of the reported bearing pressure [m]."""
     b_ref: PositiveFloat = 0.3

@@ -80,7 +80,7 @@ def rig_of(config: Config) -> Rig:
         track=config.vehicle.track,
         towing=config.vehicle.towing,
         specific_force=acceleration is not None and acceleration.kind == "specific_force",
-        skid=config.vehicle.steering == "skid",
+        max_lateral=config.estimator.max_lateral if config.vehicle.steering == "skid" else None,
         driven=None if all(w.driven for w in wheels) else np.array([w.driven for w in wheels]),
     )
     return _with_instrumentation(rig, config, computed) if measured else rig

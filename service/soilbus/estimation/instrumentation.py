@@ -19,7 +19,7 @@ observations l for the observation model, which propagates their noise through M
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -375,16 +375,3 @@ def channel_value(rig: Rig, quantity: str, name: str, of_wheels: Array) -> Array
         if row.kind == "channel" and row.name == name:
             return np.asarray(np.array(row.weight) @ of_wheels)
     return np.asarray(of_wheels[rig.wheels.index(name)])
-
-
-def describe(rig: Rig) -> Iterator[str]:
-    """A line for each quantity that is not measured at each wheel: what stands in its place."""
-    given = rig.instrumentation
-    if given is None:
-        return
-    computed = [rig.wheels[w] for w in np.flatnonzero(given.computes("load"))]
-    if computed:
-        yield (
-            f"no load cell for {', '.join(computed)}: computed from mass, centre of gravity, pitch, acceleration and"
-            f" draft, {given.load_noise:.0%} uncertain"
-        )

@@ -56,6 +56,8 @@ Steered tractors turn about centres at least 1.5 tracks away; one side that spin
 MAX_AXLE_RATIO = 2.0
 """Greatest ratio of the axles' relative differences in one turn.  The front axle's is less by the square of the
 cosine of the steering angle (1/2 at 45 degrees); the inner wheels of both axles slip about alike."""
+LEAST_SLIDING = 0.05
+"""Slip that sliding along counts at least: below it a wheel's forces are small in both directions."""
 TRACK_RANGE = (0.3, 8.0)
 """Tracks [m] of wheeled vehicles, from small rovers to 3.2 m, the latter over 1 - slip for slips up to 0.6."""
 
@@ -99,8 +101,8 @@ class Rig:
     """As `config.model.Vehicle.towing`."""
     specific_force: bool = False
     """Whether the accelerometer measures dv/dt + g sin(pitch)."""
-    skid: bool = False
-    """Whether the vehicle steers by the speeds of its sides."""
+    max_lateral: float | None = None
+    """Of a vehicle that steers by the speeds of its sides: greatest lateral over longitudinal sliding speed."""
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -237,6 +239,9 @@ def turning(window: Window, rig: Rig, max_turn: float) -> NDArray[np.bool_]:
     With a known track the difference is B r.  Without one the rim speeds must show a turn (see
     below) to the side of the yaw rate, by a difference that a track in `TRACK_RANGE` explains.
 
+    A vehicle that steers by the speeds of its sides slides sideways in every turn; there the ratio of the lateral to
+    the longitudinal sliding speed decides, too.
+
     Without a yaw rate the rim speeds decide.  In a turn the wheels of the same side are the
     faster ones on every axle, by relative differences that are equal up to the influence of
     steering angle and tracks, and no greater than in a turn about a centre one track away.  All
@@ -251,6 +256,8 @@ def turning(window: Window, rig: Rig, max_turn: float) -> NDArray[np.bool_]:
     by_rims = np.isfinite(smallest) & (smallest > max_turn) & (largest < MAX_RIM_DIFFERENCE)
     by_rims &= (largest < MAX_AXLE_RATIO * smallest) & same_sign
     yaw = window.yaw_rate
+    if rig.max_lateral is not None and rig.chassis is not None:
+        by_rims |= _slides(window, rig, rig.max_lateral, difference)
     if not np.isfinite(yaw).any():
         return np.asarray(by_rims)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -260,7 +267,29 @@ def turning(window: Window, rig: Rig, max_turn: float) -> NDArray[np.bool_]:
             track = difference / yaw[:, None]  # of the axle, if the difference is the turn's alone
             low, high = TRACK_RANGE
             by_yaw = by_rims & (np.isnan(track) | ((track > low) & (track < high))).all(axis=1)
+    if rig.max_lateral is not None:
+        by_yaw = by_yaw | by_rims
     return np.asarray(np.where(np.isfinite(yaw), by_yaw, by_rims))
+
+
+def _slides(window: Window, rig: Rig, max_lateral: float, difference: Array) -> NDArray[np.bool_]:
+    """Whether the wheels of a skid-steered vehicle slide sideways too much, (N,).
+
+    A wheel half a wheelbase from the centre of yaw slides sideways at yaw L / 2 and along at r omega - V; the shear
+    stress points against both, so that its part along is the share 1 / sqrt(1 + lateral^2) of it.  Without a yaw rate
+    the rim speeds bound it: (right less left) / B, less what the sides slip.
+    """
+    assert rig.chassis is not None
+    yaw = np.abs(window.yaw_rate)
+    if rig.track is not None:
+        with np.errstate(invalid="ignore"):
+            yaw = np.where(np.isfinite(yaw), yaw, np.abs(difference).max(axis=1, initial=0.0) / rig.track)
+    rim = rig.radius * window.speed
+    known = np.isfinite(rim)
+    mean = np.where(known, rim, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+    along = np.maximum(np.abs(mean - window.ground_speed), LEAST_SLIDING * np.abs(window.ground_speed))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(yaw * rig.chassis.wheelbase / 2.0 > max_lateral * along)
 
 
 def _rim_differences(window: Window, rig: Rig) -> tuple[Array, Array]:

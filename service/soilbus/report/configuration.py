@@ -10,14 +10,22 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import numpy as np
 from cantools.database.can import Database
 
+from soilbus.arrays import Array
 from soilbus.can.channels import Channel
 from soilbus.can.dbc_files import checked_messages, load_databases, output_database
 from soilbus.can.mapping import channels_of, without_unit
-from soilbus.config.model import Config, Table
+from soilbus.config.model import Config, Signal, Table
 from soilbus.estimation.assembly import delays_of, effects_and_parameters_of, effects_of, rig_of
+from soilbus.estimation.instrumentation import channel_value, completed
+from soilbus.estimation.window import VEHICLE_QUANTITIES, NoiseTable, made_window
+from soilbus.pipeline.estimator import WindowEstimator
+from soilbus.pipeline.intake import WindowTask
+from soilbus.pipeline.modelled_drive import modelled_drive
 from soilbus.pipeline.outputs import check_cycle_times
+from soilbus.pipeline.positions import PositionTrack
 from soilbus.report.soil_prior import prior_text
 from soilbus.report.table import table
 from soilbus.sensors.survey import Seen, Survey
@@ -66,6 +74,8 @@ def configuration_warnings(config: Config) -> list[str]:
     return lines
 
 
+SAMPLES_PER_SECOND = 50.0
+"""Of each channel, where the DBC does not say otherwise: frames every 20 ms."""
 MIN_COHESION = 70.0
 """Cohesion [Pa] below which kPa were probably meant: Wong's table has 69 kPa for stiff clay, 1 kPa for loose sand."""
 
@@ -108,6 +118,7 @@ def _heard_row(seen: Seen, found: Survey) -> tuple[str, ...]:
 def _report(config: Config, parts: list[str]) -> str:
     effects = effect_lines(config)
     parts += [f"{name:<8} {verdict}\n" for name, verdict in identifiable(config)]
+    parts += [f"\n{line}\n" for line in load_lines(config)]
     if effects:
         parts.append("\nEffects in the model:\n" + "".join(f"{line}\n" for line in effects))
     parts.append("\nWhat is assumed of the soil before any data:\n" + prior_text(config) + "\n")
@@ -128,6 +139,55 @@ def defaults_text(config: Config) -> str:
 
     walk("", config.model_dump(exclude={"wheel", "signals", "folder"}))
     return "\n".join(lines)
+
+
+def load_lines(config: Config) -> list[str]:
+    """What stands in place of load cells that are not there, and what that costs in a window of varied draft."""
+    rig = rig_of(config)
+    given = rig.instrumentation
+    if given is None or rig.chassis is None or not given.computes("load").any():
+        return []
+    wheels = [wheel.model_copy(update={"load": wheel.load or Signal(signal="A.Cell")}) for wheel in config.wheel]
+    own, with_cells = _expected(config), _expected(config.model_copy(update={"wheel": wheels}))
+    without = [rig.wheels[i] for i in np.flatnonzero(given.computes("load"))]
+    line = (
+        f"No load cell at {', '.join(without)}: the load follows from mass, centre of gravity, pitch, acceleration and"
+        f" draft; uneven ground changes it by {given.load_noise:.0%} (noise.computed_load)."
+    )
+    if own is None or with_cells is None:
+        return [line]
+    return [
+        line,
+        f"After {config.estimator.window:g} s of varied draft on the soil assumed below, bearing pressure is known to"
+        f" {own[0]:.1%} (with load cells to {with_cells[0]:.1%}), tan phi to {own[1]:.1%} ({with_cells[1]:.1%}).",
+    ]
+
+
+def _expected(config: Config) -> tuple[float, float] | None:
+    """Relative sd of bearing pressure and tan phi after one window of `modelled_drive`; None where no fit converges."""
+    s, estimator = config.estimator, WindowEstimator(config)
+    rig = estimator.rig
+    t = np.asarray((np.arange(round(s.window / s.bin)) + 0.5) * s.bin, np.float64)
+    truth = modelled_drive(config, rig, t)
+    mean: Array = np.full((len(t), len(rig.channels)), np.nan)
+    mapped = {name for name in VEHICLE_QUANTITIES if getattr(config.signals, name, None) is not None}
+    if any(wheel.sinkage is not None for wheel in config.wheel):
+        mapped.add("sinkage")
+    for i, name in enumerate(rig.channels):
+        quantity, _, part = name.partition(".")
+        if quantity in ("torque", "speed", "load") or quantity in mapped:
+            mean[:, i] = channel_value(rig, quantity, part, truth[quantity]) if part else truth[quantity]
+    count = np.isfinite(mean) * s.bin * SAMPLES_PER_SECOND
+    window = completed(made_window(NoiseTable.of(rig), t, mean, count, count), rig)
+    task = WindowTask(
+        index=0, start=0.0, end=s.window, window=window, slip=dict.fromkeys(rig.wheels), missing=(), poor=(),
+        torque_limit=np.full(len(rig.wheels), np.nan), track=PositionTrack({}), rejected={}, fresh=True,
+    )  # fmt: skip
+    posterior = estimator.estimate(task).result.posterior
+    if posterior is None:
+        return None
+    bearing, tan_phi = posterior.bearing_pressure(s.z_ref, s.b_ref), posterior.tan_phi()
+    return bearing.std / bearing.value, tan_phi.std / tan_phi.value
 
 
 def effect_lines(config: Config) -> list[str]:
