@@ -121,8 +121,8 @@ def without(lines: str, tmp_path: Path) -> Path:
     ("lines", "says"),
     [
         ("torque", "wheel FL has no torque: map wheel.FL.torque"),
-        ("torque|load", "wheel FL has no torque and no load: map wheel.FL.torque and wheel.FL.load"),
-        ("torque|load|speed", "map wheel.FL.torque and wheel.FL.speed and wheel.FL.load"),
+        ("torque|load", "wheel FL has no torque: map wheel.FL.torque or axle.front.torque, or say driven = false"),
+        ("torque|load|speed", "wheel FL has no speed: map wheel.FL.speed or axle.front.motor_speed"),
     ],
 )
 @pytest.mark.parametrize("command", ["check", "replay"])

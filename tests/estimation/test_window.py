@@ -22,6 +22,9 @@ NOISE = {
     "pitch": SensorNoise(absolute=0.002),
     "acceleration": SensorNoise(absolute=0.02),
     "yaw_rate": SensorNoise(absolute=0.01),
+    "roll": SensorNoise(absolute=0.004),
+    "steering_angle": SensorNoise(absolute=0.02),
+    "differential_lock": SensorNoise(absolute=1.0),
 }
 RIG = Rig(("L", "R"), np.array([0.5, 0.6]), np.array([0.3, 0.4]), np.array([True, False]), None, NOISE)
 EPOCH = 1_700_000_000.0

@@ -104,8 +104,8 @@ def _compressed(config: Config) -> list[str]:
         "estimator.bin": config.estimator.bin,
     }
     if config.vehicle is not None:
-        lengths = config.vehicle.model_dump(exclude={"mass"}, exclude_none=True)
-        sizes |= {f"vehicle.{name}": length for name, length in lengths.items()}
+        lengths = config.vehicle.model_dump(exclude={"mass", "mass_std"}, exclude_none=True)
+        sizes |= {f"vehicle.{name}": length for name, length in lengths.items() if isinstance(length, float)}
     return [f"{key}={size / TIME_COMPRESSION}" for key, size in sizes.items()]
 
 

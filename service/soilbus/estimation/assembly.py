@@ -99,7 +99,8 @@ def _unmeasured(config: Config) -> Iterator[str]:
         if w.driven and w.torque is None and all(a.torque is None for a in axles):
             yield (
                 f"wheel {w.name} has no torque: map wheel.{w.name}.torque or axle.{w.axle}.torque, or say"
-                " driven = false if no motor drives it"
+                " driven = false if no motor drives it; else its rolling resistance would be put down to the soil under"
+                " the other wheels"
             )
         if w.driven and w.speed is None and all(a.motor_speed is None for a in axles):
             yield (

@@ -16,7 +16,7 @@ from cantools.database.can import Database
 from soilbus.arrays import Array
 from soilbus.can.channels import Channel
 from soilbus.can.dbc_files import checked_messages, load_databases, output_database
-from soilbus.can.mapping import channels_of, without_unit
+from soilbus.can.mapping import SHARED_ROLES, channels_of, without_unit
 from soilbus.config.model import Config, Signal, Table
 from soilbus.estimation.assembly import delays_of, effects_and_parameters_of, effects_of, rig_of
 from soilbus.estimation.instrumentation import channel_value, completed
@@ -68,6 +68,14 @@ def configuration_warnings(config: Config) -> list[str]:
         lines.append("no wheel has torque, speed and load mapped: nothing can be estimated")
     elif config.table is None and config.signals.ground_speed is None:
         lines.append("signals.ground_speed is not mapped: without slip nothing can be estimated")
+    for role in SHARED_ROLES:
+        for wheels in config.same_signal(role):
+            if len(wheels) > 1:
+                names = " and ".join(wheel.name for wheel in wheels)
+                lines.append(
+                    f"{getattr(wheels[0], role).signal} is the {role} of {names}: one measurement of their mean, with"
+                    " one noise; what differs between them stays open"
+                )
     c = config.soil.c
     if 0.0 < c.value < MIN_COHESION and c.std > 0.0:
         lines.append(f"soil.c.value = {c.value:g} Pa is next to nothing; is it in kPa?")

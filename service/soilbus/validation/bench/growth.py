@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.config.model import Config
+from soilbus.config.model import Config, Wheel
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import fit_window
@@ -124,11 +124,21 @@ def _configuration(wheels: int) -> Config:
     """The reference tractor with more or fewer wheels, and as much heavier or lighter."""
     config = reference_configuration()
     axles = [next(w for w in config.wheel if w.axle == axle) for axle in ("front", "rear")]
-    fitted = [w.model_copy(update={"name": f"{w.name}{i}"}) for w in axles for i in range(wheels // 2)]
+    fitted = [_own_sensors(w, f"{w.name}{i}") for w in axles for i in range(wheels // 2)]
     if config.vehicle is None:
         raise AssertionError("the reference tractor is a vehicle")
     vehicle = config.vehicle.model_copy(update={"mass": config.vehicle.mass * wheels / len(config.wheel)})
     return config.model_copy(update={"wheel": fitted, "vehicle": vehicle})
+
+
+def _own_sensors(wheel: Wheel, name: str) -> Wheel:
+    """The wheel under another name, with sensors of its own."""
+    signals = {
+        role: mapped.model_copy(update={"signal": f"{mapped.signal}{name}"})
+        for role in ("torque", "speed", "load")
+        if (mapped := getattr(wheel, role)) is not None
+    }
+    return wheel.model_copy(update={"name": name, **signals})
 
 
 def _rows(times: Array, each: Array, iterations: Sequence[int]) -> list[str]:
