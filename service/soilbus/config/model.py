@@ -47,6 +47,7 @@ __all__ = [
     "Table",
     "Traversability",
     "Vehicle",
+    "Warning",
     "Wheel",
 ]
 
@@ -632,6 +633,37 @@ class Traversability(_Section):
         return self
 
 
+class Warning(_Section):
+    """When soilbus warns of immobilisation from slip and speed alone, whatever soil it is.
+
+    Tuned on six measured immobilisations of a 90 kg rover on snow (events 1_1 to 1_6 of the data of A. Lines, PhD
+    thesis, 2023, ch. 7): `python -m soilbus.validation.snow`.
+    """
+
+    slip_horizon: PositiveFloat = 1.0
+    """Slip that is to pass `traversability.max_slip` within this time [s] is a cause."""
+    stop_horizon: PositiveFloat = 2.0
+    """A vehicle that is to stand within this time [s], while thrust holds and wheels slip, is a cause."""
+    probability: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.7
+    """Of either, from which it counts."""
+    least_slip: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.18
+    """Slip below which a vehicle that loses speed is only slowed down."""
+    thrust_held: Annotated[float, Field(gt=0.0, le=1.0)] = 0.9
+    """Share of its mean over `thrust_time` that thrust keeps where the ground, not the driver, stops the vehicle."""
+    thrust_time: PositiveFloat = 1.0
+    """Time constant [s] of that mean."""
+    slip_noise: PositiveFloat = 0.02
+    """Sd of slip by uneven ground from bin to bin, beside the sensors' noise."""
+    slip_wander: PositiveFloat = 0.3
+    """How fast the rate of the log speed ratio changes [1/s per sqrt(s)]."""
+    speed_wander: PositiveFloat = 1.0
+    """How fast the acceleration changes [m/s^2 per sqrt(s)]."""
+    settling_time: NonNegativeFloat = 1.0
+    """Time [s] for which the vehicle must have moved: the trends of a start are not those of driving."""
+    hold: PositiveFloat = 1.0
+    """Time [s] after its last cause at which the warning ends."""
+
+
 class Effect(BaseModel):
     """A physical effect of the catalogue with its parameters."""
 
@@ -689,6 +721,7 @@ class Config(_Section):
     soil: SoilPrior = SoilPrior()
     estimator: Estimator = Estimator()
     traversability: Traversability = Traversability()
+    warning: Warning = Warning()
     model: Model = Model()
     output: Output = Output()
     folder: Path = Field(default=Path("."), exclude=True)

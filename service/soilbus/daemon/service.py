@@ -32,7 +32,7 @@ from soilbus.daemon.notify import Notifier
 from soilbus.daemon.tick_phase import next_tick
 from soilbus.daemon.totals import totals
 from soilbus.daemon.work_queue import WorkQueue, wait_for
-from soilbus.decision.immobilisation import Watch, watched, with_loss
+from soilbus.decision.immobilisation import Alert, Watch, watched, with_loss
 from soilbus.decision.judgement import Basis, at_present
 from soilbus.decision.traction_loss import NO_LOSS, observed
 from soilbus.decision.traversability import State, Status, Traversability
@@ -122,7 +122,7 @@ class Service:
         self.deadline_misses = 0
         self.failures: Counter[str] = Counter()
         """Failed solves by kind, since the start."""
-        self._watch, self._loss = Watch(), NO_LOSS
+        self._watch, self._loss, self._warned = Watch(), NO_LOSS, False
         self._curve: tuple[OverSlip | None, float] = None, -math.inf
         self._stopping = False
         self._started = clock()
@@ -234,7 +234,7 @@ class Service:
                 self.failures[result.failure] += 1
             if pending.epoch == self.intake.epoch:  # else it is of a time that is none any more
                 self._take(result, pending.at)
-                present = as_of(self._vouched(result, pending.at, now), self._loss, result.t, self.config)
+                present = as_of(self._vouched(result, pending.at, now), self._loss, result.t, self.config, self._warned)
                 for message, values in hop_frames(present):
                     self.bus.send(self.publisher.frame(message, values))
             if self.on_window is not None:
@@ -265,7 +265,7 @@ class Service:
             self.intake.ingest()
         if self.intake.epoch != self._epoch:
             self._epoch, self.result, self._watch, self._curve = self.intake.epoch, None, Watch(), (None, -math.inf)
-            self._loss = NO_LOSS
+            self._loss, self._warned = NO_LOSS, False
         self._look_after_health(now)
         self._state = self._present_state(now)
         if _interrupts(self._state) or self.bus.counts.lost != self._lost:
@@ -336,7 +336,7 @@ class Service:
             return Traversability()
         result = None if self._ended <= self._interrupted else self.result
         decision, basis = (Traversability(), Basis()) if result is None else (result.traversability, result.basis)
-        return at_present(decision, basis, self._loss, self._present_time(now), self.config)
+        return at_present(decision, basis, self._loss, self._present_time(now), self.config, self._warned)
 
     def _present_time(self, now: float) -> float:
         """The bus's time, or that of the last window's end and ours since, whichever is later: the stamps' may halt."""
@@ -363,17 +363,17 @@ class Service:
     def _publish_ten_hertz(self, now: float) -> None:
         latest = self.intake.latest(self._time.at(now)) if self.bus.is_open else Latest({}, None)
         if latest.motion is not None:
-            settings = self.config.traversability
-            self._loss = observed(self._loss, latest.motion, self.config.estimator.min_speed, settings)
+            self._loss = observed(self._loss, latest.motion, self.config)
+        self._watch = watched(
+            self._watch, self._time.at(now), latest.slip.values(), latest.pull, self._present_curve(now), latest.inertia
+        )  # fmt: skip
+        warning = with_loss(self._watch, self._loss)
+        self._warned = warning.warning is Alert.IMMOBILISATION
         decision = self.present_decision(now)
         known = decision.state is not State.UNKNOWN
         window = self.result.index % WINDOW_MODULUS if self.result is not None else None
         for message, values in slip_frames(latest.slip):
             self.bus.send(self.publisher.frame(message, values))
-        self._watch = watched(
-            self._watch, self._time.at(now), latest.slip.values(), latest.pull, self._present_curve(now), latest.inertia
-        )  # fmt: skip
-        warning = with_loss(self._watch, self._loss)
         foreseeable = self.result if known and not self._loss.stuck else None
         self.bus.send(self.publisher.frame(*forecast_frame(foreseeable, warning)))
         self.bus.send(

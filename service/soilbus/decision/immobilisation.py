@@ -369,10 +369,25 @@ def watched(
 
 
 def with_loss(watch: Watch, loss: TractionLoss) -> Watch:
-    """The watch as reported while traction is lost: a warning without any trend, and no time left once stuck."""
-    if not loss.present:
-        return watch
-    return replace(watch, warning=Alert.IMMOBILISATION, time_left=0.0 if loss.stuck else watch.time_left)
+    """The watch as reported: warned by what wheels and vehicle do as well, and no time left once stuck."""
+    if not loss.warns:
+        known = watch.warning is not Alert.UNKNOWN or math.isinf(loss.ahead.slip.var)
+        return watch if known else replace(watch, warning=Alert.NONE)
+    left = [time for time in (watch.time_left, loss.ahead.time_left) if time is not None]
+    return replace(watch, warning=Alert.IMMOBILISATION, time_left=0.0 if loss.stuck else min(left, default=None))
+
+
+class Warnings(NamedTuple):
+    """When warnings began [s]: the present one (None without), and those since the last window, ended or not."""
+
+    since: float | None = None
+    begun: tuple[float, ...] = ()
+
+    def after(self, t: float, warning: Alert) -> Warnings:
+        """After the reported warning at t [s]."""
+        if warning is not Alert.IMMOBILISATION:
+            return self._replace(since=None)
+        return self if self.since is not None else Warnings(t, (*self.begun, t))
 
 
 def moments(window: Window, rig: Rig, since: float, min_speed: float) -> Iterator[Moment]:

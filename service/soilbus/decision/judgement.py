@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from soilbus.config.model import Config
 from soilbus.config.model import Traversability as Settings
 from soilbus.decision.capability import Capability, Demand, assess
-from soilbus.decision.traction_loss import TractionLoss, missing_pull
+from soilbus.decision.traction_loss import TractionLoss, excess_slip, missing_pull
 from soilbus.decision.traversability import State, Status, Traversability, state_of
 from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.wheels import WheelTable
@@ -129,21 +129,22 @@ class Basis(NamedTuple):
 
 
 def at_present(
-    decision: Traversability, basis: Basis, loss: TractionLoss, now: float, config: Config
+    decision: Traversability, basis: Basis, loss: TractionLoss, now: float, config: Config, warned: bool = False
 ) -> Traversability:
     """What remains of a window's decision at a later time.
 
     A decision is valid for the time and place of its data, and is overruled by what the wheels show:
 
     - stuck: no_go, and no figure of the estimate;
-    - with a wheel that spins: no better than caution;
+    - with a wheel that spins, or while immobilisation is warned of: no better than caution;
     - data older than `max_age`, or on ground further back than the wheelbase: unknown;
     - wheels that pull less at their present slip than the estimate predicts: the spare pull is reduced by the miss;
+    - wheels that slip more than the forecast, where the present pull is not known: no better than caution;
     - with less than `min_share` of a window measured since a wheel last spun: no better than caution.
 
     Parameters
     ----------
-    way
+    decision
         The decision when the window ended.
     basis
         Its data.
@@ -154,6 +155,8 @@ def at_present(
     config
         Of `max_age`, `min_share` and `contradiction`; of the wheelbase, after which rear wheels stand where front
         wheels stood; of the sensors' gain errors.
+    warned
+        Whether immobilisation is warned of.
     """
     settings, length = config.traversability, 0.0 if config.vehicle is None else config.vehicle.wheelbase
     if loss.stuck:
@@ -162,6 +165,8 @@ def at_present(
         )
     if loss.spinning and decision.state is not State.NO_GO:
         return replace(decision, state=State.CAUTION, probability=None)
+    if warned and decision.state is State.GO:
+        return replace(decision, state=State.CAUTION, probability=None, contradicted="warning")
     if decision.state is State.UNKNOWN:
         return decision
     if not (now - basis.end <= settings.max_age and basis.unseen <= length):  # nor nan
@@ -170,7 +175,10 @@ def at_present(
         missing = missing_pull(loss, decision.capability.over_slip, config.noise, settings.contradiction)
         left = _above(decision.spare.value - missing, decision.spare.std)
         if left < settings.go:
-            return replace(decision, state=State.CAUTION, probability=left)
+            return replace(decision, state=State.CAUTION, probability=left, contradicted="slip")
+        forecast = decision.capability.forecast
+        if forecast is not None and excess_slip(loss, forecast.slip, config, settings.contradiction) > 0.0:
+            return replace(decision, state=State.CAUTION, probability=None, contradicted="slip")
     measured = np.count_nonzero(basis.instants > loss.last) * basis.each
     if decision.state is State.GO and measured < settings.min_share * config.estimator.window:
         return replace(decision, state=State.CAUTION, probability=None)

@@ -20,8 +20,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.config.model import NoiseOfChannels
+from soilbus.config.model import Config, NoiseOfChannels
 from soilbus.config.model import Traversability as Settings
+from soilbus.decision.stall_forecast import Sample, StallForecast, forecast
+from soilbus.estimation.posterior import Estimate
 from soilbus.estimation.window import Rig, Window, pull_given
 from soilbus.sensors.consistency import NO_TRACTION, TRACTION
 from soilbus.terra.vehicle import GRAVITY
@@ -50,6 +52,8 @@ class Motion(NamedTuple):
         Torque-weighted mean of the driving wheels.
     pull
         [N], of draft, slope and inertia; nan where the acceleration is not measured.
+    last
+        The last bin by itself, for the forecast of a stall.
     """
 
     t: float
@@ -59,6 +63,7 @@ class Motion(NamedTuple):
     at_limit: bool
     slip: float = math.nan
     pull: float = math.nan
+    last: Sample | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,12 +77,15 @@ class TractionLoss:
     spins, sticks, moves
         Since when a wheel spins or the vehicle stalls; it does not move under thrust; it moves without spinning.  inf
         where it does not.
-    spinning, stuck
-        Spinning or stalling has lasted for `spin_time`; the vehicle is stuck and has not moved since.
+    spinning, slides, stuck
+        Spinning or stalling has lasted for `spin_time`; so has spinning of half of the wheels, or without any way; the
+        vehicle is stuck and has not moved since.
     last
         The last moment that was spinning or stuck: older data do not describe the ground under the wheels.
     slip, pull
         Slip, and pull [N], low-pass filtered with the time constant `spin_time`; nan where not known.
+    ahead
+        Forecast of a stall from slip and speed.
     """
 
     t: float = -math.inf
@@ -85,21 +93,24 @@ class TractionLoss:
     sticks: float = math.inf
     moves: float = math.inf
     spinning: bool = False
+    slides: bool = False
     stuck: bool = False
     last: float = -math.inf
     slip: float = math.nan
     pull: float = math.nan
+    ahead: StallForecast = StallForecast()  # noqa: RUF009, immutable
 
     @property
-    def present(self) -> bool:
-        """Whether a wheel spins, or the vehicle is stuck."""
-        return self.spinning or self.stuck
+    def warns(self) -> bool:
+        """Whether the vehicle is stuck, a stall is ahead, or half of its wheels spin as it drives, without any gain."""
+        spins_on = self.slides and self.ahead.settled and not self.ahead.speed.rate > 0.0
+        return self.stuck or self.ahead.stalls or spins_on
 
 
 NO_LOSS = TractionLoss()
 
 
-def observed(before: TractionLoss, motion: Motion, min_speed: float, settings: Settings) -> TractionLoss:
+def observed(before: TractionLoss, motion: Motion, config: Config) -> TractionLoss:
     """The loss of traction after one more moment; moments in their order, at any rate.
 
     Parameters
@@ -108,18 +119,22 @@ def observed(before: TractionLoss, motion: Motion, min_speed: float, settings: S
         The state after the moment before; reset after LONGEST_GAP, or when time goes back.
     motion
         The wheels and the vehicle now.
-    min_speed
-        Least speed [m/s] above which the vehicle moves.
-    settings
-        `max_slip`, `spin_time`, `stuck_time`, `standstill`, `stall_resistance`.
+    config
+        `min_speed` [m/s], above which the vehicle moves; `max_slip`, `spin_time`, `stuck_time`, `standstill`,
+        `stall_resistance`; of the warning.
 
     Returns
     -------
     TractionLoss
         With `spinning` and `stuck` as of now.
     """
+    settings, min_speed, ahead = config.traversability, config.estimator.min_speed, before.ahead
+    if motion.last is not None:
+        ahead = forecast(ahead, motion.last, min_speed, config.warning, settings)
+    before = replace(before, ahead=ahead)
     if not 0.0 <= motion.t - before.t <= LONGEST_GAP:
-        before = replace(before, spins=math.inf, sticks=math.inf, moves=math.inf) if motion.t > before.t else NO_LOSS
+        fresh = before if motion.t > before.t else TractionLoss(ahead=ahead)
+        before = replace(fresh, spins=math.inf, sticks=math.inf, moves=math.inf)
     known = [rim for rim in motion.rim if math.isfinite(rim)]
     if not known or not math.isfinite(motion.ground):
         return replace(before, t=motion.t, slip=math.nan, pull=math.nan)
@@ -133,14 +148,14 @@ def observed(before: TractionLoss, motion: Motion, min_speed: float, settings: S
     sticks = min(before.sticks, t) if no_way else math.inf
     moves = min(before.moves, t) if not stands and not spinning else math.inf
     stuck = t - sticks >= settings.stuck_time or (before.stuck and t - moves < settings.spin_time)
-    lasting = t - spins >= settings.spin_time
+    lasting, slides = t - spins >= settings.spin_time, t - sticks >= settings.spin_time
     kept = math.exp(-(t - before.t) / settings.spin_time) if math.isfinite(before.slip + before.pull) else 0.0
     slip, pull = (
         now + kept * (late - now) if kept else now
         for now, late in ((motion.slip, before.slip), (motion.pull, before.pull))
     )
     last = t if lasting or stuck else before.last
-    return TractionLoss(t, spins, sticks, moves, lasting, stuck, last, slip, pull)
+    return TractionLoss(t, spins, sticks, moves, lasting, slides, stuck, last, slip, pull, ahead)
 
 
 def missing_pull(loss: TractionLoss, curve: OverSlip, noise: NoiseOfChannels, deviations: float) -> float:
@@ -171,6 +186,27 @@ def missing_pull(loss: TractionLoss, curve: OverSlip, noise: NoiseOfChannels, de
     of_slip = slope * (1.0 - loss.slip) * math.hypot(noise.speed.gain, noise.ground_speed.gain)
     sd = math.hypot(std, of_slip, noise.draft.gain * loss.pull)
     return max(predicted - loss.pull - deviations * sd, 0.0)
+
+
+def excess_slip(loss: TractionLoss, predicted: Estimate, config: Config, deviations: float) -> float:
+    """Slip beyond the one predicted for the present demand, where the present pull is not known; else 0.
+
+    Parameters
+    ----------
+    loss
+        With the present slip.
+    predicted
+        Slip that the demand needs.
+    config
+        Gain errors of both speeds; slip by uneven ground.
+    deviations
+        Standard deviations of the difference that are subtracted.
+    """
+    if math.isfinite(loss.pull) or not math.isfinite(loss.slip):
+        return 0.0
+    of_gains = (1.0 - loss.slip) * math.hypot(config.noise.speed.gain, config.noise.ground_speed.gain)
+    sd = math.hypot(predicted.std, of_gains, config.warning.slip_noise)
+    return max(loss.slip - predicted.value - deviations * sd, 0.0)
 
 
 def idle(window: Window, rig: Rig, since: float, before: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -219,6 +255,7 @@ def motion_of(window: Window, rig: Rig, torque_limit: NDArray[np.float64], setti
     """
     if not len(window.t) or rig.chassis is None:
         return None
+    drives, radius = rig.drives, rig.radius
     columns = np.column_stack(
         [window.ground_speed, pull_given(window, rig.chassis), rig.radius * window.speed, window.torque]
     )
@@ -229,10 +266,23 @@ def motion_of(window: Window, rig: Rig, torque_limit: NDArray[np.float64], setti
     limited = np.isfinite(torque_limit)
     at_limit = limited.any() and (torque[limited] >= settings.full_torque * torque_limit[limited]).all()
     resistance = ((torque / rig.radius).sum() - asked) / (rig.chassis.mass * GRAVITY)
-    weights = np.where((torque > 0.0) & (rim > 0.0), torque, 0.0)
+    weights = np.where((torque > 0.0) & (rim > 0.0) & drives, torque, 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         slip = np.where(weights > 0.0, weights * (1.0 - ground / rim), 0.0).sum() / weights.sum()
     pull = asked if np.isfinite(window.acceleration).any() else math.nan
-    return Motion(
-        float(window.t[-1]), float(ground), rim.tolist(), float(resistance), bool(at_limit), float(slip), float(pull)
+    now, of_speed = radius * window.speed[-1], radius**2 * window.variance["speed"][-1]
+    known = np.isfinite(now) & np.isfinite(of_speed) & drives
+    count = max(int(known.sum()), 1)
+    thrust = float((window.torque[-1] / radius).sum()) / (rig.chassis.mass * GRAVITY)
+    sample = Sample(
+        float(window.t[-1]),
+        float(window.ground_speed[-1]),
+        float(window.variance["ground_speed"][-1]),
+        float(now[known].mean()) if known.any() else math.nan,
+        float(of_speed[known].sum()) / count**2,
+        thrust,
     )
+    return Motion(
+        float(window.t[-1]), float(ground), rim.tolist(), float(resistance), bool(at_limit), float(slip), float(pull),
+        sample,
+    )  # fmt: skip

@@ -64,6 +64,8 @@ class Traversability:
         All other figures.
     spare
         [N], pull on the present slope less the demand and its margin.
+    contradicted
+        Why the decision is worse than its estimate says: `warning` of immobilisation, or `slip` beyond the forecast's.
     """
 
     state: State = State.UNKNOWN
@@ -77,6 +79,7 @@ class Traversability:
     since_valid: float | None = None
     capability: Capability | None = None
     spare: Estimate | None = None
+    contradicted: str | None = None
 
 
 def state_of(probability: float, status: Status, settings: Settings) -> State:

@@ -20,7 +20,7 @@ from soilbus.config.model import Config
 from soilbus.decision.capability import Demand, OverSlip
 from soilbus.decision.demand import present_demand
 from soilbus.decision.hysteresis import Held, doubted, settled
-from soilbus.decision.immobilisation import BINS_OF_A_MOMENT, Watch, moments, watched, with_loss
+from soilbus.decision.immobilisation import BINS_OF_A_MOMENT, Alert, Warnings, Watch, moments, watched, with_loss
 from soilbus.decision.judgement import Basis, judge
 from soilbus.decision.torque_ceiling import TorqueCeiling
 from soilbus.decision.traction_loss import NO_LOSS, idle, motion_of, observed
@@ -102,7 +102,7 @@ class WindowEstimator:
         self._gap = GapWatch(config.estimator.window, config.estimator.hop)
         self._held = Held()
         self._valid_at: float | None = None
-        self._watch = Watch()
+        self._watch, self._warnings = Watch(), Warnings()
         self._curve: OverSlip | None = None
         self._loss = NO_LOSS
         self._idle = np.zeros(len(self.rig.wheels), bool)
@@ -184,8 +184,9 @@ class WindowEstimator:
         capability = result.traversability.capability
         if capability is not None and result.status is Status.VALID:
             self._curve = capability.over_slip
-        now = as_of(result, self._loss, result.t, self.config)
-        return replace(now, watch=with_loss(self._watch, self._loss))
+        watch = with_loss(self._watch, self._loss)
+        now = as_of(result, self._loss, result.t, self.config, watch.warning is Alert.IMMOBILISATION)
+        return replace(now, watch=watch, warnings=self._warnings)
 
     def _decided(self, window: Undecided) -> WindowResult:
         """The result with its traversability."""
@@ -236,15 +237,17 @@ class WindowEstimator:
     def _update_watch(self, window: Undecided) -> None:
         """Update loss of traction and watch by the last hop, with the curve of the window before."""
         if window.fresh:
-            self._watch, self._curve, self._loss = Watch(), None, NO_LOSS
-        since = window.result.t - self._settings.hop
+            self._watch, self._curve, self._loss, self._warnings = Watch(), None, NO_LOSS, Warnings()
+        self._warnings = self._warnings._replace(begun=())
+        since = -math.inf if window.fresh else window.result.t - self._settings.hop
         driven = window.driven
-        for i in np.flatnonzero(driven.t > since).tolist():
+        looks = list(moments(driven, self.rig, since, self._settings.min_speed))
+        for i, moment in zip(np.flatnonzero(driven.t > since).tolist(), looks, strict=bool(looks)):
             few = driven.rows(np.arange(max(i + 1 - BINS_OF_A_MOMENT, 0), i + 1))
             if (motion := motion_of(few, self.rig, window.torque_limit, self.config.traversability)) is not None:
-                self._loss = observed(self._loss, motion, self._settings.min_speed, self.config.traversability)
-        for moment in moments(window.driven, self.rig, since, self._settings.min_speed):
+                self._loss = observed(self._loss, motion, self.config)
             self._watch = watched(self._watch, moment.t, moment.slip, moment.pull, self._curve, moment.inertia)
+            self._warnings = self._warnings.after(moment.t, with_loss(self._watch, self._loss).warning)
 
     def _effects(self, fit: Fit | None) -> list[Active]:
         """The effects with their fitted parameters, or without a fit as configured."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from soilbus.config.model import Config
-from soilbus.decision.immobilisation import Watch
+from soilbus.decision.immobilisation import Warnings, Watch
 from soilbus.decision.judgement import Basis, at_present
 from soilbus.decision.traction_loss import TractionLoss
 from soilbus.decision.traversability import Status, Traversability
@@ -54,6 +54,8 @@ class WindowResult:
         The budget of evaluations (estimator.search_rate, search_burst) ended the search for a soil.
     watch
         Immobilisation warning; unknown where the live loop computes it ten times a second.
+    warnings
+        When the warning began, ten times a second.
     log
         Name of the recording; None for the live bus.
     excitation
@@ -82,12 +84,13 @@ class WindowResult:
     z_driven: tuple[float, float] | None = None
     search_ended: bool = False
     watch: Watch = Watch()  # noqa: RUF009, immutable
+    warnings: Warnings = Warnings()  # noqa: RUF009, immutable
     log: str | None = None
     excitation: Excitation = Excitation()  # noqa: RUF009, immutable
     basis: Basis = Basis()  # noqa: RUF009, immutable
 
 
-def as_of(result: WindowResult, loss: TractionLoss, now: float, config: Config) -> WindowResult:
+def as_of(result: WindowResult, loss: TractionLoss, now: float, config: Config, warned: bool = False) -> WindowResult:
     """The result at a later time.
 
     Parameters
@@ -100,8 +103,10 @@ def as_of(result: WindowResult, loss: TractionLoss, now: float, config: Config) 
         [s], the time of the data.
     config
         Limits of age and distance.
+    warned
+        Whether immobilisation is warned of.
     """
-    decision = at_present(result.traversability, result.basis, loss, now, config)
+    decision = at_present(result.traversability, result.basis, loss, now, config, warned)
     if loss.stuck and result.status is Status.VALID:
         return replace(result, traversability=decision, status=Status.NOT_EXCITED, reason="standstill")
     return replace(result, traversability=decision)

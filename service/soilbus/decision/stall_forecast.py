@@ -1,0 +1,182 @@
+"""Immobilisation ahead without any soil: the trends of slip and ground speed, extrapolated by a Kalman filter.
+
+    q = ln(r omega / V) = -ln(1 - s)         log speed ratio of the driven wheels: grows without bound towards a stall
+    x = (value, rate)                        of q, and of V
+    x_k+1 = [1 dt; 0 1] x_k + noise          local linear trend; the rate is a random walk of intensity w
+    P(q + h_s dq/dt > -ln(1 - s_max)) > p    slip passes its limit within the horizon h_s
+    P(V + h_v dV/dt < 0) > p                 or the vehicle stands within h_v, while its wheels slip and thrust holds
+
+Both count only while a vehicle that has moved for some seconds loses speed under thrust: a start is no stall, and one
+in vain is seen by `traction_loss`.  A stall shows in both: wheels that a motor holds at their
+speed, with torque left, make slip run away; motors at their limit lose speed together with the vehicle.  In q, a wheel
+that creeps, starts, or turns on a curve needs no case of its own: what the sensors cannot know there is in the variance
+of q, (sd(V) / V)^2 + (sd(omega) / omega)^2, and the mean over left and right wheels cancels a curve.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from soilbus.config.model import Traversability
+from soilbus.config.model import Warning as Settings
+
+__all__ = ["LocalTrend", "Sample", "StallForecast", "forecast"]
+
+LONGEST_GAP = 1.0
+"""Silence [s] after which the trends start afresh."""
+FIRST_RATE_STD = 1.0
+"""Sd of a rate [1/s, m/s^2] before any sample: no vehicle brakes harder than it slides."""
+
+
+class LocalTrend(NamedTuple):
+    """Kalman filter of a value and its rate [1/s], with their covariance."""
+
+    value: float = 0.0
+    rate: float = 0.0
+    var: float = math.inf
+    cov: float = 0.0
+    rate_var: float = FIRST_RATE_STD**2
+
+    def after(self, step: float, value: float, variance: float, wander: float) -> LocalTrend:
+        """The trend after one more sample.
+
+        Parameters
+        ----------
+        step
+            [s], since the last call.
+        value, variance
+            The sample; nan where not known.
+        wander
+            [1/s per sqrt(s)], intensity of the random walk of the rate.
+        """
+        known = math.isfinite(value) and math.isfinite(variance)
+        if math.isinf(self.var):
+            return LocalTrend(value, 0.0, variance) if known else self
+        square = wander**2 * step
+        predicted = self.value + step * self.rate
+        var = self.var + step * (2.0 * self.cov + step * self.rate_var) + square * step**2 / 3.0
+        cov = self.cov + step * self.rate_var + square * step / 2.0
+        rate_var = self.rate_var + square
+        if not known:
+            return LocalTrend(predicted, self.rate, var, cov, rate_var)
+        innovation, total = value - predicted, var + variance
+        return LocalTrend(
+            predicted + var / total * innovation,
+            self.rate + cov / total * innovation,
+            var * variance / total,
+            cov * variance / total,
+            rate_var - cov**2 / total,
+        )
+
+    def probability_above(self, level: float, horizon: float) -> float:
+        """Probability that the value passes a level within a time [s]; 0 before any sample."""
+        if math.isinf(self.var):
+            return 0.0
+        var = self.var + horizon * (2.0 * self.cov + horizon * self.rate_var)
+        return 0.5 * math.erfc((level - self.value - horizon * self.rate) / math.sqrt(2.0 * var))
+
+
+class Sample(NamedTuple):
+    """One bin: time [s], ground speed and mean rim speed of the driven wheels [m/s] with their variances, thrust.
+
+    thrust is the sum of torque over radius as a share of the weight; nan where not known.
+    """
+
+    t: float
+    ground: float
+    ground_var: float
+    rim: float
+    rim_var: float
+    thrust: float
+
+
+@dataclass(frozen=True, slots=True)
+class StallForecast:
+    """State carried from one sample to the next by `forecast`.
+
+    Attributes
+    ----------
+    t, since
+        [s], of the last sample, and of the first one since which the vehicle moves.
+    slip, speed
+        Trends of the log speed ratio [1] and of the ground speed [m/s].
+    thrust
+        As a share of the weight, low-pass filtered.
+    caused
+        [s], when a stall was last seen ahead.
+    stalls
+        Whether that is no longer ago than `hold`.
+    settled
+        Whether the vehicle has moved for `settling_time`.
+    time_left
+        [s] until slip passes its limit or the vehicle stands, whichever is first; None where nothing is ahead.
+    """
+
+    t: float = -math.inf
+    since: float = math.inf
+    slip: LocalTrend = LocalTrend()  # noqa: RUF009, immutable
+    speed: LocalTrend = LocalTrend()  # noqa: RUF009, immutable
+    thrust: float = math.nan
+    caused: float = -math.inf
+    stalls: bool = False
+    settled: bool = False
+    time_left: float | None = None
+
+
+def forecast(
+    before: StallForecast, sample: Sample, min_speed: float, settings: Settings, limits: Traversability
+) -> StallForecast:
+    """The forecast after one more sample; samples in their order, at any rate.
+
+    Parameters
+    ----------
+    before
+        After the sample before; the trends start afresh after LONGEST_GAP or when time goes back.
+    sample
+        The wheels and the vehicle now.
+    min_speed
+        [m/s], speeds of wheels and vehicle below which there is no slip.
+    settings, limits
+        Horizons, probability, noise; `max_slip` and `stall_resistance`.
+    """
+    step = sample.t - before.t
+    if not 0.0 <= step <= LONGEST_GAP:
+        before, step = StallForecast(sample.t), 0.0
+    moves = sample.ground > min_speed and sample.rim > min_speed  # nor nan
+    ratio = math.log(sample.rim / sample.ground) if moves else math.nan
+    ratio_var = math.nan
+    if moves:
+        ratio_var = sample.ground_var / sample.ground**2 + sample.rim_var / sample.rim**2 + settings.slip_noise**2
+    slip = before.slip.after(step, ratio, ratio_var, settings.slip_wander)
+    speed = before.speed.after(step, sample.ground, sample.ground_var, settings.speed_wander)
+    thrust = sample.thrust
+    mean = before.thrust
+    if math.isfinite(thrust):
+        mean = thrust if math.isnan(mean) else mean + (thrust - mean) * (1.0 - math.exp(-step / settings.thrust_time))
+    pushes = thrust > limits.stall_resistance
+    holds = thrust > settings.thrust_held * mean
+    limit = -math.log(1.0 - limits.max_slip)
+    runs_away = slip.probability_above(limit, settings.slip_horizon) > settings.probability
+    stands = (
+        1.0 - speed.probability_above(0.0, settings.stop_horizon) > settings.probability
+        and holds
+        and slip.value > -math.log(1.0 - settings.least_slip)
+    )
+    stands_now = sample.ground <= min_speed or sample.rim <= min_speed  # nor nan: what is not known stays as it was
+    since = math.inf if stands_now else min(before.since, sample.t if moves else math.inf)
+    settled = sample.t - since >= settings.settling_time
+    ahead = moves and settled and pushes and speed.rate < 0.0 and math.isfinite(speed.var) and (runs_away or stands)
+    caused = sample.t if ahead else before.caused
+    stalls = sample.t - caused < settings.hold
+    return StallForecast(
+        sample.t, since, slip, speed, mean, caused, stalls, settled, _time_left(slip, speed, limit) if stalls else None
+    )
+
+
+def _time_left(slip: LocalTrend, speed: LocalTrend, limit: float) -> float:
+    """Time [s] until slip passes its limit or the vehicle stands, by the trends."""
+    to_limit = max(limit - slip.value, 0.0) / slip.rate if slip.rate > 0.0 else math.inf
+    to_stand = max(speed.value, 0.0) / -speed.rate if speed.rate < 0.0 else math.inf
+    return min(to_limit, to_stand)
