@@ -173,6 +173,7 @@ KEYS = {"t", "status", "soil", "bearing_pressure", "slip", "sinkage", "traversab
 MORE = {"search_ended", "window", "log", "reason", "state", "soil_class", "capability", "gaps", "warning"}
 CAPABILITY = {"max_draft_here", "max_grade_with_draft", "set_points", "forecast", "over_slip"}
 DECISION = {
+    "contradicted",
     "state",
     "probability",
     "torque_required",
@@ -201,7 +202,7 @@ def test_json_lines_have_the_keys_of_the_design(name, whole):
         assert set(one) - MORE == KEYS
         assert set(one["traversability"]) == DECISION
         assert one["warning"]["state"] in ("unknown", "none", "immobilisation")
-        assert set(one["warning"]) == {"state", "time_left"}
+        assert set(one["warning"]) == {"state", "time_left", "since", "begun"}
         if one["soil"] is not None:
             able = one["capability"]
             assert set(able) == CAPABILITY

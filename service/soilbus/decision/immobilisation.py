@@ -368,13 +368,19 @@ def watched(
     )  # fmt: skip
 
 
-def with_loss(watch: Watch, loss: TractionLoss) -> Watch:
-    """The watch as reported: warned by what wheels and vehicle do as well, and no time left once stuck."""
+def with_loss(watch: Watch, loss: TractionLoss, now: float = -math.inf) -> Watch:
+    """The watch as reported at `now` [s]: warned by what wheels and vehicle do as well; no time left once stuck."""
     if not loss.warns:
-        known = watch.warning is not Alert.UNKNOWN or math.isinf(loss.ahead.slip.var)
-        return watch if known else replace(watch, warning=Alert.NONE)
+        slip_known = math.isfinite(loss.ahead.slip.var) and now - loss.t <= LONGEST_GAP
+        none = watch.warning is Alert.UNKNOWN and slip_known
+        return replace(watch, warning=Alert.NONE) if none else watch
     left = [time for time in (watch.time_left, loss.ahead.time_left) if time is not None]
     return replace(watch, warning=Alert.IMMOBILISATION, time_left=0.0 if loss.stuck else min(left, default=None))
+
+
+def has_cause(watch: Watch, loss: TractionLoss, hold: float) -> bool:
+    """Whether a warning has a cause no older than `hold` [s]; else it only lasts, until a decision is go again."""
+    return loss.warns or (watch.warning is Alert.IMMOBILISATION and watch.t - watch.caused < hold)
 
 
 class Warnings(NamedTuple):

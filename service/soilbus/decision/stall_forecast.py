@@ -124,6 +124,12 @@ class StallForecast:
     settled: bool = False
     time_left: float | None = None
 
+    @property
+    def gains_speed(self) -> bool:
+        """Whether the ground speed rises, at a standstill by more than its rate's sd."""
+        least = 0.0 if self.settled else math.sqrt(self.speed.rate_var)
+        return self.speed.rate > least
+
 
 def forecast(
     before: StallForecast, sample: Sample, min_speed: float, settings: Settings, limits: Traversability

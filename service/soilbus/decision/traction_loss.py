@@ -78,7 +78,7 @@ class TractionLoss:
         Since when a wheel spins or the vehicle stalls; it does not move under thrust; it moves without spinning.  inf
         where it does not.
     spinning, slides, stuck
-        Spinning or stalling has lasted for `spin_time`; so has spinning of half of the wheels, or without any way; the
+        Spinning or stalling has lasted for `spin_time`; so has spinning of half of the wheels or without any way; the
         vehicle is stuck and has not moved since.
     last
         The last moment that was spinning or stuck: older data do not describe the ground under the wheels.
@@ -102,9 +102,8 @@ class TractionLoss:
 
     @property
     def warns(self) -> bool:
-        """Whether the vehicle is stuck, a stall is ahead, or half of its wheels spin as it drives, without any gain."""
-        spins_on = self.slides and self.ahead.settled and not self.ahead.speed.rate > 0.0
-        return self.stuck or self.ahead.stalls or spins_on
+        """Whether the vehicle is stuck, a stall is ahead, or half of its wheels spin while it gains no speed."""
+        return self.stuck or self.ahead.stalls or (self.slides and not self.ahead.gains_speed)
 
 
 NO_LOSS = TractionLoss()
@@ -148,7 +147,8 @@ def observed(before: TractionLoss, motion: Motion, config: Config) -> TractionLo
     sticks = min(before.sticks, t) if no_way else math.inf
     moves = min(before.moves, t) if not stands and not spinning else math.inf
     stuck = t - sticks >= settings.stuck_time or (before.stuck and t - moves < settings.spin_time)
-    lasting, slides = t - spins >= settings.spin_time, t - sticks >= settings.spin_time
+    lasting = t - spins >= settings.spin_time
+    slides = t - sticks >= settings.spin_time
     kept = math.exp(-(t - before.t) / settings.spin_time) if math.isfinite(before.slip + before.pull) else 0.0
     slip, pull = (
         now + kept * (late - now) if kept else now

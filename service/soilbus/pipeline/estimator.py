@@ -20,11 +20,20 @@ from soilbus.config.model import Config
 from soilbus.decision.capability import Demand, OverSlip
 from soilbus.decision.demand import present_demand
 from soilbus.decision.hysteresis import Held, doubted, settled
-from soilbus.decision.immobilisation import BINS_OF_A_MOMENT, Alert, Warnings, Watch, moments, watched, with_loss
+from soilbus.decision.immobilisation import (
+    BINS_OF_A_MOMENT,
+    Alert,
+    Warnings,
+    Watch,
+    has_cause,
+    moments,
+    watched,
+    with_loss,
+)
 from soilbus.decision.judgement import Basis, judge
 from soilbus.decision.torque_ceiling import TorqueCeiling
 from soilbus.decision.traction_loss import NO_LOSS, idle, motion_of, observed
-from soilbus.decision.traversability import Status, Traversability
+from soilbus.decision.traversability import State, Status, Traversability
 from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.wheels import WheelTable
 from soilbus.estimation.assembly import effects_and_parameters_of, form_of, model_of, prior_of, rig_of
@@ -185,7 +194,10 @@ class WindowEstimator:
         if capability is not None and result.status is Status.VALID:
             self._curve = capability.over_slip
         watch = with_loss(self._watch, self._loss)
-        now = as_of(result, self._loss, result.t, self.config, watch.warning is Alert.IMMOBILISATION)
+        warned = has_cause(watch, self._loss, self.config.warning.hold)
+        now = as_of(result, self._loss, result.t, self.config, warned)
+        if now.traversability.state is State.GO and watch.warning is Alert.IMMOBILISATION:
+            watch, self._warnings = replace(watch, warning=Alert.NONE), self._warnings._replace(since=None)
         return replace(now, watch=watch, warnings=self._warnings)
 
     def _decided(self, window: Undecided) -> WindowResult:
