@@ -371,7 +371,7 @@ def watched(
 def with_loss(watch: Watch, loss: TractionLoss, now: float = -math.inf) -> Watch:
     """The watch as reported at `now` [s]: warned by what wheels and vehicle do as well; no time left once stuck."""
     if not loss.warns:
-        slip_known = math.isfinite(loss.ahead.slip.var) and now - loss.t <= LONGEST_GAP
+        slip_known = max(now, loss.t) - loss.ahead.heard <= LONGEST_GAP
         none = watch.warning is Alert.UNKNOWN and slip_known
         return replace(watch, warning=Alert.NONE) if none else watch
     left = [time for time in (watch.time_left, loss.ahead.time_left) if time is not None]

@@ -98,8 +98,8 @@ class StallForecast:
 
     Attributes
     ----------
-    t, since
-        [s], of the last sample, and of the first one since which the vehicle moves.
+    t, heard, since
+        [s], of the last sample, of the last one with a slip, and of the first one since which the vehicle moves.
     slip, speed
         Trends of the log speed ratio [1] and of the ground speed [m/s].
     thrust
@@ -115,6 +115,7 @@ class StallForecast:
     """
 
     t: float = -math.inf
+    heard: float = -math.inf
     since: float = math.inf
     slip: LocalTrend = LocalTrend()  # noqa: RUF009, immutable
     speed: LocalTrend = LocalTrend()  # noqa: RUF009, immutable
@@ -174,10 +175,19 @@ def forecast(
     since = math.inf if stands_now else min(before.since, sample.t if moves else math.inf)
     settled = sample.t - since >= settings.settling_time
     ahead = moves and settled and pushes and speed.rate < 0.0 and math.isfinite(speed.var) and (runs_away or stands)
-    caused = sample.t if ahead else before.caused
+    heard, caused = (sample.t if now else last for now, last in ((moves, before.heard), (ahead, before.caused)))
     stalls = sample.t - caused < settings.hold
     return StallForecast(
-        sample.t, since, slip, speed, mean, caused, stalls, settled, _time_left(slip, speed, limit) if stalls else None
+        sample.t,
+        heard,
+        since,
+        slip,
+        speed,
+        mean,
+        caused,
+        stalls,
+        settled,
+        _time_left(slip, speed, limit) if stalls else None,
     )
 
 
