@@ -16,7 +16,7 @@ from soilbus.terra.dual import Dual
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS
 from soilbus.terra.tangent import forces_along
-from soilbus.terra.track import MEAN_SHEAR, SERIES_BELOW
+from soilbus.terra.track import MEAN_SHEAR
 from soilbus.terra.wheel import (
     INPUTS,
     SHAPE,
@@ -154,7 +154,7 @@ def test_tracks_beside_wheels_are_as_alone():
 
 
 @pytest.mark.parametrize("law", MEAN_SHEAR)
-@pytest.mark.parametrize("u", [1e-9, 1e-4, 0.999 * SERIES_BELOW, 1.001 * SERIES_BELOW, 0.3, 2.0, 50.0])
+@pytest.mark.parametrize("u", [1e-9, 1e-4, 0.019, 0.021, 0.3, 2.0, 50.0])
 def test_mean_shear_equals_the_mean_of_the_law(law, u):
     share, slope = MEAN_SHEAR[law](u)
     exact = {"epsabs": 0.0, "epsrel": 1e-12, "limit": 200, "points": [min(1.0, 3.0 / u)]}

@@ -29,7 +29,7 @@ def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolera
     >>> round(1e3 * float(sinkage(angle, 0.5)))  # mm
     45
     """
-    given = state if np.any(state.length) else state[:-1]
+    given = state if state.has_tracks else state[:-1]
     load, *fields = (np.asarray(a, float) for a in np.broadcast_arrays(load, *given))
     shape = load.shape
     load, *fields = (a.ravel() for a in (load, *fields))

@@ -172,7 +172,7 @@ def in_chunks(integrate: OnRim, of_track: OnTrack, n_rows: int, state: WheelStat
         for i, a in enumerate(fields)
     ))  # fmt: skip
     out = np.empty((n_rows, n_samples))
-    if np.any(rows.length):
+    if rows.has_tracks:
         tracked = np.broadcast_to(np.asarray(rows.length) > 0.0, n_samples)
         tracks, wheels = np.flatnonzero(tracked), np.flatnonzero(~tracked)
         out[:, tracks] = of_track(_samples(rows, tracks), model)

@@ -90,3 +90,8 @@ class WheelState(NamedTuple):
     c: Any
     K: Any
     length: Any = 0.0
+
+    @property
+    def has_tracks(self) -> bool:
+        """Whether any is a track."""
+        return self.length > 0.0 if isinstance(self.length, float) else bool(np.any(self.length))
