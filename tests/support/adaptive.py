@@ -36,7 +36,7 @@ def adaptive_forces(
     stands in for Bekker's, with a kink at a depth [m]; mobilised, the share of the shear
     strength at j/K >= 0, for the shear law.
     """
-    theta1, slip, r, b, K_L, n, tan_phi, c, K = (float(v) for v in state)
+    theta1, slip, r, b, K_L, n, tan_phi, c, K = (float(v) for v in state[:9])
     ahead = model.peak_c1 + model.peak_c2 * slip / (
         1.0 - (1.0 - abs(slip)) * model.peak_bend / (1.0 + model.peak_bend)
     )  # eq. 4 without a bend

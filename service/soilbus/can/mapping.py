@@ -113,7 +113,7 @@ def _roles(config: Config) -> Iterator[_Role]:
     for wheel in config.wheel:
         for quantity in WHEEL_ROLES:
             if (mapped := getattr(wheel, quantity)) is not None:
-                yield _Role(quantity, wheel, mapped, f"wheel.{wheel.name}.{quantity}")
+                yield _Role(quantity, wheel, mapped, f"{wheel.section}.{wheel.name}.{quantity}")
     for axle in config.axle:
         for role, quantity in AXLE_ROLES.items():
             if (mapped := getattr(axle, role)) is not None:

@@ -100,8 +100,8 @@ def _table_wanted(location: Sequence[Any], given: Any) -> str:
 
 def _list_wanted(location: Sequence[Any], given: Any) -> str:
     key = location[-1]
-    if key == "wheel":
-        return "write [[wheel]], in two brackets, once for each wheel"
+    if key in ("wheel", "track"):
+        return f"write [[{key}]], in two brackets, once for each {key}"
     if key == "effects" or isinstance(given, Mapping):
         return f'{_shown(given)} is not a list of tables, such as {key} = [{{ name = "..." }}]'
     return f"{_shown(given)} is not a list, such as {key} = [{_shown(given)}]"

@@ -20,6 +20,7 @@ from pydantic import (
     NonNegativeFloat,
     PositiveFloat,
     PositiveInt,
+    PrivateAttr,
     field_validator,
     model_validator,
 )
@@ -45,6 +46,7 @@ __all__ = [
     "Signals",
     "SoilPrior",
     "Table",
+    "Track",
     "Traversability",
     "Vehicle",
     "Warning",
@@ -110,6 +112,7 @@ CG_AHEAD = Usual(0.02, 8.0, "m", _SHORT)
 HEIGHT = Usual(0.02, 4.0, "m", _SHORT)
 HITCH_HEIGHT = Usual(0.0, 2.5, "m", _SHORT)
 TRACK = Usual(0.15, 5.0, "m", _SHORT)
+CONTACT_LENGTH = Usual(0.2, 8.0, "m", _SHORT)
 MASS_STD = Usual(0.0, 3.0e4, "kg", (("t", 1e3),))
 LENGTH_STD = Usual(0.0, 4.0, "m", _SHORT)
 GEAR_RATIO = Usual(0.1, 1000.0, "")
@@ -318,12 +321,68 @@ class Wheel(_Section):
     motor_speed: Signal | None = None
     """Only to find out a speed sensor that lies."""
 
+    _contact_length: float = PrivateAttr(0.0)
+
+    @property
+    def contact_length(self) -> float:
+        """Of a track on the ground [m]; 0 of a wheel."""
+        return self._contact_length
+
+    @property
+    def section(self) -> str:
+        """Of the TOML file that describes it."""
+        return "track" if self._contact_length else "wheel"
+
     @model_validator(mode="after")
     def _can_be_used(self) -> Wheel:
         of_motor = [role for role in ("torque", "torque_limit", "max_torque") if getattr(self, role) is not None]
         if not self.driven and of_motor:
             raise ValueError(f"wheel {self.name} has driven = false and a {of_motor[0]}: leave out one of the two")
         return self
+
+
+class Track(_Section):
+    """One track and its sensors, the left one first; its pressure on the ground is uniform.
+
+    Tracks alone carry the whole vehicle: its `wheelbase` is then their contact length, and it steers by `skid`, unless
+    [vehicle] says otherwise.  With wheels, or on both axles, a track takes the place of the wheel of its axle.
+    """
+
+    name: Name
+    """For messages, JSON and frames: L, R."""
+    axle: Literal["front", "rear"] | None = None
+    """Axle whose place it takes on a half-track or a machine with four tracks."""
+    contact_length: Annotated[PositiveFloat, AfterValidator(CONTACT_LENGTH)]
+    """On the ground, from the first to the last roller [m]."""
+    width: Annotated[PositiveFloat, AfterValidator(WIDTH)]
+    """Of the track [m]."""
+    sprocket_radius: Annotated[PositiveFloat, AfterValidator(RADIUS)]
+    """Pitch radius of the driving sprocket [m]: pitch of the links times number of teeth over 2 pi."""
+    driven: bool = True
+    """false: no motor drives it."""
+    gear_ratio: Annotated[PositiveFloat, AfterValidator(GEAR_RATIO)] = 1.0
+    """Turns of the motor shaft for one of the sprocket."""
+    max_torque: Annotated[PositiveFloat, AfterValidator(WHEEL_TORQUE)] | None = None
+    """The motor's limit at the sprocket [N m], where no signal reports it."""
+    torque: Signal | None = None
+    """Motor torque [N m], at the sprocket ("wheel") or the shaft."""
+    speed: Signal | None = None
+    """Rotation [rad/s], at the sprocket ("wheel") or the shaft."""
+    load: Signal | None = None
+    """Load cell [N]; without, the load follows from the vehicle's weight."""
+    sinkage: Signal | None = None
+    """Depth of the rut [m]; optional."""
+    torque_limit: Signal | None = None
+    """Greatest torque that the motor reports it can give [N m]; optional."""
+    motor_speed: Signal | None = None
+    """Only to find out a speed sensor that lies."""
+
+    def as_wheel(self) -> Wheel:
+        """The rigid wheel of the sprocket's radius that has its sensors, with the contact length."""
+        same = {key: getattr(self, key) for key in type(self).model_fields if key in Wheel.model_fields}
+        wheel = Wheel(**same | {"axle": self.axle or "front"}, radius=self.sprocket_radius, tyre="rigid")
+        wheel._contact_length = self.contact_length
+        return wheel
 
 
 class Signals(_Section):
@@ -715,6 +774,7 @@ class Config(_Section):
     vehicle: Vehicle | None = None
     axle: list[Axle] = Field(default_factory=list, max_length=3)
     wheel: list[Wheel] = Field(default_factory=list, max_length=8)
+    track: list[Track] = Field(default_factory=list, max_length=4)
     signals: Signals = Signals()
     table: Table | None = None
     noise: NoiseOfChannels = NoiseOfChannels()
@@ -725,6 +785,35 @@ class Config(_Section):
     model: Model = Model()
     output: Output = Output()
     folder: Path = Field(default=Path("."), exclude=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _vehicle_on_tracks(cls, value: Any) -> Any:
+        """What follows for [vehicle] from tracks that carry all of it."""
+        if not isinstance(value, Mapping) or value.get("wheel") or not isinstance(value.get("vehicle"), Mapping):
+            return value
+        tracks = value.get("track")
+        track = tracks[0] if isinstance(tracks, list) and tracks else None
+        if not isinstance(track, Mapping) or "contact_length" not in track or "axle" in track:
+            return value
+        length = track["contact_length"]
+        middle = {"cg_ahead_of_rear_axle": length / 2.0} if isinstance(length, (int, float)) else {}
+        return {**value, "vehicle": {"wheelbase": length, "steering": "skid", **middle, **value["vehicle"]}}
+
+    @model_validator(mode="after")
+    def _tracks_as_wheels(self) -> Config:
+        """`wheel` holds the tracks, too, behind the wheels: whatever runs on the ground."""
+        if self.track and (self.wheel or len(self.track) == 1) and any(t.axle is None for t in self.track):
+            raise ValueError("a [[track]] beside [[wheel]]s, or alone, needs its axle")
+        if len({t.axle is None for t in self.track}) > 1:
+            raise ValueError("give the axle of all [[track]]s or, where they carry the whole vehicle, of none")
+        object.__setattr__(self, "wheel", [*self.wheel, *(t.as_wheel() for t in self.track)])
+        return self
+
+    @property
+    def on_tracks(self) -> bool:
+        """Whether tracks carry the whole vehicle."""
+        return bool(self.track) and all(t.axle is None for t in self.track)
 
     @model_validator(mode="after")
     def _consistent(self) -> Config:

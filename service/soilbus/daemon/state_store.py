@@ -38,7 +38,7 @@ MAX_FILE_BYTES = 1 << 20
 """Size [bytes] beyond which a file is not a state of ours."""
 STORED_RANGE_SD = 8.0
 """Greatest distance of a stored mean from the prior's median, and greatest stored sd, in prior standard deviations."""
-SECTIONS = {"vehicle", "wheel", "signals", "noise", "soil", "estimator", "model"}
+SECTIONS = {"vehicle", "wheel", "track", "signals", "noise", "soil", "estimator", "model"}
 """Sections of the configuration that a posterior depends on."""
 _PHI = PARAMETERS.index("phi")
 

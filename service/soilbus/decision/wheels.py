@@ -47,7 +47,7 @@ ROLLING_SLIP, MAX_ROLLING_SKID = -0.05, 0.5
 
 @dataclass(frozen=True, slots=True)
 class Axles:
-    """The A kinds of wheels: those alike in axle, radius, width and whether they are driven.
+    """The A kinds of wheels: those alike in axle, radius, width, contact length and whether they are driven.
 
     Attributes
     ----------
@@ -63,6 +63,8 @@ class Axles:
         (W,), kind of each wheel.
     shared_motors
         Of several wheels.
+    length
+        (A, 1) [m], of tracks; the number 0 where all are wheels.
     """
 
     chassis: Chassis
@@ -76,6 +78,7 @@ class Axles:
     lever: Array
     of_wheel: NDArray[np.intp]
     shared_motors: tuple[Group, ...] = ()
+    length: Array | float = 0.0
 
     @classmethod
     def of(cls, rig: Rig, driven: NDArray[np.bool_] | None = None) -> Axles:
@@ -96,9 +99,11 @@ class Axles:
         if rig.chassis is None:
             raise ValueError("a capability needs the vehicle's mass and geometry")
         drives = [True] * len(rig.wheels) if driven is None else driven.tolist()
-        kinds = list(zip(rig.radius.tolist(), rig.width.tolist(), rig.front.tolist(), drives, strict=True))
+        lengths = np.zeros(len(drives)) if rig.lengths is None else rig.lengths
+        columns = (rig.radius, rig.width, rig.front, lengths)
+        kinds = list(zip(*(column.tolist() for column in columns), drives, strict=True))
         unlike = list(dict.fromkeys(kinds))
-        radius, width, front, drive = (np.array(column)[:, None] for column in zip(*unlike, strict=True))
+        radius, width, front, long, drive = (np.array(column)[:, None] for column in zip(*unlike, strict=True))
         count = np.array([[float(kinds.count(kind))] for kind in unlike])
         share = 1.0 / np.where(front, rig.front.sum(), (~rig.front).sum())
         cases = ((0.0, 0.0), (0.0, math.pi / 2.0), (1.0, 0.0))
@@ -107,7 +112,9 @@ class Axles:
         )
         of_wheel = np.array([unlike.index(kind) for kind in kinds])
         shared = () if rig.instrumentation is None else rig.instrumentation.motors
-        return cls(rig.chassis, radius, width, front, drive, count, level, tilt, drawn - level, of_wheel, shared)
+        length = 0.0 if rig.lengths is None else long
+        lever = drawn - level
+        return cls(rig.chassis, radius, width, front, drive, count, level, tilt, lever, of_wheel, shared, length)
 
     def wheel(self, load: Array) -> Wheel:
         """One wheel of each kind under a load [N] (..., A)."""
@@ -217,7 +224,8 @@ def wheel_table(
         and np.array_equal(start.axles.driven, axles.driven)
     ):
         start = None
-    slips = np.where(axles.driven, np.broadcast_to(slip, (n_soils, len(axles.count), n_slips)), ROLLING_SLIP)
+    rolling = np.where(np.asarray(axles.length) > 0.0, 0.0, ROLLING_SLIP)  # a track without thrust does not slip
+    slips = np.where(axles.driven, np.broadcast_to(slip, (n_soils, len(axles.count), n_slips)), rolling)
     if start is not None:
         pull, angle = _extrapolated(start, soils)
         pull = np.where(start.balanced, pull, 0.0)
@@ -334,7 +342,9 @@ def _state(soils: Array, axles: Axles, slip: Array, angle: Array) -> WheelState:
     """State of every kind of wheel on every soil at every slip; each field has the shape (D, A, S)."""
     k_c, k_phi, n, phi, c, K = soils.T[:, :, None, None]
     modulus = lumped_modulus(k_c, k_phi, axles.width)
-    state = WheelState(angle, slip, axles.radius, axles.width, modulus, n, np.tan(phi), c, K)
+    state: list[Any] = [angle, slip, axles.radius, axles.width, modulus, n, np.tan(phi), c, K]
+    if isinstance(axles.length, np.ndarray):
+        state.append(axles.length)
     fields = np.empty((len(state), *angle.shape))
     for field, values in zip(fields, state, strict=True):
         field[...] = values

@@ -71,6 +71,7 @@ def rig_of(config: Config) -> Rig:
         front=np.array([of_table or w.axle == "front" for w in wheels], dtype=bool),
         chassis=chassis_of(config),
         noise=noise,
+        lengths=np.array([w.contact_length for w in wheels]) if any(w.contact_length for w in wheels) else None,
     )
     if config.vehicle is None:
         return rig
@@ -98,18 +99,21 @@ def _unmeasured(config: Config) -> Iterator[str]:
         axles = [a for a in config.axle if a.name in ("both", w.axle)]
         if w.driven and w.torque is None and all(a.torque is None for a in axles):
             yield (
-                f"wheel {w.name} has no torque: map wheel.{w.name}.torque or axle.{w.axle}.torque, or say"
+                f"{w.section} {w.name} has no torque: map {w.section}.{w.name}.torque or axle.{w.axle}.torque, or say"
                 " driven = false if no motor drives it; else its rolling resistance would be put down to the soil under"
                 " the other wheels"
             )
         if w.driven and w.speed is None and all(a.motor_speed is None for a in axles):
             yield (
-                f"wheel {w.name} has no speed: map wheel.{w.name}.speed or axle.{w.axle}.motor_speed; without, it has"
-                " no slip"
+                f"{w.section} {w.name} has no speed: map {w.section}.{w.name}.speed or axle.{w.axle}.motor_speed;"
+                " without, it has no slip"
             )
         if w.load is None and config.vehicle is None:
-            yield f"wheel {w.name} has no load: map wheel.{w.name}.load, or give the [vehicle] whose weight it carries"
-    if config.vehicle is not None:
+            yield (
+                f"{w.section} {w.name} has no load: map {w.section}.{w.name}.load, or give the [vehicle]"
+                " whose weight it carries"
+            )
+    if config.vehicle is not None and not config.on_tracks:
         for axle in ("front", "rear"):
             if axle not in {w.axle for w in config.wheel}:
                 yield f"no [[wheel]] is on the {axle} axle, which carries its share of the weight: give all wheels"
@@ -268,7 +272,8 @@ def chassis_of(config: Config) -> Chassis | None:
     """Mass and geometry; None for a test rig."""
     if config.vehicle is None:
         return None
-    return Chassis(**config.vehicle.model_dump(include={f.name for f in fields(Chassis)}))
+    given = config.vehicle.model_dump(include={f.name for f in fields(Chassis)})
+    return Chassis(**given, on_tracks=config.on_tracks)
 
 
 def prior_of(config: Config) -> SoilPrior:

@@ -202,6 +202,7 @@ class Measurements:
         self._n_known = int(self._known.sum())
         self._missing = None if self._n_known == self._known.size else ~self._known
         self._radius, self._width = (np.tile(a, self.n) for a in (self.rig.radius, self.rig.width))
+        self._length = 0.0 if self.rig.lengths is None else np.tile(self.rig.lengths, self.n)
 
     def _balance(self, take: Callable[[str], Masked], usable: NDArray[np.bool_]) -> None:
         """Set the demand: pull [N] for draft, slope and inertia, and its variance."""

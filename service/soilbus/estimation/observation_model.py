@@ -686,8 +686,9 @@ class ObservationModel(Measurements):
     def _state(self, soil: Soil, angle: Array, slip: Array) -> WheelState:
         K_L = lumped_modulus(soil.k_c, soil.k_phi, self._width)
         return WheelState(
-            angle.ravel(), slip.ravel(), self._radius, self._width, K_L, soil.n, np.tan(soil.phi), soil.c, soil.K
-        )
+            angle.ravel(), slip.ravel(), self._radius, self._width, K_L, soil.n, np.tan(soil.phi), soil.c, soil.K,
+            self._length,
+        )  # fmt: skip
 
     def start(self, soil: Soil, guess: Array | None = None, gains: Array | None = None) -> Latents:
         """Latents at their measured values; entry angles solved at soil and gains (G,) from a guess (N, W) [rad]."""
@@ -860,7 +861,9 @@ class ObservationModelWithEffects(ObservationModel):
         """The wheels at entry angles (N, W) [rad], with the radii and sinkages that the effects give them."""
         slip = 1.0 - latents.ground_speed[:, None] / (self.rig.radius * latents.speed)
         K_L = lumped_modulus(soil.k_c, soil.k_phi, self.rig.width)
-        state = WheelState(angle, slip, self.rig.radius, self.rig.width, K_L, soil.n, np.tan(soil.phi), soil.c, soil.K)
+        state = WheelState(
+            angle, slip, self.rig.radius, self.rig.width, K_L, soil.n, np.tan(soil.phi), soil.c, soil.K, self.rig.length
+        )
         surroundings = self._surroundings(latents)
         state, model = wheel_with(active, state, self.model, surroundings)
         return _Wheels(state, model, sinkage(angle, state.radius), surroundings)

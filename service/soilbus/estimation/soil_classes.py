@@ -188,7 +188,7 @@ def ranked_by_likelihood(problem: ObservationModel, soils: Sequence[Soil]) -> li
     radius, shape = few.rig.radius, (len(soils), *few.load.shape)
     each = Soil(*np.array(soils).T[:, :, None, None])
     slip = np.broadcast_to(np.where(few.usable, few.slip, 0.0), shape)
-    state = state_on(each, np.nan, slip, radius, few.rig.width)
+    state = state_on(each, np.nan, slip, radius, few.rig.width, few.rig.length)
     angle = entry_angle_for_load(np.broadcast_to(few.load, shape), state, few.model, tolerance=RANKING_RELATIVE_SD**2)
     _, pull, torque = wheel_forces(state._replace(entry_angle=angle), few.model)
     depth = sinkage(angle, radius)

@@ -103,6 +103,13 @@ class Rig:
     """Whether the accelerometer measures dv/dt + g sin(pitch)."""
     max_lateral: float | None = None
     """Of a vehicle that steers by the speeds of its sides: greatest lateral over longitudinal sliding speed."""
+    lengths: Array | None = None
+    """(W,) [m], contact lengths of tracks, 0 of wheels; None where all are wheels."""
+
+    @property
+    def length(self) -> Array | float:
+        """Contact lengths [m] (W,); the number 0 where all are wheels, which then cost what wheels cost."""
+        return 0.0 if self.lengths is None else self.lengths
 
     @property
     def channels(self) -> tuple[str, ...]:

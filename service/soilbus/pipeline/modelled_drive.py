@@ -57,12 +57,13 @@ def modelled_drive(config: Config, rig: Rig, t: Array) -> dict[str, Array]:
         raise ValueError("a drive needs a [vehicle] with wheels whose torque is measured")
     phase = 2.0 * np.pi * t / config.estimator.window
     slip = SLIP_RANGE[0] + (SLIP_RANGE[1] - SLIP_RANGE[0]) * (1.0 - np.cos(phase)) / 2.0
-    slip = np.where(rig.drives[:, None], slip, ROLLING_SLIP)
+    length = 0.0 if rig.lengths is None else rig.lengths[:, None]
+    slip = np.where(rig.drives[:, None], slip, np.where(np.asarray(length) > 0.0, 0.0, ROLLING_SLIP))
     radius, width, rear = rig.radius[:, None], rig.width[:, None], ~rig.front[:, None]
     share = np.ones((len(rear), len(t))) / np.where(rear, rear.sum(), (~rear).sum())
     share[pairs(rig)] *= 1.0 + SIDE_LOAD_SHARE * np.stack([np.sin(2.0 * phase), -np.sin(2.0 * phase)])[:, None]
     model = CompletedModel.of(model_of(config), effects_of(config), GROUND_SPEED)
-    state = state_on(Soil(*(prior.value for prior in config.soil_prior.values())), np.nan, slip, radius, width)
+    state = state_on(Soil(*(prior.value for prior in config.soil_prior.values())), np.nan, slip, radius, width, length)
     draft, ratio = np.zeros(len(t)), np.ones(share.shape)
     for _ in range(FIXED_POINT_ROUNDS):
         of_front, of_rear = axle_loads(rig.chassis, draft, 0.0, 0.0)

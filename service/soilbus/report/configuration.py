@@ -145,7 +145,7 @@ def defaults_text(config: Config) -> str:
         else:
             lines.append(f"{prefix} = {value}")
 
-    walk("", config.model_dump(exclude={"wheel", "signals", "folder"}))
+    walk("", config.model_dump(exclude={"wheel", "track", "signals", "folder"}))
     return "\n".join(lines)
 
 

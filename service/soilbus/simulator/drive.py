@@ -130,7 +130,7 @@ def _chassis(config: Config) -> Chassis:
     chassis = chassis_of(config)
     if chassis is None or not config.wheel:
         raise SimulationError("the simulator needs a [vehicle] with [[wheel]]s")
-    if {wheel.axle for wheel in config.wheel} != {"front", "rear"}:
+    if not chassis.on_tracks and {wheel.axle for wheel in config.wheel} != {"front", "rear"}:
         raise SimulationError("the simulator needs wheels on both axles")
     return chassis
 
@@ -149,6 +149,8 @@ def _situation(
     test_draft = chassis.mass  # any draft will do, loads are linear in it
     level = loads(0.0)
     ahead = {"front": chassis.wheelbase - chassis.cg_ahead_of_rear_axle, "rear": -chassis.cg_ahead_of_rear_axle}
+    if chassis.on_tracks:
+        ahead["front"] = 0.0
     position = np.stack([motion.distance + ahead[str(wheel.axle)] for wheel in wheels])
     soil = soil_along(scenario.soils, position, scenario.transition)
     spread = Swing(-scenario.slip_spread, scenario.slip_spread)
@@ -169,6 +171,7 @@ def _situation(
         np.stack([realise(spread, motion.t, rng).value for _ in wheels]),
         each_wheel([wheel.radius for wheel in wheels]),
         each_wheel([wheel.width for wheel in wheels]),
+        each_wheel([wheel.contact_length for wheel in wheels]),
         np.array(soil),
         demand,
         slip_limit,

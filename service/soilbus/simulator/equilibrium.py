@@ -58,8 +58,8 @@ class Situation(NamedTuple):
         Wheel loads without draft [N] (M, N), and their change with draft (M, N).
     deviation
         Each wheel's slip beyond the common one (M, N).
-    radius, width
-        Of the wheels [m] (M, N).
+    radius, width, length
+        Of the wheels [m] (M, N); length that of a track's contact, 0 of a wheel.
     soil
         Parameters (6, M, N) in the order of wheel.Soil.
     demand
@@ -82,6 +82,7 @@ class Situation(NamedTuple):
     deviation: Array
     radius: Array
     width: Array
+    length: Array
     soil: Array
     demand: Array
     slip_limit: Array
@@ -233,7 +234,8 @@ def _transposed(situation: Situation, slip: Array, entry_angle: Array) -> WheelS
 def wheel_state(situation: Situation, slip: Array, entry_angle: Array) -> WheelState:
     """States of all wheels (M, N) at a common slip (N,) and entry angles [rad] (M, N)."""
     soil = Soil(*situation.soil)
-    return state_on(soil, entry_angle, slip + situation.deviation, situation.radius, situation.width)
+    slips = slip + situation.deviation
+    return state_on(soil, entry_angle, slips, situation.radius, situation.width, situation.length)
 
 
 def _at(situation: Situation, index: NDArray[np.intp]) -> Situation:
@@ -241,8 +243,12 @@ def _at(situation: Situation, index: NDArray[np.intp]) -> Situation:
 
 
 def _from_scratch(situation: Situation, mechanics: Mechanics) -> Equilibrium:
-    """The equilibrium from little slip and draft and entry angles that carry the level loads, effects added last."""
-    slip = np.minimum(0.1, situation.slip_limit)
+    """The equilibrium from little slip and draft and entry angles that carry the level loads, effects added last.
+
+    With tracks from no slip at all: their thrust saturates within s = K/L, and Newton's method nears a point of a
+    concave curve from below without overshooting it.
+    """
+    slip = np.minimum(0.0 if situation.length.any() else 0.1, situation.slip_limit)
     load, model = situation.level_load, mechanics.model
     unknown = wheel_state(situation, slip, np.full_like(load, np.nan))
     angle = entry_angle_for_load(load.ravel(), WheelState(*(np.ravel(a) for a in unknown)), model, tolerance=1e-3)

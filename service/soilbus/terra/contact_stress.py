@@ -51,7 +51,7 @@ class Stress(NamedTuple):
 
 def stresses(state: WheelState, model: WheelModel, skid: bool) -> Stress:
     """Of the soil alone, without its pan."""
-    theta, slip, r, _, K_L, n, _, _, K = state
+    theta, slip, r, _, K_L, n, _, _, K, _ = state
     q = model.quadrature
     if model.exit_varies:
         q = q._replace(exit=model.leave(theta, slip))

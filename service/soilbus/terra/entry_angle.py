@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.terra.wheel import MAX_ENTRY_ANGLE, MIN_ENTRY_ANGLE, WheelModel, WheelState, in_chunks, load_and_slope
+from soilbus.terra.wheel import MAX_ENTRY_ANGLE, MIN_ENTRY_ANGLE, WheelModel, WheelState, carried_and_slope
 
 
 def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolerance: float = 1e-12) -> Array:
@@ -28,7 +29,8 @@ def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolera
     >>> round(1e3 * float(sinkage(angle, 0.5)))  # mm
     45
     """
-    load, *fields = (np.asarray(a, float) for a in np.broadcast_arrays(load, *state))
+    given = state if state.has_tracks else state[:-1]
+    load, *fields = (np.asarray(a, float) for a in np.broadcast_arrays(load, *given))
     shape = load.shape
     load, *fields = (a.ravel() for a in (load, *fields))
     guess, rest = fields[0], fields[1:]
@@ -38,14 +40,14 @@ def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolera
     usable = np.isfinite(load) & (load > 0.0)
     target = np.log(np.where(usable, load, 1.0))
     with np.errstate(all="ignore"):
-        at = np.where((guess > 0.0) & np.isfinite(guess), np.log(np.abs(guess)), _first_guess(load, *rest[1:5]))
+        at = np.where((guess > 0.0) & np.isfinite(guess), np.log(np.abs(guess)), _first_guess(load, rest))
     at = np.clip(np.where(np.isfinite(at), at, np.log(0.3)), low, high)
     todo = np.flatnonzero(usable)
     for _ in range(80):
         if not len(todo):
             break
         part = WheelState(np.exp(at[todo]), *(f[todo] for f in rest))
-        W, slope = in_chunks(load_and_slope, 2, part, model)
+        W, slope = carried_and_slope(part, model)
         miss = np.where(W > 0.0, np.log(np.maximum(W, 1e-300)), -690.0) - target[todo]
         above = miss > 0.0
         high[todo] = np.where(above, at[todo], high[todo])
@@ -63,7 +65,16 @@ def entry_angle_for_load(load: Any, state: WheelState, model: WheelModel, tolera
     return angle.reshape(shape)
 
 
-def _first_guess(load: Array, radius: Array, width: Array, K_L: Array, n: Array) -> Array:
-    """log entry angle from the small-angle load K_L b r^(n+1) theta^(2n+1) / (n + 1.5)."""
+def _first_guess(load: Array, rest: Sequence[Array]) -> Array:
+    """log entry angle from the small-angle load K_L b r^(n+1) theta^(2n+1) / (n + 1.5); of a track from
+
+    K_L b L (r theta^2 / 2)^n.
+    """
+    _, radius, width, K_L, n, *_ = rest
     scale = 0.6 * width * K_L * radius ** (n + 1.0)
-    return np.asarray(np.log(load * (n + 1.5) / scale) / (2.0 * n + 1.0))
+    of_wheel = np.log(load * (n + 1.5) / scale) / (2.0 * n + 1.0)
+    if len(rest) < len(WheelState._fields) - 1:
+        return np.asarray(of_wheel)
+    length = rest[-1]
+    of_track = (np.log(load / (width * length * K_L)) / n + np.log(2.0 / radius)) / 2.0
+    return np.where(length > 0.0, of_track, of_wheel)

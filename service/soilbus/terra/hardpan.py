@@ -27,7 +27,7 @@ def reaching(state: WheelState, model: WheelModel) -> NDArray[np.bool_]:
 
 def pan_stresses(state: WheelState, model: WheelModel, skid: bool) -> Stress:
     """What the pan adds under wheels that reach it; cohesion is to be left out of the state."""
-    theta, slip, r, _, K_L, n, _, _, K = state
+    theta, slip, r, _, K_L, n, _, _, K, _ = state
     q, peak, start = model.quadrature._replace(exit=model.leave(theta, slip)), model.peak(slip), _start(state, model)
     if skid:
         x, w = split_nodes(np.maximum(place_of_turn(theta, slip, peak, q), start), q, start)

@@ -34,8 +34,8 @@ def forces_along(state: WheelState, model: WheelModel) -> tuple[Dual, Dual, Dual
     shape = {name for name, of in _SHAPES.items() if not varied.keys().isdisjoint(of)}
     if unknown := varied.keys() - {field for name in shape for field in _SHAPES[name]}:
         raise ValueError(f"no derivatives by {', '.join(sorted(unknown))}")
-    if isinstance(state.width, Dual):
-        raise ValueError("no derivatives by width")
+    if isinstance(state.width, Dual) or isinstance(state.length, Dual):
+        raise ValueError("no derivatives by width and length")
     forces, by = _derivatives(here, there, shape, of_radius=isinstance(state.radius, Dual))
     changes = {name: getattr(state, name) for name in (*INPUTS, "radius")}
     if "peak" in shape:
@@ -58,6 +58,8 @@ def _derivatives(
     """Forces (3, ...) and their derivatives (3, ...) by INPUTS, these of SHAPE and, where asked for, the radius."""
     integrated = model
     asked = shape | {"pan_depth"} if of_radius and (model.pan_stiffness or "pan_stiffness" in shape) else shape
+    if of_radius and state.has_tracks:
+        asked = asked | {"length"}
     if "pan_stiffness" in shape and not model.pan_stiffness:
         integrated = replace(model, pan_stiffness=_FAINT)
     names = sorted(asked)
@@ -75,4 +77,6 @@ def _by_radius(state: WheelState, model: WheelModel, forces: Array, by: dict[str
     lengths[2] += forces[2]
     if "pan_depth" in by:
         lengths -= model.pan_depth * by["pan_depth"]
+    if "length" in by:
+        lengths -= state.length * by["length"]
     return np.asarray(lengths / state.radius)

@@ -19,13 +19,17 @@ GRAVITY = 9.80665
 
 @dataclass(frozen=True, slots=True)
 class Chassis:
-    """Mass [kg] and lengths [m] of a two-axle vehicle; heights above the ground."""
+    """Mass [kg] and lengths [m] of a two-axle vehicle; heights above the ground.
+
+    on_tracks: the tracks of its front carry all of it, wherever the load acts (uniform pressure).
+    """
 
     mass: float
     wheelbase: float
     cg_ahead_of_rear_axle: float
     cg_height: float
     hitch_height: float
+    on_tracks: bool = False
 
 
 def slip_ratio(radius: Any, wheel_speed: Any, ground_speed: Any) -> Any:
@@ -70,6 +74,9 @@ def axle_loads(chassis: Chassis, draft: Any, pitch: Any, acceleration: Any) -> t
     weight = chassis.mass * GRAVITY
     along = weight * np.sin(pitch) + chassis.mass * acceleration
     across = weight * np.cos(pitch)
+    if chassis.on_tracks:
+        front = across + 0.0 * (along + draft)
+        return front, 0.0 * front
     moment = across * chassis.cg_ahead_of_rear_axle - along * chassis.cg_height - draft * chassis.hitch_height
     front = moment / chassis.wheelbase
     return front, across - front

@@ -1,7 +1,8 @@
 """One rigid wheel on soil: load, drawbar pull and torque with their derivatives.
 
 Equations 20-22 of Xi et al. 2024 (Wong & Reece 1967), integrated by Gauss-Legendre
-quadrature at the nodes of terra.rim.
+quadrature at the nodes of terra.rim.  Where a state has a contact length it is a track, whose closed forms
+(terra.track) stand in for the integrals.
 """
 
 from __future__ import annotations
@@ -31,6 +32,12 @@ from soilbus.terra.contact_stress import (
 )
 from soilbus.terra.hardpan import by_pan, pan_stresses, reaching
 from soilbus.terra.soil_laws import lumped_modulus
+from soilbus.terra.track import (
+    track_forces,
+    track_forces_and_jacobian,
+    track_forces_and_slopes,
+    track_load_and_slope,
+)
 from soilbus.terra.wheel_state import EXACT_NODES, FAST_NODES, WheelModel, WheelState
 
 __all__ = [
@@ -62,7 +69,11 @@ INPUTS = ("entry_angle", "slip", "K_L", "n", "tan_phi", "c", "K")
 """What the forces are differentiated by, as fields of WheelState."""
 SHAPE = ("peak", "leave", "exponential_share", "pan_stiffness", "pan_depth")
 """What the shape of the contact depends on: the angles of greatest stress and of exit over the entry angle, and
-the fields of WheelModel by name."""
+the fields of WheelModel by name.  A derivative by the length of a track is to be had, too; of a wheel it is zero."""
+OnRim = Callable[[Stress, WheelState, WheelModel], Array]
+"""Integrator of the stresses under a wheel."""
+OnTrack = Callable[[WheelState, WheelModel], Array]
+"""The same of a track, which needs no nodes."""
 
 
 class Soil(NamedTuple):
@@ -80,10 +91,10 @@ class Soil(NamedTuple):
         return float(lumped_modulus(self.k_c, self.k_phi, b_ref) * z_ref**self.n)
 
 
-def state_on(soil: Soil, entry_angle: Any, slip: Any, radius: Any, width: Any) -> WheelState:
-    """The wheel state of a wheel (radius, width [m]) on a soil."""
+def state_on(soil: Soil, entry_angle: Any, slip: Any, radius: Any, width: Any, length: Any = 0.0) -> WheelState:
+    """The state of a wheel (radius, width [m]), or of a track with a contact length [m], on a soil."""
     K_L = lumped_modulus(soil.k_c, soil.k_phi, width)
-    return WheelState(entry_angle, slip, radius, width, K_L, soil.n, np.tan(soil.phi), soil.c, soil.K)
+    return WheelState(entry_angle, slip, radius, width, K_L, soil.n, np.tan(soil.phi), soil.c, soil.K, length)
 
 
 def wheel_forces(state: WheelState, model: WheelModel) -> Array:
@@ -111,7 +122,7 @@ def wheel_forces(state: WheelState, model: WheelModel) -> Array:
     >>> round(float(W)), round(float(DP)), round(float(T))
     (8808, 1064, 1615)
     """
-    return in_chunks(_forces, 3, state, model)
+    return in_chunks(_forces, track_forces, 3, state, model)
 
 
 def wheel_forces_and_derivatives(
@@ -119,16 +130,18 @@ def wheel_forces_and_derivatives(
 ) -> tuple[Array, Array]:
     """Forces (3, ...) and their exact derivatives (3, 7 + D, ...) by INPUTS and some of SHAPE, radius and width held.
 
-    Rows as FORCES, columns as INPUTS and then as asked for; units are those of force per unit of input.
+    Rows as FORCES, columns as INPUTS and then as asked for, among which may be the `length` of a track; units are those
+    of force per unit of input.
     """
     n = len(INPUTS) + len(shape)
-    both = in_chunks(partial(_forces_and_jacobian, shape=shape), 3 + 3 * n, state, model)
+    of_rim, of_track = (partial(f, shape=shape) for f in (_forces_and_jacobian, track_forces_and_jacobian))
+    both = in_chunks(of_rim, of_track, 3 + 3 * n, state, model)
     return both[:3], both[3:].reshape(3, n, *both.shape[1:])
 
 
 def wheel_forces_and_slopes(state: WheelState, model: WheelModel) -> tuple[Array, Array]:
     """Forces (3, ...) and their exact derivatives (3, 2, ...) by entry angle and slip; cheaper than by all inputs."""
-    both = in_chunks(_forces_and_slopes, 9, state, model)
+    both = in_chunks(_forces_and_slopes, track_forces_and_slopes, 9, state, model)
     return both[:3], both[3:].reshape(3, 2, *both.shape[1:])
 
 
@@ -143,10 +156,13 @@ def sinkage(entry_angle: Any, radius: Any) -> Any:
     return radius * (1.0 - np.cos(entry_angle))
 
 
-def in_chunks(
-    integrate: Callable[[Stress, WheelState, WheelModel], Array], n_rows: int, state: WheelState, model: WheelModel
-) -> Array:
-    """(n_rows, ...) of an integrator of stresses, which gets the state as rows (N,) or floats."""
+def carried_and_slope(state: WheelState, model: WheelModel) -> Array:
+    """Load and its derivative by the entry angle (2, ...)."""
+    return in_chunks(_load_and_slope, track_load_and_slope, 2, state, model)
+
+
+def in_chunks(integrate: OnRim, of_track: OnTrack, n_rows: int, state: WheelState, model: WheelModel) -> Array:
+    """(n_rows, ...) of an integrator of stresses and of the closed form of tracks; both get rows (N,) or floats."""
     shape = np.broadcast(*state).shape
     n_samples = math.prod(shape)
     fields = [np.asarray(a, float) for a in state]
@@ -155,8 +171,16 @@ def in_chunks(
         if a.ndim or i < 2 else float(a)  # entry angle and slip always by sample
         for i, a in enumerate(fields)
     ))  # fmt: skip
-    skid = rows.slip < 0.0
     out = np.empty((n_rows, n_samples))
+    if rows.has_tracks:
+        tracked = np.broadcast_to(np.asarray(rows.length) > 0.0, n_samples)
+        tracks, wheels = np.flatnonzero(tracked), np.flatnonzero(~tracked)
+        out[:, tracks] = of_track(_samples(rows, tracks), model)
+        if len(wheels):
+            samples = _samples(rows, wheels)._replace(length=0.0)
+            out[:, wheels] = in_chunks(integrate, of_track, n_rows, samples, model)
+        return out.reshape(n_rows, *shape)
+    skid = rows.slip < 0.0
     for run, skidding in _runs(skid, model.nodes):
         samples = _samples(rows, run)
         out[:, run] = integrate(stresses(samples, model, skidding), samples, model)
@@ -186,7 +210,7 @@ def _samples(rows: WheelState, chosen: slice | NDArray[np.intp]) -> WheelState:
     return WheelState(*(a if isinstance(a, float) else a[chosen] for a in rows))
 
 
-def load_and_slope(at: Stress, state: WheelState, model: WheelModel) -> Array:
+def _load_and_slope(at: Stress, state: WheelState, model: WheelModel) -> Array:
     """Load and its derivative by the entry angle (2, N)."""
     tau, mobilising = sheared(at, state)
     normal, shear = entering(at, state, tau, mobilising)
@@ -274,6 +298,8 @@ def _by_shape(
             yield by_leave(at, state, model, tau, mobilising)
         elif name == "exponential_share":
             yield by_exponential_share(at, state, model)
+        elif name == "length":
+            yield np.zeros((3, 1))
         else:
             yield pan[name == "pan_depth"]
 

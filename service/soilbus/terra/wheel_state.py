@@ -76,7 +76,8 @@ class WheelState(NamedTuple):
     """What the forces of N wheel-instants depend on; floats or arrays that broadcast.
 
     entry_angle [rad], slip [-], radius and width [m], K_L [N/m^(n+2)], n [-],
-    tan_phi [-], c [Pa], K [m].
+    tan_phi [-], c [Pa], K [m].  length [m] is the contact length of a track, 0 of a wheel; radius is then the
+    sprocket's, entry_angle the one at which a wheel of that radius has sunk as deep (terra.track).
     """
 
     entry_angle: Any
@@ -88,3 +89,9 @@ class WheelState(NamedTuple):
     tan_phi: Any
     c: Any
     K: Any
+    length: Any = 0.0
+
+    @property
+    def has_tracks(self) -> bool:
+        """Whether any is a track."""
+        return self.length > 0.0 if isinstance(self.length, float) else bool(np.any(self.length))

@@ -177,6 +177,7 @@ def true_largest_draft(
             deviation=np.zeros(shape),
             radius=each_wheel(rig.radius),
             width=each_wheel(rig.width),
+            length=each_wheel(np.zeros(len(rig.wheels)) if rig.lengths is None else rig.lengths),
             soil=np.broadcast_to(np.asarray(soil)[:, None, None], (6, *shape)),
             demand=none + np.inf,
             slip_limit=slips,

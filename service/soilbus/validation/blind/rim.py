@@ -40,7 +40,7 @@ def rim_forces(
     entry angle; the exit angle `leave` [rad]; the height [m] of lugs whose `sides` shear
     soil; how far [m] beyond the rim their `tip` shears it.
     """
-    entry, slip, r, b, K_L, n, tan_phi, c, K = (np.asarray(a, float) for a in state)
+    entry, slip, r, b, K_L, n, tan_phi, c, K = (np.asarray(a, float) for a in state[:9])
     carry = pressure or (lambda depth: K_L * depth**n)
     top = np.asarray(peak) * entry
     total = np.zeros((3, *np.broadcast_shapes(*(a.shape for a in (entry, slip, r, K_L, top, np.asarray(leave))))))

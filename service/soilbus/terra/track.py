@@ -1,0 +1,247 @@
+"""One track on soil: load, drawbar pull and sprocket torque with their derivatives, in closed form.
+
+    sinkage       z = r (1 - cos theta)
+    pressure      p = K_L z^n                  uniform over the contact of length L and width b
+    load          W = b L p
+    thrust        F = b int_0^L (c + p tan phi) f(s x / K) dx = (b L c + W tan phi) g(s L / K)
+    resistance    R = b int_0^z K_L zeta^n d zeta = b K_L z^(n+1) / (n+1)
+    drawbar pull  DP = F - R,    torque  T = F r
+
+The shear displacement of a track grows evenly from its front, j = s x, so that the mean of the mobilised share f over
+the contact is a function g of u = s L / K alone:
+
+    exponential   f = 1 - exp(-j/K)     g = 1 - (1 - exp(-u)) / u
+    rational      f = (j/K) / (1 + j/K) g = 1 - log(1 + u) / u
+
+A track is described by the same state as a wheel: r is the pitch radius of the sprocket, slip s = 1 - V / (r omega),
+and the angle theta stands for the sinkage.  Losses inside the track are those of a drivetrain (effect
+drivetrain_loss).  A hard pan below the depth d adds pan_stiffness K_L (z^n - d^n) to the pressure.
+
+References
+----------
+Bekker 1956, Theory of Land Locomotion, and 1969, Introduction to Terrain-Vehicle Systems: compaction resistance.
+Wong, Theory of Ground Vehicles (4th ed. 2008), ch. 2: thrust and slip of a track with uniform pressure.
+Janosi & Hanamoto 1961 (1st Int. Conf. Mechanics of Soil-Vehicle Systems, Turin): exponential law, j = s x.
+Le, Rye & Durrant-Whyte 1997 (IEEE Int. Conf. Robotics and Automation, 2:1388): soil estimated from a track.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from soilbus.arrays import Array
+from soilbus.terra.wheel_state import WheelModel, WheelState
+
+__all__ = [
+    "MEAN_SHEAR",
+    "mean_exponential_shear",
+    "mean_rational_shear",
+    "track_forces",
+    "track_forces_and_jacobian",
+    "track_forces_and_slopes",
+    "track_load_and_slope",
+]
+
+SERIES_BELOW = 0.02
+"""u below which g and its derivative are power series: above, rounding costs them less than 1e-13 of their value."""
+SERIES_TERMS = 9
+"""Terms of these: the first one left out is below 1e-16 of the sum."""
+
+
+def _from_series(u: Array, near: Array, by_u: Array, coefficients: Sequence[float]) -> tuple[Array, Array]:
+    """An odd function of u and its derivative: `near` and by_u (N,) are those of |u|, small u from sum a_k |u|^k."""
+    x = np.abs(u)
+    small = np.minimum(x, SERIES_BELOW)
+    value, slope = np.zeros_like(x), np.zeros_like(x)
+    for k in range(len(coefficients), 0, -1):
+        value = (value + coefficients[k - 1]) * small
+        slope = slope * small + k * coefficients[k - 1]
+    is_small = x < SERIES_BELOW
+    return np.copysign(np.where(is_small, value, near), u), np.where(is_small, slope, by_u)
+
+
+def _inverse_factorials() -> tuple[float, ...]:
+    found, factorial = [], 1.0
+    for k in range(1, SERIES_TERMS + 1):
+        factorial *= k + 1
+        found.append((-1.0) ** (k + 1) / factorial)
+    return tuple(found)
+
+
+_OF_EXPONENTIAL = _inverse_factorials()
+_OF_RATIONAL = tuple((-1.0) ** (k + 1) / (k + 1) for k in range(1, SERIES_TERMS + 1))
+
+
+def mean_exponential_shear(u: Any) -> tuple[Array, Array]:
+    """Mean of the exponential law over a contact along which j/K grows from 0 to u, and its derivative by u.
+
+    Odd in u, so that skid brakes.
+
+    Examples
+    --------
+    >>> share, slope = mean_exponential_shear(1.0)
+    >>> round(float(share), 6), round(float(slope), 6)
+    (0.367879, 0.264241)
+    """
+    u = np.asarray(u, float)
+    x = np.maximum(np.abs(u), SERIES_BELOW)
+    risen = -np.expm1(-x)
+    return _from_series(u, 1.0 - risen / x, (risen - x * np.exp(-x)) / x**2, _OF_EXPONENTIAL)
+
+
+def mean_rational_shear(u: Any) -> tuple[Array, Array]:
+    """As mean_exponential_shear(), of the rational law.
+
+    Examples
+    --------
+    >>> share, slope = mean_rational_shear(1.0)
+    >>> round(float(share), 6), round(float(slope), 6)
+    (0.306853, 0.193147)
+    """
+    u = np.asarray(u, float)
+    x = np.maximum(np.abs(u), SERIES_BELOW)
+    log = np.log1p(x)
+    return _from_series(u, 1.0 - log / x, (log - x / (1.0 + x)) / x**2, _OF_RATIONAL)
+
+
+MEAN_SHEAR: dict[str, Callable[[Any], tuple[Array, Array]]] = {
+    "exponential": mean_exponential_shear,
+    "rational": mean_rational_shear,
+}
+"""Means of soil_laws.SHEAR_LAWS over a track, by the same names."""
+
+
+class _Pressed(NamedTuple):
+    """Sinkage z and, over K_L, the pressure and its integral over the depth; (N,).
+
+    by_angle, by_n: derivatives (pressure, integral) of both.  over, over_integral: what the soil below the pan's depth
+    adds for a pan_stiffness of 1.
+    """
+
+    pressure: Array
+    integral: Array
+    by_angle: tuple[Array, Array]
+    by_n: tuple[Array, Array]
+    over: Array
+    over_integral: Array
+    by_depth: tuple[Array, Array]
+
+
+def _power(z: Any, n: Any) -> tuple[Any, Any, Any, Any]:
+    """z^n and its integral from 0 to z, and the derivatives of both by n."""
+    power, log = z**n, np.log(np.maximum(z, 1e-300))
+    integral = power * z / (n + 1.0)
+    return power, integral, power * log, integral * (log - 1.0 / (n + 1.0))
+
+
+def _pressed(state: WheelState, model: WheelModel) -> _Pressed:
+    half, n = state.entry_angle / 2.0, state.n
+    z, by_angle = 2.0 * state.radius * np.sin(half) ** 2, state.radius * np.sin(state.entry_angle)
+    pressure, integral, pressure_by_n, integral_by_n = _power(z, n)
+    steep = n * z ** (n - 1.0)
+    k, d = model.pan_stiffness, model.pan_depth
+    deep = np.maximum(z, d)
+    at_pan, to_pan, at_pan_by_n, to_pan_by_n = _power(d, n)
+    below, to_below, below_by_n, to_below_by_n = _power(deep, n)
+    over, over_integral = below - at_pan, to_below - to_pan - at_pan * (deep - d)
+    sill = np.where(z > d, n * d ** (n - 1.0) if d else 0.0, 0.0)
+    return _Pressed(
+        pressure + k * over,
+        integral + k * over_integral,
+        ((steep + k * np.where(z > d, n * deep ** (n - 1.0), 0.0)) * by_angle, (pressure + k * over) * by_angle),
+        (
+            pressure_by_n + k * (below_by_n - at_pan_by_n),
+            integral_by_n + k * (to_below_by_n - to_pan_by_n - at_pan_by_n * (deep - d)),
+        ),
+        over,
+        over_integral,
+        (-k * sill, -k * sill * (deep - d)),
+    )
+
+
+def _mean_mobilised(u: Array, model: WheelModel) -> tuple[Array, Array]:
+    """Mean of the mobilised share of the shear strength along the track, and its derivative by u = s L / K."""
+    share, slope = MEAN_SHEAR[model.shear_law](u)
+    if not model.exponential_share:
+        return share, slope
+    w, (other, other_slope) = model.exponential_share, MEAN_SHEAR["exponential"](u)
+    return (1.0 - w) * share + w * other, (1.0 - w) * slope + w * other_slope
+
+
+def _columns(state: WheelState, model: WheelModel, shape: Sequence[str]) -> Iterator[tuple[Any, Any, Any]]:
+    """Load, thrust and resistance (N,), then their derivatives by wheel.INPUTS and by some of wheel.SHAPE."""
+    _, slip, _, width, K_L, _, tan_phi, c, K, length = state
+    at, area, u = _pressed(state, model), width * length, slip * length / K
+    share, slope = _mean_mobilised(u, model)
+    load, resistance = area * K_L * at.pressure, width * K_L * at.integral
+    strength = area * c + load * tan_phi
+
+    def pressing(pressure: Any, integral: Any) -> tuple[Any, Any, Any]:
+        """Of a change of pressure and of its integral over the depth, both over K_L."""
+        more = area * K_L * pressure
+        return more, tan_phi * share * more, width * K_L * integral
+
+    none = np.zeros_like(load)
+    yield load, strength * share, resistance
+    yield pressing(*at.by_angle)
+    yield none, strength * slope * length / K, none
+    yield load / K_L, tan_phi * share * load / K_L, resistance / K_L
+    yield pressing(*at.by_n)
+    yield none, load * share, none
+    yield none, area * share, none
+    yield none, -strength * slope * u / K, none
+    for name in shape:
+        if name == "exponential_share":
+            yield none, strength * (MEAN_SHEAR["exponential"](u)[0] - MEAN_SHEAR[model.shear_law](u)[0]), none
+        elif name == "pan_stiffness":
+            yield pressing(at.over, at.over_integral)
+        elif name == "pan_depth":
+            yield pressing(*at.by_depth)
+        elif name == "length":
+            yield load / length, strength * (share + slope * u) / length, none
+        else:  # where the stress of a rim peaks and where it ends
+            yield none, none, none
+
+
+def _forces(columns: Iterator[tuple[Any, Any, Any]], radius: Any, n_samples: int, n_columns: int) -> Array:
+    """W, DP and T (3, n_columns, N) of loads, thrusts and resistances."""
+    out = np.empty((3, n_columns, n_samples))
+    for i in range(n_columns):
+        load, thrust, resistance = next(columns)
+        out[0, i], out[1, i], out[2, i] = load, thrust - resistance, thrust * radius
+    return out
+
+
+def track_forces(state: WheelState, model: WheelModel) -> Array:
+    """Load W [N], drawbar pull DP [N] and sprocket torque T [N m] of tracks (3, N).
+
+    Parameters
+    ----------
+    state
+        Angles (N,), slips (N,), geometry and soil, each (N,) or a float; length > 0.
+    model
+        Shear law and hard pan; the shape of a rim's contact does not matter.
+    """
+    return np.asarray(_forces(_columns(state, model, ()), state.radius, len(state.entry_angle), 1)[:, 0])
+
+
+def track_forces_and_jacobian(state: WheelState, model: WheelModel, shape: Sequence[str] = ()) -> Array:
+    """Forces and their derivatives by wheel.INPUTS and some of wheel.SHAPE or the length (3 + 21 + 3 D, N)."""
+    n_columns, n = 8 + len(shape), len(state.entry_angle)
+    found = _forces(_columns(state, model, shape), state.radius, n, n_columns)
+    return np.concatenate([found[:, 0], found[:, 1:].reshape(3 * n_columns - 3, n)])
+
+
+def track_forces_and_slopes(state: WheelState, model: WheelModel) -> Array:
+    """Forces and their derivatives by angle and slip (3 + 6, N)."""
+    n = len(state.entry_angle)
+    found = _forces(_columns(state, model, ()), state.radius, n, 3)
+    return np.concatenate([found[:, 0], found[:, 1:].reshape(6, n)])
+
+
+def track_load_and_slope(state: WheelState, model: WheelModel) -> Array:
+    """Load and its derivative by the angle (2, N)."""
+    return np.asarray(_forces(_columns(state, model, ()), state.radius, len(state.entry_angle), 2)[0])

@@ -1,0 +1,189 @@
+"""A crawler with two tracks from its configuration to soil and capability."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from soilbus.config.file import load_config
+from soilbus.config.model import ConfigError
+from soilbus.decision.balance import Duty, balance
+from soilbus.decision.capability import Demand, assess, slip_grid
+from soilbus.decision.wheels import wheel_table
+from soilbus.estimation.assembly import model_of, possible_effects, rig_of
+from soilbus.estimation.nuisance_parameters import Free
+from soilbus.estimation.observation_model import ObservationModel, ObservationModelWithEffects
+from soilbus.estimation.posterior import Posterior
+from soilbus.simulator.drive import drive
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.soils import SOILS
+from soilbus.terra.wheel import Soil, WheelModel
+from soilbus.validation.driven_windows import errors, tracker_of, windows
+
+CRAWLER = Path(__file__).parents[1] / "field" / "tracked.toml"
+WITH_CELLS = (
+    "track.L.load=WheelLoads.FL", "track.R.load=WheelLoads.FR", "noise.load.relative=0.01", "noise.load.gain=0.005",
+)  # fmt: skip
+WEIGHT, R, B, L, MOST = 4500.0 * 9.80665, 0.30, 0.35, 1.6, 8000.0
+LOAM = SOILS["loam"]
+
+
+def crawler(*overrides):
+    return load_config(CRAWLER, overrides)
+
+
+def pulling(soil="loam", duration=14.0):
+    """A draft that swings from little to what the driver lets the tracks slip by 0.2 to 0.4 for."""
+    return Scenario(duration, (Patch(0.0, soil),), draft=Swing(1000.0, 22000.0), lift_slip=Swing(0.2, 0.4))
+
+
+def by_hand(soil: Soil, slip: float) -> tuple[float, float, float]:
+    """Pull [N] of the vehicle, torque [N m] and sinkage [m] of each track, from the formulas in terra.track's head."""
+    p, K_L, u = WEIGHT / (2.0 * B * L), soil.k_c / B + soil.k_phi, slip * L / soil.K
+    z = (p / K_L) ** (1.0 / soil.n)
+    thrust = B * L * (soil.c + p * math.tan(soil.phi)) * (1.0 - (1.0 - math.exp(-u)) / u)
+    return 2.0 * (thrust - B * p * z / (soil.n + 1.0)), thrust * R, z
+
+
+def test_tracks_are_a_rig_of_wheels_with_a_length():
+    rig = rig_of(crawler())
+    assert rig.wheels == ("L", "R")
+    assert rig.length.tolist() == [L, L]
+    assert rig.chassis.on_tracks
+    assert rig.max_lateral is not None  # it steers by skidding
+
+
+def test_wheels_have_no_length():
+    assert rig_of(reference_configuration()).lengths is None
+
+
+def test_an_effect_of_tyres_is_not_for_tracks():
+    assert not any(effect.of_tyre for effect in possible_effects(crawler()))
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("track.L.contact_length=160", "is it in cm"),
+        ("track.L.radius=0.3", "unknown key"),
+        ("track.R.axle=front", "give the axle of all [[track]]s"),
+        ("track.L.name=R", "two wheels are named R"),
+    ],
+)
+def test_faults_of_a_track_are_said_by_its_keys(override, said):
+    with pytest.raises(ConfigError, match=r".") as fault:
+        crawler(override)
+    assert said in str(fault.value)
+
+
+def test_the_simulated_crawler_obeys_its_formulas():
+    truth = drive(crawler(), pulling(), seed=3).columns
+    pull = truth["drawbar_pull.L"] + truth["drawbar_pull.R"]
+    assert pull == pytest.approx(truth["draft"] + 4500.0 * truth["acceleration"], abs=1e-3)
+    for name in "LR":
+        p, u = truth[f"load.{name}"] / (B * L), truth[f"slip.{name}"] * L / LOAM.K
+        z = (p / (LOAM.k_c / B + LOAM.k_phi)) ** (1.0 / LOAM.n)
+        mobilised = np.sign(u) * (1.0 + np.expm1(-np.abs(u)) / np.abs(u))
+        assert truth[f"sinkage.{name}"] == pytest.approx(z, rel=1e-6)
+        assert truth[f"torque.{name}"] == pytest.approx(
+            R * B * L * (LOAM.c + p * math.tan(LOAM.phi)) * mobilised, rel=1e-6, abs=1e-3
+        )
+
+
+@pytest.mark.parametrize("cells", [(), WITH_CELLS], ids=["weight alone", "load cells"])
+def test_a_drive_with_swinging_draft_gives_the_soil(cells):
+    config, found = crawler(*cells), []
+    for seed in range(3):
+        tracker, output = tracker_of(config), None
+        for window, end in windows(config, simulate(config, pulling(), seed)):
+            output = tracker.estimate(window, end)
+        assert output is not None
+        assert output.fit is not None
+        found.append(errors(output.fit.posterior, LOAM))
+    assert np.abs(found).max() < 3.0  # of bearing pressure and tan phi, in their sd
+    assert np.sqrt(np.square(found).mean()) < 2.0
+
+
+def observed(config, cls=ObservationModel, **more):
+    window, _ = next(windows(config, simulate(config, pulling(duration=11.0), 1)))
+    return cls(window, rig_of(config), model_of(config), config.estimator.min_speed, **more)
+
+
+def test_residuals_by_the_soil_equal_differences():
+    problem = observed(crawler(*WITH_CELLS))
+    start = problem.start(LOAM)
+    gains = np.zeros(len(problem.gain_std))
+    at = problem.linearise(LOAM, gains, start)
+    for i, (name, value) in enumerate(LOAM._asdict().items()):
+        step = 1e-4 * value
+        up, down = (
+            problem.linearise(soil, gains, problem.with_entry_angles(start, soil)).rows[:, 0]
+            for soil in (LOAM._replace(**{name: value + step}), LOAM._replace(**{name: value - step}))
+        )
+        column = at.rows[:, 1 + i]
+        assert column == pytest.approx((up - down) / (2.0 * step), abs=5e-3 * np.abs(column).max()), name
+
+
+@pytest.mark.parametrize("parameter", ["slip_sinkage.softening", "bulldozing.cohesive_factor", "hardpan.stiffness"])
+def test_residuals_by_an_effect_equal_differences(parameter):
+    name, _, key = parameter.partition(".")
+    effect = CATALOGUE[name]
+    values = {p.name: max(p.neutral, 1e-3 * p.std) for p in effect.parameters} | {
+        "depth": 0.003
+    }  # above the ruts' floor
+    free = tuple(Free(name, p, None, values[p.name], p.std if p.name == key else 0.0) for p in effect.parameters)
+    problem = observed(crawler(*WITH_CELLS), ObservationModelWithEffects, effects=(effect,), free=free)
+    place = problem.n_sensors + [p.name for p in effect.parameters].index(key)
+    gains, step = np.zeros(len(problem.gain_std)), np.eye(len(problem.gain_std))[place] * 1e-3
+    start = problem.start(LOAM, None, gains)
+    at = problem.linearise(LOAM, gains, start)
+    up, down = (problem.linearise(LOAM, g, problem.with_entry_angles(start, LOAM, g)).rows[:, 0]
+                for g in (gains + step, gains - step))  # fmt: skip
+    column = at.rows[:, 7 + place]
+    assert np.abs(column).max() > 0.0
+    assert column == pytest.approx((up - down) / 2e-3, abs=1e-2 * np.abs(column).max())
+
+
+@pytest.mark.parametrize("name", ["loam", "wet_clay", "dry_sand"])
+def test_the_balance_over_slip_equals_the_formulas(name):
+    rig = rig_of(crawler())
+    found = balance(wheel_table(np.array([SOILS[name]]), rig, WheelModel(), slip_grid(0.6)), Duty())
+    for i in range(0, len(found.slip), 20):  # at the slips of the grid
+        pull, torque, z = by_hand(SOILS[name], found.slip[i])
+        assert found.pull[0, i] == pytest.approx(pull, abs=1e-6 * WEIGHT)
+        assert found.torque[0, :, i] == pytest.approx(torque, rel=1e-5)
+        assert R * (1.0 - np.cos(found.angle[0, :, i])) == pytest.approx(z, rel=1e-5)
+
+
+def capability(soil, limit=math.inf, demand=None):
+    exactly = Posterior(soil, np.zeros((6, 6)))
+    limits = np.full(2, limit if math.isfinite(limit) else np.nan)
+    return assess(exactly, rig_of(crawler()), WheelModel(), demand, limits, 0.6, 0.25)[0]
+
+
+@pytest.mark.parametrize("name", ["loam", "wet_clay", "dry_sand"])
+def test_the_largest_draft_is_that_of_the_formulas(name):
+    found = capability(SOILS[name])
+    assert found.max_draft.value == pytest.approx(by_hand(SOILS[name], 0.6)[0], rel=1e-4)
+
+
+def test_a_torque_limit_ends_the_draft_where_root_finding_says():
+    found = capability(LOAM, 3000.0)
+    slip = brentq(lambda s: by_hand(LOAM, s)[1] - 3000.0, 1e-4, 0.6)
+    assert found.limit == "torque"
+    assert found.max_draft.value == pytest.approx(by_hand(LOAM, slip)[0], rel=1e-3)
+
+
+@pytest.mark.parametrize("pull", [12000.0, 16000.0, 22000.0])
+def test_the_slip_of_a_demand_is_that_of_root_finding(pull):
+    forecast = capability(LOAM, demand=Demand(pull, 0.0)).forecast
+    slip = brentq(lambda s: by_hand(LOAM, s)[0] - pull, 1e-4, 0.6)
+    assert forecast.slip.value == pytest.approx(slip, abs=5e-4)
+    assert forecast.sinkage["L"].value == pytest.approx(by_hand(LOAM, slip)[2], rel=1e-3)
