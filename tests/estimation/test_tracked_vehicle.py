@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from soilbus.can.channels import Column, Decoded
+from soilbus.can.mapping import load_databases
 from soilbus.config.file import load_config
 from soilbus.config.model import ConfigError
 from soilbus.decision.balance import Duty, balance
 from soilbus.decision.capability import Demand, assess, slip_grid
+from soilbus.decision.traversability import Status
 from soilbus.decision.wheels import wheel_table
 from soilbus.estimation.assembly import model_of, possible_effects, rig_of
 from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.observation_model import ObservationModel, ObservationModelWithEffects
 from soilbus.estimation.posterior import Posterior
+from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.drive import drive
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -187,3 +192,20 @@ def test_the_slip_of_a_demand_is_that_of_root_finding(pull):
     slip = brentq(lambda s: by_hand(LOAM, s)[0] - pull, 1e-4, 0.6)
     assert forecast.slip.value == pytest.approx(slip, abs=5e-4)
     assert forecast.sinkage["L"].value == pytest.approx(by_hand(LOAM, slip)[2], rel=1e-3)
+
+
+@pytest.mark.parametrize(("swing", "valid"), [(0.0, False), (0.15, True)])
+def test_a_track_at_one_load_is_not_excited(swing, valid):
+    config = crawler(*WITH_CELLS)
+    ground = replace(pulling("dry_sand", 20.0), side_shift=Swing(-swing, swing))
+    recording, pipeline = simulate(config, ground, seed=3), Pipeline(config, load_databases(config))
+    results = []
+    for since in np.arange(0.0, 20.0, 1.0):
+        part = {}
+        for name, column in recording.channels.items():
+            now = (column.t >= since) & (column.t < since + 1.0)
+            part[name] = Column(column.t[now], column.value[now])
+        pipeline.intake.add(Decoded(part))
+        results += pipeline.advance(since + 1.0)
+    assert len(results) >= 8
+    assert (Status.VALID in {result.status for result in results}) is valid
