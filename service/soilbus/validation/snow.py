@@ -5,8 +5,8 @@
     early      warnings that begin more than a second before the marked begin
 
 DIR holds what `shared/field/snow-convert.py` makes of a public data set: logs, DBC, configuration, and of each log the
-truth (begin and end of the immobilisation, the alarms of its author).  By this count the author's detector has 17 of 17,
-1.93 s and 8.  Each log goes through `replay`; a warning that only lasts does not begin again.
+truth (begin and end of the immobilisation, the alarms of its author).  By this count the author's detector has 17 of
+17, 1.93 s and 8.  Each log goes through `replay`; a warning that only lasts does not begin again.
 """
 
 from __future__ import annotations
