@@ -302,8 +302,6 @@ class Wheel(_Section):
     """A rigid wheel has no tyre that could flatten or wear."""
     driven: bool = True
     """false: it rolls freely, without any torque but the drag of its bearing."""
-    bearing_drag: Annotated[NonNegativeFloat, AfterValidator(SHARE)] = 0.005
-    """Sd of the torque of a wheel that is not driven, over its load and radius: bearing and seals."""
     gear_ratio: Annotated[PositiveFloat, AfterValidator(GEAR_RATIO)] = 1.0
     """Turns of the motor shaft for one of the wheel."""
     max_torque: Annotated[PositiveFloat, AfterValidator(WHEEL_TORQUE)] | None = None

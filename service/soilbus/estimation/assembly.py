@@ -197,9 +197,8 @@ def _with_instrumentation(rig: Rig, config: Config, computed: SensorNoise) -> Ri
     if all(np.array_equal([row.weight for row in rows], plain) and all(row.kind == "channel" for row in rows)
            for rows, _ in (torque, speed, load)):  # fmt: skip
         return rig
-    drag = np.array([w.bearing_drag for w in config.wheel])
     motors = tuple(group for group in groups["torque"] if len(group.wheels) > 1)
-    given = Instrumentation(torque[0], speed[0], load[0], couplings, ratio, drag, computed.relative, motors)
+    given = Instrumentation(torque[0], speed[0], load[0], couplings, ratio, computed.relative, motors)
     return replace(rig, instrumentation=given, names={"torque": torque[1], "speed": speed[1], "load": load[1]})
 
 

@@ -6,9 +6,9 @@ Each row of M is what one channel measures (a wheel, the sum over an axle, the m
 no channel is left, what is known without measuring:
 
     torque    T_left - T_right = 0       open differential, sd: its friction; unknown where it is locked
-              T = 0                      a wheel that is not driven, sd: drag of its bearing
+              T = 0                      a wheel that is not driven: solved for its slip, see `observation_model`
     speed     omega_left - omega_right   0, sd: SLIP_STD, nothing where the differential is locked
-              omega = V / r (1 - s)      a free wheel without sensor, until its torque row says better
+              omega = V / r (1 - s)      a wheel without sensor, until its torque says better
     load      sum W = m g cos(pitch)     and the shift to the front axle by pitch, acceleration and draft
               W_left - W_right           from the roll angle; sd: what uneven ground adds
 
@@ -104,9 +104,8 @@ class Instrumentation:
         W rows of each.
     couplings
         Differentials, and the shaft between the axles.
-    ratio, drag
-        (W,), turns of a motor of both axles for one of the wheel; sd of the torque of a free wheel over load and
-        radius.
+    ratio
+        (W,), turns of a motor of both axles for one of the wheel.
     load_noise
         Relative sd of a load that is not measured.
     motors
@@ -118,7 +117,6 @@ class Instrumentation:
     load: tuple[Row, ...]
     couplings: tuple[Coupling, ...]
     ratio: Array
-    drag: Array
     load_noise: float
     motors: tuple[Group, ...] = ()
 
@@ -347,9 +345,7 @@ def _torques(window: Window, rig: Rig, given: Instrumentation, load: Array) -> t
         weight = np.array(row.weight)
         if row.kind == "channel":
             torque[:, i], variance[:, i] = window.torque[:, row.at], window.variance["torque"][:, row.at]
-        elif row.kind == "free":
-            variance[:, i] = (given.drag[row.at] * grip[:, row.at]) ** 2
-        elif row.kind == "unknown":
+        elif row.kind in ("free", "unknown"):
             variance[:, i] = np.nan
     shares = _solved(given.torque, torque)
     for i, row in enumerate(given.torque):

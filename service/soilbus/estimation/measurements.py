@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.estimation.instrumentation import completed
+from soilbus.estimation.instrumentation import ROLLING_SLIP, completed
 from soilbus.estimation.local_cubics import Series
 from soilbus.estimation.window import WHEEL_QUANTITIES, Rig, Window, forward, turning
 from soilbus.terra.vehicle import GRAVITY
@@ -109,7 +109,8 @@ class Measurements:
         rim_speed = rig.radius * window.speed
         with np.errstate(invalid="ignore", divide="ignore"):
             slip = 1.0 - window.ground_speed[:, None] / rim_speed
-            usable = straight[:, None] & (window.load > 0.0) & (rim_speed > 0.0) & (slip < MAX_SLIP) & (slip > MIN_SLIP)
+            turns = (rim_speed > 0.0) & (slip < MAX_SLIP) & (slip > MIN_SLIP)
+            usable = straight[:, None] & (window.load > 0.0) & (turns | ~rig.drives)
         kept = np.flatnonzero(usable.any(axis=1))
         self.standstill = int(np.count_nonzero(~moving & np.isfinite(window.ground_speed)))
         self.turning = int(np.count_nonzero(moving & in_turn))
@@ -138,6 +139,9 @@ class Measurements:
         load, load_var, _ = take("load")
         speed, speed_var, _ = take("speed")
         self.ground_speed, self.ground_speed_var, _ = take("ground_speed")
+        self.rolls = ~rig.drives
+        rolling = self.ground_speed[:, None] / rig.radius / (1.0 - ROLLING_SLIP)
+        speed, speed_var = np.where(self.rolls, rolling, speed), np.where(self.rolls, 0.0, speed_var)
         self.load = np.where(usable, load, SUBSTITUTE_LOAD)
         self.speed = np.where(usable, speed, self.ground_speed[:, None] / (SUBSTITUTE_SPEED_RATIO * rig.radius))
         self.load_var, self.speed_var = np.where(usable, load_var, 0.0), np.where(usable, speed_var, 0.0)
@@ -149,7 +153,7 @@ class Measurements:
         self.gain_names, gain_std = gains_of(rig)
         self.gain_std = np.array(gain_std)
         self.n_sensors = len(self.gain_names)
-        self.slip = slip[kept]
+        self.slip = np.where(self.rolls, ROLLING_SLIP, slip[kept])
         self._latents_measured = np.concatenate([self.load, self.speed, self.ground_speed[:, None]], axis=1)
         if window.observations is None:
             self._measured = self._latents_measured

@@ -6,6 +6,7 @@ At each instant, with wheels w, soil, nuisance parameters g (sensor gains, effec
     r_T,w = T_w,measured / (1 + g_T,w) - T_w(soil, x)                      torque of each wheel [N m]
     r_D   = draft / (1 + g_D) + m (G sin(pitch) + a) - sum_w DP_w(soil, x)   draft balance [N]
     r_z,w = z_w,measured - z_w(soil, x)                                    sinkage of each wheel [m], if measured
+    T_w(soil, s_w, x) = 0                                                  fixes the slip of a wheel that is not driven
     x     = x_measured / (1 + g_x) + noise with covariance V               measured too
     W_w(soil, entry angle_w, x) = load_w                                   fixes the entry angle of each wheel
 
@@ -68,6 +69,11 @@ MAX_LOAD_ITERATIONS = 6
 """Secant steps to the entry angles that carry the loads under effects; no evidence recorded."""
 ENTRY_ANGLE_TOLERANCE = 0.01
 """Relative step of an entry angle after which these steps end; no evidence recorded."""
+MAX_ROLLING_SKID, MAX_ROLLING_STEP = 0.5, 0.05
+"""Largest skid (minus slip) of a free wheel, as in the capability, and the largest change of it in one step: its torque
+is curved within K over the contact's length of zero."""
+ROLLING_ROUNDS = 4
+"""Newton steps to the first slips of free wheels; each linearisation adds one."""
 TIME_TOLERANCE = 1e-3
 """Times [s] closer than this are those of one bin."""
 FORM_STRIDE = 4
@@ -226,6 +232,7 @@ class Linearisation:
     load_by_slip: Array
     load_by_soil: Array  # (6, N, W)
     load_by_effects: Array  # (P, N, W)
+    rolling_slip: Array  # (N, F) slips of the free wheels after a Newton step
 
     @property
     def chi2(self) -> float:
@@ -251,6 +258,7 @@ class Linearisation:
             load_by_slip=np.concatenate([self.load_by_slip[first:], new.load_by_slip]),
             load_by_soil=np.concatenate([self.load_by_soil[:, first:], new.load_by_soil], axis=1),
             load_by_effects=np.concatenate([self.load_by_effects[:, first:], new.load_by_effects], axis=1),
+            rolling_slip=np.concatenate([self.rolling_slip[first:], new.rolling_slip]),
         )
 
 
@@ -297,6 +305,21 @@ class Response(NamedTuple):
     by_effects: Array
     extra_pull: Array
     extra_pull_by_effects: Array
+
+    def rolling(self, free: NDArray[np.bool_]) -> Response:
+        """The response with the slips of free wheels (mask (W,)) eliminated by T = 0, to first order.
+
+        y <- y - (dy/ds) / (dT/ds) T for pull and sinkage and all their derivatives; nothing depends on their speeds.
+        """
+        torque = self.by_speed[1][:, free]
+        ratio = self.by_speed[:, :, free] / np.where(torque == 0.0, np.inf, torque)
+        for values in (self.value, self.by_load):
+            values[:, :, free] -= ratio * values[1][:, free]
+        for values in (self.by_soil, self.by_effects):
+            values[..., free] -= ratio[:, None] * values[1][..., free]
+        self.by_speed[:, :, free] = 0.0
+        self.by_ground[:, :, free] = 0.0
+        return self
 
 
 class DelayTerms(NamedTuple):
@@ -375,6 +398,9 @@ class ObservationModel(Measurements):
         torques, balance, sinkages = layout.torques, layout.balance, layout.sinkages
         self.work.instants += self.n
         at = self._response(soil, gains, latents)
+        rolling_slip = self._rolling_slip(at, latents)
+        if self.rolls.any():
+            at = at.rolling(self.rolls)
         A = self._by_observed(self._by_latents(at))
         torque = self.torque_rows(at.value[1])
 
@@ -438,7 +464,20 @@ class ObservationModel(Measurements):
             load_by_slip=at.load_by_slip,
             load_by_soil=at.load_by_soil,
             load_by_effects=at.load_by_effects,
+            rolling_slip=rolling_slip,
         )
+
+    def _rolling_slip(self, at: Response, latents: Latents) -> Array:
+        """Slips (N, F) of the F free wheels after one Newton step to T = 0."""
+        free = self.rolls
+        if not free.any():
+            return np.zeros((self.n, 0))
+        rim = self.rig.radius[free] * latents.speed[:, free]
+        ratio = latents.ground_speed[:, None] / rim  # 1 - slip
+        by_slip = at.by_speed[1][:, free] * latents.speed[:, free] / ratio
+        step = np.where(by_slip > 0.0, -at.value[1][:, free] / np.where(by_slip > 0.0, by_slip, 1.0), -MAX_ROLLING_STEP)
+        slip = 1.0 - ratio + np.clip(step, -MAX_ROLLING_STEP, MAX_ROLLING_STEP)
+        return np.asarray(np.clip(slip, -MAX_ROLLING_SKID, 0.0))
 
     def _response(self, soil: Soil, gains: Array, latents: Latents) -> Response:
         """Response of the wheels with the entry angle eliminated: it follows from the latent load."""
@@ -575,6 +614,9 @@ class ObservationModel(Measurements):
             new += np.tensordot(gain_step[layout.effects], at.by_delay, 1)
         new = self.from_observed(new)
         load, speed, ground = new[:, layout.loads], new[:, layout.speeds], new[:, layout.ground_speed]
+        if self.rolls.any():
+            speed = speed.copy()
+            speed[:, self.rolls] = ground[:, None] / (self.rig.radius[self.rolls] * (1.0 - at.rolling_slip))
         slip_change = (latents.ground_speed[:, None] / latents.speed - ground[:, None] / speed) / self.rig.radius
         more = load - latents.load - at.load_by_slip * slip_change
         return Latents(
@@ -704,7 +746,22 @@ class ObservationModel(Measurements):
         angle = entry_angle_for_load(latents.load.ravel(), state, self.model, tolerance=START_LOAD_TOLERANCE)
         angle = angle.reshape(self.n, self.n_wheels)
         angle = np.where(np.isfinite(angle), angle, MAX_ENTRY_ANGLE * 0.98)
-        return Latents(latents.load, latents.speed, latents.ground_speed, angle)
+        solved = Latents(latents.load, latents.speed, latents.ground_speed, angle)
+        return self._rolled(solved, soil) if self.rolls.any() else solved
+
+    def _rolled(self, latents: Latents, soil: Soil) -> Latents:
+        """The latents with the speeds and entry angles at which the free wheels need no torque, nearly."""
+        free, no_gains = self.rolls, np.zeros(self.n_sensors)
+        for _ in range(ROLLING_ROUNDS):
+            at = ObservationModel._response(self, soil, no_gains, latents)
+            slip, speed, angle = self._rolling_slip(at, latents), latents.speed.copy(), latents.entry_angle.copy()
+            before = 1.0 - latents.ground_speed[:, None] / (self.rig.radius[free] * latents.speed[:, free])
+            speed[:, free] = latents.ground_speed[:, None] / (self.rig.radius[free] * (1.0 - slip))
+            short = at.load_residual[:, free] - at.load_by_slip[:, free] * (slip - before)
+            factor = np.clip(1.0 + short / at.load_slope[:, free] / angle[:, free], 0.8, 1.25)
+            angle[:, free] = np.minimum(angle[:, free] * factor, MAX_ENTRY_ANGLE)
+            latents = Latents(latents.load, speed, latents.ground_speed, angle)
+        return latents
 
     def thinned(self, max_instants: int) -> ObservationModel:
         """The same window with at most `max_instants` of its usable instants, evenly spread."""
