@@ -206,6 +206,31 @@ def test_nothing_towed_is_a_draft_of_zero_and_not_an_unknown_one(tmp_path):
     assert (problem.draft == 0.0).all()
 
 
+def test_a_value_that_is_missing_leaves_what_does_not_follow_from_it(tmp_path):
+    rig = rig_of(configured(tmp_path, without(PLAIN, "load")))
+    whole = window_of(configured(tmp_path, without(PLAIN, "load")), rig)
+    torque, speed = whole.torque.copy(), whole.speed.copy()
+    torque[7, 1] = speed[9, 2] = np.nan
+    one, other = completed(replace(whole, torque=torque, speed=speed), rig), completed(whole, rig)
+    assert np.argwhere(np.isnan(one.torque)).tolist() == [[7, 1]]
+    assert np.argwhere(np.isnan(one.speed)).tolist() == [[9, 2]]
+    known = np.isfinite(one.speed)
+    assert one.speed[known] == pytest.approx(other.speed[known])
+    assert np.isfinite(one.variance["speed"][known]).all()
+
+
+def test_wheels_on_a_differential_of_one_measured_speed_are_all_missing_with_it(tmp_path):
+    config = configured(tmp_path, rear_driven())
+    rig = rig_of(config)
+    whole = window_of(config, rig)
+    rear = [rig.wheels.index("RL"), rig.wheels.index("RR")]
+    speed = whole.speed.copy()
+    speed[5, rear] = np.nan  # the motor's, in the column of its first wheel
+    one = completed(replace(whole, speed=speed), rig)
+    assert np.isnan(one.speed[5, rear]).all()
+    assert np.isfinite(one.speed[5, [rig.wheels.index("FL"), rig.wheels.index("FR")]]).all()
+
+
 def test_a_free_wheel_rolls_at_the_slip_that_needs_no_torque(tmp_path):
     config = configured(tmp_path, rear_driven())
     rig = rig_of(config)

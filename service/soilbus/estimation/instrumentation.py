@@ -41,6 +41,8 @@ LOCKED_STD = 1e-3
 """Relative sd of speeds that a shaft makes equal: backlash and twist."""
 LEAST_TORQUE = 0.05
 """Torque over load and radius that a differential's friction counts at least, and that of a coasting vehicle."""
+LEAST_WEIGHT = 1e-12
+"""Weight below which an entry of an inverse is rounding: its rows hold ones, halves and gear ratios' shares."""
 
 
 class Group(NamedTuple):
@@ -223,7 +225,7 @@ def completed(window: Window, rig: Rig) -> Window:
     ):  # fmt: skip
         inverse = np.linalg.inv(np.array([row.weight for row in rows]))
         known = np.where(np.isfinite(of_rows), of_rows, np.nan if quantity != "torque" else 0.0)
-        variance[quantity] = known @ (inverse**2).T
+        variance[quantity] = _combined(known, inverse**2)
     return replace(window, torque=torque, speed=speed, load=load, variance=variance, observations=observations)
 
 
@@ -232,7 +234,7 @@ def with_speeds(window: Window, rig: Rig, speed: Array) -> Window:
     given, observations = rig.instrumentation, window.observations
     if given is not None and observations is not None:
         W, value = len(rig.wheels), observations.value.copy()
-        value[:, W : 2 * W] = speed @ np.array([row.weight for row in given.speed]).T
+        value[:, W : 2 * W] = _combined(speed, np.array([row.weight for row in given.speed]))
         observations = observations._replace(value=value)
     return replace(window, speed=speed, observations=observations)
 
@@ -258,7 +260,16 @@ def _of_vehicle(window: Window, rig: Rig) -> Window:
 
 def _solved(rows: Sequence[Row], observed: Array) -> Array:
     """Values of the wheels (N, W) from those of the rows (N, W)."""
-    return np.asarray(np.linalg.solve(np.array([row.weight for row in rows]), observed.T).T)
+    return _combined(observed, np.linalg.inv(np.array([row.weight for row in rows])))
+
+
+def _combined(values: Array, weight: Array) -> Array:
+    """Weighted sums (N, W) of values (N, W); nan where a value with a weight is nan, whatever those without one are."""
+    unknown = np.isnan(values)
+    sums = np.where(unknown, 0.0, values) @ weight.T
+    if unknown.any():
+        sums[(unknown.astype(float) @ (np.abs(weight) > LEAST_WEIGHT).astype(float).T) > 0.0] = np.nan
+    return np.asarray(sums)
 
 
 def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Array, Array]:
