@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -261,10 +262,13 @@ def test_the_same_slope_loads_the_same_axle_forward_and_in_reverse(tmp_path):
 def test_intervals_hold_the_truth_on_shaking_loads_without_cells(machine, tmp_path):
     """Another generator: loads that shake by 13 %; mass, centre of gravity, c and K drawn as their priors say.
 
-    Larger: 10 seeds each, three soils: pressure covered in 0.97 to 1.00, tan phi in 0.90 to 0.97, of 30 windows each.
+    SOILBUS_SEEDS=10 pytest -s: rms of the errors in sd, and share in the intervals, of so many times the windows.
     """
     off = []
-    for seed, ground in ((0, shaking.LOAM), (1, shaking.CLAY), (2, shaking.STUBBLE), (3, shaking.LOAM)):
+    grounds = (shaking.LOAM, shaking.CLAY, shaking.STUBBLE, shaking.LOAM)
+    many = int(os.environ.get("SOILBUS_SEEDS", "1"))
+    for seed in range(4 * many):
+        ground = grounds[seed % 4]
         rng = np.random.default_rng([seed, 7])
         of_c, of_K, of_mass, of_cg = np.exp(0.2 * rng.standard_normal(2)).tolist() + rng.standard_normal(2).tolist()
         config = configured(
@@ -280,7 +284,8 @@ def test_intervals_hold_the_truth_on_shaking_loads_without_cells(machine, tmp_pa
             tan_phi, pressure = result.posterior.tan_phi(), result.bearing
             off.append((tan_phi.value - np.tan(ground.phi)) / tan_phi.std)
             off.append(np.log(pressure.value / ground.bearing_pressure()) * pressure.value / pressure.std)
-    assert len(off) == 24
+    assert len(off) == 24 * many
+    print(f"{machine}: rms {np.sqrt(np.mean(np.square(off))):.2f} sd, {np.mean(np.abs(off) < 1.96):.3f} of {len(off)}")
     assert np.mean(np.abs(off) < 1.96) >= 0.85  # at 0.95 each, fewer than 21 of 24 happen once in 30
     assert 0.3 < np.sqrt(np.mean(np.square(off))) < 1.4
 
