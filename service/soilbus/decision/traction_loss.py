@@ -196,24 +196,43 @@ def missing_pull(loss: TractionLoss, curve: OverSlip, noise: NoiseOfChannels, de
 
 
 def excess_slip(loss: TractionLoss, predicted: Estimate, config: Config, deviations: float) -> float:
-    """Slip beyond the one predicted for the present demand, where the present pull is not known; else 0.
+    """Slip beyond the predicted one, as far as it is significant; else 0.
 
     Parameters
     ----------
     loss
         With the present slip.
     predicted
-        Slip that the demand needs.
+        Slip that the present pull needs (`slip_needed`), or where that is not known the present demand.
     config
         Gain errors of both speeds; slip by uneven ground.
     deviations
-        Standard deviations of the difference that are subtracted.
+        Standard deviations of the innovation that are subtracted.
     """
-    if math.isfinite(loss.pull) or not math.isfinite(loss.slip):
+    if not math.isfinite(loss.slip):
         return 0.0
     of_gains = (1.0 - loss.slip) * math.hypot(config.noise.speed.gain, config.noise.ground_speed.gain)
     sd = math.hypot(predicted.std, of_gains, config.warning.slip_noise)
     return max(loss.slip - predicted.value - deviations * sd, 0.0)
+
+
+def slip_needed(pull: float, curve: OverSlip, noise: NoiseOfChannels) -> Estimate | None:
+    """The least slip that gives a pull [N]; None where none does, or where slip hardly changes the pull.
+
+    Notes
+    -----
+    ds = dP / (dP/ds), with the curve's std and the draft's gain error in dP.
+    """
+    known = np.isfinite(curve.pull)
+    slips, pulls, stds = curve.slip[known], curve.pull[known], curve.pull_std[known]
+    if len(slips) < 2 or not pull < pulls.max():
+        return None
+    i = max(int(np.argmax(pulls > pull)), 1)
+    slope = float((pulls[i] - pulls[i - 1]) / (slips[i] - slips[i - 1]))
+    if slope <= 0.0:
+        return None
+    slip = max(float(slips[i] - (pulls[i] - pull) / slope), 0.0)
+    return Estimate(slip, math.hypot(float(np.interp(slip, slips, stds)), noise.draft.gain * pull) / slope)
 
 
 def idle(window: Window, rig: Rig, since: float, before: NDArray[np.bool_]) -> NDArray[np.bool_]:
