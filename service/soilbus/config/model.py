@@ -709,6 +709,9 @@ class Warning(_Section):
     """Of either, from which it counts."""
     least_slip: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.18
     """Slip below which a vehicle that loses speed is only slowed down."""
+    least_thrust: NonNegativeFloat = 0.03
+    """Thrust, as a share of the weight, from which wheels drive the vehicle: rolling resistance on a road is less
+    (0.02, Wong 2008, table 1.3)."""
     thrust_held: Annotated[float, Field(gt=0.0, le=1.0)] = 0.9
     """Share of its mean over `thrust_time` that thrust keeps where the ground, not the driver, stops the vehicle."""
     thrust_time: PositiveFloat = 1.0

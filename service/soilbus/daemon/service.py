@@ -32,7 +32,7 @@ from soilbus.daemon.notify import Notifier
 from soilbus.daemon.tick_phase import next_tick
 from soilbus.daemon.totals import totals
 from soilbus.daemon.work_queue import WorkQueue, wait_for
-from soilbus.decision.immobilisation import Alert, Watch, has_cause, watched, with_loss
+from soilbus.decision.immobilisation import Alert, Watch, ended, has_cause, watched, with_loss
 from soilbus.decision.judgement import Basis, at_present
 from soilbus.decision.traction_loss import NO_LOSS, observed
 from soilbus.decision.traversability import State, Status, Traversability
@@ -371,7 +371,8 @@ class Service:
         self._warned = has_cause(self._watch, self._loss, self.config.warning.hold)
         decision = self.present_decision(now)
         if decision.state is State.GO and warning.warning is Alert.IMMOBILISATION:
-            warning = replace(warning, warning=Alert.NONE)
+            self._watch = ended(self._watch)
+            warning = with_loss(self._watch, self._loss, self._time.at(now))
         known = decision.state is not State.UNKNOWN
         window = self.result.index % WINDOW_MODULUS if self.result is not None else None
         for message, values in slip_frames(latest.slip):

@@ -383,6 +383,11 @@ def has_cause(watch: Watch, loss: TractionLoss, hold: float) -> bool:
     return loss.warns or (watch.warning is Alert.IMMOBILISATION and watch.t - watch.caused < hold)
 
 
+def ended(watch: Watch) -> Watch:
+    """The watch after a decision is go: a warning that only lasts is over, and begins anew with a new cause only."""
+    return replace(watch, caused=-math.inf, warning=Alert.NONE)
+
+
 class Warnings(NamedTuple):
     """When warnings began [s]: the present one (None without), and those since the last window, ended or not."""
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from soilbus.config.model import Config
 from soilbus.config.model import Traversability as Settings
 from soilbus.decision.capability import Capability, Demand, assess
-from soilbus.decision.traction_loss import TractionLoss, excess_slip, missing_pull
+from soilbus.decision.traction_loss import TractionLoss, excess_slip, missing_pull, slip_needed
 from soilbus.decision.traversability import State, Status, Traversability, state_of
 from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.wheels import WheelTable
@@ -139,7 +139,8 @@ def at_present(
     - with a wheel that spins, or while immobilisation is warned of: no better than caution;
     - data older than `max_age`, or on ground further back than the wheelbase: unknown;
     - wheels that pull less at their present slip than the estimate predicts: the spare pull is reduced by the miss;
-    - wheels that slip more than the forecast, where the present pull is not known: no better than caution;
+    - wheels that slip more than the present pull needs by the estimate, or the forecast where that pull is not known:
+      no better than caution;
     - with less than `min_share` of a window measured since a wheel last spun: no better than caution.
 
     Parameters
@@ -177,7 +178,10 @@ def at_present(
         if left < settings.go:
             return replace(decision, state=State.CAUTION, probability=left, contradicted="slip")
         forecast = decision.capability.forecast
-        if forecast is not None and excess_slip(loss, forecast.slip, config, settings.contradiction) > 0.0:
+        predicted = None if forecast is None else forecast.slip
+        if math.isfinite(loss.pull):
+            predicted = slip_needed(loss.pull, decision.capability.over_slip, config.noise)
+        if predicted is not None and excess_slip(loss, predicted, config, settings.contradiction) > 0.0:
             return replace(decision, state=State.CAUTION, probability=None, contradicted="slip")
     measured = np.count_nonzero(basis.instants > loss.last) * basis.each
     if decision.state is State.GO and measured < settings.min_share * config.estimator.window:

@@ -4,13 +4,14 @@
     x = (value, rate)                        of q, and of V
     x_k+1 = [1 dt; 0 1] x_k + noise          local linear trend; the rate is a random walk of intensity w
     P(q + h_s dq/dt > -ln(1 - s_max)) > p    slip passes its limit within the horizon h_s
-    P(V + h_v dV/dt < 0) > p                 or the vehicle stands within h_v, while its wheels slip and thrust holds
+    P(V + h_v dV/dt < 0) > p                 or the vehicle stands within h_v, while thrust holds and wheels slip,
+                                             or all motors are at their limit
 
 Both count only while a vehicle that has moved for some seconds loses speed under thrust: a start is no stall, and one
 in vain is seen by `traction_loss`.  A stall shows in both: wheels that a motor holds at their
 speed, with torque left, make slip run away; motors at their limit lose speed together with the vehicle.  In q, a wheel
 that creeps, starts, or turns on a curve needs no case of its own: what the sensors cannot know there is in the variance
-of q, (sd(V) / V)^2 + (sd(omega) / omega)^2, and the mean over left and right wheels cancels a curve.
+of q, (sd(V) / V)^2 + (sd(omega) / omega)^2, and V is the mean ground speed of the very wheels whose speed is known.
 """
 
 from __future__ import annotations
@@ -79,9 +80,22 @@ class LocalTrend(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """One bin: time [s], ground speed and mean rim speed of the driven wheels [m/s] with their variances, thrust.
+    """One bin; nan where not known.
 
-    thrust is the sum of torque over radius as a share of the weight; nan where not known.
+    Attributes
+    ----------
+    t
+        [s].
+    ground, ground_var
+        [m/s], ground speed of the vehicle's middle, and its variance.
+    rim, rim_var
+        [m/s], mean rim speed of the driven wheels whose speed is known, and its variance.
+    thrust
+        Sum of torque over radius, as a share of the weight.
+    beside
+        [m/s], mean ground speed of those wheels less that of the middle: not zero on a curve with a side missing.
+    at_limit
+        Every motor whose limit is known is at its limit, and at least one limit is known.
     """
 
     t: float
@@ -90,6 +104,8 @@ class Sample(NamedTuple):
     rim: float
     rim_var: float
     thrust: float
+    beside: float = 0.0
+    at_limit: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,36 +158,37 @@ def forecast(
     before
         After the sample before; the trends start afresh after LONGEST_GAP or when time goes back.
     sample
-        The wheels and the vehicle now.
+        The wheels and the vehicle now; one of the time of the last is the same bin, seen again.
     min_speed
         [m/s], speeds of wheels and vehicle below which there is no slip.
     settings, limits
-        Horizons, probability, noise; `max_slip` and `stall_resistance`.
+        Horizons, probability, noise; `max_slip`.
     """
     step = sample.t - before.t
+    if step == 0.0:
+        return before
     if not 0.0 <= step <= LONGEST_GAP:
         before, step = StallForecast(sample.t), 0.0
-    moves = sample.ground > min_speed and sample.rim > min_speed  # nor nan
-    ratio = math.log(sample.rim / sample.ground) if moves else math.nan
+    ground = sample.ground + sample.beside
+    moves = ground > min_speed and sample.rim > min_speed  # nor nan
+    ratio = math.log(sample.rim / ground) if moves else math.nan
     ratio_var = math.nan
     if moves:
-        ratio_var = sample.ground_var / sample.ground**2 + sample.rim_var / sample.rim**2 + settings.slip_noise**2
+        ratio_var = sample.ground_var / ground**2 + sample.rim_var / sample.rim**2 + settings.slip_noise**2
     slip = before.slip.after(step, ratio, ratio_var, settings.slip_wander)
     speed = before.speed.after(step, sample.ground, sample.ground_var, settings.speed_wander)
     thrust = sample.thrust
     mean = before.thrust
     if math.isfinite(thrust):
         mean = thrust if math.isnan(mean) else mean + (thrust - mean) * (1.0 - math.exp(-step / settings.thrust_time))
-    pushes = thrust > limits.stall_resistance
+    pushes = thrust > settings.least_thrust
     holds = thrust > settings.thrust_held * mean
     limit = -math.log(1.0 - limits.max_slip)
     runs_away = slip.probability_above(limit, settings.slip_horizon) > settings.probability
-    stands = (
-        1.0 - speed.probability_above(0.0, settings.stop_horizon) > settings.probability
-        and holds
-        and slip.value > -math.log(1.0 - settings.least_slip)
-    )
-    stands_now = sample.ground <= min_speed or sample.rim <= min_speed  # nor nan: what is not known stays as it was
+    slips = holds and slip.value > -math.log(1.0 - settings.least_slip)
+    stops = 1.0 - speed.probability_above(0.0, settings.stop_horizon) > settings.probability
+    stands = stops and (slips or sample.at_limit)
+    stands_now = ground <= min_speed or sample.rim <= min_speed  # nor nan: what is not known stays as it was
     since = math.inf if stands_now else min(before.since, sample.t if moves else math.inf)
     settled = sample.t - since >= settings.settling_time
     ahead = moves and settled and pushes and speed.rate < 0.0 and math.isfinite(speed.var) and (runs_away or stands)

@@ -20,11 +20,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from soilbus.arrays import Array
 from soilbus.config.model import Config, NoiseOfChannels
 from soilbus.config.model import Traversability as Settings
 from soilbus.decision.stall_forecast import Sample, StallForecast, forecast
 from soilbus.estimation.posterior import Estimate
-from soilbus.estimation.window import Rig, Window, pull_given
+from soilbus.estimation.window import Rig, Window, pairs, pull_given
 from soilbus.sensors.consistency import NO_TRACTION, TRACTION
 from soilbus.terra.vehicle import GRAVITY
 
@@ -42,8 +43,9 @@ class Motion(NamedTuple):
     ----------
     t
         [s].
-    ground, rim
-        [m/s], ground speed, and rim speed of each wheel.
+    ground, rim, beside
+        [m/s], ground speed of the vehicle's middle, rim speed of each wheel that a motor can drive, and ground speed of
+        each of these less that of the middle (on a curve).
     resistance
         Thrust less draft, slope and inertia, as a share of the weight.
     at_limit
@@ -64,6 +66,7 @@ class Motion(NamedTuple):
     slip: float = math.nan
     pull: float = math.nan
     last: Sample | None = None
+    beside: Sequence[float] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,10 +137,14 @@ def observed(before: TractionLoss, motion: Motion, config: Config) -> TractionLo
     if not 0.0 <= motion.t - before.t <= LONGEST_GAP:
         fresh = before if motion.t > before.t else TractionLoss(ahead=ahead)
         before = replace(fresh, spins=math.inf, sticks=math.inf, moves=math.inf)
+    beside = motion.beside or [0.0] * len(motion.rim)
     known = [rim for rim in motion.rim if math.isfinite(rim)]
     if not known or not math.isfinite(motion.ground):
         return replace(before, t=motion.t, slip=math.nan, pull=math.nan)
-    spinning = sum(rim - motion.ground > max(min_speed, settings.max_slip * rim) for rim in known)
+    spinning = sum(
+        rim - (motion.ground + more) > max(min_speed, settings.max_slip * rim)
+        for rim, more in zip(motion.rim, beside, strict=True)  # nor nan
+    )
     stands = motion.ground < min_speed
     forced = motion.at_limit or motion.resistance > settings.stall_resistance  # nan: not known
     stalls = stands and forced and max(known) < settings.standstill
@@ -189,24 +196,43 @@ def missing_pull(loss: TractionLoss, curve: OverSlip, noise: NoiseOfChannels, de
 
 
 def excess_slip(loss: TractionLoss, predicted: Estimate, config: Config, deviations: float) -> float:
-    """Slip beyond the one predicted for the present demand, where the present pull is not known; else 0.
+    """Slip beyond the predicted one, as far as it is significant; else 0.
 
     Parameters
     ----------
     loss
         With the present slip.
     predicted
-        Slip that the demand needs.
+        Slip that the present pull needs (`slip_needed`), or where that is not known the present demand.
     config
         Gain errors of both speeds; slip by uneven ground.
     deviations
-        Standard deviations of the difference that are subtracted.
+        Standard deviations of the innovation that are subtracted.
     """
-    if math.isfinite(loss.pull) or not math.isfinite(loss.slip):
+    if not math.isfinite(loss.slip):
         return 0.0
     of_gains = (1.0 - loss.slip) * math.hypot(config.noise.speed.gain, config.noise.ground_speed.gain)
     sd = math.hypot(predicted.std, of_gains, config.warning.slip_noise)
     return max(loss.slip - predicted.value - deviations * sd, 0.0)
+
+
+def slip_needed(pull: float, curve: OverSlip, noise: NoiseOfChannels) -> Estimate | None:
+    """The least slip that gives a pull [N]; None where none does, or where slip hardly changes the pull.
+
+    Notes
+    -----
+    ds = dP / (dP/ds), with the curve's std and the draft's gain error in dP.
+    """
+    known = np.isfinite(curve.pull)
+    slips, pulls, stds = curve.slip[known], curve.pull[known], curve.pull_std[known]
+    if len(slips) < 2 or not pull < pulls.max():
+        return None
+    i = max(int(np.argmax(pulls > pull)), 1)
+    slope = float((pulls[i] - pulls[i - 1]) / (slips[i] - slips[i - 1]))
+    if slope <= 0.0:
+        return None
+    slip = max(float(slips[i] - (pulls[i] - pull) / slope), 0.0)
+    return Estimate(slip, math.hypot(float(np.interp(slip, slips, stds)), noise.draft.gain * pull) / slope)
 
 
 def idle(window: Window, rig: Rig, since: float, before: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -257,32 +283,50 @@ def motion_of(window: Window, rig: Rig, torque_limit: NDArray[np.float64], setti
         return None
     drives, radius = rig.drives, rig.radius
     columns = np.column_stack(
-        [window.ground_speed, pull_given(window, rig.chassis), rig.radius * window.speed, window.torque]
+        [window.ground_speed, pull_given(window, rig.chassis), radius * window.speed, window.torque, window.yaw_rate]
     )
     known = np.isfinite(columns)
     with np.errstate(invalid="ignore"):
-        ground, asked, *wheels = np.where(known, columns, 0.0).sum(axis=0) / known.sum(axis=0)
+        ground, asked, *wheels, yaw_rate = np.where(known, columns, 0.0).sum(axis=0) / known.sum(axis=0)
     rim, torque = np.split(np.array(wheels), 2)
-    limited = np.isfinite(torque_limit)
-    at_limit = limited.any() and (torque[limited] >= settings.full_torque * torque_limit[limited]).all()
-    resistance = ((torque / rig.radius).sum() - asked) / (rig.chassis.mass * GRAVITY)
+    beside = _side(rig) * (yaw_rate if math.isfinite(yaw_rate) else 0.0)
+    limited = np.isfinite(torque_limit) & (torque_limit > 0.0)
+    at_limit = bool(limited.any() and (torque[limited] >= settings.full_torque * torque_limit[limited]).all())
+    weight = rig.chassis.mass * GRAVITY
+    resistance = ((torque / radius).sum() - asked) / weight
     weights = np.where((torque > 0.0) & (rim > 0.0) & drives, torque, 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        slip = np.where(weights > 0.0, weights * (1.0 - ground / rim), 0.0).sum() / weights.sum()
+        slip = np.where(weights > 0.0, weights * (1.0 - (ground + beside) / rim), 0.0).sum() / weights.sum()
     pull = asked if np.isfinite(window.acceleration).any() else math.nan
-    now, of_speed = radius * window.speed[-1], radius**2 * window.variance["speed"][-1]
-    known = np.isfinite(now) & np.isfinite(of_speed) & drives
-    count = max(int(known.sum()), 1)
-    thrust = float((window.torque[-1] / radius).sum()) / (rig.chassis.mass * GRAVITY)
-    sample = Sample(
+    return Motion(
+        float(window.t[-1]), float(ground), rim[drives].tolist(), float(resistance), at_limit, float(slip),
+        float(pull), _last(window, rig, beside, at_limit), beside[drives].tolist(),
+    )  # fmt: skip
+
+
+def _last(window: Window, rig: Rig, beside: Array, at_limit: bool) -> Sample:
+    """The last bin of a window of a rig with a chassis, for the forecast of a stall."""
+    rim, of_rim = rig.radius * window.speed[-1], rig.radius**2 * window.variance["speed"][-1]
+    known = np.isfinite(rim) & np.isfinite(of_rim) & rig.drives
+    count, force = max(int(known.sum()), 1), window.torque[-1] / rig.radius
+    assert rig.chassis is not None  # `motion_of` sees to it
+    thrust = force[np.isfinite(force)].sum() if np.isfinite(force).any() else math.nan
+    return Sample(
         float(window.t[-1]),
         float(window.ground_speed[-1]),
         float(window.variance["ground_speed"][-1]),
-        float(now[known].mean()) if known.any() else math.nan,
-        float(of_speed[known].sum()) / count**2,
-        thrust,
+        float(rim[known].mean()) if known.any() else math.nan,
+        float(of_rim[known].sum()) / count**2,
+        float(thrust) / (rig.chassis.mass * GRAVITY),
+        float(beside[known].mean()) if known.any() else 0.0,
+        at_limit,
     )
-    return Motion(
-        float(window.t[-1]), float(ground), rim.tolist(), float(resistance), bool(at_limit), float(slip), float(pull),
-        sample,
-    )  # fmt: skip
+
+
+def _side(rig: Rig) -> Array:
+    """Lever [m] (W,) by which a yaw rate, positive to the left, adds to a wheel's ground speed; 0 without a track."""
+    lever = np.zeros(len(rig.wheels))
+    if rig.track is not None:
+        left, right = pairs(rig)
+        lever[left], lever[right] = -rig.track / 2.0, rig.track / 2.0
+    return lever

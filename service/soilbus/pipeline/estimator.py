@@ -25,6 +25,7 @@ from soilbus.decision.immobilisation import (
     Alert,
     Warnings,
     Watch,
+    ended,
     has_cause,
     moments,
     watched,
@@ -197,7 +198,8 @@ class WindowEstimator:
         warned = has_cause(watch, self._loss, self.config.warning.hold)
         now = as_of(result, self._loss, result.t, self.config, warned)
         if now.traversability.state is State.GO and watch.warning is Alert.IMMOBILISATION:
-            watch, self._warnings = replace(watch, warning=Alert.NONE), self._warnings._replace(since=None)
+            self._watch, self._warnings = ended(self._watch), self._warnings._replace(since=None)
+            watch = with_loss(self._watch, self._loss)
         return replace(now, watch=watch, warnings=self._warnings)
 
     def _decided(self, window: Undecided) -> WindowResult:
