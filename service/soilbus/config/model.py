@@ -722,6 +722,9 @@ class Warning(_Section):
     """How fast the rate of the log speed ratio changes [1/s per sqrt(s)]."""
     speed_wander: PositiveFloat = 1.0
     """How fast the acceleration changes [m/s^2 per sqrt(s)]."""
+    depth_wander: PositiveFloat = 0.05
+    """How fast the rate of sinkage changes [m/s per sqrt(s)]: ruts deepen by centimetres a second.  No evidence
+    recorded."""
     settling_time: NonNegativeFloat = 1.0
     """Time [s] for which the vehicle must have moved: the trends of a start are not those of driving."""
     hold: PositiveFloat = 1.0

@@ -6,12 +6,13 @@
     P(q + h_s dq/dt > -ln(1 - s_max)) > p    slip passes its limit within the horizon h_s
     P(V + h_v dV/dt < 0) > p                 or the vehicle stands within h_v, while thrust holds and wheels slip,
                                              or all motors are at their limit
+    P(z + h_s dz/dt > z_max) > p             or the deepest wheel passes the sinkage limit, where sinkage is measured
 
-Both count only while a vehicle that has moved for some seconds loses speed under thrust: a start is no stall, and one
-in vain is seen by `traction_loss`.  A stall shows in both: wheels that a motor holds at their
-speed, with torque left, make slip run away; motors at their limit lose speed together with the vehicle.  In q, a wheel
-that creeps, starts, or turns on a curve needs no case of its own: what the sensors cannot know there is in the variance
-of q, (sd(V) / V)^2 + (sd(omega) / omega)^2, and V is the mean ground speed of the very wheels whose speed is known.
+The first two count only while a vehicle that has moved for some seconds loses speed under thrust: a start is no stall,
+and one in vain is seen by `traction_loss`.  A stall shows in both: wheels that a motor holds at their speed, with
+torque left, make slip run away; motors at their limit lose speed together with the vehicle.  In q, a wheel that creeps,
+starts, or turns on a curve needs no case of its own: what the sensors cannot know there is in the variance of q,
+(sd(V) / V)^2 + (sd(omega) / omega)^2, and V is the mean ground speed of the very wheels whose speed is known.
 """
 
 from __future__ import annotations
@@ -96,6 +97,8 @@ class Sample(NamedTuple):
         [m/s], mean ground speed of those wheels less that of the middle: not zero on a curve with a side missing.
     at_limit
         Every motor whose limit is known is at its limit, and at least one limit is known.
+    depth, depth_var
+        [m], sinkage of the deepest wheel, and its variance.
     """
 
     t: float
@@ -106,6 +109,8 @@ class Sample(NamedTuple):
     thrust: float
     beside: float = 0.0
     at_limit: bool = False
+    depth: float = math.nan
+    depth_var: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +121,8 @@ class StallForecast:
     ----------
     t, heard, since
         [s], of the last sample, of the last one with a slip, and of the first one since which the vehicle moves.
-    slip, speed
-        Trends of the log speed ratio [1] and of the ground speed [m/s].
+    slip, speed, depth
+        Trends of the log speed ratio [1], of the ground speed [m/s] and of the sinkage [m].
     thrust
         As a share of the weight, low-pass filtered.
     caused
@@ -135,6 +140,7 @@ class StallForecast:
     since: float = math.inf
     slip: LocalTrend = LocalTrend()  # noqa: RUF009, immutable
     speed: LocalTrend = LocalTrend()  # noqa: RUF009, immutable
+    depth: LocalTrend = LocalTrend()  # noqa: RUF009, immutable
     thrust: float = math.nan
     caused: float = -math.inf
     stalls: bool = False
@@ -162,7 +168,7 @@ def forecast(
     min_speed
         [m/s], speeds of wheels and vehicle below which there is no slip.
     settings, limits
-        Horizons, probability, noise; `max_slip`.
+        Horizons, probability, noise; `max_slip` and `max_sinkage`.
     """
     step = sample.t - before.t
     if step == 0.0:
@@ -177,6 +183,7 @@ def forecast(
         ratio_var = sample.ground_var / ground**2 + sample.rim_var / sample.rim**2 + settings.slip_noise**2
     slip = before.slip.after(step, ratio, ratio_var, settings.slip_wander)
     speed = before.speed.after(step, sample.ground, sample.ground_var, settings.speed_wander)
+    depth = before.depth.after(step, sample.depth, sample.depth_var, settings.depth_wander)
     thrust = sample.thrust
     mean = before.thrust
     if math.isfinite(thrust):
@@ -191,7 +198,9 @@ def forecast(
     stands_now = ground <= min_speed or sample.rim <= min_speed  # nor nan: what is not known stays as it was
     since = math.inf if stands_now else min(before.since, sample.t if moves else math.inf)
     settled = sample.t - since >= settings.settling_time
-    ahead = moves and settled and pushes and speed.rate < 0.0 and math.isfinite(speed.var) and (runs_away or stands)
+    loses_speed = speed.rate < 0.0 and math.isfinite(speed.var)
+    sinks = depth.probability_above(limits.max_sinkage, settings.slip_horizon) > settings.probability
+    ahead = moves and settled and pushes and (sinks or (loses_speed and (runs_away or stands)))
     heard, caused = (sample.t if now else last for now, last in ((moves, before.heard), (ahead, before.caused)))
     stalls = sample.t - caused < settings.hold
     return StallForecast(
@@ -200,16 +209,18 @@ def forecast(
         since,
         slip,
         speed,
+        depth,
         mean,
         caused,
         stalls,
         settled,
-        _time_left(slip, speed, limit) if stalls else None,
+        _time_left(slip, speed, depth, limit, limits.max_sinkage) if stalls else None,
     )
 
 
-def _time_left(slip: LocalTrend, speed: LocalTrend, limit: float) -> float:
-    """Time [s] until slip passes its limit or the vehicle stands, by the trends."""
-    to_limit = max(limit - slip.value, 0.0) / slip.rate if slip.rate > 0.0 else math.inf
+def _time_left(slip: LocalTrend, speed: LocalTrend, depth: LocalTrend, max_ratio: float, max_depth: float) -> float:
+    """Time [s] until slip or sinkage passes its limit, or the vehicle stands, by the trends."""
+    to_limit = max(max_ratio - slip.value, 0.0) / slip.rate if slip.rate > 0.0 else math.inf
     to_stand = max(speed.value, 0.0) / -speed.rate if speed.rate < 0.0 else math.inf
-    return min(to_limit, to_stand)
+    to_depth = max(max_depth - depth.value, 0.0) / depth.rate if depth.rate > 0.0 else math.inf
+    return min(to_limit, to_stand, to_depth)

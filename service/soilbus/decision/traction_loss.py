@@ -311,6 +311,9 @@ def _last(window: Window, rig: Rig, beside: Array, at_limit: bool) -> Sample:
     count, force = max(int(known.sum()), 1), window.torque[-1] / rig.radius
     assert rig.chassis is not None  # `motion_of` sees to it
     thrust = force[np.isfinite(force)].sum() if np.isfinite(force).any() else math.nan
+    depth, of_depth = window.sinkage[-1], window.variance["sinkage"][-1]
+    sunk = np.flatnonzero(np.isfinite(depth) & np.isfinite(of_depth))
+    deepest = sunk[np.argmax(depth[sunk])] if len(sunk) else None
     return Sample(
         float(window.t[-1]),
         float(window.ground_speed[-1]),
@@ -320,6 +323,8 @@ def _last(window: Window, rig: Rig, beside: Array, at_limit: bool) -> Sample:
         float(thrust) / (rig.chassis.mass * GRAVITY),
         float(beside[known].mean()) if known.any() else 0.0,
         at_limit,
+        math.nan if deepest is None else float(depth[deepest]),
+        math.nan if deepest is None else float(of_depth[deepest]),
     )
 
 
