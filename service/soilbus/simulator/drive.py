@@ -30,7 +30,6 @@ from soilbus.terra.effects.effect import Active, Surroundings
 from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads, pull_required
 from soilbus.terra.wheel import WheelModel
 
-
 _MASS_STREAM = 3
 """Names the random numbers of the true mass, which disturb no others."""
 
@@ -134,7 +133,7 @@ def drive(config: Config, scenario: Scenario, seed: int, effects: Sequence[Activ
 
 
 def _climbs(config: Config, scenario: Scenario) -> bool:
-    """Whether slopes take the pull that the prescribed slip gives; nothing else holds a vehicle back that tows nothing."""
+    """Whether slopes take the pull that the prescribed slip gives, as nothing is towed that could."""
     if config.vehicle is None or config.vehicle.towing != "never":
         return False
     if scenario.draft is not None:

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.config.model import Axle, Config, Wheel
@@ -55,8 +56,8 @@ class Drivetrain:
     speed: Array
     torque: Array
     bias: Array
-    is_motor: Array
-    leader: Array
+    is_motor: NDArray[np.bool_]
+    leader: NDArray[np.intp]
     limited: Array
     limit: Array
 

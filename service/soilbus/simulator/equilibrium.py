@@ -109,7 +109,7 @@ class Situation(NamedTuple):
 
     def _sine(self, draft: Array) -> Array:
         """Sine (N,) of the pitch whose share of the weight is this."""
-        return np.clip(draft / self.level_load.sum(axis=0), -_STEEPEST_SINE, _STEEPEST_SINE)
+        return np.asarray(np.clip(draft / self.level_load.sum(axis=0), -_STEEPEST_SINE, _STEEPEST_SINE))
 
 
 class Mechanics(NamedTuple):
@@ -416,7 +416,7 @@ def _leads(
     rim = 1.0 / (1.0 - here.slip - situation.deviation - here.lead)
     lever = (situation.level_load * situation.radius).sum(axis=0)  # makes torques numbers
     speed, of_torque = drivetrain.speed, _torque_weights(drivetrain, rim, now / lever)
-    by_speed = ~of_torque.any(axis=1)  # (M, N)
+    by_speed = np.asarray(~of_torque.any(axis=1))  # (M, N)
     motor, lead = drivetrain.is_motor[:, None], here.lead
     of_speed = np.where(motor, speed @ (rim * lead), speed @ rim)
     miss = np.where(by_speed, of_speed, np.einsum("ijn,jn->in", of_torque, value / lever))
