@@ -16,7 +16,7 @@ from soilbus.config.model import Config
 from soilbus.decision.capability import Capability, Forecast, OverSlip
 from soilbus.decision.immobilisation import Alert, Warnings, Watch, ended, has_cause, watched
 from soilbus.decision.judgement import Basis, at_present
-from soilbus.decision.traction_loss import NO_LOSS, motion_of, observed
+from soilbus.decision.traction_loss import TractionLoss, motion_of, observed
 from soilbus.decision.traversability import State, Traversability
 from soilbus.estimation.posterior import Estimate
 from soilbus.estimation.window import Rig, SensorNoise, Window, forward, window_of_samples
@@ -129,7 +129,7 @@ class Machine:
         config, rig = Config(), self.rig
         config = config.model_copy(update={"estimator": replaced(config.estimator, min_speed=self.min_speed)})
         limit = np.full(4, self.limit * self.mass * GRAVITY / 4.0 * self.radius if self.known_limit else np.nan)
-        state, begun = NO_LOSS, []
+        state, begun = TractionLoss(), []
         for i in range(len(window.t)):
             motion = motion_of(forward(window.rows(np.arange(max(i - 2, 0), i + 1))), rig, limit, config.traversability)
             later = observed(state, motion, config)
@@ -204,7 +204,7 @@ def test_ordinary_drives_are_left_in_peace(case, seed):
 def test_a_bin_that_is_seen_twice_counts_once():
     machine = BOGGED["rover"][0]
     window, _ = machine.driven(1)
-    config, limit, once, twice = Config(), np.full(4, np.nan), NO_LOSS, NO_LOSS
+    config, limit, once, twice = Config(), np.full(4, np.nan), TractionLoss(), TractionLoss()
     for i in range(3, 40):
         motion = motion_of(window.rows(np.arange(i - 2, i + 1)), machine.rig, limit, config.traversability)
         once = observed(once, motion, config)
@@ -223,7 +223,7 @@ def judged(slip: float, pull: float = math.nan):
     forecast = Forecast(Estimate(0.035, 0.003), {}, known, known, known)
     capability = Capability(known, None, None, None, known, known, "slip", {}, forecast, CURVE)
     go = Traversability(State.GO, 0.999, capability=capability, spare=known)
-    loss = replace(NO_LOSS, t=10.0, slip=slip, pull=pull)
+    loss = replace(TractionLoss(), t=10.0, slip=slip, pull=pull)
     config = reference_configuration()
     return at_present(go, Basis(np.linspace(0.0, 10.0, 101), 0.1), loss, 10.0, config)
 
@@ -247,11 +247,11 @@ def test_a_warning_that_only_lasts_ends_with_a_go_and_does_not_begin_again():
     for i in range(40):  # a draft grows to nearly all that there is
         draft = 4000.0 + 30.0 * i
         state = watched(state, 0.1 * i, [0.3 * draft / (8000.0 - draft)], draft, CURVE)
-    assert has_cause(state, NO_LOSS, 1.0)
+    assert has_cause(state, TractionLoss(), 1.0)
     for i in range(40, 70):  # and is gone
         state = watched(state, 0.1 * i, [0.04], 1000.0, CURVE)
     assert state.warning is Alert.IMMOBILISATION
-    assert not has_cause(state, NO_LOSS, 1.0)
+    assert not has_cause(state, TractionLoss(), 1.0)
     over, log = ended(state), Warnings()
     for i in range(70, 110):
         over = watched(over, 0.1 * i, [0.04], 1000.0, CURVE)
