@@ -394,11 +394,11 @@ class Warnings(NamedTuple):
     since: float | None = None
     begun: tuple[float, ...] = ()
 
-    def after(self, t: float, warning: Alert, caused: bool) -> Warnings:
-        """After the reported warning at t [s]; only one that has a cause begins."""
+    def after(self, t: float, warning: Alert) -> Warnings:
+        """After the reported warning at t [s]."""
         if warning is not Alert.IMMOBILISATION:
             return self._replace(since=None)
-        return self if self.since is not None or not caused else Warnings(t, (*self.begun, t))
+        return self if self.since is not None else Warnings(t, (*self.begun, t))
 
 
 def moments(window: Window, rig: Rig, since: float, min_speed: float) -> Iterator[Moment]:

@@ -261,9 +261,7 @@ class WindowEstimator:
             if (motion := motion_of(few, self.rig, window.torque_limit, self.config.traversability)) is not None:
                 self._loss = observed(self._loss, motion, self.config)
             self._watch = watched(self._watch, moment.t, moment.slip, moment.pull, self._curve, moment.inertia)
-            warning = with_loss(self._watch, self._loss).warning
-            caused = has_cause(self._watch, self._loss, self.config.warning.hold)
-            self._warnings = self._warnings.after(moment.t, warning, caused)
+            self._warnings = self._warnings.after(moment.t, with_loss(self._watch, self._loss).warning)
 
     def _effects(self, fit: Fit | None) -> list[Active]:
         """The effects with their fitted parameters, or without a fit as configured."""
