@@ -82,6 +82,13 @@ def brute_force(config: Config, soil, driven: tuple[str, ...], weights: dict[str
 CASES = {
     "rear driven": (("rear",), [{"name": "rear", "torque": "M.T", "motor_speed": "M.S", "max_torque": 30000.0}]),
     "rear driven, weak": (("rear",), [{"name": "rear", "torque": "M.T", "motor_speed": "M.S", "max_torque": 5000.0}]),
+    "a motor on each axle": (
+        ("front", "rear"),
+        [
+            {"name": "rear", "torque": "M.T", "motor_speed": "M.S", "max_torque": 5000.0},
+            {"name": "front", "torque": "N.T", "motor_speed": "N.S", "max_torque": 90000.0},
+        ],
+    ),
     "both axles": (
         ("front", "rear"),
         [

@@ -12,7 +12,7 @@ import pytest
 from cantools.database.can.c_source import camel_to_snake_case
 
 DBC = Path(__file__).resolve().parents[2] / "dbc"
-FILES = ("soilbus", "tractor")
+FILES = ("soilbus", "tractor", "axles")
 WHOLE_RANGE = {"Counter", "Checksum"}  # protocol, not values
 
 

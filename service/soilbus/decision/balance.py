@@ -166,7 +166,7 @@ class Limits(NamedTuple):
             of_kind = np.zeros(A)
             np.add.at(of_kind, axles.of_wheel[list(group.wheels)], group.weight)
             limit = float(np.array(group.weight) @ torque_limit[list(group.wheels)])
-            torque[of_kind > 0.0] = np.inf
+            torque[:A][of_kind > 0.0] = np.inf
             motors, torque = np.vstack([motors, of_kind]), np.append(torque, np.inf if np.isnan(limit) else limit)
         deepest = model.angle_of_sinkage(max_sinkage, axles.wheel(axles.level[:, 0]))
         return cls(torque, np.minimum(deepest, MAX_ENTRY_ANGLE), motors)

@@ -3,15 +3,17 @@
     sum of drawbar pulls = draft + m g sin(pitch) + m dv/dt + forces of effects
     load of wheel i      = its vertical force
 
-Quasi-static at 50 samples a second: ground speed and its rate are given, and slip, draft, loads, sinkages and torques
-solve these balances with the wheel-soil model (simulator/equilibrium.py). Turning is not modelled; a side slope only
-shifts load. Effects on forces take part in the balance; effects on sensors belong to simulator/sensors.py.
+Quasi-static at 50 samples a second: ground speed and its rate are given, and slips, draft, loads, sinkages and torques
+solve these balances with the wheel-soil model and the drive line (simulator/equilibrium.py, simulator/drivetrain.py).
+A vehicle that never tows anything drives over the given slopes, or, where slip is prescribed, up and down slopes that
+take it. Turning is not modelled; a side slope only shifts load. Effects on forces take part in the balance; effects on
+sensors belong to simulator/sensors.py.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,13 +21,17 @@ from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.config.model import Config, Wheel
-from soilbus.estimation.assembly import chassis_of, effects_of
+from soilbus.estimation.assembly import UNKNOWN_SHARE, chassis_of, effects_of
 from soilbus.simulator.course import positions
-from soilbus.simulator.equilibrium import Equilibrium, Mechanics, Situation, sinkages, solve, surroundings
+from soilbus.simulator.drivetrain import Drivetrain, drivetrain_of
+from soilbus.simulator.equilibrium import Equilibrium, Mechanics, Situation, sinkages, solve, surroundings, wheel_slips
 from soilbus.simulator.scenario import SAMPLE_RATE, Scenario, Swing, realise, soil_along, soil_names
 from soilbus.terra.effects.effect import Active, Surroundings
-from soilbus.terra.vehicle import Chassis, axle_loads, pull_required
+from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads, pull_required
 from soilbus.terra.wheel import WheelModel
+
+_MASS_STREAM = 3
+"""Names the random numbers of the true mass, which disturb no others."""
 
 
 class SimulationError(Exception):
@@ -39,21 +45,25 @@ class Drive:
     Attributes
     ----------
     columns
-        By name, each (N,), in SI: t, distance, ground_speed, acceleration, pitch, latitude, longitude [rad], draft,
-        demand (nan where slip was prescribed), soil (names); and for each wheel W slip.W, entry_angle.W, sinkage.W,
-        load.W, torque.W (at the wheel), drawbar_pull.W, speed.W [rad/s], torque_limit.W (nan: unknown).
+        By name, each (N,), in SI: t, distance, ground_speed, acceleration, pitch, roll (nan without a track), latitude,
+        longitude [rad], draft, demand (nan where slip was prescribed), soil (names); and for each wheel W slip.W,
+        entry_angle.W, sinkage.W, load.W, torque.W (at the wheel), drawbar_pull.W, speed.W [rad/s], torque_limit.W (of
+        its own motor; nan: unknown).
     bogged_at
         Time [s] at which no slip lets the tractor go on and the drive ends; None without.
     effects
         Effects that acted.
     surroundings
         What these may depend on (N, W).
+    chassis
+        Mass and geometry as they were.
     """
 
     columns: dict[str, NDArray[Any]]
     bogged_at: float | None
     effects: tuple[Active, ...]
     surroundings: Surroundings
+    chassis: Chassis
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,24 +92,26 @@ def drive(config: Config, scenario: Scenario, seed: int, effects: Sequence[Activ
     Raises
     ------
     SimulationError
-        There is no vehicle, or it cannot even start.
+        There is no vehicle, it cannot even start, or it shall tow what it never tows.
     KeyError
         A soil is unknown.
     ConfigError
         An effect cannot be.
     """
-    chassis = _chassis(config)
+    chassis = _chassis(config, scenario, seed)
     present = (*effects_of(config), *effects)
     rng = np.random.default_rng(seed)
     t = np.arange(round(scenario.duration * SAMPLE_RATE)) / SAMPLE_RATE
     speed = realise(scenario.speed, t, rng)
     knots = np.array(scenario.slope, float)
-    pitch = np.interp(speed.integral, knots[:, 0], knots[:, 1])
+    climbs = _climbs(config, scenario)
+    pitch = np.zeros_like(t) if climbs else np.interp(speed.integral, knots[:, 0], knots[:, 1])
     motion = _Motion(t, speed.integral, speed.value, speed.rate, pitch)
-    situation = _situation(config.wheel, chassis, scenario, motion, rng)
+    drivetrain = drivetrain_of(config)
+    situation, side = _situation(config.wheel, chassis, scenario, motion, drivetrain, climbs, rng)
     rear = np.array([wheel.axle == "rear" for wheel in config.wheel])
-    model = WheelModel(shear_law=config.model.shear_law)
-    mechanics = Mechanics(model, rear, chassis.mass, scenario.duration, float(motion.distance[-1]), present)
+    model, length = WheelModel(shear_law=config.model.shear_law), float(motion.distance[-1])
+    mechanics = Mechanics(model, rear, chassis.mass, scenario.duration, length, drivetrain, present, climbs)
     result = solve(_with_resisting_effects(situation, mechanics), mechanics)
     stuck = np.flatnonzero(~result.found)
     end = int(stuck[0]) if len(stuck) else len(t)
@@ -107,77 +119,121 @@ def drive(config: Config, scenario: Scenario, seed: int, effects: Sequence[Activ
         soil = soil_names(scenario.soils, motion.distance[:1])[0]
         raise SimulationError(f"the tractor cannot drive on {soil}: no slip lets it move")
     columns = _columns(config.wheel, scenario, motion, situation, result, sinkages(situation, mechanics, result))
-    around: tuple[Any, ...] = surroundings(situation, mechanics, result.slip, result.draft)
+    columns |= {"roll": _roll(config, side)}
+    if climbs:
+        columns |= {"pitch": np.arcsin(result.draft / (chassis.mass * GRAVITY)), "draft": np.zeros_like(t)}
+    around: tuple[Any, ...] = surroundings(situation, mechanics, wheel_slips(situation, result), result.draft)
     return Drive(
         {name: column[:end] for name, column in columns.items()},
         float(t[end]) if len(stuck) else None,
         present,
         Surroundings(*(a if np.ndim(a) < 2 else a[:end] for a in around)),
+        chassis,
     )
+
+
+def _climbs(config: Config, scenario: Scenario) -> bool:
+    """Whether slopes take the pull that the prescribed slip gives, as nothing is towed that could."""
+    if config.vehicle is None or config.vehicle.towing != "never":
+        return False
+    if scenario.draft is not None:
+        raise SimulationError("vehicle.towing = never, but the scenario has a draft: give it slopes, speeds or a slip")
+    if scenario.slip is not None and any(pitch for _, pitch in scenario.slope):
+        raise SimulationError("vehicle.towing = never: a scenario has slopes or a slip, which makes its own slopes")
+    return scenario.slip is not None
 
 
 def _with_resisting_effects(situation: Situation, mechanics: Mechanics) -> Situation:
     """The situation with the forces of resisting effects added to the resistance, at zero draft."""
     resistance, nothing = situation.resistance, np.zeros(len(situation.t))
-    around = surroundings(situation, mechanics, nothing, nothing)
+    around = surroundings(situation, mechanics, np.zeros_like(situation.radius), nothing)
     for effect, values in mechanics.effects:
         if effect.resistance is not None:
             resistance = resistance + np.ravel(effect.resistance(around, values))
     return situation._replace(resistance=resistance)
 
 
-def _chassis(config: Config) -> Chassis:
-    chassis = chassis_of(config)
-    if chassis is None or not config.wheel:
+def _chassis(config: Config, scenario: Scenario, seed: int) -> Chassis:
+    """Mass and geometry, as configured or as the scenario draws them."""
+    chassis, vehicle = chassis_of(config), config.vehicle
+    if chassis is None or vehicle is None or not config.wheel:
         raise SimulationError("the simulator needs a [vehicle] with [[wheel]]s")
     if not chassis.on_tracks and {wheel.axle for wheel in config.wheel} != {"front", "rear"}:
         raise SimulationError("the simulator needs wheels on both axles")
-    return chassis
+    if not scenario.drawn_mass:
+        return chassis
+    usual = UNKNOWN_SHARE if any(wheel.load is None for wheel in config.wheel) else 0.0
+    mass_std = usual * vehicle.mass if vehicle.mass_std is None else vehicle.mass_std
+    cg_std = usual * vehicle.wheelbase if vehicle.cg_std is None else vehicle.cg_std
+    drawn = np.random.default_rng([seed, _MASS_STREAM]).standard_normal(2) * (mass_std, cg_std)
+    ahead = np.clip(chassis.cg_ahead_of_rear_axle + drawn[1], 0.0, chassis.wheelbase)
+    return replace(chassis, mass=chassis.mass + float(drawn[0]), cg_ahead_of_rear_axle=float(ahead))
+
+
+def _roll(config: Config, side: Array) -> Array:
+    """Roll [rad] (N,), left side up, of a side slope that shifts this share of the load to the left."""
+    assert config.vehicle is not None  # _chassis sees to it
+    if config.vehicle.track is None:
+        return np.full_like(side, np.nan)
+    return np.asarray(-np.arcsin(side * config.vehicle.track / (2.0 * config.vehicle.cg_height)))
 
 
 def _situation(
-    wheels: list[Wheel], chassis: Chassis, scenario: Scenario, motion: _Motion, rng: np.random.Generator
-) -> Situation:
+    wheels: list[Wheel],
+    chassis: Chassis,
+    scenario: Scenario,
+    motion: _Motion,
+    drivetrain: Drivetrain,
+    climbs: bool,
+    rng: np.random.Generator,
+) -> tuple[Situation, Array]:
+    """What is given, and the share (N,) of its axle's load that a side slope shifts to the left."""
     shape = (len(wheels), len(motion.t))
     side = realise(scenario.side_shift, motion.t, rng).value
     share = np.stack([_load_share(wheels, i, side) for i in range(len(wheels))])
 
-    def loads(draft: float) -> Array:
-        front, rear = axle_loads(chassis, draft, motion.pitch, motion.acceleration)
+    def loads(draft: float, inertia: float = 0.0) -> Array:
+        front, rear = axle_loads(chassis, draft, motion.pitch, motion.acceleration + inertia)
         return np.asarray(share * np.stack([front if wheel.axle == "front" else rear for wheel in wheels]))
 
     test_draft = chassis.mass  # any draft will do, loads are linear in it
     level = loads(0.0)
+    drawn = loads(0.0, 1.0) if climbs else loads(test_draft)
+    static = axle_loads(chassis, 0.0, 0.0, 0.0)
+    upright = share * np.array([[static[wheel.axle != "front"]] for wheel in wheels]) * float(climbs)
     ahead = {"front": chassis.wheelbase - chassis.cg_ahead_of_rear_axle, "rear": -chassis.cg_ahead_of_rear_axle}
     if chassis.on_tracks:
         ahead["front"] = 0.0
     position = np.stack([motion.distance + ahead[str(wheel.axle)] for wheel in wheels])
     soil = soil_along(scenario.soils, position, scenario.transition)
     spread = Swing(-scenario.slip_spread, scenario.slip_spread)
-    limits = [wheel.max_torque or np.inf for wheel in wheels]
 
     def each_wheel(values: list[float]) -> Array:
         return np.broadcast_to(np.array(values)[:, None], shape)
 
     demand, slip_limit, least = _driver(scenario, motion.t, rng)
-    return Situation(
+    deviation = np.stack([realise(spread, motion.t, rng).value for _ in wheels])
+    deviation = np.where((drivetrain.leader < 0)[:, None], 0.0, deviation[drivetrain.leader])
+    given = Situation(
         motion.t,
         motion.distance,
         motion.speed,
         motion.acceleration,
         pull_required(chassis, 0.0, motion.pitch, motion.acceleration),
         level,
-        (loads(test_draft) - level) / test_draft,
-        np.stack([realise(spread, motion.t, rng).value for _ in wheels]),
+        (drawn - level) / test_draft,
+        upright,
+        deviation,
         each_wheel([wheel.radius for wheel in wheels]),
         each_wheel([wheel.width for wheel in wheels]),
         each_wheel([wheel.contact_length for wheel in wheels]),
         np.array(soil),
         demand,
         slip_limit,
-        each_wheel(limits),
+        np.broadcast_to(drivetrain.limit[:, None], (len(drivetrain.limit), len(motion.t))),
         least,
     )
+    return given, side
 
 
 def _load_share(wheels: list[Wheel], index: int, side: Array) -> Array:
@@ -192,8 +248,7 @@ def _driver(scenario: Scenario, t: Array, rng: np.random.Generator) -> tuple[Arr
     if scenario.slip is not None:
         unbounded = np.full(len(t), np.inf)
         return unbounded, realise(scenario.slip, t, rng).value, -unbounded
-    assert scenario.draft is not None  # Scenario sees to it
-    demand = realise(scenario.draft, t, rng).value
+    demand = np.zeros_like(t) if scenario.draft is None else realise(scenario.draft, t, rng).value
     return demand, realise(scenario.lift_slip, t, rng).value, np.minimum(demand, 0.0)
 
 
@@ -213,14 +268,14 @@ def _columns(
         "demand": np.where(np.isfinite(situation.demand), situation.demand, np.nan),
         "soil": np.array(soil_names(scenario.soils, motion.distance)),
     }
-    slip = result.slip + situation.deviation
+    slip, load = wheel_slips(situation, result), situation.load(result.draft)
     limit = np.where(np.isfinite(situation.torque_limit), situation.torque_limit, np.nan)
     for i, wheel in enumerate(wheels):
         of_wheel = {
             "slip": slip[i],
             "entry_angle": result.entry_angle[i],
             "sinkage": sunk[i],
-            "load": situation.level_load[i] + situation.load_per_draft[i] * result.draft,
+            "load": load[i],
             "drawbar_pull": result.forces[1, i],
             "torque": result.forces[2, i],
             "speed": motion.speed / (wheel.radius * (1.0 - slip[i])),

@@ -27,10 +27,10 @@ from soilbus.can.channels import Channel
 from soilbus.can.checksum import COUNTER, column_checksums
 from soilbus.can.mapping import channels_of, load_databases
 from soilbus.can.publish import checksum_byte, value_codes
-from soilbus.config.model import Config, Wheel
+from soilbus.config.model import Config
 from soilbus.files import placed
 from soilbus.simulator.recording import Recording
-from soilbus.simulator.sensors import channel_rng
+from soilbus.simulator.sensors import channel_rng, true_speed
 
 __all__ = ["START_TIME", "Payload", "encoded", "frames", "write_log"]
 
@@ -87,7 +87,7 @@ def frames(
     for number, (name, channels) in enumerate(_by_message(channels_of(config, database)).items()):
         message = database.get_message_by_name(name)
         t, values = _sampled(recording, channels)
-        values |= _unmapped_signals(recording, config.wheel, message, channels, t)
+        values |= _unmapped_signals(recording, config, message, channels, t)
         jitter = channel_rng(recording.seed, name).uniform(0.0, _MAX_JITTER, len(t))
         times.append(start + t + _PHASE_STEP * (number % _PHASES) + jitter)
         payloads.append(encoded(message, _raw_codes(message, channels, values, len(t))))
@@ -189,18 +189,18 @@ def _sampled(recording: Recording, channels: list[Channel]) -> tuple[Array, dict
 
 
 def _unmapped_signals(
-    recording: Recording, wheels: list[Wheel], message: Message, channels: list[Channel], t: Array
+    recording: Recording, config: Config, message: Message, channels: list[Channel], t: Array
 ) -> dict[str, Array]:
     """Values of unmapped signals that follow from the drive, found by their names in the DBC."""
     truth, mapped = recording.truth, {channel.signal for channel in channels}
-    gears = {wheel.name: wheel.gear_ratio for wheel in wheels}
+    gears = {wheel.name: wheel.gear_ratio for wheel in config.wheel} | {a.name: a.gear_ratio for a in config.axle}
     motor = next((c.wheel for c in channels if c.quantity == "torque"), None)
     known = {
         "GroundBasedMachineDistance": truth["distance"],
         "GroundBasedMachineDirection": np.ones_like(truth["t"]),
     }
     if motor is not None:
-        known["ShaftSpeed"] = truth[f"speed.{motor}"] * gears[motor] * 30.0 / math.pi
+        known["ShaftSpeed"] = true_speed(truth, config, motor) * gears[motor] * 30.0 / math.pi
     names = {signal.name for signal in message.signals} - mapped
     return {name: np.interp(t, truth["t"], known[name]) for name in known.keys() & names}
 

@@ -1,4 +1,4 @@
-"""Our reference tractor (tractor.toml): for the demo, and for commands without a configuration."""
+"""Our reference machines: the tractor of the demo and of commands without a configuration, and others beside it."""
 
 from __future__ import annotations
 
@@ -8,11 +8,16 @@ from pathlib import Path
 from soilbus.config.file import load_config
 from soilbus.config.model import Config
 
-__all__ = ["TRACTOR", "reference_configuration"]
+__all__ = ["AXLE_MOTORS", "REAR_DRIVE", "TRACTOR", "reference_configuration"]
 
 TRACTOR = Path(__file__).with_name("tractor.toml")
+"""Four motors, four load cells."""
+REAR_DRIVE = TRACTOR.with_name("tractor-2wd.toml")
+"""One motor on the rear axle, front wheels that roll freely, a load cell of the rear axle."""
+AXLE_MOTORS = TRACTOR.with_name("tractor-axles.toml")
+"""A motor on each axle, no load cells, an inertial sensor."""
 
 
-def reference_configuration(overrides: Iterable[str] = ()) -> Config:
-    """Configuration of the reference tractor; ConfigError for a wrong override."""
-    return load_config(TRACTOR, overrides)
+def reference_configuration(overrides: Iterable[str] = (), machine: Path = TRACTOR) -> Config:
+    """Configuration of the reference tractor or another machine; ConfigError for a wrong override."""
+    return load_config(machine, overrides)

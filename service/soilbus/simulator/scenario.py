@@ -141,7 +141,8 @@ class Scenario:
     speed
         Ground speed [m/s].
     draft, slip
-        Exactly one is given: the draft that the implement asks for [N], or the common slip of all wheels.
+        One at most is given: the draft that the implement asks for [N], or the common slip of all driven wheels.
+        Without both nothing is towed: slope and acceleration alone take pull.
     lift_slip
         With `draft`: the driver lifts the implement as far as needed to keep slip below this, and never pushes.
     slip_spread
@@ -154,6 +155,8 @@ class Scenario:
         Length [m] over which one soil turns into the next.
     course
         Where on the earth.
+    drawn_mass
+        The true mass and centre of gravity are drawn about the configured ones, by `mass_std` and `cg_std`.
     """
 
     duration: float
@@ -167,14 +170,15 @@ class Scenario:
     slope: Sequence[tuple[float, float]] = ((0.0, 0.0),)
     transition: float = 1.0
     course: Course = NORTHWARD
+    drawn_mass: bool = False
 
     def __post_init__(self) -> None:
         """Raise ValueError for a scenario that cannot be driven."""
         starts = [patch.start for patch in self.soils]
         if not starts or starts != sorted(set(starts)):
             raise ValueError("soils: at least one, at ascending distances")
-        if (self.draft is None) == (self.slip is None):
-            raise ValueError("exactly one of draft and slip must be given")
+        if self.draft is not None and self.slip is not None:
+            raise ValueError("one of draft and slip at most may be given")
         if self.duration * SAMPLE_RATE < 2.0:
             raise ValueError(f"duration: {self.duration} s is too short")
         if self.speed.low <= 0.0 or self.transition <= 0.0:

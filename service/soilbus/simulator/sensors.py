@@ -3,25 +3,29 @@
     reading(t) = (1 + gain error) truth(t - delay) + sd e(t),    e ~ N(0, 1)
     sd^2 = absolute^2 + (relative truth)^2 + (of_mean window mean)^2
 
-The gain error is drawn once for a drive from config [noise]. Quantisation comes with the frames (simulator/frames.py).
+A torque or load of an axle is the sum over its wheels, a motor's speed and one signal mapped for several wheels are
+means of theirs; a torque before a differential between the axles is that of its shaft. The gain error is drawn once
+for a drive from config [noise]. Quantisation comes with the frames (simulator/frames.py).
 """
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.can.channels import Column
-from soilbus.config.model import Config, Noise
+from soilbus.can.mapping import AXLE_ROLES, LOCK, POSITION_ROLES, SHARED_ROLES, VEHICLE_ROLES, WHEEL_ROLES
+from soilbus.config.model import Axle, Config, Noise, Signal, Wheel
 from soilbus.simulator.drive import Drive
 from soilbus.simulator.scenario import SAMPLE_RATE
 from soilbus.terra.earth import SEMI_MAJOR_AXIS, wrapped
 from soilbus.terra.effects.sensors import read_late
+from soilbus.terra.vehicle import GRAVITY
 
 _RATE_DIVIDERS = {"ground_speed": 2, "latitude": 5, "longitude": 5}
 """Samples of the truth (50 Hz) per sample of the sensor: radars give 25 Hz, position receivers 10 Hz, others 50."""
@@ -29,7 +33,8 @@ POSITION_SD = 0.02
 """Standard deviation of a position, north and east [m]: a receiver with real-time corrections."""
 _MEASURED_QUANTITY = {"motor_speed": "speed"}
 """Quantities that measure the same truth as another sensor, with the same noise."""
-_NOISELESS = frozenset({"torque_limit"})  # sent by the motor controller, not measured
+_NOISELESS = frozenset({"torque_limit", LOCK})
+"""Sent by the motor controller or switched by the driver, not measured."""
 
 
 def channel_rng(seed: int, name: str) -> np.random.Generator:
@@ -37,15 +42,69 @@ def channel_rng(seed: int, name: str) -> np.random.Generator:
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
-def fitted(config: Config) -> Iterator[tuple[str, str]]:
-    """(quantity, wheel or "") of every channel that the configuration maps."""
+class Sensor(NamedTuple):
+    """A mapped signal: what it measures, of which wheel or axle ("": of the vehicle).
+
+    weight: of the wheels' true values, by name of the wheel; empty where the truth is the vehicle's.
+    """
+
+    quantity: str
+    part: str
+    mapped: Signal
+    weight: Mapping[str, float]
+
+    @property
+    def name(self) -> str:
+        """Of its channel."""
+        return f"{self.quantity}.{self.part}" if self.part else self.quantity
+
+
+def sensors(config: Config) -> Iterator[Sensor]:
+    """Every sensor that the configuration maps, in the order of its channels."""
+    seen: set[tuple[str, str]] = set()
     for wheel in config.wheel:
-        for quantity in ("torque", "speed", "load", "sinkage", "torque_limit", "motor_speed"):
-            if getattr(wheel, quantity) is not None:
-                yield quantity, wheel.name
-    for quantity in ("ground_speed", "draft", "pitch", "acceleration", "yaw_rate", "latitude", "longitude"):
-        if getattr(config.signals, quantity) is not None:
-            yield quantity, ""
+        for quantity in WHEEL_ROLES:
+            mapped = getattr(wheel, quantity)
+            shared = quantity in SHARED_ROLES
+            if mapped is not None and not (shared and (quantity, mapped.signal) in seen):
+                seen.add((quantity, mapped.signal))
+                same = [
+                    w.name
+                    for w in config.wheel
+                    if getattr(w, quantity) and getattr(w, quantity).signal == mapped.signal
+                ]
+                yield Sensor(
+                    quantity, wheel.name, mapped, dict.fromkeys(same, 1.0 / len(same)) if shared else {wheel.name: 1.0}
+                )
+    for axle in config.axle:
+        for role, quantity in AXLE_ROLES.items():
+            if (mapped := getattr(axle, role)) is not None:
+                yield Sensor(quantity, axle.name, mapped, _of_axle(config, axle, quantity))
+    for quantity in VEHICLE_ROLES:
+        if (mapped := getattr(config.signals, quantity)) is not None:
+            yield Sensor(quantity, "", mapped, {})
+    if config.vehicle is not None and config.vehicle.differential_lock is not None:
+        yield Sensor(LOCK, "", config.vehicle.differential_lock, {})
+
+
+def _of_axle(config: Config, axle: Axle, quantity: str) -> dict[str, float]:
+    """Weights of the wheels in a quantity of an axle, or of the shaft that drives both."""
+    wheels = [w for w in config.wheel if axle.name in ("both", w.axle) and (w.driven or quantity == "load")]
+
+    def turns(wheel: Wheel) -> float:
+        """Of the shaft for one of the wheel."""
+        own = config.axle_named(wheel.axle) if axle.name == "both" else None
+        return 1.0 if own is None else own.gear_ratio
+
+    if quantity == "speed":
+        return {wheel.name: turns(wheel) / len(wheels) for wheel in wheels}
+    return {wheel.name: 1.0 if quantity == "load" else 1.0 / turns(wheel) for wheel in wheels}
+
+
+def fitted(config: Config) -> Iterator[tuple[str, str]]:
+    """(quantity, wheel, axle or "") of every channel that the configuration maps."""
+    for sensor in sensors(config):
+        yield sensor.quantity, sensor.part
 
 
 def measure(drive: Drive, config: Config, seed: int) -> dict[str, Column]:
@@ -65,31 +124,46 @@ def measure(drive: Drive, config: Config, seed: int) -> dict[str, Column]:
     SI, by channel name (can.channels).
     """
     columns: dict[str, Column] = {}
-    wheels = {wheel.name: wheel for wheel in config.wheel}
-    t, true_columns = (
-        drive.columns["t"],
-        drive.columns | _with_sensor_effects(drive, [wheel.name for wheel in config.wheel]),
-    )
-    true_columns = true_columns | {"yaw_rate": np.zeros(len(t))}  # the drives are straight
-    for quantity, wheel in fitted(config):
-        name = f"{quantity}.{wheel}" if wheel else quantity
+    t = drive.columns["t"]
+    true_columns = drive.columns | _with_sensor_effects(drive, config)
+    limits = {axle.name: axle.max_torque or np.nan for axle in config.axle}
+    for sensor in sensors(config):
+        quantity = sensor.quantity
         every = slice(None, None, _RATE_DIVIDERS.get(quantity, 1))
-        measured = _MEASURED_QUANTITY.get(quantity, quantity)
-        truth, rng = true_columns[f"{measured}.{wheel}" if wheel else measured], channel_rng(seed, name)
-        if (delay := getattr(wheels[wheel] if wheel else config.signals, quantity).delay) != 0.0:
-            truth = np.interp(t - delay, t, truth)
-        if quantity in ("latitude", "longitude"):
+        measured, rng = _MEASURED_QUANTITY.get(quantity, quantity), channel_rng(seed, sensor.name)
+        if quantity == "torque_limit" and sensor.part in limits:
+            truth = np.full_like(t, limits[sensor.part])
+        else:
+            truth = _true_reading(true_columns, measured, sensor.weight)
+        if sensor.mapped.delay != 0.0:
+            truth = np.interp(t - sensor.mapped.delay, t, truth)
+        if quantity in POSITION_ROLES:
             parallel = 1.0 if quantity == "latitude" else np.cos(drive.columns["latitude"])
             truth = wrapped(truth + POSITION_SD / (SEMI_MAJOR_AXIS * parallel) * rng.standard_normal(len(t)))
         elif quantity not in _NOISELESS:
             truth = disturbed(truth, getattr(config.noise, measured), config.estimator.window, rng)
-        columns[name] = Column(t[every].copy(), truth[every].copy())
+        columns[sensor.name] = Column(t[every].copy(), truth[every].copy())
     return columns
 
 
-def _with_sensor_effects(drive: Drive, wheels: list[str]) -> dict[str, NDArray[Any]]:
-    """Columns (N,) that effects on sensors change, before noise."""
-    around = drive.surroundings
+def true_speed(true_columns: Mapping[str, NDArray[Any]], config: Config, part: str) -> Array:
+    """Rotation [rad/s] (N,) of a wheel, or the mean of an axle's wheels, at the wheels' side of the motor's gear."""
+    axle = next((axle for axle in config.axle if axle.name == part), None)
+    weight = {part: 1.0} if axle is None else _of_axle(config, axle, "speed")
+    return _true_reading(true_columns, "speed", weight)
+
+
+def _true_reading(true_columns: Mapping[str, NDArray[Any]], quantity: str, weight: Mapping[str, float]) -> Array:
+    """What a sensor without errors reads (N,)."""
+    if not weight:
+        return np.asarray(true_columns[quantity])
+    first, *others = (share * true_columns[f"{quantity}.{wheel}"] for wheel, share in weight.items())
+    return np.asarray(sum(others, start=first))
+
+
+def _with_sensor_effects(drive: Drive, config: Config) -> dict[str, NDArray[Any]]:
+    """Columns (N,) that sensors see by effects and gravity, before noise, and those that are zero on a straight way."""
+    around, wheels = drive.surroundings, [wheel.name for wheel in config.wheel]
     torque, load = (np.stack([drive.columns[f"{q}.{wheel}"] for wheel in wheels], axis=1) for q in ("torque", "load"))
     draft = drive.columns["draft"]
     for effect, values in drive.effects:
@@ -99,7 +173,10 @@ def _with_sensor_effects(drive: Drive, wheels: list[str]) -> dict[str, NDArray[A
             load = load + effect.load(around, values)
         if effect.draft is not None:
             draft = draft + np.ravel(effect.draft(drive.columns["draft"], around, values))
-    changed = {"draft": draft}
+    changed = {"draft": draft} | dict.fromkeys(("yaw_rate", "steering_angle", LOCK), np.zeros(len(draft)))
+    mapped = config.signals.acceleration
+    if mapped is not None and mapped.kind == "specific_force":
+        changed["acceleration"] = drive.columns["acceleration"] + GRAVITY * np.sin(drive.columns["pitch"])
     for i, wheel in enumerate(wheels):
         changed |= {f"torque.{wheel}": torque[:, i], f"load.{wheel}": load[:, i]}
     return changed | _late(drive, drive.columns | changed, wheels)

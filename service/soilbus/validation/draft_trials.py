@@ -24,6 +24,7 @@ from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import NORMAL_95
 from soilbus.estimation.window import Rig
 from soilbus.sensors.bins import Bins
+from soilbus.simulator.drivetrain import Drivetrain, drivetrain_of, own_motors
 from soilbus.simulator.equilibrium import Mechanics, Situation, solve
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
@@ -122,7 +123,9 @@ def trial(task: Task) -> DraftTrial:
     prior = prior_about(prior_of(config), soil, np.random.default_rng([seed, 1]))
     fit = cold_fit(ObservationModel(store.window(0.0, duration), rig, model, config.estimator.min_speed), prior)
     limit = np.array([wheel.max_torque or np.nan for wheel in config.wheel])
-    truth = true_largest_draft(soil, rig, limit, settings.max_slip, WheelModel(shear_law=config.model.shear_law))
+    truth = true_largest_draft(
+        soil, rig, limit, settings.max_slip, WheelModel(shear_law=config.model.shear_law), np.inf, drivetrain_of(config)
+    )
     if fit is None or not fit.converged:
         return DraftTrial(name, np.nan, np.nan, truth)
     able, _ = assess(fit.reported.posterior, rig, model, None, limit, settings.max_slip, settings.max_sinkage)
@@ -132,7 +135,13 @@ def trial(task: Task) -> DraftTrial:
 
 
 def true_largest_draft(
-    soil: Soil, rig: Rig, torque_limit: Array, max_slip: float, model: WheelModel, max_sinkage: float = np.inf
+    soil: Soil,
+    rig: Rig,
+    torque_limit: Array,
+    max_slip: float,
+    model: WheelModel,
+    max_sinkage: float = np.inf,
+    drivetrain: Drivetrain | None = None,
 ) -> float:
     """Largest draft [N] held steadily on level ground; nan where there is none.
 
@@ -141,13 +150,15 @@ def true_largest_draft(
     soil, rig
         Ground and vehicle.
     torque_limit
-        (W,) [N m]; nan for none.
+        Of the wheels (W,) [N m]; nan for none.
     max_slip
         Greatest slip.
     model
         Wheel-soil model.
     max_sinkage
         Greatest sinkage of a wheel [m].
+    drivetrain
+        What turns the wheels, with the limits of axles; by default a motor for each wheel.
 
     Raises
     ------
@@ -161,6 +172,9 @@ def true_largest_draft(
     share = 1.0 / np.where(rig.front, rig.front.sum(), (~rig.front).sum())
     free, drawn = (np.where(rig.front, *axle_loads(rig.chassis, draft, 0.0, 0.0)) * share for draft in (0.0, 1.0))
     none = np.zeros(len(slips))
+    limit = np.where(np.isfinite(torque_limit), torque_limit, np.inf)
+    drivetrain = own_motors(limit) if drivetrain is None else drivetrain
+    limits = np.concatenate([limit, drivetrain.limit[len(limit) :]])
 
     def each_wheel(values: Any) -> Array:
         return np.broadcast_to(np.asarray(values, float)[:, None], shape)
@@ -174,6 +188,7 @@ def true_largest_draft(
             resistance=none,
             level_load=each_wheel(free),
             load_per_draft=each_wheel(drawn - free),
+            upright_load=np.zeros(shape),
             deviation=np.zeros(shape),
             radius=each_wheel(rig.radius),
             width=each_wheel(rig.width),
@@ -181,10 +196,10 @@ def true_largest_draft(
             soil=np.broadcast_to(np.asarray(soil)[:, None, None], (6, *shape)),
             demand=none + np.inf,
             slip_limit=slips,
-            torque_limit=each_wheel(np.where(np.isfinite(torque_limit), torque_limit, np.inf)),
+            torque_limit=np.broadcast_to(limits[:, None], (len(limits), len(slips))),
             least_draft=none - np.inf,
         ),
-        Mechanics(model, ~rig.front, rig.chassis.mass, 0.0, 0.0),
+        Mechanics(model, ~rig.front, rig.chassis.mass, 0.0, 0.0, drivetrain),
     )
     usable = found.found & (sinkage(found.entry_angle, rig.radius[:, None]) <= max_sinkage).all(axis=0)
     return float(found.draft[usable].max()) if usable.any() else float("nan")
