@@ -131,12 +131,14 @@ def test_a_sample_that_is_not_known_widens_the_trend_and_moves_nothing():
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.015, 0.04])
-def test_wheels_that_sink_to_their_limit_are_warned_of_while_the_vehicle_still_drives(rate):
+def test_wheels_that_sink_to_their_limit_are_warned_of_while_the_vehicle_loses_little_speed(rate):
     rng = np.random.default_rng(5)
     limit, t = Traversability().max_sinkage, np.arange(0.0, 25.0, LOOK)
     depth = np.minimum(0.05 + rate * np.maximum(t - 5.0, 0.0), limit + 0.05) if rate else np.full(len(t), limit - 0.06)
     samples = [
-        Sample(now, 1.2, 0.02**2, 1.4, 0.01**2, 0.3, depth=z + 0.01 * rng.standard_normal(), depth_var=0.01**2)
+        Sample(
+            now, 1.4 - 0.01 * now, 0.02**2, 1.6, 0.01**2, 0.3, depth=z + 0.01 * rng.standard_normal(), depth_var=0.01**2
+        )
         for now, z in zip(t.tolist(), depth.tolist(), strict=True)
     ]
     begun = warnings(samples)

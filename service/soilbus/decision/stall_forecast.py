@@ -1,15 +1,15 @@
 """Immobilisation ahead without any soil: the trends of slip and ground speed, extrapolated by a Kalman filter.
 
     q = ln(r omega / V) = -ln(1 - s)         log speed ratio of the driven wheels: grows without bound towards a stall
-    x = (value, rate)                        of q, and of V
+    x = (value, rate)                        of q, of V, and of the sinkage z
     x_k+1 = [1 dt; 0 1] x_k + noise          local linear trend; the rate is a random walk of intensity w
     P(q + h_s dq/dt > -ln(1 - s_max)) > p    slip passes its limit within the horizon h_s
     P(V + h_v dV/dt < 0) > p                 or the vehicle stands within h_v, while thrust holds and wheels slip,
                                              or all motors are at their limit
     P(z + h_s dz/dt > z_max) > p             or the deepest wheel passes the sinkage limit, where sinkage is measured
 
-The first two count only while a vehicle that has moved for some seconds loses speed under thrust: a start is no stall,
-and one in vain is seen by `traction_loss`.  A stall shows in both: wheels that a motor holds at their speed, with
+Each counts only while a vehicle that has moved for some seconds loses speed under thrust: a start is no stall, and one
+in vain is seen by `traction_loss`.  A stall shows in both: wheels that a motor holds at their speed, with
 torque left, make slip run away; motors at their limit lose speed together with the vehicle.  In q, a wheel that creeps,
 starts, or turns on a curve needs no case of its own: what the sensors cannot know there is in the variance of q,
 (sd(V) / V)^2 + (sd(omega) / omega)^2, and V is the mean ground speed of the very wheels whose speed is known.
@@ -200,7 +200,7 @@ def forecast(
     settled = sample.t - since >= settings.settling_time
     loses_speed = speed.rate < 0.0 and math.isfinite(speed.var)
     sinks = depth.probability_above(limits.max_sinkage, settings.slip_horizon) > settings.probability
-    ahead = moves and settled and pushes and (sinks or (loses_speed and (runs_away or stands)))
+    ahead = moves and settled and pushes and loses_speed and (sinks or runs_away or stands)
     heard, caused = (sample.t if now else last for now, last in ((moves, before.heard), (ahead, before.caused)))
     stalls = sample.t - caused < settings.hold
     return StallForecast(
