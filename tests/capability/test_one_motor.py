@@ -66,15 +66,15 @@ def brute_force(config: Config, soil, driven: tuple[str, ...], weights: dict[str
     def draft_at(slip: float) -> float:
         if at(slip, -6000.0)[0] < -6000.0:
             return -math.inf  # it cannot even be pushed at this slip
-        return brentq(lambda D: at(slip, D)[0] - D, -6000.0, 25000.0, xtol=1.0)
+        return brentq(lambda D: at(slip, D)[0] - D, -6000.0, 25000.0, xtol=20.0)
 
-    slips = np.linspace(0.02, MAX_SLIP, 20).tolist()
+    slips = np.linspace(0.04, MAX_SLIP, 9).tolist()
     drafts = [draft_at(slip) for slip in slips]
     spare = [limit - at(slip, max(draft, -6000.0))[1] for slip, draft in zip(slips, drafts, strict=True)]
     best = max((draft for draft, left in zip(drafts, spare, strict=True) if left >= 0.0), default=-math.inf)
     for low, high, *left in zip(slips, slips[1:], spare, spare[1:], strict=False):
         if left[0] > 0.0 > left[1]:
-            meets = brentq(lambda s: limit - at(s, draft_at(s))[1], low, high, xtol=1e-3)
+            meets = brentq(lambda s: limit - at(s, draft_at(s))[1], low, high, xtol=4e-3)
             best = max(best, draft_at(meets))
     return best
 
@@ -100,8 +100,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("soil", ["loam", "sandy_loam_11_michigan"])
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    ("case", "soil"), [*((case, "loam") for case in CASES), ("rear driven", "sandy_loam_11_michigan")]
+)
 def test_the_largest_draft_is_that_of_brute_force(case, soil):
     driven, axles = CASES[case]
     config, true_soil = machine(driven, axles), soil_named(soil)
