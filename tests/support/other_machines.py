@@ -269,7 +269,8 @@ def drive(
     drag
         Torque of a free wheel's bearing over load and radius.
     work
-        Mean and sd of the draft over the largest one on the level; (0, 0) tows nothing.
+        Mean and sd of the draft over the largest one on the level, which it passes only if the mean does; (0, 0) tows
+        nothing.
     steepest
         Sd of the slope [rad].
     """
@@ -278,7 +279,7 @@ def drive(
     t = np.arange(round(duration / STEP)) * STEP
     mean, sd = work
     draft = most * (mean + sd * wander(rng, t, 0.03, 0.3) + 0.2 * sd * wander(rng, t, 0.4, 1.5))
-    draft = np.clip(draft, min(200.0, mean * most), 0.9 * most)
+    draft = np.clip(draft, min(200.0, mean * most), max(0.9, mean) * most)
     pitch, roll = steepest * wander(rng, t, 0.01, 0.06), 0.03 * wander(rng, t, 0.02, 0.1)
     rim = np.clip(1.6 + 0.35 * wander(rng, t, 0.02, 0.12), 0.8, 2.6)
     command = [rim * (1.0 + 0.012 * wander(rng, t, 0.05, 0.4)) / machine.radius[motor[0]] for motor in machine.motors]
