@@ -1,4 +1,4 @@
-"""The second generator obeys its own mechanics, shakes as it says, and agrees with the first where they are the same."""
+"""The second generator obeys its own mechanics, shakes as it says, and agrees with the first where both coincide."""
 
 import math
 
