@@ -201,6 +201,26 @@ def test_ordinary_drives_are_left_in_peace(case, seed):
     assert ORDINARY[case].warned(window) == []
 
 
+ON_ICE = Machine(softens=0.0, soft=(0.06, 0.7, 0.7, 0.06), base=0.3, digs=0.0, gain=1.5, ramp=4.0, known_limit=True)
+"""A start with two wheels on ice: those spin at once, and the others push on until the vehicle moves after 3 s."""
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_start_is_open_while_wheels_that_grip_have_torque_left(seed):
+    window, _ = ON_ICE.driven(seed, 10.0)
+    assert window.ground_speed[-1] > 0.4
+    assert ON_ICE.warned(window) == []
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("why", [{"limit": 0.5}, {"drive": "open"}])
+def test_it_is_in_vain_where_they_have_none_left_or_a_differential_gives_them_none(why, seed):
+    machine = replace(ON_ICE, **why)
+    window, _ = machine.driven(seed, 10.0)
+    assert window.ground_speed[-1] < 0.1
+    assert machine.warned(window)
+
+
 def test_a_bin_that_is_seen_twice_counts_once():
     machine = BOGGED["rover"][0]
     window, _ = machine.driven(1)

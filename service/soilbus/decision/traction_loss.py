@@ -5,6 +5,8 @@
     the vehicle stalls where   V < v_min and no wheel turns, while the wheels' thrust sum(T / r) exceeds what draft,
                                slope and inertia ask by `stall_resistance`, or all motors are at their limits
 
+Wheels that spin are no loss of the vehicle's traction while others grip with torque left.
+
 Slip 1 - V/(r omega) is not defined at standstill, its velocity is: so one rule holds from standstill to full speed.
 Either one that lasts for `spin_time` overrules a go of the estimate.  A vehicle that spins or stalls without moving for
 `stuck_time` is stuck.  It stays stuck until it has moved, for the ground is the same.
@@ -24,6 +26,7 @@ from soilbus.arrays import Array
 from soilbus.config.model import Config, NoiseOfChannels
 from soilbus.config.model import Traversability as Settings
 from soilbus.decision.stall_forecast import Sample, StallForecast, forecast
+from soilbus.estimation.assembly import DIFFERENTIAL_BIAS
 from soilbus.estimation.posterior import Estimate
 from soilbus.estimation.window import Rig, Window, pairs, pull_given
 from soilbus.sensors.consistency import NO_TRACTION, TRACTION
@@ -56,6 +59,8 @@ class Motion(NamedTuple):
         [N], of draft, slope and inertia; nan where the acceleration is not measured.
     last
         The last bin by itself, for the forecast of a stall.
+    torque, reserve
+        [N m], of each of these wheels; whether it is known to be below its limit.
     """
 
     t: float
@@ -67,6 +72,8 @@ class Motion(NamedTuple):
     pull: float = math.nan
     last: Sample | None = None
     beside: Sequence[float] = ()
+    torque: Sequence[float] = ()
+    reserve: Sequence[bool] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,14 +148,15 @@ def observed(before: TractionLoss, motion: Motion, config: Config) -> TractionLo
     known = [rim for rim in motion.rim if math.isfinite(rim)]
     if not known or not math.isfinite(motion.ground):
         return replace(before, t=motion.t, slip=math.nan, pull=math.nan)
-    spinning = sum(
+    spin_now = [
         rim - (motion.ground + more) > max(min_speed, settings.max_slip * rim)
         for rim, more in zip(motion.rim, beside, strict=True)  # nor nan
-    )
-    stands = motion.ground < min_speed
+    ]
+    spinning, stands = sum(spin_now), motion.ground < min_speed
     forced = motion.at_limit or motion.resistance > settings.stall_resistance  # nan: not known
     stalls = stands and forced and max(known) < settings.standstill
-    no_way = stalls or (spinning > 0 and stands) or 2 * spinning >= len(known)
+    slips = (spinning > 0 and stands) or 2 * spinning >= len(known)
+    no_way = stalls or (slips and not _others_grip(motion, spin_now))
     t = motion.t
     spins = min(before.spins, t) if spinning or stalls else math.inf
     sticks = min(before.sticks, t) if no_way else math.inf
@@ -163,6 +171,20 @@ def observed(before: TractionLoss, motion: Motion, config: Config) -> TractionLo
     )
     last = t if lasting or stuck else before.last
     return TractionLoss(t, spins, sticks, moves, lasting, slides, stuck, last, slip, pull, ahead)
+
+
+def _others_grip(motion: Motion, spins: Sequence[bool]) -> bool:
+    """Whether the wheels that do not spin grip with torque left: more than an open differential could hand them.
+
+    mean torque of wheels that grip > (0.5 + b) / (0.5 - b) times that of wheels that spin
+    """
+    wheels = list(zip(motion.torque, spins, motion.reserve, strict=False))
+    spinning = [torque for torque, spin, _ in wheels if spin and math.isfinite(torque)]
+    gripping = [torque for torque, spin, below in wheels if below and not spin]
+    if not spinning or not gripping:
+        return False
+    b = DIFFERENTIAL_BIAS["open"]
+    return (0.5 - b) * sum(gripping) / len(gripping) > (0.5 + b) * max(sum(spinning) / len(spinning), 0.0)
 
 
 def missing_pull(loss: TractionLoss, curve: OverSlip, noise: NoiseOfChannels, deviations: float) -> float:
@@ -291,7 +313,8 @@ def motion_of(window: Window, rig: Rig, torque_limit: NDArray[np.float64], setti
     rim, torque = np.split(np.array(wheels), 2)
     beside = _side(rig) * (yaw_rate if math.isfinite(yaw_rate) else 0.0)
     limited = np.isfinite(torque_limit) & (torque_limit > 0.0)
-    at_limit = bool(limited.any() and (torque[limited] >= settings.full_torque * torque_limit[limited]).all())
+    full = torque >= settings.full_torque * torque_limit
+    at_limit = bool(limited.any() and full[limited].all())
     weight = rig.chassis.mass * GRAVITY
     resistance = ((torque / radius).sum() - asked) / weight
     weights = np.where((torque > 0.0) & (rim > 0.0) & drives, torque, 0.0)
@@ -300,7 +323,8 @@ def motion_of(window: Window, rig: Rig, torque_limit: NDArray[np.float64], setti
     pull = asked if np.isfinite(window.acceleration).any() else math.nan
     return Motion(
         float(window.t[-1]), float(ground), rim[drives].tolist(), float(resistance), at_limit, float(slip),
-        float(pull), _last(window, rig, beside, at_limit), beside[drives].tolist(),
+        float(pull), _last(window, rig, beside, at_limit), beside[drives].tolist(), torque[drives].tolist(),
+        (limited & ~full)[drives].tolist(),
     )  # fmt: skip
 
 
