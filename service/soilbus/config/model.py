@@ -698,16 +698,18 @@ class Warning(_Section):
     """When soilbus warns of immobilisation from slip and speed alone, whatever soil it is.
 
     Tuned on six measured immobilisations of a 90 kg rover on snow (events 1_1 to 1_6 of the data of A. Lines, PhD
-    thesis, 2023, ch. 7): `python -m soilbus.validation.snow`.
+    thesis, 2023, ch. 7), with eleven others looked at: `python -m soilbus.validation.snow`.
     """
 
     slip_horizon: PositiveFloat = 1.0
     """Slip that is to pass `traversability.max_slip` within this time [s] is a cause."""
-    stop_horizon: PositiveFloat = 2.0
+    stop_horizon: PositiveFloat = 1.5
     """A vehicle that is to stand within this time [s], while thrust holds and wheels slip, is a cause."""
+    steady_horizon: PositiveFloat = 3.0
+    """The same by the steady trend of its speed."""
     probability: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.7
     """Of either, from which it counts."""
-    least_slip: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.18
+    least_slip: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.25
     """Slip below which a vehicle that loses speed is only slowed down."""
     least_thrust: NonNegativeFloat = 0.03
     """Thrust, as a share of the weight, from which wheels drive the vehicle: rolling resistance on a road is less
@@ -722,6 +724,8 @@ class Warning(_Section):
     """How fast the rate of the log speed ratio changes [1/s per sqrt(s)]."""
     speed_wander: PositiveFloat = 1.0
     """How fast the acceleration changes [m/s^2 per sqrt(s)]."""
+    steady_wander: PositiveFloat = 0.2
+    """The same of the steady trend."""
     depth_wander: PositiveFloat = 0.05
     """How fast the rate of sinkage changes [m/s per sqrt(s)]: ruts deepen by centimetres a second.  No evidence
     recorded."""

@@ -4,8 +4,9 @@
     x = (value, rate)                        of q, of V, and of the sinkage z
     x_k+1 = [1 dt; 0 1] x_k + noise          local linear trend; the rate is a random walk of intensity w
     P(q + h_s dq/dt > -ln(1 - s_max)) > p    slip passes its limit within the horizon h_s
-    P(V + h_v dV/dt < 0) > p                 or the vehicle stands within h_v, while thrust holds and wheels slip,
-                                             or all motors are at their limit
+    P(V + h_v dV/dt < 0) > p                 or the vehicle stands within h_v, while thrust holds and wheels slip more,
+                                             or all motors are at their limit; by a trend that follows each change
+                                             of its acceleration, or over a longer time by a steadier one
     P(z + h_s dz/dt > z_max) > p             or the deepest wheel passes the sinkage limit, where sinkage is measured
 
 Each counts only while a vehicle that has moved for some seconds loses speed under thrust: a start is no stall, and one
@@ -123,6 +124,8 @@ class StallForecast:
         [s], of the last sample, of the last one with a slip, and of the first one since which the vehicle moves.
     slip, speed, depth
         Trends of the log speed ratio [1], of the ground speed [m/s] and of the sinkage [m].
+    steady
+        Trend of the ground speed [m/s] whose acceleration changes slowly: what a bump takes, it gives back.
     thrust
         As a share of the weight, low-pass filtered.
     caused
@@ -141,6 +144,7 @@ class StallForecast:
     slip: LocalTrend = LocalTrend()  # noqa: RUF009, immutable
     speed: LocalTrend = LocalTrend()  # noqa: RUF009, immutable
     depth: LocalTrend = LocalTrend()  # noqa: RUF009, immutable
+    steady: LocalTrend = LocalTrend()  # noqa: RUF009, immutable
     thrust: float = math.nan
     caused: float = -math.inf
     stalls: bool = False
@@ -183,6 +187,7 @@ def forecast(
         ratio_var = sample.ground_var / ground**2 + sample.rim_var / sample.rim**2 + settings.slip_noise**2
     slip = before.slip.after(step, ratio, ratio_var, settings.slip_wander)
     speed = before.speed.after(step, sample.ground, sample.ground_var, settings.speed_wander)
+    steady = before.steady.after(step, sample.ground, sample.ground_var, settings.steady_wander)
     depth = before.depth.after(step, sample.depth, sample.depth_var, settings.depth_wander)
     thrust = sample.thrust
     mean = before.thrust
@@ -192,8 +197,9 @@ def forecast(
     holds = thrust > settings.thrust_held * mean
     limit = -math.log(1.0 - limits.max_slip)
     runs_away = slip.probability_above(limit, settings.slip_horizon) > settings.probability
-    slips = holds and slip.value > -math.log(1.0 - settings.least_slip)
-    stops = 1.0 - speed.probability_above(0.0, settings.stop_horizon) > settings.probability
+    slips = holds and slip.rate > 0.0 and slip.value > -math.log(1.0 - settings.least_slip)
+    horizons = ((speed, settings.stop_horizon), (steady, settings.steady_horizon))
+    stops = any(1.0 - trend.probability_above(0.0, horizon) > settings.probability for trend, horizon in horizons)
     stands = stops and (slips or sample.at_limit)
     stands_now = ground <= min_speed or sample.rim <= min_speed  # nor nan: what is not known stays as it was
     since = math.inf if stands_now else min(before.since, sample.t if moves else math.inf)
@@ -210,6 +216,7 @@ def forecast(
         slip,
         speed,
         depth,
+        steady,
         mean,
         caused,
         stalls,
