@@ -258,7 +258,7 @@ def test_the_same_slope_loads_the_same_axle_forward_and_in_reverse(tmp_path):
     assert behind.load == pytest.approx(ahead.load)
 
 
-@pytest.mark.parametrize("machine", ["no load cells", "a cell of the rear axle"])
+@pytest.mark.parametrize("machine", ["all load cells", "a cell of the rear axle", "no load cells"])
 def test_intervals_hold_the_truth_on_shaking_loads_without_cells(machine, tmp_path):
     """Another generator: loads that shake by 13 %; mass, centre of gravity, c and K drawn as their priors say.
 
@@ -270,13 +270,13 @@ def test_intervals_hold_the_truth_on_shaking_loads_without_cells(machine, tmp_pa
     for seed in range(4 * many):
         ground = grounds[seed % 4]
         rng = np.random.default_rng([seed, 7])
-        of_c, of_K, of_mass, of_cg = np.exp(0.2 * rng.standard_normal(2)).tolist() + rng.standard_normal(2).tolist()
+        of_c, of_K, of_mass, of_cg = rng.standard_normal(4).tolist()
         config = configured(
-            tmp_path, MACHINES[machine][0], *CLOSED,
+            tmp_path, MACHINES[machine][0] if machine in MACHINES else PLAIN, *CLOSED,
             f"vehicle.mass={{value={2300.0 + 46.0 * of_mass}, std=46.0}}",
             f"vehicle.cg_ahead_of_rear_axle={{value={0.95 + 0.039 * of_cg}, std=0.039}}",
-            f"soil.c={{value={ground.c * of_c}, std={0.25 * ground.c * of_c}}}",
-            f"soil.K={{value={ground.K * of_K}, std={0.25 * ground.K * of_K}}}",
+            f"soil.c={{value={ground.c * (1.0 + 0.25 * of_c)}, std={0.25 * ground.c}}}",
+            f"soil.K={{value={ground.K * (1.0 + 0.25 * of_K)}, std={0.25 * ground.K}}}",
         )  # fmt: skip
         drive = shaking.drive(seed, ground, duration=31.0, shake=4.0)
         for result in estimated(config, drive)[::10]:
@@ -292,7 +292,7 @@ def test_intervals_hold_the_truth_on_shaking_loads_without_cells(machine, tmp_pa
 
 def estimated(config, drive):
     pipeline = Pipeline(config, load_databases(config))
-    channels = {name: Column(t, value) for name, (t, value) in drive.channels.items() if not name.startswith("load.")}
+    channels = {name: Column(t, value) for name, (t, value) in drive.channels.items()}
     rear, other = drive.channels["load.RL"], drive.channels["load.RR"]
     channels["load.rear"] = Column(rear[0], rear[1] + other[1])
     known = set(pipeline.intake.rig.channels)
