@@ -190,7 +190,7 @@ WRITES = """
 import sys
 from pathlib import Path
 from soilbus.files import whole_file
-from soilbus.simulator.frames import write_log
+from soilbus.can.log_writer import write_log
 import can
 
 def frames():

@@ -15,6 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from soilbus.can.dbc_files import load_databases
+from soilbus.can.log_writer import write_log
 from soilbus.cli.main import main
 from soilbus.decision.traversability import Status, Traversability
 from soilbus.offline.recordings import recordings_of
@@ -24,7 +25,7 @@ from soilbus.pipeline.outputs import json_line
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.report.windows import stretches, summary
-from soilbus.simulator.frames import frames, write_log
+from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import TRACTOR, reference_configuration
 from soilbus.simulator.scenario import excited

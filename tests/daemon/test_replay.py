@@ -13,12 +13,13 @@ import pytest
 
 from soilbus.can.candump import frame_of
 from soilbus.can.dbc_files import load_databases
+from soilbus.can.log_writer import write_log
 from soilbus.estimation.window import Rig, SensorNoise
 from soilbus.offline.replay import LogError, estimator_beside, read_frames, read_log, replay
 from soilbus.pipeline.intake import coverage
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.sensors.bins import Bins
-from soilbus.simulator.frames import frames, write_log
+from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited

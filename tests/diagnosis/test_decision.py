@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from soilbus.can.dbc_files import load_databases
+from soilbus.can.log_writer import write_log
 from soilbus.decision.balance import LEVEL, Duty, balance
 from soilbus.decision.capability import slip_grid
 from soilbus.decision.wheels import Axles, wheel_table
@@ -16,7 +17,7 @@ from soilbus.estimation.nuisance_parameters import active_at
 from soilbus.offline.replay import fed
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.drive import drive
-from soilbus.simulator.frames import frames, write_log
+from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, excited

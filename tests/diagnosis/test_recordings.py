@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from soilbus.can.dbc_files import load_databases
+from soilbus.can.log_writer import write_log
 from soilbus.diagnosis.records import TooLittle
 from soilbus.estimation.window import VEHICLE_QUANTITIES, WHEEL_QUANTITIES, Window
 from soilbus.offline.recordings import parts, recordings_of
 from soilbus.offline.replay import fed
 from soilbus.pipeline.intake import Intake
-from soilbus.simulator.frames import frames, write_log
+from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 import tomlkit
 
+from soilbus.can.log_writer import write_log
 from soilbus.cli.main import main
-from soilbus.simulator.frames import frames, write_log
+from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.reference import TRACTOR
 from soilbus.validation.blind.cases import Case, cases

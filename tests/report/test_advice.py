@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from soilbus.can.dbc_files import load_databases
+from soilbus.can.log_writer import write_log
 from soilbus.decision.traversability import Status, Traversability
 from soilbus.offline.replay import replay
 from soilbus.pipeline.excitation import Excitation
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.report.windows import summary_of, why_of_no_use
-from soilbus.simulator.frames import START_TIME, frames, write_log
+from soilbus.simulator.frames import START_TIME, frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, excited

@@ -9,9 +9,10 @@ import pytest
 
 import soilbus.simulator
 from soilbus.can.checksum import frame_checksum
+from soilbus.can.log_writer import write_log
 from soilbus.can.mapping import channels_of, load_databases
 from soilbus.config.file import load_config, parse_config
-from soilbus.simulator.frames import START_TIME, encoded, frames, write_log
+from soilbus.simulator.frames import START_TIME, encoded, frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.scenario import demo, excited
 

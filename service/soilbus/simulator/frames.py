@@ -1,4 +1,4 @@
-"""Simulated sensor series -> CAN frames of the vehicle's own DBC, to a log or a bus.
+"""Simulated sensor series -> CAN frames of the vehicle's own DBC, in the order of their stamps.
 
     raw code = round((value - offset) / scale),    stamp = start + sample time + phase of the message + jitter
 
@@ -8,13 +8,8 @@ available", save those that follow from the drive. Frames of all messages come i
 
 from __future__ import annotations
 
-import gzip
-import io
 import math
-import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping
 
 import can
 import numpy as np
@@ -28,11 +23,10 @@ from soilbus.can.checksum import COUNTER, column_checksums
 from soilbus.can.mapping import channels_of, load_databases
 from soilbus.can.publish import checksum_byte, value_codes
 from soilbus.config.model import Config
-from soilbus.files import placed
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.sensors import channel_rng, true_speed
 
-__all__ = ["START_TIME", "Payload", "encoded", "frames", "write_log"]
+__all__ = ["START_TIME", "Payload", "encoded", "frames"]
 
 START_TIME = 1_700_000_000.0
 """Stamp [s, Unix] of a recording's first instant: logs hold wall clock time."""
@@ -41,14 +35,6 @@ _MAX_JITTER = 1e-3
 _PHASE_STEP = 0.9e-3
 """Phase [s] between one message and the next, which begins again after _PHASES messages."""
 _PHASES = 12
-
-_WRITERS: dict[str, Callable[[Any], Any]] = {
-    ".log": can.CanutilsLogWriter,
-    ".asc": can.ASCWriter,
-    ".csv": can.CSVWriter,
-    ".blf": can.BLFWriter,
-}
-"""Those that write into a file that is open."""
 
 Payload = NDArray[np.uint8]
 
@@ -94,42 +80,6 @@ def frames(
         messages.append(message)
     if times:
         yield from _in_order(times, payloads, messages, str(config.bus.channel))
-
-
-def write_log(messages: Iterable[can.Message], path: Path) -> None:
-    """Write a log in the format of the file's suffix (.log, .asc, .blf, .log.gz ...); it appears only when complete.
-
-    Raises
-    ------
-    ValueError
-        The suffix is unknown.
-    OSError
-        The file cannot be written.
-    """
-    *_, kind, last = ("", "", *(suffix.lower() for suffix in path.suffixes))
-    is_packed = last == ".gz"
-    kind = kind if is_packed else last
-    if kind not in _WRITERS or (is_packed and kind == ".blf"):
-        _write_by_name(messages, path, kind + last if is_packed else kind)
-        return
-    with placed(path) as descriptor, open(descriptor, "wb+", closefd=False) as raw:
-        packed = gzip.GzipFile(fileobj=raw, mode="wb") if is_packed else raw
-        file = packed if kind == ".blf" else io.TextIOWrapper(packed, encoding="utf-8")
-        with _WRITERS[kind](file) as log:
-            for message in messages:
-                log(message)
-
-
-def _write_by_name(messages: Iterable[can.Message], path: Path, suffix: str) -> None:
-    """Write a log of a format that its writer opens itself, under a hidden name first."""
-    part = path.with_name(f".soilbus-{os.getpid()}{suffix}")
-    try:
-        with can.Logger(part) as log:
-            for message in messages:
-                log(message)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def encoded(message: Message, codes: Mapping[str, NDArray[np.int64]]) -> Payload:

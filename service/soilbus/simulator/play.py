@@ -9,9 +9,10 @@ from pathlib import Path
 import can
 
 from soilbus.can.bus import bus_fault, open_bus
+from soilbus.can.log_writer import write_log
 from soilbus.config.model import Config
 from soilbus.simulator.course import NORTHWARD, Course
-from soilbus.simulator.frames import frames, write_log
+from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS

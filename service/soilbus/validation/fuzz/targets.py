@@ -19,6 +19,7 @@ from cantools.database import Database
 
 from soilbus.can.bus import LiveBus
 from soilbus.can.dbc_files import load_databases, output_database
+from soilbus.can.log_writer import write_log
 from soilbus.can.publish import Publisher
 from soilbus.config.file import load_config, shipped_dbc
 from soilbus.config.model import Config, ConfigError
@@ -30,7 +31,7 @@ from soilbus.estimation.gaussian import Gaussian
 from soilbus.offline.replay import LogError, read_frames
 from soilbus.pipeline.intake import Intake
 from soilbus.pipeline.pipeline import Pipeline
-from soilbus.simulator.frames import frames, write_log
+from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import TRACTOR, reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
