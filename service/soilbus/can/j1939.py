@@ -8,8 +8,12 @@ from dataclasses import dataclass, field
 __all__ = ["STANDARD_PGNS", "SourceLock", "group_mask", "pgn_of", "source_of"]
 
 GROUND_BASED_SPEED = 65097
-STANDARD_PGNS = frozenset({65093, 65094, 65096, GROUND_BASED_SPEED, 65265, 65267, 129025})
-"""Groups whose meaning the standards fix (hitch, speed, position), whoever sends them."""
+STANDARD_PGNS = frozenset(
+    {61444, 61449, 61459, 61481, 61482, 61485}  # engine torque, vehicle dynamics, attitude, rates, acceleration
+    | {65093, 65094, 65096, GROUND_BASED_SPEED, 65258, 65265, 65267}  # hitch, speeds, axle weight, position
+    | {127251, 127257, 129025, 129026}  # NMEA 2000: rate of turn, attitude, position, speed over ground
+)
+"""Groups whose meaning the standards fix, whoever sends them."""
 
 LOCK_RELEASE, LOCK_CYCLES = 2.0, 3.0
 """Silence [s] of a locked source after which another may take its place, and the same in cycles of the message:

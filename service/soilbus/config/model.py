@@ -186,6 +186,17 @@ class Signal(_Section):
     """How much earlier what a sample reports was true [s]: a filter, a receiver, a queue."""
     torque_constant: PositiveFloat | None = None
     """Torque for a current [N m/A], where a motor's current is mapped to its torque."""
+    reference_torque: PositiveFloat | None = None
+    """Torque of 100 % [N m], where a percentage of it is mapped: in J1939 SPN 513, of the engine's reference torque,
+    SPN 544."""
+
+    @model_validator(mode="after")
+    def _one_way_to_torque(self) -> Signal:
+        if self.torque_constant is not None and self.reference_torque is not None:
+            raise ValueError(
+                "torque_constant is for a current, reference_torque for a percentage: leave out one of the two"
+            )
+        return self
 
     @model_validator(mode="before")
     @classmethod
@@ -274,7 +285,7 @@ class Axle(_Section):
     max_torque: Annotated[PositiveFloat, AfterValidator(AXLE_TORQUE)] | None = None
     """Greatest torque at the axle [N m], where no signal reports it."""
     torque: Signal | None = None
-    """Torque [N m] or, with `torque_constant`, current [A] of its motor."""
+    """Torque [N m] of its motor; with `torque_constant` its current [A], with `reference_torque` a percentage."""
     torque_limit: Signal | None = None
     """Greatest torque that the motor reports it can give [N m]; optional."""
     motor_speed: Signal | None = None
