@@ -43,6 +43,7 @@ from soilbus.pipeline.result import WindowResult, as_of
 from soilbus.pipeline.states import ServiceState, state_after
 
 if TYPE_CHECKING:
+    from soilbus.daemon.mqtt import MqttOutlet
     from soilbus.daemon.state_persistence import StatePersistence
     from soilbus.decision.capability import OverSlip
     from soilbus.estimation.gaussian import Gaussian
@@ -93,6 +94,8 @@ class Service:
         Called in the worker before the first window; returns the stored state of the last run, or None.
     waiting
         Waits for a future, for at most the seconds given (as WorkQueue).
+    outlet
+        Takes each window's result beside the bus; None without [mqtt].
 
     Notes
     -----
@@ -111,6 +114,7 @@ class Service:
         on_window: Callable[[WindowResult], None] | None = None,
         open_persistence: Callable[[], StatePersistence | None] = lambda: None,
         waiting: Callable[[Future[WindowResult], float], None] = wait_for,
+        outlet: MqttOutlet | None = None,
     ) -> None:
         self.config, self.bus, self.publisher = config, bus, publisher
         self.intake = pipeline.intake
@@ -118,6 +122,7 @@ class Service:
         self._guarded_estimator = GuardedEstimator(self._first_estimator, pipeline.new_estimator)
         self._persistence: StatePersistence | None = None
         self.notifier, self.clock, self.on_window = notifier, clock, on_window
+        self._outlet = outlet
         self.result: WindowResult | None = None
         self.deadline_misses = 0
         self.failures: Counter[str] = Counter()
@@ -174,6 +179,8 @@ class Service:
         self._publish_ten_hertz(self.clock())
         self._work_queue.close()
         self.bus.close()
+        if self._outlet is not None:
+            self._outlet.close()
         if self._persistence is not None:
             self._persistence.close(self.newest_posterior, self._totals())
 
@@ -239,6 +246,8 @@ class Service:
                     self.bus.send(self.publisher.frame(message, values))
             if self.on_window is not None:
                 self.on_window(result)
+            if self._outlet is not None:
+                self._outlet.put(result)
 
     def _vouched(self, result: WindowResult, ended: float, now: float) -> WindowResult:
         """The result as it may go out: valid only where nothing has interrupted the inputs since its window's end."""
@@ -440,6 +449,8 @@ class Service:
             text += ", failed solves: " + ", ".join(f"{kind} {n}" for kind, n in self.failures.most_common())
         if health := health_text(self.bus.state, self.bus.counts):
             text += f", bus: {health}"
+        if self._outlet is not None and (said := self._outlet.status()):
+            text += f", {said}"
         self.notifier.status(text)
 
 

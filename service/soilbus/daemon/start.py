@@ -29,6 +29,7 @@ from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 
 if TYPE_CHECKING:
+    from soilbus.daemon.mqtt import MqttOutlet
     from soilbus.daemon.state_persistence import StatePersistence
 
 SWITCH_INTERVAL = 0.0005
@@ -64,6 +65,7 @@ def start_service(
     """
     pipeline, ours = Pipeline(config, load_databases(config, mapped_only=True)), output_database(config)
     check_cycle_times(config, ours)
+    outlet = _outlet(config)
     publisher = Publisher(ours)
     settings = config.bus.model_dump()
     filters = pipeline.admission.can_filters() + filters_of(ours)
@@ -83,11 +85,20 @@ def start_service(
         _load()
     service = Service(
         config, pipeline, bus, publisher, Notifier.from_environment(), workers, on_window=on_window,
-        open_persistence=partial(_state_persistence, pipeline, os.environ),
+        open_persistence=partial(_state_persistence, pipeline, os.environ), outlet=outlet,
     )  # fmt: skip
     if rehearse:
         workers.submit(_rehearse, config, pipeline.database, ours)  # where it raises, the first window is late, no more
     return service
+
+
+def _outlet(config: Config) -> MqttOutlet | None:
+    """What [mqtt] asks for; nothing of it is loaded where the section is missing."""
+    if config.mqtt is None:
+        return None
+    from soilbus.daemon.mqtt import MqttOutlet
+
+    return MqttOutlet(config.mqtt, config)
 
 
 def _load() -> None:
