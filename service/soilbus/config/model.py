@@ -28,6 +28,7 @@ from pydantic import (
 from soilbus.words import did_you_mean
 
 __all__ = [
+    "J1939",
     "Axle",
     "Bus",
     "Column",
@@ -801,6 +802,35 @@ class Output(_Section):
         return value
 
 
+class J1939(_Section):
+    """Our source address and NAME (SAE J1939-81, ISO 11783-5); the claim concerns `soilbus run` only.
+
+    Without the claim frames carry the address of the DBC.  With it nothing is sent before the address is claimed, nor
+    after a node with a smaller NAME has taken it.
+    """
+
+    address_claim: bool = False
+    """Claim the address before anything is sent (extra `j1939`)."""
+    address: Annotated[int, Field(ge=128, le=247)] | None = None
+    """Source address of our frames, in the range of those that are claimed; by default that of `output.dbc`."""
+    identity_number: Annotated[int, Field(ge=0, lt=2**21)] = 0
+    """Serial number; two of the same NAME cannot live on one bus."""
+    manufacturer_code: Annotated[int, Field(ge=0, lt=2**11)] = 0x7FF
+    """Of the vehicle's maker, as SAE assigns it; by default not available."""
+    ecu_instance: Annotated[int, Field(ge=0, lt=2**3)] = 0
+    """Of several ECUs that do one function."""
+    function_instance: Annotated[int, Field(ge=0, lt=2**5)] = 0
+    """Of several units of one function."""
+    function: Annotated[int, Field(ge=0, lt=2**8)] = 0xFF
+    """By default not available."""
+    device_class: Annotated[int, Field(ge=0, lt=2**7)] = 17
+    """17: sensor system."""
+    device_class_instance: Annotated[int, Field(ge=0, lt=2**4)] = 0
+    """Of several of one class."""
+    industry_group: Annotated[int, Field(ge=0, lt=2**3)] = 2
+    """2: agriculture and forestry."""
+
+
 class Mqtt(_Section):
     """A broker that each window is published to, as JSON; only `soilbus run`, and only where this section stands.
 
@@ -846,6 +876,7 @@ class Config(_Section):
     warning: Warning = Warning()
     model: Model = Model()
     output: Output = Output()
+    j1939: J1939 = J1939()
     mqtt: Mqtt | None = None
     folder: Path = Field(default=Path("."), exclude=True)
 

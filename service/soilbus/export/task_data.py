@@ -22,6 +22,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from soilbus import __version__
+from soilbus.can.j1939 import name_of
 from soilbus.config.model import Config
 from soilbus.decision.traversability import State, Status
 from soilbus.files import NotWritten, whole_file, whole_file_of_bytes
@@ -33,8 +34,6 @@ COMPACTION = 470
 """DDI "soil compaction" of ISO 11783-11."""
 FIRST_PROPRIETARY_DDI = 57344
 """ISO 11783-11 leaves 57344 to 65534 to manufacturers."""
-NAME = 1 << 63 | 2 << 60 | 17 << 49 | 0xFF << 40 | 0x7FF << 21
-"""ISO 11783-5: agriculture, sensor system, function and manufacturer not available."""
 STRUCTURE, LOCALISATION = "01000000000000", "FF000000006E65"
 """Labels of the device: of its structure, first version; of its language, English."""
 STATES = (State.UNKNOWN, State.NO_GO, State.CAUTION, State.GO)
@@ -88,14 +87,17 @@ def write_task_data(folder: Path, results: Iterable[WindowResult], config: Confi
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise NotWritten(f"{folder}: {error.strerror or error}") from None
-    root = _root()
+    client = f"{name_of(config.j1939):016X}"
+    root = _root(client)
     for n, (log, group) in enumerate(groupby(kept, lambda result: result.log), start=1):
         windows = list(group)
         name, records = f"TLG{n:05}", b"".join(_record(result, config.output.compaction) for result in windows)
         with whole_file_of_bytes(folder / f"{name}.bin") as binary:
             binary.write(records)
         _write(folder / f"{name}.xml", _header())
-        _add_task(root, n, log or "live", windows, name, len(records))
+        task = _add_task(root, n, log or "live", windows)
+        ElementTree.SubElement(task, "DAN", A=client, C="DVC1")
+        ElementTree.SubElement(task, "TLG", A=name, B=str(len(records)), C="1")
     _write(folder / "TASKDATA.XML", root)
     return len(every) - len(kept)
 
@@ -134,7 +136,7 @@ def _header() -> ElementTree.Element:
     return time
 
 
-def _root() -> ElementTree.Element:
+def _root(name: str) -> ElementTree.Element:
     """TASKDATA.XML without tasks: the device with its element and the description of each quantity."""
     root = ElementTree.Element(
         "ISO11783_TaskData", VersionMajor="4", VersionMinor="3", DataTransferOrigin="2",
@@ -142,7 +144,7 @@ def _root() -> ElementTree.Element:
         TaskControllerManufacturer="the soilbus authors", TaskControllerVersion=__version__,
     )  # fmt: skip
     device = ElementTree.SubElement(
-        root, "DVC", A="DVC1", B="soilbus", C=__version__, D=f"{NAME:016X}", F=STRUCTURE, G=LOCALISATION
+        root, "DVC", A="DVC1", B="soilbus", C=__version__, D=name, F=STRUCTURE, G=LOCALISATION
     )
     element = ElementTree.SubElement(device, "DET", A="DET1", B="1", C="1", D="soilbus", E="0", F="0")
     first = 2
@@ -160,15 +162,12 @@ def _root() -> ElementTree.Element:
     return root
 
 
-def _add_task(
-    root: ElementTree.Element, n: int, log: str, windows: Sequence[WindowResult], name: str, length: int
-) -> None:
-    """A finished task: from the first to the last window of a log, with its time log."""
+def _add_task(root: ElementTree.Element, n: int, log: str, windows: Sequence[WindowResult]) -> ElementTree.Element:
+    """A finished task: from the first to the last window of a log."""
     task = ElementTree.SubElement(root, "TSK", A=f"TSK{n}", B=f"soilbus {log}"[:32], G="4")
     begin, end = (datetime.fromtimestamp(w.t, UTC).strftime("%Y-%m-%dT%H:%M:%SZ") for w in (windows[0], windows[-1]))
     ElementTree.SubElement(task, "TIM", A=begin, B=end, D="4")
-    ElementTree.SubElement(task, "DAN", A=f"{NAME:016X}", C="DVC1")
-    ElementTree.SubElement(task, "TLG", A=name, B=str(length), C="1")
+    return task
 
 
 def _write(path: Path, root: ElementTree.Element) -> None:
