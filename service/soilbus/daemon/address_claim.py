@@ -48,6 +48,7 @@ class AddressClaim:
     def __init__(self, settings: J1939, address: int) -> None:
         if find_spec("j1939") is None:
             raise ConfigError(["j1939: needs the extra soilbus[j1939]"])
+        logging.getLogger("j1939").setLevel(logging.CRITICAL)  # what of it matters is said here
         self.wanted = address
         self._name = name_of(settings).to_bytes(8, "little")
         self._outgoing: deque[Frame] = deque()
