@@ -8,7 +8,7 @@ import cantools
 import numpy as np
 import pytest
 
-from soilbus.can.admission import hears_any_source
+from soilbus.can.admission import Admission, hears_any_source
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.decode import ColumnDecoder
 from soilbus.can.j1939 import STANDARD_PGNS, pgn_of
@@ -98,3 +98,16 @@ def test_a_signal_of_the_pages_table_can_be_mapped_as_it_stands(role, signal, pg
 def test_the_table_has_every_role_that_a_standard_signal_can_fill():
     assert {role for role, _, _ in ROWS} >= {"ground_speed", "draft", "torque", "load", "pitch", "yaw_rate", "latitude"}
     assert len(ROWS) > 20
+
+
+def test_an_engines_percentage_is_a_torque_of_the_axle_whatever_its_address():
+    torque = {"signal": "ElectronicEngineController1.ActualEnginePercentTorque", "reference_torque": 1250.0}
+    raw = {"dbc": {"input": ["iso11783.dbc"]}, "vehicle": VEHICLE, "wheel": [WHEEL]}
+    config = parse_config(raw | {"axle": [{"name": "both", "gear_ratio": 20.0, "torque": torque}]}, folder=Path())
+    database = load_databases(config)
+    (channel,) = channels_of(config, database)
+    admission = Admission([channel], database)
+    for n, payload in enumerate(("FFFFA54038FFFFFF", "FFFFFFFFFFFFFFFF", "FFFF694038FFFFFF")):
+        admission.feed(0.02 * n, 0x0CF00405, True, bytes.fromhex(payload))
+    column = admission.take().columns[channel.name]
+    assert column.value.tolist() == pytest.approx([0.40 * 1250.0 * 20.0, -0.20 * 1250.0 * 20.0])  # 255: not available

@@ -183,11 +183,11 @@ class Service:
         self._publish_ten_hertz(self.clock())
         self._work_queue.close()
         self.bus.close()
+        if self._persistence is not None:
+            self._persistence.close(self.newest_posterior, self._totals())
         for beside in (self._outlet, self._claim):
             if beside is not None:
                 beside.close()
-        if self._persistence is not None:
-            self._persistence.close(self.newest_posterior, self._totals())
 
     def step(self) -> None:
         """Receive until the next tick, then hand out, collect and publish what is due."""
