@@ -141,6 +141,17 @@ def test_windows_faster_than_the_rate_are_left_out_and_not_counted_as_dropped(br
     outlet.close()
 
 
+def test_windows_at_the_rate_are_all_sent_though_some_come_early(broker, heard):
+    clock = FakeClock()
+    outlet = MqttOutlet(Mqtt(host="127.0.0.1", port=broker.port, topic="field", rate=1.0), CONFIG, {}, clock)
+    heard.get(timeout=PATIENCE)
+    for index, gap in enumerate((0.9, 1.1, 0.95, 1.05, 0.9)):
+        outlet.put(window(index))
+        clock.sleep(gap)
+    assert [json.loads(heard.get(timeout=PATIENCE)[1])["window"] for _ in range(5)] == [0, 1, 2, 3, 4]
+    outlet.close()
+
+
 def test_a_broker_that_comes_late_gets_what_is_kept(broker, heard):
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
