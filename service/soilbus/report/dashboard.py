@@ -171,7 +171,7 @@ class Dashboard:
         self._began = self.known.now
 
     def sample(self) -> None:
-        """Take the present values into the history; call it as often as the picture is drawn."""
+        """Take the present values into the history; call it for each frame and each picture."""
         now, known = self.known.now, self.known
         self._watch_for_inputs()
         if self._samples and 0.0 <= now - self._samples[-1][0] < SAMPLE_PERIOD:
@@ -275,7 +275,7 @@ class Dashboard:
         known = [(value, i) for i in range(WHEELS) if (value := self.wheel_slip(i)) is not None]
         if not known:
             return Slip(None, "", *self._set_points(None))
-        value, i = max(known)
+        value, i = max(known, key=lambda pair: pair[0])
         axle = self.vehicle.axles[i] if i < len(self.vehicle.axles) else None
         return Slip(value, self.vehicle.name(i), *self._set_points(axle))
 

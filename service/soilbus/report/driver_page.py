@@ -13,10 +13,10 @@ from soilbus.report.block_letters import in_cells, in_half_cells
 from soilbus.report.dashboard import Dashboard, Verdict, force, percent
 from soilbus.report.text_charts import area, bar, place
 
-LEAST_WIDTH, LEAST_HEIGHT = 60, 20
+LEAST_WIDTH, LEAST_HEIGHT = 72, 20
 """Columns and rows below which the page is text."""
 KEYS = "d driver  e engineer  q quit"
-AXIS = 9
+AXIS = 11
 """Columns beside the chart of the draft for its scale."""
 
 

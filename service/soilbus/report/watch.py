@@ -221,7 +221,7 @@ def _show_lines(
     dashboard: Dashboard, source: Source, console: Console, done: Callable[[], bool], clock: Callable[[], float]
 ) -> None:
     """A line at once when the state or what to do changes, else at most one a second and only where it differs."""
-    last, said, line_due, redraw = "", None, clock(), clock()
+    last, said, line_due, redraw = "", None, clock(), clock() + REDRAW_PERIOD
     while not done():
         _take(dashboard, source, redraw - clock())
         if clock() < redraw:
@@ -240,6 +240,7 @@ def _take(dashboard: Dashboard, source: Source, timeout: float) -> None:
     dashboard.fault = source.fault
     if message is not None:
         dashboard.known.receive(message)
+        dashboard.sample()
 
 
 @contextmanager
