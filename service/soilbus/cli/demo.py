@@ -3,6 +3,9 @@
 Three parties share one bus: the tractor's ECUs (simulator) send, the service estimates, the dashboard reads only the
 service's frames. The bus is a vcan where the kernel has it, else python-can's in-process virtual bus. The simulated
 drive plays TIME_COMPRESSION times as fast as real time, so the service's times are shortened by the same factor.
+
+    soilbus demo --picture service/docs/dashboard.svg     draws the README's pictures: dashboard.svg, the driver's page
+                                                          at the end of the drive, and dashboard-engineer.svg
 """
 
 from __future__ import annotations
@@ -50,7 +53,6 @@ def run_demo(duration: float, picture: Path | None = None) -> None:
     """Drive `duration` simulated seconds from loam onto wet clay and show what the service says.
 
     `picture` is where the last state of the dashboard is kept as SVG; the engineer's page has `-engineer` in its name.
-    The pictures of the README: `soilbus demo --picture service/docs/dashboard.svg`.
     """
     console = Console()
     real = reference_configuration()

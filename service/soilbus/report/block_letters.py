@@ -50,11 +50,11 @@ def in_cells(word: str, width: int, height: int) -> list[str]:
 
 
 def in_half_cells(word: str, width: int) -> list[str]:
-    """Three lines of a word; none where it is wider than `width` columns."""
+    """Three lines of a word below half an empty one; none where it is wider than `width` columns."""
     rows = pixels(word)
     if len(rows[0]) > width:
         return []
-    rows.append("." * len(rows[0]))
+    rows.insert(0, "." * len(rows[0]))
     return [
         "".join(HALVES[upper + lower] for upper, lower in zip(rows[i], rows[i + 1], strict=True))
         for i in range(0, len(rows), 2)

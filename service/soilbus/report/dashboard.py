@@ -31,7 +31,7 @@ WHEELS = 8
 NAMES = {"go": "GO", "caution": "CAUTION", "no_go": "NO-GO", "unknown": "UNKNOWN"}
 TODO = {
     ("go", None): "Keep going",
-    ("caution", "torque"): "Less draft, motors near limit",
+    ("caution", "torque"): "Less draft, motor limit",
     ("caution", "traction"): "Less draft, more load",
     ("caution", "slip"): "Less draft, more load",
     ("caution", "sinkage"): "Less load, firmer ground",
@@ -45,7 +45,7 @@ TODO = {
 """What to do by state and limiting cause, in at most five words."""
 WARNED_TODO = "Stop, lift, add no torque"
 GONE_TODO = "Rely on your own judgement"
-MEASURING = "Go carefully, soilbus is measuring"
+MEASURING = "Go slowly, still measuring"
 COLOURS = {
     "go": ("#000000", "#00d700"),
     "caution": ("#000000", "#ffd700"),

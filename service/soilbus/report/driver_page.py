@@ -1,6 +1,6 @@
 """The driver's page: state in block letters, what to do, slip beside the best slip, draft beside the possible draft.
 
-It fills the terminal, whatever its size; where it is too small for charts the page is a few lines of text.
+It fills a terminal of any size; where there is too little room for charts the page is a few lines of text.
 """
 
 from __future__ import annotations
@@ -26,9 +26,11 @@ def driver_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
         return small_page(dashboard, width, height)
     verdict = dashboard.verdict()
     lines = band(verdict, width, height // 3)
+    is_roomy = height > LEAST_HEIGHT + 4
+    lines += [Text()] if is_roomy else []
     lines += _todo(verdict.todo, width, height // 10)
     lines += _slip(dashboard, width, max(height // 16, 1))
-    lines.append(Text())
+    lines += [Text()] if is_roomy else []
     lines += _draft(dashboard, width, height - len(lines) - 1)
     return [*lines, footer(dashboard, width)]
 
@@ -65,10 +67,18 @@ def footer(dashboard: Dashboard, width: int) -> Text:
 
 
 def _todo(todo: str, width: int, height: int) -> list[Text]:
-    """What to do below an empty line, as large as fits into `height` rows and 3 at least, else as text."""
-    letters = in_cells(todo, width - 2, height) or in_half_cells(todo, width - 2) or ["", todo.upper(), ""]
-    block = max(map(len, letters))
-    return [Text(), *(Text(row.center(block).center(width), style="bold") for row in letters)]
+    """What to do as large as fits into `height` rows, in three rows at least, in two lines of them if need be."""
+    letters = in_cells(todo, width - 2, height) or in_half_cells(todo, width - 2)
+    lines = [letters] if letters else [in_half_cells(half, width - 2) or [half] for half in _halves(todo)]
+    rows = [row for line in lines for row in line]
+    return [Text(row.center(width).rstrip(), style="bold") for row in rows]
+
+
+def _halves(sentence: str) -> tuple[str, str]:
+    """The sentence in two lines of nearly equal length."""
+    words = sentence.split()
+    halves = ((" ".join(words[:i]), " ".join(words[i:])) for i in range(1, len(words)))
+    return min(halves, key=lambda pair: max(map(len, pair)))
 
 
 def _slip(dashboard: Dashboard, width: int, height: int) -> list[Text]:
