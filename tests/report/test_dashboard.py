@@ -216,6 +216,18 @@ def test_what_to_do_has_at_most_five_words_and_the_sentence_begins_with_the_stat
     assert {verdict.kind for *_, verdict in seen} == {"go", "caution", "no_go", "unknown", "warned", "gone"}
 
 
+def test_every_reason_for_an_unknown_state_is_said_in_words_of_its_own():
+    said = {}
+    for reason in set(REASONS) - {"none", "model_gap", "error", "not_available"}:
+        desk = Desk()
+        desk.send("SoilbusStatus", State="degraded", Reason=reason, Window=1)
+        desk.send("Traversability", State="unknown")
+        said[reason] = desk.dashboard.verdict().said
+    assert len(said) > 12
+    assert len(set(said.values())) == len(said)
+    assert not any("_" in words or "too old" in words for words in said.values())
+
+
 def luminance(colour: tuple[int, int, int]) -> float:
     """Relative luminance of an sRGB colour, WCAG 2."""
     parts = [c / 255.0 for c in colour]
@@ -306,6 +318,9 @@ def test_soilbus_is_gone_when_its_frames_stop_and_for_how_long(desk):
     assert desk.dashboard.verdict().said == "UNKNOWN: soilbus is gone, for 12 s"
     for name in PAGES:
         assert "soilbus is gone, for 12 s" in desk.text(name, (80, 24))
+    desk.dashboard.fault = "bus socketcan:can0: Network is down"
+    for name in PAGES:
+        assert desk.text(name, (80, 24)).splitlines()[-1].startswith("bus away: bus socketcan:can0: Network is down")
     desk.send("Traversability", State="go")
     assert desk.dashboard.verdict().word == "GO"
 

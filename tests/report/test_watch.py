@@ -57,8 +57,8 @@ def sent(seconds: float, state="go") -> list[can.Message]:
     return found
 
 
-def lines_of(source, clock, done, now=None) -> list[tuple[float, str]]:
-    """What `show` prints where there is no terminal, with the time of each line."""
+def lines_of(source, clock, done, now=None, plain=False, **console) -> list[tuple[float, str]]:
+    """What `show` prints where there is no terminal, or none to draw on, with the time of each line."""
 
     class Paper(io.StringIO):
         def write(self, text: str) -> int:
@@ -68,7 +68,7 @@ def lines_of(source, clock, done, now=None) -> list[tuple[float, str]]:
     said: list[tuple[float, str]] = []
     begin = clock.now
     dashboard = Dashboard(ReceivedFrames(DATABASE, now or clock))
-    show(dashboard, source, Console(file=Paper(), width=40), done=done, clock=clock)
+    show(dashboard, source, Console(file=Paper(), width=40, **console), plain, done, clock)
     return said
 
 
@@ -124,6 +124,16 @@ def test_lines_come_once_a_second_and_at_once_when_the_state_changes():
     for _, text in said:
         assert "\x1b" not in text
         assert re.search(r"Slip 1\d % at wheel \d\. Draft 3\.0 kN\. Data 0\.5 s old, valid 0\.5 s ago\.$", text)
+
+
+@pytest.mark.parametrize(("plain", "kind"), [(True, "xterm-256color"), (False, "dumb")])
+def test_lines_come_on_a_terminal_too_where_they_are_asked_for_or_nothing_else_is_possible(plain, kind):
+    clock = FakeClock()
+    source = PlayedLog(sent(4.0), 1.0, clock, clock.sleep)
+    terminal = {"force_terminal": True, "_environ": {"TERM": kind}}
+    said = lines_of(source, clock, lambda: source.is_over, source.now, plain, **terminal)
+    assert 3 <= len(said) <= 5
+    assert "\x1b" not in "".join(text for _, text in said)
 
 
 def test_a_bus_that_goes_is_said_and_waited_for():
