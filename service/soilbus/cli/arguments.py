@@ -141,13 +141,18 @@ def command_line() -> argparse.ArgumentParser:
     sub = command("batch", "many logs of many vehicles, on Dask (extra: batch)")
     sub.add_argument(
         "logs", nargs="+", metavar="LOG",
-        help="log, folder, glob, URL, or manifest: a CSV or Parquet file with columns log, vehicle, configuration, start",
+        help="log, folder, glob, URL, or manifest: a CSV or Parquet file with log, vehicle, configuration, start",
     )  # fmt: skip
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
     sub.add_argument(
-        "--scheduler", metavar="ADDRESS", help="of Dask, such as tcp://10.0.0.1:8786; by default processes of this machine"
+        "--scheduler",
+        metavar="ADDRESS",
+        help="of Dask, such as tcp://10.0.0.1:8786; by default processes of this machine",
     )
     sub.add_argument("--resume", action="store_true", help="go on with DIR: logs that are done are not read again")
+    sub.add_argument(
+        "--diagnose", action="store_true", help="and say which vehicles have which fault, in DIR/diagnosis.json"
+    )
 
     sub = command("watch", "terminal dashboard that reads only our frames, of the bus or of a recording", "optional")
     sub.add_argument("log", nargs="?", type=Path, metavar="LOG", help="a recording of our frames, played in real time")

@@ -210,7 +210,7 @@ def batch(args: argparse.Namespace) -> None:
     try:
         jobs = jobs_of(config, Path(args.config).name, args.logs, lambda path: load_config(path, args.set))
         with phases("batch") as progress, cluster(args.scheduler, say) as client:
-            done = run_batch(client, jobs, args.out, progress or (lambda _: None))
+            done = run_batch(client, jobs, args.out, progress or (lambda _: None), args.diagnose)
     except BatchError as error:
         raise WorkError(str(error)) from None
     print(batch_text(done, args.out), end="")

@@ -2,15 +2,17 @@
 
     LOG...  ->  jobs  ->  parts/DIGEST.gz (one a log)  ->  windows, summaries, errors, map
 
-Only logs that have no part yet are replayed, so a run that was stopped, whatever stopped it, loses the logs in work and
-no more.  Workers need neither the configuration nor the DBC files nor the output folder: settings travel with a job, and
-parts come back.  Logs are opened by the workers where they see them, by path or URL, and are sent along where they do not.
+Only logs that have no part yet are replayed, so a run that was stopped, whatever stopped it, loses the logs in work
+and no more.  Workers need neither the configuration nor the DBC files nor the output folder: settings travel with a
+job, and parts come back.  Workers open a log by its path or URL; where they do not see the path, it is sent along.
 """
 
 from __future__ import annotations
 
 import csv
 import glob
+import hashlib
+import json
 import logging
 import math
 import shutil
@@ -19,6 +21,7 @@ from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from importlib import import_module
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
@@ -27,7 +30,9 @@ from typing import Any
 from soilbus import __version__
 from soilbus.config.model import Config, ConfigError
 from soilbus.offline import dataset
+from soilbus.offline.fleet import chosen, findings_of, judged, no_findings
 from soilbus.offline.parts import Job, OtherVersion, Outcome, Setup, part_of, setup_of, summary_of_part
+from soilbus.pipeline.outputs import known
 from soilbus.words import one_line
 
 __all__ = ["Batch", "BatchError", "check_new", "cluster", "jobs_of", "run_batch"]
@@ -61,6 +66,8 @@ class Batch:
         Windows of all logs.
     resumed
         Logs that were done before this run.
+    fleet
+        Content of diagnosis.json; None where it was not asked for.
     cpu_seconds, log_bytes, duration
         Cost of the logs of this run: processor time [s] and bytes, for recordings of `duration` [s].
     """
@@ -69,6 +76,7 @@ class Batch:
     errors: list[dict[str, Any]]
     windows: int
     resumed: int
+    fleet: dict[str, Any] | None
     cpu_seconds: float
     log_bytes: int
     duration: float
@@ -227,26 +235,28 @@ def cluster(address: str | None, say: Callable[[str], None]) -> Iterator[Any]:
     BatchError
         There is no scheduler, it has no workers, or these have another soilbus.
     """
-    import dask
-    from distributed import Client, LocalCluster
-
+    dask: Any = import_module("dask")
+    distributed: Any = import_module("distributed")  # typed only in part
     # Dask speaks of every worker that is lost; what it means for a log we say ourselves
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    settings = {"distributed.comm.timeouts.connect": CONNECT_TIMEOUT, "distributed.client.scheduler-info-interval": 2000}
+    settings = {
+        "distributed.comm.timeouts.connect": CONNECT_TIMEOUT,
+        "distributed.client.scheduler-info-interval": 2000,
+    }
     with dask.config.set(settings):
         if address is None:
             dashboard = "127.0.0.1:0" if find_spec("bokeh") else None
             with (
-                LocalCluster(
+                distributed.LocalCluster(
                     threads_per_worker=1, processes=True, dashboard_address=dashboard, silence_logs=logging.CRITICAL
                 ) as local,
-                Client(local) as client,
+                distributed.Client(local) as client,
             ):
                 _announce(client, say)
                 yield client
             return
         try:
-            client = Client(address, timeout=CONNECT_TIMEOUT)
+            client = distributed.Client(address, timeout=CONNECT_TIMEOUT)
         except (OSError, TimeoutError, ValueError) as error:
             raise BatchError(f"{address}: no Dask scheduler there ({one_line(error, 100)})") from None
         with client:
@@ -295,8 +305,7 @@ def done_in_turn(
     BatchError
         The scheduler is lost.
     """
-    from distributed import as_completed
-
+    as_completed: Any = import_module("distributed").as_completed
     waiting = iter(tasks)
     threads = sum(client.nthreads().values()) or 1
     name = function.__name__
@@ -335,6 +344,7 @@ def run_batch(
     jobs: Sequence[Job],
     out: Path,
     progress: Callable[[str], None] = lambda _: None,
+    diagnose: bool = False,
 ) -> Batch:
     """Replay all logs that are not done yet, then write the results of all.
 
@@ -348,6 +358,8 @@ def run_batch(
         Folder for the results.
     progress
         Called with what is done.
+    diagnose
+        Whether to diagnose each vehicle over its logs, and the fleet.
 
     Raises
     ------
@@ -364,7 +376,9 @@ def run_batch(
         first = next(iter(outcomes.values())).fault
         names = ", ".join(sorted({job.setup.name for job in jobs}))
         raise ConfigError([f"{names}: fits no log: none of {len(jobs)} logs has a frame that its DBC knows ({first})"])
-    summaries = {job.digest: summary for job in jobs if (summary := summary_of_part(_part_path(parts, job.digest))) is not None}
+    summaries = {
+        job.digest: summary for job in jobs if (summary := summary_of_part(_part_path(parts, job.digest))) is not None
+    }
     errors = [
         {"vehicle": job.vehicle, "log": job.log, "windows": summary["windows.all"] if summary else 0, "fault": fault}
         for job in jobs
@@ -383,6 +397,7 @@ def run_batch(
         errors,
         sum(summary["windows.all"] for summary in summaries.values()),
         len(jobs) - len(outcomes),
+        _diagnose_all(client, jobs, summaries, out, progress) if diagnose else None,
         math.fsum(outcome.cpu_seconds for outcome in outcomes.values()),
         sum(outcome.log_bytes for outcome in outcomes.values()),
         math.fsum(summary["duration"] for digest, summary in summaries.items() if digest in outcomes),
@@ -393,9 +408,7 @@ def _part_path(parts: Path, digest: str) -> Path:
     return parts / f"{digest}.gz"
 
 
-def _replay_all(
-    client: Any, jobs: Sequence[Job], parts: Path, progress: Callable[[str], None]
-) -> dict[str, Outcome]:
+def _replay_all(client: Any, jobs: Sequence[Job], parts: Path, progress: Callable[[str], None]) -> dict[str, Outcome]:
     """Outcomes, by digest, of the logs that had no part, or one of a damaged log: it may be whole now."""
     known = {job.digest: summary_of_part(_part_path(parts, job.digest)) for job in jobs}
     left = {job.digest: job for job in jobs if (summary := known[job.digest]) is None or summary["fault"]}
@@ -473,3 +486,37 @@ def _write_windows(
     dataset.replace_folder(new, windows)
     progress("map")
     dataset.write_map(out / "map.parquet", windows)
+
+
+def _diagnose_all(
+    client: Any,
+    jobs: Sequence[Job],
+    summaries: Mapping[str, Mapping[str, Any]],
+    out: Path,
+    progress: Callable[[str], None],
+) -> dict[str, Any]:
+    """Findings of every vehicle, kept one by one, and the fleet's diagnosis of them."""
+    groups: dict[tuple[str, str], list[Job]] = {}
+    for job in sorted(jobs, key=lambda job: (summaries.get(job.digest, {}).get("begin") or 0, job.log)):
+        if job.digest in summaries:
+            groups.setdefault((job.vehicle, job.setup.digest), []).append(job)
+    together = {_digest_of(group): chosen(group) for _, group in sorted(groups.items())}
+    kept = {digest: out / "parts" / f"{digest}.json" for digest in together}
+    left = {digest: group for digest, group in together.items() if not kept[digest].exists()}
+    unseen = _unseen_folders(client, (job for group in left.values() for job in group))
+    tasks = ((digest, ([_carrying(job, unseen) for job in group], __version__)) for digest, group in left.items())
+    for n, (digest, found) in enumerate(done_in_turn(client, findings_of, tasks), 1):
+        if isinstance(found, OtherVersion):
+            raise BatchError(str(found))
+        if isinstance(found, BaseException):
+            fault = f"{one_line(Exception(str(found)), 200)} ({type(found).__name__})"
+            found = no_findings(together[digest][0].vehicle, fault)
+        dataset.put(kept[digest], json.dumps(known(found), indent=1, allow_nan=False).encode())
+        progress(f"{n} of {len(left)} vehicles diagnosed")
+    fleet = judged([json.loads(path.read_bytes()) for path in kept.values()])
+    dataset.put(out / "diagnosis.json", (json.dumps(fleet, indent=1, allow_nan=False) + "\n").encode())
+    return fleet
+
+
+def _digest_of(jobs: Sequence[Job]) -> str:
+    return hashlib.sha256(" ".join(job.digest for job in jobs).encode()).hexdigest()[:24]

@@ -28,8 +28,8 @@ from soilbus.pipeline.outputs import column_names
 
 ROW_GROUP = 2000
 """Rows that are converted at once: 2 MB of columns."""
-NO_DAY = "__HIVE_DEFAULT_PARTITION__"
-"""Name that readers of partitioned tables take for null: the day of windows whose log has no dates."""
+NO_DAY = "unknown"
+"""Day of windows whose log has no dates; Hive's name for null is not taken, as pandas cannot read it beside others."""
 MAP_COLUMNS = (
     "vehicle", "log", "window", "t", "time", "status", "reason", "bearing_pressure.value", "bearing_pressure.std",
     "soil.phi.value", "soil.phi.std", "traversability.state", "traversability.probability",

@@ -146,7 +146,7 @@ def setup_of(config: Config, name: str) -> Setup:
 
 
 @lru_cache(maxsize=16)
-def _unpacked(content: bytes) -> tuple[Config, Database | None]:
+def unpacked(content: bytes) -> tuple[Config, Database | None]:
     config, database = pickle.loads(content)
     return config, database
 
@@ -204,7 +204,7 @@ def local_log(job: Job) -> Iterator[Path]:
 
 
 def _replayed(job: Job, path: Path) -> Outcome:
-    config, database = _unpacked(job.setup.content)
+    config, database = unpacked(job.setup.content)
     lines, summary = BytesIO(), _Summary(job, config)
     fault: LogError | None = None
     with gzip.GzipFile(fileobj=lines, mode="wb", compresslevel=1, mtime=0) as out:

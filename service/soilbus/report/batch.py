@@ -31,8 +31,30 @@ def batch_text(batch: Batch, out: Path) -> str:
         text += f"  and {len(batch.errors) - MAX_FAULTS} more in {out / 'errors.parquet'}\n"
     if batch.duration:
         hours = batch.duration / 3600.0
-        text += f"cost of an hour of log: {batch.cpu_seconds / hours:.0f} CPU s, {batch.log_bytes / hours / 1e6:.1f} MB\n"
-    return text
+        text += (
+            f"cost of an hour of log: {batch.cpu_seconds / hours:.0f} CPU s, {batch.log_bytes / hours / 1e6:.1f} MB\n"
+        )
+    return text + (fleet_text(batch.fleet) if batch.fleet else "")
+
+
+def fleet_text(fleet: Mapping[str, Any]) -> str:
+    """Which vehicles have which fault, since when; content of diagnosis.json in words."""
+    lines = [
+        f"{fleet['vehicles_diagnosed']} of {len(fleet['vehicles'])} vehicles diagnosed; of the names given, "
+        f"{fleet['false_discovery_rate']:.0%} are expected to be false"
+    ]
+    for vehicle in fleet["vehicles"]:
+        onset = vehicle.get("onset")
+        for effect in vehicle["effects"]:
+            if effect["named"]:
+                since = ""
+                if onset and onset["effect"] == effect["name"] and onset["log"] != vehicle["logs"][0]:
+                    since = f", since {onset['log']} (probability {onset['probability']:.2f})"
+                sizes = ", ".join(f"{n} {e['value']:.4g} ± {e['std']:.2g}" for n, e in effect["parameters"].items())
+                lines.append(f"  {vehicle['vehicle']}: {effect['name']} ({sizes}){since}")
+        if vehicle["fault"]:
+            lines.append(f"  {vehicle['vehicle']}: not diagnosed: {vehicle['fault']}")
+    return "\n".join(lines) + "\n"
 
 
 def _row(row: Mapping[str, Any]) -> tuple[str, ...]:
