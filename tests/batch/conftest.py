@@ -64,7 +64,7 @@ def in_process() -> Any:
 
     @contextmanager
     def opened() -> Iterator[tuple[Any, Any]]:
-        options = {"processes": False, "threads_per_worker": 1, "dashboard_address": ":0", "silence_logs": 50}
+        options = {"processes": False, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0", "silence_logs": 50}
         with (
             dask.config.set(quick),
             distributed.LocalCluster(1, **options) as local,

@@ -7,6 +7,8 @@
 Naming each vehicle's best effect would give a fleet of 10 000 hundreds of false names.  The set S bounds their expected
 share (Newton et al. 2004, Biostatistics 5:155).  A fault of a sensor begins at some day: E0 and E1 are the -2 log
 evidences of each log alone, without and with the effect, its size free in each; the soil is each log's own in any case.
+That no log has it is one more case, and its probability is taken from the name's: what all logs together seem to show,
+and none of them by itself, may be a difference between them that is none of the vehicle's.
 """
 
 from __future__ import annotations
@@ -37,6 +39,9 @@ __all__ = [
 FALSE_DISCOVERY_RATE = 0.05
 """Expected share of names that are false, over the fleet: the usual level of a test."""
 
+MAX_ROUNDS = 2
+"""Times that a vehicle is diagnosed once more from the onset on, as another effect may then explain most."""
+
 
 @dataclass(frozen=True, slots=True)
 class Onset:
@@ -44,19 +49,19 @@ class Onset:
 
     Attributes
     ----------
-    effect
-        Its name.
     first
         Index of the first log with the effect, the most probable one.
     probabilities
         Of each log to be the first.
+    never
+        Probability that no log has it.
     sizes
         The effect's parameters as each log alone shows them; None where its fit failed.
     """
 
-    effect: str
     first: int
     probabilities: tuple[float, ...]
+    never: float
     sizes: tuple[Mapping[str, Estimate] | None, ...]
 
 
@@ -68,12 +73,12 @@ class VehicleDiagnosis:
     ----------
     diagnosis
         Joint diagnosis of the logs that have the effects: all, or those from the onset of the first effect on.
-    onset
-        Of the effect that explains most; None where none was found, or there is one log only.
+    onsets
+        Of each effect found, by name; none where there is one log only.
     """
 
     diagnosis: Diagnosis
-    onset: Onset | None
+    onsets: Mapping[str, Onset]
 
     @property
     def probabilities(self) -> dict[str, float]:
@@ -82,8 +87,10 @@ class VehicleDiagnosis:
         if self.diagnosis.verdict is Verdict.UNKNOWN:
             return found
         for addition in self.diagnosis.additions:
+            onset = self.onsets.get(addition.effect.name)
+            shown = 1.0 if onset is None else 1.0 - onset.never
             for name, p in ({addition.effect.name: addition.probability} | addition.alternatives).items():
-                found[name] = max(p, found.get(name, 0.0))
+                found[name] = max(p * shown, found.get(name, 0.0))
         return found
 
 
@@ -104,16 +111,25 @@ def diagnose_vehicle(records: Sequence[Record], prior: SoilPrior, catalogue: Seq
     NotFitted
         Where already the present model cannot be fitted.
     """
-    found = diagnose(records, prior, catalogue)
-    if not found.additions or len(records) == 1:
-        return VehicleDiagnosis(found, None)
-    onset = onset_of(records, prior, found.additions[0].effect)
-    if onset.first > 0:  # one value of the effect for all logs was wrong: it belongs to the later ones
-        found = diagnose(records[onset.first :], prior, catalogue)
-    return VehicleDiagnosis(found, onset)
+    first, found = 0, diagnose(records, prior, catalogue)
+    onsets = onsets_of(records, prior, found)
+    for _ in range(MAX_ROUNDS):
+        begin = next((onset.first for onset in onsets.values()), first)
+        if begin == first:
+            break
+        # one value of the effect for all logs was wrong: it belongs to those from its onset on
+        first, found = begin, diagnose(records[begin:], prior, catalogue)
+        onsets = onsets_of(records, prior, found)
+    return VehicleDiagnosis(found, onsets)
 
 
-def onset_of(records: Sequence[Record], prior: SoilPrior, effect: Effect) -> Onset:
+def onsets_of(records: Sequence[Record], prior: SoilPrior, found: Diagnosis) -> dict[str, Onset]:
+    """The onset of each effect of a diagnosis, beside its others, by name; none of a single log."""
+    effects = [addition.effect for addition in found.additions] if len(records) > 1 else []
+    return {e.name: onset_of(records, prior, e, [other for other in effects if other is not e]) for e in effects}
+
+
+def onset_of(records: Sequence[Record], prior: SoilPrior, effect: Effect, beside: Sequence[Effect] = ()) -> Onset:
     """The first of several logs from which on a vehicle has an effect.
 
     Parameters
@@ -124,20 +140,22 @@ def onset_of(records: Sequence[Record], prior: SoilPrior, effect: Effect) -> Ons
         Of the soil.
     effect
         The effect.
+    beside
+        Other effects of the model.
     """
-    without, along, sizes = [], [], []
+    falls: list[float] = []
+    sizes: list[Mapping[str, Estimate] | None] = []
     for record in records:
-        present = record.training.effects
+        present = (*record.training.effects, *beside)
         base, full = (fit_model([record], prior, effects) for effects in (present, (*present, effect)))
-        without.append(np.inf if base is None else base.neg2_log_evidence)
-        along.append(np.inf if full is None else full.neg2_log_evidence)
+        falls.append(np.nan if base is None or full is None else base.neg2_log_evidence - full.neg2_log_evidence)
         sizes.append(None if full is None else full.parameters()[effect.name])
-    probabilities = onset_probabilities(np.array(without) - np.array(along))
-    return Onset(effect.name, int(np.argmax(probabilities)), tuple(probabilities), tuple(sizes))
+    *probabilities, never = onset_probabilities(falls)
+    return Onset(int(np.argmax(probabilities)), tuple(probabilities), never, tuple(sizes))
 
 
 def onset_probabilities(falls: Sequence[float]) -> list[float]:
-    """Probability of each log to be the first with an effect.
+    """Probability of each log to be the first with an effect, and, last, that none has it.
 
     Parameters
     ----------
@@ -146,10 +164,10 @@ def onset_probabilities(falls: Sequence[float]) -> list[float]:
 
     Returns
     -------
-    Probabilities; each log is as likely as any other beforehand, and evidences are tempered as in `verdict`.
+    Probabilities; beforehand each case is as likely as any other, and evidences are tempered as in `verdict`.
     """
     known = np.where(np.isfinite(falls), falls, 0.0)
-    explained = np.cumsum(known[::-1])[::-1]
+    explained = np.append(np.cumsum(known[::-1])[::-1], 0.0)
     return [float(p) for p in softmax(explained / (2.0 * TEMPERATURE))]
 
 

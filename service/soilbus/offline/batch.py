@@ -245,11 +245,10 @@ def cluster(address: str | None, say: Callable[[str], None]) -> Iterator[Any]:
     }
     with dask.config.set(settings):
         if address is None:
-            dashboard = "127.0.0.1:0" if find_spec("bokeh") else None
+            options = {"threads_per_worker": 1, "processes": True, "silence_logs": logging.CRITICAL}
+            here = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
             with (
-                distributed.LocalCluster(
-                    threads_per_worker=1, processes=True, dashboard_address=dashboard, silence_logs=logging.CRITICAL
-                ) as local,
+                distributed.LocalCluster(**options, **here) as local,
                 distributed.Client(local) as client,
             ):
                 _announce(client, say)

@@ -13,7 +13,7 @@ import numpy as np
 
 from soilbus import __version__
 from soilbus.diagnosis.diagnose import NotFitted
-from soilbus.diagnosis.fleet import FALSE_DISCOVERY_RATE, diagnose_vehicle, named
+from soilbus.diagnosis.fleet import FALSE_DISCOVERY_RATE, Onset, diagnose_vehicle, named
 from soilbus.diagnosis.records import Record, TooLittle
 from soilbus.estimation.assembly import possible_effects, prior_of
 from soilbus.offline.parts import Job, OtherVersion, local_log, unpacked
@@ -71,7 +71,7 @@ def findings_of(jobs: Sequence[Job], version: str) -> dict[str, Any]:
         found = diagnose_vehicle(records, prior_of(config), possible_effects(config))
     except (NotFitted, np.linalg.LinAlgError) as error:
         return record | {"fault": one_line(error, 200)}
-    diagnosis, onset = found.diagnosis, found.onset
+    diagnosis = found.diagnosis
     record |= {
         "fault": None,
         "verdict": str(diagnosis.verdict),
@@ -79,20 +79,26 @@ def findings_of(jobs: Sequence[Job], version: str) -> dict[str, Any]:
     }
     values = diagnosis.completed.parameters()
     record["effects"] = [
-        {"name": name, "probability": p, "parameters": _estimates(values.get(name, {}))}
+        {
+            "name": name,
+            "probability": p,
+            "parameters": _estimates(values.get(name, {})),
+            "onset": _onset(found.onsets[name], record["logs"]) if name in found.onsets else None,
+        }
         for name, p in found.probabilities.items()
     ]
-    if onset is not None:
-        record["onset"] = {
-            "effect": onset.effect,
-            "log": record["logs"][onset.first],
-            "probability": onset.probabilities[onset.first],
-            "by_log": [
-                {"log": log, "probability": p, "parameters": _estimates(sizes or {})}
-                for log, p, sizes in zip(record["logs"], onset.probabilities, onset.sizes, strict=True)
-            ],
-        }
     return record
+
+
+def _onset(onset: Onset, logs: Sequence[str]) -> dict[str, Any]:
+    """The first log with an effect, and the size in each log alone."""
+    by_log = zip(logs, onset.probabilities, onset.sizes, strict=True)
+    return {
+        "log": logs[onset.first],
+        "probability": onset.probabilities[onset.first],
+        "never": onset.never,
+        "by_log": [{"log": log, "probability": p, "parameters": _estimates(s or {})} for log, p, s in by_log],
+    }
 
 
 def no_findings(vehicle: str, fault: str) -> dict[str, Any]:

@@ -3,7 +3,8 @@
     log -> replay -> part = gzip(summary) + gzip(a line of JSON for each window)
 
 A part depends on the log, the configuration and the version of soilbus alone: the same log gives the same bytes on
-every machine.  The replay yields one window at a time, so memory grows by the part's bytes only, about 1 kB a window.
+every machine.  The replay yields one window at a time and its line goes to a temporary file, so memory does not grow
+with the log; at the end the part is in memory as a whole, about 1 kB a window.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from functools import lru_cache
 from io import BytesIO
 from itertools import islice
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
+from tempfile import TemporaryDirectory, TemporaryFile
+from typing import IO, Any
 
 from cantools.database.can import Database
 
@@ -205,9 +206,15 @@ def local_log(job: Job) -> Iterator[Path]:
 
 def _replayed(job: Job, path: Path) -> Outcome:
     config, database = unpacked(job.setup.content)
-    lines, summary = BytesIO(), _Summary(job, config)
+    with TemporaryFile() as lines:
+        return _part_by_way_of(lines, job, config, database, path)
+
+
+def _part_by_way_of(lines: IO[bytes], job: Job, config: Config, database: Database | None, path: Path) -> Outcome:
+    """The outcome; `lines` is an empty file that holds the windows until the summary, which goes before, is known."""
+    summary = _Summary(job, config)
     fault: LogError | None = None
-    with gzip.GzipFile(fileobj=lines, mode="wb", compresslevel=1, mtime=0) as out:
+    with gzip.GzipFile(filename="", fileobj=lines, mode="wb", mtime=0) as out:
         pipeline = None if database is None else Pipeline(config, database)
         try:
             for result in replay_tables(config, [path]) if pipeline is None else replay(pipeline, [path]):
@@ -221,7 +228,8 @@ def _replayed(job: Job, path: Path) -> Outcome:
     if not summary.windows:
         return Outcome(None, f"{job.log}: no recording in it lasts the {config.estimator.window:g} s of a window")
     head = json.dumps(summary.record(pipeline, text), allow_nan=False).encode() + b"\n"
-    return Outcome(gzip.compress(head, mtime=0) + lines.getvalue(), text, summary.windows)
+    lines.seek(0)
+    return Outcome(b"".join((gzip.compress(head, mtime=0), lines.read())), text, summary.windows)
 
 
 class _Summary:

@@ -44,11 +44,10 @@ def fleet_text(fleet: Mapping[str, Any]) -> str:
         f"{fleet['false_discovery_rate']:.0%} are expected to be false"
     ]
     for vehicle in fleet["vehicles"]:
-        onset = vehicle.get("onset")
         for effect in vehicle["effects"]:
             if effect["named"]:
-                since = ""
-                if onset and onset["effect"] == effect["name"] and onset["log"] != vehicle["logs"][0]:
+                since, onset = "", effect["onset"]
+                if onset and onset["log"] != vehicle["logs"][0]:
                     since = f", since {onset['log']} (probability {onset['probability']:.2f})"
                 sizes = ", ".join(f"{n} {e['value']:.4g} ± {e['std']:.2g}" for n, e in effect["parameters"].items())
                 lines.append(f"  {vehicle['vehicle']}: {effect['name']} ({sizes}){since}")
