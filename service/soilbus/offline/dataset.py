@@ -130,9 +130,7 @@ def vehicle_rows(logs: Sequence[Mapping[str, Any]], errors: Sequence[Mapping[str
     One row for each vehicle: counts added up, the mean bearing pressure over valid windows, first begin and last end.
     """
     rows = []
-    for vehicle in sorted({str(row["vehicle"]) for row in (*logs, *errors)}):
-        own = [row for row in logs if row["vehicle"] == vehicle]
-        faults = [row for row in errors if row["vehicle"] == vehicle]
+    for vehicle, (own, faults) in sorted(_by_vehicle(logs, errors).items()):
         row: dict[str, Any] = {
             "vehicle": vehicle,
             "logs.all": len({str(each["log"]) for each in (*own, *faults)}),
@@ -150,6 +148,15 @@ def vehicle_rows(logs: Sequence[Mapping[str, Any]], errors: Sequence[Mapping[str
         row["bearing_pressure.mean"] = sum(m * n for m, n in known) / sum(n for _, n in known) if known else None
         rows.append({name: value for name, value in row.items() if name not in ("fault", "log", "configuration")})
     return rows
+
+
+def _by_vehicle(*tables: Sequence[Mapping[str, Any]]) -> dict[str, tuple[list[Mapping[str, Any]], ...]]:
+    """The rows of each table that are of one vehicle."""
+    found: dict[str, tuple[list[Mapping[str, Any]], ...]] = {}
+    for i, rows in enumerate(tables):
+        for row in rows:
+            found.setdefault(str(row["vehicle"]), tuple([] for _ in tables))[i].append(row)
+    return found
 
 
 def write_map(path: Path, windows: Path) -> int:

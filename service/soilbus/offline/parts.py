@@ -313,7 +313,14 @@ def summary_of_part(path: Path) -> dict[str, Any] | None:
             summary: dict[str, Any] = json.loads(next(lines))
     except (OSError, EOFError, StopIteration, ValueError):
         return None
+    summary["columns"] = _shared(tuple(summary["columns"]))
     return summary
+
+
+@lru_cache(maxsize=256)
+def _shared(columns: tuple[str, ...]) -> tuple[str, ...]:
+    """The same columns as one object: a fleet's summaries are in memory at once, and most have the same."""
+    return columns
 
 
 def rows_of_part(part: bytes, at_once: int) -> Iterator[list[dict[str, Any]]]:
