@@ -82,6 +82,9 @@ def command_line() -> argparse.ArgumentParser:
     sub.add_argument("--json", type=Path, metavar="OUT", help="one JSON object a line per window; - for stdout")
     sub.add_argument("--report", type=Path, metavar="OUT.html", help="self-contained HTML with plots (extra: plots)")
     sub.add_argument("--map", type=Path, metavar="OUT.geojson", help="a point for each window; needs a mapped position")
+    sub.add_argument(
+        "--frames", type=Path, metavar="OUT", help="log of the frames that the service sends (.log .log.gz .asc .blf)"
+    )
     sub.add_argument("--partial", action="store_true", help="keep the windows before the point where a log is damaged")
 
     sub = command("simulate", "simulated tractor, to a bus in real time or to a log", "optional")

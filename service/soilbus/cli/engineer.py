@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 def replay(args: argparse.Namespace) -> None:
     """`soilbus replay`: the daemon's pipeline over recorded logs, or over tables of a test rig."""
     from soilbus.can.dbc_files import load_databases
+    from soilbus.config.model import ConfigError
     from soilbus.offline.replay import LogError, estimator_beside, other_channel, replay
     from soilbus.pipeline.pipeline import Pipeline
     from soilbus.report.progress import progress
@@ -34,8 +35,11 @@ def replay(args: argparse.Namespace) -> None:
     if args.report is not None:
         need_extra("matplotlib", "plots", "--report")
     if config.table is not None:
+        if args.frames is not None:
+            raise ConfigError(["--frames: a table of a test rig has no bus to send on"])
         _replay_tables(args, config)
         return
+    check_folders(args.frames)
     for line in other_channel(config, args.logs):
         say(line)
     pipeline = Pipeline(config, load_databases(config))
@@ -60,9 +64,23 @@ def replay(args: argparse.Namespace) -> None:
             out.write(map_text)
         if left_out:
             say(f"{left_out} of {len(results)} windows have no position: not on the map")
+    if args.frames is not None:
+        _write_frames(args, config)
     if "-" not in (str(args.json), str(args.map)):
         print(text, end="")
     _need_a_use(results, config)
+
+
+def _write_frames(args: argparse.Namespace, config: Config) -> None:
+    from soilbus.can.log_writer import write_log
+    from soilbus.offline.sent_frames import sent_frames
+
+    try:
+        write_log(sent_frames(config, args.logs), args.frames)
+    except OSError as error:
+        raise WorkError(f"{args.frames}: {error.strerror or error}") from None
+    except ValueError as error:
+        raise WorkError(f"{args.frames}: {error}") from None
 
 
 def _need_a_use(results: Sequence[WindowResult], config: Config) -> None:
