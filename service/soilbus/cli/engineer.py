@@ -17,11 +17,13 @@ from soilbus.process import say
 if TYPE_CHECKING:
     from soilbus.config.model import Config
     from soilbus.pipeline.result import WindowResult
+    from soilbus.simulator.scenario import Scenario
 
 
 def replay(args: argparse.Namespace) -> None:
     """`soilbus replay`: the daemon's pipeline over recorded logs, or over tables of a test rig."""
     from soilbus.can.dbc_files import load_databases
+    from soilbus.config.model import ConfigError
     from soilbus.offline.replay import LogError, estimator_beside, other_channel, replay
     from soilbus.pipeline.pipeline import Pipeline
     from soilbus.report.progress import progress
@@ -34,8 +36,11 @@ def replay(args: argparse.Namespace) -> None:
     if args.report is not None:
         need_extra("matplotlib", "plots", "--report")
     if config.table is not None:
+        if args.frames is not None:
+            raise ConfigError(["--frames: a table of a test rig has no bus to send on"])
         _replay_tables(args, config)
         return
+    check_folders(args.frames)
     for line in other_channel(config, args.logs):
         say(line)
     pipeline = Pipeline(config, load_databases(config))
@@ -60,9 +65,23 @@ def replay(args: argparse.Namespace) -> None:
             out.write(map_text)
         if left_out:
             say(f"{left_out} of {len(results)} windows have no position: not on the map")
+    if args.frames is not None:
+        _write_frames(args, config)
     if "-" not in (str(args.json), str(args.map)):
         print(text, end="")
     _need_a_use(results, config)
+
+
+def _write_frames(args: argparse.Namespace, config: Config) -> None:
+    from soilbus.can.log_writer import write_log
+    from soilbus.offline.sent_frames import sent_frames
+
+    try:
+        write_log(sent_frames(config, args.logs), args.frames)
+    except OSError as error:
+        raise WorkError(f"{args.frames}: {error.strerror or error}") from None
+    except ValueError as error:
+        raise WorkError(f"{args.frames}: {error}") from None
 
 
 def _need_a_use(results: Sequence[WindowResult], config: Config) -> None:
@@ -112,20 +131,60 @@ def simulate(args: argparse.Namespace) -> None:
     from soilbus.estimation.assembly import with_effects
     from soilbus.simulator.course import course
     from soilbus.simulator.drive import SimulationError
-    from soilbus.simulator.play import play, scenario_over
-    from soilbus.simulator.recording import simulate
+    from soilbus.simulator.play import scenario_over
 
+    if args.truth is not None:
+        check_folders(args.truth)
+        if args.truth.suffix.lower() in (".parquet", ".pq"):
+            need_extra("pyarrow", "tables", "--truth in Parquet")
     config = with_effects(configured_or_reference(args), args.effect)
     try:
         way = course(args.start, args.heading, args.rows)
-        recording = simulate(config, scenario_over(args.soil or ["loam"], args.duration, way), args.seed)
-        play(recording, config, args.log)
+        scenario = scenario_over(
+            args.soil or ["loam"], args.duration, way, args.draft, args.slope / 100.0, args.speed, args.vehicle_seed
+        )
+        bogged_at = _simulate_live(args, config, scenario) if args.bus else _simulate_log(args, config, scenario)
     except (SimulationError, KeyError, ValueError, BusError) as error:
         raise WorkError(str(error.args[0])) from None
+    if bogged_at is not None:
+        say(f"the tractor is stuck after {bogged_at:.1f} s")
+
+
+def _simulate_log(args: argparse.Namespace, config: Config, scenario: Scenario) -> float | None:
+    """Write the log; when the tractor bogged down [s]."""
+    from soilbus.can.log_writer import write_log
+    from soilbus.simulator.drive import drive
+    from soilbus.simulator.frames import START_TIME, frames
+    from soilbus.simulator.recording import recorded
+    from soilbus.simulator.truth import write_truth
+
+    done = drive(config, scenario, args.seed)
+    try:
+        write_log(frames(recorded(done, config, scenario, args.seed), config), args.log)
     except OSError as error:
-        raise WorkError(f"{args.log or 'bus'}: {error.strerror or error}") from None
-    if recording.bogged_at is not None:
-        say(f"the tractor is stuck after {recording.bogged_at:.1f} s")
+        raise WorkError(f"{args.log}: {error.strerror or error}") from None
+    if args.truth is not None:
+        write_truth(done, args.truth, START_TIME)
+    return done.bogged_at
+
+
+def _simulate_live(args: argparse.Namespace, config: Config, scenario: Scenario) -> float | None:
+    """Drive on the bus; when the tractor bogged down [s]. An interrupted drive leaves its true values too."""
+    import time
+    from collections import deque
+
+    from soilbus.simulator.drive import Drive, joined
+    from soilbus.simulator.live import drive_live
+    from soilbus.simulator.truth import write_truth
+
+    driven: deque[Drive] = deque(maxlen=1 if args.truth is None else None)
+    begin = time.time()
+    try:
+        begin = drive_live(config, scenario, args.seed, driven)
+    finally:
+        if args.truth is not None and driven:
+            write_truth(joined(driven), args.truth, begin)
+    return driven[-1].bogged_at
 
 
 def diagnose(args: argparse.Namespace) -> None:
