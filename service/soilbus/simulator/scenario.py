@@ -70,6 +70,11 @@ class Profile:
         """The least value."""
         return min(self.value)
 
+    @property
+    def high(self) -> float:
+        """The greatest value."""
+        return max(self.value)
+
 
 class Wave(NamedTuple):
     """One realisation of a swing or a profile: value, rate of change [1/s], integral from the start [s]; each (N,)."""

@@ -6,7 +6,7 @@
 
 Beside it the same cases after as long a drive like the first one: what more of the same settles.  The drive is that of
 the blind generator, with the hidden effect in its own formula (`soilbus.validation.blind`); recordings have one field
-and one vehicle, own noise and own gain errors of the sensors.
+and one vehicle, and own noise.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ KINDS = ("right", "wrong", "open")
 
 
 def driven(case: Case, scenario: Scenario, seed: int) -> Diagnosis:
-    """The case's recording and a further drive of its tractor, diagnosed together."""
-    how = case.how
+    """The case's recording and a further drive of its tractor, with its gain errors, diagnosed together."""
+    how, scenario = case.how, replace(scenario, vehicle_seed=case.seed)
     further = how.after(simulate(how.tractor(case.config), how.way(scenario), seed, how.effects))
     recordings = {"before": case.recording, "next": further}
     records = [record_of_recording(name, recording, case.config) for name, recording in recordings.items()]
