@@ -118,6 +118,7 @@ def command_line() -> argparse.ArgumentParser:
         "--truth", type=Path, metavar="OUT",
         help="table of true values: soil, slip, draft, load, sinkage, torque (.csv, or .parquet with the extra tables)",
     )  # fmt: skip
+    sub.add_argument("--manoeuvre", type=Path, metavar="FILE", help="drive what diagnose --manoeuvre-out has written")
     target = sub.add_mutually_exclusive_group(required=True)
     target.add_argument(
         "--bus", action="store_true", help="drive on the configured bus in real time, by its commands (dbc/tractor.dbc)"
@@ -130,6 +131,9 @@ def command_line() -> argparse.ArgumentParser:
     sub.add_argument("--report", type=Path, metavar="OUT.html", help="self-contained HTML with plots (extra: plots)")
     sub.add_argument(
         "--model-out", type=Path, metavar="OUT.toml", help="the configuration with the effects found, for any command"
+    )
+    sub.add_argument(
+        "--manoeuvre-out", type=Path, metavar="OUT.json", help="of an ambiguous diagnosis, what to drive to settle it"
     )
 
     sub = command("watch", "live terminal dashboard that reads only our frames", "optional")

@@ -143,11 +143,28 @@ def simulate(args: argparse.Namespace) -> None:
         scenario = scenario_over(
             args.soil or ["loam"], args.duration, way, args.draft, args.slope / 100.0, args.speed, args.vehicle_seed
         )
+        if args.manoeuvre is not None:
+            scenario = _of_manoeuvre(args.manoeuvre, scenario, config)
         bogged_at = _simulate_live(args, config, scenario) if args.bus else _simulate_log(args, config, scenario)
     except (SimulationError, KeyError, ValueError, BusError) as error:
         raise WorkError(str(error.args[0])) from None
     if bogged_at is not None:
         say(f"the tractor is stuck after {bogged_at:.1f} s")
+
+
+def _of_manoeuvre(path: Path, scenario: Scenario, config: Config) -> Scenario:
+    """The scenario's soils and vehicle, driven as a manoeuvre says."""
+    from soilbus.files import read_bounded
+    from soilbus.simulator.manoeuvre import LARGEST, of_json
+
+    try:
+        manoeuvre = of_json(read_bounded(path, LARGEST).decode())
+    except OSError as error:
+        raise WorkError(f"{path}: {error.strerror or error}") from None
+    except ValueError as error:
+        raise WorkError(f"{path}: {error}") from None
+    nothing_towed = config.vehicle is not None and config.vehicle.towing == "never"
+    return manoeuvre.over(scenario, nothing_towed)
 
 
 def _simulate_log(args: argparse.Namespace, config: Config, scenario: Scenario) -> float | None:
@@ -188,12 +205,15 @@ def _simulate_live(args: argparse.Namespace, config: Config, scenario: Scenario)
 
 
 def diagnose(args: argparse.Namespace) -> None:
-    """`soilbus diagnose`: find, name, add, show."""
+    """`soilbus diagnose`: find, name, add, show, and say what to drive next."""
+    import json
+
     from soilbus.config.edit import with_effects_text
     from soilbus.diagnosis.diagnose import NotFitted
     from soilbus.diagnosis.model_out import effect_tables
     from soilbus.diagnosis.records import TooLittle
     from soilbus.offline.diagnose import diagnose_logs
+    from soilbus.offline.manoeuvre import what_to_drive
     from soilbus.offline.replay import LogError
     from soilbus.report.findings import findings_json, findings_text
     from soilbus.report.progress import phases
@@ -202,23 +222,30 @@ def diagnose(args: argparse.Namespace) -> None:
     if args.report is not None:
         need_extra("matplotlib", "plots", "--report")
         from soilbus.report.diagnosis import diagnosis_report
-    check_folders(args.json, args.report, args.model_out)
+    check_folders(args.json, args.report, args.model_out, args.manoeuvre_out)
     try:
         with phases("diagnose") as say:
             findings = diagnose_logs(config, args.logs, say)
+            if say is not None:
+                say("finding what to drive next")
+            plan = what_to_drive(findings.diagnosis, config)
     except (LogError, NotFitted, TooLittle) as error:
         raise WorkError(str(error)) from None
     texts: list[tuple[Path, str]] = []
     if args.json is not None:
-        texts.append((args.json, findings_json(findings)))
+        texts.append((args.json, findings_json(findings, plan)))
     if args.report is not None:
         texts.append((args.report, diagnosis_report(findings)))
     if args.model_out is not None:
         effects, notes = effect_tables(findings.diagnosis.completed)
         text = with_effects_text(Path(args.config), args.set, effects, args.model_out.parent, notes)
         texts.append((args.model_out, text))
+    if args.manoeuvre_out is not None:
+        if plan is None:
+            raise WorkError("--manoeuvre-out: no names are left to decide between that a drive would tell apart")
+        texts.append((args.manoeuvre_out, json.dumps(plan.as_json(), indent=1) + "\n"))
     for path, text in texts:
         with whole_file(path) as out:
             out.write(text)
     if all(str(path) != "-" for path, _ in texts):
-        print(findings_text(findings), end="")
+        print(findings_text(findings, plan), end="")

@@ -174,7 +174,17 @@ def diagnose(
         progress("fitting the rivals")
         rivals = rivals_of(full, present, additions, candidates)
     return Diagnosis(
-        verdict, tuple(where), tuple(additions), base, present, tuple(remaining), before, after, imitation, shown, rivals
+        verdict,
+        tuple(where),
+        tuple(additions),
+        base,
+        present,
+        tuple(remaining),
+        before,
+        after,
+        imitation,
+        shown,
+        rivals,
     )
 
 

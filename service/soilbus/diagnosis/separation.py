@@ -4,9 +4,9 @@
     S(A, B) = d' (Sigma + J P J')^-1 d           J, P: Jacobian and posterior covariance of B
 
 Sigma is the covariance of the drive's measurements, latents included; J P J' is what B's gains and effects may still
-change, and any soil within its prior.  So S is the criterion of T-optimum designs (Atkinson & Fedorov 1975, Biometrika 62:57) with the rival's
-parameters as open as the data have left them: the fall of -2 log likelihood that the drive is expected to add where A
-is true.
+change, and any soil within its prior.  So S is the criterion of T-optimum designs (Atkinson & Fedorov 1975, Biometrika
+62:57) with the rival's parameters as open as the data have left them: the fall of -2 log likelihood that the drive is
+expected to add where A is true.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from soilbus.diagnosis.verdict import probabilities
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.nuisance_parameters import active_at
 from soilbus.estimation.observation_model import ObservationModelWithEffects, inverse_covariance
-from soilbus.estimation.posterior import SoilPrior
+from soilbus.estimation.posterior import Posterior, SoilPrior
 from soilbus.terra.effects.effect import Active
 from soilbus.terra.wheel import Soil
 
@@ -100,6 +100,17 @@ def _squared_distance(rival: HeldOutCheck, posterior: Gaussian, prior: SoilPrior
     covariance = posterior.with_prior_soil(prior).covariance
     shrunk = covariance @ np.linalg.solve(np.eye(len(covariance)) + information @ covariance, gradient)
     return float(difference @ weighed - gradient @ shrunk)
+
+
+def expected_posterior(drive: ObservationModelWithEffects, prior: SoilPrior, soil: Soil) -> Posterior:
+    """The posterior that a drive is expected to give: prior and Fisher information at a soil, by a noise-free drive."""
+    joint_prior, gains = Gaussian.of(prior, drive.gain_std), np.zeros(len(drive.gain_std))
+    at = drive.linearise(soil, gains, drive.start(soil, None, gains))
+    scale = np.concatenate([np.array(soil), np.ones(len(gains))])
+    information = (scale[:, None] * at.normal[1:, 1:]) * scale
+    covariance = joint_prior.covariance
+    shrunk = np.linalg.solve(np.eye(len(covariance)) + covariance @ information, covariance)
+    return Posterior(soil, shrunk[: len(soil), : len(soil)])
 
 
 def expected_probability(addition: Addition, true: str, gained: dict[str, float], explained: float) -> float:

@@ -1,18 +1,19 @@
-"""What to drive next: the manoeuvre that is expected to settle an ambiguous diagnosis.
+"""What to drive next: the manoeuvre that is expected to settle an ambiguous diagnosis, or to determine a soil best.
 
-    best manoeuvre = argmax over manoeuvres of  min over rivals A, B of  S(A, B)      (S: diagnosis/separation.py)
+    rivals   argmax over manoeuvres of  sum over rivals A of P(A) P(A named | S(A, .))  (S: diagnosis/separation.py)
+    soil     argmin over manoeuvres of  sum of log sd of bearing pressure, phi and n    (D-optimum for these three)
 
 A manoeuvre is a table of steps of slip, ground speed, load from side to side, and slope.  Each candidate is simulated
-without noise as every rival in turn predicts it, and bounded by the vehicle's limits: slips up to
-`traversability.max_slip`, torques up to those of the motors.  The search changes one column of the table at a time
+without noise, as every rival in turn predicts it or on the soil found, and bounded by the vehicle's limits: slips up
+to `traversability.max_slip`, torques up to those of the motors.  The search changes one column of the table at a time
 and keeps what is best: one simulation for each pattern in place of one for each combination.
 """
 
 from __future__ import annotations
 
-import json
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,15 +21,19 @@ import numpy as np
 from soilbus.config.model import Config, Noise
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.records import Record, TooLittle, record_of
-from soilbus.diagnosis.separation import Truth, expected_probability, separations, truths
-from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.diagnosis.separation import Truth, expected_posterior, expected_probability, separations, truths
+from soilbus.diagnosis.verdict import NAMED_PROBABILITY
+from soilbus.estimation.assembly import effects_of, model_of, prior_of, rig_of
 from soilbus.estimation.observation_model import ObservationModelWithEffects
+from soilbus.estimation.posterior import Posterior
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import SimulationError
+from soilbus.simulator.manoeuvre import Manoeuvre
 from soilbus.simulator.recording import Recording, simulate
-from soilbus.simulator.scenario import Patch, Profile, Scenario
+from soilbus.simulator.scenario import Patch, Scenario
+from soilbus.terra.wheel import Soil
 
-__all__ = ["Manoeuvre", "Plan", "of_json", "record_of_recording", "what_to_drive"]
+__all__ = ["Plan", "record_of_recording", "what_excites", "what_to_drive"]
 
 STEP = 4.0
 """Time [s] of a step: as long as a time block of the diagnosis, several windows' bins at every step."""
@@ -36,79 +41,12 @@ RAMP = 1.0
 """Time [s] from one step to the next: at 1 m/s^2 a tractor changes its speed by what a step asks."""
 BRISK_PERIOD = 2.0
 """Period [s] of a brisk swing: slow beside a sample, quick beside the lag of a sensor or a motor."""
+MAX_REPEATS = 10
+"""Repetitions beyond which a drive is no advice: eight minutes."""
+LEAST_GAIN = 0.1
+"""Gain of a score, a logarithm, for which a pattern takes the place of an easier one: a tenth."""
 STEPS = 12
 """Steps of a manoeuvre: 48 s of driving."""
-
-
-@dataclass(frozen=True, slots=True)
-class Manoeuvre:
-    """Values at times, with straight lines between them.
-
-    Attributes
-    ----------
-    t
-        [s], ascending from 0.
-    slip
-        Common slip of the driven wheels.
-    speed
-        Ground speed [m/s].
-    side_load
-        Share of an axle's load that a side slope moves to its left wheel.
-    slope
-        [rad], uphill positive.
-    words
-        What varies, in words.
-    """
-
-    t: tuple[float, ...]
-    slip: tuple[float, ...]
-    speed: tuple[float, ...]
-    side_load: tuple[float, ...]
-    slope: tuple[float, ...]
-    words: str
-
-    @property
-    def duration(self) -> float:
-        """[s]."""
-        return self.t[-1]
-
-    def scenario(self, soil: Patch, nothing_towed: bool = False) -> Scenario:
-        """The drive on one soil; a vehicle that tows nothing finds its own slopes for the slip."""
-        t, speed = np.array(self.t), np.array(self.speed)
-        distance = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2.0 * np.diff(t))])
-        slope = ((0.0, 0.0),) if nothing_towed else tuple(zip(distance.tolist(), self.slope, strict=True))
-        return Scenario(
-            self.duration,
-            (soil,),
-            speed=Profile(self.t, self.speed),
-            slip=Profile(self.t, self.slip),
-            side_shift=Profile(self.t, self.side_load),
-            slope=slope,
-        )
-
-    def as_json(self) -> dict[str, Any]:
-        """Plain objects, which of_json() reads."""
-        return asdict(self)
-
-
-def of_json(text: str) -> Manoeuvre:
-    """A manoeuvre from JSON: of its own, or the `manoeuvre` of a diagnosis.
-
-    Raises
-    ------
-    ValueError
-        The text is no JSON, or has no manoeuvre.
-    """
-    document = json.loads(text)
-    table = document.get("manoeuvre", document) if isinstance(document, Mapping) else None
-    columns = ("t", "slip", "speed", "side_load", "slope")
-    if not isinstance(table, Mapping) or not all(isinstance(table.get(name), list) for name in columns):
-        raise ValueError(f"no manoeuvre in it: lists {', '.join(columns)}")
-    rows = [tuple(float(x) for x in table[name]) for name in columns]
-    lengths = {len(row) for row in rows}
-    if len(lengths) != 1 or len(rows[0]) < 2 or any(b <= a for a, b in zip(rows[0], rows[0][1:], strict=False)):
-        raise ValueError("lists of a manoeuvre are of one length, at ascending times")
-    return Manoeuvre(*rows, str(table.get("words", "")))
 
 
 def _steps(levels: Sequence[float]) -> Callable[[float], float]:
@@ -153,25 +91,40 @@ def _manoeuvre(chosen: Mapping[str, Pattern]) -> Manoeuvre:
     if any("every two seconds" in words for words, _ in chosen.values()):
         knots |= set(np.arange(0.0, STEPS * STEP, BRISK_PERIOD / 8.0).tolist())
     t = tuple(sorted(knots))
-    columns = (tuple(round(of_time(at), 4) for at in t) for _, of_time in chosen.values())
-    return Manoeuvre(t, *columns, ", ".join(words for words, _ in chosen.values() if words))
+    columns = {name: tuple(round(of_time(at), 4) for at in t) for name, (_, of_time) in chosen.items()}
+    return Manoeuvre(t, **columns, words=", ".join(words for words, _ in chosen.values() if words))
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """The manoeuvre, between which names it decides, and the least probability that the right one is to have then."""
+    """The manoeuvre, and between which names it decides.
+
+    Attributes
+    ----------
+    manoeuvre, between
+        What to drive, and the rivals' names.
+    separations
+        S by the name that is true and by its rival.
+    expected_probability
+        That of the right name after one such drive, whichever it is.
+    repeats
+        How often it must be driven until the right name stands alone, as S grows with the time; None for more than
+        MAX_REPEATS.
+    """
 
     manoeuvre: Manoeuvre
     between: tuple[str, ...]
-    separation: float
+    separations: Mapping[str, Mapping[str, float]]
     expected_probability: float
+    repeats: int | None
 
     def as_json(self) -> dict[str, Any]:
         """Keys of `manoeuvre` in the JSON of a diagnosis."""
         return {
             "between": list(self.between),
-            "separation": self.separation,
+            "separations": {name: dict(row) for name, row in self.separations.items()},
             "expected_probability": self.expected_probability,
+            "repeats": self.repeats,
             **self.manoeuvre.as_json(),
         }
 
@@ -189,30 +142,81 @@ def what_to_drive(diagnosis: Diagnosis, config: Config) -> Plan | None:
     if len(diagnosis.rivals) < 2 or config.vehicle is None:
         return None
     true = truths(diagnosis.rivals)
+    names = tuple(one.name for one in true)
+    least = min(diagnosis.additions, key=lambda a: a.probability if a.alternatives else np.inf)
+    explained = diagnosis.base.neg2_log_evidence - diagnosis.completed.neg2_log_evidence - max(least.falls.values())
+    chances = {least.effect.name: least.probability, **least.alternatives}
+    weight = np.array([chances[name] for name in names])
+
+    def chance(found: Sequence[Sequence[float]], times: int = 1) -> float:
+        """Expected probability of the right name after this number of drives."""
+        after = [
+            expected_probability(least, name, {n: times * s for n, s in zip(names, row, strict=True)}, explained)
+            for name, row in zip(names, found, strict=True)
+        ]
+        return float(weight @ after / weight.sum()) if after else 0.0
+
+    def score(manoeuvre: Manoeuvre) -> float:
+        found = _separations(diagnosis, config, manoeuvre, true)
+        return -math.log1p(-chance(found)) if found else -np.inf
+
+    best = _best(config, score)
+    if best is None:
+        return None
+    found = _separations(diagnosis, config, best[0], true)
+    enough = (times for times in range(1, MAX_REPEATS + 1) if chance(found, times) >= NAMED_PROBABILITY)
+    separations = {
+        name: {other: s for other, s in zip(names, row, strict=True) if other != name}
+        for name, row in zip(names, found, strict=True)
+    }
+    return Plan(best[0], names, separations, chance(found), next(enough, None))
+
+
+def what_excites(config: Config, soil: Soil) -> tuple[Manoeuvre, Posterior] | None:
+    """The manoeuvre that determines a soil best, and its expected posterior.
+
+    Parameters
+    ----------
+    config
+        The vehicle, with its prior; None for one that the simulator cannot drive.
+    soil
+        The best guess.
+    """
+    if config.vehicle is None:
+        return None
+    settings = config.estimator
+
+    def expected(manoeuvre: Manoeuvre) -> Posterior | None:
+        drive = _noise_free(config, manoeuvre, Truth("", soil, effects_of(config)))
+        return None if drive is None else expected_posterior(drive, prior_of(config), soil)
+
+    def precision(manoeuvre: Manoeuvre) -> float:
+        posterior = expected(manoeuvre)
+        if posterior is None:
+            return -np.inf
+        parameters, pressure = posterior.parameters(), posterior.bearing_pressure(settings.z_ref, settings.b_ref)
+        return -math.log(pressure.std * parameters["phi"].std * parameters["n"].std)
+
+    found = _best(config, precision)
+    posterior = None if found is None else expected(found[0])
+    return None if found is None or posterior is None else (found[0], posterior)
+
+
+def _best(config: Config, score: Callable[[Manoeuvre], float]) -> tuple[Manoeuvre, float] | None:
+    """The manoeuvre of the highest score, one column of its table after the other; None where none can be driven.
+
+    score: a logarithm of what is to be great; -inf where it cannot be driven.
+    """
     columns = patterns(config.traversability.max_slip)
     chosen = {column: tried[0] for column, tried in columns.items()}
-    best = _separations(diagnosis, config, _manoeuvre(chosen), true)
+    best = score(_manoeuvre(chosen))
     for column, tried in columns.items():
         for pattern in tried[1:]:
             changed = {**chosen, column: pattern}
-            found = _separations(diagnosis, config, _manoeuvre(changed), true)
-            if _least(found) > _least(best):
+            found = score(_manoeuvre(changed))
+            if found > best + LEAST_GAIN:
                 best, chosen = found, changed
-    if not best:
-        return None
-    least = min(diagnosis.additions, key=lambda a: a.probability if a.alternatives else np.inf)
-    explained = diagnosis.base.neg2_log_evidence - diagnosis.completed.neg2_log_evidence - max(least.falls.values())
-    names = tuple(one.name for one in true)
-    chance = min(
-        expected_probability(least, name, dict(zip(names, gains, strict=True)), max(explained, 0.0))
-        for name, gains in zip(names, best, strict=True)
-    )
-    return Plan(_manoeuvre(chosen), names, _least(best), chance)
-
-
-def _least(found: Sequence[Sequence[float]]) -> float:
-    """The least S of two different rivals; -inf where the manoeuvre cannot be driven."""
-    return min((gain for i, row in enumerate(found) for j, gain in enumerate(row) if i != j), default=-np.inf)
+    return (_manoeuvre(chosen), best) if np.isfinite(best) else None
 
 
 def _separations(
@@ -239,7 +243,8 @@ def _noise_free(config: Config, manoeuvre: Manoeuvre, truth: Truth) -> Observati
         }
     )
     nothing_towed = config.vehicle is not None and config.vehicle.towing == "never"
-    scenario = replace(manoeuvre.scenario(Patch(0.0, "the soil found", truth.soil), nothing_towed), slip_spread=0.0)
+    ground = Scenario(manoeuvre.duration, (Patch(0.0, "the soil found", truth.soil),), slip_spread=0.0)
+    scenario = manoeuvre.over(ground, nothing_towed)
     try:
         recording = simulate(silent, scenario, 0, truth.effects)
         if recording.bogged_at is not None or _beyond_motors(recording, config):
@@ -272,4 +277,3 @@ def record_of_recording(name: str, recording: Recording, config: Config) -> Reco
     store.add(columns)
     end = max(float(t[-1]) for t, _ in columns.values())
     return record_of(name, store.window(0.0, end), rig, model_of(config), settings.min_speed, settings.max_turn)
-

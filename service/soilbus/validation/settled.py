@@ -50,11 +50,13 @@ def outcome(case: Case, found: Diagnosis) -> str:
 
 def settled(case: Case) -> tuple[Plan, str, str] | None:
     """The plan, and the outcomes after it and after more of the same; None where the case is not ambiguous at first."""
-    first = diagnose([record_of_recording(case.id, case.recording, case.config)], prior_of(case.config), [*CATALOGUE.values()])
+    first = diagnose(
+        [record_of_recording(case.id, case.recording, case.config)], prior_of(case.config), [*CATALOGUE.values()]
+    )
     plan = what_to_drive(first, case.config)
     if plan is None:
         return None
-    manoeuvre = plan.manoeuvre.scenario(Patch(0.0, case.soil_name, case.soil))
+    manoeuvre = plan.manoeuvre.over(Scenario(plan.manoeuvre.duration, (Patch(0.0, case.soil_name, case.soil),)))
     same = replace(case.scenario, duration=plan.manoeuvre.duration)
     planned, control = (outcome(case, driven(case, drive, case.seed + 1)) for drive in (manoeuvre, same))
     return plan, planned, control
@@ -62,7 +64,9 @@ def settled(case: Case) -> tuple[Plan, str, str] | None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print a line a case and the table."""
-    parser = argparse.ArgumentParser(prog="python -m soilbus.validation.settled", description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m soilbus.validation.settled", description=(__doc__ or "").split("\n")[0]
+    )
     parser.add_argument("--seed", type=int, default=1, help="of the blind cases (1)")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="take each N-th case only (1)")
     parser.add_argument("--only", default="", help="only cases with this in their id")
@@ -77,7 +81,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if one is not None:
             plan, planned, control = one
             found.append(one)
-            print(f"{case.id}: {planned} (more of the same: {control}); expected {plan.expected_probability:.2f}, S {plan.separation:.0f}, {plan.manoeuvre.duration:.0f} s: {plan.manoeuvre.words}", flush=True)
+            print(
+                f"{case.id}: {planned} (more of the same: {control}); expected {plan.expected_probability:.2f}, "
+                f"{plan.repeats} times, {plan.manoeuvre.duration:.0f} s: {plan.manoeuvre.words}",
+                flush=True,
+            )
     rows = []
     for name, picked in (("as planned", 1), ("more of the same", 2)):
         counts = Counter(one[picked] for one in found)
