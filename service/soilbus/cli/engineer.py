@@ -27,20 +27,16 @@ def replay(args: argparse.Namespace) -> None:
     from soilbus.offline.replay import LogError, estimator_beside, other_channel, replay
     from soilbus.pipeline.pipeline import Pipeline
     from soilbus.report.progress import progress
-    from soilbus.report.soil_map import check_position_is_mapped, soil_map
     from soilbus.report.windows import summary
 
     config = configured(args)
-    if args.map is not None:
-        check_position_is_mapped(config)
-    if args.report is not None:
-        need_extra("matplotlib", "plots", "--report")
+    _check_outputs(args, config)
     if config.table is not None:
         if args.frames is not None:
             raise ConfigError(["--frames: a table of a test rig has no bus to send on"])
         _replay_tables(args, config)
         return
-    check_folders(args.frames)
+    check_folders(args.frames, args.manoeuvre_out)
     for line in other_channel(config, args.logs):
         say(line)
     pipeline = Pipeline(config, load_databases(config))
@@ -59,17 +55,40 @@ def replay(args: argparse.Namespace) -> None:
         say(f"{fault}; {fault.windows} windows before that are kept")
     text = summary(results, pipeline)
     _write_windows(args, config, results, text)
-    if args.map is not None:
-        map_text, left_out = soil_map(results)
-        with whole_file(args.map) as out:
-            out.write(map_text)
-        if left_out:
-            say(f"{left_out} of {len(results)} windows have no position: not on the map")
     if args.frames is not None:
         _write_frames(args, config)
+    text += _what_to_drive(args, config, results)
     if "-" not in (str(args.json), str(args.map)):
         print(text, end="")
     _need_a_use(results, config)
+
+
+def _what_to_drive(args: argparse.Namespace, config: Config, results: Sequence[WindowResult]) -> str:
+    """Where most windows are not excited, or on demand, what to drive to know the soil better: lines for the summary.
+
+    Written where --manoeuvre-out says.
+    """
+    import json
+
+    from soilbus.offline.manoeuvre import what_excites
+    from soilbus.report.advice import of_use
+    from soilbus.report.next_drive import excitation_lines
+
+    useful = of_use(results)
+    weak = sum(result.reason.startswith(("not_excited", "ambiguous")) for result in useful)
+    if not useful or (args.manoeuvre_out is None and 2 * weak < len(useful)):
+        return ""
+    now = useful[-1].posterior
+    assert now is not None  # of_use sees to it
+    found = what_excites(config, now.soil)
+    if found is None:
+        if args.manoeuvre_out is not None:
+            raise WorkError("--manoeuvre-out: no manoeuvre of the table can be driven by this vehicle on this soil")
+        return ""
+    if args.manoeuvre_out is not None:
+        with whole_file(args.manoeuvre_out) as out:
+            out.write(json.dumps(found[0].as_json(), indent=1) + "\n")
+    return "\n".join(excitation_lines(*found, now, config)) + "\n"
 
 
 def _write_frames(args: argparse.Namespace, config: Config) -> None:
@@ -112,7 +131,12 @@ def _replay_tables(args: argparse.Namespace, config: Config) -> None:
 
 
 def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[WindowResult], text: str) -> None:
-    """What --json and --report ask for, under a summary."""
+    """What the options for files ask for, under a summary."""
+    from soilbus.export.geopackage import write_geopackage
+    from soilbus.export.mcap_log import write_mcap
+    from soilbus.export.soil_map import soil_map
+    from soilbus.export.table import write_table
+    from soilbus.export.task_data import write_task_data
     from soilbus.pipeline.outputs import json_line
     from soilbus.report.windows import html_report
 
@@ -123,6 +147,39 @@ def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[W
     if args.report is not None:
         with whole_file(args.report) as out:
             out.write(html_report(results, text, args.logs))
+    if args.table is not None:
+        write_table(args.table, results, config)
+    if args.mcap is not None:
+        write_mcap(args.mcap, results, config)
+    if args.map is not None:
+        map_text, left_out = soil_map(results)
+        if args.map.suffix == ".gpkg":
+            write_geopackage(args.map, map_text)
+        else:
+            with whole_file(args.map) as out:
+                out.write(map_text)
+        if left_out:
+            say(f"{left_out} of {len(results)} windows have no position: not on the map")
+    if args.isoxml is not None and (left_out := write_task_data(args.isoxml, results, config)):
+        say(f"{left_out} of {len(results)} windows have no position or no date: not in the task data")
+
+
+def _check_outputs(args: argparse.Namespace, config: Config) -> None:
+    """Ask before the work whether what the options for files need is there."""
+    from soilbus.export.soil_map import check_position_is_mapped
+
+    for path, option in ((args.map, "--map"), (args.isoxml, "--isoxml")):
+        if path is not None:
+            check_position_is_mapped(config, option)
+    if args.report is not None:
+        need_extra("matplotlib", "plots", "--report")
+    if args.table is not None and args.table.suffix == ".parquet":
+        need_extra("pyarrow", "tables", "--table OUT.parquet")
+    if args.mcap is not None:
+        need_extra("mcap", "mcap", "--mcap")
+    if args.map is not None and args.map.suffix == ".gpkg":
+        need_extra("pyogrio", "geo", "--map OUT.gpkg")
+    check_folders(args.table, args.mcap, args.map)
 
 
 def simulate(args: argparse.Namespace) -> None:

@@ -21,8 +21,9 @@ from soilbus.diagnosis.verdict import gap_limit
 from soilbus.diagnosis.where import Disagreement
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.offline.diagnose import Findings
-from soilbus.offline.manoeuvre import MAX_REPEATS, Plan
+from soilbus.offline.manoeuvre import Plan
 from soilbus.pipeline.outputs import known
+from soilbus.report.next_drive import plan_lines
 from soilbus.report.statement import (
     doubt,
     is_open,
@@ -228,21 +229,6 @@ def effect_lines(number: int, addition: Addition, completed: FittedModel) -> lis
         lines += ["   what would tell them apart:"]
         lines += [f"   - {name}: {CATALOGUE[name].tells}" for name in (effect.name, *addition.alternatives)]
     return lines
-
-
-def plan_lines(plan: Plan) -> list[str]:
-    """What to drive next, and what it is expected to settle."""
-    if plan.repeats is None:
-        hope = f"even {MAX_REPEATS} such drives are not expected to settle it: rather take one of the sensors above"
-    else:
-        times = "once" if plan.repeats == 1 else f"{plan.repeats} times"
-        hope = f"driven {times} and diagnosed together with what there is, it is expected to settle the name"
-    return [
-        f"what to drive next, to decide between {', '.join(plan.between)} ({plan.manoeuvre.duration:.0f} s; "
-        "--manoeuvre-out keeps it):",
-        f"  {plan.manoeuvre.words}",
-        f"  {hope}",
-    ]
 
 
 def residual_lines(descriptions: Sequence[ResidualTerms]) -> list[str]:
