@@ -17,6 +17,7 @@ from soilbus.process import say
 if TYPE_CHECKING:
     from soilbus.config.model import Config
     from soilbus.pipeline.result import WindowResult
+    from soilbus.report.page import Source
 
 
 def replay(args: argparse.Namespace) -> None:
@@ -32,7 +33,7 @@ def replay(args: argparse.Namespace) -> None:
     if args.map is not None:
         check_position_is_mapped(config)
     if args.report is not None:
-        need_extra("matplotlib", "plots", "--report")
+        _need_plots()
     if config.table is not None:
         _replay_tables(args, config)
         return
@@ -95,15 +96,29 @@ def _replay_tables(args: argparse.Namespace, config: Config) -> None:
 def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[WindowResult], text: str) -> None:
     """What --json and --report ask for, under a summary."""
     from soilbus.pipeline.outputs import json_line
-    from soilbus.report.windows import html_report
 
     if args.json is not None:
         with whole_file(args.json) as out:
             for result in results:
                 out.write(json_line(result, config) + "\n")
     if args.report is not None:
+        from soilbus.report.replay import replay_report
+
         with whole_file(args.report) as out:
-            out.write(html_report(results, text, args.logs))
+            out.write(replay_report(results, text, _source(args, config)))
+
+
+def _need_plots() -> None:
+    """What --report needs."""
+    for module in ("jinja2", "matplotlib"):
+        need_extra(module, "plots", "--report")
+
+
+def _source(args: argparse.Namespace, config: Config) -> Source:
+    """What a report is made from."""
+    from soilbus.report.page import Source
+
+    return Source(config, Path(args.config), args.set, args.logs)
 
 
 def simulate(args: argparse.Namespace) -> None:
@@ -141,7 +156,7 @@ def diagnose(args: argparse.Namespace) -> None:
 
     config = configured(args)
     if args.report is not None:
-        need_extra("matplotlib", "plots", "--report")
+        _need_plots()
         from soilbus.report.diagnosis import diagnosis_report
     check_folders(args.json, args.report, args.model_out)
     try:
@@ -153,7 +168,7 @@ def diagnose(args: argparse.Namespace) -> None:
     if args.json is not None:
         texts.append((args.json, findings_json(findings)))
     if args.report is not None:
-        texts.append((args.report, diagnosis_report(findings)))
+        texts.append((args.report, diagnosis_report(findings, _source(args, config), args.model_out)))
     if args.model_out is not None:
         effects, notes = effect_tables(findings.diagnosis.completed)
         text = with_effects_text(Path(args.config), args.set, effects, args.model_out.parent, notes)

@@ -19,6 +19,7 @@ from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.search import Addition
 from soilbus.diagnosis.verdict import P_LARGE_FORMULA_ERROR, Verdict, gap_limit
 from soilbus.estimation.posterior import Posterior, bearing_pressure
+from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.vehicle import GRADE_BESIDE_PITCH
 from soilbus.terra.vehicle import GRAVITY
 
@@ -39,6 +40,36 @@ def statement(diagnosis: Diagnosis) -> str:
         limit = gap_limit(diagnosis.gap_after.rows)
         text += f"; something is left besides: the gap of {diagnosis.gap_after.value:.2f} is above {limit:.2f}"
     return text
+
+
+def headline(diagnosis: Diagnosis) -> str:
+    """The diagnosis in a few words: what is missing."""
+    names = [" or ".join([a.effect.name, *a.alternatives]) for a in diagnosis.additions]
+    if diagnosis.verdict is Verdict.NONE:
+        return "No effect is found missing" if diagnosis.where else "Model and data agree"
+    if diagnosis.verdict is Verdict.UNKNOWN:
+        return " and ".join(["Missing: something that the catalogue does not have", *names])
+    return f"Missing from the model: {' and '.join(names)}"
+
+
+def plain_gap(diagnosis: Diagnosis) -> str:
+    """The gap before and after in words, as a multiple of the noise: the root of the reduced chi-square."""
+    before, after = math.sqrt(diagnosis.gap_before.value), math.sqrt(diagnosis.gap_after.value)
+    text = f"On readings that it was not fitted to, the model is off by {before:.2f} times the sensors’ noise"
+    if diagnosis.additions:
+        text += f", with {' and '.join(a.effect.name for a in diagnosis.additions)} by {after:.2f} times"
+    return f"{text} (1 is as good as can be)."
+
+
+def to_tell_apart(diagnosis: Diagnosis) -> Iterator[str]:
+    """What to drive or measure next: to confirm or to tell apart effects, or to show what could not be seen."""
+    for addition in diagnosis.additions:
+        names = [addition.effect.name, *addition.alternatives]
+        why = "To confirm" if len(names) == 1 else "To tell from the others"
+        yield from (f"{why} {name}: {CATALOGUE[name].tells}." for name in names)
+    for found in diagnosis.detectable:
+        if found.size is None:
+            yield f"To see {found.effect.name}, which these recordings could not show: {found.effect.tells}."
 
 
 def _found(verdict: Verdict, names: Sequence[str], disagree: bool) -> str:
