@@ -244,8 +244,8 @@ def _series(held_out: HeldOutCheck, fit: Fit) -> list[Series]:
         known = np.isfinite(standardised[:, i])
         one = wheels.index(wheel) if wheel in wheels else None
         of_slip, of_load = (values.mean(1) if one is None else values[:, one] for values in (slip, latents.load))
-        columns = measured[:, i], modelled[:, i], standardised[:, i], of_slip, of_load
-        columns = *columns, latents.ground_speed, problem.since
+        of_row = measured[:, i], modelled[:, i], standardised[:, i]
+        columns = *of_row, of_slip, of_load, latents.ground_speed, problem.since
         if known.any():
             found.append(Series(channel, wheel, *(column[known] for column in columns)))
     return found

@@ -61,9 +61,10 @@ class Findings:
         """
         found, soils = self.diagnosis, self.soils()
         drafts = []
-        for i, (name, before, after) in zip(self.recordings.first, soils, strict=True):
-            models = (found.base, before), (found.completed, after)
-            drafts.append((name, *(largest_draft(model, i, soil, self.config) for model, soil in models)))
+        for i, (name, soil_before, soil_after) in zip(self.recordings.first, soils, strict=True):
+            before = largest_draft(found.base, i, soil_before, self.config)
+            after = largest_draft(found.completed, i, soil_after, self.config)
+            drafts.append((name, before, after))
         return drafts
 
 

@@ -56,7 +56,6 @@ def diagnosis_report(findings: Findings, source: Source, model_out: Path | None 
     pictures = [pair for channel in channels for pair in agreement_pictures(channel, added)]
     sums = list(_sums(findings))
     lead = 2 if added else 1
-    pair = pictures[:lead] if added else [*pictures[:1], *sums[:1]]
     return page(
         "diagnosis.html",
         source,
@@ -66,15 +65,14 @@ def diagnosis_report(findings: Findings, source: Source, model_out: Path | None 
         doubt=doubt(diagnosis),
         consequence=_consequence(findings),
         plain_gap=plain_gap(diagnosis),
-        pair=pair,
+        pair=pictures[:2] if added else [*pictures[:1], *sums[:1]],
+        added=added,
         sums=sums if added else sums[1:],
         pictures=pictures[lead:],
         effects=list(_effects(findings)),
         shown=list(shown_lines(diagnosis, findings.config)),
         steps=list(_steps(findings, source, model_out)),
-        soils=[
-            (name, Table(("", "before", "after"), soil_rows(b, a, findings.config))) for name, b, a in findings.soils()
-        ],
+        soils=list(_soils(findings)),
         gap_line=gap_line(findings),
         candidates=list(_candidates(findings)),
         places=_places(findings),
@@ -104,11 +102,21 @@ def _consequence(findings: Findings) -> str:
     name, before, after = findings.soils()[0]
     pressures = [p.bearing_pressure(settings.z_ref, settings.b_ref).value / 1e3 for p in (before, after)]
     of = f" of {name}" if len(findings.soils()) > 1 else ""
-    text = f"With it the bearing pressure{of} is {pressures[1]:.3g} kPa, not {pressures[0]:.3g}"
+    it = "it" if len(findings.diagnosis.additions) == 1 else "them"
+    text = f"With {it} the bearing pressure{of} is {pressures[1]:.3g} kPa, not {pressures[0]:.3g}"
     _, draft_before, draft_after = findings.largest_drafts()[0]
     if draft_before is not None and draft_after is not None:
         text += f"; the largest draft {draft_after.value / 1e3:.2f} kN, not {draft_before.value / 1e3:.2f}"
     return text + "."
+
+
+def _soils(findings: Findings) -> Iterator[tuple[str, Table]]:
+    """Name and table of each recording's soil: before and after, or one column where nothing was added."""
+    added = findings.diagnosis.completed is not findings.diagnosis.base
+    head = ("", "before", "after") if added else ("", "value")
+    for name, before, after in findings.soils():
+        rows = soil_rows(before, after, findings.config)
+        yield name, Table(head, [[cell.replace("+-", "±") for cell in row[: len(head)]] for row in rows])
 
 
 def _effects(findings: Findings) -> Iterator[dict[str, Any]]:
@@ -124,23 +132,23 @@ def _effects(findings: Findings) -> Iterator[dict[str, Any]]:
         }
 
 
-def _steps(findings: Findings, source: Source, model_out: Path | None) -> Iterator[tuple[str, str]]:
-    """What to do next: a sentence, and a command that does it or nothing."""
+def _steps(findings: Findings, source: Source, model_out: Path | None) -> Iterator[tuple[str, str, list[str]]]:
+    """What to do next: a sentence, a command that does it or nothing, and more lines."""
     diagnosis = findings.diagnosis
     if diagnosis.additions and model_out is None:
-        yield "Write a configuration that has what was found:", f"{source.command('diagnose')} --model-out new.toml"
+        yield "Write a configuration that has what was found:", f"{source.command('diagnose')} --model-out new.toml", []
     if diagnosis.additions:
         file = "new.toml" if model_out is None else str(model_out)
-        yield (
-            "See what the service makes of the recording with it:",
-            source.command("replay", file) + " --report replay.html",
-        )
+        command = f"{source.command('replay', file)} --report replay.html"
+        yield "See what the service makes of the recording with it:", command, []
     if diagnosis.verdict is Verdict.UNKNOWN:
-        yield "Check mass, radii, gear ratios, signs and mounting of the channels that disagree most.", ""
-    for line in to_tell_apart(diagnosis):
-        yield line, ""
+        yield "Check mass, radii, gear ratios, signs and mounting of the channels that disagree most.", "", []
+    if diagnosis.verdict is Verdict.NONE:
+        yield "Nothing is to be added. Smaller effects show in longer recordings that vary the load more.", "", []
+    for sentence, lines in to_tell_apart(diagnosis):
+        yield sentence, "", lines
     if not any(check.problem.with_sinkage for check in diagnosis.base.checks) and source.config.table is None:
-        yield "Map a sinkage sensor (wheel.sinkage) if there is one: it tells many effects apart.", ""
+        yield "Map a sinkage sensor (wheel.sinkage) if there is one: it tells many effects apart.", "", []
 
 
 def _candidates(findings: Findings) -> Iterator[tuple[int, Table, str]]:

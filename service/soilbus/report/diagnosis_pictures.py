@@ -5,6 +5,7 @@ All readings are of held-out blocks, which the model was not fitted to.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import FittedModel, Series
+from soilbus.estimation.posterior import Estimate
 from soilbus.offline.diagnose import Findings
 from soilbus.report.page import Picture, picture
 
@@ -25,7 +27,8 @@ POINTS_SHOWN = 99.5
 """Per cent of the differences that a picture's range holds."""
 MARKERS = "o^sDvP*X"
 """Of the wheels, one after the other."""
-BEFORE_COLOUR, AFTER_COLOUR = "#b9b9b9", "#1f6fb4"
+LOOKS = {"before": ("#b9b9b9", "///"), "after": ("#1f6fb4", "")}
+"""Colour and hatch of bars."""
 
 
 class Quantity(NamedTuple):
@@ -87,39 +90,66 @@ def _bins(values: Array) -> list[Any]:
     return [part for part in np.array_split(np.argsort(values, kind="stable"), BINS) if len(part)]
 
 
-def agreement_pictures(of: Agreement, completed: bool) -> Iterator[tuple[str, Picture]]:
+def agreement_pictures(of: Agreement, added: bool) -> Iterator[tuple[str, Picture]]:
     """Caption and picture of a channel before and, where anything was added, after; in the same scales."""
-    difference = np.concatenate([s.measured - s.modelled for s in (*of.before, *of.after)])
-    unit = QUANTITIES[of.channel]
-    half = float(np.percentile(np.abs(difference), POINTS_SHOWN)) / unit.si
-    name = f"{of.channel} measured against modelled"
-    for when, series in (("Before", of.before), ("After", of.after))[: 1 + completed]:
-        scatter = float(np.sqrt(np.mean(np.concatenate([s.measured - s.modelled for s in series]) ** 2))) / unit.si
-        words = f"{name}, {when.lower()}"
-        caption = f"{when}: {name}; typical difference {scatter:.3g} {unit.unit}."
-        yield caption, picture(lambda figure, series=series: _draw_agreement(figure, of, series, half), 4.6, words)  # type: ignore[misc]
+    unit, name = QUANTITIES[of.channel], f"{of.channel} measured against modelled"
+    shown = {"Before: ": of.before, "After: ": of.after} if added else {"": of.before}
+    scales = _Scales.of(of)
+    for when, series in shown.items():
+        difference = np.concatenate([s.measured - s.modelled for s in series]) / unit.si
+        typical = float(np.sqrt(np.mean(difference**2)))
+        caption = f"{when}{name}; typical difference {typical:.3g} {unit.unit}."
+        yield caption[0].upper() + caption[1:], _agreement_picture(of, series, scales, f"{when}{name}")
 
 
-def _draw_agreement(figure: Any, of: Agreement, series: Sequence[Series], half: float) -> None:
+class _Scales(NamedTuple):
+    """Ends of the axes, in the units of the picture: readings, regressor, and the largest difference."""
+
+    readings: tuple[float, float]
+    regressor: tuple[float, float]
+    difference: float
+
+    @classmethod
+    def of(cls, shown: Agreement) -> _Scales:
+        """Scales that hold what is before and after."""
+        both = shown.before + shown.after
+        readings = np.concatenate([values for s in both for values in (s.measured, s.modelled)])
+        regressor = np.concatenate([getattr(s, shown.regressor) for s in both])
+        difference = np.concatenate([s.measured - s.modelled for s in both])
+        unit = QUANTITIES[shown.channel].si
+        return cls(
+            _ends(readings / unit), _ends(regressor / REGRESSORS[shown.regressor].si),
+            float(np.percentile(np.abs(difference), POINTS_SHOWN)) / unit,
+        )  # fmt: skip
+
+
+def _ends(values: Array) -> tuple[float, float]:
+    """Ends of an axis that holds nearly all of the values."""
+    low, high = np.percentile(values, (100.0 - POINTS_SHOWN, POINTS_SHOWN)).tolist()
+    space = 0.05 * (high - low) or 1.0
+    return low - space, high + space
+
+
+def _agreement_picture(of: Agreement, series: Sequence[Series], scales: _Scales, words: str) -> Picture:
+    return picture(lambda figure: _draw_agreement(figure, of, series, scales), 4.6, words)
+
+
+def _draw_agreement(figure: Any, of: Agreement, series: Sequence[Series], scales: _Scales) -> None:
     """Above: measured over modelled. Below: the difference over the regressor, with means over bins."""
     whole, part = figure.subplots(2, 1, height_ratios=[1.1, 1.0])
     unit, regressor = QUANTITIES[of.channel], REGRESSORS[of.regressor]
-    ends = np.array(
-        [s.modelled[[i]] for s in (*of.before, *of.after) for i in (s.modelled.argmin(), s.modelled.argmax())]
-    )
-    line = np.array([ends.min(), ends.max()]) / unit.si
     for i, one in enumerate(series):
         step = max(len(one.measured) // MAX_POINTS, 1)
         measured, modelled = one.measured / unit.si, one.modelled / unit.si
-        x = getattr(one, of.regressor) / regressor.si
-        whole.plot(
-            modelled[::step], measured[::step], MARKERS[i % 8], ms=2.5, mew=0, alpha=0.35, color=f"C{i}",
-            label=one.wheel or of.channel,
-        )  # fmt: skip
-        part.plot(x[::step], (measured - modelled)[::step], MARKERS[i % 8], ms=2, mew=0, alpha=0.15, color=f"C{i}")
-        means = np.array([(x[b].mean(), (measured - modelled)[b].mean()) for b in _bins(x)])
-        part.plot(*means.T, "-", marker=MARKERS[i % 8], ms=5, lw=1.6, color=f"C{i}", mec="white", mew=0.6)
-    whole.plot(line, line, "-", color="black", lw=1.0, zorder=0.5)
+        x, difference = getattr(one, of.regressor) / regressor.si, measured - modelled
+        look = {"color": f"C{i}", "marker": MARKERS[i % len(MARKERS)]}
+        points = look | {"ls": "", "mew": 0}
+        whole.plot(modelled[::step], measured[::step], ms=2.5, alpha=0.35, label=one.wheel or of.channel, **points)
+        part.plot(x[::step], difference[::step], ms=2, alpha=0.15, **points)
+        means = np.array([(x[b].mean(), difference[b].mean()) for b in _bins(x)])
+        part.plot(*means.T, ls="-", ms=5, lw=1.6, mec="white", mew=0.6, **look)
+    whole.plot(scales.readings, scales.readings, "-", color="black", lw=1.0, zorder=0.5)
+    whole.set(xlim=scales.readings, ylim=scales.readings)
     whole.set_xlabel(f"modelled {of.channel}, {unit.unit}")
     whole.set_ylabel(f"measured, {unit.unit}")
     if len(series) > 1:
@@ -127,7 +157,7 @@ def _draw_agreement(figure: Any, of: Agreement, series: Sequence[Series], half: 
         for handle in legend.legend_handles:
             handle.set_alpha(1.0)
     part.axhline(0.0, color="black", lw=1.0)
-    part.set_ylim(-half, half)
+    part.set(xlim=scales.regressor, ylim=(-scales.difference, scales.difference))
     part.set_xlabel(f"{REGRESSOR_NAMES[of.regressor]}, {regressor.unit}")
     part.set_ylabel(f"difference, {unit.unit}")
 
@@ -142,74 +172,98 @@ def channel_gaps(fitted: FittedModel) -> dict[str, float]:
 
 def gap_picture(base: FittedModel, completed: FittedModel) -> Picture:
     """Root of the gap of each channel, before and after, as bars."""
-    before, after = channel_gaps(base), channel_gaps(completed)
-    bars = {"before": before} if completed is base else {"before": before, "after": after}
+    models = _before_and_after(base, completed)
+    bars = {when: {c: gap**0.5 for c, gap in channel_gaps(model).items()} for when, model in models.items()}
     words = "; ".join(
-        f"{when}: " + ", ".join(f"{channel} {gap**0.5:.2f}" for channel, gap in gaps.items())
-        for when, gaps in bars.items()
+        " ".join([when, *(f"{channel} {size:.2f}" for channel, size in of.items())]).strip()
+        for when, of in bars.items()
     )
-    return picture(lambda figure: _draw_gaps(figure, bars), 1.3 + 0.62 * len(before), f"gap of each channel, {words}")
+    height = 1.2 + 0.62 * len(bars["before"]) * (1.0 if len(bars) > 1 else 0.7)
+    return picture(lambda figure: _draw_gaps(figure, bars), height, f"error of the model over noise: {words}")
+
+
+def _before_and_after(before: FittedModel, after: FittedModel) -> dict[str, FittedModel]:
+    """Both by name, or what was before alone where nothing was added."""
+    return {"before": before} if before is after else {"before": before, "after": after}
+
+
+def _bars(
+    axis: Any, bars: Mapping[str, Sequence[float]], height: float, labels: Sequence[str],
+    sd: Mapping[str, Sequence[float]] | None = None,
+) -> list[Any]:  # fmt: skip
+    """Draw groups of horizontal bars, before above after, each with a label at its end; returns one for each look."""
+    words = iter(labels)
+    drawn = []
+    for i, (when, sizes) in enumerate(bars.items()):
+        colour, hatch = LOOKS[when] if len(bars) > 1 else LOOKS["after"]
+        y = np.arange(len(sizes)) + (i - (len(bars) - 1) / 2.0) * height
+        error = {} if sd is None else {"xerr": 2.0 * np.array(sd[when]), "capsize": 3}
+        drawn.append(
+            axis.barh(y, sizes, 0.92 * height, color=colour, hatch=hatch, edgecolor="0.3", lw=0.4, label=when, **error)
+        )
+        spread = [0.0] * len(sizes) if sd is None else sd[when]
+        for place, size, std in zip(y, sizes, spread, strict=True):
+            axis.annotate(
+                next(words), (np.nan_to_num(size + 2.0 * std), place), (5, 0), textcoords="offset points", va="center",
+                fontsize=10, bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.8},
+            )  # fmt: skip
+    axis.invert_yaxis()
+    axis.set_xlim(min(0.0, axis.get_xlim()[0]), 1.16 * axis.get_xlim()[1])
+    axis.grid(axis="y", visible=False)
+    return drawn
 
 
 def _draw_gaps(figure: Any, bars: Mapping[str, Mapping[str, float]]) -> None:
     axis = figure.subplots()
     channels = list(bars["before"])
-    looks = {"before": (BEFORE_COLOUR, "///"), "after": (AFTER_COLOUR, "")}
-    height = 0.8 / len(bars)
-    for i, (when, gaps) in enumerate(bars.items()):
-        colour, hatch = looks[when]
-        y = np.arange(len(channels)) + (i - (len(bars) - 1) / 2.0) * height
-        size = [gaps[channel] ** 0.5 for channel in channels]
-        drawn = axis.barh(y, size, 0.92 * height, color=colour, hatch=hatch, edgecolor="0.3", lw=0.4, label=when)
-        axis.bar_label(drawn, [f"{s:.2f}" for s in size], padding=3, fontsize=10)
-    axis.axvline(1.0, color="black", lw=1.2, ls="--", label="noise alone")
+    noise = axis.axvline(1.0, color="black", lw=1.2, ls="--", label="noise alone")
+    sizes = {when: list(of.values()) for when, of in bars.items()}
+    labels = [f"{size:.2f}" for of in sizes.values() for size in of]
+    drawn = _bars(axis, sizes, 0.8 / len(bars) if len(bars) > 1 else 0.6, labels)
     axis.set_yticks(range(len(channels)), channels)
-    axis.invert_yaxis()
-    axis.margins(x=0.12)
-    axis.grid(axis="y", visible=False)
     axis.set_xlabel("model’s error, × noise of the sensors")
-    figure.legend(loc="outside lower center", ncols=3, frameon=False)
+    handles = [*(drawn if len(bars) > 1 else []), noise]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
 
 
 def draft_picture(findings: Findings) -> Picture | None:
     """Largest draft on each log's soil before and after, beside the drafts that were pulled; None without a vehicle."""
-    drafts = [(name, b, a) for name, b, a in findings.largest_drafts() if b is not None and a is not None]
-    if not drafts:
+    drafts = findings.largest_drafts()
+    if all(before is None and after is None for _, before, after in drafts):
         return None
-    words = "; ".join(f"{name}: {b.value / 1e3:.2f} kN before, {a.value / 1e3:.2f} kN after" for name, b, a in drafts)
+    names = [name for name, _, _ in drafts]
+    bars = {"before": [before for _, before, _ in drafts]}
+    if findings.diagnosis.completed is not findings.diagnosis.base:
+        bars["after"] = [after for _, _, after in drafts]
     pulled = [findings.diagnosis.base.checks[i].problem.draft / 1e3 for i in findings.recordings.first]
-    added = findings.diagnosis.completed is not findings.diagnosis.base
+    words = "; ".join(
+        " ".join([name, *(f"{when} {_kilonewtons(of[i])}" for when, of in bars.items())])
+        for i, name in enumerate(names)
+    )
     return picture(
-        lambda figure: _draw_drafts(figure, drafts, pulled, added), 1.6 + 0.75 * len(drafts), f"largest draft, {words}"
+        lambda figure: _draw_drafts(figure, names, bars, pulled), 1.6 + 0.75 * len(drafts), f"largest draft: {words}"
     )
 
 
-def _draw_drafts(figure: Any, drafts: Sequence[Any], pulled: Sequence[Array], added: bool) -> None:
+def _kilonewtons(draft: Estimate | None) -> str:
+    return "none within the limits" if draft is None else f"{draft.value / 1e3:.2f} kN"
+
+
+def _draw_drafts(
+    figure: Any, names: Sequence[str], bars: Mapping[str, Sequence[Estimate | None]], pulled: Sequence[Array]
+) -> None:
     axis = figure.subplots()
-    bars = {"before": 1, "after": 2} if added else {"before": 1}
-    looks = {"before": (BEFORE_COLOUR, "///"), "after": (AFTER_COLOUR, "")}
-    height = 0.55 / len(bars)
-    for k, (when, column) in enumerate(bars.items()):
-        colour, hatch = looks[when]
-        value, sd = np.array([(d[column].value, d[column].std) for d in drafts]).T / 1e3
-        y = np.arange(len(drafts)) + (k - len(bars) / 2.0) * height
-        drawn = axis.barh(
-            y, value, 0.92 * height, xerr=2.0 * sd, capsize=3, color=colour, hatch=hatch, edgecolor="0.3", lw=0.4,
-            label=f"largest draft{', ' + when if added else ''}",
-        )  # fmt: skip
-        axis.bar_label(drawn, [f"{v:.2f}" for v in value], padding=4, fontsize=10)
+    none = Estimate(math.nan, math.nan)
+    sizes, sds = (
+        {when: [getattr(e or none, part) / 1e3 for e in of] for when, of in bars.items()} for part in ("value", "std")
+    )
+    drawn = _bars(axis, sizes, 0.55 / len(bars), [_kilonewtons(e) for of in bars.values() for e in of], sds)
     for i, draft in enumerate(pulled):
         low, high = np.percentile(draft, (2.5, 97.5))
-        axis.plot(
-            [low, high], [i + 0.36] * 2, "-", color="black", lw=3.0, label="" if i else "pulled (95 % of the time)"
-        )
-    axis.set_yticks(range(len(drafts)), [d[0] if len(d[0]) <= 14 else d[0][:13] + "…" for d in drafts])
-    axis.invert_yaxis()
-    axis.set_xlim(left=min(0.0, axis.get_xlim()[0]))
-    axis.margins(x=0.12)
-    axis.grid(axis="y", visible=False)
+        (line,) = axis.plot([low, high], [i + 0.38] * 2, "-", color="black", lw=3.0, label="pulled, 95 % of the time")
+    axis.set_yticks(range(len(names)), [name if len(name) <= 14 else name[:13] + "…" for name in names])
     axis.set_xlabel("draft, kN")
-    figure.legend(loc="outside lower center", ncols=2, frameon=False)
+    figure.legend(handles=[*(drawn if len(bars) > 1 else []), line], loc="outside lower center", ncols=3, frameon=False)
 
 
 def residual_picture(fitted: FittedModel, title: str) -> Picture:
@@ -218,7 +272,11 @@ def residual_picture(fitted: FittedModel, title: str) -> Picture:
     for series in fitted.held_out_series():
         channels.setdefault(series.channel, []).append(series)
     return picture(
-        lambda figure: _draw_residuals(figure, channels, title), 0.6 + 2.2 * len(channels), f"residuals {title}", 10.0
+        lambda figure: _draw_residuals(figure, channels, title),
+        0.6 + 2.2 * len(channels),
+        f"residuals {title}",
+        10.0,
+        100,
     )
 
 

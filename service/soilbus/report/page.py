@@ -163,7 +163,7 @@ def _environment() -> Environment:
     )  # fmt: skip
 
 
-def picture(draw: Callable[[Any], None], height: float, words: str, width: float = WIDTH) -> Picture:
+def picture(draw: Callable[[Any], None], height: float, words: str, width: float = WIDTH, dpi: int = DPI) -> Picture:
     """A picture for a page.
 
     Parameters
@@ -174,13 +174,15 @@ def picture(draw: Callable[[Any], None], height: float, words: str, width: float
         [inch].
     words
         What it shows.
+    dpi
+        Pixels per inch.
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
     png = io.BytesIO()
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(width, height), layout="constrained")
         draw(figure)
-        figure.savefig(png, format="png", dpi=DPI)
+        figure.savefig(png, format="png", dpi=dpi)
     return Picture(words, base64.b64encode(png.getvalue()).decode())

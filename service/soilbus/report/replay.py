@@ -105,23 +105,23 @@ def _range(values: Sequence[float] | Array, unit: str) -> str:
     return f"{low} {unit}" if low == high else f"{low} to {high} {unit}"
 
 
-def next_steps(results: Sequence[WindowResult], source: Source) -> Iterator[str]:
-    """What to do about windows that were of no or little use, and what to map."""
+def next_steps(results: Sequence[WindowResult], source: Source) -> Iterator[tuple[str, str]]:
+    """What to do about windows of no or little use, and what to map: a sentence, and a command or nothing."""
     config = source.config
     good = [r for r in results if r.status is Status.VALID]
     for (status, reason), group in grouped(results):
         what = advice(group, good)
         if what is not None:
             why = reason.removeprefix(f"{status} ").replace("_", " ")
-            yield f"{len(group)} of {len(results)} windows were {str(status).replace('_', ' ')} ({why}): {what}."
+            yield f"{len(group)} of {len(results)} windows were {str(status).replace('_', ' ')} ({why}): {what}.", ""
     if any(r.reason in ("model_mismatch", "no_convergence") for r in results):
-        yield f"What the model misses: {source.command('diagnose')} --report diagnosis.html"
+        yield "Find what the model misses:", f"{source.command('diagnose')} --report diagnosis.html"
     if config.table is not None:
         return
     if config.signals.latitude is None:
-        yield "For a map of the route, map a position: signals.latitude and signals.longitude."
+        yield "For a map of the route, map a position: signals.latitude and signals.longitude.", ""
     if not any(wheel.sinkage is not None for wheel in config.wheel):
-        yield "A sinkage sensor (wheel.sinkage) narrows the error bars of the soil; none is mapped."
+        yield "A sinkage sensor (wheel.sinkage) narrows the error bars of the soil; none is mapped.", ""
 
 
 def _by_log(results: Sequence[WindowResult]) -> Table | None:

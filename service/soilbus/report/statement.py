@@ -17,7 +17,7 @@ from soilbus.diagnosis.detectable import Detectable
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.search import Addition
-from soilbus.diagnosis.verdict import P_LARGE_FORMULA_ERROR, Verdict, gap_limit
+from soilbus.diagnosis.verdict import NAMED_PROBABILITY, P_LARGE_FORMULA_ERROR, Verdict, gap_limit
 from soilbus.estimation.posterior import Posterior, bearing_pressure
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.vehicle import GRADE_BESIDE_PITCH
@@ -44,12 +44,23 @@ def statement(diagnosis: Diagnosis) -> str:
 
 def headline(diagnosis: Diagnosis) -> str:
     """The diagnosis in a few words: what is missing."""
-    names = [" or ".join([a.effect.name, *a.alternatives]) for a in diagnosis.additions]
+    names = [_named(addition) for addition in diagnosis.additions]
     if diagnosis.verdict is Verdict.NONE:
         return "No effect is found missing" if diagnosis.where else "Model and data agree"
     if diagnosis.verdict is Verdict.UNKNOWN:
         return " and ".join(["Missing: something that the catalogue does not have", *names])
     return f"Missing from the model: {' and '.join(names)}"
+
+
+def _named(addition: Addition) -> str:
+    """The name of an effect, or of the first of a set, as in "grade, lugs or one of 2 others"."""
+    names = [addition.effect.name, *addition.alternatives]
+    if addition.probability >= NAMED_PROBABILITY or len(names) == 1:
+        return names[0]
+    if len(names) == 2:
+        return " or ".join(names)
+    others = names[2] if len(names) == 3 else f"one of {len(names) - 2} others"
+    return f"{names[0]}, {names[1]} or {others}"
 
 
 def plain_gap(diagnosis: Diagnosis) -> str:
@@ -61,15 +72,17 @@ def plain_gap(diagnosis: Diagnosis) -> str:
     return f"{text} (1 is as good as can be)."
 
 
-def to_tell_apart(diagnosis: Diagnosis) -> Iterator[str]:
-    """What to drive or measure next: to confirm or to tell apart effects, or to show what could not be seen."""
+def to_tell_apart(diagnosis: Diagnosis) -> Iterator[tuple[str, list[str]]]:
+    """What to drive or measure next: a sentence, and a line for each effect."""
+    sure = [addition.effect.name for addition in diagnosis.additions if not addition.alternatives]
+    if sure:
+        yield f"What would confirm {'it' if len(sure) == 1 else 'them'}:", [f"{n}: {CATALOGUE[n].tells}" for n in sure]
     for addition in diagnosis.additions:
-        names = [addition.effect.name, *addition.alternatives]
-        why = "To confirm" if len(names) == 1 else "To tell from the others"
-        yield from (f"{why} {name}: {CATALOGUE[name].tells}." for name in names)
-    for found in diagnosis.detectable:
-        if found.size is None:
-            yield f"To see {found.effect.name}, which these recordings could not show: {found.effect.tells}."
+        if addition.alternatives:
+            names = [addition.effect.name, *addition.alternatives]
+            yield "What would tell these apart:", [f"{name}: {CATALOGUE[name].tells}" for name in names]
+    if hidden := [found.effect for found in diagnosis.detectable if found.size is None]:
+        yield "What these recordings could not show, and what would:", [f"{e.name}: {e.tells}" for e in hidden]
 
 
 def _found(verdict: Verdict, names: Sequence[str], disagree: bool) -> str:
