@@ -19,6 +19,8 @@ from soilbus.report.page import Picture, picture
 
 MAX_POINTS = 1500
 """Readings of a wheel that a picture shows; the means are of all."""
+FEW_POINTS = 100
+"""Readings of a wheel up to which their dots are large."""
 BINS = 10
 """Equally filled bins of a picture's means."""
 PLOT_RANGE_SD = 5.0
@@ -144,7 +146,8 @@ def _draw_agreement(figure: Any, of: Agreement, series: Sequence[Series], scales
         x, difference = getattr(one, of.regressor) / regressor.si, measured - modelled
         look = {"color": f"C{i}", "marker": MARKERS[i % len(MARKERS)]}
         points = look | {"ls": "", "mew": 0}
-        whole.plot(modelled[::step], measured[::step], ms=2.5, alpha=0.35, label=one.wheel or of.channel, **points)
+        size = 2.5 if len(measured) > FEW_POINTS else 5.0
+        whole.plot(modelled[::step], measured[::step], ms=size, alpha=0.35, label=one.wheel or of.channel, **points)
         part.plot(x[::step], difference[::step], ms=2, alpha=0.15, **points)
         means = np.array([(x[b].mean(), difference[b].mean()) for b in _bins(x)])
         part.plot(*means.T, ls="-", ms=5, lw=1.6, mec="white", mew=0.6, **look)

@@ -42,7 +42,7 @@ def replay_report(results: Sequence[WindowResult], text: str, source: Source) ->
     return page(
         "replay.html",
         source,
-        headline=headline(results, config.estimator.window),
+        headline=headline(results, config),
         sentences=list(sentences(results)),
         pair=shown[:2],
         pictures=shown[2:],
@@ -66,14 +66,16 @@ def _pictures(results: Sequence[WindowResult], config: Config) -> Iterator[tuple
     yield from curve_pictures(results, config)
 
 
-def headline(results: Sequence[WindowResult], window: float) -> str:
+def headline(results: Sequence[WindowResult], config: Config) -> str:
     """What the decisions come to, in one sentence."""
-    if not of_use(results):
-        text = why_of_no_use(results, window)
+    known = of_use(results)
+    if not known:
+        text = why_of_no_use(results, config.estimator.window)
         return text[0].upper() + text[1:]
     states = Counter(r.traversability.state for r in results)
     if states[State.UNKNOWN] == len(results):
-        return f"The soil is known in {len(of_use(results))} of {len(results)} windows; nothing was decided"
+        what = "windows" if config.table is None else "runs"
+        return f"The soil is known in {len(known)} of {len(results)} {what}"
     (name, n), *others = [(look.name, states[state]) for state, look in STATES.items() if states[state]]
     return ", ".join([f"{name} in {n} of {len(results)} windows", *(f"{name} in {n}" for name, n in others)])
 
@@ -101,7 +103,7 @@ def sentences(results: Sequence[WindowResult]) -> Iterator[str]:
 
 def _range(values: Sequence[float] | Array, unit: str) -> str:
     """Such as "22 to 99 kPa": from the 5 % to the 95 % quantile; one number where both are written alike."""
-    low, high = (f"{q:.2g}" if abs(q) < 100.0 else f"{q:.0f}" for q in np.percentile(values, (5.0, 95.0)).tolist())
+    low, high = (f"{float(f'{q:.2g}'):g}" if abs(q) < 99.5 else f"{q:.0f}" for q in np.percentile(values, (5.0, 95.0)))
     return f"{low} {unit}" if low == high else f"{low} to {high} {unit}"
 
 

@@ -28,7 +28,7 @@ FIRST_CLOCK, LAST_CLOCK = 946684800.0, 4102444800.0
 """Stamps [s] from 2000 to 2100 are times of day; others count from some start."""
 SPACE_BETWEEN = 0.03
 """Space between two recordings in a picture, as a share of the time of all."""
-TICK_STEPS = (0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 21600, 43200, 86400)
+TICK_STEPS = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 21600, 43200, 86400)
 """Distances [s] of ticks that are easy to read on a clock."""
 MAX_TICKS = 5
 """Ticks of a time axis: as many clock times as fit side by side."""
@@ -136,7 +136,7 @@ class TimeAxis:
         """Ticks with clock times, and a rule between recordings."""
         step = next((s for s in TICK_STEPS if self.length / s <= MAX_TICKS), TICK_STEPS[-1])
         places, labels = self._ticks(step)
-        axis.set_xlim(0.0, self.end)
+        axis.set_xlim(0.0, 1.01 * self.end)
         axis.set_xticks(places, labels)
         for shift, part in list(zip(self.shift, self.parts, strict=True))[1:]:
             axis.axvline(part[0].t - self.hop + shift - SPACE_BETWEEN * self.length / 2.0, color="0.4", lw=0.8, ls=":")
@@ -205,36 +205,36 @@ def decision_picture(results: Sequence[WindowResult], config: Config) -> Picture
 
 
 def curve_pictures(results: Sequence[WindowResult], config: Config) -> Iterator[tuple[str, Picture]]:
-    """Caption and picture of each quantity over time, the bearing pressure first."""
+    """Caption and picture of each quantity over time that is known anywhere, the bearing pressure first."""
     time = TimeAxis(results, config.estimator.hop)
-    wheels = list(results[0].slip)
     plate = f"a plate of {100 * config.estimator.b_ref:g} cm at {1e3 * config.estimator.z_ref:g} mm depth"
+    wheels = list(results[0].slip)
 
     def drawn(label: str, draw: Callable[[Any], None], words: str) -> Picture:
         return _over_time(time, label, draw, words)
 
-    yield (
-        f"How firm is the ground? Pressure that carries {plate}.",
-        drawn(
-            "bearing pressure, kPa", lambda a: _band(a, time, lambda r: r.bearing, 1e3), "bearing pressure over time"
-        ),
-    )
-    yield (
-        "How well does the ground hold against shearing off?",
-        drawn("friction angle, °", lambda a: _band(a, time, _friction, math.radians(1.0)), "friction angle over time"),
-    )
-    yield (
-        "How well do model and sensors agree? At 1 as well as the sensors’ noise allows.",
-        drawn("model’s error, × noise", lambda a: _draw_gap(a, time), "misfit of the model over time"),
-    )
-    yield (
-        "How much does each wheel slip?",
-        drawn("slip, %", lambda a: _draw_wheels(a, time, wheels, "slip", 0.01), "slip of each wheel over time"),
-    )
+    if of_use(results):
+        yield (
+            f"How firm is the ground? Pressure that carries {plate}.",
+            drawn("bearing pressure, kPa", lambda a: _band(a, time, lambda r: r.bearing, 1e3), "bearing pressure"),
+        )
+        yield (
+            "How well does the ground hold against shearing off?",
+            drawn("friction angle, °", lambda a: _band(a, time, _friction, math.radians(1.0)), "friction angle"),
+        )
+        yield (
+            "How well do model and sensors agree? At 1 as well as the sensors’ noise allows.",
+            drawn("model’s error, × noise", lambda a: _draw_gap(a, time), "misfit of the model"),
+        )
+    if any(slip is not None for r in results for slip in r.slip.values()):
+        yield (
+            "How much does each wheel slip?",
+            drawn("slip, %", lambda a: _draw_wheels(a, time, wheels, "slip", 0.01), "slip of each wheel"),
+        )
     if any(z is not None for r in results for z in r.sinkage.values()):
         yield (
             "How deep does each wheel sink, by the estimated soil?",
-            drawn("sinkage, mm", lambda a: _draw_wheels(a, time, wheels, "sinkage", 1e-3), "sinkage over time"),
+            drawn("sinkage, mm", lambda a: _draw_wheels(a, time, wheels, "sinkage", 1e-3), "sinkage of each wheel"),
         )
 
 
@@ -300,7 +300,7 @@ def _over_time(time: TimeAxis, label: str, draw_curve: Callable[[Any], None], wo
         time.dress(axis)
         time.name_recordings(ribbon)
 
-    return picture(draw, 3.2, words)
+    return picture(draw, 3.2, f"{words} over time")
 
 
 def _ribbon(axis: Any, time: TimeAxis, look_of: Callable[[WindowResult], Look], named: bool) -> set[Look]:
