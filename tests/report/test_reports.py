@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import yaml
 
+import soilbus
 from availability import unavailable
-from soilbus import __version__
 from soilbus.can.dbc_files import load_databases
 from soilbus.cli.main import main
 from soilbus.config.file import load_config, parse_config
@@ -227,7 +227,7 @@ def test_the_foot_names_version_vehicle_configuration_date_and_how_to_cite(made)
     config = load_config(TRACTOR, ["vehicle.mass=2500"])
     source = Source(config, TRACTOR, ["vehicle.mass=2500"], [made.log], datetime(2026, 5, 4, 7, 30, tzinfo=UTC))
     foot = dict(source.rows())
-    assert foot["soilbus"] == f"version {__version__}"
+    assert foot["soilbus"] == f"version {soilbus.__version__}"
     digest = hashlib.sha256(TRACTOR.read_bytes()).hexdigest()
     assert foot["Configuration"].startswith(f"{TRACTOR.name} (SHA-256 {digest[:8]}")
     assert foot["Configuration"].endswith("vehicle.mass=2500")

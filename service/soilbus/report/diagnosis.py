@@ -39,7 +39,7 @@ from soilbus.report.statement import (
 
 
 def diagnosis_report(findings: Findings, source: Source, model_out: Path | None = None) -> str:
-    """The whole page: verdict and pictures first, what to do next, soil, then the statistics folded away.
+    """The whole page: verdict and pictures first, then soil, what to do next, and the statistics folded away.
 
     Parameters
     ----------
@@ -122,14 +122,18 @@ def _soils(findings: Findings) -> Iterator[tuple[str, Table]]:
 def _effects(findings: Findings) -> Iterator[dict[str, Any]]:
     """Name, physics, how sure, and all figures of each effect added."""
     for number, addition in enumerate(findings.diagnosis.additions, 1):
-        others = ", ".join(f"{name} {100.0 * p:.0f} %" for name, p in addition.alternatives.items())
+        others = ", ".join(f"{name} {_per_cent(p)}" for name, p in addition.alternatives.items())
         lines = effect_lines(number, addition, findings.diagnosis.completed)
         yield {
             "name": addition.effect.name,
             "physics": addition.effect.physics,
-            "sure": f"{100.0 * min(addition.probability, 0.99):.0f} %" + (f"; else {others}" if others else ""),
+            "sure": _per_cent(addition.probability) + (f"; else {others}" if others else ""),
             "lines": "\n".join([*lines, f"   source: {addition.effect.source}"]),
         }
+
+
+def _per_cent(probability: float) -> str:
+    return "over 99 %" if probability > 0.99 else f"{100.0 * probability:.0f} %"
 
 
 def _steps(findings: Findings, source: Source, model_out: Path | None) -> Iterator[tuple[str, str, list[str]]]:

@@ -238,7 +238,9 @@ def draft_picture(findings: Findings) -> Picture | None:
     bars = {"before": [before for _, before, _ in drafts]}
     if findings.diagnosis.completed is not findings.diagnosis.base:
         bars["after"] = [after for _, _, after in drafts]
-    pulled = [findings.diagnosis.base.checks[i].problem.draft / 1e3 for i in findings.recordings.first]
+    parts = [findings.diagnosis.base.checks[i].problem for i in findings.recordings.first]
+    measured = findings.config.signals.draft is not None
+    pulled = [part.draft[part.has_balance] / 1e3 if measured else part.draft[:0] for part in parts]
     words = "; ".join(
         " ".join([name, *(f"{when} {_kilonewtons(of[i])}" for when, of in bars.items())])
         for i, name in enumerate(names)
@@ -261,12 +263,15 @@ def _draw_drafts(
         {when: [getattr(e or none, part) / 1e3 for e in of] for when, of in bars.items()} for part in ("value", "std")
     )
     drawn = _bars(axis, sizes, 0.55 / len(bars), [_kilonewtons(e) for of in bars.values() for e in of], sds)
-    for i, draft in enumerate(pulled):
-        low, high = np.percentile(draft, (2.5, 97.5))
-        (line,) = axis.plot([low, high], [i + 0.38] * 2, "-", color="black", lw=3.0, label="pulled, 95 % of the time")
+    handles = drawn if len(bars) > 1 else []
+    known = [(i, *np.percentile(draft, (2.5, 97.5))) for i, draft in enumerate(pulled) if len(draft)]
+    for i, low, high in known:
+        line = axis.plot([low, high], [i + 0.38] * 2, "-", color="black", lw=3.0, label="pulled, 95 % of the time")
+        handles = [*(drawn if len(bars) > 1 else []), *line]
     axis.set_yticks(range(len(names)), [name if len(name) <= 14 else name[:13] + "…" for name in names])
     axis.set_xlabel("draft, kN")
-    figure.legend(handles=[*(drawn if len(bars) > 1 else []), line], loc="outside lower center", ncols=3, frameon=False)
+    if handles:
+        figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
 
 
 def residual_picture(fitted: FittedModel, title: str) -> Picture:

@@ -19,6 +19,7 @@ from soilbus.report.replay_pictures import (
     curve_pictures,
     dates,
     decision_picture,
+    is_clock,
     map_pictures,
     run_pictures,
 )
@@ -152,7 +153,7 @@ def _windows(results: Sequence[WindowResult]) -> Table:
     rows = [
         (
             r.log or "-",
-            clock_text(r.t, "%H:%M:%S.%f")[:-5] if clock_text(r.t) != f"{r.t:g} s" else f"{r.t:.1f}",
+            clock_text(r.t, "%H:%M:%S.%f")[:-5] if is_clock(r.t) else f"{r.t:.1f}",
             str(r.status) + ("" if r.reason == "none" else f" ({r.reason})"),
             "-" if r.bearing is None else f"{r.bearing.value / 1e3:.2f} ± {r.bearing.std / 1e3:.2f}",
             "-" if r.traversability.max_draft is None else f"{r.traversability.max_draft.value / 1e3:.2f}",

@@ -119,8 +119,9 @@ class TimeAxis:
             for r in part:
                 if r.t - last > 1.5 * self.hop:
                     rows.append([r.t + shift] + [math.nan] * columns)
-                values = np.atleast_1d(of(r)) if of(r) is not None else [math.nan] * columns
-                rows.append([r.t + shift, *map(float, values)])
+                value = of(r)
+                known = [math.nan] * columns if value is None else np.atleast_1d(value).tolist()
+                rows.append([r.t + shift, *known])
                 last = r.t
         return np.array(rows)
 
@@ -135,12 +136,13 @@ class TimeAxis:
     def dress(self, axis: Any) -> None:
         """Ticks with clock times, and a rule between recordings."""
         step = next((s for s in TICK_STEPS if self.length / s <= MAX_TICKS), TICK_STEPS[-1])
+        day = dates(self._results)
         places, labels = self._ticks(step)
+        labels = labels if day else [label.removesuffix(" s") for label in labels]
         axis.set_xlim(0.0, 1.01 * self.end)
         axis.set_xticks(places, labels)
         for shift, part in list(zip(self.shift, self.parts, strict=True))[1:]:
             axis.axvline(part[0].t - self.hop + shift - SPACE_BETWEEN * self.length / 2.0, color="0.4", lw=0.8, ls=":")
-        day = dates(self._results)
         axis.set_xlabel(f"UTC, {day}" if day else "time of the log, s")
 
     def _ticks(self, step: float) -> tuple[list[float], list[str]]:
@@ -153,7 +155,7 @@ class TimeAxis:
             for t in times:
                 if not places or t + shift - places[-1] >= 0.8 * self.end / (MAX_TICKS + 1):
                     places.append(t + shift)
-                    labels.append(clock_text(t, form).removesuffix(" s"))
+                    labels.append(clock_text(t, form))
         return places, labels
 
     def name_recordings(self, axis: Any) -> None:
@@ -183,7 +185,8 @@ def decision_picture(results: Sequence[WindowResult], config: Config) -> Picture
         unnamed |= _ribbon(status, time, lambda r: STATUSES[r.status], True)
         state.set_ylabel("may go on", rotation=0, ha="right", va="center", fontsize=9.5)
         status.set_ylabel("estimate", rotation=0, ha="right", va="center", fontsize=9.5)
-        _band(axis, time, lambda r: r.traversability.max_draft, 1e3, "largest possible, on the level")
+        if any(r.traversability.max_draft for r in of_use(results)):
+            _band(axis, time, lambda r: r.traversability.max_draft, 1e3, "largest possible, on the level")
         pulled = time.curve(lambda r: r.excitation.draft)
         if np.isfinite(pulled[:, 1]).any():
             axis.plot(pulled[:, 0], pulled[:, 1] / 1e3, "-", color="black", lw=1.3, label="pulled")
@@ -195,7 +198,11 @@ def decision_picture(results: Sequence[WindowResult], config: Config) -> Picture
             )  # fmt: skip
         axis.set_ylabel("draft, kN")
         axis.set_ylim(bottom=min(0.0, 1.1e-3 * float(np.nanmin(pulled[:, 1], initial=0.0))))
-        axis.legend(loc="best")
+        if axis.get_legend_handles_labels()[1]:
+            axis.legend(loc="best")
+        else:
+            axis.text(0.5, 0.5, "no draft is known", ha="center", va="center", transform=axis.transAxes)
+            axis.set_yticks([])
         time.dress(axis)
         time.name_recordings(state)
         _legend(figure, [look for look in (*STATES.values(), *STATUSES.values()) if look in unnamed])
@@ -271,7 +278,7 @@ def map_pictures(results: Sequence[WindowResult]) -> Iterator[tuple[str, Picture
         "The route by decision.",
         picture(lambda figure: _draw_map(figure, placed, _by_state), 4.0, "map of the route, coloured by decision"),
     )
-    if any(r.traversability.max_draft for r in placed):
+    if any(r.traversability.max_draft for r in of_use(placed)):
         yield (
             "The route by the largest possible draft.",
             picture(

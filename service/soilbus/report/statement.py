@@ -69,7 +69,7 @@ def plain_gap(diagnosis: Diagnosis) -> str:
     text = f"On readings that it was not fitted to, the model is off by {before:.2f} times the sensors’ noise"
     if diagnosis.additions:
         text += f", with {' and '.join(a.effect.name for a in diagnosis.additions)} by {after:.2f} times"
-    return f"{text} (1 is as good as can be)."
+    return f"{text} (noise alone makes 1)."
 
 
 def to_tell_apart(diagnosis: Diagnosis) -> Iterator[tuple[str, list[str]]]:
