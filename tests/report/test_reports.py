@@ -154,7 +154,10 @@ def test_the_policy_of_a_report_stops_what_would_reach_outside(browser, made, tm
     bad.write_text(
         text.replace("</main>", "<img src='https://example.invalid/x.png'><script>document.title=''</script></main>")
     )
-    assert len(opened(browser, bad, 1280).errors) == 2
+    stopped = opened(browser, bad, 1280)
+    assert len(stopped.errors) == 2
+    assert all("Content Security Policy" in error for error in stopped.errors)
+    assert stopped.requests == [bad.as_uri()]
     wide = tmp_path / "wide.html"
     wide.write_text(text.replace("</main>", "<div style='width:500px;height:1px'></div></main>"))
     page = opened(browser, wide, 390)
