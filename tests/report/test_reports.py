@@ -7,7 +7,9 @@ import re
 import shutil
 from collections.abc import Iterator
 from datetime import UTC, datetime
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -149,17 +151,36 @@ def test_sentence_and_both_pictures_are_on_the_first_screen(browser, made, repor
 
 
 def test_the_policy_of_a_report_stops_what_would_reach_outside(browser, made, tmp_path):
-    text = made.replay.read_text()
-    bad = tmp_path / "bad.html"
-    bad.write_text(
-        text.replace("</main>", "<img src='https://example.invalid/x.png'><script>document.title=''</script></main>")
-    )
-    stopped = opened(browser, bad, 1280)
-    assert len(stopped.errors) == 2
-    assert all("Content Security Policy" in error for error in stopped.errors)
-    assert stopped.requests == [bad.as_uri()]
+    """A browser announces a request that the policy stops, so a server counts those that come."""
+    came: list[str] = []
+
+    class Outside(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            came.append(self.path)
+            self.send_error(404)
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Outside) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        image = f"<img src='http://127.0.0.1:{server.server_port}/x.png'><script>document.title = ''</script>"
+        text = made.replay.read_text().replace("</main>", f"{image}</main>")
+        stopped, free = tmp_path / "stopped.html", tmp_path / "free.html"
+        stopped.write_text(text)
+        free.write_text(re.sub("<meta http-equiv.*>", "", text))
+        errors = opened(browser, stopped, 1280).errors
+        assert came == []
+        opened(browser, free, 1280)
+        assert came == ["/x.png"]
+        server.shutdown()
+    assert len(errors) == 2
+    assert all("Content Security Policy" in error for error in errors)
+
+
+def test_a_page_that_is_too_wide_is_seen_to_be(browser, made, tmp_path):
     wide = tmp_path / "wide.html"
-    wide.write_text(text.replace("</main>", "<div style='width:500px;height:1px'></div></main>"))
+    wide.write_text(made.replay.read_text().replace("</main>", "<div style='width:500px;height:1px'></div></main>"))
     page = opened(browser, wide, 390)
     assert page.width > page.window
 
