@@ -17,6 +17,7 @@ from soilbus.process import say
 if TYPE_CHECKING:
     from soilbus.config.model import Config
     from soilbus.pipeline.result import WindowResult
+    from soilbus.report.page import Source
     from soilbus.simulator.scenario import Scenario
 
 
@@ -138,15 +139,16 @@ def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[W
     from soilbus.export.table import write_table
     from soilbus.export.task_data import write_task_data
     from soilbus.pipeline.outputs import json_line
-    from soilbus.report.windows import html_report
 
     if args.json is not None:
         with whole_file(args.json) as out:
             for result in results:
                 out.write(json_line(result, config) + "\n")
     if args.report is not None:
+        from soilbus.report.replay import replay_report
+
         with whole_file(args.report) as out:
-            out.write(html_report(results, text, args.logs))
+            out.write(replay_report(results, text, _source(args, config)))
     if args.table is not None:
         write_table(args.table, results, config)
     if args.mcap is not None:
@@ -172,7 +174,7 @@ def _check_outputs(args: argparse.Namespace, config: Config) -> None:
         if path is not None:
             check_position_is_mapped(config, option)
     if args.report is not None:
-        need_extra("matplotlib", "plots", "--report")
+        _need_plots()
     if args.table is not None and args.table.suffix == ".parquet":
         need_extra("pyarrow", "tables", "--table OUT.parquet")
     if args.mcap is not None:
@@ -180,6 +182,19 @@ def _check_outputs(args: argparse.Namespace, config: Config) -> None:
     if args.map is not None and args.map.suffix == ".gpkg":
         need_extra("pyogrio", "geo", "--map OUT.gpkg")
     check_folders(args.table, args.mcap, args.map)
+
+
+def _need_plots() -> None:
+    """What --report needs."""
+    for module in ("jinja2", "matplotlib"):
+        need_extra(module, "plots", "--report")
+
+
+def _source(args: argparse.Namespace, config: Config) -> Source:
+    """What a report is made from."""
+    from soilbus.report.page import Source
+
+    return Source(config, Path(args.config), args.set, args.logs)
 
 
 def simulate(args: argparse.Namespace) -> None:
@@ -277,7 +292,7 @@ def diagnose(args: argparse.Namespace) -> None:
 
     config = configured(args)
     if args.report is not None:
-        need_extra("matplotlib", "plots", "--report")
+        _need_plots()
         from soilbus.report.diagnosis import diagnosis_report
     check_folders(args.json, args.report, args.model_out, args.manoeuvre_out)
     try:
@@ -292,7 +307,7 @@ def diagnose(args: argparse.Namespace) -> None:
     if args.json is not None:
         texts.append((args.json, findings_json(findings, plan)))
     if args.report is not None:
-        texts.append((args.report, diagnosis_report(findings)))
+        texts.append((args.report, diagnosis_report(findings, _source(args, config), args.model_out)))
     if args.model_out is not None:
         effects, notes = effect_tables(findings.diagnosis.completed)
         text = with_effects_text(Path(args.config), args.set, effects, args.model_out.parent, notes)
