@@ -20,6 +20,8 @@ from soilbus.diagnosis.diagnose import NotFitted
 from soilbus.offline.replay import LogError
 from soilbus.offline.tables import TableError
 from soilbus.simulator.reference import TRACTOR
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.effects.effect import Active
 from soilbus.terra.soils import SOILS
 
 TRUTH = soilbus.Soil(k_c=2e3, k_phi=1.5e6, n=0.8, phi=0.5, c=2e3, K=0.015)
@@ -90,6 +92,21 @@ def test_load_and_sinkage_are_each_others_inverse_in_any_shape():
     assert alone.torque == pytest.approx(by_load.torque[0, 0])
 
 
+@pytest.mark.parametrize(("name", "value"), [("slip_sinkage", 0.5), ("lugs", 0.02), ("hardpan", 3.0)])
+def test_effects_act_as_in_the_catalogue(name, value):
+    effect = CATALOGUE[name]
+    active = Active(effect, effect.neutral | {effect.parameters[0].name: value})
+    wanted = sweep(TRUTH, (800.0, 1500.0), (0.05, 0.3, 0.6), [active])
+    found = soilbus.wheel_forces(
+        TRUTH, wanted["load"], wanted["slip"], radius=RADIUS, width=WIDTH, effects={name: value}
+    )
+    np.testing.assert_allclose(found.drawbar_pull, wanted["pull"], rtol=1e-6, atol=1e-4)
+    np.testing.assert_allclose(found.torque, wanted["torque"], rtol=1e-6)
+    np.testing.assert_allclose(found.sinkage, wanted["sink"], rtol=1e-6)
+    heavy = soilbus.wheel_forces(TRUTH, [800.0, 1e9], 0.2, radius=RADIUS, width=WIDTH, effects={name: value})
+    assert np.isnan(heavy.torque).tolist() == [False, True]
+
+
 def test_what_is_not_known_or_not_carried_stays_unknown():
     found = soilbus.wheel_forces("loam", [np.nan, 1e9, 6000.0], 0.2, radius=0.5, width=0.3)
     for values in (found.load, found.drawbar_pull, found.torque, found.entry_angle, found.sinkage):
@@ -107,6 +124,11 @@ def test_what_is_not_known_or_not_carried_stays_unknown():
         ({"sinkage": 0.05}, "either the load or the sinkage"),
         ({"load": None, "sinkage": 0.5}, "sinkage must be above 0 and below"),
         ({"model": "linear"}, "no shear law is named linear"),
+        ({"effects": {"slipsinkage": 0.4}}, "no effect is named slipsinkage; did you mean slip_sinkage"),
+        ({"effects": {"hardpan.width": 0.4}}, "hardpan has no parameter width; known: stiffness, depth"),
+        ({"effects": {"draft_offset": 40.0}}, "draft_offset does not act on a single wheel"),
+        ({"effects": {"lugs": 0.01, "multipass": 0.5}}, "multipass does not act on a single wheel"),
+        ({"effects": {"lugs": 0.01}, "load": None, "sinkage": 0.05}, "effects need the load"),
     ],
 )
 def test_a_wrong_wheel_is_refused_in_a_line(change, complaint):
