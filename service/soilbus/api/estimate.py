@@ -239,7 +239,7 @@ def estimate(data: Any, rig: SingleWheelRig | Config | Path | str, *, run: str |
     elif run is not None:
         raise TableError(f"data: no column says which rows are of the soil bed {run}")
     (found,) = runs_of_columns(config, columns)
-    (result,) = replay_runs(config, [("data", found)])
+    (result,) = replay_runs(config, [found])
     if result.posterior is None or result.bearing is None:
         raise NotFitted(f"no soil describes the {len(found.window.t)} rows ({result.reason})")
     settings = config.estimator

@@ -66,7 +66,7 @@ class Run:
     rejected: dict[str, int]
 
 
-def runs_of(config: Config, path: Path) -> list[Run]:
+def runs_of(config: Config, path: Path, name: str | None = None) -> list[Run]:
     """The runs of a CSV or Parquet file, in the order of their first rows.
 
     Parameters
@@ -75,6 +75,8 @@ def runs_of(config: Config, path: Path) -> list[Run]:
         Its [table] maps the columns.
     path
         The file.
+    name
+        What its runs are called by, with the soil bed where [table] run tells several; by default the file's name.
 
     Returns
     -------
@@ -86,7 +88,7 @@ def runs_of(config: Config, path: Path) -> list[Run]:
     TableError
         The file cannot be read, a column is missing, a cell is no number, or no row is left.
     """
-    return _runs(config, _columns(path, _needed(_table_of(config, str(path)))), str(path), path.name)
+    return _runs(config, _columns(path, _needed(_table_of(config, str(path)))), str(path), name or path.name)
 
 
 def runs_of_columns(config: Config, columns: Columns, source: str = "data") -> list[Run]:
@@ -134,15 +136,14 @@ def _runs(config: Config, columns: Columns, source: str, name: str) -> list[Run]
 def replay_tables(config: Config, paths: Sequence[Path]) -> Iterator[WindowResult]:
     """Each run as one window of the daemon's own estimator; t is its last row's. TableError as runs_of()."""
     named = zip(paths, log_names(paths), strict=True)
-    return replay_runs(config, ((name, run) for path, name in named for run in runs_of(config, path)))
+    return replay_runs(config, (run for path, name in named for run in runs_of(config, path, name)))
 
 
-def replay_runs(config: Config, runs: Iterable[tuple[str, Run]]) -> Iterator[WindowResult]:
-    """Each named run as one window of the daemon's own estimator; runs without rows are left out."""
+def replay_runs(config: Config, runs: Iterable[Run]) -> Iterator[WindowResult]:
+    """Each run as one window of the daemon's own estimator, `log` its name; runs without rows are left out."""
     estimator = WindowEstimator(config)
-    usable = ((name, run) for name, run in runs if len(run.window.t))
-    for index, (name, run) in enumerate(usable):
-        yield replace(estimator.solve(_task(index, run, estimator.rig)), log=name)
+    for index, run in enumerate(run for run in runs if len(run.window.t)):
+        yield replace(estimator.solve(_task(index, run, estimator.rig)), log=run.name)
 
 
 def _task(index: int, run: Run, rig: Rig) -> WindowTask:
