@@ -164,6 +164,7 @@ def test_an_estimate_prints_every_parameter_with_unit_and_prior(columns):
     assert "kPa" in text
     assert "C(k_phi, n) = +" in text
     assert found.std["K"] == 0.0
+    assert "c:     0 (held)" in repr(soilbus.estimate(columns, rig(soil={"c": (0.0, 0.0)})))
     assert np.isnan(found.correlation[5]).all()
     assert max(map(len, text.splitlines())) < 100
 
@@ -197,6 +198,8 @@ def test_each_soil_bed_has_its_own_estimate(columns):
         soilbus.estimate(both, rig())
     with pytest.raises(TableError, match="no soil bed lose; did you mean loose"):
         soilbus.estimate(both, rig(), run="lose")
+    with pytest.raises(TableError, match=r"no usable row of the soil bed loose .slip_range"):
+        soilbus.estimate(both | {"slip": np.where(both["run"] == "loose", 99.0, both["slip"])}, rig(), run="loose")
     with pytest.raises(TableError, match="no column says"):
         soilbus.estimate(columns, rig(), run="firm")
 

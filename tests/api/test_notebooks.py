@@ -18,7 +18,8 @@ def executed(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[
     """All text that a copy of a notebook prints, and the number of its pictures; run in its folder."""
     shutil.copytree(NOTEBOOKS, folder, dirs_exist_ok=True)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(REPO / "service"), os.environ.get("PYTHONPATH", "")]))
-    monkeypatch.setenv("JUPYTER_PLATFORM_DIRS", "1")
+    for variable in ("IPYTHONDIR", "JUPYTER_RUNTIME_DIR", "JUPYTER_CONFIG_DIR"):
+        monkeypatch.setenv(variable, str(folder / variable.lower()))  # nothing of the user's
     book = nbformat.read(folder / name, 4)
     NotebookClient(book, timeout=120, kernel_name="python3", resources={"metadata": {"path": str(folder)}}).execute()
     outputs = [output for cell in book.cells if cell.cell_type == "code" for output in cell.outputs]

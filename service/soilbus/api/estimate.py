@@ -6,7 +6,7 @@ columns -> rows of one soil bed (offline/tables.py) -> posterior (estimation) ->
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
@@ -19,13 +19,15 @@ from soilbus.config.file import load_config, parse_config
 from soilbus.config.model import Config
 from soilbus.diagnosis.diagnose import NotFitted
 from soilbus.estimation.posterior import PARAMETERS, Estimate, Posterior
-from soilbus.offline.tables import TableError, replay_runs, runs_of_columns
+from soilbus.offline.tables import Run, TableError, replay_runs, runs_of_columns
 from soilbus.report.soil_prior import SHOWN
 from soilbus.terra.wheel import Soil
 from soilbus.words import did_you_mean
 
 __all__ = ["SingleWheelRig", "SoilEstimate", "estimate"]
 
+SOURCE = "data"
+"""What messages call the columns."""
 ROLES = ("wheel_load", "slip", "drawbar_pull", "torque", "sinkage", "t", "run")
 """Columns that a rig's table can have."""
 CHANNELS = {"wheel_load": "load", "slip": "slip", "drawbar_pull": "draft", "torque": "torque", "sinkage": "sinkage"}
@@ -80,9 +82,9 @@ class SingleWheelRig:
         absent = [role for role in ROLES if role not in names]
         for name in (name for name in names if name not in ROLES):
             if meant := did_you_mean(name, absent):
-                raise TableError(f"data: no column of a rig is named {name}{meant}")
+                raise TableError(f"{SOURCE}: no column of a rig is named {name}{meant}")
         if needed := [role for role in ("wheel_load", "slip") if role in absent]:
-            raise TableError(f"data: no column {' and '.join(needed)}; it has {', '.join(names) or 'none'}")
+            raise TableError(f"{SOURCE}: no column {' and '.join(needed)}; it has {', '.join(names) or 'none'}")
         if unknown := [name for name in self.noise if name not in CHANNELS]:
             raise TableError(f"noise of {unknown[0]}{did_you_mean(unknown[0], CHANNELS)}; known: {', '.join(CHANNELS)}")
         raw = {
@@ -231,14 +233,9 @@ def estimate(data: Any, rig: SingleWheelRig | Config | Path | str, *, run: str |
     columns = {str(name): np.asarray(data[name]).tolist() for name in data}
     lengths = {len(cells) for cells in columns.values() if isinstance(cells, list)}
     if len(lengths) != 1 or not all(isinstance(cells, list) for cells in columns.values()):
-        raise TableError("data: its columns are not of one length")
+        raise TableError(f"{SOURCE}: its columns are not of one length")
     config = _configuration(rig, columns)
-    table_run = None if config.table is None else config.table.run
-    if table_run is not None and table_run in columns:
-        columns = _of_bed(columns, table_run, run)
-    elif run is not None:
-        raise TableError(f"data: no column says which rows are of the soil bed {run}")
-    (found,) = runs_of_columns(config, columns)
+    found = _of_bed(runs_of_columns(config, columns, SOURCE), run)
     (result,) = replay_runs(config, [found])
     if result.posterior is None or result.bearing is None:
         raise NotFitted(f"no soil describes the {len(found.window.t)} rows ({result.reason})")
@@ -263,16 +260,19 @@ def _configuration(rig: SingleWheelRig | Config | Path | str, columns: Iterable[
     return rig if isinstance(rig, Config) else load_config(rig)
 
 
-def _of_bed(columns: Mapping[str, list[Any]], column: str, run: str | None) -> dict[str, list[Any]]:
-    """The rows of one soil bed."""
-    names = [str(cell).strip() for cell in columns[column]]
-    beds = list(dict.fromkeys(names))
-    if run is None and len(beds) > 1:
-        raise TableError(f"data: rows of {len(beds)} soil beds: say which by run: {', '.join(beds)}")
-    wanted = beds[0] if run is None else str(run)
+def _of_bed(runs: Sequence[Run], bed: str | None) -> Run:
+    """The run of one soil bed, or the only one."""
+    beds = {run.name.removeprefix(f"{SOURCE}, "): run for run in runs}
+    if bed is None and len(beds) > 1:
+        raise TableError(f"{SOURCE}: rows of {len(beds)} soil beds: say which by run: {', '.join(beds)}")
+    if bed is not None and SOURCE in beds:
+        raise TableError(f"{SOURCE}: no column says which rows are of the soil bed {bed}")
+    wanted = next(iter(beds)) if bed is None else str(bed)
     if wanted not in beds:
-        raise TableError(f"data: no soil bed {wanted}{did_you_mean(wanted, beds)}; it has {', '.join(beds)}")
-    return {name: [c for c, bed in zip(cells, names, strict=True) if bed == wanted] for name, cells in columns.items()}
+        raise TableError(f"{SOURCE}: no soil bed {wanted}{did_you_mean(wanted, beds)}; it has {', '.join(beds)}")
+    if not len(beds[wanted].window.t):
+        raise TableError(f"{SOURCE}: no usable row of the soil bed {wanted} ({', '.join(beds[wanted].rejected)})")
+    return beds[wanted]
 
 
 def _noise(sd: float | Mapping[str, float]) -> Mapping[str, float]:
@@ -281,8 +281,10 @@ def _noise(sd: float | Mapping[str, float]) -> Mapping[str, float]:
 
 def _quantity(found: Estimate, unit: float) -> str:
     """Value and std, and the std in per cent."""
+    if found.std == 0.0:
+        return f"{_plus_minus(found, unit)} (held)"
     share = 100.0 * found.std / found.value
-    return _plus_minus(found, unit) + (f" ({share:.{int(share < 10.0)}f} %)" if found.std else " (held)")
+    return f"{_plus_minus(found, unit)} ({share:.{int(share < 10.0)}f} %)"
 
 
 def _plus_minus(found: Estimate, unit: float) -> str:

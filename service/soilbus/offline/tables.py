@@ -91,7 +91,7 @@ def runs_of(config: Config, path: Path, name: str | None = None) -> list[Run]:
     return _runs(config, _columns(path, _needed(_table_of(config, str(path)))), str(path), name or path.name)
 
 
-def runs_of_columns(config: Config, columns: Columns, source: str = "data") -> list[Run]:
+def runs_of_columns(config: Config, columns: Columns, source: str) -> list[Run]:
     """The runs of columns in memory; as runs_of(), with cells in place of a file's and None missing, too.
 
     Parameters
