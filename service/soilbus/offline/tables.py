@@ -76,7 +76,7 @@ def runs_of(config: Config, path: Path, name: str | None = None) -> list[Run]:
     path
         The file.
     name
-        What its runs are called by, with the soil bed where [table] run tells several; by default the file's name.
+        What its runs are called by, with the soil bed where [table] run is given; by default the file's name.
 
     Returns
     -------
