@@ -285,7 +285,6 @@ def diagnose(args: argparse.Namespace) -> None:
     from soilbus.diagnosis.model_out import effect_tables
     from soilbus.diagnosis.records import TooLittle
     from soilbus.offline.diagnose import diagnose_logs
-    from soilbus.offline.manoeuvre import what_to_drive
     from soilbus.offline.replay import LogError
     from soilbus.report.findings import findings_json, findings_text
     from soilbus.report.progress import phases
@@ -298,14 +297,11 @@ def diagnose(args: argparse.Namespace) -> None:
     try:
         with phases("diagnose") as say:
             findings = diagnose_logs(config, args.logs, say)
-            if say is not None:
-                say("finding what to drive next")
-            plan = what_to_drive(findings.diagnosis, config)
     except (LogError, NotFitted, TooLittle) as error:
         raise WorkError(str(error)) from None
     texts: list[tuple[Path, str]] = []
     if args.json is not None:
-        texts.append((args.json, findings_json(findings, plan)))
+        texts.append((args.json, findings_json(findings)))
     if args.report is not None:
         texts.append((args.report, diagnosis_report(findings, _source(args, config), args.model_out)))
     if args.model_out is not None:
@@ -313,11 +309,11 @@ def diagnose(args: argparse.Namespace) -> None:
         text = with_effects_text(Path(args.config), args.set, effects, args.model_out.parent, notes)
         texts.append((args.model_out, text))
     if args.manoeuvre_out is not None:
-        if plan is None:
+        if findings.plan is None:
             raise WorkError("--manoeuvre-out: no names are left to decide between that a drive would tell apart")
-        texts.append((args.manoeuvre_out, json.dumps(plan.as_json(), indent=1) + "\n"))
+        texts.append((args.manoeuvre_out, json.dumps(findings.plan.as_json(), indent=1) + "\n"))
     for path, text in texts:
         with whole_file(path) as out:
             out.write(text)
     if all(str(path) != "-" for path, _ in texts):
-        print(findings_text(findings, plan), end="")
+        print(findings_text(findings), end="")

@@ -20,7 +20,6 @@ from soilbus.diagnosis.verdict import gap_limit
 from soilbus.diagnosis.where import Disagreement
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.offline.diagnose import Findings
-from soilbus.offline.manoeuvre import Plan
 from soilbus.pipeline.outputs import known
 from soilbus.report.next_drive import plan_lines
 from soilbus.report.soil_prior import SHOWN
@@ -43,15 +42,12 @@ UNITS = {"torque": "N m", "draft": "N", "sinkage": "m"}
 """Unit of each channel's residuals."""
 
 
-def findings_json(findings: Findings, plan: Plan | None = None) -> str:
-    """All findings as one JSON object (docs/json.md), with null for numbers that are not finite.
-
-    plan: what to drive next.
-    """
-    return json.dumps(findings_record(findings, plan), indent=1, allow_nan=False) + "\n"
+def findings_json(findings: Findings) -> str:
+    """All findings as one JSON object (docs/json.md), with null for numbers that are not finite."""
+    return json.dumps(findings_record(findings), indent=1, allow_nan=False) + "\n"
 
 
-def findings_record(findings: Findings, plan: Plan | None = None) -> dict[str, Any]:
+def findings_record(findings: Findings) -> dict[str, Any]:
     """The same as nested dicts and lists, None for numbers that are not finite."""
     diagnosis, recordings = findings.diagnosis, findings.recordings
     soils = [
@@ -76,7 +72,7 @@ def findings_record(findings: Findings, plan: Plan | None = None) -> dict[str, A
         "soil_after": soils[0]["after"],
         "soils": soils,
         "model": {name: _estimates(values) for name, values in findings.diagnosis.completed.parameters().items()},
-        "manoeuvre": None if plan is None else plan.as_json(),
+        "manoeuvre": None if findings.plan is None else findings.plan.as_json(),
         "learned": [_residual_terms(description) for description in diagnosis.residual_terms],
         "warning": WARNING if diagnosis.residual_terms else None,
         "samples": recordings.samples,
@@ -163,7 +159,7 @@ def _estimates(estimates: dict[str, Estimate]) -> dict[str, dict[str, float]]:
     return {name: {"value": e.value, "std": e.std} for name, e in estimates.items()}
 
 
-def findings_text(findings: Findings, plan: Plan | None = None) -> str:
+def findings_text(findings: Findings) -> str:
     """All findings for a reader at a terminal."""
     diagnosis = findings.diagnosis
     lines = [f"{diagnosis.verdict}: {statement(diagnosis)}", *filter(None, [doubt(diagnosis)]), "", gap_line(findings)]
@@ -171,8 +167,8 @@ def findings_text(findings: Findings, plan: Plan | None = None) -> str:
     lines += shown_lines(diagnosis, findings.config)
     for number, addition in enumerate(diagnosis.additions, 1):
         lines += ["", *effect_lines(number, addition, findings.diagnosis.completed)]
-    if plan is not None:
-        lines += ["", *plan_lines(plan)]
+    if findings.plan is not None:
+        lines += ["", *plan_lines(findings.plan)]
     if diagnosis.residual_terms:
         lines += ["", "what is left, described:", *(f"  {line}" for line in residual_lines(diagnosis.residual_terms))]
     lines += ["", *_soil_lines(findings), "", admission_line(findings)]
