@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import threading
+
 import can
 import cantools
 import numpy as np
 import pytest
 
-from soilbus.can.dbc_files import load_databases
 from soilbus.can.publish import Publisher
 from soilbus.config.file import shipped_dbc
 from soilbus.estimation.assembly import with_effects
 from soilbus.simulator.commands import Commands
-from soilbus.simulator.drive import Command, drive, joined, steps
+from soilbus.simulator.drive import Command, Drive, drive, joined, steps
 from soilbus.simulator.frames import frames
-from soilbus.simulator.live import driven_frames
+from soilbus.simulator.live import drive_live, driven_frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing, demo
@@ -150,12 +151,25 @@ def test_a_command_with_a_wrong_checksum_or_a_halted_counter_is_none(publisher):
     assert not any(commands.take(frame, 2.0) for frame in (short, other))
 
 
-def test_filters_pass_the_commands_and_nothing_of_the_vehicle(publisher):
-    filters = Commands(CONFIG).filters
-    passed = {f["can_id"] for f in filters}
-    assert passed == {command_frame(publisher, name).arbitration_id for name in ("DriveCommand", "TorqueLimitCommand")}
-    mapped = {m.frame_id for m in load_databases(CONFIG).messages if m.cycle_time and m.cycle_time < 100}
-    assert not passed & mapped
+def test_on_a_busy_bus_in_real_time_the_commands_are_heard(publisher):
+    config = reference_configuration(["bus.interface=virtual", "bus.channel=commanded"])
+    scenario = Scenario(2.4, (Patch(0.0, "loam"),), Swing(1.4, 1.4), draft=Swing(500.0, 500.0), lift_slip=None)
+    driven: list[Drive] = []
+    with can.Bus(interface="virtual", channel="commanded") as control:
+        tractor = threading.Thread(target=drive_live, args=(config, scenario, 1, driven))
+        tractor.start()
+        heard = 0
+        while tractor.is_alive():
+            heard += control.recv(0.02) is not None
+            for identifier in range(0x100, 0x110):  # more than one frame between two commands
+                control.send(can.Message(arbitration_id=identifier, is_extended_id=False))
+            if heard % 20 == 0:
+                control.send(command_frame(publisher, Draft=1500.0))
+        tractor.join()
+    draft = joined(driven).columns["draft"]
+    assert draft[0] == pytest.approx(500.0)
+    assert draft[-1] == pytest.approx(1500.0)
+    assert heard > 500
 
 
 def test_the_same_vehicle_has_the_same_gains_in_other_drives():
