@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.files import whole_file
+from soilbus.files import placed, whole_file
 from soilbus.simulator.drive import Drive
 
 __all__ = ["PARQUET", "write_truth"]
@@ -45,7 +45,8 @@ def write_truth(done: Drive, path: Path, start: float) -> None:
     }
     if path.suffix.lower() in PARQUET:
         arrow: Any = import_module("pyarrow")  # typed only in part
-        import_module("pyarrow.parquet").write_table(arrow.table(columns), path)
+        with placed(path) as descriptor, open(descriptor, "wb", closefd=False) as raw:
+            import_module("pyarrow.parquet").write_table(arrow.table(columns), raw)
         return
     with whole_file(path) as out:
         rows = csv.writer(out, lineterminator="\n")
