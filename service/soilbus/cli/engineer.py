@@ -27,20 +27,15 @@ def replay(args: argparse.Namespace) -> None:
     from soilbus.offline.replay import LogError, estimator_beside, other_channel, replay
     from soilbus.pipeline.pipeline import Pipeline
     from soilbus.report.progress import progress
-    from soilbus.report.soil_map import check_position_is_mapped, soil_map
     from soilbus.report.windows import summary
 
     config = configured(args)
-    if args.map is not None:
-        check_position_is_mapped(config)
-    if args.report is not None:
-        need_extra("matplotlib", "plots", "--report")
+    _check_outputs(args, config)
     if config.table is not None:
         if args.frames is not None:
             raise ConfigError(["--frames: a table of a test rig has no bus to send on"])
         _replay_tables(args, config)
         return
-    check_folders(args.frames)
     for line in other_channel(config, args.logs):
         say(line)
     pipeline = Pipeline(config, load_databases(config))
@@ -59,12 +54,6 @@ def replay(args: argparse.Namespace) -> None:
         say(f"{fault}; {fault.windows} windows before that are kept")
     text = summary(results, pipeline)
     _write_windows(args, config, results, text)
-    if args.map is not None:
-        map_text, left_out = soil_map(results)
-        with whole_file(args.map) as out:
-            out.write(map_text)
-        if left_out:
-            say(f"{left_out} of {len(results)} windows have no position: not on the map")
     if args.frames is not None:
         _write_frames(args, config)
     if "-" not in (str(args.json), str(args.map)):
@@ -112,7 +101,12 @@ def _replay_tables(args: argparse.Namespace, config: Config) -> None:
 
 
 def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[WindowResult], text: str) -> None:
-    """What --json and --report ask for, under a summary."""
+    """What the options for files ask for, under a summary."""
+    from soilbus.export.geopackage import write_geopackage
+    from soilbus.export.mcap_log import write_mcap
+    from soilbus.export.soil_map import soil_map
+    from soilbus.export.table import write_table
+    from soilbus.export.task_data import write_task_data
     from soilbus.pipeline.outputs import json_line
     from soilbus.report.windows import html_report
 
@@ -123,6 +117,39 @@ def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[W
     if args.report is not None:
         with whole_file(args.report) as out:
             out.write(html_report(results, text, args.logs))
+    if args.table is not None:
+        write_table(args.table, results, config)
+    if args.mcap is not None:
+        write_mcap(args.mcap, results, config)
+    if args.map is not None:
+        map_text, left_out = soil_map(results)
+        if args.map.suffix == ".gpkg":
+            write_geopackage(args.map, map_text)
+        else:
+            with whole_file(args.map) as out:
+                out.write(map_text)
+        if left_out:
+            say(f"{left_out} of {len(results)} windows have no position: not on the map")
+    if args.isoxml is not None and (left_out := write_task_data(args.isoxml, results, config)):
+        say(f"{left_out} of {len(results)} windows have no position or no date: not in the task data")
+
+
+def _check_outputs(args: argparse.Namespace, config: Config) -> None:
+    """Ask before the work whether what the options for files need is there."""
+    from soilbus.export.soil_map import check_position_is_mapped
+
+    for path, option in ((args.map, "--map"), (args.isoxml, "--isoxml")):
+        if path is not None:
+            check_position_is_mapped(config, option)
+    if args.report is not None:
+        need_extra("matplotlib", "plots", "--report")
+    if args.table is not None and args.table.suffix == ".parquet":
+        need_extra("pyarrow", "tables", "--table OUT.parquet")
+    if args.mcap is not None:
+        need_extra("mcap", "mcap", "--mcap")
+    if args.map is not None and args.map.suffix == ".gpkg":
+        need_extra("pyogrio", "geo", "--map OUT.gpkg")
+    check_folders(args.table, args.mcap, args.map, args.frames)
 
 
 def simulate(args: argparse.Namespace) -> None:
@@ -132,11 +159,10 @@ def simulate(args: argparse.Namespace) -> None:
     from soilbus.simulator.course import course
     from soilbus.simulator.drive import SimulationError
     from soilbus.simulator.play import scenario_over
-    from soilbus.simulator.truth import PARQUET
 
     check_folders(args.truth)
-    if args.truth is not None and args.truth.suffix.lower() in PARQUET:
-        need_extra("pyarrow", "tables", "--truth in Parquet")
+    if args.truth is not None and args.truth.suffix == ".parquet":
+        need_extra("pyarrow", "tables", "--truth OUT.parquet")
     config = with_effects(configured_or_reference(args), args.effect)
     try:
         way = course(args.start, args.heading, args.rows)
