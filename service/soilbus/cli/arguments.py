@@ -96,6 +96,9 @@ def command_line() -> argparse.ArgumentParser:
     sub.add_argument("--json", type=Path, metavar="OUT", help="one JSON object a line per window; - for stdout")
     sub.add_argument("--report", type=Path, metavar="OUT.html", help="self-contained HTML with plots (extra: plots)")
     sub.add_argument(
+        "--frames", type=Path, metavar="OUT", help="log of the frames that the service sends (.log .log.gz .asc .blf)"
+    )
+    sub.add_argument(
         "--table", type=named(".csv", ".parquet"), metavar="OUT",
         help="windows as rows: .csv, or .parquet (extra: tables)",
     )  # fmt: skip
@@ -112,7 +115,7 @@ def command_line() -> argparse.ArgumentParser:
         help="ISO 11783-10 task data for farm software; needs a mapped position",
     )  # fmt: skip
     sub.add_argument(
-        "--frames", type=Path, metavar="OUT", help="log of the frames that the service sends (.log .log.gz .asc .blf)"
+        "--manoeuvre-out", type=Path, metavar="OUT.json", help="what to drive to know the soil better (see simulate)"
     )
     sub.add_argument("--partial", action="store_true", help="keep the windows before the point where a log is damaged")
 
@@ -147,6 +150,7 @@ def command_line() -> argparse.ArgumentParser:
         "--truth", type=named(".csv", ".parquet"), metavar="OUT",
         help="true values as rows: soil, slip, draft, load, sinkage, torque: .csv, or .parquet (extra: tables)",
     )  # fmt: skip
+    sub.add_argument("--manoeuvre", type=Path, metavar="FILE", help="drive what --manoeuvre-out has written")
     target = sub.add_mutually_exclusive_group(required=True)
     target.add_argument(
         "--bus", action="store_true", help="drive on the configured bus in real time, by its commands (dbc/tractor.dbc)"
@@ -159,6 +163,9 @@ def command_line() -> argparse.ArgumentParser:
     sub.add_argument("--report", type=Path, metavar="OUT.html", help="self-contained HTML with plots (extra: plots)")
     sub.add_argument(
         "--model-out", type=Path, metavar="OUT.toml", help="the configuration with the effects found, for any command"
+    )
+    sub.add_argument(
+        "--manoeuvre-out", type=Path, metavar="OUT.json", help="of an ambiguous diagnosis, what to drive to settle it"
     )
 
     sub = command("watch", "terminal dashboard that reads only our frames, of the bus or of a recording", "optional")

@@ -21,7 +21,9 @@ from soilbus.diagnosis.verdict import gap_limit
 from soilbus.diagnosis.where import Disagreement
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.offline.diagnose import Findings
+from soilbus.offline.manoeuvre import Plan
 from soilbus.pipeline.outputs import known
+from soilbus.report.next_drive import plan_lines
 from soilbus.report.statement import (
     doubt,
     is_open,
@@ -41,10 +43,10 @@ UNITS = {"torque": "N m", "draft": "N", "sinkage": "m"}
 """Unit of each channel's residuals."""
 
 
-def findings_json(findings: Findings) -> str:
+def findings_json(findings: Findings, plan: Plan | None = None) -> str:
     """All findings as one JSON object, with null for numbers that are not finite.
 
-    Its keys are listed in DESIGN.md.
+    Its keys are listed in DESIGN.md.  plan: what to drive next.
     """
     diagnosis, recordings = findings.diagnosis, findings.recordings
     soils = [
@@ -69,6 +71,7 @@ def findings_json(findings: Findings) -> str:
         "soil_after": soils[0]["after"],
         "soils": soils,
         "model": {name: _estimates(values) for name, values in findings.diagnosis.completed.parameters().items()},
+        "manoeuvre": None if plan is None else plan.as_json(),
         "learned": [_residual_terms(description) for description in diagnosis.residual_terms],
         "warning": WARNING if diagnosis.residual_terms else None,
         "samples": recordings.samples,
@@ -154,7 +157,7 @@ def _estimates(estimates: dict[str, Estimate]) -> dict[str, dict[str, float]]:
     return {name: {"value": e.value, "std": e.std} for name, e in estimates.items()}
 
 
-def findings_text(findings: Findings) -> str:
+def findings_text(findings: Findings, plan: Plan | None = None) -> str:
     """All findings for a reader at a terminal."""
     diagnosis = findings.diagnosis
     lines = [f"{diagnosis.verdict}: {statement(diagnosis)}", *filter(None, [doubt(diagnosis)]), "", gap_line(findings)]
@@ -162,6 +165,8 @@ def findings_text(findings: Findings) -> str:
     lines += shown_lines(diagnosis, findings.config)
     for number, addition in enumerate(diagnosis.additions, 1):
         lines += ["", *effect_lines(number, addition, findings.diagnosis.completed)]
+    if plan is not None:
+        lines += ["", *plan_lines(plan)]
     if diagnosis.residual_terms:
         lines += ["", "what is left, described:", *(f"  {line}" for line in residual_lines(diagnosis.residual_terms))]
     lines += ["", *_soil_lines(findings), "", admission_line(findings)]

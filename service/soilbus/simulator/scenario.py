@@ -70,6 +70,11 @@ class Profile:
         """The least value."""
         return min(self.value)
 
+    @property
+    def high(self) -> float:
+        """The greatest value."""
+        return max(self.value)
+
 
 class Wave(NamedTuple):
     """One realisation of a swing or a profile: value, rate of change [1/s], integral from the start [s]; each (N,)."""
@@ -166,10 +171,10 @@ class Scenario:
     soils: Sequence[Patch]
     speed: Swing | Profile = Swing(1.0, 1.8)
     draft: Swing | Profile | None = None
-    slip: Swing | None = None
+    slip: Swing | Profile | None = None
     lift_slip: Swing | None = Swing(0.45, 0.45)
     slip_spread: float = 0.015
-    side_shift: Swing = Swing(-0.15, 0.15)
+    side_shift: Swing | Profile = Swing(-0.15, 0.15)
     slope: Sequence[tuple[float, float]] = ((0.0, 0.0),)
     transition: float = 1.0
     course: Course = NORTHWARD
