@@ -147,8 +147,8 @@ def command_line() -> argparse.ArgumentParser:
         help="picks true mass (by vehicle.mass_std) and sensor gains; without it --seed picks the gains",
     )  # fmt: skip
     sub.add_argument(
-        "--truth", type=Path, metavar="OUT",
-        help="table of true values: soil, slip, draft, load, sinkage, torque (.csv, or .parquet with the extra tables)",
+        "--truth", type=named(".csv", ".parquet"), metavar="OUT",
+        help="true values as rows: soil, slip, draft, load, sinkage, torque: .csv, or .parquet (extra: tables)",
     )  # fmt: skip
     sub.add_argument("--manoeuvre", type=Path, metavar="FILE", help="drive what --manoeuvre-out has written")
     target = sub.add_mutually_exclusive_group(required=True)

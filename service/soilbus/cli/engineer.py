@@ -205,10 +205,9 @@ def simulate(args: argparse.Namespace) -> None:
     from soilbus.simulator.drive import SimulationError
     from soilbus.simulator.play import scenario_over
 
-    if args.truth is not None:
-        check_folders(args.truth)
-        if args.truth.suffix.lower() in (".parquet", ".pq"):
-            need_extra("pyarrow", "tables", "--truth in Parquet")
+    check_folders(args.truth)
+    if args.truth is not None and args.truth.suffix == ".parquet":
+        need_extra("pyarrow", "tables", "--truth OUT.parquet")
     config = with_effects(configured_or_reference(args), args.effect)
     try:
         way = course(args.start, args.heading, args.rows)
