@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from soilbus import __version__
@@ -43,16 +43,41 @@ def counted(text: str) -> int:
     return number
 
 
+EXAMPLES: Mapping[str, str] = {
+    "demo": "soilbus demo --picture dashboard.svg",
+    "init": "soilbus init --dbc vehicle.dbc --log drive.log -o soilbus.toml",
+    "run": "soilbus run --config soilbus.toml --set bus.channel=can1",
+    "check": "soilbus check --config soilbus.toml --log drive.log",
+    "replay": "soilbus replay --config soilbus.toml drive.log --json windows.jsonl --report drive.html",
+    "simulate": "soilbus simulate --config tractor-2wd --soil loam --effect slip_sinkage=0.4 --log drive.log",
+    "diagnose": "soilbus diagnose --config soilbus.toml drive.log --report findings.html --model-out better.toml",
+    "effects": "soilbus effects slip_sinkage",
+    "watch": "soilbus watch --config soilbus.toml",
+    "completion": "soilbus completion bash >/etc/bash_completion.d/soilbus",
+    "paper": "soilbus paper --sinkage 0.05",
+    "montecarlo": "soilbus montecarlo --windows 50 --json figures.json",
+    "decisions": "soilbus decisions --drives 20 --json figures.json",
+    "bench": "soilbus bench --json figures.json",
+}
+"""A line that works, for the end of each command's help."""
+
+
 def command_line() -> argparse.ArgumentParser:
     """Parser of the whole command line; `command` names the one to do."""
     parser = argparse.ArgumentParser(prog="soilbus", description="What soil a tractor is driving on, from its CAN bus.")
     parser.add_argument("--version", action="version", version=f"soilbus {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def command(name: str, text: str, config: str = "required") -> argparse.ArgumentParser:
-        sub = commands.add_parser(name, help=text, description=text)
+    def command(name: str, text: str, config: str = "found") -> argparse.ArgumentParser:
+        sub = commands.add_parser(
+            name, help=text, description=text, epilog=f"example:\n  {EXAMPLES[name]}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )  # fmt: skip
         if config:
-            sub.add_argument("--config", metavar="FILE", required=config == "required", help="TOML configuration")
+            default = "soilbus.toml in this folder" if config == "found" else "the simulated tractor"
+            sub.add_argument(
+                "--config", metavar="FILE", help=f"TOML configuration or a reference machine's name; default: {default}"
+            )
             sub.add_argument(
                 "--set", action="append", default=[], metavar="KEY=VALUE", help="override a value (dotted TOML path)"
             )
@@ -66,6 +91,16 @@ def command_line() -> argparse.ArgumentParser:
     sub = command("demo", "simulated tractor, service and dashboard; needs no hardware, ends by itself", "")
     sub.add_argument("--duration", type=float, default=42.0, metavar="S", help="simulated seconds (default 42)")
     sub.add_argument("--picture", type=Path, metavar="OUT.svg", help="keep the last state of the dashboard")
+
+    sub = command("init", "propose a configuration from the vehicle's DBC, and from a log of a drive", "")
+    sub.add_argument(
+        "--dbc", action="append", type=Path, required=True, metavar="FILE", help="of the vehicle; repeat it for more"
+    )
+    sub.add_argument("--log", type=Path, metavar="LOG", help="a drive with varied load, to see what each signal does")
+    sub.add_argument(
+        "-o", "--out", type=Path, default=Path("-"), metavar="OUT.toml", help="file to write (default: stdout)"
+    )
+    sub.add_argument("--force", action="store_true", help="replace a file that is there already")
 
     sub = command("run", "the service on a live bus")
     sub.add_argument("--wait", action="store_true", help="wait for an interface that is not there yet")
@@ -111,6 +146,13 @@ def command_line() -> argparse.ArgumentParser:
 
     sub = command("watch", "live terminal dashboard that reads only our frames", "optional")
     sub.add_argument("--seconds", type=float, metavar="S", help="stop after this time")
+
+    sub = command("effects", "the catalogue of effects: physics, parameters, ranges, source, what tells it apart", "")
+    sub.add_argument("name", nargs="?", metavar="NAME", help="one effect in full (default: a line for each)")
+    sub.add_argument("--json", type=Path, metavar="OUT", help="write them as JSON; - for stdout")
+
+    sub = command("completion", "completion of commands and options for a shell (extra: completion)", "")
+    sub.add_argument("shell", choices=("bash", "zsh"), help="the shell; its output belongs where that shell looks")
 
     sub = command("paper", "the tables of Xi et al. 2024 beside ours, and what holds of its method", "")
     sub.add_argument(

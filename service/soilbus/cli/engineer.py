@@ -1,4 +1,4 @@
-"""Commands of the controls engineer: replay, simulate, diagnose.
+"""Commands of the controls engineer: replay, simulate, diagnose, effects.
 
 Each function takes the parsed arguments, imports what it needs, does the work and writes the outputs asked for.
 """
@@ -131,6 +131,7 @@ def simulate(args: argparse.Namespace) -> None:
 def diagnose(args: argparse.Namespace) -> None:
     """`soilbus diagnose`: find, name, add, show."""
     from soilbus.config.edit import with_effects_text
+    from soilbus.config.file import found_configuration
     from soilbus.diagnosis.diagnose import NotFitted
     from soilbus.diagnosis.model_out import effect_tables
     from soilbus.diagnosis.records import TooLittle
@@ -156,7 +157,7 @@ def diagnose(args: argparse.Namespace) -> None:
         texts.append((args.report, diagnosis_report(findings)))
     if args.model_out is not None:
         effects, notes = effect_tables(findings.diagnosis.completed)
-        text = with_effects_text(Path(args.config), args.set, effects, args.model_out.parent, notes)
+        text = with_effects_text(found_configuration(args.config), args.set, effects, args.model_out.parent, notes)
         texts.append((args.model_out, text))
     for path, text in texts:
         with whole_file(path) as out:

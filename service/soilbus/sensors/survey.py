@@ -35,14 +35,8 @@ from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.window import Rig, Window, forward, pairs, pull_given, turning
 from soilbus.sensors.bins import Bins
 from soilbus.sensors.consistency import change, implausible, median, resolution_of, without
+from soilbus.sensors.recorded import Columns, Frame, longest_part
 from soilbus.terra.vehicle import GRAVITY, axle_loads, slip_ratio
-
-Frame = tuple[float, int, bool, bytes | bytearray, bool, bool]
-
-BATCH_SIZE = 5000
-"""Number of frames that are decoded at a time."""
-LONGEST_SILENCE = 60.0
-"""Time [s] without a frame, or jump back, after which another part begins; the part with most samples is compared."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,8 +200,7 @@ def survey(config: Config, database: Database, frames: Iterable[Frame], limits: 
     except ConfigError:  # of a speed that nobody mapped
         with_motors, channels = config, channels_of(config, database)
     admission = Admission(channels, database, checked_messages(config))
-    parts, refused, n = _decoded(admission, frames)
-    longest = max(parts, key=lambda part: sum(len(t) for t, _ in part.values()))
+    longest, refused, n = longest_part(admission, frames)
     seen = tuple(_seen(c, longest, refused) for c in channels if c.name in mapped)
     if not sum(admission.counts.received.values()):
         text = f"none of the {n} frames heard is of a mapped message: another bus or channel, or the wrong DBC?"
@@ -248,47 +241,6 @@ def _rotation(text: str | None) -> bool:
     except ValueError:
         return False
     return unit is not None and unit.dimension == "rotation"
-
-
-Columns = dict[str, tuple[Array, Array]]
-
-
-def _decoded(admission: Admission, frames: Iterable[Frame]) -> tuple[list[Columns], Counter[tuple[str, Reason]], int]:
-    """Samples by channel for each part of the recording with one clock, refusals, and the number of frames."""
-    pieces: list[list[Columns]] = [[]]
-    refused: Counter[tuple[str, Reason]] = Counter()
-    last, n, steps = math.nan, 0, 0
-
-    def take() -> None:
-        decoded = admission.take()
-        refused.update({key: len(t) for key, t in decoded.refused.items()})
-        pieces[-1].append({name: (c.t, c.value) for name, c in decoded.columns.items() if len(c.t)})
-
-    for t, identifier, extended, data, remote, error in frames:
-        n += 1
-        if error:
-            continue
-        if abs(t - last) > LONGEST_SILENCE:
-            take()
-            pieces.append([])
-        last = t
-        admission.feed(t, identifier, extended, data, remote)
-        if n % BATCH_SIZE == 0:
-            if admission.counts.clock_steps != steps:
-                steps = admission.counts.clock_steps
-                pieces.append([])
-            take()
-    take()
-    return [_joined(piece) for piece in pieces], refused, n
-
-
-def _joined(pieces: list[Columns]) -> Columns:
-    names = {name for piece in pieces for name in piece}
-    joined: Columns = {}
-    for name in names:
-        parts = [piece[name] for piece in pieces if name in piece]
-        joined[name] = (np.concatenate([t for t, _ in parts]), np.concatenate([v for _, v in parts]))
-    return joined
 
 
 def _seen(channel: Channel, heard: Columns, refused: Mapping[tuple[str, Reason], int]) -> Seen:
