@@ -58,7 +58,7 @@ _ABBREVIATIONS: Mapping[str, str] = {
     "ground": "gnd radar gps gnss sog doppler overground", "sinkage": "sink rut", "height": "hgt ride",
     "pitch": "ptch", "slope": "grade inclination incline", "roll": "bank", "yaw": "gz", "rate": "rt",
     "acceleration": "acc accel accelerometer", "longitudinal": "lgt lon long along forward x ax",
-    "lateral": "lat y ay", "vertical": "vert z az", "steering": "steer str", "angle": "ang",
+    "lateral": "lat y ay", "vertical": "vert z az", "steering": "steer str eps mdps", "angle": "ang",
     "latitude": "lat", "longitude": "lon long lng", "position": "pos gps gnss",
     "differential": "diff", "lock": "locked lck",
     "limit": "lim max maximum avail available avl greatest", "least": "min minimum",
@@ -68,7 +68,7 @@ _ABBREVIATIONS: Mapping[str, str] = {
     "front": "frnt frt fnt fwd", "rear": "re rer back hind", "left": "lft lh", "right": "rght rgt rh",
 }  # fmt: skip
 _OTHER = (
-    "force specific hand column pump fan cruise gravity course cog distance direction travel steady"
+    "force specific hand column pump fan cruise gravity course cog fraction coverage distance direction travel steady"
     " temperature voltage current counter checksum percent rated loss friction north east up down link lift position"
 )
 _WORDS: dict[str, frozenset[str]] = {}
@@ -89,9 +89,9 @@ _ASKED = frozenset({"request", "least", "rated"})
 _OTHER_MACHINES = frozenset({"pto", "engine", "brake", "pump", "fan", "steering"})
 _ROLES: Mapping[str, tuple[tuple[str, ...], float, Mapping[str, float], frozenset[str]]] = {
     "torque": (
-        ("torque",), 0.8,
+        ("torque",), 0.6,
         {"motor": 0.4, "shaft": 0.2, "wheel": 0.2, "axle": 0.2, "torque": 0.3, "actual": 0.4},
-        _ASKED | _OTHER_MACHINES | {"limit", "loss", "friction"},
+        _ASKED | _OTHER_MACHINES | {"limit", "loss", "friction", "lock", "differential"},
     ),
     "torque_limit": (("torque",), 0.0, {"limit": 1.2}, _ASKED | _OTHER_MACHINES),
     "motor_speed": (
@@ -108,8 +108,8 @@ _ROLES: Mapping[str, tuple[tuple[str, ...], float, Mapping[str, float], frozense
     ),
     "sinkage": (("length",), 0.0, {"sinkage": 1.2, "height": 0.3}, _ASKED | {"distance", "travel", "hitch", "limit"}),
     "ground_speed": (
-        ("speed",), 0.1, {"ground": 0.9, "speed": 0.2, "vehicle": 0.1},
-        _ASKED | {"wheel", "odometer", "cruise", "limit", "lateral", "vertical", "north", "east", "motor"},
+        ("speed",), 0.1, {"ground": 0.85, "speed": 0.3, "vehicle": 0.1},
+        _ASKED | {"wheel", "odometer", "cruise", "limit", "lateral", "vertical", "north", "east", "motor", "coverage"},
     ),
     "draft": (
         ("force",), 0.1, {"draft": 1.0, "pull": 0.6, "hitch": 0.3, "force": 0.1},
@@ -132,13 +132,16 @@ _ROLES: Mapping[str, tuple[tuple[str, ...], float, Mapping[str, float], frozense
         _ASKED | {"lateral", "vertical", "limit"},
     ),
     "steering_angle": (
-        ("angle",), 0.1, {"steering": 0.8, "angle": 0.2, "front": 0.3}, _ASKED | {"hand", "column", "rate", "limit"},
+        ("angle",), 0.1, {"steering": 0.8, "angle": 0.2, "front": 0.3},
+        _ASKED | {"hand", "column", "rate", "limit", "fraction"},
     ),
     "latitude": (("angle",), 0.1, {"latitude": 0.8, "position": 0.4}, frozenset({"slope", "acceleration", "pitch"})),
     "longitude": (("angle",), 0.1, {"longitude": 0.8, "position": 0.4}, frozenset({"slope", "acceleration", "pitch"})),
     "differential_lock": (("",), 0.0, {"differential": 0.6, "lock": 0.6}, _ASKED),
 }  # fmt: skip
 """Of each role: dimensions of its unit, score of a fitting unit, weights of words, words that speak against it."""
+COARSEST_POSITION = 2e-5
+"""Resolution [rad] up to which a signal alone can be a latitude: 130 m."""
 _AGAINST = 1.5
 """Score that a word against a role costs."""
 _NO_UNIT = 0.4
@@ -301,12 +304,14 @@ def _by_range(role: str, signal: Signal, unit: Unit | None, own: frozenset[str])
     )
     extent = max(abs(low), abs(high)) if math.isfinite(low) and math.isfinite(high) else math.nan
     if role == "steering_angle":
-        return -1.0 if extent > 1.6 or {"steering", "wheel"} <= own else 0.0  # the hand wheel turns further
+        # the hand wheel turns further, and is what "steering angle" means on a car
+        return -1.0 if extent > 1.6 or {"steering", "wheel"} <= own else 0.0 if extent > 0.0 else -0.3
     if role in ("latitude", "longitude"):
         least = (math.pi / 2.0 if role == "latitude" else math.pi) - 1e-6
-        return -1.0 if extent < least or low >= 0.0 else 0.0
+        is_part = float(signal.scale) * (unit.factor if unit else 1.0) > COARSEST_POSITION  # minutes stand elsewhere
+        return -1.0 if extent < least or low >= 0.0 or is_part else 0.0
     if role in ("pitch", "roll"):
-        return -1.0 if extent > math.pi + 1e-3 or low >= 0.0 else 0.0
+        return -1.0 if extent > 2.0 * math.pi - 0.1 or low >= 0.0 else 0.0  # a course
     if role in ("torque", "draft", "acceleration", "yaw_rate") and low >= 0.0:
         return -0.2 if role == "torque" else -0.1  # braking or pushing cannot be said
     if role == "torque_limit" and low < 0.0 and high <= 0.0:

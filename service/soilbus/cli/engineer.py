@@ -128,6 +128,23 @@ def simulate(args: argparse.Namespace) -> None:
         say(f"the tractor is stuck after {recording.bogged_at:.1f} s")
 
 
+def effects(args: argparse.Namespace) -> None:
+    """`soilbus effects`: the catalogue."""
+    from soilbus.cli.effects import effect_text, effects_json, overview
+    from soilbus.config.model import ConfigError
+    from soilbus.terra.effects.catalogue import CATALOGUE
+    from soilbus.words import did_you_mean
+
+    if args.name is not None and args.name not in CATALOGUE:
+        raise ConfigError([f"no effect {args.name}{did_you_mean(args.name, CATALOGUE)}"])
+    wanted = [CATALOGUE[args.name]] if args.name else list(CATALOGUE.values())
+    if args.json is not None:
+        with whole_file(args.json) as out:
+            out.write(effects_json(wanted) + "\n")
+    if str(args.json) != "-":
+        print(effect_text(wanted[0]) if args.name else overview(wanted), end="")
+
+
 def diagnose(args: argparse.Namespace) -> None:
     """`soilbus diagnose`: find, name, add, show."""
     from soilbus.config.edit import with_effects_text

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from soilbus.allocator import loading
-from soilbus.cli.common import WorkError, check_folders, configured, configured_or_reference
+from soilbus.cli.common import WorkError, check_folders, configured, configured_or_reference, need_extra
 from soilbus.files import whole_file
 from soilbus.process import say
 
@@ -152,3 +152,18 @@ def watch(args: argparse.Namespace) -> None:
         watch(config, args.seconds)
     except BusError as error:
         raise WorkError(str(error)) from None
+
+
+def completion(args: argparse.Namespace) -> None:
+    """`soilbus completion`: a shell's completion of commands, options and files."""
+    need_extra("shtab", "completion", "completion")
+    import shtab
+
+    from soilbus.cli.arguments import command_line, subcommands
+
+    parser = command_line()
+    for command in subcommands(parser).values():
+        for action in command._actions:
+            if action.type is Path or action.dest == "config":
+                action.complete = shtab.FILE  # type: ignore[attr-defined]
+    print(shtab.complete(parser, args.shell))

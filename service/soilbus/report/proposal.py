@@ -185,11 +185,14 @@ def _put_axle(draft: _Draft, axle: str) -> None:
         if axle:
             draft.note("the motor turns with this axle's wheels in the log")
     if torque := draft.matched("torque", place):
-        _put_gear(draft, axle if axle else "?")
+        speed = _beside(draft, torque, draft.matched("motor_speed", place))
+        at_wheel = _is_at_wheel(torque)
+        if not at_wheel or speed is not None:
+            _put_gear(draft, axle if axle else "?")
         draft.put_open("differential", '"open", "locked" or "limited"')
-        draft.put_signal("torque", torque)
-        _put_limit(draft, place, "axle")
-        if speed := draft.matched("motor_speed", place):
+        draft.put_signal("torque", torque, **({"at": "wheel"} if at_wheel else {}))
+        _put_limit(draft, torque, "axle")
+        if speed is not None:
             draft.put_signal("motor_speed", speed)
     if axle and (load := draft.matched("load", axle)):
         draft.put_signal("load", load)
@@ -207,11 +210,11 @@ def _put_wheel(draft: _Draft, wheel: str, layout: _Layout) -> None:
     motor = draft.matched("motor_speed", wheel)
     by_axle = bool(layout.axles_driven & {axle, "both"})
     if torque is not None:
-        at_wheel = is_word_in(torque, "wheel") and not is_word_in(torque, "motor", "shaft")
+        at_wheel = _is_at_wheel(torque)
         if not at_wheel or (speed is None and motor is not None):
             _put_gear(draft, wheel)
         draft.put_signal("torque", torque, **({"at": "wheel"} if at_wheel else {}))
-        _put_limit(draft, wheel, "wheel")
+        _put_limit(draft, torque, "wheel")
     elif not by_axle and (layout.wheels_driven or layout.axles_driven or "" in layout.axles):
         draft.put_open("driven", "true or false: no torque of it was found")
     elif not by_axle:
@@ -241,11 +244,24 @@ def _put_gear(draft: _Draft, place: str) -> None:
     draft.put_open("gear_ratio", f"{text}; {per_metre:.4g} * radius by the log" if per_metre else text)
 
 
-def _put_limit(draft: _Draft, place: str, at: str) -> None:
-    if limit := draft.matched("torque_limit", place):
+def _put_limit(draft: _Draft, torque: Candidate, at: str) -> None:
+    limit = _beside(draft, torque, draft.matched("torque_limit", torque.slot.place))
+    if limit is not None:
         draft.put_signal("torque_limit", limit)
     else:
         draft.note(f"max_torque = 5000.0  # N m at the {at}: the motor's limit")
+
+
+def _beside(draft: _Draft, torque: Candidate, c: Candidate | None) -> Candidate | None:
+    """A signal that belongs to a torque: of its place or, where no name says a place, of its message or sender."""
+    if c is None or torque.slot.place or c.message == torque.message:
+        return c
+    one, other = (draft.database.get_message_by_name(name).senders for name in (c.message, torque.message))
+    return c if set(one) & set(other) - {"Vector__XXX"} else None
+
+
+def _is_at_wheel(torque: Candidate) -> bool:
+    return is_word_in(torque, "wheel") and not is_word_in(torque, "motor", "shaft")
 
 
 def _put_signals(draft: _Draft) -> None:
@@ -324,7 +340,7 @@ def _rounded(ratio: float) -> str:
     return text if "." in text else f"{text}.0"
 
 
-ROUNDING = 0.002
+ROUNDING = 0.001
 """Relative change by which a measured gear ratio may be rounded: gain errors of two speed sensors."""
 
 
