@@ -17,6 +17,7 @@ import tomlkit
 from soilbus.cli.main import main
 from soilbus.config.file import machine, shipped_dbc
 
+HERE = Path(__file__).resolve().parent
 LOAM = (5300.0 / 0.3 + 1.515e6) * 0.02**0.7
 """Bearing pressure [Pa] of the simulated soil."""
 MACHINES = ("tractor", "tractor-2wd", "tractor-axles")
@@ -60,6 +61,8 @@ def filled(text: str, truth: Mapping[str, Any]) -> str:
     document = tomlkit.parse(text)
     defaults = {"driven": True, "kind": "kinematic"}
     for path in list(open_keys(document.unwrap())):
+        if path[-1] == "name":
+            continue
         try:
             value = at(truth, path)
         except (KeyError, TypeError):
@@ -112,6 +115,26 @@ def test_the_roles_of_a_log_are_those_of_the_machine(drive, tmp_path):
     text = (tmp_path / "a.toml").read_text()
     if (sum_of_loads := re.search(r"loads sum to (\d+) kg", text)) is not None:
         assert float(sum_of_loads[1]) == pytest.approx(truth["vehicle"]["mass"], rel=0.02)
+
+
+@pytest.mark.parametrize("name", ["orchard", "hubs"])
+def test_a_filled_proposal_of_another_maker_is_a_configuration(name, tmp_path, capsys):
+    path = tmp_path / "soilbus.toml"
+    assert main(["init", "--dbc", str(HERE / f"{name}.dbc"), "-o", str(path)]) == 0
+    vehicle = {"mass": 3000.0, "wheelbase": 2.0, "cg_ahead_of_rear_axle": 0.9, "cg_height": 0.8, "hitch_height": 0.4}
+    wheel = {"radius": 0.6, "width": 0.3, "gear_ratio": 20.0, "driven": True}
+    sheet = {
+        "vehicle": vehicle,
+        "wheel": [{"name": wheel_name, **wheel} for wheel_name in ("FL", "FR", "RL", "RR")],
+        "axle": [{"name": "?", "gear_ratio": 20.0, "differential": "open"}],
+    }
+    text = filled(path.read_text(), sheet).replace('name = "?"', 'name = "both"')
+    path.write_text(text)
+    capsys.readouterr()
+    assert main(["check", "--config", str(path)]) == 0
+    out, err = capsys.readouterr()
+    assert "ok" in out
+    assert [line for line in err.splitlines() if "warning" not in line] == []
 
 
 def test_a_file_that_is_there_is_not_overwritten_unasked(tmp_path, capsys):

@@ -36,7 +36,7 @@ def init(args: argparse.Namespace) -> None:
     from soilbus.can.dbc_files import load_databases
     from soilbus.can.role_matching import assigned, candidates
     from soilbus.config.edit import named_from
-    from soilbus.config.file import parse_config
+    from soilbus.config.file import located, parse_config
     from soilbus.config.model import ConfigError
     from soilbus.offline.replay import LogError, read_frames
     from soilbus.report.progress import progress
@@ -47,8 +47,9 @@ def init(args: argparse.Namespace) -> None:
     if not to_stdout and args.out.exists() and not args.force:
         raise WorkError(f"{args.out} is there already; --force replaces it")
     check_folders(None if to_stdout else args.out)
+    dbcs = [located(Path(), str(path)) for path in args.dbc]
     try:
-        database = load_databases(parse_config({"dbc": {"input": [str(path.absolute()) for path in args.dbc]}}))
+        database = load_databases(parse_config({"dbc": {"input": [str(path.absolute()) for path in dbcs]}}))
     except ConfigError as error:
         raise ConfigError(fault.replace("dbc.input", "--dbc") for fault in error.faults) from None
     found, facts = candidates(database), Facts()
@@ -62,7 +63,7 @@ def init(args: argparse.Namespace) -> None:
             raise WorkError(f"{args.log}: no frame of a signal in {', '.join(map(str, args.dbc))} that could be mapped")
         found = weighed(found, recording)
         facts = facts_of(assigned(found), recording)
-    files = [named_from(Path() if to_stdout else args.out.parent, path) for path in args.dbc]
+    files = [named_from(Path() if to_stdout else args.out.parent, path) for path in dbcs]
     words = ["soilbus init", *(f"--dbc {path}" for path in args.dbc), *([f"--log {args.log}"] if args.log else [])]
     made = proposal(database, assigned(found), facts, files, " ".join(words))
     with whole_file(args.out) as out:
