@@ -65,6 +65,7 @@ _ABBREVIATIONS: Mapping[str, str] = {
     "request": "req requested cmd command commanded demand dmd setpoint setpt sp target tgt desired des ref reference",
     "actual": "act fbk feedback fb measured meas estimated est real", "pto": "powertakeoff", "engine": "eng ice",
     "brake": "brk braking", "vehicle": "veh machine motion", "odometer": "odo", "valid": "ok qualifier vld",
+    "state": "status stat",
     "front": "frnt frt fnt fwd", "rear": "re rer back hind", "left": "lft lh", "right": "rght rgt rh",
 }  # fmt: skip
 _OTHER = (

@@ -7,6 +7,7 @@ value stand in comments beside it.
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -16,12 +17,14 @@ from cantools.database.can import Database, Message
 from soilbus.can.mapping import VEHICLE_ROLES
 from soilbus.can.role_matching import AXLES, WHEELS, Assignment, Candidate, Slot, is_word_in, shown
 from soilbus.config.file import OPEN
-from soilbus.sensors.role_evidence import Facts
+from soilbus.sensors.role_evidence import Facts, is_absent
 
 __all__ = ["Proposal", "proposal"]
 
 COLUMN = 34
 """Column in which comments beside a value begin."""
+MOST_STATE_BITS = 8
+"""Length of a signal that can be the state of a drive."""
 MOST_LISTED = 4
 """Candidates that one comment lists."""
 
@@ -36,13 +39,14 @@ class Proposal(NamedTuple):
 
 @dataclass
 class _Draft:
-    """What is known of the vehicle, and the lines written so far."""
+    """What is known of the vehicle, the lines so far, and the signals that they map or name."""
 
     database: Database
     assignment: Assignment
     facts: Facts
     lines: list[str] = field(default_factory=list)
     used: set[str] = field(default_factory=set)
+    named: set[str] = field(default_factory=set)
     axles: tuple[str, ...] = ()
 
     def put(self, key: str, value: str, comment: str = "") -> None:
@@ -51,6 +55,11 @@ class _Draft:
 
     def put_open(self, key: str, comment: str) -> None:
         self.put(key, f'"{OPEN}"', comment)
+
+    def put_choice(self, key: str, found: Sequence[Candidate], else_text: str) -> None:
+        """An open role with its candidates."""
+        self.named.update(c.path for c in found)
+        self.put_open(key, _listed(found) or else_text)
 
     def note(self, text: str) -> None:
         self.lines.append(f"# {text}")
@@ -62,19 +71,22 @@ class _Draft:
         return self.assignment.asserted.get(Slot(role, place))
 
     def put_signal(self, key: str, c: Candidate, **more: str) -> None:
-        """The line that maps a role to a signal, with its sign, its validity and the other candidates."""
+        """The line that maps a role to a signal, with its sign and what vouches for it."""
         self.used.add(c.path)
-        if valid := _valid_signal(self.database.get_message_by_name(c.message), c):
+        message = self.database.get_message_by_name(c.message)
+        state = next(
+            (s.name for s in message.signals if s.length <= MOST_STATE_BITS and is_word_in(s.name, "state")), ""
+        )
+        if valid := _valid_signal(message, c):
             more["valid"] = valid
         back = self.facts.backward.get(c.path)
         parts = [f'signal = "{c.path}"', *(f'{k} = "{v}"' for k, v in more.items())] + ["sign = -1"] * bool(back)
         value = f"{{ {', '.join(parts)} }}" if len(parts) > 1 else f'"{c.path}"'
         remarks = [f"negative in {back} in the log"] if back else []
-        remarks += [f"no unit in the DBC: {_SI_ASSUMED}"] if not c.unit and c.dimension else []
+        if state and c.slot.role == "torque":
+            remarks.append(f'does {state} vouch for it? then valid = "{state}", valid_values = [...]')
+        remarks += ["no unit in the DBC: SI assumed"] if not c.unit and c.dimension else []
         self.put(key, value, "; ".join(remarks))
-
-
-_SI_ASSUMED = "SI assumed"
 
 
 def proposal(database: Database, assignment: Assignment, facts: Facts, files: Sequence[str], origin: str) -> Proposal:
@@ -93,7 +105,7 @@ def proposal(database: Database, assignment: Assignment, facts: Facts, files: Se
     """
     draft = _Draft(database, _one_layout(assignment), facts)
     draft.lines += [
-        f"# Proposed by `{origin}`: read each line.",
+        f"# Proposed by `{' '.join(origin.split())}`: read each line.",
         f'# "{OPEN}" is open: put the value in its place. `soilbus check` names every line that is still open.',
         "", "[bus]", 'interface = "socketcan"', 'channel = "can0"',
         "", "[dbc]", f"input = [{', '.join(_quoted(name) for name in files)}]",
@@ -158,7 +170,7 @@ def _layout_of(draft: _Draft) -> _Layout:
 def _put_vehicle(draft: _Draft) -> None:
     draft.section("[vehicle]")
     mass = f"; the loads sum to {draft.facts.mass:.0f} kg in the log" if math.isfinite(draft.facts.mass) else ""
-    draft.put_open("mass", f"kg, ballast and driver included{mass}; or {{ value = , std = }}")
+    draft.put_open("mass", f"kg with ballast, tank and driver{mass}")
     draft.put_open("wheelbase", "m, front to rear axle")
     draft.put_open("cg_ahead_of_rear_axle", "m, centre of gravity: wheelbase * load of the front axle / weight")
     draft.put_open("cg_height", "m, centre of gravity above the ground")
@@ -204,7 +216,9 @@ def _put_wheel(draft: _Draft, wheel: str, layout: _Layout) -> None:
     draft.put("name", _quoted(wheel))
     draft.put("axle", _quoted(axle))
     radius = draft.facts.radius.get(wheel)
-    draft.put_open("radius", "m, rolling radius" + (f"; at least {radius:.2f} by the log" if radius else ""))
+    draft.put_open(
+        "radius", "m, rolling radius" + (f"; radius * (1 - slip) is {radius:.2f} in the log" if radius else "")
+    )
     draft.put_open("width", "m, of the tyre")
     torque, speed = draft.matched("torque", wheel), draft.matched("speed", wheel)
     motor = draft.matched("motor_speed", wheel)
@@ -218,8 +232,8 @@ def _put_wheel(draft: _Draft, wheel: str, layout: _Layout) -> None:
     elif not by_axle and (layout.wheels_driven or layout.axles_driven or "" in layout.axles):
         draft.put_open("driven", "true or false: no torque of it was found")
     elif not by_axle:
-        known = _listed(_of_role(draft, "torque", wheel))
-        draft.put_open("torque", known or '"Message.Signal" of its motor, here or in [[axle]]')
+        known = _of_role(draft, "torque", wheel)
+        draft.put_choice("torque", known, '"Message.Signal" of its motor, here or in [[axle]]')
         draft.put_open("gear_ratio", "motor shaft to wheel; 1.0 where it is measured at the wheel")
     if speed is not None:
         draft.put_signal("speed", speed)
@@ -228,7 +242,7 @@ def _put_wheel(draft: _Draft, wheel: str, layout: _Layout) -> None:
     elif motor is not None:
         draft.put_signal("speed", motor, at="shaft")
     elif not (by_axle and any(draft.matched("motor_speed", a) for a in (axle, "both", ""))):
-        draft.put_open("speed", _listed(_of_role(draft, "speed", wheel)) or '"Message.Signal" of its rotation')
+        draft.put_choice("speed", _of_role(draft, "speed", wheel), '"Message.Signal" of its rotation')
     for role in ("load", "sinkage"):
         if c := draft.matched(role, wheel):
             draft.put_signal(role, c)
@@ -271,8 +285,8 @@ def _put_signals(draft: _Draft) -> None:
         c = draft.matched(role)
         if c is None:
             if role == "ground_speed":
-                known = _listed(_of_role(draft, role, ""))
-                draft.put_open(role, known or '"Message.Signal" of a radar or receiver, not of the wheels')
+                known = _of_role(draft, role, "")
+                draft.put_choice(role, known, '"Message.Signal" of a radar or receiver, not of the wheels')
             continue
         if role == "acceleration":
             kind = draft.facts.kind or _kind_by_words(draft.database, c)
@@ -292,15 +306,18 @@ def _put_rest(draft: _Draft) -> None:
         "",
         "# [noise]: sd of each sensor, from data sheets or a drive on the road; else the defaults hold",
     ]
-    rest: dict[str, list[Candidate]] = {}
-    for slot, found in draft.assignment.open.items():
-        rest.setdefault(slot.role, []).extend(c for c in found if c.path not in draft.used)
-    for slot, c in draft.assignment.asserted.items():
-        if c.path not in draft.used:
-            rest.setdefault(slot.role, []).append(c)
-    if any(rest.values()):
+    found = [c for cs in draft.assignment.open.values() for c in cs] + list(draft.assignment.asserted.values())
+    rest = {c.path: c for c in found if c.path not in draft.used | draft.named}
+    perhaps: dict[str, list[Candidate]] = {}
+    for c in rest.values():
+        if not is_absent(c):
+            perhaps.setdefault(c.slot.role, []).append(c)
+    if perhaps:
         draft.lines += ["", "# Not used, but perhaps:"]
-        draft.lines += [f"#   {role}: {_listed(found)}" for role, found in rest.items() if found]
+        draft.lines += [f"#   {role}: {_listed(cs)}" for role, cs in perhaps.items()]
+    if absent := sorted(path for path, c in rest.items() if is_absent(c)):
+        text = textwrap.fill(", ".join(absent), 116, break_long_words=False)
+        draft.lines += ["", "# In the DBC, but never in the log:", *(f"#   {line}" for line in text.splitlines())]
 
 
 # --- words ---
