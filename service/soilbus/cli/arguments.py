@@ -90,7 +90,10 @@ def command_line() -> argparse.ArgumentParser:
 
     sub = command("demo", "simulated tractor, service and dashboard; needs no hardware, ends by itself", "")
     sub.add_argument("--duration", type=float, default=42.0, metavar="S", help="simulated seconds (default 42)")
-    sub.add_argument("--picture", type=Path, metavar="OUT.svg", help="keep the last state of the dashboard")
+    sub.add_argument(
+        "--picture", type=Path, metavar="OUT.svg",
+        help="keep the dashboard's last state: the driver's page, and the engineer's in OUT-engineer.svg",
+    )  # fmt: skip
 
     sub = command("init", "propose a configuration from the vehicle's DBC, and from a log of a drive", "")
     sub.add_argument(
@@ -144,7 +147,12 @@ def command_line() -> argparse.ArgumentParser:
         "--model-out", type=Path, metavar="OUT.toml", help="the configuration with the effects found, for any command"
     )
 
-    sub = command("watch", "live terminal dashboard that reads only our frames", "optional")
+    sub = command("watch", "terminal dashboard that reads only our frames, of the bus or of a recording", "optional")
+    sub.add_argument("log", nargs="?", type=Path, metavar="LOG", help="a recording of our frames, played in real time")
+    sub.add_argument(
+        "--speed", type=between(0.1, 1000.0), default=1.0, metavar="X", help="play LOG X times as fast (default 1)"
+    )
+    sub.add_argument("--plain", action="store_true", help="lines of text, for a screen reader; also in a pipe")
     sub.add_argument("--seconds", type=float, metavar="S", help="stop after this time")
 
     sub = command("effects", "the catalogue of effects: physics, parameters, ranges, source, what tells it apart", "")

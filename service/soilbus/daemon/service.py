@@ -37,7 +37,7 @@ from soilbus.decision.judgement import Basis, at_present
 from soilbus.decision.traction_loss import NO_LOSS, observed
 from soilbus.decision.traversability import State, Status, Traversability
 from soilbus.pipeline.intake import Latest
-from soilbus.pipeline.outputs import TICK, WINDOW_MODULUS, forecast_frame, hop_frames, slip_frames
+from soilbus.pipeline.outputs import TICK, WINDOW_MODULUS, demand_frame, forecast_frame, hop_frames, slip_frames
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult, as_of
 from soilbus.pipeline.states import ServiceState, state_after
@@ -379,6 +379,7 @@ class Service:
             self.bus.send(self.publisher.frame(message, values))
         foreseeable = self.result if known and not self._loss.stuck else None
         self.bus.send(self.publisher.frame(*forecast_frame(foreseeable, warning)))
+        self.bus.send(self.publisher.frame(*demand_frame(latest.draft, latest.pitch)))
         self.bus.send(
             self.publisher.frame(
                 "Traversability",

@@ -30,6 +30,7 @@ __all__ = [
     "FAST_FRAMES",
     "HOP_FRAMES",
     "check_cycle_times",
+    "demand_frame",
     "forecast_frame",
     "hop_frames",
     "json_line",
@@ -43,7 +44,7 @@ WINDOW_MODULUS = 251
 
 TICK = 0.1
 """Cycle [s] of the fast frames, on which other devices act."""
-FAST_FRAMES = ("WheelSlip", "WheelSlip2", "Traversability", "TorqueDemand", "DemandForecast")
+FAST_FRAMES = ("WheelSlip", "WheelSlip2", "Traversability", "TorqueDemand", "DemandForecast", "PresentDemand")
 
 LONGEST_TIME = 1e6
 """Time left [s] that stands for no end: above the range of any signal."""
@@ -61,10 +62,12 @@ PARAMETER_FRAMES = {
     "K": ("SoilShearModulus", 1e-3),
 }
 
+REASONS_AS_SENT = {"not_available": "no_value", "error": "sensor_error"}
+"""Reasons of refusal whose names mean in a value table that the signal itself has no value."""
 
 HOP_FRAMES = (
     "SoilStrength", "SoilClass", *(message for message, _ in PARAMETER_FRAMES.values()), "DraftCapability",
-    "GradeCapability", "TractionAdvice", "TractionLimits", "WheelSinkage", "WheelSinkage2",
+    "GradeCapability", "TractionAdvice", "TractionLimits", "WheelSinkage", "WheelSinkage2", "WindowQuality",
 )  # fmt: skip
 """Names of the frames that are sent once per window."""
 
@@ -203,6 +206,15 @@ def hop_frames(result: WindowResult) -> Iterator[tuple[str, dict[str, Any]]]:
     yield "TractionLimits", common | {"LimitingCause": decision.limit} | _limits(decision.capability)
     for message, values in _by_wheel("WheelSinkage", "SinkageWheel", result.sinkage, 1e-3):
         yield message, common | values
+    yield "WindowQuality", {"Window": common["Window"]} | _quality(result)
+
+
+def _quality(result: WindowResult) -> dict[str, Any]:
+    """Chi-square of each channel; the most frequent reason of refusals, and the number of all."""
+    rejected = result.rejected
+    reason = max(rejected, key=lambda name: rejected[name]) if rejected else "none"
+    chi2 = {f"Chi2{channel.capitalize()}": value for channel, value in result.channel_chi2.items()}
+    return chi2 | {"RejectedReason": REASONS_AS_SENT.get(reason, reason), "Rejected": sum(rejected.values())}
 
 
 def _value_and_std(value: str, std: str, estimate: Estimate | None, unit: float) -> dict[str, float | None]:
@@ -246,6 +258,11 @@ def forecast_frame(result: WindowResult | None, watch: Watch) -> tuple[str, dict
         "Window": None if result is None else result.index % WINDOW_MODULUS,
         "Status": None if result is None else str(result.status),
     }
+
+
+def demand_frame(draft: float | None, pitch: float | None) -> tuple[str, dict[str, Any]]:
+    """(message, values in the DBC's units) of the present draft [N] and pitch [rad]; None where not known."""
+    return "PresentDemand", {"Draft": draft, "Slope": pitch}
 
 
 def known(value: Any) -> Any:
