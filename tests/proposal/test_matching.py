@@ -123,3 +123,19 @@ def test_what_no_name_says_stays_open(swaps, open_keys, tmp_path, capsys):
     found = mapped(proposed(capsys, renamed(tmp_path, *swaps)))
     assert [key for key in open_keys if key in found] == []
     assert {key: signal for key, signal in found.items() if HUBS.get(key) not in (signal, None)} == {}
+
+
+def test_a_shaft_without_a_torque_still_asks_for_its_gear(tmp_path, capsys):
+    units = [('"N*m" CHS', '"furlong" CHS')]  # every actual torque and limit
+    for wheel in proposed(capsys, renamed(tmp_path, *units))["wheel"]:
+        assert wheel["speed"]["at"] == "shaft"
+        assert [wheel["torque"], wheel["gear_ratio"]] == ["?", "?"]
+
+
+def test_the_remains_of_a_dbc_without_any_role_are_all_open(tmp_path, capsys):
+    path = tmp_path / "doors.dbc"
+    path.write_text('VERSION ""\nBU_: A\nBO_ 1 Doors: 8 A\n SG_ LeftOpen : 0|1@1+ (1,0) [0|1] "" A\n')
+    found = proposed(capsys, path)
+    assert mapped(found) == {}
+    assert found["signals"]["ground_speed"] == "?"
+    assert [wheel["speed"] for wheel in found["wheel"]] == ["?"] * 4

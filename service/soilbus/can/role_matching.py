@@ -5,7 +5,7 @@
 
 A slot is a role at a place ("torque" at "FL", "load" at "rear", "draft").  A match is asserted where its score reaches
 ASSERTED and beats the next free candidate of its slot by MARGIN; anything else stays open and lists its candidates.
-The weights are judgement, held by the share of roles right, wrong and open on seven DBCs (tests/proposal).
+The weights are judgement, held by the share of roles right, wrong and open on the DBCs of tests/proposal.
 """
 
 from __future__ import annotations
@@ -49,6 +49,9 @@ LISTED = 0.25
 """Score from which a candidate is worth a line."""
 IN_MESSAGE, IN_COMMENT = 0.7, 0.5
 """Share of a word's weight where it stands in the message's name or in the comment, not in the signal's own name."""
+
+HINT = 0.25
+"""The same of a word against a role, where the signal's own name speaks for it."""
 
 _ABBREVIATIONS: Mapping[str, str] = {
     "torque": "tq trq trque torq", "speed": "spd vel velocity rpm sog revolution",
@@ -284,17 +287,13 @@ def _score(role: str, own: frozenset[str], around: frozenset[str], comment: froz
         share = 1.0 if word in own else (1.0 if is_bare else IN_MESSAGE) if word in around else 0.0
         score += weight * max(share, IN_COMMENT if word in comment else 0.0)
     for word in against:
-        # a word with two meanings ("lat") counts for the role that it speaks for
-        if word in own and not own & weights.keys() & _WORDS_OF_TWO.get(word, frozenset()):
+        if word in own:
             score -= _AGAINST
-        elif word in around and word not in ("limit", "request") and not (own & weights.keys()):
-            score -= _AGAINST * IN_MESSAGE
-        elif word in around or word in comment & _ASKED:
-            score -= _AGAINST * IN_COMMENT * 0.5
+        elif word in around:
+            score -= _AGAINST * (HINT if own & weights.keys() else IN_MESSAGE)
+        elif word in comment & _ASKED:
+            score -= _AGAINST * HINT
     return score
-
-
-_WORDS_OF_TWO = {"lateral": frozenset({"latitude"}), "longitudinal": frozenset({"longitude"})}
 
 
 def _by_range(role: str, signal: Signal, unit: Unit | None, own: frozenset[str]) -> float:

@@ -74,9 +74,8 @@ class _Draft:
         """The line that maps a role to a signal, with its sign and what vouches for it."""
         self.used.add(c.path)
         message = self.database.get_message_by_name(c.message)
-        state = next(
-            (s.name for s in message.signals if s.length <= MOST_STATE_BITS and is_word_in(s.name, "state")), ""
-        )
+        short = [s.name for s in message.signals if s.length <= MOST_STATE_BITS]
+        state = next((name for name in short if is_word_in(name, "state")), "")
         if valid := _valid_signal(message, c):
             more["valid"] = valid
         back = self.facts.backward.get(c.path)
@@ -198,11 +197,10 @@ def _put_axle(draft: _Draft, axle: str) -> None:
             draft.note("the motor turns with this axle's wheels in the log")
     if torque := draft.matched("torque", place):
         speed = _beside(draft, torque, draft.matched("motor_speed", place))
-        at_wheel = _is_at_wheel(torque)
-        if not at_wheel or speed is not None:
-            _put_gear(draft, axle if axle else "?")
+        if speed is not None or not _is_at_wheel(torque):
+            _put_gear(draft, axle)
         draft.put_open("differential", '"open", "locked" or "limited"')
-        draft.put_signal("torque", torque, **({"at": "wheel"} if at_wheel else {}))
+        draft.put_signal("torque", torque, **_side(torque))
         _put_limit(draft, torque, "axle")
         if speed is not None:
             draft.put_signal("motor_speed", speed)
@@ -216,25 +214,24 @@ def _put_wheel(draft: _Draft, wheel: str, layout: _Layout) -> None:
     draft.put("name", _quoted(wheel))
     draft.put("axle", _quoted(axle))
     radius = draft.facts.radius.get(wheel)
-    draft.put_open(
-        "radius", "m, rolling radius" + (f"; radius * (1 - slip) is {radius:.2f} in the log" if radius else "")
-    )
+    seen = f"; radius * (1 - slip) is {radius:.2f} in the log" if radius else ""
+    draft.put_open("radius", f"m, rolling radius{seen}")
     draft.put_open("width", "m, of the tyre")
     torque, speed = draft.matched("torque", wheel), draft.matched("speed", wheel)
     motor = draft.matched("motor_speed", wheel)
     by_axle = bool(layout.axles_driven & {axle, "both"})
+    if motor is not None or (torque is not None and not _is_at_wheel(torque)):
+        _put_gear(draft, wheel)
     if torque is not None:
-        at_wheel = _is_at_wheel(torque)
-        if not at_wheel or (speed is None and motor is not None):
-            _put_gear(draft, wheel)
-        draft.put_signal("torque", torque, **({"at": "wheel"} if at_wheel else {}))
+        draft.put_signal("torque", torque, **_side(torque))
         _put_limit(draft, torque, "wheel")
     elif not by_axle and (layout.wheels_driven or layout.axles_driven or "" in layout.axles):
         draft.put_open("driven", "true or false: no torque of it was found")
     elif not by_axle:
         known = _of_role(draft, "torque", wheel)
         draft.put_choice("torque", known, '"Message.Signal" of its motor, here or in [[axle]]')
-        draft.put_open("gear_ratio", "motor shaft to wheel; 1.0 where it is measured at the wheel")
+        if motor is None:
+            _put_gear(draft, wheel)
     if speed is not None:
         draft.put_signal("speed", speed)
         if motor is not None:
@@ -255,6 +252,8 @@ def _put_gear(draft: _Draft, place: str) -> None:
         return
     per_metre = draft.facts.per_metre.get(place)
     text = "motor shaft to wheel; 1.0 where torque is measured at the wheel"
+    if place in ("both", ""):
+        text += "; of both axles: to their shafts, where [[axle]] front and rear have ratios of their own"
     draft.put_open("gear_ratio", f"{text}; {per_metre:.4g} * radius by the log" if per_metre else text)
 
 
@@ -276,6 +275,10 @@ def _beside(draft: _Draft, torque: Candidate, c: Candidate | None) -> Candidate 
 
 def _is_at_wheel(torque: Candidate) -> bool:
     return is_word_in(torque, "wheel") and not is_word_in(torque, "motor", "shaft")
+
+
+def _side(torque: Candidate) -> dict[str, str]:
+    return {"at": "wheel"} if _is_at_wheel(torque) else {}
 
 
 def _put_signals(draft: _Draft) -> None:
