@@ -144,6 +144,8 @@ _ROLES: Mapping[str, tuple[tuple[str, ...], float, Mapping[str, float], frozense
     "differential_lock": (("",), 0.0, {"differential": 0.6, "lock": 0.6}, _ASKED),
 }  # fmt: skip
 """Of each role: dimensions of its unit, score of a fitting unit, weights of words, words that speak against it."""
+FEWEST_BITS = 7
+"""Length of the shortest signal that measures anything; shorter ones are codes and flags."""
 COARSEST_POSITION = 2e-5
 """Resolution [rad] up to which a signal alone can be a latitude: 130 m."""
 _AGAINST = 1.5
@@ -187,10 +189,11 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """What is asserted by slot, and the candidates of slots that stay open, best first."""
+    """What is asserted by slot, the candidates of slots that stay open, best first, and rivals of asserted ones."""
 
     asserted: dict[Slot, Candidate] = field(default_factory=dict)
     open: dict[Slot, list[Candidate]] = field(default_factory=dict)
+    rivals: list[Candidate] = field(default_factory=list)
 
 
 def candidates(database: Database) -> list[Candidate]:
@@ -234,6 +237,7 @@ def assigned(found: Iterable[Candidate]) -> Assignment:
         is_clear = chosen is not None and chosen.score >= ASSERTED
         if chosen is not None and is_clear and all(chosen.score - c.score >= MARGIN for c in rivals):
             out.asserted[slot] = chosen
+            out.rivals.extend(rivals)
         elif chosen is not None or rivals:
             out.open[slot] = sorted(([chosen] if chosen else []) + rivals, key=lambda c: -c.score)
     return out
@@ -241,8 +245,8 @@ def assigned(found: Iterable[Candidate]) -> Assignment:
 
 def shown(candidate: Candidate) -> str:
     """A candidate for a comment: path, unit and what speaks against it."""
-    notes = f"; {', '.join(candidate.notes)}" if candidate.notes else ""
-    return f"{candidate.path} ({candidate.unit or 'no unit'}{notes})"
+    said = [candidate.unit] * bool(candidate.unit) + list(candidate.notes)
+    return f"{candidate.path} ({', '.join(said)})" if said else candidate.path
 
 
 def is_word_in(name: Candidate | str, *words: str) -> bool:
@@ -267,6 +271,8 @@ def _of_signal(message: Message, signal: Signal) -> list[Candidate]:
     found = []
     for role, (dimensions, *_) in _ROLES.items():
         if unit is not None and unit.dimension not in dimensions:
+            continue
+        if signal.length < FEWEST_BITS and dimensions != ("",):
             continue
         score = _score(role, own, around, _words(comment), unit) + _by_range(role, signal, unit, own)
         slot = Slot(role, _place_of(role, place))

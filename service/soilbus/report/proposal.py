@@ -143,7 +143,7 @@ def _one_layout(assignment: Assignment) -> Assignment:
     for slot in assignment.asserted:
         if slot.role in ("torque", "torque_limit", "motor_speed"):
             left[slot] = [asserted.pop(slot)]
-    return Assignment(asserted, left)
+    return Assignment(asserted, left, assignment.rivals)
 
 
 def _layout_of(draft: _Draft) -> _Layout:
@@ -309,7 +309,8 @@ def _put_rest(draft: _Draft) -> None:
         "",
         "# [noise]: sd of each sensor, from data sheets or a drive on the road; else the defaults hold",
     ]
-    found = [c for cs in draft.assignment.open.values() for c in cs] + list(draft.assignment.asserted.values())
+    known = draft.assignment
+    found = [*(c for cs in known.open.values() for c in cs), *known.asserted.values(), *known.rivals]
     rest = {c.path: c for c in found if c.path not in draft.used | draft.named}
     perhaps: dict[str, list[Candidate]] = {}
     for c in rest.values():
