@@ -41,7 +41,9 @@ ISO = {
     "signals.ground_speed": "GroundBasedSpeedAndDistance.GroundBasedMachineSpeed",
     "signals.draft": "RearHitchStatus.RearDraft", "signals.latitude": "VehiclePosition.Latitude",
     "signals.longitude": "VehiclePosition.Longitude",
+    "signals.acceleration": "AccelerationSensor.LongitudinalAccelerationExtendedRange",
 }  # fmt: skip
+"""Of pitch, roll and yaw rate there are two signals each; torque is a percentage."""
 
 
 def mapped(raw: Mapping[str, Any]) -> dict[str, str]:
@@ -91,6 +93,20 @@ def test_motors_of_wheels_and_of_axles_in_one_dbc_are_a_question(capsys):
     assert "#   acceleration: Attitude.LongAccel (m/s^2)" in text  # there is another accelerometer
     assert [key for key in found if key.endswith("torque")] == []
     assert "wheel.FL.speed" in found
+
+
+def test_two_signals_of_a_kind_and_a_percentage_are_questions(capsys):
+    assert main(["init", "--dbc", "iso11783.dbc"]) == 0
+    text = capsys.readouterr().out
+    assert "#   pitch: SlopeSensorInformation.PitchAngle (deg), SlopeSensorInformation2.PitchAngleExtended" in text
+    assert "# ElectronicEngineController1.ActualEnginePercentTorque (%, with reference_torque)\n" in text
+
+
+def test_a_comment_on_the_direction_sets_the_sign(capsys):
+    signals = proposed(capsys, shipped_dbc("nmea2000.dbc"))["signals"]
+    assert signals["yaw_rate"] == {"signal": "RateOfTurn.Rate", "sign": -1}  # "positive to the right"
+    assert [signals["pitch"], signals["roll"]] == ["Attitude.Pitch", "Attitude.Roll"]
+    assert "sign" not in proposed(capsys, HERE / "hubs.dbc")["signals"]["draft"]  # "positive backward" is the role's
 
 
 def test_what_a_log_does_not_hold_is_not_mapped(field_recording, capsys):

@@ -68,12 +68,12 @@ _ABBREVIATIONS: Mapping[str, str] = {
     "request": "req requested cmd command commanded demand dmd setpoint setpt sp target tgt desired des ref reference",
     "actual": "act fbk feedback fb measured meas estimated est real", "pto": "powertakeoff", "engine": "eng ice",
     "brake": "brk braking", "vehicle": "veh machine motion", "odometer": "odo", "valid": "ok qualifier vld",
-    "state": "status stat",
+    "state": "status stat", "current": "curr cur amps iq",
     "front": "frnt frt fnt fwd", "rear": "re rer back hind", "left": "lft lh", "right": "rght rgt rh",
 }  # fmt: skip
 _OTHER = (
     "force specific hand column pump fan cruise gravity course cog fraction coverage distance direction travel steady"
-    " temperature voltage current counter checksum percent rated loss friction north east up down link lift position"
+    " temperature voltage counter checksum percent rated loss friction north east up down link lift position"
 )
 _WORDS: dict[str, frozenset[str]] = {}
 for _word, _short in _ABBREVIATIONS.items():
@@ -86,7 +86,7 @@ _CORNERS = {"fl": "FL", "lf": "FL", "fr": "FR", "rf": "FR", "rl": "RL", "lr": "R
 _GROUPS: Mapping[int, frozenset[str]] = {
     65093: frozenset({"draft", "rear"}), 65094: frozenset({"draft", "front"}), 65096: frozenset({"wheel"}),
     65097: frozenset({"ground"}), 65265: frozenset({"wheel"}), 65267: frozenset({"position"}),
-    129025: frozenset({"position"}),
+    127251: frozenset({"yaw"}), 129025: frozenset({"position"}),
 }  # fmt: skip
 """What the standards say of a parameter group, whatever its signals are called."""
 _ASKED = frozenset({"request", "least", "rated"})
@@ -226,20 +226,20 @@ def assigned(found: Iterable[Candidate]) -> Assignment:
     paths = sorted({path for _, path in best})
     score = np.zeros((len(slots), len(paths)))
     for (slot, path), c in best.items():
-        score[slots.index(slot), paths.index(path)] = c.score
+        score[slots.index(slot), paths.index(path)] = c.score * (c.score >= ASSERTED)
     taken = {(slots[i], paths[j]) for i, j in zip(*linear_sum_assignment(-score), strict=True) if score[i, j] > 0.0}
     out = Assignment()
     for slot in slots:
-        of_slot = sorted((c for (s, _), c in best.items() if s == slot), key=lambda c: -c.score)
+        elsewhere = {path for other, path in taken if other != slot}
+        of_slot = [c for (s, path), c in best.items() if s == slot and path not in elsewhere]
+        of_slot.sort(key=lambda c: -c.score)
         chosen = next((c for c in of_slot if (slot, c.path) in taken), None)
-        elsewhere = {path for s, path in taken if s != slot and best[s, path].score >= ASSERTED}
-        rivals = [c for c in of_slot if c is not chosen and c.path not in elsewhere]
-        is_clear = chosen is not None and chosen.score >= ASSERTED
-        if chosen is not None and is_clear and all(chosen.score - c.score >= MARGIN for c in rivals):
+        rivals = [c for c in of_slot if c is not chosen]
+        if chosen is not None and all(chosen.score - c.score >= MARGIN for c in rivals):
             out.asserted[slot] = chosen
-            out.rivals.extend(rivals)
-        elif chosen is not None or rivals:
-            out.open[slot] = sorted(([chosen] if chosen else []) + rivals, key=lambda c: -c.score)
+            out.rivals.extend(c for c in rivals if c.score >= ASSERTED)
+        elif of_slot:
+            out.open[slot] = of_slot
     return out
 
 
@@ -262,7 +262,7 @@ def _of_signal(message: Message, signal: Signal) -> list[Candidate]:
     try:
         unit = unit_of(signal.unit)
     except ValueError:
-        return []
+        return _indirect(message, signal)
     group = pgn_of(message.frame_id) if message.is_extended_frame else 0
     comment = signal.comment or ""
     own, around = _words(signal.name), _words(message.name) | _GROUPS.get(group, frozenset())
@@ -283,6 +283,21 @@ def _of_signal(message: Message, signal: Signal) -> list[Candidate]:
             factor, dimension = (unit.factor, unit.dimension) if unit is not None else (1.0, dimensions[0])
             found.append(Candidate(slot, message.name, signal.name, score, signal.unit or "", factor, dimension, notes))
     return found
+
+
+def _indirect(message: Message, signal: Signal) -> list[Candidate]:
+    """A percentage or a current, which is a torque with a number that the DBC does not have: never asserted."""
+    own, around, unit = _words(signal.name), _words(message.name), (signal.unit or "").strip()
+    if own & _ASKED or "limit" in own:
+        return []
+    note = ""
+    if unit == "%" and "torque" in own:
+        note = "with reference_torque"
+    elif unit in ("A", "mA", "kA") and "current" in own and "motor" in own | around:
+        note = "with torque_constant"
+    place = next((p for text in (signal.name, message.name) if (p := _place(text))), "")
+    slot, score = Slot("torque", place), (LISTED + ASSERTED) / 2.0
+    return [Candidate(slot, message.name, signal.name, score, unit, 1.0, "torque", (note,))] if note else []
 
 
 def _score(role: str, own: frozenset[str], around: frozenset[str], comment: frozenset[str], unit: Unit | None) -> float:

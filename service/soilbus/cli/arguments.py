@@ -62,6 +62,17 @@ EXAMPLES: Mapping[str, str] = {
 """A line that works, for the end of each command's help."""
 
 
+def named(*suffixes: str) -> Callable[[str], Path]:
+    """Parser of the path of a file to write, whose name must end in one of `suffixes`."""
+
+    def path(text: str) -> Path:
+        if Path(text).suffix not in suffixes:
+            raise argparse.ArgumentTypeError(f"{text} does not end in {' or '.join(suffixes)}")
+        return Path(text)
+
+    return path
+
+
 def command_line() -> argparse.ArgumentParser:
     """Parser of the whole command line; `command` names the one to do."""
     parser = argparse.ArgumentParser(prog="soilbus", description="What soil a tractor is driving on, from its CAN bus.")
@@ -119,7 +130,22 @@ def command_line() -> argparse.ArgumentParser:
     sub.add_argument("logs", nargs="+", type=Path, metavar="LOG")
     sub.add_argument("--json", type=Path, metavar="OUT", help="one JSON object a line per window; - for stdout")
     sub.add_argument("--report", type=Path, metavar="OUT.html", help="self-contained HTML with plots (extra: plots)")
-    sub.add_argument("--map", type=Path, metavar="OUT.geojson", help="a point for each window; needs a mapped position")
+    sub.add_argument(
+        "--table", type=named(".csv", ".parquet"), metavar="OUT",
+        help="windows as rows: .csv, or .parquet (extra: tables)",
+    )  # fmt: skip
+    sub.add_argument(
+        "--mcap", type=Path, metavar="OUT.mcap",
+        help="windows, positions, warnings for Foxglove or PlotJuggler (extra: mcap)",
+    )  # fmt: skip
+    sub.add_argument(
+        "--map", type=Path, metavar="OUT",
+        help="a point for each window, GeoJSON or .gpkg (extra: geo); needs a mapped position",
+    )  # fmt: skip
+    sub.add_argument(
+        "--isoxml", type=Path, metavar="FOLDER",
+        help="ISO 11783-10 task data for farm software; needs a mapped position",
+    )  # fmt: skip
     sub.add_argument("--partial", action="store_true", help="keep the windows before the point where a log is damaged")
 
     sub = command("simulate", "simulated tractor, to a bus in real time or to a log", "optional")

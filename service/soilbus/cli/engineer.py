@@ -25,14 +25,10 @@ def replay(args: argparse.Namespace) -> None:
     from soilbus.offline.replay import LogError, estimator_beside, other_channel, replay
     from soilbus.pipeline.pipeline import Pipeline
     from soilbus.report.progress import progress
-    from soilbus.report.soil_map import check_position_is_mapped, soil_map
     from soilbus.report.windows import summary
 
     config = configured(args)
-    if args.map is not None:
-        check_position_is_mapped(config)
-    if args.report is not None:
-        need_extra("matplotlib", "plots", "--report")
+    _check_outputs(args, config)
     if config.table is not None:
         _replay_tables(args, config)
         return
@@ -54,12 +50,6 @@ def replay(args: argparse.Namespace) -> None:
         say(f"{fault}; {fault.windows} windows before that are kept")
     text = summary(results, pipeline)
     _write_windows(args, config, results, text)
-    if args.map is not None:
-        map_text, left_out = soil_map(results)
-        with whole_file(args.map) as out:
-            out.write(map_text)
-        if left_out:
-            say(f"{left_out} of {len(results)} windows have no position: not on the map")
     if "-" not in (str(args.json), str(args.map)):
         print(text, end="")
     _need_a_use(results, config)
@@ -93,7 +83,12 @@ def _replay_tables(args: argparse.Namespace, config: Config) -> None:
 
 
 def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[WindowResult], text: str) -> None:
-    """What --json and --report ask for, under a summary."""
+    """What the options for files ask for, under a summary."""
+    from soilbus.export.geopackage import write_geopackage
+    from soilbus.export.mcap_log import write_mcap
+    from soilbus.export.soil_map import soil_map
+    from soilbus.export.table import write_table
+    from soilbus.export.task_data import write_task_data
     from soilbus.pipeline.outputs import json_line
     from soilbus.report.windows import html_report
 
@@ -104,6 +99,39 @@ def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[W
     if args.report is not None:
         with whole_file(args.report) as out:
             out.write(html_report(results, text, args.logs))
+    if args.table is not None:
+        write_table(args.table, results, config)
+    if args.mcap is not None:
+        write_mcap(args.mcap, results, config)
+    if args.map is not None:
+        map_text, left_out = soil_map(results)
+        if args.map.suffix == ".gpkg":
+            write_geopackage(args.map, map_text)
+        else:
+            with whole_file(args.map) as out:
+                out.write(map_text)
+        if left_out:
+            say(f"{left_out} of {len(results)} windows have no position: not on the map")
+    if args.isoxml is not None and (left_out := write_task_data(args.isoxml, results, config)):
+        say(f"{left_out} of {len(results)} windows have no position or no date: not in the task data")
+
+
+def _check_outputs(args: argparse.Namespace, config: Config) -> None:
+    """Ask before the work whether what the options for files need is there."""
+    from soilbus.export.soil_map import check_position_is_mapped
+
+    for path, option in ((args.map, "--map"), (args.isoxml, "--isoxml")):
+        if path is not None:
+            check_position_is_mapped(config, option)
+    if args.report is not None:
+        need_extra("matplotlib", "plots", "--report")
+    if args.table is not None and args.table.suffix == ".parquet":
+        need_extra("pyarrow", "tables", "--table OUT.parquet")
+    if args.mcap is not None:
+        need_extra("mcap", "mcap", "--mcap")
+    if args.map is not None and args.map.suffix == ".gpkg":
+        need_extra("pyogrio", "geo", "--map OUT.gpkg")
+    check_folders(args.table, args.mcap, args.map)
 
 
 def simulate(args: argparse.Namespace) -> None:

@@ -169,6 +169,6 @@ def completion(args: argparse.Namespace) -> None:
     parser = command_line()
     for command in subcommands(parser).values():
         for action in command._actions:
-            if action.type is Path or action.dest == "config":
+            if str(action.metavar).partition(".")[0] in ("FILE", "LOG", "OUT"):
                 action.complete = shtab.FILE  # type: ignore[attr-defined]
     print(shtab.complete(parser, args.shell))

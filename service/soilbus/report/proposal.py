@@ -7,6 +7,7 @@ value stand in comments beside it.
 from __future__ import annotations
 
 import math
+import re
 import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -79,9 +80,12 @@ class _Draft:
         if valid := _valid_signal(message, c):
             more["valid"] = valid
         back = self.facts.backward.get(c.path)
-        parts = [f'signal = "{c.path}"', *(f'{k} = "{v}"' for k, v in more.items())] + ["sign = -1"] * bool(back)
+        said = _said_backward(message, c)
+        parts = [f'signal = "{c.path}"', *(f'{k} = "{v}"' for k, v in more.items())] + ["sign = -1"] * bool(
+            back or said
+        )
         value = f"{{ {', '.join(parts)} }}" if len(parts) > 1 else f'"{c.path}"'
-        remarks = [f"negative in {back} in the log"] if back else []
+        remarks = [f"negative in {back} in the log"] if back else [f"the DBC: {said}"] if said else []
         if state and c.slot.role == "torque":
             remarks.append(f'does {state} vouch for it? then valid = "{state}", valid_values = [...]')
         remarks += ["no unit in the DBC: SI assumed"] if not c.unit and c.dimension else []
@@ -347,6 +351,21 @@ def _kind_by_words(database: Database, c: Candidate) -> str:
         return "kinematic"
     is_force = is_word_in(c, "force") or is_word_in(c, "specific")
     return "specific_force" if is_force or "specific force" in comment else ""
+
+
+_OTHER_WAY: Mapping[str, str] = {
+    "yaw_rate": r"(?:to the )?right|clockwise|(?:to )?starboard", "steering_angle": r"(?:to the )?right|clockwise",
+    "roll": r"right side up|left side down", "pitch": r"(?:nose|bow) down", "acceleration": r"backward|rearward",
+    "draft": r"forward", "ground_speed": r"backward", "sinkage": r"up",
+}  # fmt: skip
+"""What a comment says after "positive" where a signal reads the other way round than its role."""
+
+
+def _said_backward(message: Message, c: Candidate) -> str:
+    """The words of a comment by which the signal needs sign = -1; "" without."""
+    comment = message.get_signal_by_name(c.signal).comment or ""
+    pattern = rf"positive (?:{_OTHER_WAY.get(c.slot.role, '(?!)')})\b"
+    return found[0] if (found := re.search(pattern, comment, re.IGNORECASE)) else ""
 
 
 def _valid_signal(message: Message, c: Candidate) -> str:
