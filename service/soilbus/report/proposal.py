@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -52,7 +52,7 @@ class _Draft:
 
     def put(self, key: str, value: str, comment: str = "") -> None:
         line = f"{key} = {value}"
-        self.lines.append(f"{line.ljust(COLUMN)}# {comment}" if comment else line)
+        self.lines.append(f"{line:<{COLUMN - 2}}  # {comment}" if comment else line)
 
     def put_open(self, key: str, comment: str) -> None:
         self.put(key, f'"{OPEN}"', comment)
@@ -81,9 +81,8 @@ class _Draft:
             more["valid"] = valid
         back = self.facts.backward.get(c.path)
         said = _said_backward(message, c)
-        parts = [f'signal = "{c.path}"', *(f'{k} = "{v}"' for k, v in more.items())] + ["sign = -1"] * bool(
-            back or said
-        )
+        parts = [f'signal = "{c.path}"', *(f'{k} = "{v}"' for k, v in more.items())]
+        parts += ["sign = -1"] * bool(back or said)
         value = f"{{ {', '.join(parts)} }}" if len(parts) > 1 else f'"{c.path}"'
         remarks = [f"negative in {back} in the log"] if back else [f"the DBC: {said}"] if said else []
         if state and c.slot.role == "torque":
