@@ -311,7 +311,8 @@ def _score(role: str, own: frozenset[str], around: frozenset[str], comment: froz
         if word in own:
             score -= _AGAINST
         elif word in around:
-            score -= _AGAINST * (HINT if own & weights.keys() else IN_MESSAGE)
+            is_hint = own & weights.keys() and word not in _ASKED
+            score -= _AGAINST * (HINT if is_hint else IN_MESSAGE)
         elif word in comment & _ASKED:
             score -= _AGAINST * HINT
     return score

@@ -131,6 +131,9 @@ def command_line() -> argparse.ArgumentParser:
     sub.add_argument("--json", type=Path, metavar="OUT", help="one JSON object a line per window; - for stdout")
     sub.add_argument("--report", type=Path, metavar="OUT.html", help="self-contained HTML with plots (extra: plots)")
     sub.add_argument(
+        "--frames", type=Path, metavar="OUT", help="log of the frames that the service sends (.log .log.gz .asc .blf)"
+    )
+    sub.add_argument(
         "--table", type=named(".csv", ".parquet"), metavar="OUT",
         help="windows as rows: .csv, or .parquet (extra: tables)",
     )  # fmt: skip
@@ -146,6 +149,9 @@ def command_line() -> argparse.ArgumentParser:
         "--isoxml", type=Path, metavar="FOLDER",
         help="ISO 11783-10 task data for farm software; needs a mapped position",
     )  # fmt: skip
+    sub.add_argument(
+        "--manoeuvre-out", type=Path, metavar="OUT.json", help="what to drive to know the soil better (see simulate)"
+    )
     sub.add_argument("--partial", action="store_true", help="keep the windows before the point where a log is damaged")
 
     sub = command("simulate", "simulated tractor, to a bus in real time or to a log", "optional")
@@ -161,8 +167,29 @@ def command_line() -> argparse.ArgumentParser:
     sub.add_argument(
         "--rows", nargs=2, type=float, metavar=("LENGTH", "SPACING"), help="up and down a field [m], not straight on"
     )
+    sub.add_argument(
+        "--draft", type=between(0.0, 128_000.0), metavar="N",
+        help="draft of an implement that nobody lifts; without it slip is swept from 0.05 to 0.40",
+    )  # fmt: skip
+    sub.add_argument(
+        "--slope", type=between(-60.0, 60.0), default=0.0, metavar="PERCENT", help="uphill is positive (default 0)"
+    )
+    sub.add_argument(
+        "--speed", type=between(0.2, 20.0), metavar="M_PER_S", help="over ground (default: swings from 1.0 to 1.8)"
+    )
+    sub.add_argument(
+        "--vehicle-seed", type=natural, metavar="N",
+        help="picks true mass (by vehicle.mass_std) and sensor gains; without it --seed picks the gains",
+    )  # fmt: skip
+    sub.add_argument(
+        "--truth", type=Path, metavar="OUT",
+        help="table of true values: soil, slip, draft, load, sinkage, torque (.csv, or .parquet with the extra tables)",
+    )  # fmt: skip
+    sub.add_argument("--manoeuvre", type=Path, metavar="FILE", help="drive what --manoeuvre-out has written")
     target = sub.add_mutually_exclusive_group(required=True)
-    target.add_argument("--bus", action="store_true", help="send to the configured bus in real time")
+    target.add_argument(
+        "--bus", action="store_true", help="drive on the configured bus in real time, by its commands (dbc/tractor.dbc)"
+    )
     target.add_argument("--log", type=Path, metavar="OUT", help="write a log (.log .log.gz .asc .blf)")
 
     sub = command("diagnose", "what the model misses: find, name, add, show")
@@ -171,6 +198,9 @@ def command_line() -> argparse.ArgumentParser:
     sub.add_argument("--report", type=Path, metavar="OUT.html", help="self-contained HTML with plots (extra: plots)")
     sub.add_argument(
         "--model-out", type=Path, metavar="OUT.toml", help="the configuration with the effects found, for any command"
+    )
+    sub.add_argument(
+        "--manoeuvre-out", type=Path, metavar="OUT.json", help="of an ambiguous diagnosis, what to drive to settle it"
     )
 
     sub = command("watch", "terminal dashboard that reads only our frames, of the bus or of a recording", "optional")
