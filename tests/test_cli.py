@@ -397,3 +397,8 @@ def test_a_broken_line_is_named_in_words(log, tractor, tmp_path, capsys):
     assert main(["replay", "--config", str(tractor), str(cut)]) == 1
     (line,) = lines(capsys)[1]
     assert "(a line that is no frame)" in line
+
+
+def test_a_part_that_the_configuration_has_not_cannot_be_set(tractor, capsys):
+    assert main(["check", "--config", str(tractor), "--set", "axle.rear.gear_ratio=3"]) == 2
+    assert lines(capsys) == ([], ["soilbus: --set axle.rear.gear_ratio=3: the configuration has no [[axle]]"])
