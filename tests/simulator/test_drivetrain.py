@@ -2,12 +2,10 @@
 
 import math
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.integrate import quad
-
 
 from soilbus.config.file import MACHINES, load_config, parse_config
 from soilbus.simulator.drive import SimulationError, drive
