@@ -85,18 +85,13 @@ def at_window_end(objective: Objective, fit: Fit, window: float, drift: float) -
     gains = iterate.gains.copy()
     gains[objective.active] -= step[free:]
     at_end = replace(iterate, soil=objective.coordinates.stepped(iterate.soil, -step[:free]), gains=gains)
-    mode = objective.gaussian_with(at_end, covariance)
 
     def shifted(gaussian: Gaussian) -> Gaussian:
-        return (
-            mode
-            if gaussian is fit.mode
-            else objective.shifted(gaussian, constant.step - step, covariance - constant.covariance)
-        )
+        return objective.shifted(gaussian, constant.step - step, covariance - constant.covariance)
 
     return replace(
         fit,
-        mode=mode,
+        mode=shifted(fit.mode),
         gaussian=shifted(fit.gaussian),
         second_mode=None
         if fit.second_mode is None

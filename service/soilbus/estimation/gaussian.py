@@ -4,20 +4,24 @@ Equations.  With x = (log soil, gains), mean m and covariance C, the prior's res
 
     p = x - m,    -2 log prior = p' C^-1 p                                         (log-normal in all parameters)
 
-or, for a likelihood factor, which is Gaussian in k_c itself with offset e in units of the soil's k_c,
+or, for a likelihood factor, which is Gaussian in y = k_c, tan phi, c themselves, with offset e in units of their
+change with the logarithm at the soil y0,
 
-    p_k_c = k_c / k_c0 - 1 - e,    p_R = log k_c - log prior median
+    p_y = (y - y0) / (dy/dlog)_0 - e,    p_R = log parameter - log prior median
     -2 log prior = p' diag(C^-1, prior sd^-2) p - least value
 
 A window determines combinations of soil and gains, so its posterior is kept jointly.  Gains do not change from
 window to window; without their covariance with the soil the same ignorance would count as new information each
-time.  Forces are nearly linear in k_c, so several windows multiply as Gaussians of k_c and not of log k_c: a
-likelihood factor is a posterior with the prior of log k_c divided out, in that form.
+time.  Forces are nearly linear in k_c and linear in c and tan phi, so several windows multiply as Gaussians of these
+and not of their logarithms: a likelihood factor is a posterior with the log-normal priors of k_c, phi and c divided
+out, in that form.  At one load a window determines A c + W tan phi alone, a straight line in (c, tan phi) and a curve
+in logarithms: two windows linearised at two points of the curve would seem to determine c where they cross.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -33,14 +37,29 @@ if TYPE_CHECKING:
 
 
 _SOIL = len(PARAMETERS)
-_K_C = PARAMETERS.index("k_c")
+_K_C, _PHI, _C = (PARAMETERS.index(name) for name in ("k_c", "phi", "c"))
+LINEAR = np.array([_K_C, _PHI, _C])
+"""Parameters in which forces are linear, of phi in its tangent: a likelihood factor is Gaussian in these."""
 MIN_VARIANCE_REDUCTION = 1e-3
-"""Least share [1] of the prior variance of log k_c that data are taken to remove.
+"""Least share [1] of the prior variance of a linear parameter's logarithm that data are taken to remove.
 
 Keeps the likelihood factor finite where they remove none.  No evidence recorded.
 """
-LEAST_VALUE_SD, LEAST_VALUE_NODES = 4.0, 161
-"""Half width in prior sd of log k_c, and nodes, of the grid on which the least -2 log prior is looked for."""
+LEAST_VALUE_STEPS, LEAST_VALUE_TOLERANCE = 20, 1e-3
+"""Newton steps to the least -2 log prior, at most, and the length [1, of logarithms] below which they end."""
+
+
+def deviations(soil: Array, base: Array) -> tuple[Array, Array]:
+    """Changes (3,) of the LINEAR parameters from a base (6,) to a soil (6,), and their derivatives by the logarithms.
+
+    In units of the change with the logarithm at the base: (y - y0) / (dy/dlog)_0.
+    """
+    value, slope, start, unit = soil[LINEAR], soil[LINEAR], base[LINEAR], base[LINEAR].copy()
+    tan, tan_at_base = math.tan(soil[_PHI]), math.tan(base[_PHI])
+    value[1], start[1], slope = tan, tan_at_base, slope.copy()
+    slope[1] *= 1.0 + tan**2
+    unit[1] *= 1.0 + tan_at_base**2
+    return (value - start) / unit, slope / unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +74,8 @@ class Gaussian:
         Relative errors of the sensors and standardised effect parameters.
     covariance : (6 + G, 6 + G)
         Of the soil's logarithms and the gains; rows of held ones are zero.
-    k_c_offset : float, optional
-        Only for a likelihood factor: Gaussian in k_c / soil's k_c, with mean 1 + k_c_offset.
+    offset : (3,), optional
+        Only for a likelihood factor: Gaussian in the `deviations` of LINEAR from this soil, with this mean.
     form : FormPosterior, optional
         What the model's form leaves open; everything else is of the configured form.
     """
@@ -64,7 +83,7 @@ class Gaussian:
     soil: Array
     gains: Array
     covariance: Array
-    k_c_offset: float | None = None
+    offset: Array | None = None
     form: FormPosterior | None = None
 
     @classmethod
@@ -85,10 +104,10 @@ class Gaussian:
     def shifted(self, step: Array, covariance: Array) -> Gaussian:
         """With its mean shifted by a step (6 + G,) of logarithms and gains, and another covariance."""
         soil, gains = self.soil * np.exp(step[:_SOIL]), self.gains + step[_SOIL:]
-        if self.k_c_offset is None:
+        if self.offset is None:
             return Gaussian(soil, gains, covariance)
-        soil[_K_C] = self.soil[_K_C]
-        return Gaussian(soil, gains, covariance, self.k_c_offset + float(step[_K_C]))
+        soil[LINEAR] = self.soil[LINEAR]
+        return Gaussian(soil, gains, covariance, self.offset + step[LINEAR])
 
     def conditioned_on(self, parameter: int, log: float) -> Gaussian:
         """Conditional on the logarithm of a free parameter, which is held from then on."""
@@ -119,7 +138,7 @@ class Gaussian:
         return Gaussian(prior.median, self.gains, covariance)
 
     def likelihood_factor(self, prior: SoilPrior) -> Gaussian:
-        """The posterior with the prior of log k_c divided out.
+        """The posterior with the priors of the logarithms of LINEAR divided out.
 
         Parameters
         ----------
@@ -128,21 +147,42 @@ class Gaussian:
 
         Notes
         -----
-        Windows multiply as Gaussians of k_c, and what compensates for k_c is proportional to it.  In log k_c,
-        of which a window may determine less than the prior does, neither holds: window after window would seem
-        to exclude large k_c.
+        Windows multiply as Gaussians of k_c, tan phi and c, and what compensates for k_c or c is proportional to it.
+        In logarithms, of which a window may determine less than the prior does, neither holds: window after window
+        would seem to exclude large k_c, and to determine c where only the strength at one pressure is measured.
         """
-        variance, along = float(prior.log_std[_K_C] ** 2), self.covariance[:, _K_C]
-        if variance == 0.0:
+        free, covariance = self._without_priors(prior)
+        if not len(free):
             return self
-        removed = max(variance - float(along[_K_C]), MIN_VARIANCE_REDUCTION * variance)
-        off = along * (math.log(self.soil[_K_C] / prior.median[_K_C]) / removed)
-        return replace(self, k_c_offset=0.0).shifted(off, self.covariance + np.outer(along, along) / removed)
+        off = covariance[:, free] @ (np.log(self.soil[free] / prior.median[free]) / prior.log_std[free] ** 2)
+        return replace(self, offset=np.zeros(len(LINEAR))).shifted(off, covariance)
+
+    def relinearised(self, soil: Array, gains: Array, prior: SoilPrior) -> Gaussian:
+        """About another mean, with the covariance that the same linear model and the prior have there.
+
+        What compensates for a LINEAR parameter is proportional to the parameter itself, and so more or less of its
+        logarithm; the prior stays that of the logarithm.
+        """
+        free, covariance = self._without_priors(prior)
+        scale = np.ones(len(covariance))
+        scale[LINEAR] = 1.0 / deviations(soil, self.soil)[1]
+        covariance = scale[:, None] * covariance * scale
+        along = covariance[:, free]
+        removed = np.linalg.solve(along[free] + np.diag(prior.log_std[free] ** 2), along.T)
+        return replace(self, soil=soil, gains=gains, covariance=covariance - along @ removed)
+
+    def _without_priors(self, prior: SoilPrior) -> tuple[NDArray[np.intp], Array]:
+        """Free parameters of LINEAR, and the covariance (6 + G, 6 + G) with the priors of their logarithms divided out."""
+        free = LINEAR[prior.log_std[LINEAR] > 0.0]
+        unit, along = prior.log_std[free], self.covariance[:, free]
+        removed, axes = np.linalg.eigh(np.eye(len(free)) - along[free] / np.outer(unit, unit))
+        inverse = (axes / np.maximum(removed, MIN_VARIANCE_REDUCTION)) @ axes.T / np.outer(unit, unit)
+        return free, self.covariance + along @ inverse @ along.T
 
     def variance_of_k_c(self, prior: SoilPrior) -> float:
         """Variance of log k_c, the prior included."""
         own = float(self.covariance[_K_C, _K_C])
-        return own if self.k_c_offset is None else 1.0 / (1.0 / own + float(prior.log_std[_K_C] ** -2))
+        return own if self.offset is None else 1.0 / (1.0 / own + float(prior.log_std[_K_C] ** -2))
 
 
 class PriorQuadratic(NamedTuple):
@@ -157,8 +197,8 @@ class PriorQuadratic(NamedTuple):
     neg2_log_prior : float
         The value.
     gradient_of_data : (F + A,)
-        The part of the gradient that is Gaussian in k_c: without the prior of log k_c; 0 where all of it is
-        log-normal.
+        The part of the gradient that is Gaussian in the LINEAR parameters: without the priors of their logarithms; 0
+        where all of it is log-normal.
     """
 
     information: Array
@@ -182,10 +222,10 @@ class PriorFactor:
     Attributes
     ----------
     precision : (R, R)
-        Of the residuals.  R is F + A, and one more where the prior is a likelihood factor: its residual of k_c
-        itself comes with one of log k_c by the configured prior.
+        Of the residuals.  R is F + A, and one more for each free parameter of LINEAR where the prior is a likelihood
+        factor: besides the parameter's own residual there is one of its logarithm, by the configured prior.
     least_value : float
-        Least -2 log of likelihood factor and prior of log k_c together, which is subtracted from every value.
+        Least -2 log of likelihood factor and these priors together, which is subtracted from every value.
 
     Raises
     ------
@@ -203,10 +243,16 @@ class PriorFactor:
         self._mean = np.concatenate([np.log(gaussian_prior.soil[self._free]), gaussian_prior.gains[active]])
         self._zero_gradient = np.zeros(len(unknowns))
         self.least_value = 0.0
-        self._is_likelihood_factor = gaussian_prior.k_c_offset is not None and _K_C in self._free
+        self._is_likelihood_factor = gaussian_prior.offset is not None
         if self._is_likelihood_factor:
-            self.precision = np.pad(self.precision, (0, 1))
-            self.precision[-1, -1] = prior.log_std[_K_C] ** -2
+            self._of_linear = np.flatnonzero(np.isin(LINEAR, self._free))
+            self._linear = LINEAR[self._of_linear]
+            self._place = np.searchsorted(self._free, self._linear)
+            n = len(self.precision)
+            self.precision = np.pad(self.precision, (0, len(self._linear)))
+            self.precision[range(n, len(self.precision)), range(n, len(self.precision))] = (
+                prior.log_std[self._linear] ** -2
+            )
             self.least_value = self._least()
 
     def quadratic_at(self, soil: Array, gains: Array, by_logs: Array) -> PriorQuadratic:
@@ -224,7 +270,7 @@ class PriorFactor:
         gradient, of_data = slopes.T @ weighted, self._zero_gradient
         if self._is_likelihood_factor:
             of_data = gradient.copy()
-            of_data[_K_C] -= weighted[-1]
+            of_data[self._place] -= weighted[len(by_logs) :]
         value = float(off @ weighted) - self.least_value
         return PriorQuadratic(slopes.T @ self.precision @ slopes, gradient, value, of_data)
 
@@ -233,11 +279,11 @@ class PriorFactor:
         off = np.concatenate([np.log(soil[self._free]), gains[self._active]]) - self._mean
         if not self._is_likelihood_factor:
             return np.asarray(off)
-        of_prior = np.log(soil[_K_C] / self._prior.median[_K_C])
-        off[_K_C] = soil[_K_C] / self._gaussian_prior.soil[_K_C] - 1.0 - self._gaussian_prior.k_c_offset
-        return np.append(off, of_prior)
+        changes, _ = deviations(soil, self._gaussian_prior.soil)
+        off[self._place] = (changes - self._gaussian_prior.offset)[self._of_linear]
+        return np.append(off, np.log(soil[self._linear] / self._prior.median[self._linear]))
 
-    def jacobian(self, soil: Array, by_logs: Array, by_k_c: Array | None = None) -> Array:
+    def jacobian(self, soil: Array, by_logs: Array, by_values: Mapping[int, Array] | None = None) -> Array:
         """Derivatives (R, M) of the residuals by M unknowns.
 
         Parameters
@@ -246,31 +292,42 @@ class PriorFactor:
             In SI.
         by_logs : (F + A, M)
             Derivatives of logarithms and gains by the unknowns.
-        by_k_c : (M,), optional
-            Those of the relative change of k_c, where they are not those of log k_c.
+        by_values : {index of a parameter: (M,)}, optional
+            Those of the relative change of a LINEAR parameter, where they are not those of its logarithm.
         """
         if not self._is_likelihood_factor:
             return by_logs
-        slopes = np.vstack([by_logs, by_logs[_K_C]])
-        slopes[_K_C] = by_logs[_K_C] if by_k_c is None else by_k_c
-        slopes[_K_C] *= soil[_K_C] / self._gaussian_prior.soil[_K_C]
+        slopes = np.vstack([by_logs, by_logs[self._place]])
+        for parameter, row in (by_values or {}).items():
+            slopes[np.searchsorted(self._free, parameter)] = row
+        slopes[self._place] *= deviations(soil, self._gaussian_prior.soil)[1][self._of_linear, None]
         return slopes
 
     def jacobian_by_mean(self, soil: Array, gains: Array, shift: Array) -> tuple[Array, Array, Array]:
         """Derivatives (R, M) of the residuals by M shifts (6 + G, M) of the mean, with precision and residuals."""
         by_mean = -shift[np.concatenate([self._free, _SOIL + self._active])]
-        if self._is_likelihood_factor:
-            by_mean[_K_C] *= 1.0 + (self._gaussian_prior.k_c_offset or 0.0)
-            by_mean = np.vstack([by_mean, np.zeros((1, by_mean.shape[1]))])  # the prior of log k_c does not shift
+        if self._is_likelihood_factor:  # the priors of the logarithms do not shift
+            by_mean = np.vstack([by_mean, np.zeros((len(self._linear), by_mean.shape[1]))])
         return by_mean, self.precision, self.residuals(soil, gains)
 
     def _least(self) -> float:
-        """Least -2 log of the likelihood factor of k_c and the prior of log k_c together, on a grid."""
-        gaussian_prior, spread = self._gaussian_prior, self._prior.log_std[_K_C]
-        deviation = np.linspace(-LEAST_VALUE_SD, LEAST_VALUE_SD, LEAST_VALUE_NODES)
-        k_c = self._prior.median[_K_C] * np.exp(spread * deviation) / gaussian_prior.soil[_K_C]
-        off = k_c - 1.0 - gaussian_prior.k_c_offset
-        return float(np.min(off**2 / gaussian_prior.covariance[_K_C, _K_C] + deviation**2))
+        """Least -2 log of the likelihood factor of LINEAR and the priors of their logarithms together."""
+        base, prior, linear = self._gaussian_prior.soil, self._prior, self._linear
+        precision = np.linalg.inv(self._gaussian_prior.covariance[np.ix_(linear, linear)])
+        of_prior, soil, least = prior.log_std[linear] ** -2, base.copy(), math.inf
+        for _ in range(LEAST_VALUE_STEPS):
+            changes, slopes = (a[self._of_linear] for a in deviations(soil, base))
+            off = changes - self._gaussian_prior.offset[self._of_linear]
+            log = np.log(soil[linear] / prior.median[linear])
+            weighted = precision @ off
+            least = min(least, float(off @ weighted + log @ (of_prior * log)))
+            curved = slopes[:, None] * precision * slopes + np.diag(of_prior + np.maximum(weighted * slopes, 0.0))
+            step = -np.linalg.solve(curved, slopes * weighted + of_prior * log)
+            step *= min(1.0, 1.0 / float(np.abs(step).max()))
+            soil[linear] *= np.exp(step)
+            if np.abs(step).max() < LEAST_VALUE_TOLERANCE:
+                break
+        return least
 
 
 def solve_with_inverse(information: Array, gradient: Array) -> tuple[Array, Array] | None:

@@ -41,7 +41,7 @@ from soilbus.estimation.posterior import PARAMETERS, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective
 from soilbus.terra.wheel import Soil
 
-DETERMINED_N_SD = 0.05
+DETERMINED_N_SD = 0.0
 """Sd of log n [1] below which a posterior with one mode counts as Gaussian.  No evidence recorded."""
 FIRST_NODE_STEP = 0.1
 """Longest first step of log n [1] from the mode.  No evidence recorded."""

@@ -497,7 +497,7 @@ class Objective:
         by_changes[[_K_C, _K_PHI], [_LOG_SHARE, _LOG_REST]] = 1.0
         by_k_c = by_changes[_K_C].copy()
         by_k_c[[_SHARE, _LOG_SHARE]] = 1.0, 0.0
-        slopes = self.prior_factor.jacobian(iterate.soil, by_changes, by_k_c)
+        slopes = self.prior_factor.jacobian(iterate.soil, by_changes, {_K_C: by_k_c})
         quadratic = slopes.T @ self.prior_factor.precision @ slopes
         of_data = np.concatenate([[_SHARE], others + _OTHERS - 1])
         quadratic[of_data[:, None], of_data] += by_share.T @ (model.information - model.prior_information) @ by_share
@@ -530,8 +530,10 @@ class Objective:
         """A Gaussian shifted by a step (F + A,), with this covariance (F + A, F + A) of the step added."""
         free, gains = len(self.free), gaussian.gains.copy()
         gains[self.active] += step[free:]
-        added = self._gaussian(self.coordinates.stepped(gaussian.soil, step[:free]), gains, covariance)
-        return replace(added, covariance=gaussian.covariance + added.covariance)
+        soil = self.coordinates.stepped(gaussian.soil, step[:free])
+        added = self._gaussian(gaussian.soil, gains, covariance).covariance
+        wider = replace(gaussian, covariance=gaussian.covariance + added)
+        return wider.relinearised(soil, gains, self.coordinates.prior)
 
     def _log_directions(self, soil: Array) -> Array:
         return self.coordinates.log_directions(soil)
