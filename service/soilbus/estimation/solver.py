@@ -94,7 +94,11 @@ OTHER_OPTIMUM_SD = 10.0
 """Posterior sd on a few instants [1] beyond which the end of a descent is another optimum.  No evidence recorded."""
 
 _SOIL = len(PARAMETERS)
-_K_C, _K_PHI, _N = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n"))
+_K_C, _K_PHI, _N, _PHI, _C = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "phi", "c"))
+SMALL_SHARE = 1e-12
+"""Share [1] that stands for one whose complement does not change."""
+MIN_TAN_SHARE = 0.1
+"""Least mean of tan phi over that at the optimum [1]: a linear shift could reach zero."""
 _SHARE, _LOG_SHARE, _LOG_REST, _OTHERS = 0, 1, 2, 3
 """Columns of changes for the moments along k_c's share s: of s, log s and log (1 - s); the others follow."""
 
@@ -453,7 +457,7 @@ class Objective:
         return self._approximation[1]
 
     def gaussians_at(self, iterate: Iterate, model: QuadraticModel, base: Array) -> tuple[Gaussian, Gaussian] | None:
-        """Gaussians of the posterior at an optimum: by its moments along k_c's share, and by its curvature.
+        """Gaussians of the posterior at an optimum: by its moments along c and k_c's share, and by its curvature.
 
         Parameters
         ----------
@@ -467,25 +471,71 @@ class Objective:
         Returns
         -------
         moments, mode
-            Both by the curvature where there are no finite moments, or k_c and k_phi are not both free, or
-            the sd of log K_L exceeds MAX_MODULUS_SD.  None where the information is singular.
+            By the curvature where there are no finite moments; along k_c's share also where k_c and k_phi are not
+            both free, or the sd of log K_L exceeds MAX_MODULUS_SD.  None where the information is singular.
         """
         inverse = solve_with_inverse(model.information, model.gradient)
         if inverse is None:
             return None
         covariance = inverse[1]
         mode = self._gaussian(iterate.soil, iterate.gains, covariance, base)
-        if not {_K_C, _K_PHI} <= set(self.free.tolist()) or covariance[_K_PHI, _K_PHI] > MAX_MODULUS_SD**2:
+        free, has_share = len(self.free), {_K_C, _K_PHI} <= set(self.free.tolist())
+        along_share = (
+            self._moments(iterate, model) if has_share and covariance[_K_PHI, _K_PHI] <= MAX_MODULUS_SD**2 else None
+        )
+        along_c = self._moments_along_c(iterate, model)
+        if along_share is None and along_c is None:
             return mode, mode
-        moments = self._moments(iterate, model)
-        if moments is None:
-            return mode, mode
-        free, gains = len(self.free), iterate.gains.copy()
-        step = self._by_share(iterate.soil) @ moments.mean
+        step = np.zeros(len(covariance)) if along_share is None else self._by_share(iterate.soil) @ along_share.mean
+        step += 0.0 if along_c is None else along_c.mean
         soil = self.coordinates.soil_at(self.coordinates.position(iterate.soil) + step[:free])
+        gains = iterate.gains.copy()
         gains[self.active] += step[free:]
-        by_share = self._by_share(soil)
-        return self._gaussian(soil, gains, by_share @ moments.covariance @ by_share.T), mode
+        own = covariance
+        if along_share is not None:
+            by_share = self._by_share(soil)
+            own = by_share @ along_share.covariance @ by_share.T
+        if along_c is None:
+            return self._gaussian(soil, gains, own), mode
+        scale = np.ones(len(own))
+        if _PHI in self.free:  # its tangent is linear in c
+            place, phi = int(np.searchsorted(self.free, _PHI)), float(iterate.soil[_PHI])
+            slope = phi * (1.0 + math.tan(phi) ** 2)
+            tan = math.tan(phi) + slope * step[place]
+            soil[_PHI] = math.atan(max(tan, MIN_TAN_SHARE * math.tan(phi)))
+            self.coordinates.within(soil)
+            scale[place] = slope / (soil[_PHI] * (1.0 + math.tan(soil[_PHI]) ** 2))
+        own = scale[:, None] * (own + along_c.covariance - covariance) * scale
+        return self._gaussian(soil, gains, own), mode
+
+    def _moments_along_c(self, iterate: Iterate, model: QuadraticModel) -> Moments | None:
+        """Moments (F + A) of coordinates and gains about the optimum, c being log-normal and the forces linear in it.
+
+        As along a share of k_c that is small, whose complement does not change.
+        """
+        if _C not in self.free:
+            return None
+        place, n = int(np.searchsorted(self.free, _C)), len(model.gradient)
+        others = np.delete(np.arange(n), place)
+        by_changes = np.zeros((n, n - 1 + _OTHERS))
+        by_changes[others, _OTHERS + np.arange(n - 1)] = 1.0
+        by_value = by_changes[place].copy()
+        by_changes[place, _LOG_SHARE], by_value[_SHARE] = 1.0, 1.0
+        by_logs = by_changes.copy()
+        by_logs[: len(self.free)] = self._log_directions(iterate.soil)[self.free] @ by_changes[: len(self.free)]
+        slopes = self.prior_factor.jacobian(iterate.soil, by_logs, {_C: by_value})
+        weighted = self.prior_factor.precision @ slopes
+        quadratic = slopes.T @ weighted
+        of_data, order = np.concatenate([[_SHARE], _OTHERS + np.arange(n - 1)]), np.concatenate([[place], others])
+        quadratic[of_data[:, None], of_data] += (model.information - model.prior_information)[order[:, None], order]
+        gradient = np.zeros(len(quadratic))  # at the optimum the data's gradient is minus the prior's
+        gradient[_LOG_SHARE] = weighted[:, _LOG_SHARE] @ self.prior_factor.residuals(iterate.soil, iterate.gains)
+        gradient[_SHARE] = -gradient[_LOG_SHARE]
+        found = moments_along_share(quadratic, gradient, SMALL_SHARE)
+        if found is None:
+            return None
+        back = np.argsort(order)
+        return Moments(found.mean[back], found.covariance[back[:, None], back])
 
     def _moments(self, iterate: Iterate, model: QuadraticModel) -> Moments | None:
         """Moments of log s, s = k_c's share in K_L, of the other coordinates and of the gains, about the optimum."""
