@@ -37,9 +37,11 @@ if TYPE_CHECKING:
 
 
 _SOIL = len(PARAMETERS)
-_K_C, _PHI, _C = (PARAMETERS.index(name) for name in ("k_c", "phi", "c"))
-LINEAR = np.array([_K_C, _PHI, _C])
-"""Parameters in which forces are linear, of phi in its tangent: a likelihood factor is Gaussian in these."""
+_K_C, _N, _PHI, _C = (PARAMETERS.index(name) for name in ("k_c", "n", "phi", "c"))
+LINEAR = np.array([_K_C, _N, _PHI, _C])
+"""Parameters in which forces, of n the logarithm of pressure, are linear, of phi in its tangent."""
+_TAN = 2
+"""Place of phi among LINEAR."""
 MIN_VARIANCE_REDUCTION = 1e-3
 """Least share [1] of the prior variance of a linear parameter's logarithm that data are taken to remove.
 
@@ -50,15 +52,15 @@ LEAST_VALUE_STEPS, LEAST_VALUE_TOLERANCE = 20, 1e-3
 
 
 def deviations(soil: Array, base: Array) -> tuple[Array, Array]:
-    """Changes (3,) of the LINEAR parameters from a base (6,) to a soil (6,), and their derivatives by the logarithms.
+    """Changes (4,) of the LINEAR parameters from a base (6,) to a soil (6,), and their derivatives by the logarithms.
 
     In units of the change with the logarithm at the base: (y - y0) / (dy/dlog)_0.
     """
-    value, slope, start, unit = soil[LINEAR], soil[LINEAR], base[LINEAR], base[LINEAR].copy()
+    value, slope, start, unit = soil[LINEAR], soil[LINEAR], base[LINEAR], base[LINEAR]
     tan, tan_at_base = math.tan(soil[_PHI]), math.tan(base[_PHI])
-    value[1], start[1], slope = tan, tan_at_base, slope.copy()
-    slope[1] *= 1.0 + tan**2
-    unit[1] *= 1.0 + tan_at_base**2
+    value[_TAN], start[_TAN] = tan, tan_at_base
+    slope[_TAN] *= 1.0 + tan**2
+    unit[_TAN] *= 1.0 + tan_at_base**2
     return (value - start) / unit, slope / unit
 
 
@@ -74,7 +76,7 @@ class Gaussian:
         Relative errors of the sensors and standardised effect parameters.
     covariance : (6 + G, 6 + G)
         Of the soil's logarithms and the gains; rows of held ones are zero.
-    offset : (3,), optional
+    offset : (4,), optional
         Only for a likelihood factor: Gaussian in the `deviations` of LINEAR from this soil, with this mean.
     form : FormPosterior, optional
         What the model's form leaves open; everything else is of the configured form.
@@ -114,7 +116,22 @@ class Gaussian:
         along = self.covariance[:, parameter] / self.covariance[parameter, parameter]
         covariance = self.covariance - np.outer(along, self.covariance[parameter])
         covariance[parameter] = covariance[:, parameter] = 0.0
-        return self.shifted(along * (log - np.log(self.soil[parameter])), covariance)
+        return self.shifted(along * self._deviation(parameter, log), covariance)
+
+    def neg2_log_marginal(self, parameter: int, log: float, prior: SoilPrior) -> float:
+        """-2 log of the marginal at the logarithm of a free parameter; of a likelihood factor with the prior."""
+        value = self._deviation(parameter, log) ** 2 / float(self.covariance[parameter, parameter])
+        if self.offset is None or parameter not in LINEAR:
+            return value
+        return value + ((log - math.log(prior.median[parameter])) / float(prior.log_std[parameter])) ** 2
+
+    def _deviation(self, parameter: int, log: float) -> float:
+        """Of a parameter with this logarithm from its mean: of the logarithm, or linear in a likelihood factor."""
+        if self.offset is None or parameter not in LINEAR:
+            return float(log - np.log(self.soil[parameter]))
+        soil, place = self.soil.copy(), int(np.searchsorted(LINEAR, parameter))
+        soil[parameter] = math.exp(log)
+        return float(deviations(soil, self.soil)[0][place] - self.offset[place])
 
     def mixture(self, other: Gaussian, share: float) -> Gaussian:
         """This mean, with the second moment about it of a mixture: this with 1 - share, the other with share."""

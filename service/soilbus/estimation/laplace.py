@@ -298,13 +298,12 @@ def _node(
         soil[free] = Coordinates(prior, float(problem.rig.width.mean())).within(np.exp(predicted[:_SOIL]))[free]
         gains = problem.allowed(predicted[_SOIL:])
     soil[_N] = n
-    deviation = (u - math.log(joint_prior.soil[_N])) / math.sqrt(joint_prior.covariance[_N, _N])
     median, log_std = prior.median.copy(), prior.log_std.copy()
     median[_N], log_std[_N] = n, 0.0
     objective = Objective(problem, SoilPrior(median, log_std), joint_prior.conditioned_on(_N, u))
     latents = problem.with_entry_angles(near.optimum.latents, Soil(*soil.tolist()), gains)
     fit = _converged(objective, Iterate(soil, gains, latents, np.inf, 1))
-    return None if fit is None else Node(u, fit, deviation**2 + objective.prior_factor.least_value)
+    return None if fit is None else Node(u, fit, joint_prior.neg2_log_marginal(_N, u, prior) + objective.prior_factor.least_value)
 
 
 def _converged(objective: Objective, start: Iterate) -> Fit | None:
