@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 _SOIL = len(PARAMETERS)
-_K_C, _N, _PHI, _C = (PARAMETERS.index(name) for name in ("k_c", "n", "phi", "c"))
+_K_C, _K_PHI, _N, _PHI, _C = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "phi", "c"))
 LINEAR = np.array([_K_C, _N, _PHI, _C])
 """Parameters in which forces, of n the logarithm of pressure, are linear, of phi in its tangent."""
 _TAN = 2
@@ -51,17 +51,29 @@ LEAST_VALUE_STEPS, LEAST_VALUE_TOLERANCE = 20, 1e-3
 """Newton steps to the least -2 log prior, at most, and the length [1, of logarithms] below which they end."""
 
 
-def deviations(soil: Array, base: Array) -> tuple[Array, Array]:
-    """Changes (4,) of the LINEAR parameters from a base (6,) to a soil (6,), and their derivatives by the logarithms.
+def deviations(soil: Array, base: Array, width: float) -> tuple[Array, Array]:
+    """Changes (6,) from a base (6,) to a soil (6,) in which windows are linear, and their derivatives by the logarithms.
 
-    In units of the change with the logarithm at the base: (y - y0) / (dy/dlog)_0.
+    Each is that of the parameter's logarithm at the base.  There and elsewhere the LINEAR parameters change linearly;
+    that of k_phi is log K_L less the part of k_c, K_L = k_c / width + k_phi; K changes by its logarithm.
+
+    Returns
+    -------
+    (6,), (6, 6)
     """
-    value, slope, start, unit = soil[LINEAR], soil[LINEAR], base[LINEAR], base[LINEAR]
+    change, slopes = np.log(soil / base), np.eye(len(soil))
+    value, start, by_log, unit = soil[LINEAR], base[LINEAR], soil[LINEAR], base[LINEAR]
     tan, tan_at_base = math.tan(soil[_PHI]), math.tan(base[_PHI])
     value[_TAN], start[_TAN] = tan, tan_at_base
-    slope[_TAN] *= 1.0 + tan**2
+    by_log[_TAN] *= 1.0 + tan**2
     unit[_TAN] *= 1.0 + tan_at_base**2
-    return (value - start) / unit, slope / unit
+    change[LINEAR], slopes[LINEAR, LINEAR] = (value - start) / unit, by_log / unit
+    K_L, K_L_at_base = (s[_K_PHI] + s[_K_C] / width for s in (soil, base))
+    k_phi, ratio = base[_K_PHI], K_L_at_base / K_L
+    change[_K_PHI] = (-math.log(ratio) * K_L_at_base - (soil[_K_C] - base[_K_C]) / width) / k_phi
+    slopes[_K_PHI, _K_PHI] = ratio * soil[_K_PHI] / k_phi
+    slopes[_K_PHI, _K_C] = (ratio - 1.0) * soil[_K_C] / width / k_phi
+    return change, slopes
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,8 +88,8 @@ class Gaussian:
         Relative errors of the sensors and standardised effect parameters.
     covariance : (6 + G, 6 + G)
         Of the soil's logarithms and the gains; rows of held ones are zero.
-    offset : (4,), optional
-        Only for a likelihood factor: Gaussian in the `deviations` of LINEAR from this soil, with this mean.
+    offset : (6,), optional
+        Only for a likelihood factor: Gaussian in the `deviations` from this soil, with this mean.
     form : FormPosterior, optional
         What the model's form leaves open; everything else is of the configured form.
     """
@@ -105,11 +117,10 @@ class Gaussian:
 
     def shifted(self, step: Array, covariance: Array) -> Gaussian:
         """With its mean shifted by a step (6 + G,) of logarithms and gains, and another covariance."""
-        soil, gains = self.soil * np.exp(step[:_SOIL]), self.gains + step[_SOIL:]
+        gains = self.gains + step[_SOIL:]
         if self.offset is None:
-            return Gaussian(soil, gains, covariance)
-        soil[LINEAR] = self.soil[LINEAR]
-        return Gaussian(soil, gains, covariance, self.offset + step[LINEAR])
+            return Gaussian(self.soil * np.exp(step[:_SOIL]), gains, covariance)
+        return Gaussian(self.soil, gains, covariance, self.offset + step[:_SOIL])
 
     def conditioned_on(self, parameter: int, log: float) -> Gaussian:
         """Conditional on the logarithm of a free parameter, which is held from then on."""
@@ -127,11 +138,11 @@ class Gaussian:
 
     def _deviation(self, parameter: int, log: float) -> float:
         """Of a parameter with this logarithm from its mean: of the logarithm, or linear in a likelihood factor."""
-        if self.offset is None or parameter not in LINEAR:
-            return float(log - np.log(self.soil[parameter]))
-        soil, place = self.soil.copy(), int(np.searchsorted(LINEAR, parameter))
-        soil[parameter] = math.exp(log)
-        return float(deviations(soil, self.soil)[0][place] - self.offset[place])
+        base = float(self.soil[parameter])
+        if self.offset is None:
+            return log - math.log(base)
+        change = math.expm1(log - math.log(base)) if parameter in LINEAR else log - math.log(base)
+        return change - float(self.offset[parameter])
 
     def mixture(self, other: Gaussian, share: float) -> Gaussian:
         """This mean, with the second moment about it of a mixture: this with 1 - share, the other with share."""
@@ -172,18 +183,18 @@ class Gaussian:
         if not len(free):
             return self
         off = covariance[:, free] @ (np.log(self.soil[free] / prior.median[free]) / prior.log_std[free] ** 2)
-        return replace(self, offset=np.zeros(len(LINEAR))).shifted(off, covariance)
+        return replace(self, offset=np.zeros(_SOIL)).shifted(off, covariance)
 
-    def relinearised(self, soil: Array, gains: Array, prior: SoilPrior) -> Gaussian:
+    def relinearised(self, soil: Array, gains: Array, prior: SoilPrior, width: float) -> Gaussian:
         """About another mean, with the covariance that the same linear model and the prior have there.
 
         What compensates for a LINEAR parameter is proportional to the parameter itself, and so more or less of its
         logarithm; the prior stays that of the logarithm.
         """
         free, covariance = self._without_priors(prior)
-        scale = np.ones(len(covariance))
-        scale[LINEAR] = 1.0 / deviations(soil, self.soil)[1]
-        covariance = scale[:, None] * covariance * scale
+        by_deviations = np.eye(len(covariance))
+        by_deviations[:_SOIL, :_SOIL] = np.linalg.inv(deviations(soil, self.soil, width)[1])
+        covariance = by_deviations @ covariance @ by_deviations.T
         along = covariance[:, free]
         removed = np.linalg.solve(along[free] + np.diag(prior.log_std[free] ** 2), along.T)
         return replace(self, soil=soil, gains=gains, covariance=covariance - along @ removed)
@@ -235,6 +246,8 @@ class PriorFactor:
         The configured prior of the soil.
     active : (A,)
         Indices of the gains that are not held.
+    width
+        Mean width [m] of the tyres.
 
     Attributes
     ----------
@@ -250,7 +263,7 @@ class PriorFactor:
         Where `gaussian_prior` has no proper covariance.
     """
 
-    def __init__(self, gaussian_prior: Gaussian, prior: SoilPrior, active: NDArray[np.intp]) -> None:
+    def __init__(self, gaussian_prior: Gaussian, prior: SoilPrior, active: NDArray[np.intp], width: float) -> None:
         self._gaussian_prior, self._prior, self._free, self._active = gaussian_prior, prior, prior.free, active
         unknowns = np.concatenate([self._free, _SOIL + active])
         inverse = solve_with_inverse(gaussian_prior.covariance[unknowns[:, None], unknowns], np.zeros(len(unknowns)))
@@ -258,12 +271,11 @@ class PriorFactor:
             raise ValueError("the prior has no proper covariance")
         self.precision = inverse[1]
         self._mean = np.concatenate([np.log(gaussian_prior.soil[self._free]), gaussian_prior.gains[active]])
-        self._zero_gradient = np.zeros(len(unknowns))
+        self._zero_gradient, self._width = np.zeros(len(unknowns)), width
         self.least_value = 0.0
         self._is_likelihood_factor = gaussian_prior.offset is not None
         if self._is_likelihood_factor:
-            self._of_linear = np.flatnonzero(np.isin(LINEAR, self._free))
-            self._linear = LINEAR[self._of_linear]
+            self._linear = LINEAR[np.isin(LINEAR, self._free)]
             self._place = np.searchsorted(self._free, self._linear)
             n = len(self.precision)
             self.precision = np.pad(self.precision, (0, len(self._linear)))
@@ -296,8 +308,8 @@ class PriorFactor:
         off = np.concatenate([np.log(soil[self._free]), gains[self._active]]) - self._mean
         if not self._is_likelihood_factor:
             return np.asarray(off)
-        changes, _ = deviations(soil, self._gaussian_prior.soil)
-        off[self._place] = (changes - self._gaussian_prior.offset)[self._of_linear]
+        changes, _ = deviations(soil, self._gaussian_prior.soil, self._width)
+        off[: len(self._free)] = (changes - self._gaussian_prior.offset)[self._free]
         return np.append(off, np.log(soil[self._linear] / self._prior.median[self._linear]))
 
     def jacobian(self, soil: Array, by_logs: Array, by_values: Mapping[int, Array] | None = None) -> Array:
@@ -314,11 +326,11 @@ class PriorFactor:
         """
         if not self._is_likelihood_factor:
             return by_logs
-        slopes = np.vstack([by_logs, by_logs[self._place]])
+        free, changes = len(self._free), by_logs[: len(self._free)].copy()
         for parameter, row in (by_values or {}).items():
-            slopes[np.searchsorted(self._free, parameter)] = row
-        slopes[self._place] *= deviations(soil, self._gaussian_prior.soil)[1][self._of_linear, None]
-        return slopes
+            changes[np.searchsorted(self._free, parameter)] = row
+        slopes = deviations(soil, self._gaussian_prior.soil, self._width)[1][np.ix_(self._free, self._free)]
+        return np.vstack([slopes @ changes, by_logs[free:], by_logs[self._place]])
 
     def jacobian_by_mean(self, soil: Array, gains: Array, shift: Array) -> tuple[Array, Array, Array]:
         """Derivatives (R, M) of the residuals by M shifts (6 + G, M) of the mean, with precision and residuals."""
@@ -333,8 +345,8 @@ class PriorFactor:
         precision = np.linalg.inv(self._gaussian_prior.covariance[np.ix_(linear, linear)])
         of_prior, soil, least = prior.log_std[linear] ** -2, base.copy(), math.inf
         for _ in range(LEAST_VALUE_STEPS):
-            changes, slopes = (a[self._of_linear] for a in deviations(soil, base))
-            off = changes - self._gaussian_prior.offset[self._of_linear]
+            changes, by_logs = deviations(soil, base, self._width)
+            off, slopes = (changes - self._gaussian_prior.offset)[linear], by_logs[linear, linear]
             log = np.log(soil[linear] / prior.median[linear])
             weighted = precision @ off
             least = min(least, float(off @ weighted + log @ (of_prior * log)))

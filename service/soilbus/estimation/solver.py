@@ -265,7 +265,7 @@ class Objective:
         self._gain_directions = np.zeros((FIRST_GAIN + len(joint_prior.gains), len(self._identity)))
         self._gain_directions[FIRST_GAIN + self.active] = self._identity[len(self.free) :]
         self._by_sensors = with_gains and first_gain == 0
-        self.prior_factor = PriorFactor(joint_prior, prior, self.active)
+        self.prior_factor = PriorFactor(joint_prior, prior, self.active, self.coordinates.width)
         self._prior_cache: tuple[Array, Array, PriorQuadratic] | None = None
         self._approximation: tuple[Optimum, GaussianApproximation | None] | None = None
 
@@ -583,7 +583,7 @@ class Objective:
         soil = self.coordinates.stepped(gaussian.soil, step[:free])
         added = self._gaussian(gaussian.soil, gains, covariance).covariance
         wider = replace(gaussian, covariance=gaussian.covariance + added)
-        return wider.relinearised(soil, gains, self.coordinates.prior)
+        return wider.relinearised(soil, gains, self.coordinates.prior, self.coordinates.width)
 
     def _log_directions(self, soil: Array) -> Array:
         return self.coordinates.log_directions(soil)
