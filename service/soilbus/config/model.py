@@ -663,10 +663,6 @@ class Estimator(_Section):
     """Relative std of the bearing pressure up to which a window counts as excited."""
     max_tan_phi_std: PositiveFloat = 0.15
     """Relative std of tan phi up to which a window counts as excited."""
-    min_track_load_change: NonNegativeFloat = 0.05
-    """Relative sd of the load on a track, beyond noise, from which a window of a tracked vehicle counts as excited: at
-    one load a track shows the pressure at its own depth and A c + W tan phi only (after a minute at constant load on
-    simulated dry sand tan phi was 5 to 35 standard deviations off)."""
     max_chi2: PositiveFloat = 1.1
     """Reduced chi-square, beyond its own scatter, above which the model does not describe the data."""
     search_rate: NonNegativeFloat = 4.0

@@ -505,8 +505,8 @@ class Objective:
             soil[_PHI] = math.atan(max(tan, MIN_TAN_SHARE * math.tan(phi)))
             self.coordinates.within(soil)
             scale[place] = slope / (soil[_PHI] * (1.0 + math.tan(soil[_PHI]) ** 2))
-        own = scale[:, None] * (own + along_c.covariance - covariance) * scale
-        return self._gaussian(soil, gains, own), mode
+        to_moments = scale[:, None] * _root_of(along_c.covariance) @ np.linalg.inv(_root_of(covariance))
+        return self._gaussian(soil, gains, to_moments @ own @ to_moments.T), mode
 
     def _moments_along_c(self, iterate: Iterate, model: QuadraticModel) -> Moments | None:
         """Moments (F + A) of coordinates and gains about the optimum, c being log-normal and the forces linear in it.
@@ -587,6 +587,13 @@ class Objective:
 
     def _log_directions(self, soil: Array) -> Array:
         return self.coordinates.log_directions(soil)
+
+
+def _root_of(covariance: Array) -> Array:
+    """Symmetric root of a covariance (M, M) whose variances may differ by many decades."""
+    scale = np.sqrt(covariance.diagonal())
+    variance, axes = np.linalg.eigh(covariance / np.outer(scale, scale))
+    return np.asarray(scale[:, None] * (axes * np.sqrt(np.maximum(variance, 1e-300))) @ axes.T)
 
 
 class Descent(NamedTuple):
