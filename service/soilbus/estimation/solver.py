@@ -94,11 +94,9 @@ OTHER_OPTIMUM_SD = 10.0
 """Posterior sd on a few instants [1] beyond which the end of a descent is another optimum.  No evidence recorded."""
 
 _SOIL = len(PARAMETERS)
-_K_C, _K_PHI, _N, _PHI, _C = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "phi", "c"))
+_K_C, _K_PHI, _N, _C = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "c"))
 SMALL_SHARE = 1e-12
 """Share [1] that stands for one whose complement does not change."""
-MIN_TAN_SHARE = 0.1
-"""Least mean of tan phi over that at the optimum [1]: a linear shift could reach zero."""
 _SHARE, _LOG_SHARE, _LOG_REST, _OTHERS = 0, 1, 2, 3
 """Columns of changes for the moments along k_c's share s: of s, log s and log (1 - s); the others follow."""
 
@@ -457,7 +455,7 @@ class Objective:
         return self._approximation[1]
 
     def gaussians_at(self, iterate: Iterate, model: QuadraticModel, base: Array) -> tuple[Gaussian, Gaussian] | None:
-        """Gaussians of the posterior at an optimum: by its moments along c and k_c's share, and by its curvature.
+        """Gaussians of the posterior at an optimum: by its moments along k_c's share and c, and by its curvature.
 
         Parameters
         ----------
@@ -486,27 +484,18 @@ class Objective:
         along_c = self._moments_along_c(iterate, model)
         if along_share is None and along_c is None:
             return mode, mode
-        step = np.zeros(len(covariance)) if along_share is None else self._by_share(iterate.soil) @ along_share.mean
-        step += 0.0 if along_c is None else along_c.mean
-        soil = self.coordinates.soil_at(self.coordinates.position(iterate.soil) + step[:free])
-        gains = iterate.gains.copy()
-        gains[self.active] += step[free:]
-        own = covariance
+        soil, gains, own = iterate.soil, iterate.gains.copy(), covariance
         if along_share is not None:
+            step = self._by_share(iterate.soil) @ along_share.mean
+            soil = self.coordinates.soil_at(self.coordinates.position(iterate.soil) + step[:free])
+            gains[self.active] += step[free:]
             by_share = self._by_share(soil)
             own = by_share @ along_share.covariance @ by_share.T
-        if along_c is None:
-            return self._gaussian(soil, gains, own), mode
-        scale = np.ones(len(own))
-        if _PHI in self.free:  # its tangent is linear in c
-            place, phi = int(np.searchsorted(self.free, _PHI)), float(iterate.soil[_PHI])
-            slope = phi * (1.0 + math.tan(phi) ** 2)
-            tan = math.tan(phi) + slope * step[place]
-            soil[_PHI] = math.atan(max(tan, MIN_TAN_SHARE * math.tan(phi)))
-            self.coordinates.within(soil)
-            scale[place] = slope / (soil[_PHI] * (1.0 + math.tan(soil[_PHI]) ** 2))
-        to_moments = scale[:, None] * _root_of(along_c.covariance) @ np.linalg.inv(_root_of(covariance))
-        return self._gaussian(soil, gains, to_moments @ own @ to_moments.T), mode
+        if along_c is not None:  # about the optimum, at which c and tan phi make the strength that was measured
+            square = along_c.covariance + np.outer(along_c.mean, along_c.mean)
+            to_square = _root_of(square) @ np.linalg.inv(_root_of(covariance))
+            own = to_square @ own @ to_square.T
+        return self._gaussian(soil, gains, own), mode
 
     def _moments_along_c(self, iterate: Iterate, model: QuadraticModel) -> Moments | None:
         """Moments (F + A) of coordinates and gains about the optimum, c being log-normal and the forces linear in it.
@@ -590,7 +579,7 @@ class Objective:
 
 
 def _root_of(covariance: Array) -> Array:
-    """Symmetric root of a covariance (M, M) whose variances may differ by many decades."""
+    """R (M, M) with R R' = a covariance (M, M), whose variances may differ by many decades."""
     scale = np.sqrt(covariance.diagonal())
     variance, axes = np.linalg.eigh(covariance / np.outer(scale, scale))
     return np.asarray(scale[:, None] * (axes * np.sqrt(np.maximum(variance, 1e-300))) @ axes.T)
