@@ -314,7 +314,9 @@ def _node(
     objective = Objective(problem, SoilPrior(median, log_std), joint_prior.conditioned_on(_N, u))
     latents = problem.with_entry_angles(near.optimum.latents, Soil(*soil.tolist()), gains)
     fit = _converged(objective, Iterate(soil, gains, latents, np.inf, 1))
-    return None if fit is None else Node(u, fit, joint_prior.neg2_log_marginal(_N, u, prior) + objective.prior_factor.least_value)
+    if fit is None:
+        return None
+    return Node(u, fit, joint_prior.neg2_log_marginal(_N, u, prior) + objective.prior_factor.least_value)
 
 
 def _converged(objective: Objective, start: Iterate) -> Fit | None:
