@@ -479,9 +479,9 @@ class Objective:
         mode = self._gaussian(iterate.soil, iterate.gains, covariance, base)
         free, has_share = len(self.free), {_K_C, _K_PHI} <= set(self.free.tolist())
         along_share = (
-            self._moments(iterate, model) if has_share and covariance[_K_PHI, _K_PHI] <= MAX_MODULUS_SD**2 else None
+            self._moments(iterate, model, base) if has_share and covariance[_K_PHI, _K_PHI] <= MAX_MODULUS_SD**2 else None
         )
-        along_c = self._moments_along_c(iterate, model)
+        along_c = self._moments_along_c(iterate, model, base)
         if along_share is None and along_c is None:
             return mode, mode
         soil, gains, own = iterate.soil, iterate.gains.copy(), covariance
@@ -497,10 +497,11 @@ class Objective:
             own = to_square @ own @ to_square.T
         return self._gaussian(soil, gains, own), mode
 
-    def _moments_along_c(self, iterate: Iterate, model: QuadraticModel) -> Moments | None:
+    def _moments_along_c(self, iterate: Iterate, model: QuadraticModel, base: Array) -> Moments | None:
         """Moments (F + A) of coordinates and gains about the optimum, c being log-normal and the forces linear in it.
 
-        As along a share of k_c that is small, whose complement does not change.
+        As along a share of k_c that is small, whose complement does not change.  The prior is linearised at the model's
+        soil `base`, too: at another c what compensates for c is another share of tan phi.
         """
         if _C not in self.free:
             return None
@@ -511,8 +512,8 @@ class Objective:
         by_value = by_changes[place].copy()
         by_changes[place, _LOG_SHARE], by_value[_SHARE] = 1.0, 1.0
         by_logs = by_changes.copy()
-        by_logs[: len(self.free)] = self._log_directions(iterate.soil)[self.free] @ by_changes[: len(self.free)]
-        slopes = self.prior_factor.jacobian(iterate.soil, by_logs, {_C: by_value})
+        by_logs[: len(self.free)] = self._log_directions(base)[self.free] @ by_changes[: len(self.free)]
+        slopes = self.prior_factor.jacobian(base, by_logs, {_C: by_value})
         weighted = self.prior_factor.precision @ slopes
         quadratic = slopes.T @ weighted
         of_data, order = np.concatenate([[_SHARE], _OTHERS + np.arange(n - 1)]), np.concatenate([[place], others])
@@ -526,17 +527,20 @@ class Objective:
         back = np.argsort(order)
         return Moments(found.mean[back], found.covariance[back[:, None], back])
 
-    def _moments(self, iterate: Iterate, model: QuadraticModel) -> Moments | None:
-        """Moments of log s, s = k_c's share in K_L, of the other coordinates and of the gains, about the optimum."""
+    def _moments(self, iterate: Iterate, model: QuadraticModel, base: Array) -> Moments | None:
+        """Moments of log s, s = k_c's share in K_L, of the other coordinates and of the gains, about the optimum.
+
+        Linearised at the model's soil `base`, as in `_moments_along_c`.
+        """
         others = np.arange(1, len(model.gradient))
-        by_share = self._by_share(iterate.soil)
+        by_share = self._by_share(base)
         by_changes = np.zeros((len(others) + 1, len(others) + _OTHERS))  # of log k_c = log s K_L b, log (1 - s) K_L, ..
         by_changes[others, others + _OTHERS - 1] = 1.0
         by_changes[[_K_C, _K_PHI], _OTHERS:] = by_share[_K_C, 1:]
         by_changes[[_K_C, _K_PHI], [_LOG_SHARE, _LOG_REST]] = 1.0
         by_k_c = by_changes[_K_C].copy()
         by_k_c[[_SHARE, _LOG_SHARE]] = 1.0, 0.0
-        slopes = self.prior_factor.jacobian(iterate.soil, by_changes, {_K_C: by_k_c})
+        slopes = self.prior_factor.jacobian(base, by_changes, {_K_C: by_k_c})
         quadratic = slopes.T @ self.prior_factor.precision @ slopes
         of_data = np.concatenate([[_SHARE], others + _OTHERS - 1])
         quadratic[of_data[:, None], of_data] += by_share.T @ (model.information - model.prior_information) @ by_share
