@@ -489,13 +489,13 @@ class Objective:
             step = self._by_share(iterate.soil) @ along_share.mean
             soil = self.coordinates.soil_at(self.coordinates.position(iterate.soil) + step[:free])
             gains[self.active] += step[free:]
-            by_share = self._by_share(soil)
+            by_share = self._by_share(base)
             own = by_share @ along_share.covariance @ by_share.T
         if along_c is not None:  # about the optimum, at which c and tan phi make the strength that was measured
             square = along_c.covariance + np.outer(along_c.mean, along_c.mean)
             to_square = _root_of(square) @ np.linalg.inv(_root_of(covariance))
             own = to_square @ own @ to_square.T
-        return self._gaussian(soil, gains, own), mode
+        return self._gaussian(soil, gains, own, base), mode
 
     def _moments_along_c(self, iterate: Iterate, model: QuadraticModel, base: Array) -> Moments | None:
         """Moments (F + A) of coordinates and gains about the optimum, c being log-normal and the forces linear in it.
@@ -559,11 +559,15 @@ class Objective:
         return by_share
 
     def _gaussian(self, soil: Array, gains: Array, covariance: Array, base: Array | None = None) -> Gaussian:
-        """The Gaussian with this covariance (F + A, F + A) of coordinates and active gains, taken at soil `base`."""
+        """The Gaussian with this covariance (F + A, F + A) of coordinates and active gains, linearised at soil `base`."""
         free = len(self.free)
         jacobian = self._gain_directions[1:].copy()
         jacobian[:_SOIL, :free] = self._log_directions(soil if base is None else base)
-        return Gaussian(soil, gains, jacobian @ covariance @ jacobian.T)
+        logs = jacobian @ covariance @ jacobian.T
+        if base is None:
+            return Gaussian(soil, gains, logs)
+        of_base, prior = Gaussian(base, gains, logs), self.coordinates.prior
+        return of_base.relinearised(soil, gains, prior, self.coordinates.width)
 
     def gaussian_with(self, iterate: Iterate, covariance: Array) -> Gaussian:
         """The Gaussian at an iterate with this covariance (F + A, F + A) of coordinates and active gains."""
