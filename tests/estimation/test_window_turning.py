@@ -138,7 +138,7 @@ def test_diagonal_spin_before_a_vehicle_is_stuck_keeps_its_samples(yaw):
 
 @given(yaw=st.floats(-0.1, 0.1), slip=st.floats(0.05, 0.6), speed=st.floats(0.5, 2.0), known=st.booleans())
 def test_of_a_skid_steered_vehicle_slip_counts_where_wheels_slide_along_more_than_sideways(yaw, slip, speed, known):
-    """Sideways half the wheelbase times the yaw rate, along r omega - V; of the shear stress cos of the angle counts."""
+    """Sideways: half the wheelbase times the yaw rate; along: r omega - V; the stress along is cos of their angle."""
     rims = (speed - yaw * TRACK / 2.0 * np.array([1.0, -1.0, 1.0, -1.0])) / (1.0 - slip)
     rate = abs(yaw) if known else abs(yaw) / (1.0 - slip)  # without a yaw rate the rims bound it
     sideways, along = rate * 1.6 / 2.0, speed / (1.0 - slip) - speed

@@ -845,7 +845,9 @@ class Config(_Section):
         if self.track and (self.wheel or len(self.track) == 1) and any(t.axle is None for t in self.track):
             raise ValueError("a [[track]] beside [[wheel]]s, or alone, needs its axle")
         if len({t.rollers for t in self.track}) > 1:
-            raise ValueError("the [[track]]s of a vehicle need the same number of rollers: contact_length / roller_spacing")
+            raise ValueError(
+                "the [[track]]s of a vehicle need the same number of rollers: contact_length / roller_spacing"
+            )
         if len({t.axle is None for t in self.track}) > 1:
             raise ValueError("give the axle of all [[track]]s or, where they carry the whole vehicle, of none")
         object.__setattr__(self, "wheel", [*self.wheel, *(t.as_wheel() for t in self.track)])

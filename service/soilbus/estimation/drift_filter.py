@@ -82,7 +82,10 @@ def at_window_end(objective: Objective, fit: Fit, window: float, drift: float) -
         return fit
     step, covariance = _model_average(models)
     covariance[:free, :free] += np.eye(free) * drift**2 / (3.0 * PIECES)  # the end of the last piece is not its mean
-    at_optimum, drift_covariance = objective.gaussian_with(iterate, constant.covariance), covariance - constant.covariance
+    at_optimum, drift_covariance = (
+        objective.gaussian_with(iterate, constant.covariance),
+        covariance - constant.covariance,
+    )
 
     def shifted(gaussian: Gaussian) -> Gaussian:
         if gaussian is fit.mode and fit.marginalised is None:

@@ -52,7 +52,7 @@ LEAST_VALUE_STEPS, LEAST_VALUE_TOLERANCE = 20, 1e-3
 
 
 def deviations(soil: Array, base: Array, width: float) -> tuple[Array, Array]:
-    """Changes (6,) from a base (6,) to a soil (6,) in which windows are linear, and their derivatives by the logarithms.
+    """Changes (6,) from a base (6,) to a soil (6,) in which windows are linear, and derivatives by the logarithms.
 
     Each is that of the parameter's logarithm at the base.  There and elsewhere the LINEAR parameters change linearly;
     that of k_phi is log K_L less the part of k_c, K_L = k_c / width + k_phi; K changes by its logarithm.
@@ -200,7 +200,7 @@ class Gaussian:
         return replace(self, soil=soil, gains=gains, covariance=covariance - along @ removed)
 
     def _without_priors(self, prior: SoilPrior) -> tuple[NDArray[np.intp], Array]:
-        """Free parameters of LINEAR, and the covariance (6 + G, 6 + G) with the priors of their logarithms divided out."""
+        """Free parameters of LINEAR, and the covariance (6 + G, 6 + G) without the priors of their logarithms."""
         free = LINEAR[prior.log_std[LINEAR] > 0.0]
         unit, along = prior.log_std[free], self.covariance[:, free]
         removed, axes = np.linalg.eigh(np.eye(len(free)) - along[free] / np.outer(unit, unit))
@@ -273,6 +273,7 @@ class PriorFactor:
         self._mean = np.concatenate([np.log(gaussian_prior.soil[self._free]), gaussian_prior.gains[active]])
         self._zero_gradient, self._width = np.zeros(len(unknowns)), width
         self.least_value = 0.0
+        self._offset = np.zeros(_SOIL) if gaussian_prior.offset is None else gaussian_prior.offset
         self._is_likelihood_factor = gaussian_prior.offset is not None
         if self._is_likelihood_factor:
             self._linear = LINEAR[np.isin(LINEAR, self._free)]
@@ -309,7 +310,7 @@ class PriorFactor:
         if not self._is_likelihood_factor:
             return np.asarray(off)
         changes, _ = deviations(soil, self._gaussian_prior.soil, self._width)
-        off[: len(self._free)] = (changes - self._gaussian_prior.offset)[self._free]
+        off[: len(self._free)] = (changes - self._offset)[self._free]
         return np.append(off, np.log(soil[self._linear] / self._prior.median[self._linear]))
 
     def jacobian(self, soil: Array, by_logs: Array, by_values: Mapping[int, Array] | None = None) -> Array:
@@ -346,7 +347,7 @@ class PriorFactor:
         of_prior, soil, least = prior.log_std[linear] ** -2, base.copy(), math.inf
         for _ in range(LEAST_VALUE_STEPS):
             changes, by_logs = deviations(soil, base, self._width)
-            off, slopes = (changes - self._gaussian_prior.offset)[linear], by_logs[linear, linear]
+            off, slopes = (changes - self._offset)[linear], by_logs[linear, linear]
             log = np.log(soil[linear] / prior.median[linear])
             weighted = precision @ off
             least = min(least, float(off @ weighted + log @ (of_prior * log)))

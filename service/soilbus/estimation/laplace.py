@@ -164,7 +164,7 @@ def load_signal(problem: ObservationModel, fit: Fit) -> float:
 def profile_over_n(
     problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, found: Fit, has_nodes: bool = True
 ) -> ProfileOverN | None:
-    """Fits of the denoised window through its optimum near `found`, with nodes along n; None without such an optimum."""
+    """Fits of the denoised window through its optimum near `found`, with nodes along n; None without an optimum."""
     optimum = found.optimum
     denoised = DenoisedObservationModel(problem, optimum)
     start = Iterate(optimum.soil, optimum.gains, denoised.latents, np.inf, 1)

@@ -478,9 +478,8 @@ class Objective:
         covariance = inverse[1]
         mode = self._gaussian(iterate.soil, iterate.gains, covariance, base)
         free, has_share = len(self.free), {_K_C, _K_PHI} <= set(self.free.tolist())
-        along_share = (
-            self._moments(iterate, model, base) if has_share and covariance[_K_PHI, _K_PHI] <= MAX_MODULUS_SD**2 else None
-        )
+        has_share = has_share and bool(covariance[_K_PHI, _K_PHI] <= MAX_MODULUS_SD**2)
+        along_share = self._moments(iterate, model, base) if has_share else None
         along_c = self._moments_along_c(iterate, model, base)
         if along_share is None and along_c is None:
             return mode, mode
@@ -559,7 +558,7 @@ class Objective:
         return by_share
 
     def _gaussian(self, soil: Array, gains: Array, covariance: Array, base: Array | None = None) -> Gaussian:
-        """The Gaussian with this covariance (F + A, F + A) of coordinates and active gains, linearised at soil `base`."""
+        """The Gaussian with this covariance (F + A, F + A) of coordinates and active gains, linearised at `base`."""
         free = len(self.free)
         jacobian = self._gain_directions[1:].copy()
         jacobian[:_SOIL, :free] = self._log_directions(soil if base is None else base)
