@@ -61,6 +61,8 @@ def deviations(soil: Array, base: Array, width: float) -> tuple[Array, Array]:
     -------
     (6,), (6, 6)
     """
+    free = base > 0.0  # a parameter that is held may be zero
+    soil, base = np.where(free, soil, 1.0), np.where(free, base, 1.0)
     change, slopes = np.log(soil / base), np.eye(len(soil))
     value, start, by_log, unit = soil[LINEAR], base[LINEAR], soil[LINEAR], base[LINEAR]
     tan, tan_at_base = math.tan(soil[_PHI]), math.tan(base[_PHI])

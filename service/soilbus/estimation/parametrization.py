@@ -148,6 +148,12 @@ class Coordinates:
         low, high = self._log_bounds
         change = self.log_directions(soil)[self.free] @ step
         room = np.where(change > 0.0, high, low) - np.log(soil[self.free])
+        if _C in self._column:  # changes linearly, see `stepped`
+            room[self._column[_C]] = np.expm1(room[self._column[_C]])
+        if _PHI in self._column:
+            column, tan = self._column[_PHI], math.tan(soil[_PHI])
+            bound = math.tan(soil[_PHI] * math.exp(room[column]))
+            room[column] = (bound - tan) / (soil[_PHI] * (1.0 + tan**2))
         longest = MAX_LOG_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-12)
         return min(longest, step_fraction_within(room, change))
 

@@ -488,13 +488,13 @@ class Objective:
             step = self._by_share(iterate.soil) @ along_share.mean
             soil = self.coordinates.soil_at(self.coordinates.position(iterate.soil) + step[:free])
             gains[self.active] += step[free:]
-            by_share = self._by_share(base)
+            by_share = self._by_share(soil)
             own = by_share @ along_share.covariance @ by_share.T
         if along_c is not None:  # about the optimum, at which c and tan phi make the strength that was measured
             square = along_c.covariance + np.outer(along_c.mean, along_c.mean)
             to_square = _root_of(square) @ np.linalg.inv(_root_of(covariance))
             own = to_square @ own @ to_square.T
-        return self._gaussian(soil, gains, own, base), mode
+        return self._gaussian(soil, gains, own), mode
 
     def _moments_along_c(self, iterate: Iterate, model: QuadraticModel, base: Array) -> Moments | None:
         """Moments (F + A) of coordinates and gains about the optimum, c being log-normal and the forces linear in it.

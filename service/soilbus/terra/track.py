@@ -60,8 +60,8 @@ SERIES_BELOW = 0.02
 """u below which g and its derivative are power series: above, rounding costs them less than 1e-13 of their value."""
 SERIES_TERMS = 9
 """Terms of these: the first one left out is below 1e-16 of the sum."""
-NODES_PER_PERIOD = 16
-"""Gauss nodes in each period of the pressure: 4e-8 of the thrust where j grows to 60 K on three rollers."""
+NODES_PER_PERIOD = 32
+"""Gauss nodes in each period of the pressure: 1e-8 of the thrust where j grows to 200 K on three rollers."""
 
 
 def _from_series(u: Array, near: Array, by_u: Array, coefficients: Sequence[float]) -> tuple[Array, Array]:
