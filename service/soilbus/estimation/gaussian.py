@@ -4,17 +4,17 @@ Equations.  With x = (log soil, gains), mean m and covariance C, the prior's res
 
     p = x - m,    -2 log prior = p' C^-1 p                                         (log-normal in all parameters)
 
-or, for a likelihood factor, which is Gaussian in y = k_c, tan phi, c themselves, with offset e in units of their
-change with the logarithm at the soil y0,
+or, for a likelihood factor, which is Gaussian in y = k_c, n, tan phi and c themselves and in log K_L in place of
+log k_phi (`deviations`), with offset e in units of their change with the logarithm at the soil y0,
 
     p_y = (y - y0) / (dy/dlog)_0 - e,    p_R = log parameter - log prior median
     -2 log prior = p' diag(C^-1, prior sd^-2) p - least value
 
 A window determines combinations of soil and gains, so its posterior is kept jointly.  Gains do not change from
 window to window; without their covariance with the soil the same ignorance would count as new information each
-time.  Forces are nearly linear in k_c and linear in c and tan phi, so several windows multiply as Gaussians of these
-and not of their logarithms: a likelihood factor is a posterior with the log-normal priors of k_c, phi and c divided
-out, in that form.  At one load a window determines A c + W tan phi alone, a straight line in (c, tan phi) and a curve
+time.  Forces are linear in c and tan phi and nearly so in k_c, the logarithm of pressure is linear in n, so several
+windows multiply as Gaussians of these and not of their logarithms: a likelihood factor is a posterior with their
+log-normal priors divided out, in that form.  At one load a window determines A c + W tan phi alone, a straight line in (c, tan phi) and a curve
 in logarithms: two windows linearised at two points of the curve would seem to determine c where they cross.
 """
 
