@@ -14,8 +14,9 @@ A window determines combinations of soil and gains, so its posterior is kept joi
 window to window; without their covariance with the soil the same ignorance would count as new information each
 time.  Forces are linear in c and tan phi and nearly so in k_c, the logarithm of pressure is linear in n, so several
 windows multiply as Gaussians of these and not of their logarithms: a likelihood factor is a posterior with their
-log-normal priors divided out, in that form.  At one load a window determines A c + W tan phi alone, a straight line in (c, tan phi) and a curve
-in logarithms: two windows linearised at two points of the curve would seem to determine c where they cross.
+log-normal priors divided out, in that form.  At one load a window determines A c + W tan phi alone, a straight line in
+(c, tan phi) and a curve in logarithms: two windows linearised at two points of the curve would seem to determine c
+where they cross.
 """
 
 from __future__ import annotations

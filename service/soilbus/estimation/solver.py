@@ -494,6 +494,10 @@ class Objective:
             square = along_c.covariance + np.outer(along_c.mean, along_c.mean)
             to_square = _root_of(square) @ np.linalg.inv(_root_of(covariance))
             own = to_square @ own @ to_square.T
+            place, prior_sd = int(np.searchsorted(self.free, _C)), float(self.coordinates.prior.log_std[_C])
+            scale = np.ones(len(own))
+            scale[place] = min(1.0, prior_sd / math.sqrt(own[place, place]))  # c is known no less than beforehand
+            own = scale[:, None] * own * scale
         return self._gaussian(soil, gains, own), mode
 
     def _moments_along_c(self, iterate: Iterate, model: QuadraticModel, base: Array) -> Moments | None:
