@@ -25,13 +25,15 @@ from soilbus.estimation.assembly import UNKNOWN_SHARE, chassis_of, effects_of
 from soilbus.simulator.course import positions
 from soilbus.simulator.drivetrain import Drivetrain, drivetrain_of
 from soilbus.simulator.equilibrium import Equilibrium, Mechanics, Situation, sinkages, solve, surroundings, wheel_slips
-from soilbus.simulator.scenario import SAMPLE_RATE, Scenario, Swing, realise, soil_along, soil_names
+from soilbus.simulator.scenario import SAMPLE_RATE, Scenario, Swing, oscillation, realise, soil_along, soil_names
 from soilbus.terra.effects.effect import Active, Surroundings
 from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads, pull_required
 from soilbus.terra.wheel import WheelModel
 
-_MASS_STREAM = 3
-"""Names the random numbers of the true mass, which disturb no others."""
+_MASS_STREAM, _BOUNCE_STREAM = 3, 4
+"""Name the random numbers of the true mass and of bouncing wheels, which disturb no others."""
+_LARGEST_LOSS = 0.9
+"""Share of its load that a bouncing wheel loses at most: quasi-static wheels do not jump."""
 
 
 class SimulationError(Exception):
@@ -108,7 +110,8 @@ def drive(config: Config, scenario: Scenario, seed: int, effects: Sequence[Activ
     pitch = np.zeros_like(t) if climbs else np.interp(speed.integral, knots[:, 0], knots[:, 1])
     motion = _Motion(t, speed.integral, speed.value, speed.rate, pitch)
     drivetrain = drivetrain_of(config)
-    situation, side = _situation(config.wheel, chassis, scenario, motion, drivetrain, climbs, rng)
+    bounce = _bounce(config.wheel, scenario, t, seed)
+    situation, side = _situation(config.wheel, chassis, scenario, motion, drivetrain, climbs, bounce, rng)
     rear = np.array([wheel.axle == "rear" for wheel in config.wheel])
     model, length = WheelModel(shear_law=config.model.shear_law), float(motion.distance[-1])
     mechanics = Mechanics(model, rear, chassis.mass, scenario.duration, length, drivetrain, present, climbs)
@@ -170,6 +173,20 @@ def _chassis(config: Config, scenario: Scenario, seed: int) -> Chassis:
     return replace(chassis, mass=chassis.mass + float(drawn[0]), cg_ahead_of_rear_axle=float(ahead))
 
 
+def _bounce(wheels: Sequence[Wheel], scenario: Scenario, t: Array, seed: int) -> Array:
+    """What bounce and roll of each axle add to the loads of its wheels (W, N), over these."""
+    if not scenario.bounce:
+        return np.zeros((len(wheels), len(t)))
+    rng = np.random.default_rng([seed, _BOUNCE_STREAM])
+    modes = {axle: (oscillation(t, rng), oscillation(t, rng)) for axle in ("front", "rear")}
+    of_wheels = []
+    for wheel in wheels:
+        up, roll = modes[str(wheel.axle)]
+        mates = [w.name for w in wheels if w.axle == wheel.axle]
+        of_wheels.append(up + (roll if mates.index(wheel.name) < len(mates) / 2.0 else -roll))
+    return np.asarray(np.maximum(scenario.bounce * np.sqrt(0.5) * np.stack(of_wheels), -_LARGEST_LOSS))
+
+
 def _roll(config: Config, side: Array) -> Array:
     """Roll [rad] (N,), left side up, of a side slope that shifts this share of the load to the left."""
     assert config.vehicle is not None  # _chassis sees to it
@@ -185,12 +202,13 @@ def _situation(
     motion: _Motion,
     drivetrain: Drivetrain,
     climbs: bool,
+    bounce: Array,
     rng: np.random.Generator,
 ) -> tuple[Situation, Array]:
     """What is given, and the share (N,) of its axle's load that a side slope shifts to the left."""
     shape = (len(wheels), len(motion.t))
     side = realise(scenario.side_shift, motion.t, rng).value
-    share = np.stack([_load_share(wheels, i, side) for i in range(len(wheels))])
+    share = np.stack([_load_share(wheels, i, side) for i in range(len(wheels))]) * (1.0 + bounce)
 
     def loads(draft: float, inertia: float = 0.0) -> Array:
         front, rear = axle_loads(chassis, draft, motion.pitch, motion.acceleration + inertia)

@@ -23,7 +23,7 @@ import numpy as np
 from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import chassis_of, rig_of
-from soilbus.estimation.instrumentation import Row, unit
+from soilbus.estimation.instrumentation import UNKNOWN_SIDE_SHARE, Row, unit
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import SAMPLE_RATE
 from soilbus.terra.vehicle import GRAVITY, axle_loads
@@ -196,13 +196,15 @@ class _Instants:
     def noise(self, value: Array) -> Array:
         """Sd of each reading (N, R) of these values."""
         sd, computed = np.empty_like(value), self.config.noise.computed_load.relative
+        of_slope = UNKNOWN_SIDE_SHARE * (self.config.signals.roll is None)
         load, _, torque = self._forces(self.latents, self.log_soil)
         grip = load * [wheel.radius for wheel in self.config.wheel]
         for k, row in enumerate(self.of):
             if row.kind not in ("channel", "vehicle"):
                 of_row = {
                     "weight": computed / 2.0 * row.scale, "transfer": computed / 2.0 * row.scale,
-                    "side": computed / np.sqrt(2.0) * row.scale, "free": BEARING * grip @ np.abs(row.weight),
+                    "side": np.hypot(computed / np.sqrt(2.0), of_slope) * row.scale,
+                    "free": BEARING * grip @ np.abs(row.weight),
                     "coupling": row.bias * np.abs(torque) @ np.abs(row.weight),
                 }  # fmt: skip
                 sd[:, k] = of_row[row.kind] / np.sqrt(EVERY)
