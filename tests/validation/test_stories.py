@@ -39,7 +39,9 @@ def test_go_is_said_where_the_truth_allows_it_and_nowhere_else(machine, seeds):
     assert go > 10 * len(seeds)
 
 
-@pytest.mark.parametrize(("machine", "seeds"), [("tractor", range(4)), ("tractor-2wd", (0, 4)), ("tractor-axles", (0, 4))])
+@pytest.mark.parametrize(
+    ("machine", "seeds"), [("tractor", range(4)), ("tractor-2wd", (0, 4)), ("tractor-axles", (0, 4))]
+)
 def test_an_estimator_that_is_given_nothing_says_no_more_than_the_truth(machine, seeds):
     go = 0
     for seed in seeds:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
 
 from soilbus.arrays import Array
 from soilbus.simulator.course import NORTHWARD, Course
@@ -199,12 +198,14 @@ def oscillation(t: Array, rng: np.random.Generator) -> Array:
 
     x'' + 2 zeta w x' + w^2 x = white noise, sampled without error: an autoregression of second order
     """
+    from scipy.signal import lfilter  # not needed without
+
     w = 2.0 * np.pi * rng.uniform(*_BOUNCE_BAND)
     decay, turn = np.exp(-_BOUNCE_DAMPING * w / SAMPLE_RATE), w * np.sqrt(1.0 - _BOUNCE_DAMPING**2) / SAMPLE_RATE
     settled = round(10.0 * SAMPLE_RATE)
     noise = rng.standard_normal(len(t) + settled)
-    mode = lfilter([1.0], [1.0, -2.0 * decay * np.cos(turn), decay**2], noise)[settled:]
     a, b = 2.0 * decay * np.cos(turn), -(decay**2)
+    mode = lfilter([1.0], [1.0, -a, -b], noise)[settled:]
     variance = (1.0 - b) / ((1.0 + b) * ((1.0 - b) ** 2 - a**2))
     return np.asarray(mode / np.sqrt(variance))
 
