@@ -6,10 +6,11 @@ import errno
 import os
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from soilbus.files import NotWritten, placed, whole_file
+from soilbus.files import NotWritten, placed, whole_file, whole_file_of_bytes
 
 
 @pytest.fixture(params=[True, False], ids=["unnamed", "hidden"])
@@ -83,6 +84,13 @@ def test_what_a_killed_process_left_under_a_hidden_name_is_in_nobodys_way(folder
     (folder / f".soilbus-{os.getpid()}").write_text("left")
     put(folder / "out", b"x")
     assert list(folder.iterdir()) == [folder / "out"]
+
+
+@pytest.mark.parametrize("opened", [whole_file, whole_file_of_bytes])
+def test_a_file_that_cannot_be_written_to_its_end_is_none(folder: Path, opened: Any):
+    with pytest.raises(NotWritten, match="out: no space"), opened(folder / "out") as out:
+        raise OSError(f"no space after {out.tell()} bytes")
+    assert list(folder.iterdir()) == []
 
 
 def test_a_folder_that_is_not_there_is_one_line(folder: Path):

@@ -113,3 +113,16 @@ def whole_file(path: Path) -> Iterator[IO[str]]:
             yield out
     except OSError as error:
         raise NotWritten(f"{path}: {error.strerror or error}") from None
+
+
+@contextmanager
+def whole_file_of_bytes(path: Path) -> Iterator[IO[bytes]]:
+    """A binary file that appears under its name only when it is complete.
+
+    Raises NotWritten where it cannot be, and then there is none.
+    """
+    try:
+        with placed(path) as descriptor, open(descriptor, "wb", closefd=False) as out:
+            yield out
+    except OSError as error:
+        raise NotWritten(f"{path}: {error.strerror or error}") from None

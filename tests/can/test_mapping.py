@@ -342,3 +342,30 @@ def test_what_cannot_be_checked_is_a_fault(tmp_path: Path) -> None:
         "dbc.checked: no message Moto in the DBC; did you mean Motor?",
         "dbc.checked: Motor has no Counter and byte-aligned 8-bit Checksum",
     ]
+
+
+def test_a_percentage_times_its_reference_is_a_torque_at_the_shaft(tmp_path):
+    c = config(tmp_path, torque={"signal": "Wheel.Grade", "reference_torque": 800.0})
+    (channel,) = channels_of(c, load_databases(c))
+    assert channel.factor == pytest.approx(800.0 / 100.0 * 20.0)  # N m at the wheel for one per cent
+    assert without_unit([channel], load_databases(c)) == []
+
+
+@pytest.mark.parametrize(
+    ("wheel", "fault"),
+    [
+        ({"torque": {"signal": "Motor.Torque", "reference_torque": 800.0}}, "Torque is in Nm; with"),
+        ({"torque": {"signal": "Wheel.Bare", "reference_torque": 800.0}}, "Bare is in no unit; with"),
+        ({"speed": {"signal": "Wheel.Grade", "reference_torque": 800.0}}, "no meaning for speed"),
+        ({"torque": "Wheel.Grade"}, "or for a torque its reference_torque"),
+    ],
+)
+def test_a_reference_torque_is_for_a_percentage_of_torque(tmp_path, wheel, fault):
+    (line,) = faults(tmp_path, **wheel)
+    assert fault in line
+
+
+def test_a_current_and_a_percentage_exclude_each_other(tmp_path):
+    both = {"signal": "Wheel.Grade", "reference_torque": 800.0, "torque_constant": 0.6}
+    with pytest.raises(ConfigError, match="leave out one of the two"):
+        config(tmp_path, torque=both)

@@ -55,6 +55,7 @@ def test_a_channel_counts_by_its_own_residuals_and_is_forgotten():
     for t in range(100):
         watch.take(float(t), {"torque": Square(400.0, 400), "draft": Square(150.0, 100)})
     assert watch.gaps() == {"draft": pytest.approx(1.5)}
+    assert watch.chi2() == {"torque": pytest.approx(1.0), "draft": pytest.approx(1.5)}
     for t in range(100, 300):
         watch.take(float(t), {"torque": Square(400.0, 400), "draft": Square(100.0, 100)})
     assert watch.gaps() == {}

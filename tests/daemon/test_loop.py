@@ -142,6 +142,42 @@ def test_advice_limits_and_forecast_are_those_of_the_result(recording):
         assert frame["Sinkage"] == pytest.approx(1e3 * forecast.deepest.value, abs=0.251)
 
 
+def test_present_draft_is_that_of_the_vehicles_own_frames_and_blank_without_them(recording):
+    bench = Bench(recording)
+    bench.run(DURATION + 2.0)
+    of_hitch = load_databases(bench.config).get_message_by_name("DrawbarPin")
+    drafts = [
+        (m.timestamp, of_hitch.decode(bytes(m.data))["Draft"])
+        for m in recording
+        if m.arbitration_id == of_hitch.frame_id
+    ]
+    sent = [(f["at"] + bench.wire.offset, f["Draft"], f["Slope"]) for f in bench.sent("PresentDemand")]
+    compared = [f for f in sent if recording[0].timestamp + 2.0 < f[0] < recording[-1].timestamp - 0.2]
+    assert len(compared) > 100
+    for at, draft, slope in compared[::10]:
+        of_last = [value for t, value in drafts if at - 0.4 < t < at]
+        assert min(of_last) <= draft <= max(of_last)
+        assert abs(slope) < 0.1
+    assert (str(sent[-1][1]), str(sent[-1][2])) == ("not_available", "not_available")
+
+
+def test_quality_of_a_window_names_refusals_and_chi_square_of_each_channel(recording):
+    of_hitch = load_databases(reference_configuration()).get_message_by_name("DrawbarPin")
+    broken = [copy(message) for message in recording]
+    bad = [m for m in broken if m.arbitration_id == of_hitch.frame_id][::50]
+    for message in bad:
+        message.data = bytes((*message.data[:7], message.data[7] ^ 1))
+    bench = Bench(broken)
+    bench.run(DURATION)
+    for result, frame in zip(bench.results, bench.sent("WindowQuality"), strict=True):
+        assert frame["Window"] == result.index % 251
+        assert str(frame["RejectedReason"]) == "bad_checksum"
+        assert frame["Rejected"] == sum(result.rejected.values()) >= len(bad) / 2
+        assert set(result.channel_chi2) == {"torque", "draft", "sinkage"}
+        for channel, chi2 in result.channel_chi2.items():
+            assert frame[f"Chi2{channel.capitalize()}"] == pytest.approx(chi2, abs=0.026)
+
+
 def test_the_warning_is_unknown_until_slip_is_known_and_when_the_bus_falls_silent(recording):
     bench = Bench(recording)
     bench.run(DURATION + 4.0)

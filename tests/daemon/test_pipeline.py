@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from soilbus.can.dbc_files import load_databases
 from soilbus.config.file import load_config
 from soilbus.decision.traversability import State, Status
-from soilbus.pipeline.outputs import json_line
+from soilbus.pipeline.outputs import flat_record, json_line, window_record
 from soilbus.pipeline.pipeline import Pipeline
 
 FIELD_TOML = Path(__file__).resolve().parents[1] / "field/field.toml"
@@ -231,20 +231,11 @@ def test_json_lines_have_the_keys_of_the_design(name, whole):
     assert np.diff([r.t for r in results]) == pytest.approx(np.ones(len(results) - 1))
 
 
-def flat(value, path: str = ""):
-    """Leaves of nested JSON by path."""
-    if isinstance(value, list):
-        value = dict(enumerate(value))
-    if isinstance(value, dict):
-        return {k: v for key, inner in value.items() for k, v in flat(inner, f"{path}.{key}").items()}
-    return {path: value}
-
-
 def same(results, expected, config) -> bool:
     """All numbers equal but for the order in which a bin's samples were added up."""
     assert len(results) == len(expected)
     for a, b in zip(results, expected, strict=True):
-        one, other = (flat(json.loads(json_line(r, config))) for r in (a, b))
+        one, other = (flat_record(window_record(r, config)) for r in (a, b))
         assert one.keys() == other.keys()
         for key, value in one.items():
             assert value == (pytest.approx(other[key], rel=1e-7) if isinstance(value, float) else other[key]), key

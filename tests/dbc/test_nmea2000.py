@@ -51,3 +51,22 @@ def test_a_position_off_the_american_coast():
 )
 def test_codes_without_a_place(payload, reasons):
     assert verdicts(payload) == reasons
+
+
+@pytest.mark.parametrize(
+    ("message", "pgn", "signal", "payload", "value"),
+    [
+        ("Attitude", 127257, "Pitch", "00ff7fe803ff7fff", 0.1),
+        ("Attitude", 127257, "Roll", "00ff7fff7f18fcff", -0.1),
+        ("RateOfTurn", 127251, "Rate", "000048e801ffffff", 1.0),
+        ("CourseAndSpeedRapidUpdate", 129026, "SpeedOverGround", "00fcffff8c00ffff", 1.4),
+    ],
+)
+def test_what_an_inertial_or_satellite_receiver_sends(message, pgn, signal, payload, value):
+    layout = DATABASE.get_message_by_name(message)
+    assert pgn_of(layout.frame_id) == pgn
+    assert pgn in STANDARD_PGNS
+    assert layout.decode(bytes.fromhex(payload))[signal] == pytest.approx(value)
+    for each in layout.signals:
+        code = max(code for code, name in each.choices.items() if str(name) == "not_available")
+        assert each.raw_to_scaled(code, decode_choices=False) > each.maximum

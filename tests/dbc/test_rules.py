@@ -97,7 +97,8 @@ def test_generated_struct_members_are_no_words_of_c_or_cpp():
 def test_fast_frames_are_fast_and_all_results_are_protected():
     messages = {message.name: message for message in load("soilbus").messages}
     fast = {name for name, message in messages.items() if message.cycle_time == 100}
-    assert fast == {"WheelSlip", "WheelSlip2", "Traversability", "TorqueDemand", "DemandForecast"}
+    fast_ones = {"WheelSlip", "WheelSlip2", "Traversability", "TorqueDemand", "DemandForecast", "PresentDemand"}
+    assert fast == fast_ones
     assert all(message.cycle_time == 1000 for name, message in messages.items() if name not in fast)
     for message in messages.values():
         places = {signal.name: (signal.start, signal.length) for signal in message.signals}
@@ -190,3 +191,13 @@ def test_generated_c_code_compiles_and_decodes_as_cantools(name, tmp_path):
         expected = message.decode(data, decode_choices=False)
         for signal, value in zip(message.signals, values, strict=True):
             assert float(value) == pytest.approx(expected[signal.name], rel=1e-12, abs=1e-12), signal.name
+
+
+def test_every_reason_of_a_refusal_has_its_code():
+    from soilbus.can.channels import Reason
+
+    of_window = load("soilbus").get_message_by_name("WindowQuality").get_signal_by_name("RejectedReason")
+    names = [str(of_window.choices[code]) for code in range(int(of_window.maximum) + 1)]
+    of_reason = {Reason.NOT_AVAILABLE: "no_value", Reason.ERROR: "sensor_error"}
+    assert names == ["none", *(of_reason.get(reason, str(reason)) for reason in Reason), "outlier"]
+    assert set(of_window.choices) == {*range(len(names)), 254, 255}

@@ -108,7 +108,10 @@ def test_text_has_verdict_effect_physics_and_soil(diagnosed):
 
 def test_report_needs_nothing_but_itself(diagnosed):
     report = diagnosed.report
-    assert len(re.findall("<img alt='residuals (?:before|after)' src='data:image/png;base64,", report)) == 2
+    assert re.findall('<img alt="residuals (before|after): gap [0-9.]+" src="data:image/png;base64,', report) == [
+        "before",
+        "after",
+    ]
     assert set(re.findall(r"""(?:src|href|url)\s*[=(]\s*['"]?(.{5})""", report)) == {"data:"}
     assert "Candidates for effect 1" in report
     assert "<td>multipass</td>" in report

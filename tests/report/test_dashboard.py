@@ -1,9 +1,11 @@
-"""The terminal dashboard believes only fresh frames with a right checksum."""
+"""The dashboard believes only fresh frames with a right checksum, and says the state at a glance on any terminal."""
 
 from __future__ import annotations
 
-import errno
+import functools
 import io
+import itertools
+import math
 import re
 
 import can
@@ -11,55 +13,259 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from soilbus.can.bus import BusError, LiveBus
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.dbc_files import output_database
 from soilbus.can.publish import Publisher
-from soilbus.report.dashboard import panel, show
+from soilbus.report.block_letters import in_cells, in_half_cells
+from soilbus.report.dashboard import Dashboard, Vehicle
 from soilbus.report.received_frames import ReceivedFrames
+from soilbus.report.text_charts import area, bar, sparkline
+from soilbus.report.watch import page
 from soilbus.simulator.reference import reference_configuration
-from soilbus.validation.fakes import FakeClock, ScriptedBus
+from soilbus.validation.fakes import FakeClock
 
-WIDTH = 80
-"""Columns of the narrowest terminal."""
+SIZES = [(80, 24), (120, 40), (200, 60)]
+SMALLER = [(79, 24), (72, 20), (71, 24), (80, 19), (40, 12), (20, 6), (9, 3)]
+PAGES = ("driver", "engineer")
+CONFIG = reference_configuration()
+
+
+class Desk:
+    """A dashboard, what sends to it, and its clock."""
+
+    def __init__(self, vehicle: Vehicle | None = None) -> None:
+        database = output_database(CONFIG)
+        self.clock, self.publisher = FakeClock(), Publisher(database)
+        self.known = ReceivedFrames(database, self.clock)
+        self.dashboard = Dashboard(self.known, vehicle or Vehicle.of(CONFIG))
+
+    def send(self, name: str, **values) -> None:
+        self.known.receive(message(self.publisher.frame(name, values)))
+        self.dashboard.sample()
+
+    def send_all(self, **changed) -> None:
+        """Every frame, some with other values."""
+        for name, values in WHOLE.items():
+            self.send(name, **(values | changed.get(name, {})))
+
+    def text(self, name: str, size=(120, 40), **console) -> str:
+        paper = Console(file=io.StringIO(), width=size[0] + 20, height=size[1], **console)
+        paper.print(page(self.dashboard, name, *size), end="")
+        return paper.file.getvalue()
 
 
 @pytest.fixture
-def setup():
-    database = output_database(reference_configuration())
-    clock = FakeClock()
-    return Publisher(database), ReceivedFrames(database, clock), clock
+def desk() -> Desk:
+    return Desk()
+
+
+@pytest.fixture
+def setup(desk):
+    return desk.publisher, desk.known, desk.clock
 
 
 def message(frame) -> can.Message:
     return can.Message(arbitration_id=frame.arbitration_id, is_extended_id=frame.extended, data=frame.data)
 
 
-def shown(dashboard) -> str:
-    console = Console(width=2 * WIDTH, record=True, file=io.StringIO())
-    console.print(panel(dashboard))
-    return console.export_text()
+WHOLE = {
+    "SoilbusStatus": {"State": "valid", "Reason": "none", "RejectedShare": 2.0, "DeadlineMisses": 4, "Window": 7},
+    "SoilbusIdentity": {"VersionMajor": 0, "VersionMinor": 3, "VersionPatch": 1, "Uptime": 5},
+    "WheelSlip": {f"SlipWheel{i}": 0.11 for i in range(1, 5)},
+    "WheelSlip2": {"SlipWheel5": 0.15, "SlipWheel6": 0.16},
+    "Traversability": {
+        "State": "go", "LimitingCause": "slip", "Probability": 0.97, "Age": 0.4, "SinceValid": 1.4, "Window": 7
+    },
+    "TorqueDemand": {"TorqueRequired": 3456, "TorqueAvailable": 9600},
+    "DraftCapability": {"MaxDraft": 6410, "MaxDraftStd": 110},
+    "GradeCapability": {"MaxGrade": 0.271, "MaxGradeStd": 0.004},
+    "SoilStrength": {"BearingPressure": 99.1, "BearingPressureStd": 0.45, "Chi2": 1.3},
+    "SoilCohesiveModulus": {"Value": 5.3, "Std": 2.0},
+    "SoilFrictionalModulus": {"Value": 1515.0, "Std": 30.0},
+    "SoilSinkageExponent": {"Value": 0.7, "Std": 0.02},
+    "SoilFrictionAngle": {"Value": 29.0, "Std": 0.6},
+    "SoilCohesion": {"Value": 1.7, "Std": 0.4},
+    "SoilShearModulus": {"Value": 25.0, "Std": 3.0},
+    "WheelSinkage": {f"SinkageWheel{i}": 31.0 for i in range(1, 5)},
+    "WheelSinkage2": {"SinkageWheel5": 35.0, "SinkageWheel6": 36.0},
+    "TractionAdvice": {
+        "SlipForEfficiencyFront": 0.12, "SlipForEfficiencyRear": 0.1, "SlipForPullFront": 0.6, "SlipForPullRear": 0.55
+    },
+    "TractionLimits": {"MaxDraft": 5900, "MaxDraftStd": 120, "MaxGrade": 0.13, "MaxGradeStd": 0.006},
+    "DemandForecast": {"Slip": 0.21, "SlipStd": 0.01, "Sinkage": 44.0, "Warning": "immobilisation", "TimeLeft": 4.2},
+    "SoilClass": {"Kind": "sandy_loam_15", "Probability": 0.93, "UnknownProbability": 0.05},
+    "PresentDemand": {"Draft": 3120, "Slope": 0.02},
+    "WindowQuality": {
+        "Chi2Torque": 1.05, "Chi2Draft": 2.35, "Chi2Sinkage": 0.95, "RejectedReason": "bad_checksum", "Rejected": 17
+    },
+    "BusHealth": {"BusState": "error_passive", "Overruns": 7, "Dropped": 3, "ErrorFrames": 21, "Reopened": 2},
+}  # fmt: skip
+SAID = {
+    "SoilbusStatus": (r"state +valid", r"inputs +2\.0 %", r"late windows +4"),
+    "SoilbusIdentity": (r"version +0\.3\.1, up 5 s",),
+    "WheelSlip": (r"FR +\+11\.0",), "WheelSlip2": (r"5 +\+15\.0", r"6 +\+16\.0"),
+    "Traversability": (r" GO, limit: slip, p = 0\.97", r"data 0\.4 s old, valid 1\.4 s ago"),
+    "TorqueDemand": (r"torque 3456 of 9600 N m",), "DraftCapability": (r"on the level +6410 ± 110",),
+    "GradeCapability": (r"27\.8 ± 0\.43",), "SoilStrength": (r"bearing +99\.1 ± 0\.45 +kPa", r"window +1\.3"),
+    "SoilCohesiveModulus": (r"k_c +5\.3 ± 2 ",), "SoilFrictionalModulus": (r"k_φ +1515 ± 30 ",),
+    "SoilSinkageExponent": (r"n +0\.7 ± 0\.02",), "SoilFrictionAngle": (r"φ +29 ± 0\.6 +°",),
+    "SoilCohesion": (r"c +1\.7 ± 0\.4 +kPa",), "SoilShearModulus": (r"K +25 ± 3 +mm",),
+    "WheelSinkage": (r"RL +\S+ +31",), "WheelSinkage2": (r"5 +\S+ +35", r"6 +\S+ +36"),
+    "TractionAdvice": (r"efficiency +12 +10", r"most pull +60 +55"), "TractionLimits": (r"here +5900 ± 120 +13\.1 ±",),
+    "DemandForecast": (r"slip to come 21 %", r"sinkage to come 44 mm", r": getting stuck in 4 s"),
+    "SoilClass": (r"soil: sandy_loam_15  \(0\.93\)",),
+    "PresentDemand": (r"now +3120 +2\.0",),
+    "WindowQuality": (r"torque +1\.05", r"draft +2\.35", r"sinkage +0\.95", r"in window +17, most bad_checksum"),
+    "BusHealth": (r"bus +error_passive", r"overruns 7 dropped 3", r"errors 21 reopened 2"),
+}  # fmt: skip
 
 
-def test_what_was_sent_is_shown(setup):
-    publisher, dashboard, _ = setup
-    dashboard.receive(message(publisher.frame("Traversability", {"State": "no_go", "Probability": 0.25})))
-    dashboard.receive(message(publisher.frame("SoilStrength", {"BearingPressure": 99.1, "BearingPressureStd": 0.4})))
-    dashboard.receive(message(publisher.frame("WheelSlip", {"SlipWheel2": -0.125})))
-    text = shown(dashboard)
-    assert "NO-GO" in text
-    assert "p = 0.25" in text
-    assert "99.1 ± 0.4" in text
-    assert "-0.12" in text
+@pytest.mark.parametrize("size", SIZES)
+def test_every_frame_is_on_the_engineers_page_and_gone_when_it_is_stale(desk, size):
+    assert set(SAID) == set(WHOLE) == set(desk.publisher.schedule)
+    desk.send("SoilbusStatus")
+    for name, values in WHOLE.items():
+        desk.clock.now += 0.01
+        desk.send(name, **values)
+        text = desk.text("engineer", size)
+        if name == "Traversability":  # before the warning takes its place
+            assert re.search(SAID[name][0], text)
+        for words in SAID[name][name == "Traversability" :]:
+            assert re.search(words, text), (name, words)
+    desk.clock.now += 4.0
+    text = desk.text("engineer", size)
+    assert [words for said in SAID.values() for words in said if re.search(words, text)] == []
 
 
-def test_a_stale_go_is_no_go_any_more(setup):
-    publisher, dashboard, clock = setup
-    dashboard.receive(message(publisher.frame("Traversability", {"State": "go", "Probability": 0.99})))
-    assert dashboard.value("Traversability", "State") == "go"
-    clock.now += 1.0
-    assert dashboard.value("Traversability", "State") is None
-    assert " UNKNOWN " in shown(dashboard)
+@pytest.mark.parametrize("name", PAGES)
+@pytest.mark.parametrize("size", SIZES + SMALLER)
+def test_no_line_is_longer_than_the_terminal_is_wide_and_no_page_higher(desk, name, size):
+    for _ in range(3):
+        desk.send_all()
+        lines = desk.text(name, size).splitlines()
+        assert max(map(len, lines)) <= size[0]
+        assert len(lines) <= size[1]
+        if size in SIZES:
+            assert len(lines) == size[1]
+        assert "…" not in "".join(lines)
+        desk.clock.now += 2.0
+
+
+@pytest.mark.parametrize("size", SIZES + SMALLER)
+def test_no_payload_whatever_breaks_a_page(desk, size):
+    rng = np.random.default_rng(11)
+    for _ in range(6):
+        for layout in output_database(CONFIG).messages:
+            data = bytearray(rng.bytes(layout.length))
+            data[7] = frame_checksum(layout.frame_id, bytes(data), 7)
+            desk.known.receive(can.Message(arbitration_id=layout.frame_id, is_extended_id=True, data=data))
+        desk.clock.now += 0.1
+        desk.dashboard.sample()
+        for name in PAGES:
+            lines = desk.text(name, size).splitlines()
+            assert max(map(len, lines)) <= size[0]
+            assert len(lines) <= size[1]
+    assert desk.known.value("SoilbusIdentity", "Uptime") is not None
+
+
+STATES = ("go", "caution", "no_go", "unknown")
+LIMITS = ("none", "torque", "traction", "slip", "sinkage", None)
+REASONS = [
+    str(name)
+    for message in output_database(CONFIG).messages
+    for signal in message.signals
+    if (message.name, signal.name) == ("SoilbusStatus", "Reason")
+    for name in (signal.choices or {}).values()
+]
+
+
+@functools.cache
+def verdicts() -> list:
+    """A verdict of every state, limit, warning and reason, and of silence."""
+    return list(made_verdicts())
+
+
+def made_verdicts():
+    for state, limit, warning in itertools.product(STATES, LIMITS, ("none", "immobilisation")):
+        for reason in REASONS if state == "unknown" else ("none",):
+            desk = Desk()
+            desk.send("SoilbusStatus", State="valid", Reason=reason, Window=3)
+            desk.send("Traversability", State=state, LimitingCause=limit, Probability=0.5)
+            desk.send("DemandForecast", Warning=warning, TimeLeft=6.0)
+            yield state, warning, desk.dashboard.verdict()
+    silent = Desk()
+    yield "unknown", "none", silent.dashboard.verdict()
+    silent.send_all()
+    silent.clock.now += 9.0
+    yield "unknown", "none", silent.dashboard.verdict()
+
+
+def test_what_to_do_has_at_most_five_words_and_the_sentence_begins_with_the_state():
+    words = {"go": "GO", "caution": "CAUTION", "no_go": "NO-GO", "unknown": "UNKNOWN"}
+    seen = verdicts()
+    for state, warning, verdict in seen:
+        assert 2 <= len(verdict.todo.split()) <= 5, verdict
+        assert re.match(rf"{words[state]}\b", verdict.said)
+        assert ("stuck" in verdict.said) == (warning == "immobilisation")
+        assert verdict.word in (*words.values(), "STUCK", "WAIT", "GONE")
+        assert in_cells(verdict.word, 78, 6), "fits the smallest terminal with charts"
+        words_of = verdict.todo.split()
+        halves = [(" ".join(words_of[:i]), " ".join(words_of[i:])) for i in range(1, len(words_of))]
+        assert any(in_half_cells(first, 78) and in_half_cells(second, 78) for first, second in halves), verdict.todo
+        assert state == "go" or "keep" not in verdict.todo.lower()
+    assert {verdict.kind for *_, verdict in seen} == {"go", "caution", "no_go", "unknown", "warned", "gone"}
+
+
+def test_every_reason_for_an_unknown_state_is_said_in_words_of_its_own():
+    said = {}
+    for reason in set(REASONS) - {"none", "model_gap", "error", "not_available"}:
+        desk = Desk()
+        desk.send("SoilbusStatus", State="degraded", Reason=reason, Window=1)
+        desk.send("Traversability", State="unknown")
+        said[reason] = desk.dashboard.verdict().said
+    assert len(said) > 12
+    assert len(set(said.values())) == len(said)
+    assert not any("_" in words or "too old" in words for words in said.values())
+
+
+def luminance(colour: tuple[int, int, int]) -> float:
+    """Relative luminance of an sRGB colour, WCAG 2."""
+    parts = [c / 255.0 for c in colour]
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in parts]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def test_contrast_of_every_state_is_above_seven_also_where_a_terminal_has_256_colours():
+    from rich.color import ColorSystem
+
+    for *_, verdict in verdicts():
+        for system in (ColorSystem.TRUECOLOR, ColorSystem.EIGHT_BIT):
+            pair = [c.downgrade(system).get_truecolor() for c in (verdict.style.color, verdict.style.bgcolor)]
+            dark, light = sorted(luminance(tuple(c)) for c in pair)
+            assert (light + 0.05) / (dark + 0.05) >= 7.0, verdict
+        assert verdict.style.reverse, "else nothing is left of it without colour"
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_the_state_fills_a_third_of_the_drivers_page(desk, size):
+    desk.send_all(DemandForecast={"Warning": "none"})
+    coloured = desk.text("driver", size, force_terminal=True, color_system="truecolor").splitlines()
+    band = [line for line in coloured if re.search(r"\x1b\[[\d;]*48;2;|\x1b\[[\d;]*38;2;", line)]
+    assert len(band) == size[1] // 3
+    plain = desk.text("driver", size).splitlines()[: len(band)]
+    assert all(len(line) == size[0] for line in plain)
+    letters = [line for line in plain if "█" in line]
+    assert len(letters) >= len(band) // 2
+    assert "GO" in plain[-1]
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_without_colour_the_state_stands_there_in_words_and_reverse_video(desk, name, monkeypatch):
+    monkeypatch.setenv("NO_COLOR", "1")
+    desk.send_all(Traversability={"State": "no_go"}, DemandForecast={"Warning": "none"})
+    text = desk.text(name, force_terminal=True, color_system="truecolor")
+    assert not re.search(r"\x1b\[[\d;]*[34]8;", text)
+    assert re.search(r"\x1b\[[\d;]*7m[^\n]*NO-GO", text)
 
 
 def test_a_frame_with_one_bit_wrong_is_not_believed(setup):
@@ -91,105 +297,134 @@ def test_not_available_is_shown_as_nothing(setup):
     assert dashboard.value("WheelSlip", "SlipWheel1") is None
 
 
-def test_the_warning_and_the_best_slips_are_shown(setup):
-    publisher, dashboard, clock = setup
-    dashboard.receive(message(publisher.frame("DemandForecast", {"Warning": "none", "TimeLeft": 25.0})))
-    advice = {"SlipForEfficiencyFront": 0.123, "SlipForEfficiencyRear": 0.105}
-    dashboard.receive(message(publisher.frame("TractionAdvice", advice)))
-    assert "GETTING STUCK" not in shown(dashboard)
-    assert re.search(r"efficiency +0\.12 +0\.10", shown(dashboard))
-    dashboard.receive(message(publisher.frame("DemandForecast", {"Warning": "immobilisation", "TimeLeft": 4.2})))
-    assert "GETTING STUCK in 4 s" in shown(dashboard)
-    clock.now += 1.0
-    assert "GETTING STUCK" not in shown(dashboard)
+def test_a_stale_go_is_no_go_any_more(desk):
+    desk.send("SoilbusStatus", State="valid", Window=1)
+    desk.send("Traversability", State="go", Probability=0.99)
+    assert desk.dashboard.verdict().word == "GO"
+    desk.clock.now += 1.0
+    assert desk.known.value("Traversability", "State") is None
+    verdict = desk.dashboard.verdict()
+    assert (verdict.word, verdict.said) == ("UNKNOWN", "UNKNOWN: its frames stopped")
 
 
-def test_the_soil_class_is_shown_while_it_is_fresh(setup):
-    publisher, dashboard, clock = setup
-    dashboard.receive(message(publisher.frame("SoilClass", {})))
-    assert "soil: " not in shown(dashboard)
-    said = {"Kind": "sandy_loam_15", "Probability": 0.93, "UnknownProbability": 0.05}
-    dashboard.receive(message(publisher.frame("SoilClass", said)))
-    assert "soil: sandy_loam_15 (0.93)" in shown(dashboard)
-    clock.now += 4.0
-    assert "sandy_loam" not in shown(dashboard)
-    dashboard.receive(message(publisher.frame("SoilClass", {"Kind": "unknown", "Probability": 0.6})))
-    assert "soil: unknown (0.60)" in shown(dashboard)
+def test_soilbus_is_gone_when_its_frames_stop_and_for_how_long(desk):
+    assert desk.dashboard.verdict().said == "UNKNOWN: no frame of soilbus yet, 0 s"
+    desk.send_all()
+    assert desk.dashboard.verdict().word != "GONE"
+    desk.clock.now += 3.0
+    desk.send("WheelSlip")  # a gateway may go on with one frame
+    assert desk.dashboard.verdict().word != "GONE"
+    desk.clock.now += 9.0
+    assert desk.dashboard.verdict().said == "UNKNOWN: soilbus is gone, for 12 s"
+    for name in PAGES:
+        assert "soilbus is gone, for 12 s" in desk.text(name, (80, 24))
+    desk.dashboard.fault = "bus socketcan:can0: Network is down"
+    for name in PAGES:
+        assert desk.text(name, (80, 24)).splitlines()[-1].startswith("bus away: bus socketcan:can0: Network is down")
+    desk.send("Traversability", State="go")
+    assert desk.dashboard.verdict().word == "GO"
 
 
-WHOLE = {
-    "SoilbusStatus": {"State": "valid", "Reason": "none", "RejectedShare": 2.0},
-    "SoilbusIdentity": {"VersionMajor": 0, "VersionMinor": 3, "VersionPatch": 1, "Uptime": 5},
-    "WheelSlip": {f"SlipWheel{i}": 0.11 for i in range(1, 5)},
-    "WheelSlip2": {"SlipWheel5": 0.15, "SlipWheel6": 0.16},
-    "Traversability": {
-        "State": "go", "LimitingCause": "slip", "Probability": 0.97, "Age": 0.4, "SinceValid": 1.4, "Window": 7
-    },
-    "TorqueDemand": {"TorqueRequired": 3456, "TorqueAvailable": 9600},
-    "DraftCapability": {"MaxDraft": 6410, "MaxDraftStd": 110},
-    "GradeCapability": {"MaxGrade": 0.271, "MaxGradeStd": 0.004},
-    "SoilStrength": {"BearingPressure": 99.1, "BearingPressureStd": 0.45, "Chi2": 1.3},
-    "SoilCohesiveModulus": {"Value": 5.3, "Std": 2.0},
-    "SoilFrictionalModulus": {"Value": 1515.0, "Std": 30.0},
-    "SoilSinkageExponent": {"Value": 0.7, "Std": 0.02},
-    "SoilFrictionAngle": {"Value": 29.0, "Std": 0.6},
-    "SoilCohesion": {"Value": 1.7, "Std": 0.4},
-    "SoilShearModulus": {"Value": 25.0, "Std": 3.0},
-    "WheelSinkage": {f"SinkageWheel{i}": 31.0 for i in range(1, 5)},
-    "WheelSinkage2": {"SinkageWheel5": 35.0, "SinkageWheel6": 36.0},
-    "TractionAdvice": {
-        "SlipForEfficiencyFront": 0.12, "SlipForEfficiencyRear": 0.1, "SlipForPullFront": 0.6, "SlipForPullRear": 0.55
-    },
-    "TractionLimits": {"MaxDraft": 5900, "MaxDraftStd": 120, "MaxGrade": 0.13, "MaxGradeStd": 0.006},
-    "DemandForecast": {"Slip": 0.21, "SlipStd": 0.01, "Sinkage": 44.0, "Warning": "immobilisation", "TimeLeft": 4.2},
-    "SoilClass": {"Kind": "sandy_loam_15", "Probability": 0.93, "UnknownProbability": 0.05},
-    "BusHealth": {"BusState": "error_passive", "Overruns": 7, "Dropped": 3, "ErrorFrames": 21, "Reopened": 2},
-}  # fmt: skip
-SAID = {
-    "SoilbusStatus": ("service: valid", "refused 2.0 %"), "SoilbusIdentity": ("soilbus 0.3.1",),
-    "WheelSlip": ("+0.11",), "WheelSlip2": ("+0.15", "+0.16"),
-    "Traversability": (" GO ", "p = 0.97", "limit: slip", "0.4 s old", "valid 1.4 s ago"),
-    "TorqueDemand": ("torque 3456 of 9600 N m",), "DraftCapability": ("6410 ± 110",),
-    "GradeCapability": ("0.271 ± 0.004",), "SoilStrength": ("99.1 ± 0.45", "1.3"),
-    "SoilCohesiveModulus": ("5.3 ± 2",), "SoilFrictionalModulus": ("1515 ± 30",),
-    "SoilSinkageExponent": ("0.7 ± 0.02",), "SoilFrictionAngle": ("29 ± 0.6",), "SoilCohesion": ("1.7 ± 0.4",),
-    "SoilShearModulus": ("25 ± 3",), "WheelSinkage": ("31",), "WheelSinkage2": ("35", "36"),
-    "TractionAdvice": ("0.12   0.10", "0.60   0.55"), "TractionLimits": ("5900 ± 120", "0.13 ± 0.006"),
-    "DemandForecast": ("slip to come 0.21", "sinkage 44 mm", "GETTING STUCK in 4 s"),
-    "SoilClass": ("soil: sandy_loam_15 (0.93)", "none of the known 0.05"),
-    "BusHealth": ("bus: error_passive", "overruns 7", "dropped 3", "errors 21", "reopened 2"),
-}  # fmt: skip
+def waiting_for_first_window(desk: Desk, seconds: int) -> list[str]:
+    said = []
+    for _ in range(seconds):
+        desk.send("SoilbusStatus", State="estimating", Reason="none")
+        desk.send("SoilbusIdentity", Uptime=500)
+        desk.send("Traversability", State="unknown")
+        said.append(desk.dashboard.verdict().said)
+        desk.clock.now += 1.0
+    return said
 
 
-def test_every_frame_is_shown_and_gone_when_it_is_stale(setup):
-    publisher, dashboard, clock = setup
-    assert set(SAID) == set(WHOLE) == set(publisher.schedule)
-    for name, values in WHOLE.items():
-        before = shown(dashboard)
-        dashboard.receive(message(publisher.frame(name, values)))
-        text = shown(dashboard)
-        for words in SAID[name]:
-            assert words in text, name
-            assert words not in before, name
-        assert max(len(line) for line in text.splitlines()) <= WIDTH
-    clock.now += 4.0
-    text = shown(dashboard)
-    assert not [words for said in SAID.values() for words in said if words in text]
+def test_the_first_window_is_counted_down_from_when_inputs_began(desk):
+    desk.send("SoilbusStatus", State="listening", Reason="no_frames")
+    desk.send("Traversability", State="unknown")
+    assert "nothing on the bus" in desk.dashboard.verdict().said
+    desk.clock.now += 1.0
+    said = waiting_for_first_window(desk, 12)
+    assert said[0] == "UNKNOWN: 10 s until the first window"
+    assert said[7] == "UNKNOWN: 3 s until the first window"
+    assert said[11] == "UNKNOWN: the first window is due"
+    desk.send("SoilbusStatus", State="valid", Reason="none", Window=0)
+    desk.send("Traversability", State="go", Probability=0.99)
+    assert desk.dashboard.verdict().word == "GO"
 
 
-def test_what_is_not_vouched_for_is_grey(setup):
-    publisher, dashboard, _ = setup
+def test_who_comes_later_knows_only_how_long_the_first_window_takes_at_most():
+    desk = Desk(Vehicle(window=5.0))
+    said = waiting_for_first_window(desk, 3)
+    assert said[2] == "UNKNOWN: at most 3 s until the first window"
+
+
+def test_the_slip_bar_is_of_the_wheel_that_slips_most_and_the_best_slip_of_its_axle(desk):
+    slips = {"SlipWheel1": 0.05, "SlipWheel2": 0.08, "SlipWheel3": 0.31, "SlipWheel4": -0.02}
+    advice = {"SlipForEfficiencyFront": 0.12, "SlipForEfficiencyRear": 0.2, "SlipForPullFront": 0.5, "Status": "valid"}
+    desk.send("WheelSlip", **slips)
+    desk.send("TractionAdvice", **advice)
+    assert desk.dashboard.slip() == (pytest.approx(0.31), "RL", pytest.approx(0.2), None)
+    text = desk.text("driver", (80, 24))
+    assert re.search(r"SLIP +31 % at wheel RL", text)
+    row, marks = re.search(r"\n(█.*)\n( *▲ best 20 %)", text).groups()
+    assert row.index("·") == pytest.approx(80 * 0.31 / CONFIG.traversability.max_slip, abs=1.5)
+    assert marks.index("▲") == pytest.approx(80 * 0.2 / CONFIG.traversability.max_slip, abs=1.0)
+    nameless = Desk(Vehicle())
+    nameless.send("WheelSlip", **slips)
+    nameless.send("TractionAdvice", **advice)
+    assert nameless.dashboard.slip() == (pytest.approx(0.31), "3", pytest.approx(0.12), pytest.approx(0.5))
+    nameless.send("TractionAdvice", **(advice | {"Status": "degraded"}))
+    assert nameless.dashboard.slip().best is None
+
+
+def test_the_chart_of_the_draft_has_a_gap_where_its_frames_did_not_come_and_never_a_zero(desk):
+    for i in range(600):
+        if not 200 <= i < 300:
+            desk.send("PresentDemand", Draft=2000.0 + 5.0 * i)
+            desk.send("TractionLimits", MaxDraft=8000.0, MaxDraftStd=100.0, Status="valid")
+        desk.dashboard.sample()
+        desk.clock.now += 0.1
+    draft = desk.dashboard.history("draft", 60)
+    assert draft[0] == pytest.approx(2000.0, abs=60.0)
+    assert draft[-1] == pytest.approx(4990.0, abs=60.0)
+    assert all(a is None or b is None or a < b for a, b in itertools.pairwise(draft))
+    assert 8 <= draft.count(None) <= 10
+    assert {i for i, value in enumerate(draft) if value is None} <= set(range(19, 31))
+    text = desk.text("driver", (120, 40))
+    assert re.search(r"DRAFT  5\.0 kN  of possible 8\.0 kN", text)
+    bottom = next(line for line in text.splitlines() if line.startswith("        0 ┤"))
+    assert re.fullmatch(r" +0 ┤█+ +█+", bottom)
+
+
+def test_draft_and_slope_that_nobody_measures_are_no_zero(desk):
+    desk.send_all(PresentDemand={"Draft": None, "Slope": None}, TractionLimits={"Status": "valid"})
+    assert re.search(r"DRAFT  -  of possible 5\.9 kN", desk.text("driver"))
+    assert re.search(r"now +- +-\s", desk.text("engineer"))
+
+
+def test_slopes_are_in_per_cent(desk):
+    desk.send("GradeCapability", MaxGrade=0.3, MaxGradeStd=0.01, Status="valid")
+    of_slope = re.search(r"on the level +- +(\S+) ± (\S+)", desk.text("engineer"))
+    assert float(of_slope[1]) == pytest.approx(100.0 * math.sin(0.3) / math.cos(0.3), abs=0.06)
+    steeper = [100.0 * math.sin(0.3 + d) / math.cos(0.3 + d) for d in (-0.01, 0.01)]
+    assert float(of_slope[2]) == pytest.approx((steeper[1] - steeper[0]) / 2.0, abs=0.02)
+
+
+def test_what_is_not_vouched_for_is_grey(desk):
     for status, grey in (("valid", False), ("not_excited", True), ("degraded", True)):
-        values = {"MaxDraft": 6410, "MaxDraftStd": 110, "Status": status}
-        dashboard.receive(message(publisher.frame("DraftCapability", values)))
-        console = Console(width=WIDTH, record=True, file=io.StringIO(), force_terminal=True, color_system="standard")
-        console.print(panel(dashboard))
-        (line,) = (line for line in console.export_text(styles=True).splitlines() if "6410" in line)
+        desk.send("DraftCapability", MaxDraft=6410, MaxDraftStd=110, Status=status)
+        text = desk.text("engineer", force_terminal=True, color_system="standard")
+        (line,) = (line for line in text.splitlines() if "6410" in line)
         assert ("\x1b[2m6410" in line) == grey
-        assert dashboard.is_valid("DraftCapability") != grey
-    assert not dashboard.is_valid("TractionAdvice")
-    dashboard.receive(message(publisher.frame("WheelSlip", WHOLE["WheelSlip"])))
-    assert dashboard.is_valid("WheelSlip")  # has no status of its own
+        assert desk.known.is_valid("DraftCapability") != grey
+    assert not desk.known.is_valid("TractionAdvice")
+    desk.send("WheelSlip", **WHOLE["WheelSlip"])
+    assert desk.known.is_valid("WheelSlip")  # has no status of its own
+
+
+def test_a_bad_frame_is_counted_on_the_engineers_page(desk):
+    frame = message(desk.publisher.frame("Traversability", {"State": "go"}))
+    frame.data[0] ^= 1
+    desk.known.receive(frame)
+    assert re.search(r"bad frames +1", desk.text("engineer", (80, 24)))
 
 
 def with_code(frame, byte: int, code: int) -> can.Message:
@@ -201,56 +436,35 @@ def with_code(frame, byte: int, code: int) -> can.Message:
 
 
 @pytest.mark.parametrize("code", range(4, 14))
-def test_a_state_that_has_no_name_yet_is_unknown(setup, code):
-    publisher, dashboard, _ = setup
-    dashboard.receive(with_code(publisher.frame("Traversability", {"State": "go", "Probability": 0.9}), 0, code))
-    assert dashboard.bad_frames == 0
-    assert dashboard.value("Traversability", "State") is None
-    assert dashboard.number("Traversability", "Probability") == pytest.approx(0.9, abs=3e-4)
-    text = shown(dashboard)
-    assert " UNKNOWN " in text
-    assert "p = 0.90" in text
+def test_a_state_that_has_no_name_yet_is_unknown(desk, code):
+    desk.send("SoilbusStatus", State="valid", Window=1)
+    desk.known.receive(with_code(desk.publisher.frame("Traversability", {"State": "go", "Probability": 0.9}), 0, code))
+    assert desk.known.bad_frames == 0
+    assert desk.known.value("Traversability", "State") is None
+    assert desk.known.number("Traversability", "Probability") == pytest.approx(0.9, abs=3e-4)
+    assert desk.dashboard.verdict().word == "UNKNOWN"
 
 
-def test_no_payload_whatever_breaks_the_dashboard():
-    database = output_database(reference_configuration())
-    dashboard = ReceivedFrames(database, FakeClock())
-    rng = np.random.default_rng(11)
-    for _ in range(30):
-        for layout in database.messages:
-            data = bytearray(rng.bytes(layout.length))
-            data[7] = frame_checksum(layout.frame_id, bytes(data), 7)
-            dashboard.receive(can.Message(arbitration_id=layout.frame_id, is_extended_id=True, data=data))
-        assert "soilbus" in shown(dashboard)
-    assert dashboard.value("SoilbusIdentity", "Uptime") is not None
+def test_letters_differ_and_grow_with_the_room_there_is():
+    letters = "ABCDEFGHIJKLMNOPQRSTUVWXYZ-, "
+    assert len({tuple(in_cells(letter, 99, 5)) for letter in letters}) == len(letters)
+    for width, height in ((34, 5), (78, 6), (118, 11), (198, 18)):
+        lines = in_cells("CAUTION", width, height)
+        assert height - 5 < len(lines) <= height
+        assert len({len(line) for line in lines}) == 1
+        assert width / 2 < len(lines[0]) <= width
+    assert in_cells("CAUTION", 33, 5) == in_cells("CAUTION", 78, 4) == []
+    small, large = in_half_cells("NO", 80), in_cells("NO", 9, 5)
+    assert [sum(line.count(c) for line in small) for c in "▀▄"] != [0, 0]
+    halves = sum(line.count("▀") + line.count("▄") + 2 * line.count("█") for line in small)
+    assert halves == sum(line.count("█") for line in large)
 
 
-def test_a_bus_that_goes_is_said_and_waited_for(setup):
-    publisher, dashboard, clock = setup
-    wire = ScriptedBus(clock, [message(publisher.frame("Traversability", {"State": "go"}))], start=-5.0)
-    wire.fail_receive.append(can.CanOperationError("Network is down", errno.ENETDOWN))
-    tries, screens = [], []
-
-    def opened():
-        tries.append(clock.now)
-        if 1 < len(tries) < 4:
-            raise BusError("bus socketcan:can0: Network is down", may_come=True)
-        return wire
-
-    bus = LiveBus(opened, clock, clock.sleep)
-    bus.open()
-
-    def is_back() -> bool:
-        screens.append(shown_with(dashboard, bus.fault))
-        return dashboard.value("Traversability", "State") == "go"
-
-    show(dashboard, bus, Console(file=io.StringIO()), done=is_back)
-    assert len(tries) == 4
-    assert any("bus: away (bus socketcan:can0: Network is down)" in screen for screen in screens)
-    assert "away" not in screens[-1]
-
-
-def shown_with(dashboard, fault: str) -> str:
-    console = Console(width=WIDTH, record=True, file=io.StringIO())
-    console.print(panel(dashboard, fault))
-    return console.export_text()
+def test_charts_are_to_scale_and_blank_where_nothing_is_known():
+    assert bar(0.25, 1.0, 8) == "██      "
+    assert bar(-0.3, 1.0, 4) == bar(None, 1.0, 4) == "    "
+    assert bar(7.0, 1.0, 4) == "████"
+    assert sparkline([0.0, None, 7.0]) == "▁ █"
+    assert sparkline([5.0, 5.0]) == "▄▄"
+    assert area([0.0, 4.0, None, 8.0], 2, 8.0) == ["   █", " █ █"]
+    assert area([1.0, 1.0], 2, 8.0, [8.0, None]) == ["─ ", "▂▂"]

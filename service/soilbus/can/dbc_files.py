@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from copy import copy
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -98,7 +99,7 @@ def checked_messages(config: Config) -> frozenset[str]:
 
 
 def output_database(config: Config) -> Database:
-    """The DBC of the frames that soilbus sends.
+    """The DBC of the frames that soilbus sends, from the address of [j1939] where there is one.
 
     Raises ConfigError where it is missing, not a DBC, or lacks a message of ours.
     """
@@ -113,7 +114,14 @@ def output_database(config: Config) -> Database:
     missing = sorted(ours - {m.name for m in database.messages})
     if missing:
         raise ConfigError([f"output.dbc: {name}: no message {', '.join(missing)}"])
-    return database
+    if config.j1939.address is None:
+        return database
+    messages = [copy(message) for message in database.messages]
+    for message in messages:
+        if not message.is_extended_frame:
+            raise ConfigError([f"j1939.address: {message.name} in {name} has an identifier of 11 bits, without one"])
+        message.frame_id = message.frame_id & ~0xFF | config.j1939.address
+    return _database(messages)
 
 
 def filters_of(database: Database) -> list[dict[str, Any]]:

@@ -5,11 +5,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-__all__ = ["STANDARD_PGNS", "SourceLock", "group_mask", "pgn_of", "source_of"]
+from soilbus.config.model import J1939
+
+__all__ = ["STANDARD_PGNS", "SourceLock", "group_mask", "name_of", "pgn_of", "source_of"]
 
 GROUND_BASED_SPEED = 65097
-STANDARD_PGNS = frozenset({65093, 65094, 65096, GROUND_BASED_SPEED, 65265, 65267, 129025})
-"""Groups whose meaning the standards fix (hitch, speed, position), whoever sends them."""
+STANDARD_PGNS = frozenset(
+    {61444, 61449, 61459, 61481, 61482, 61485}  # engine torque, vehicle dynamics, attitude, rates, acceleration
+    | {65093, 65094, 65096, GROUND_BASED_SPEED, 65258, 65265, 65267}  # hitch, speeds, axle weight, position
+    | {127251, 127257, 129025, 129026}  # NMEA 2000: rate of turn, attitude, position, speed over ground
+)
+"""Groups whose meaning the standards fix, whoever sends them."""
 
 LOCK_RELEASE, LOCK_CYCLES = 2.0, 3.0
 """Silence [s] of a locked source after which another may take its place, and the same in cycles of the message:
@@ -37,6 +43,13 @@ def pgn_of(arbitration_id: int) -> int:
 def source_of(arbitration_id: int) -> int:
     """Source address of a 29-bit identifier."""
     return arbitration_id & 0xFF
+
+
+def name_of(unit: J1939) -> int:
+    """The NAME of a unit that is content with one address (ISO 11783-5), as 64 bits."""
+    name = unit.identity_number | unit.manufacturer_code << 21
+    name |= unit.ecu_instance << 32 | unit.function_instance << 35 | unit.function << 40
+    return name | unit.device_class << 49 | unit.device_class_instance << 56 | unit.industry_group << 60
 
 
 @dataclass(slots=True)

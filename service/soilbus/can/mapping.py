@@ -102,7 +102,14 @@ def channels_of(config: Config, database: Database) -> list[Channel]:
 
 def without_unit(channels: Iterable[Channel], database: Database) -> list[Channel]:
     """Channels whose signal has no unit, so that SI was assumed."""
-    return [c for c in channels if unit_of(_signal(c, database).unit) is None]
+    return [c for c in channels if _is_bare(_signal(c, database))]
+
+
+def _is_bare(signal: Signal) -> bool:
+    try:
+        return unit_of(signal.unit) is None
+    except ValueError:  # ampere or per cent of a torque
+        return False
 
 
 def _signal(channel: Channel, database: Database) -> Signal:
@@ -203,7 +210,7 @@ def _factor(role: _Role, signal: Signal) -> float:
     quantity, part, mapped, where = role
     if mapped.at is not None and quantity not in _HAS_SIDE:
         raise _Fault(f"at = {mapped.at} has no meaning for {quantity}")
-    dimension, factor = _unit(quantity, signal, mapped.torque_constant)
+    dimension, factor = _unit(quantity, signal, mapped)
     of_motor = quantity in _SHAFT_BY_DEFAULT or where.endswith("motor_speed")
     at_shaft = (mapped.at or ("shaft" if of_motor else "wheel")) == "shaft"
     if part is None:
@@ -223,13 +230,15 @@ def _factor(role: _Role, signal: Signal) -> float:
     return mapped.sign * factor
 
 
-def _unit(quantity: str, signal: Signal, torque_constant: float | None = None) -> tuple[str, float]:
+def _unit(quantity: str, signal: Signal, mapped: Mapped) -> tuple[str, float]:
     """Dimension and factor to SI of a signal, which must suit the quantity; no unit means SI."""
     fitting = _DIMENSIONS[quantity]
     if fitting == ("",):
         return "", 1.0  # a code
-    if torque_constant is not None:
-        return _current(quantity, signal, torque_constant)
+    if mapped.torque_constant is not None:
+        return _current(quantity, signal, mapped.torque_constant)
+    if mapped.reference_torque is not None:
+        return _percentage(quantity, signal, mapped.reference_torque)
     wanted = " or ".join(SI[dimension] for dimension in fitting)
     try:
         unit = unit_of(signal.unit)
@@ -252,6 +261,15 @@ def _current(quantity: str, signal: Signal, torque_constant: float) -> tuple[str
     if unit is None:
         raise _Fault(f"{signal.name} is in {signal.unit}; with torque_constant it must be a current in A or mA")
     return "torque", torque_constant * unit
+
+
+def _percentage(quantity: str, signal: Signal, reference_torque: float) -> tuple[str, float]:
+    """Torque for one per cent of a reference torque [N m]."""
+    if quantity not in ("torque", "torque_limit"):
+        raise _Fault(f"reference_torque has no meaning for {quantity}")
+    if (signal.unit or "").strip() != "%":
+        raise _Fault(f"{signal.name} is in {signal.unit or 'no unit'}; with reference_torque it must be %")
+    return "torque", reference_torque / 100.0
 
 
 def plausible(config: Config, quantity: str, part: Wheel | Axle | None) -> tuple[float, float]:

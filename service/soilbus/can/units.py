@@ -77,7 +77,8 @@ _SAME_CHARACTER = str.maketrans(
 )
 
 _WHY_NOT = {
-    "%": "a percentage is not a quantity of its own; give the signal that carries the physical value",
+    "%": "a percentage is not a quantity of its own; give the signal that carries the physical value,"
+    " or for a torque its reference_torque",
     "hz": "Hz may be turns or sensor pulses; write rpm, rev/s or rad/s in the DBC",
 }
 

@@ -29,7 +29,7 @@ Verdicts = NDArray[np.uint8]
 
 _VERDICT = {reason: np.uint8(i + 1) for i, reason in enumerate(REASONS)}
 _BANDS = {2: (2, 2, 3), 4: (14, 14, 15), 8: (0xFB, 0xFE, 0xFF)}
-_BANDS |= {bits: (0xFB << bits - 8, 0xFE << bits - 8, 0xFF << bits - 8) for bits in (16, 32)}
+_BANDS |= {bits: (0xFB << bits - 8, 0xFE << bits - 8, 0xFF << bits - 8) for bits in (16, 24, 32)}
 
 _NO_FAULT = re.compile(r"\b(no|not|without|non) (an )?(errors?|faults?|failures?)\b|\b(error|fault) free\b")
 _NOT_AVAILABLE = re.compile(r"\b(sna|n a|na|unavailable|not ?(avail\w*|installed|present)|no (data|signal))\b")

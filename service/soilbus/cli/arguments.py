@@ -43,6 +43,17 @@ def counted(text: str) -> int:
     return number
 
 
+def named(*suffixes: str) -> Callable[[str], Path]:
+    """Parser of the path of a file to write, whose name must end in one of `suffixes`."""
+
+    def path(text: str) -> Path:
+        if Path(text).suffix not in suffixes:
+            raise argparse.ArgumentTypeError(f"{text} does not end in {' or '.join(suffixes)}")
+        return Path(text)
+
+    return path
+
+
 def command_line() -> argparse.ArgumentParser:
     """Parser of the whole command line; `command` names the one to do."""
     parser = argparse.ArgumentParser(prog="soilbus", description="What soil a tractor is driving on, from its CAN bus.")
@@ -65,7 +76,10 @@ def command_line() -> argparse.ArgumentParser:
 
     sub = command("demo", "simulated tractor, service and dashboard; needs no hardware, ends by itself", "")
     sub.add_argument("--duration", type=float, default=42.0, metavar="S", help="simulated seconds (default 42)")
-    sub.add_argument("--picture", type=Path, metavar="OUT.svg", help="keep the last state of the dashboard")
+    sub.add_argument(
+        "--picture", type=Path, metavar="OUT.svg",
+        help="keep the dashboard's last state: the driver's page, and the engineer's in OUT-engineer.svg",
+    )  # fmt: skip
 
     sub = command("run", "the service on a live bus")
     sub.add_argument("--wait", action="store_true", help="wait for an interface that is not there yet")
@@ -81,7 +95,28 @@ def command_line() -> argparse.ArgumentParser:
     sub.add_argument("logs", nargs="+", type=Path, metavar="LOG")
     sub.add_argument("--json", type=Path, metavar="OUT", help="one JSON object a line per window; - for stdout")
     sub.add_argument("--report", type=Path, metavar="OUT.html", help="self-contained HTML with plots (extra: plots)")
-    sub.add_argument("--map", type=Path, metavar="OUT.geojson", help="a point for each window; needs a mapped position")
+    sub.add_argument(
+        "--frames", type=Path, metavar="OUT", help="log of the frames that the service sends (.log .log.gz .asc .blf)"
+    )
+    sub.add_argument(
+        "--table", type=named(".csv", ".parquet"), metavar="OUT",
+        help="windows as rows: .csv, or .parquet (extra: tables)",
+    )  # fmt: skip
+    sub.add_argument(
+        "--mcap", type=Path, metavar="OUT.mcap",
+        help="windows, positions, warnings for Foxglove or PlotJuggler (extra: mcap)",
+    )  # fmt: skip
+    sub.add_argument(
+        "--map", type=Path, metavar="OUT",
+        help="a point for each window, GeoJSON or .gpkg (extra: geo); needs a mapped position",
+    )  # fmt: skip
+    sub.add_argument(
+        "--isoxml", type=Path, metavar="FOLDER",
+        help="ISO 11783-10 task data for farm software; needs a mapped position",
+    )  # fmt: skip
+    sub.add_argument(
+        "--manoeuvre-out", type=Path, metavar="OUT.json", help="what to drive to know the soil better (see simulate)"
+    )
     sub.add_argument("--partial", action="store_true", help="keep the windows before the point where a log is damaged")
 
     sub = command("simulate", "simulated tractor, to a bus in real time or to a log", "optional")
@@ -97,8 +132,29 @@ def command_line() -> argparse.ArgumentParser:
     sub.add_argument(
         "--rows", nargs=2, type=float, metavar=("LENGTH", "SPACING"), help="up and down a field [m], not straight on"
     )
+    sub.add_argument(
+        "--draft", type=between(0.0, 128_000.0), metavar="N",
+        help="draft of an implement that nobody lifts; without it slip is swept from 0.05 to 0.40",
+    )  # fmt: skip
+    sub.add_argument(
+        "--slope", type=between(-60.0, 60.0), default=0.0, metavar="PERCENT", help="uphill is positive (default 0)"
+    )
+    sub.add_argument(
+        "--speed", type=between(0.2, 20.0), metavar="M_PER_S", help="over ground (default: swings from 1.0 to 1.8)"
+    )
+    sub.add_argument(
+        "--vehicle-seed", type=natural, metavar="N",
+        help="picks true mass (by vehicle.mass_std) and sensor gains; without it --seed picks the gains",
+    )  # fmt: skip
+    sub.add_argument(
+        "--truth", type=named(".csv", ".parquet"), metavar="OUT",
+        help="true values as rows: soil, slip, draft, load, sinkage, torque: .csv, or .parquet (extra: tables)",
+    )  # fmt: skip
+    sub.add_argument("--manoeuvre", type=Path, metavar="FILE", help="drive what --manoeuvre-out has written")
     target = sub.add_mutually_exclusive_group(required=True)
-    target.add_argument("--bus", action="store_true", help="send to the configured bus in real time")
+    target.add_argument(
+        "--bus", action="store_true", help="drive on the configured bus in real time, by its commands (dbc/tractor.dbc)"
+    )
     target.add_argument("--log", type=Path, metavar="OUT", help="write a log (.log .log.gz .asc .blf)")
 
     sub = command("diagnose", "what the model misses: find, name, add, show")
@@ -108,8 +164,16 @@ def command_line() -> argparse.ArgumentParser:
     sub.add_argument(
         "--model-out", type=Path, metavar="OUT.toml", help="the configuration with the effects found, for any command"
     )
+    sub.add_argument(
+        "--manoeuvre-out", type=Path, metavar="OUT.json", help="of an ambiguous diagnosis, what to drive to settle it"
+    )
 
-    sub = command("watch", "live terminal dashboard that reads only our frames", "optional")
+    sub = command("watch", "terminal dashboard that reads only our frames, of the bus or of a recording", "optional")
+    sub.add_argument("log", nargs="?", type=Path, metavar="LOG", help="a recording of our frames, played in real time")
+    sub.add_argument(
+        "--speed", type=between(0.1, 1000.0), default=1.0, metavar="X", help="play LOG X times as fast (default 1)"
+    )
+    sub.add_argument("--plain", action="store_true", help="lines of text, for a screen reader; also in a pipe")
     sub.add_argument("--seconds", type=float, metavar="S", help="stop after this time")
 
     sub = command("paper", "the tables of Xi et al. 2024 beside ours, and what holds of its method", "")

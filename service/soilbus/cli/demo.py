@@ -3,6 +3,9 @@
 Three parties share one bus: the tractor's ECUs (simulator) send, the service estimates, the dashboard reads only the
 service's frames. The bus is a vcan where the kernel has it, else python-can's in-process virtual bus. The simulated
 drive plays TIME_COMPRESSION times as fast as real time, so the service's times are shortened by the same factor.
+
+    soilbus demo --picture service/docs/dashboard.svg     draws the README's pictures: dashboard.svg, the driver's page
+                                                          at the end of the drive, and dashboard-engineer.svg
 """
 
 from __future__ import annotations
@@ -18,8 +21,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 
 import can
-from rich.console import Console
-from rich.panel import Panel
+from rich.console import Console, Group
 
 from soilbus.can.bus import BusError, LiveBus, open_bus
 from soilbus.can.dbc_files import filters_of, output_database
@@ -27,9 +29,10 @@ from soilbus.config.model import Config
 from soilbus.daemon.start import start_service
 from soilbus.files import whole_file
 from soilbus.pipeline.result import WindowResult
-from soilbus.report.dashboard import WIDTH, panel, show
+from soilbus.report.dashboard import Dashboard, Vehicle
 from soilbus.report.received_frames import ReceivedFrames
 from soilbus.report.table import table
+from soilbus.report.watch import page, show
 from soilbus.simulator.frames import frames
 from soilbus.simulator.play import send_in_time
 from soilbus.simulator.recording import simulate
@@ -40,6 +43,8 @@ TIME_COMPRESSION = 8.0
 """Seconds of the simulated drive per second."""
 SEED = 1
 """Picks the simulated drive."""
+PICTURE_SIZE = 80, 24
+"""Columns and rows of the pictures."""
 STORY_PERIOD = 4.0
 """Time [s] of the simulated drive between two rows of the table at the end."""
 
@@ -47,7 +52,7 @@ STORY_PERIOD = 4.0
 def run_demo(duration: float, picture: Path | None = None) -> None:
     """Drive `duration` simulated seconds from loam onto wet clay and show what the service says.
 
-    `picture` is where the last state of the dashboard is kept as SVG.
+    `picture` is where the last state of the dashboard is kept as SVG; the engineer's page has `-engineer` in its name.
     """
     console = Console()
     real = reference_configuration()
@@ -70,14 +75,17 @@ def run_demo(duration: float, picture: Path | None = None) -> None:
             worker = threading.Thread(target=service.run, daemon=True)
             worker.start()
             sender.start()
-            known = ReceivedFrames(ours)
-            show(known, ear, console, done=lambda: not sender.is_alive())
-            shown = panel(known)
+            dashboard = Dashboard(ReceivedFrames(ours), Vehicle.of(config), span=duration / TIME_COMPRESSION)
+            show(dashboard, ear, console, done=lambda: not sender.is_alive())
+            pictures = {name: page(dashboard, name, *PICTURE_SIZE) for name in ("driver", "engineer")}
             service.stop()
             worker.join(timeout=2.0)
     if picture is not None:
-        with whole_file(picture) as out:
-            out.write(_svg(shown))
+        for name, path in (("driver", picture), ("engineer", picture.with_stem(f"{picture.stem}-engineer"))):
+            with whole_file(path) as out:
+                out.write(_svg(pictures[name]))
+    if console.is_terminal:
+        console.print(pictures["driver"])
     console.print("\n" + _story(results), highlight=False, end="")
 
 
@@ -140,9 +148,11 @@ def _ip(*words: str) -> bool:
         return False
 
 
-def _svg(shown: Panel) -> str:
-    """A dashboard as SVG that asks for no font from elsewhere."""
-    paper = Console(record=True, file=io.StringIO(), width=WIDTH, force_terminal=True)
+def _svg(shown: Group) -> str:
+    """A page as SVG that asks for no font from elsewhere."""
+    paper = Console(
+        record=True, file=io.StringIO(), width=PICTURE_SIZE[0], force_terminal=True, color_system="truecolor"
+    )
     paper.print(shown)
     return re.sub(r"@font-face \{.*?\}\s*", "", paper.export_svg(title="soilbus watch"), flags=re.DOTALL)
 

@@ -17,25 +17,27 @@ from soilbus.process import say
 if TYPE_CHECKING:
     from soilbus.config.model import Config
     from soilbus.pipeline.result import WindowResult
+    from soilbus.report.page import Source
+    from soilbus.simulator.scenario import Scenario
 
 
 def replay(args: argparse.Namespace) -> None:
     """`soilbus replay`: the daemon's pipeline over recorded logs, or over tables of a test rig."""
     from soilbus.can.dbc_files import load_databases
+    from soilbus.config.model import ConfigError
     from soilbus.offline.replay import LogError, estimator_beside, other_channel, replay
     from soilbus.pipeline.pipeline import Pipeline
     from soilbus.report.progress import progress
-    from soilbus.report.soil_map import check_position_is_mapped, soil_map
     from soilbus.report.windows import summary
 
     config = configured(args)
-    if args.map is not None:
-        check_position_is_mapped(config)
-    if args.report is not None:
-        need_extra("matplotlib", "plots", "--report")
+    _check_outputs(args, config)
     if config.table is not None:
+        if args.frames is not None:
+            raise ConfigError(["--frames: a table of a test rig has no bus to send on"])
         _replay_tables(args, config)
         return
+    check_folders(args.frames, args.manoeuvre_out)
     for line in other_channel(config, args.logs):
         say(line)
     pipeline = Pipeline(config, load_databases(config))
@@ -54,15 +56,52 @@ def replay(args: argparse.Namespace) -> None:
         say(f"{fault}; {fault.windows} windows before that are kept")
     text = summary(results, pipeline)
     _write_windows(args, config, results, text)
-    if args.map is not None:
-        map_text, left_out = soil_map(results)
-        with whole_file(args.map) as out:
-            out.write(map_text)
-        if left_out:
-            say(f"{left_out} of {len(results)} windows have no position: not on the map")
+    if args.frames is not None:
+        _write_frames(args, config)
+    text += _what_to_drive(args, config, results)
     if "-" not in (str(args.json), str(args.map)):
         print(text, end="")
     _need_a_use(results, config)
+
+
+def _what_to_drive(args: argparse.Namespace, config: Config, results: Sequence[WindowResult]) -> str:
+    """Where most windows are not excited, or on demand, what to drive to know the soil better: lines for the summary.
+
+    Written where --manoeuvre-out says.
+    """
+    import json
+
+    from soilbus.offline.manoeuvre import what_excites
+    from soilbus.report.advice import of_use
+    from soilbus.report.next_drive import excitation_lines
+
+    useful = of_use(results)
+    weak = sum(result.reason.startswith(("not_excited", "ambiguous")) for result in useful)
+    if not useful or (args.manoeuvre_out is None and 2 * weak < len(useful)):
+        return ""
+    now = useful[-1].posterior
+    assert now is not None  # of_use sees to it
+    found = what_excites(config, now.soil)
+    if found is None:
+        if args.manoeuvre_out is not None:
+            raise WorkError("--manoeuvre-out: no manoeuvre of the table can be driven by this vehicle on this soil")
+        return ""
+    if args.manoeuvre_out is not None:
+        with whole_file(args.manoeuvre_out) as out:
+            out.write(json.dumps(found[0].as_json(), indent=1) + "\n")
+    return "\n".join(excitation_lines(*found, now, config)) + "\n"
+
+
+def _write_frames(args: argparse.Namespace, config: Config) -> None:
+    from soilbus.can.log_writer import write_log
+    from soilbus.offline.sent_frames import sent_frames
+
+    try:
+        write_log(sent_frames(config, args.logs), args.frames)
+    except OSError as error:
+        raise WorkError(f"{args.frames}: {error.strerror or error}") from None
+    except ValueError as error:
+        raise WorkError(f"{args.frames}: {error}") from None
 
 
 def _need_a_use(results: Sequence[WindowResult], config: Config) -> None:
@@ -93,17 +132,69 @@ def _replay_tables(args: argparse.Namespace, config: Config) -> None:
 
 
 def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[WindowResult], text: str) -> None:
-    """What --json and --report ask for, under a summary."""
+    """What the options for files ask for, under a summary."""
+    from soilbus.export.geopackage import write_geopackage
+    from soilbus.export.mcap_log import write_mcap
+    from soilbus.export.soil_map import soil_map
+    from soilbus.export.table import write_table
+    from soilbus.export.task_data import write_task_data
     from soilbus.pipeline.outputs import json_line
-    from soilbus.report.windows import html_report
 
     if args.json is not None:
         with whole_file(args.json) as out:
             for result in results:
                 out.write(json_line(result, config) + "\n")
     if args.report is not None:
+        from soilbus.report.replay import replay_report
+
         with whole_file(args.report) as out:
-            out.write(html_report(results, text, args.logs))
+            out.write(replay_report(results, text, _source(args, config)))
+    if args.table is not None:
+        write_table(args.table, results, config)
+    if args.mcap is not None:
+        write_mcap(args.mcap, results, config)
+    if args.map is not None:
+        map_text, left_out = soil_map(results)
+        if args.map.suffix == ".gpkg":
+            write_geopackage(args.map, map_text)
+        else:
+            with whole_file(args.map) as out:
+                out.write(map_text)
+        if left_out:
+            say(f"{left_out} of {len(results)} windows have no position: not on the map")
+    if args.isoxml is not None and (left_out := write_task_data(args.isoxml, results, config)):
+        say(f"{left_out} of {len(results)} windows have no position or no date: not in the task data")
+
+
+def _check_outputs(args: argparse.Namespace, config: Config) -> None:
+    """Ask before the work whether what the options for files need is there."""
+    from soilbus.export.soil_map import check_position_is_mapped
+
+    for path, option in ((args.map, "--map"), (args.isoxml, "--isoxml")):
+        if path is not None:
+            check_position_is_mapped(config, option)
+    if args.report is not None:
+        _need_plots()
+    if args.table is not None and args.table.suffix == ".parquet":
+        need_extra("pyarrow", "tables", "--table OUT.parquet")
+    if args.mcap is not None:
+        need_extra("mcap", "mcap", "--mcap")
+    if args.map is not None and args.map.suffix == ".gpkg":
+        need_extra("pyogrio", "geo", "--map OUT.gpkg")
+    check_folders(args.table, args.mcap, args.map)
+
+
+def _need_plots() -> None:
+    """What --report needs."""
+    for module in ("jinja2", "matplotlib"):
+        need_extra(module, "plots", "--report")
+
+
+def _source(args: argparse.Namespace, config: Config) -> Source:
+    """What a report is made from."""
+    from soilbus.report.page import Source
+
+    return Source(config, Path(args.config), args.set, args.logs)
 
 
 def simulate(args: argparse.Namespace) -> None:
@@ -112,24 +203,82 @@ def simulate(args: argparse.Namespace) -> None:
     from soilbus.estimation.assembly import with_effects
     from soilbus.simulator.course import course
     from soilbus.simulator.drive import SimulationError
-    from soilbus.simulator.play import play, scenario_over
-    from soilbus.simulator.recording import simulate
+    from soilbus.simulator.play import scenario_over
 
+    check_folders(args.truth)
+    if args.truth is not None and args.truth.suffix == ".parquet":
+        need_extra("pyarrow", "tables", "--truth OUT.parquet")
     config = with_effects(configured_or_reference(args), args.effect)
     try:
         way = course(args.start, args.heading, args.rows)
-        recording = simulate(config, scenario_over(args.soil or ["loam"], args.duration, way), args.seed)
-        play(recording, config, args.log)
+        scenario = scenario_over(
+            args.soil or ["loam"], args.duration, way, args.draft, args.slope / 100.0, args.speed, args.vehicle_seed
+        )
+        if args.manoeuvre is not None:
+            scenario = _of_manoeuvre(args.manoeuvre, scenario, config)
+        bogged_at = _simulate_live(args, config, scenario) if args.bus else _simulate_log(args, config, scenario)
     except (SimulationError, KeyError, ValueError, BusError) as error:
         raise WorkError(str(error.args[0])) from None
+    if bogged_at is not None:
+        say(f"the tractor is stuck after {bogged_at:.1f} s")
+
+
+def _of_manoeuvre(path: Path, scenario: Scenario, config: Config) -> Scenario:
+    """The scenario's soils and vehicle, driven as a manoeuvre says."""
+    from soilbus.files import read_bounded
+    from soilbus.simulator.manoeuvre import LARGEST, of_json
+
+    try:
+        manoeuvre = of_json(read_bounded(path, LARGEST).decode())
     except OSError as error:
-        raise WorkError(f"{args.log or 'bus'}: {error.strerror or error}") from None
-    if recording.bogged_at is not None:
-        say(f"the tractor is stuck after {recording.bogged_at:.1f} s")
+        raise WorkError(f"{path}: {error.strerror or error}") from None
+    except ValueError as error:
+        raise WorkError(f"{path}: {error}") from None
+    nothing_towed = config.vehicle is not None and config.vehicle.towing == "never"
+    return manoeuvre.over(scenario, nothing_towed)
+
+
+def _simulate_log(args: argparse.Namespace, config: Config, scenario: Scenario) -> float | None:
+    """Write the log; when the tractor bogged down [s]."""
+    from soilbus.can.log_writer import write_log
+    from soilbus.simulator.drive import drive
+    from soilbus.simulator.frames import START_TIME, frames
+    from soilbus.simulator.recording import recorded
+    from soilbus.simulator.truth import write_truth
+
+    done = drive(config, scenario, args.seed)
+    try:
+        write_log(frames(recorded(done, config, scenario, args.seed), config), args.log)
+    except OSError as error:
+        raise WorkError(f"{args.log}: {error.strerror or error}") from None
+    if args.truth is not None:
+        write_truth(done, args.truth, START_TIME)
+    return done.bogged_at
+
+
+def _simulate_live(args: argparse.Namespace, config: Config, scenario: Scenario) -> float | None:
+    """Drive on the bus; when the tractor bogged down [s]. An interrupted drive leaves its true values too."""
+    import time
+    from collections import deque
+
+    from soilbus.simulator.drive import Drive, joined
+    from soilbus.simulator.live import drive_live
+    from soilbus.simulator.truth import write_truth
+
+    driven: deque[Drive] = deque(maxlen=1 if args.truth is None else None)
+    begin = time.time()
+    try:
+        begin = drive_live(config, scenario, args.seed, driven)
+    finally:
+        if args.truth is not None and driven:
+            write_truth(joined(driven), args.truth, begin)
+    return driven[-1].bogged_at
 
 
 def diagnose(args: argparse.Namespace) -> None:
-    """`soilbus diagnose`: find, name, add, show."""
+    """`soilbus diagnose`: find, name, add, show, and say what to drive next."""
+    import json
+
     from soilbus.config.edit import with_effects_text
     from soilbus.diagnosis.diagnose import NotFitted
     from soilbus.diagnosis.model_out import effect_tables
@@ -141,9 +290,9 @@ def diagnose(args: argparse.Namespace) -> None:
 
     config = configured(args)
     if args.report is not None:
-        need_extra("matplotlib", "plots", "--report")
+        _need_plots()
         from soilbus.report.diagnosis import diagnosis_report
-    check_folders(args.json, args.report, args.model_out)
+    check_folders(args.json, args.report, args.model_out, args.manoeuvre_out)
     try:
         with phases("diagnose") as say:
             findings = diagnose_logs(config, args.logs, say)
@@ -153,11 +302,15 @@ def diagnose(args: argparse.Namespace) -> None:
     if args.json is not None:
         texts.append((args.json, findings_json(findings)))
     if args.report is not None:
-        texts.append((args.report, diagnosis_report(findings)))
+        texts.append((args.report, diagnosis_report(findings, _source(args, config), args.model_out)))
     if args.model_out is not None:
         effects, notes = effect_tables(findings.diagnosis.completed)
         text = with_effects_text(Path(args.config), args.set, effects, args.model_out.parent, notes)
         texts.append((args.model_out, text))
+    if args.manoeuvre_out is not None:
+        if findings.plan is None:
+            raise WorkError("--manoeuvre-out: no names are left to decide between that a drive would tell apart")
+        texts.append((args.manoeuvre_out, json.dumps(findings.plan.as_json(), indent=1) + "\n"))
     for path, text in texts:
         with whole_file(path) as out:
             out.write(text)

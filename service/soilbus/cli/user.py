@@ -98,12 +98,16 @@ def _counted(frames: Iterable[Frame], step: Callable[[int, float], None] | None)
 
 
 def watch(args: argparse.Namespace) -> None:
-    """`soilbus watch`: the live dashboard."""
+    """`soilbus watch`: the dashboard of the live bus or of a recording."""
     from soilbus.can.bus import BusError
-    from soilbus.report.dashboard import watch
+    from soilbus.offline.replay import LogError
+    from soilbus.report.watch import watch, watch_log
 
-    config = configured_or_reference(args)
+    config, is_named = configured_or_reference(args), args.config is not None
     try:
-        watch(config, args.seconds)
-    except BusError as error:
+        if args.log is None:
+            watch(config, is_named, args.seconds, args.plain)
+        else:
+            watch_log(config, args.log, args.speed, is_named, args.seconds, args.plain)
+    except (BusError, LogError) as error:
         raise WorkError(str(error)) from None

@@ -28,6 +28,7 @@ from pydantic import (
 from soilbus.words import did_you_mean
 
 __all__ = [
+    "J1939",
     "Axle",
     "Bus",
     "Column",
@@ -38,6 +39,7 @@ __all__ = [
     "Estimator",
     "Form",
     "Model",
+    "Mqtt",
     "Noise",
     "NoiseOfChannels",
     "Output",
@@ -186,6 +188,17 @@ class Signal(_Section):
     """How much earlier what a sample reports was true [s]: a filter, a receiver, a queue."""
     torque_constant: PositiveFloat | None = None
     """Torque for a current [N m/A], where a motor's current is mapped to its torque."""
+    reference_torque: PositiveFloat | None = None
+    """Torque of 100 % [N m], where a percentage of it is mapped: in J1939 SPN 513, of the engine's reference torque,
+    SPN 544."""
+
+    @model_validator(mode="after")
+    def _one_way_to_torque(self) -> Signal:
+        if self.torque_constant is not None and self.reference_torque is not None:
+            raise ValueError(
+                "torque_constant is for a current, reference_torque for a percentage: leave out one of the two"
+            )
+        return self
 
     @model_validator(mode="before")
     @classmethod
@@ -274,7 +287,7 @@ class Axle(_Section):
     max_torque: Annotated[PositiveFloat, AfterValidator(AXLE_TORQUE)] | None = None
     """Greatest torque at the axle [N m], where no signal reports it."""
     torque: Signal | None = None
-    """Torque [N m] or, with `torque_constant`, current [A] of its motor."""
+    """Torque [N m] of its motor; with `torque_constant` its current [A], with `reference_torque` a percentage."""
     torque_limit: Signal | None = None
     """Greatest torque that the motor reports it can give [N m]; optional."""
     motor_speed: Signal | None = None
@@ -434,27 +447,26 @@ class Column(_Section):
 
 
 class Table(_Section):
-    """A test rig's table, each row one steady state: where its quantities stand.
+    """A test rig's table, each row one steady state: where its quantities stand, with an example in test-rig.md.
 
-    wheel_load [N], drawbar_pull [N] positive forward, torque [N m] about the axle, slip
-    (1 - V/(r omega)), sinkage [m], t [s].  The soil bed is the same in all rows, or in those
-    with the same value of the column `run`.  Only rows that equal `where` count.
+    At least one of drawbar_pull, torque and sinkage must be mapped.  The soil bed is the same in all rows, or in those
+    with the same value of the column `run`.
     """
 
     wheel_load: Column
-    """[N]."""
+    """Vertical load on the wheel [N]; a row without it is left out."""
     slip: Column
-    """1 - V/(r omega)."""
+    """1 - V/(r omega), r the wheel's rolling radius; a row without it is left out."""
     drawbar_pull: Column | None = None
-    """[N], positive forward."""
+    """Net pull [N], positive forward; its noise is that of `draft`."""
     torque: Column | None = None
-    """[N m] about the axle."""
+    """Torque about the axle [N m]."""
     sinkage: Column | None = None
-    """[m]."""
+    """Depth of the wheel's deepest point [m]."""
     t: Column | None = None
-    """[s]."""
+    """Time [s]; without it no effect of time is a candidate of a diagnosis."""
     run: Annotated[str, Field(min_length=1)] | None = None
-    """Column by which soil beds differ."""
+    """Name of the column by which soil beds differ."""
     where: dict[str, Any] = Field(default_factory=dict)
     """Only rows that equal these values count."""
 
@@ -776,6 +788,73 @@ class Output(_Section):
 
     dbc: str = "soilbus.dbc"
     """Layout of our own frames."""
+    compaction: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = (5.0e4, 1.0e5, 2.0e5)
+    """Bearing pressures [Pa] from which the soil counts as slightly compacted, compacted, very compacted: codes 2, 3, 4
+    of DDI 470 in `replay --isoxml`.  A tyre presses on soft ground about as hard as it is inflated (Wong 2008, ch. 2):
+    from 0.5, 1, 2 bar on the ground carries a tyre of that pressure with a rut of at most `estimator.z_ref`."""
+
+    @field_validator("compaction")
+    @classmethod
+    def _rising(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not value[0] < value[1] < value[2]:
+            raise ValueError("the three pressures must rise")
+        return value
+
+
+class J1939(_Section):
+    """Our source address and NAME (SAE J1939-81, ISO 11783-5); the claim concerns `soilbus run` only.
+
+    Without the claim frames carry the address of the DBC.  With it nothing is sent before the address is claimed, nor
+    after a node with a smaller NAME has taken it.
+    """
+
+    address_claim: bool = False
+    """Claim the address before anything is sent (extra `j1939`)."""
+    address: Annotated[int, Field(ge=128, le=247)] | None = None
+    """Source address of our frames, in the range of those that are claimed; by default that of `output.dbc`."""
+    identity_number: Annotated[int, Field(ge=0, lt=2**21)] = 0
+    """Serial number; two of the same NAME cannot live on one bus."""
+    manufacturer_code: Annotated[int, Field(ge=0, lt=2**11)] = 0x7FF
+    """Of the vehicle's maker, as SAE assigns it; by default not available."""
+    ecu_instance: Annotated[int, Field(ge=0, lt=2**3)] = 0
+    """Of several ECUs that do one function."""
+    function_instance: Annotated[int, Field(ge=0, lt=2**5)] = 0
+    """Of several units of one function."""
+    function: Annotated[int, Field(ge=0, lt=2**8)] = 0xFF
+    """By default not available."""
+    device_class: Annotated[int, Field(ge=0, lt=2**7)] = 17
+    """17: sensor system."""
+    device_class_instance: Annotated[int, Field(ge=0, lt=2**4)] = 0
+    """Of several of one class."""
+    industry_group: Annotated[int, Field(ge=0, lt=2**3)] = 2
+    """2: agriculture and forestry."""
+
+
+class Mqtt(_Section):
+    """A broker that each window is published to, as JSON; only `soilbus run`, and only where this section stands.
+
+    Username and password are not written here: SOILBUS_MQTT_USERNAME and SOILBUS_MQTT_PASSWORD in the environment, or
+    systemd's credentials `mqtt-username` and `mqtt-password`.
+    """
+
+    host: Annotated[str, Field(min_length=1)]
+    """Name or address of the broker."""
+    port: Annotated[int, Field(ge=1, le=65535)] | None = None
+    """By default 1883, with `tls` 8883."""
+    topic: Annotated[str, Field(pattern=r"^[^#+\s/]+(/[^#+\s/]+)*$")] = "soilbus"
+    """`TOPIC/window` and `TOPIC/status` are published."""
+    rate: Annotated[PositiveFloat, Field(le=10.0)] = 1.0
+    """Windows a second at most; those in between are left out."""
+    tls: bool = False
+    """Encrypted, the broker's certificate checked."""
+    ca: str | None = None
+    """File of the certificate authority for `tls`, beside the configuration; by default the system's."""
+
+    @model_validator(mode="after")
+    def _ca_with_tls(self) -> Mqtt:
+        if self.ca is not None and not self.tls:
+            raise ValueError("ca has no meaning without tls = true")
+        return self
 
 
 class Config(_Section):
@@ -796,6 +875,8 @@ class Config(_Section):
     warning: Warning = Warning()
     model: Model = Model()
     output: Output = Output()
+    j1939: J1939 = J1939()
+    mqtt: Mqtt | None = None
     folder: Path = Field(default=Path("."), exclude=True)
 
     @model_validator(mode="before")

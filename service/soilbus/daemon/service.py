@@ -14,10 +14,10 @@ import logging
 import math
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, Future
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from soilbus import __version__
 from soilbus.can.bus import LiveBus
@@ -37,12 +37,14 @@ from soilbus.decision.judgement import Basis, at_present
 from soilbus.decision.traction_loss import NO_LOSS, observed
 from soilbus.decision.traversability import State, Status, Traversability
 from soilbus.pipeline.intake import Latest
-from soilbus.pipeline.outputs import TICK, WINDOW_MODULUS, forecast_frame, hop_frames, slip_frames
+from soilbus.pipeline.outputs import TICK, WINDOW_MODULUS, demand_frame, forecast_frame, hop_frames, slip_frames
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult, as_of
 from soilbus.pipeline.states import ServiceState, state_after
 
 if TYPE_CHECKING:
+    from soilbus.daemon.address_claim import AddressClaim
+    from soilbus.daemon.mqtt import MqttOutlet
     from soilbus.daemon.state_persistence import StatePersistence
     from soilbus.decision.capability import OverSlip
     from soilbus.estimation.gaussian import Gaussian
@@ -93,6 +95,10 @@ class Service:
         Called in the worker before the first window; returns the stored state of the last run, or None.
     waiting
         Waits for a future, for at most the seconds given (as WorkQueue).
+    outlet
+        Takes each window's result beside the bus; None without [mqtt].
+    claim
+        Of our source address; None where [j1939] asks for none.
 
     Notes
     -----
@@ -111,6 +117,8 @@ class Service:
         on_window: Callable[[WindowResult], None] | None = None,
         open_persistence: Callable[[], StatePersistence | None] = lambda: None,
         waiting: Callable[[Future[WindowResult], float], None] = wait_for,
+        outlet: MqttOutlet | None = None,
+        claim: AddressClaim | None = None,
     ) -> None:
         self.config, self.bus, self.publisher = config, bus, publisher
         self.intake = pipeline.intake
@@ -118,6 +126,7 @@ class Service:
         self._guarded_estimator = GuardedEstimator(self._first_estimator, pipeline.new_estimator)
         self._persistence: StatePersistence | None = None
         self.notifier, self.clock, self.on_window = notifier, clock, on_window
+        self._outlet, self._claim, self._claimed_after = outlet, claim, bus.counts.reopened
         self.result: WindowResult | None = None
         self.deadline_misses = 0
         self.failures: Counter[str] = Counter()
@@ -176,10 +185,15 @@ class Service:
         self.bus.close()
         if self._persistence is not None:
             self._persistence.close(self.newest_posterior, self._totals())
+        for beside in (self._outlet, self._claim):
+            if beside is not None:
+                beside.close()
 
     def step(self) -> None:
         """Receive until the next tick, then hand out, collect and publish what is due."""
         self._receive()
+        if self._claim is not None:
+            self._keep_address(self._claim)
         now = self.clock()
         if self.bus.is_open:
             self._hand_out(now)
@@ -191,7 +205,15 @@ class Service:
             self._next_tick = max(next_tick(self._next_tick, window_ends), now - TICK)
             self._tick(now)
 
+    def _keep_address(self, claim: AddressClaim) -> None:
+        if self.bus.counts.reopened != self._claimed_after:
+            self._claimed_after = self.bus.counts.reopened
+            claim.begin()
+        for frame in claim.outgoing():
+            self.bus.send(frame)
+
     def _receive(self) -> None:
+        claim = self._claim
         feed, longest, now = self.intake.admission.feed, MAX_WAIT, self.clock()
         if self._work_queue and self.bus.is_open:
             undisturbed = UNDISTURBED_TIME_LARGE_BUFFER if self.bus.holds_seconds else UNDISTURBED_TIME
@@ -216,6 +238,8 @@ class Service:
                 message.data,
                 message.is_remote_frame,
             )
+            if claim is not None:
+                claim.hear(message.timestamp, message.arbitration_id, message.is_extended_id, message.data)
             self._time.took(message.timestamp, now)
             if message.timestamp >= self.intake.next_end or now >= self._next_tick:
                 return
@@ -236,9 +260,16 @@ class Service:
                 self._take(result, pending.at)
                 present = as_of(self._vouched(result, pending.at, now), self._loss, result.t, self.config, self._warned)
                 for message, values in hop_frames(present):
-                    self.bus.send(self.publisher.frame(message, values))
+                    self._send(message, values)
             if self.on_window is not None:
                 self.on_window(result)
+            if self._outlet is not None:
+                self._outlet.put(result)
+
+    def _send(self, message: str, values: Mapping[str, Any]) -> None:
+        """One of our frames, unless our address is not ours."""
+        if self._claim is None or self._claim.holds:
+            self.bus.send(self.publisher.frame(message, values))
 
     def _vouched(self, result: WindowResult, ended: float, now: float) -> WindowResult:
         """The result as it may go out: valid only where nothing has interrupted the inputs since its window's end."""
@@ -284,6 +315,7 @@ class Service:
 
     def _look_after_health(self, now: float) -> None:
         hears = self.bus.is_open and now - self._time.last_frame <= SILENCE_TIME
+        hears = hears and not (self._claim is not None and self._claim.is_lost)  # a restart would not win it back
         fault = self._health.fault(now, self._work_queue.solving_since, hears, self.bus.counts.sent) or ""
         if fault and fault != self._fault:
             log.error("fault: %s; systemd no longer hears that all is well", fault)
@@ -376,31 +408,28 @@ class Service:
         known = decision.state is not State.UNKNOWN
         window = self.result.index % WINDOW_MODULUS if self.result is not None else None
         for message, values in slip_frames(latest.slip):
-            self.bus.send(self.publisher.frame(message, values))
+            self._send(message, values)
         foreseeable = self.result if known and not self._loss.stuck else None
-        self.bus.send(self.publisher.frame(*forecast_frame(foreseeable, warning)))
-        self.bus.send(
-            self.publisher.frame(
-                "Traversability",
-                {
-                    "State": str(decision.state),
-                    "LimitingCause": decision.limit if known else None,
-                    "Probability": decision.probability if known else None,
-                    "Age": max(age, 0.0) if math.isfinite(age := self._age(now)) else None,
-                    "SinceValid": self._since_valid(now),
-                    "Window": window,
-                },
-            )
+        self._send(*forecast_frame(foreseeable, warning))
+        self._send(*demand_frame(latest.draft, latest.pitch))
+        self._send(
+            "Traversability",
+            {
+                "State": str(decision.state),
+                "LimitingCause": decision.limit if known else None,
+                "Probability": decision.probability if known else None,
+                "Age": max(age, 0.0) if math.isfinite(age := self._age(now)) else None,
+                "SinceValid": self._since_valid(now),
+                "Window": window,
+            },
         )
-        self.bus.send(
-            self.publisher.frame(
-                "TorqueDemand",
-                {
-                    "TorqueRequired": decision.torque_required if known else None,
-                    "TorqueAvailable": decision.torque_available if known else None,
-                    "Window": window,
-                },
-            )
+        self._send(
+            "TorqueDemand",
+            {
+                "TorqueRequired": decision.torque_required if known else None,
+                "TorqueAvailable": decision.torque_available if known else None,
+                "Window": window,
+            },
         )
 
     def _publish_slow(self, message: str, now: float) -> None:
@@ -410,24 +439,22 @@ class Service:
             values = {
                 "VersionMajor": major, "VersionMinor": minor, "VersionPatch": patch, "Uptime": now - self._started,
             }  # fmt: skip
-            self.bus.send(self.publisher.frame(message, values))
+            self._send(message, values)
             return
         if message == "BusHealth":
-            self.bus.send(self.publisher.frame(*health_frame(self.bus.state, self.bus.counts)))
+            self._send(*health_frame(self.bus.state, self.bus.counts))
             return
         counts = self.intake.admission.counts
         received = sum(counts.received.values())
-        self.bus.send(
-            self.publisher.frame(
-                message,
-                {
-                    "State": str(state),
-                    "Reason": _first_word(reason),
-                    "RejectedShare": 100.0 * sum(counts.refused.values()) / received if received else None,
-                    "DeadlineMisses": self.deadline_misses,
-                    "Window": self.result.index % WINDOW_MODULUS if self.result is not None else None,
-                },
-            )
+        self._send(
+            message,
+            {
+                "State": str(state),
+                "Reason": _first_word(reason),
+                "RejectedShare": 100.0 * sum(counts.refused.values()) / received if received else None,
+                "DeadlineMisses": self.deadline_misses,
+                "Window": self.result.index % WINDOW_MODULUS if self.result is not None else None,
+            },
         )
         text = f"{state}" if reason == "none" else f"{state}: {reason}"
         if self.result is not None and self.result.bearing is not None:
@@ -440,6 +467,9 @@ class Service:
             text += ", failed solves: " + ", ".join(f"{kind} {n}" for kind, n in self.failures.most_common())
         if health := health_text(self.bus.state, self.bus.counts):
             text += f", bus: {health}"
+        for beside in (self._claim, self._outlet):
+            if beside is not None and (said := beside.status()):
+                text += f", {said}"
         self.notifier.status(text)
 
 

@@ -20,8 +20,9 @@ from cantools.database.can import Database
 from soilbus.allocator import loading
 from soilbus.can.bus import BusError, LiveBus, open_bus
 from soilbus.can.dbc_files import filters_of, load_databases, output_database
+from soilbus.can.j1939 import source_of
 from soilbus.can.publish import Publisher
-from soilbus.config.model import Config
+from soilbus.config.model import Config, ConfigError
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.service import Service
 from soilbus.pipeline.outputs import check_cycle_times
@@ -29,6 +30,8 @@ from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 
 if TYPE_CHECKING:
+    from soilbus.daemon.address_claim import AddressClaim
+    from soilbus.daemon.mqtt import MqttOutlet
     from soilbus.daemon.state_persistence import StatePersistence
 
 SWITCH_INTERVAL = 0.0005
@@ -64,9 +67,10 @@ def start_service(
     """
     pipeline, ours = Pipeline(config, load_databases(config, mapped_only=True)), output_database(config)
     check_cycle_times(config, ours)
+    outlet, claim = _outlet(config), _claim(config, ours)
     publisher = Publisher(ours)
     settings = config.bus.model_dump()
-    filters = pipeline.admission.can_filters() + filters_of(ours)
+    filters = pipeline.admission.can_filters() + filters_of(ours) + ([] if claim is None else list(claim.filters))
     own = [(message.frame_id, message.is_extended_frame) for message in ours.messages]
     bus = LiveBus(lambda: open_bus(settings, filters), time.monotonic, time.sleep, own)
     try:
@@ -83,11 +87,32 @@ def start_service(
         _load()
     service = Service(
         config, pipeline, bus, publisher, Notifier.from_environment(), workers, on_window=on_window,
-        open_persistence=partial(_state_persistence, pipeline, os.environ),
+        open_persistence=partial(_state_persistence, pipeline, os.environ), outlet=outlet, claim=claim,
     )  # fmt: skip
     if rehearse:
         workers.submit(_rehearse, config, pipeline.database, ours)  # where it raises, the first window is late, no more
     return service
+
+
+def _outlet(config: Config) -> MqttOutlet | None:
+    """What [mqtt] asks for; nothing of it is loaded where the section is missing."""
+    if config.mqtt is None:
+        return None
+    from soilbus.daemon.mqtt import MqttOutlet
+
+    return MqttOutlet(config.mqtt, config)
+
+
+def _claim(config: Config, ours: Database) -> AddressClaim | None:
+    """What [j1939] asks for, of the address that our frames have."""
+    if not config.j1939.address_claim:
+        return None
+    from soilbus.daemon.address_claim import AddressClaim
+
+    addresses = {source_of(message.frame_id) for message in ours.messages if message.is_extended_frame}
+    if len(addresses) != 1:
+        raise ConfigError([f"j1939.address: missing; the frames of {config.output.dbc} have no one address"])
+    return AddressClaim(config.j1939, addresses.pop())
 
 
 def _load() -> None:

@@ -1,15 +1,14 @@
 """How late a channel is: joint posterior of the dead time d and the time constant tau of its low pass.
 
     p(d, tau) ~ exp(-cost(d, tau) / 2),  cost = squared prior terms + sum over recordings of min -2 log posterior / T
-    E[x] = integral over tau of  sd(tau) exp(-cost(tau) / 2) x(tau)      (sum d + tau: Laplace at each tau)
+    E[x] = integral over tau and d + tau of  exp(-cost / 2) x            on a grid along the ridge
 
 Evenly driven recordings determine the sum d + tau well and its parts hardly: the effect of tau beyond the sum goes
 with tau^2.  The likelihood is a curved ridge, of which a Gaussian at the top is too wide where tau is 0 and too narrow
 elsewhere.  So -2 log posterior, minimised over soil, gains and other effects (in which it is taken as quadratic about
-the fit), is evaluated along the ridge: at each tau a parabola over the sum, then moments over all tau (Laplace's
-method with one parameter integrated numerically: Tierney & Kadane 1986, J. Am. Stat. Assoc. 81:82).  It is divided by
-the temperature T of `verdict`: interpolating measurements leaves bias and noise that are not the model's, and a delay
-shares them with a low pass.
+the fit), is followed along the ridge and integrated numerically about it: curves through samples make it uneven over
+a sample time, so that its local curvature says little.  It is divided by the temperature T of `verdict`: interpolating
+measurements leaves bias and noise that are not the model's, and a delay shares them with a low pass.
 """
 
 from __future__ import annotations
@@ -42,6 +41,8 @@ NODES = 11
 """Time constants of the quadrature: over the whole range, and again over where the posterior is."""
 SUM_STEP = 0.005
 """Half the span of sums [s] that a parabola goes through."""
+SUMS, SPAN_SD = 17, 4.0
+"""Sums of the quadrature at each time constant, and how many sd to either side of the ridge they lie."""
 MAX_NEWTON_STEPS = 12
 """Steps along the sum at one time constant."""
 ERROR_OF_PARTS, ERROR_OF_SUM = 0.1, 0.02
@@ -161,27 +162,32 @@ def _posterior(
     most = min(second.parameter.high, max(sum(here) - low, SUM_STEP) + 2.0 * SUM_STEP)
     bounds, start = (low, high), (sum(here), here[1])
     ridge = _ridge(cost, np.linspace(0.0, most, NODES), start, bounds, first.std)
-    share = ridge.weights()
-    near = np.flatnonzero(share > 1e-3)
+    near = np.flatnonzero(softmax(-0.5 * ridge.cost) > 1e-3)
     begin, end = ridge.tau[max(near[0] - 1, 0)], ridge.tau[min(near[-1] + 1, NODES - 1)]
     top = int(np.argmin(ridge.cost))
     start = float(ridge.total[top]), float(ridge.tau[top])
     ridge = _ridge(cost, np.linspace(begin, end, NODES), start, bounds, first.std)
-    share, best = ridge.weights(), int(np.argmin(ridge.cost))
+    best = int(np.argmin(ridge.cost))
+    total = ridge.total[:, None] + SPAN_SD * np.median(ridge.sd) * np.linspace(-1.0, 1.0, SUMS)
+    tau = np.broadcast_to(ridge.tau[:, None], total.shape)
+    delay = total - tau
+    within = (low <= delay) & (delay <= high)
+    costs = np.full(total.shape, np.inf)
+    costs[within] = [cost(d, t) for d, t in zip(delay[within], tau[within], strict=True)]
+    share = softmax(-0.5 * costs)
+    mean_total = float((share * total).sum())
+    tau_cell, sum_cell = (float(step) / np.sqrt(12.0) for step in (tau[1, 0] - tau[0, 0], total[0, 1] - total[0, 0]))
 
-    mean_total = float(share @ ridge.total)
+    def estimate_of(values: Array, cell: float, error: float) -> Estimate:
+        mean = float((share * values).sum())
+        variance = float((share * (values - mean) ** 2).sum())
+        return Estimate(mean, float(np.sqrt(variance + cell**2 + (error * mean_total) ** 2)))
 
-    def estimate_of(values: Array, sd: Array, error: float) -> Estimate:
-        mean = float(share @ values)
-        return Estimate(mean, float(np.sqrt(share @ (sd**2 + (values - mean) ** 2) + (error * mean_total) ** 2)))
-
-    within = np.full(NODES, (ridge.tau[1] - ridge.tau[0]) / np.sqrt(12.0))  # sd inside a node's interval
-    delay = ridge.total - ridge.tau
     return DelayPosterior(
-        estimate_of(delay, np.hypot(ridge.sd, within), ERROR_OF_PARTS),
-        estimate_of(ridge.tau, within, ERROR_OF_PARTS),
-        estimate_of(ridge.total, ridge.sd, ERROR_OF_SUM),
-        (float(delay[best]), float(ridge.tau[best])),
+        estimate_of(delay, np.hypot(tau_cell, sum_cell), ERROR_OF_PARTS),
+        estimate_of(tau, tau_cell, ERROR_OF_PARTS),
+        estimate_of(total, sum_cell, ERROR_OF_SUM),
+        (float(ridge.total[best] - ridge.tau[best]), float(ridge.tau[best])),
         divisor * (cost(*here) - float(ridge.cost[best])),
     )
 
@@ -193,11 +199,6 @@ class _Ridge(NamedTuple):
     total: Array
     sd: Array
     cost: Array
-
-    def weights(self) -> Array:
-        """Shares (K,) of the posterior's mass."""
-        edges = np.concatenate([self.tau[:1], (self.tau[1:] + self.tau[:-1]) / 2.0, self.tau[-1:]])
-        return np.asarray(softmax(np.log(self.sd * np.diff(edges)) - 0.5 * self.cost))
 
 
 def _ridge(cost: Cost, taus: Array, here: tuple[float, float], bounds: tuple[float, float], std: float) -> _Ridge:

@@ -173,6 +173,7 @@ class WindowEstimator:
             position=task.track.at((tracked.since + task.end) / 2.0),
             failure=self._failure(tracked),
             gaps=self._model_gaps(task, fit),
+            channel_chi2=self._gap.chi2(),
             excitation=excitation_of(task.window, self.rig, self._settings.min_speed),
             basis=basis,
             z_driven=None if fit is None or posterior is None else self._sinkage_range(fit),

@@ -96,13 +96,15 @@ class WindowTask:
 class Latest(NamedTuple):
     """Means over the last SLIP_SPAN: slip by wheel, pull [N] (draft, slope, inertia), its inertia [N], motion.
 
-    None where not known.
+    And draft [N] and pitch [rad] as measured. None where not known.
     """
 
     slip: dict[str, float | None]
     pull: float | None
     inertia: float = 0.0
     motion: Motion | None = None
+    draft: float | None = None
+    pitch: float | None = None
 
 
 @dataclass(slots=True)
@@ -380,7 +382,7 @@ class Intake:
         ]
 
     def latest(self, now: float) -> Latest:
-        """Slip, pull and motion over the last SLIP_SPAN before `now` [s]."""
+        """Slip, pull, motion, draft and pitch over the last SLIP_SPAN before `now` [s]."""
         if self._bins is None or not abs(now - self._newest) <= LONGEST_GAP:  # nor nan: no bins for years of silence
             return Latest(dict.fromkeys(self.rig.wheels), None)
         last = math.floor((now - self._bins.origin) / self._settings.bin) * self._settings.bin + self._bins.origin
@@ -392,7 +394,8 @@ class Intake:
         given = column_means(pull[:, None])[0]
         motion = motion_of(window, self.rig, self._limits.at(now), self._decision)
         part = 0.0 if given is None else float(inertia[np.isfinite(pull)].mean())
-        return Latest(self._slip(window), given, part, motion)
+        draft, pitch = column_means(np.column_stack((window.draft, window.pitch)))
+        return Latest(self._slip(window), given, part, motion, draft, pitch)
 
     def _slip(self, window: Window) -> dict[str, float | None]:
         ground = window.ground_speed[:, None]

@@ -74,11 +74,24 @@ class GapWatch:
         """Reduced chi-square of the channels that have not fitted for minutes, the worst first."""
         if not self._seen or self._seen[-1][0] - self._seen[0][0] < LEAST_SPAN:
             return {}
-        out = {}
-        for channel in {name for _, found in self._seen for name in found}:
-            parts = [found[channel] for _, found in self._seen if channel in found]
-            rows = sum(part.rows for part in parts)
-            chi2 = sum(part.total for part in parts) / rows
-            if chi2 > max(LIMIT, 1.0 + DEVIATIONS * math.sqrt(2.0 * self._overlap / rows)):
-                out[channel] = chi2
+        out = {
+            channel: known.total / known.rows
+            for channel, known in self._sums().items()
+            if known.total / known.rows > max(LIMIT, 1.0 + DEVIATIONS * math.sqrt(2.0 * self._overlap / known.rows))
+        }
         return dict(sorted(out.items(), key=lambda item: -item[1]))
+
+    def chi2(self) -> dict[str, float]:
+        """Reduced chi-square of every channel, whether it fits or not."""
+        return {channel: known.total / known.rows for channel, known in self._sums().items()}
+
+    def _sums(self) -> dict[str, Square]:
+        """Of each channel over the windows kept."""
+        of_channel: dict[str, list[Square]] = {}
+        for _, found in self._seen:
+            for channel, square in found.items():
+                of_channel.setdefault(channel, []).append(square)
+        return {
+            channel: Square(sum(part.total for part in parts), sum(part.rows for part in parts))
+            for channel, parts in of_channel.items()
+        }

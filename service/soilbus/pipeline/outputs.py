@@ -1,6 +1,7 @@
-"""One window's result as a JSON line and as values of the CAN frames that soilbus sends.
+"""One window's result as a JSON line, as a row of a table and as values of the CAN frames that soilbus sends.
 
-    WindowResult -> json_line                       one object per window, SI units, keys in DESIGN.md
+    WindowResult -> window_record, json_line        one object per window, SI units, keys in docs/json.md
+    window_record -> flat_record                    the same as a row: soil.phi.value, slip.FL
     WindowResult -> hop_frames                      frames sent once per window
     WindowResult, Watch -> forecast_frame           frame sent every TICK
 
@@ -11,7 +12,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from cantools.database.can import Database
@@ -30,12 +31,16 @@ __all__ = [
     "FAST_FRAMES",
     "HOP_FRAMES",
     "check_cycle_times",
+    "column_names",
+    "demand_frame",
+    "flat_record",
     "forecast_frame",
     "hop_frames",
     "json_line",
     "known",
     "likeliest",
     "slip_frames",
+    "window_record",
 ]
 
 WINDOW_MODULUS = 251
@@ -43,7 +48,7 @@ WINDOW_MODULUS = 251
 
 TICK = 0.1
 """Cycle [s] of the fast frames, on which other devices act."""
-FAST_FRAMES = ("WheelSlip", "WheelSlip2", "Traversability", "TorqueDemand", "DemandForecast")
+FAST_FRAMES = ("WheelSlip", "WheelSlip2", "Traversability", "TorqueDemand", "DemandForecast", "PresentDemand")
 
 LONGEST_TIME = 1e6
 """Time left [s] that stands for no end: above the range of any signal."""
@@ -61,10 +66,12 @@ PARAMETER_FRAMES = {
     "K": ("SoilShearModulus", 1e-3),
 }
 
+REASONS_AS_SENT = {"not_available": "no_value", "error": "sensor_error"}
+"""Reasons of refusal whose names mean in a value table that the signal itself has no value."""
 
 HOP_FRAMES = (
     "SoilStrength", "SoilClass", *(message for message, _ in PARAMETER_FRAMES.values()), "DraftCapability",
-    "GradeCapability", "TractionAdvice", "TractionLimits", "WheelSinkage", "WheelSinkage2",
+    "GradeCapability", "TractionAdvice", "TractionLimits", "WheelSinkage", "WheelSinkage2", "WindowQuality",
 )  # fmt: skip
 """Names of the frames that are sent once per window."""
 
@@ -93,7 +100,12 @@ def check_cycle_times(config: Config, database: Database) -> None:
 
 
 def json_line(result: WindowResult, config: Config) -> str:
-    """The result as one line of JSON (keys: DESIGN.md), in SI units, null where not known."""
+    """The result as one line of JSON (keys: docs/json.md), in SI units, null where not known."""
+    return json.dumps(window_record(result, config), allow_nan=False)
+
+
+def window_record(result: WindowResult, config: Config) -> dict[str, Any]:
+    """The result as nested dicts and lists (keys: docs/json.md), in SI units, None where not known."""
     decision = result.traversability
     bearing = {
         "z_ref": config.estimator.z_ref,
@@ -140,7 +152,54 @@ def json_line(result: WindowResult, config: Config) -> str:
         "samples": result.samples,
         "rejected": result.rejected,
     }
-    return json.dumps(known(line), allow_nan=False)
+    record: dict[str, Any] = known(line)
+    return record
+
+
+def flat_record(record: Mapping[str, Any]) -> dict[str, float | str | int | None]:
+    """A nested record as one row of a table.
+
+    Parameters
+    ----------
+    record
+        Nested mappings and lists, as `window_record` makes them or a line of `replay --json` holds them.
+
+    Returns
+    -------
+    dict
+        One entry for each number, text or None, in the record's order.  Its name is the path to it: keys joined by
+        dots, the places of a list counted from 0.  Empty mappings and lists have no entry.
+
+    Examples
+    --------
+    >>> flat_record({"t": 10.0, "soil": {"phi": {"value": 0.5, "std": None}}, "z_driven": [0.03, 0.05], "gaps": {}})
+    {'t': 10.0, 'soil.phi.value': 0.5, 'soil.phi.std': None, 'z_driven.0': 0.03, 'z_driven.1': 0.05}
+    """
+    return dict(_leaves("", record))
+
+
+def _leaves(path: str, value: Any) -> Iterator[tuple[str, Any]]:
+    if not isinstance(value, Mapping | list):
+        yield path, value
+        return
+    for key, inner in value.items() if isinstance(value, Mapping) else enumerate(value):
+        yield from _leaves(f"{path}.{key}" if path else str(key), inner)
+
+
+def column_names(rows: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Columns of a table of flat records: those of all rows, parts of one quantity together.
+
+    A part that is null as a whole in some rows (`soil` of an invalid window) is no column beside its own parts.
+
+    Examples
+    --------
+    >>> column_names([{"t": 9.0, "soil": None, "chi2": None}, {"t": 10.0, "soil.n.value": 0.7, "chi2": 1.0}])
+    ['t', 'soil.n.value', 'chi2']
+    """
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    wholes = {".".join(parts[:n]) for parts in (name.split(".") for name in names) for n in range(1, len(parts))}
+    keys = list(dict.fromkeys(name.partition(".")[0] for name in names))
+    return sorted(set(names) - wholes, key=lambda name: (keys.index(name.partition(".")[0]), names.index(name)))
 
 
 def _extrapolates(result: WindowResult, z_ref: float) -> bool | None:
@@ -203,6 +262,15 @@ def hop_frames(result: WindowResult) -> Iterator[tuple[str, dict[str, Any]]]:
     yield "TractionLimits", common | {"LimitingCause": decision.limit} | _limits(decision.capability)
     for message, values in _by_wheel("WheelSinkage", "SinkageWheel", result.sinkage, 1e-3):
         yield message, common | values
+    yield "WindowQuality", {"Window": common["Window"]} | _quality(result)
+
+
+def _quality(result: WindowResult) -> dict[str, Any]:
+    """Chi-square of each channel; the most frequent reason of refusals, and the number of all."""
+    rejected = result.rejected
+    reason = max(rejected, key=lambda name: rejected[name]) if rejected else "none"
+    chi2 = {f"Chi2{channel.capitalize()}": value for channel, value in result.channel_chi2.items()}
+    return chi2 | {"RejectedReason": REASONS_AS_SENT.get(reason, reason), "Rejected": sum(rejected.values())}
 
 
 def _value_and_std(value: str, std: str, estimate: Estimate | None, unit: float) -> dict[str, float | None]:
@@ -246,6 +314,11 @@ def forecast_frame(result: WindowResult | None, watch: Watch) -> tuple[str, dict
         "Window": None if result is None else result.index % WINDOW_MODULUS,
         "Status": None if result is None else str(result.status),
     }
+
+
+def demand_frame(draft: float | None, pitch: float | None) -> tuple[str, dict[str, Any]]:
+    """(message, values in the DBC's units) of the present draft [N] and pitch [rad]; None where not known."""
+    return "PresentDemand", {"Draft": draft, "Slope": pitch}
 
 
 def known(value: Any) -> Any:

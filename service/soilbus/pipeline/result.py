@@ -48,6 +48,8 @@ class WindowResult:
         Kind of failure of the solve; None for none.
     gaps
         Reduced chi-square of channels that have not fitted for minutes, the worst first.
+    channel_chi2
+        Reduced chi-square of every channel over the last minutes.
     z_driven
         5 % and 95 % quantiles of the sinkage [m].
     search_ended
@@ -81,6 +83,7 @@ class WindowResult:
     position: Position | None = None
     failure: str | None = None
     gaps: Mapping[str, float] = field(default_factory=dict)
+    channel_chi2: Mapping[str, float] = field(default_factory=dict)
     z_driven: tuple[float, float] | None = None
     search_ended: bool = False
     watch: Watch = Watch()  # noqa: RUF009, immutable

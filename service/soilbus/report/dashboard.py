@@ -1,241 +1,341 @@
-"""A live terminal dashboard that reads only our frames, as any dashboard ECU would.
+"""The dashboard's knowledge: what our frames say now and said in the last minute, in words.
 
-Grey figures have a Status other than valid: they are guesses that must not be acted on. "-" is a value that is not
-available or too old.
+It reads only our frames, as any dashboard ECU would, and judges them by the rules of dbc/README.md. The pages
+(`driver_page`, `engineer_page`) draw it; `sentences` say it to whoever hears or logs it.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
-from contextlib import closing
+import math
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
-from rich.console import Console, Group
-from rich.live import Live
-from rich.panel import Panel
-from rich.table import Table
-from rich.text import Text
+from rich.style import Style
 
-from soilbus.can.bus import LiveBus, open_bus
-from soilbus.can.dbc_files import filters_of, output_database
 from soilbus.config.model import Config
 from soilbus.report.received_frames import ReceivedFrames
 
-COLOURS = {"go": "green", "caution": "yellow", "no_go": "red", "unknown": "white"}
-PARAMETERS = {
-    "k_c": ("SoilCohesiveModulus", "kN/m^(n+1)"),
-    "k_φ": ("SoilFrictionalModulus", "kN/m^(n+2)"),
-    "n": ("SoilSinkageExponent", ""),
-    "φ": ("SoilFrictionAngle", "°"),
-    "c": ("SoilCohesion", "kPa"),
-    "K": ("SoilShearModulus", "mm"),
+__all__ = ["Dashboard", "Vehicle", "Verdict", "force", "percent"]
+
+SAMPLE_PERIOD = 0.1
+"""Least time [s] between two samples of the history: the cycle of the fast frames."""
+LONGEST_HOLD = 0.5
+"""Time [s] for which a sample stands where none follows: more than twice the time between two pictures."""
+TOP_TIME_LEFT = 25.0
+"""Top of the range [s] of DemandForecast.TimeLeft: this long or longer."""
+WHEELS = 8
+"""Wheels of which our frames can speak."""
+
+NAMES = {"go": "GO", "caution": "CAUTION", "no_go": "NO-GO", "unknown": "UNKNOWN"}
+TODO = {
+    ("go", None): "Keep going",
+    ("caution", "torque"): "Less draft, motor limit",
+    ("caution", "traction"): "Less draft, more load",
+    ("caution", "slip"): "Less draft, more load",
+    ("caution", "sinkage"): "Less load, firmer ground",
+    ("caution", None): "Go slowly, watch the slip",
+    ("no_go", "torque"): "Stop, reduce the draft",
+    ("no_go", "traction"): "Stop, lift the implement",
+    ("no_go", "slip"): "Stop, lift the implement",
+    ("no_go", "sinkage"): "Stop, turn off soft ground",
+    ("no_go", None): "Stop, lift the implement",
 }
-LIMITS = {
-    "on the level": ("DraftCapability", "GradeCapability"),
-    "here and now": ("TractionLimits", "TractionLimits"),
+"""What to do by state and limiting cause, in at most five words."""
+WARNED_TODO = "Stop, lift, add no torque"
+GONE_TODO = "Rely on your own judgement"
+MEASURING = "Go slowly, still measuring"
+COLOURS = {
+    "go": ("#000000", "#00d700"),
+    "caution": ("#000000", "#ffd700"),
+    "no_go": ("#ffffff", "#870000"),
+    "warned": ("#ffffff", "#5f005f"),
+    "unknown": ("#000000", "#d0d0d0"),
+    "gone": ("#ffffff", "#303030"),
 }
-"""Messages of draft and of slope, by what they hold for."""
-ADVICE = {"efficiency": "SlipForEfficiency", "pull": "SlipForPull"}
-FAULTS_OF_BUS = {
-    "Overruns": "overruns",
-    "Dropped": "dropped",
-    "ForeignFrames": "foreign",
-    "ErrorFrames": "errors",
-    "Reopened": "reopened",
+"""Foreground and background by kind of verdict: of the fixed colours of a 256-colour terminal, as the first 16 are
+whatever its theme makes of them; contrast by WCAG 2 above 7 (level AAA)."""
+REASONS = {
+    "bus_down": ("the bus is down", "Check the CAN connection"),
+    "bus_error": ("the bus has errors", "Check the CAN connection"),
+    "no_frames": ("nothing on the bus", "Check the CAN connection"),
+    "standstill": ("standing still", "Drive on to measure"),
+    "not_excited": ("load and slip hardly vary", "Go carefully, vary the load"),
+    "ambiguous": ("several soils fit", "Go carefully, vary the load"),
+    "turning": ("turning", "Drive straight to measure"),
+    "input_missing": ("an input never came", "Check the sensors"),
+    "input_stale": ("an input stopped", "Check the sensors"),
+    "input_rejected": ("an input is refused", "Check the sensors"),
+    "implausible": ("a sensor contradicts the others", "Check the sensors"),
+    "foreign_sender": ("another node sends our frames", "Remove the second soilbus"),
+    "model_mismatch": ("the model does not fit", GONE_TODO),
+    "no_convergence": ("no soil fits", GONE_TODO),
+    "overload": ("soilbus is too slow", GONE_TODO),
+    "internal": ("soilbus has a defect", GONE_TODO),
 }
-WIDTH = 78
-"""Characters of the dashboard."""
+"""What the service's reason means, and what to do while the state is unknown for it."""
 
 
-def panel(known: ReceivedFrames, fault: str = "") -> Panel:
-    """The dashboard's picture.
+class Verdict(NamedTuple):
+    """State in a word for block letters, in a sentence that begins with it, what to do, and the kind of its colours."""
 
-    Parameters
+    word: str
+    said: str
+    todo: str
+    kind: str
+
+    @property
+    def style(self) -> Style:
+        """Its colours, as reversed ones: a terminal without colour then shows it in reverse video."""
+        foreground, background = COLOURS[self.kind]
+        return Style(color=background, bgcolor=foreground, reverse=True, bold=True)
+
+    @property
+    def block_style(self) -> Style:
+        """Of a full block: its colour also behind it, as fonts leave gaps between blocks."""
+        foreground, _ = COLOURS[self.kind]
+        return Style(color=foreground, bgcolor=foreground, reverse=True)
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """What a configuration adds to the frames.
+
+    Attributes
+    ----------
+    wheels
+        Names in the order of the frames; empty where no configuration names them.
+    axles
+        Axle of each of these wheels.
+    window
+        Length of an estimation window [s].
+    max_slip
+        Slip at the end of the slip bar.
+    """
+
+    wheels: tuple[str, ...] = ()
+    axles: tuple[str | None, ...] = ()
+    window: float = 10.0
+    max_slip: float = 0.6
+
+    @classmethod
+    def of(cls, config: Config, names_wheels: bool = True) -> Vehicle:
+        """Of a configuration; without names where the configuration is not that of the vehicle that is watched."""
+        wheels = config.wheel if names_wheels else []
+        return cls(
+            tuple(w.name for w in wheels), tuple(w.axle for w in wheels),
+            config.estimator.window, config.traversability.max_slip,
+        )  # fmt: skip
+
+    def name(self, wheel: int) -> str:
+        """Name of a wheel, numbered from 0; its number from 1 where it has none."""
+        return self.wheels[wheel] if wheel < len(self.wheels) else str(wheel + 1)
+
+
+class Slip(NamedTuple):
+    """Slip of the wheel that slips most, that wheel's name, and the set-points of its axle; None where not known."""
+
+    value: float | None = None
+    wheel: str = ""
+    best: float | None = None
+    most_pull: float | None = None
+
+
+@dataclass
+class Dashboard:
+    """Received frames and their last minute.
+
+    Attributes
     ----------
     known
         The received frames.
+    vehicle
+        What the configuration adds to them.
     fault
         Why the bus is away; empty while it is there.
+    span
+        Time [s] that the charts show.
     """
-    decision = str(known.value("Traversability", "State"))
-    decision = decision if decision in COLOURS else "unknown"
-    head = Text(f" {decision.upper().replace('_', '-')} ", style=f"bold black on {COLOURS[decision]}")
-    ground, task = (Table.grid(padding=(0, 4)) for _ in range(2))
-    ground.add_row(_soil(known), _wheels(known))
-    task.add_row(_limits(known), _advice(known))
-    lines = (Text("  ".join(words)) for words in (_detail(known), _demand(known)))
-    parts = (head, _warning(known), *lines, Text(" ".join(_kind(known))), Text(""))
-    service, bus = (Text("  ".join(words)) for words in (_service(known), _bus(known)))
-    last = (Text(""), task, Text(""), service, Text(f"bus: away ({fault})") if fault else bus)
-    return Panel(Group(*parts, ground, *last), title="soilbus", width=WIDTH)
+
+    known: ReceivedFrames
+    vehicle: Vehicle = field(default_factory=Vehicle)
+    fault: str = ""
+    span: float = 60.0
+    _samples: deque[tuple[float, dict[str, float]]] = field(default_factory=deque, repr=False)
+    _began: float = math.nan
+    _inputs_since: float | None = None
+    _saw_them_begin: bool = False
+
+    def __post_init__(self) -> None:
+        self._began = self.known.now
+
+    def sample(self) -> None:
+        """Take the present values into the history; call it for each frame and each picture."""
+        now, known = self.known.now, self.known
+        self._watch_for_inputs()
+        if self._samples and 0.0 <= now - self._samples[-1][0] < SAMPLE_PERIOD:
+            return
+        values = {
+            "draft": known.number("PresentDemand", "Draft"),
+            "max_draft": self.max_draft(),
+            "slip": self.slip().value,
+            "best_slip": self.slip().best,
+            "bearing": known.number("SoilStrength", "BearingPressure"),
+            "chi2": known.number("SoilStrength", "Chi2"),
+            "rejected": known.number("WindowQuality", "Rejected"),
+        }
+        self._samples.append((now, {name: value for name, value in values.items() if value is not None}))
+        while self._samples[0][0] < now - self.span or self._samples[0][0] > now:
+            self._samples.popleft()
+
+    def history(self, name: str, columns: int) -> list[float | None]:
+        """One value over the last `span` seconds, oldest first: the last sample in or before each column's time.
+
+        None where it was not known for LONGEST_HOLD.
+        """
+        start, width = self.known.now - self.span, self.span / columns
+        samples, last = deque(self._samples), (-math.inf, dict[str, float]())
+        held: list[float | None] = []
+        for column in range(columns):
+            end = start + (column + 1) * width
+            while samples and samples[0][0] <= end + 1e-9:
+                last = samples.popleft()
+            held.append(last[1].get(name) if end - last[0] <= max(LONGEST_HOLD, width) else None)
+        return held
+
+    def verdict(self) -> Verdict:
+        """The state and what to do; stale frames are no state."""
+        known, silence = self.known, self.known.age("SoilbusStatus", "Traversability")
+        if known.is_stale("SoilbusStatus") and known.is_stale("Traversability"):
+            if silence is None:
+                said = f"no frame of soilbus yet, {known.now - self._began:.0f} s"
+                return Verdict("WAIT", f"UNKNOWN: {said}", "Check that soilbus runs", "gone")
+            return Verdict("GONE", f"UNKNOWN: soilbus is gone, for {silence:.0f} s", GONE_TODO, "gone")
+        state = str(known.value("Traversability", "State"))
+        state = state if state in NAMES else "unknown"
+        if known.value("DemandForecast", "Warning") == "immobilisation":
+            is_stuck = state == "no_go" and known.number("Traversability", "Probability") == 0.0
+            left = known.number("DemandForecast", "TimeLeft")
+            when = "" if left is None or left >= TOP_TIME_LEFT else " now" if left < 0.5 else f" in {left:.0f} s"
+            what = "stuck" if is_stuck else f"getting stuck{when}"
+            return Verdict("STUCK", f"{NAMES[state]}: {what}", WARNED_TODO, "warned")
+        if state == "unknown":
+            why, todo = self._unknown()
+            return Verdict("UNKNOWN", f"UNKNOWN: {why}", todo, "unknown")
+        limit = known.value("Traversability", "LimitingCause")
+        todo = TODO.get((state, str(limit)), TODO[state, None])
+        return Verdict(NAMES[state], ", ".join((NAMES[state], *self._because())), todo, state)
+
+    def _because(self) -> Iterator[str]:
+        """Probability and limit of a known state."""
+        limit = self.known.value("Traversability", "LimitingCause")
+        probability = self.known.number("Traversability", "Probability")
+        if limit is not None and limit != "none":
+            yield f"limit: {limit}"
+        if probability is not None:
+            yield f"p = {probability:.2f}"
+
+    def _unknown(self) -> tuple[str, str]:
+        """Why the state is unknown, and what to do."""
+        known = self.known
+        if known.is_stale("Traversability"):
+            return "its frames stopped", GONE_TODO
+        reason = str(known.value("SoilbusStatus", "Reason"))
+        left = self.until_first_window()
+        if left is not None and reason in ("none", "None", "not_excited", "model_gap"):
+            return left, MEASURING
+        if known.value("SoilbusStatus", "State") == "starting":
+            return "soilbus is starting", MEASURING
+        return REASONS.get(reason, ("the estimate is too old", MEASURING))
+
+    def _watch_for_inputs(self) -> None:
+        """Since when the service has had inputs, as a first window needs `window` seconds of them."""
+        state, reason = (self.known.value("SoilbusStatus", name) for name in ("State", "Reason"))
+        if state is None:
+            return
+        if state in ("starting", "waiting") or reason in ("no_frames", "bus_down"):
+            self._inputs_since, self._saw_them_begin = None, True
+        elif self._inputs_since is None:
+            uptime = self.known.number("SoilbusIdentity", "Uptime")
+            self._saw_them_begin |= uptime is not None and uptime < 2.0
+            self._inputs_since = self.known.now
+
+    def until_first_window(self) -> str | None:
+        """How long until the first window has ended; None once there was one, or without inputs."""
+        if self._inputs_since is None or self.known.number("SoilbusStatus", "Window") is not None:
+            return None
+        left = math.ceil(self.vehicle.window - (self.known.now - self._inputs_since))
+        if left <= 0:
+            return "the first window is due"
+        return f"{'' if self._saw_them_begin else 'at most '}{left} s until the first window"
+
+    def slip(self) -> Slip:
+        """Slip and set-points of the wheel that slips most; unknown axle: the smaller set-points of both."""
+        known = [(value, i) for i in range(WHEELS) if (value := self.wheel_slip(i)) is not None]
+        if not known:
+            return Slip(None, "", *self._set_points(None))
+        value, i = max(known, key=lambda pair: pair[0])
+        axle = self.vehicle.axles[i] if i < len(self.vehicle.axles) else None
+        return Slip(value, self.vehicle.name(i), *self._set_points(axle))
+
+    def _set_points(self, axle: str | None) -> tuple[float | None, float | None]:
+        """Slip for efficiency and for pull, while the frame may be acted on."""
+        if not self.known.is_valid("TractionAdvice"):
+            return None, None
+        axles = ("Front", "Rear") if axle is None else (axle.capitalize(),)
+        of_kind = (
+            [self.known.number("TractionAdvice", f"SlipFor{kind}{name}") for name in axles]
+            for kind in ("Efficiency", "Pull")
+        )
+        best, most_pull = (min((x for x in values if x is not None), default=None) for values in of_kind)
+        return best, most_pull
+
+    def wheel_slip(self, wheel: int) -> float | None:
+        """Slip of a wheel, numbered from 0."""
+        return self.known.number("WheelSlip" if wheel < 4 else "WheelSlip2", f"SlipWheel{wheel + 1}")
+
+    def wheel_sinkage(self, wheel: int) -> float | None:
+        """Sinkage [mm] of a wheel, numbered from 0."""
+        return self.known.number("WheelSinkage" if wheel < 4 else "WheelSinkage2", f"SinkageWheel{wheel + 1}")
+
+    def wheels(self) -> list[int]:
+        """Numbers of the wheels to show: those of the configuration, else four and those that have a value."""
+        named = len(self.vehicle.wheels) or 4
+        has_value = (self.wheel_slip(i) is not None or self.wheel_sinkage(i) is not None for i in range(WHEELS))
+        return [i for i, is_known in enumerate(has_value) if i < named or is_known]
+
+    def max_draft(self) -> float | None:
+        """Largest draft [N] here and now, while it may be acted on."""
+        return self.known.number("TractionLimits", "MaxDraft") if self.known.is_valid("TractionLimits") else None
+
+    def freshness(self) -> str:
+        """Age of the data behind the state."""
+        age, since = (self.known.number("Traversability", name) for name in ("Age", "SinceValid"))
+        if age is None:
+            return "no data"
+        return f"data {age:.1f} s old" + ("" if since is None else f", valid {since:.1f} s ago")
+
+    def sentences(self) -> list[str]:
+        """State, what to do, slip, draft, age, and why the bus is away; each where it is known."""
+        verdict, slip, draft = self.verdict(), self.slip(), self.known.number("PresentDemand", "Draft")
+        parts = [verdict.said, verdict.todo]
+        if slip.value is not None:
+            best = "" if slip.best is None else f", best {percent(slip.best)}"
+            parts.append(f"Slip {percent(slip.value)} at wheel {slip.wheel}{best}")
+        if draft is not None:
+            possible = "" if (most := self.max_draft()) is None else f" of {force(most)}"
+            parts.append(f"Draft {force(draft)}{possible}")
+        parts += [] if verdict.kind == "gone" else [self.freshness().capitalize()]
+        parts += [f"Bus away: {self.fault}"] if self.fault else []
+        return parts
 
 
-def _detail(known: ReceivedFrames) -> Iterator[str]:
-    """Of the verdict."""
-    yield from _measured(known, "Traversability", "Probability", "p = {:.2f}")
-    yield from _said(known, "Traversability", "LimitingCause", "limit: {}")
-    yield from _measured(known, "Traversability", "Age", "{:.1f} s old")
-    yield from _measured(known, "Traversability", "SinceValid", "valid {:.1f} s ago")
+def percent(share: float) -> str:
+    """A share or a slip in per cent."""
+    return f"{100.0 * share:.0f} %"
 
 
-def _kind(known: ReceivedFrames) -> Iterator[str]:
-    yield from _said(known, "SoilClass", "Kind", "soil: {}")
-    yield from _measured(known, "SoilClass", "Probability", "({:.2f})")
-    yield from _measured(known, "SoilClass", "UnknownProbability", "none of the known {:.2f}")
-
-
-def _demand(known: ReceivedFrames) -> Iterator[str]:
-    """Torque that the present demand needs, and the slip and sinkage predicted for it."""
-    needed, there = (known.number("TorqueDemand", f"Torque{what}") for what in ("Required", "Available"))
-    if needed is not None or there is not None:
-        yield "torque {} of {} N m".format(*("-" if x is None else f"{x:.0f}" for x in (needed, there)))
-    yield from _measured(known, "DemandForecast", "Slip", "slip to come {:.2f}")
-    yield from _measured(known, "DemandForecast", "Sinkage", "sinkage {:.0f} mm")
-
-
-def _service(known: ReceivedFrames) -> Iterator[str]:
-    version = [known.number("SoilbusIdentity", f"Version{part}") for part in ("Major", "Minor", "Patch")]
-    if None not in version:
-        yield "soilbus " + ".".join(f"{part:.0f}" for part in version)
-    yield from _said(known, "SoilbusStatus", "State", "service: {}")
-    yield from _said(known, "SoilbusStatus", "Reason", "({})")
-    yield from _measured(known, "SoilbusStatus", "RejectedShare", "refused {:.1f} %")
-    if known.bad_frames:
-        yield f"bad frames {known.bad_frames}"
-
-
-def _bus(known: ReceivedFrames) -> Iterator[str]:
-    """How the bus does, by what the service counted on it."""
-    yield from _said(known, "BusHealth", "BusState", "bus: {}")
-    for signal, what in FAULTS_OF_BUS.items():
-        if count := known.number("BusHealth", signal):
-            yield f"{what} {count:.0f}"
-
-
-def _soil(known: ReceivedFrames) -> Table:
-    soil = _table("soil", "value ± std", "unit")
-    soil.add_row("bearing pressure", _pair(known, "SoilStrength", "BearingPressure"), "kPa")
-    for name, (message, unit) in PARAMETERS.items():
-        soil.add_row(name, _pair(known, message, "Value", "Std"), unit)
-    soil.add_row("fit, chi-square", _one(known, "SoilStrength", "Chi2", "{:.1f}"), "")
-    return soil
-
-
-def _limits(known: ReceivedFrames) -> Table:
-    limits = _table("largest", "draft, N", "slope, rad")
-    for name, (of_draft, of_slope) in LIMITS.items():
-        limits.add_row(name, _pair(known, of_draft, "MaxDraft"), _pair(known, of_slope, "MaxGrade"))
-    return limits
-
-
-def _advice(known: ReceivedFrames) -> Table:
-    advice = _table("best slip for", "front", "rear")
-    for name, signal in ADVICE.items():
-        axles = [_one(known, "TractionAdvice", f"{signal}{axle}", "{:.2f}") for axle in ("Front", "Rear")]
-        advice.add_row(name, *axles)
-    return advice
-
-
-def _wheels(known: ReceivedFrames) -> Table:
-    """One row for each wheel; wheels 5 to 8 only where they have a value."""
-    wheels = _table("wheel", "slip", "sinkage, mm")
-    for i in range(1, 9):
-        more = "2" if i > 4 else ""
-        slip = _one(known, f"WheelSlip{more}", f"SlipWheel{i}", "{:+.2f}")
-        depth = _one(known, f"WheelSinkage{more}", f"SinkageWheel{i}", "{:.0f}")
-        if i <= 4 or {slip.plain, depth.plain} != {"-"}:
-            wheels.add_row(str(i), slip, depth)
-    return wheels
-
-
-def _warning(known: ReceivedFrames) -> Text:
-    if known.value("DemandForecast", "Warning") != "immobilisation":
-        return Text("")
-    left = "".join(_measured(known, "DemandForecast", "TimeLeft", " in {:.0f} s"))
-    return Text(f" GETTING STUCK{left} ", style="bold white on red")
-
-
-def _table(*titles: str) -> Table:
-    table = Table(box=None, pad_edge=False)
-    for title in titles:
-        table.add_column(title, no_wrap=True)
-    return table
-
-
-def _said(known: ReceivedFrames, message: str, signal: str, form: str) -> Iterator[str]:
-    """A named value in words, nothing where it is not known."""
-    value = known.value(message, signal)
-    if value is not None and value != "none":
-        yield form.format(value)
-
-
-def _measured(known: ReceivedFrames, message: str, signal: str, form: str) -> Iterator[str]:
-    """A number in words, nothing where it is not known."""
-    value = known.number(message, signal)
-    if value is not None:
-        yield form.format(value)
-
-
-def _one(known: ReceivedFrames, message: str, signal: str, form: str) -> Text:
-    value = known.number(message, signal)
-    return Text("-" if value is None else form.format(value), style="" if known.is_valid(message) else "dim")
-
-
-def _pair(known: ReceivedFrames, message: str, signal: str, std: str | None = None) -> Text:
-    value, spread = known.number(message, signal), known.number(message, std or f"{signal}Std")
-    figure = "-" if value is None or spread is None else f"{_figures(value, spread)}"
-    return Text(figure, style="" if known.is_valid(message) else "dim")
-
-
-def _figures(value: float, spread: float) -> str:
-    """Value and std, without powers of ten."""
-    large = max(abs(value), spread) >= 100.0
-    return f"{value:.0f} ± {spread:.0f}" if large and spread >= 1.0 else f"{value:.3g} ± {spread:.2g}"
-
-
-def watch(config: Config, seconds: float | None = None) -> None:
-    """Show the dashboard of the configured bus until interrupted or for some seconds; wait for a bus that goes away.
-
-    Raises
-    ------
-    BusError
-        The bus cannot be opened at the start.
-    """
-    database = output_database(config)
-    settings, filters = config.bus.model_dump(), filters_of(database)
-    with closing(LiveBus(lambda: open_bus(settings, filters), time.monotonic, time.sleep)) as bus:
-        bus.open()
-        show(ReceivedFrames(database), bus, Console(), until=None if seconds is None else time.monotonic() + seconds)
-
-
-def show(
-    known: ReceivedFrames,
-    bus: LiveBus,
-    console: Console,
-    until: float | None = None,
-    done: Callable[[], bool] = lambda: False,
-) -> None:
-    """Feed received frames from a bus and redraw five times a second.
-
-    Parameters
-    ----------
-    known
-        Takes the frames.
-    bus
-        The open bus.
-    console
-        Where to draw.
-    until
-        Monotonic time [s] at which to stop; None for never.
-    done
-        Whether to stop, asked in every round.
-    """
-    with Live(panel(known), console=console, auto_refresh=False, screen=False) as live:
-        redraw = time.monotonic()
-        while not done() and (until is None or time.monotonic() < until):
-            message = bus.receive(max(0.0, redraw - time.monotonic()))
-            if message is not None:
-                known.receive(message)
-            if time.monotonic() >= redraw:
-                redraw = time.monotonic() + 0.2
-                live.update(panel(known, bus.fault), refresh=True)
+def force(newtons: float) -> str:
+    """A force in kN, in N below 1 kN."""
+    return f"{newtons:.0f} N" if abs(newtons) < 1000.0 else f"{newtons / 1000.0:.1f} kN"

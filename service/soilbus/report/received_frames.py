@@ -48,6 +48,21 @@ class ReceivedFrames:
         self._seen: dict[str, float] = {}
         self.bad_frames = 0
 
+    @property
+    def now(self) -> float:
+        """Time [s] of the clock."""
+        return self._clock()
+
+    def age(self, *messages: str) -> float | None:
+        """Time [s] since the last good frame of any of these messages, or of any at all; None where there was none."""
+        seen = [self._seen[name] for name in messages or self._seen if name in self._seen]
+        return self._clock() - max(seen) if seen else None
+
+    def is_stale(self, message: str) -> bool:
+        """Whether no good frame came for CYCLES_UNTIL_STALE cycles, or none at all."""
+        age = self.age(message)
+        return age is None or age > CYCLES_UNTIL_STALE * self._cycle[message] + BUS_DELAY
+
     def receive(self, message: Received | can.Message) -> None:
         """Take one frame; a bad one (wrong checksum, repeated counter, not decodable) is counted and not used."""
         layout = self._messages.get(message.arbitration_id) if message.is_extended_id else None
@@ -76,8 +91,7 @@ class ReceivedFrames:
         -------
         None where the frame is stale, or the value not available, an error or reserved.
         """
-        age = self._clock() - self._seen.get(message, -1e9)
-        if age > CYCLES_UNTIL_STALE * self._cycle[message] + BUS_DELAY:
+        if self.is_stale(message):
             return None
         value = self._values[message].get(signal)
         if isinstance(value, NamedSignalValue):

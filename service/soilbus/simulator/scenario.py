@@ -75,6 +75,11 @@ class Profile:
         """The least value."""
         return min(self.value)
 
+    @property
+    def high(self) -> float:
+        """The greatest value."""
+        return max(self.value)
+
 
 class Wave(NamedTuple):
     """One realisation of a swing or a profile: value, rate of change [1/s], integral from the start [s]; each (N,)."""
@@ -149,7 +154,8 @@ class Scenario:
         One at most is given: the draft that the implement asks for [N], or the common slip of all driven wheels.
         Without both nothing is towed: slope and acceleration alone take pull.
     lift_slip
-        With `draft`: the driver lifts the implement as far as needed to keep slip below this, and never pushes.
+        With `draft`: the driver lifts the implement as far as needed to keep slip below this, and never pushes. None:
+        nobody lifts it; what the wheels cannot give slows the vehicle down.
     slip_spread
         Greatest deviation of a single wheel from the common slip.
     side_shift
@@ -164,21 +170,29 @@ class Scenario:
         Where on the earth.
     drawn_mass
         The true mass and centre of gravity are drawn about the configured ones, by `mass_std` and `cg_std`.
+    vehicle_seed
+        Picks true mass and gain errors of the sensors: the same vehicle in several drives; None: the drive's seed does.
     """
 
     duration: float
     soils: Sequence[Patch]
     speed: Swing | Profile = Swing(1.0, 1.8)
     draft: Swing | Profile | None = None
-    slip: Swing | None = None
-    lift_slip: Swing = Swing(0.45, 0.45)
+    slip: Swing | Profile | None = None
+    lift_slip: Swing | None = Swing(0.45, 0.45)
     slip_spread: float = 0.015
-    side_shift: Swing = Swing(-0.15, 0.15)
+    side_shift: Swing | Profile = Swing(-0.15, 0.15)
     bounce: float = 0.0
     slope: Sequence[tuple[float, float]] = ((0.0, 0.0),)
     transition: float = 1.0
     course: Course = NORTHWARD
     drawn_mass: bool = False
+    vehicle_seed: int | None = None
+
+    @property
+    def lifted(self) -> bool:
+        """Whether slip is limited by a driver who lifts the implement, or prescribed."""
+        return self.slip is not None or self.lift_slip is not None
 
     def __post_init__(self) -> None:
         """Raise ValueError for a scenario that cannot be driven."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,9 @@ import pytest
 from soilbus.cli.main import main
 from soilbus.decision.traversability import Status, Traversability
 from soilbus.estimation.posterior import Estimate
+from soilbus.export.soil_map import soil_map
 from soilbus.pipeline.estimator import WindowResult
 from soilbus.pipeline.positions import Position
-from soilbus.report.soil_map import soil_map
 from soilbus.simulator.course import course, positions
 from soilbus.simulator.frames import START_TIME
 from soilbus.simulator.play import scenario_over
@@ -128,6 +129,22 @@ def test_gdal_opens_it_as_a_layer_of_points_in_wgs84(collection, log):
         f["geometry"]["coordinates"] for f in collection["features"]
     ]
     assert values["phi_deg"].tolist() == [f["properties"]["phi_deg"] for f in collection["features"]]
+
+
+def test_a_geopackage_holds_the_same_points(collection, log):
+    path = log.with_suffix(".gpkg")
+    assert main(["replay", "--config", str(TRACTOR), str(log), "--map", str(path)]) == 0
+    info = pyogrio.read_info(path)
+    assert (info["driver"], info["geometry_type"], info["crs"]) == ("GPKG", "Point", "EPSG:4326")
+    meta, _, geometry, columns = pyogrio.raw.read(path, layer="soil")
+    points = [[*struct.unpack_from("<dd", wkb, 5)] for wkb in geometry]
+    assert points == [f["geometry"]["coordinates"] for f in collection["features"]]
+    values = dict(zip(meta["fields"].tolist(), columns, strict=True))
+    said = [f["properties"] for f in collection["features"]]
+    assert set(values) == set(said[0])
+    for name in ("bearing_pressure_kpa", "phi_deg", "state", "soil_class", "max_draft_std_n"):
+        assert values[name].tolist() == [properties[name] for properties in said]
+    assert str(values["time"][0]) == said[0]["time"].removesuffix("+00:00")
 
 
 def test_windows_without_a_position_are_left_out_and_counted(log, tmp_path, capsys):

@@ -20,10 +20,10 @@ DEGREE_DECIMALS = 7
 """Decimals of a degree: the seventh is a centimetre."""
 
 
-def check_position_is_mapped(config: Config) -> None:
-    """Raises ConfigError where a map could only be empty."""
+def check_position_is_mapped(config: Config, option: str) -> None:
+    """Raises ConfigError where what an option asks for could only be empty."""
     if config.signals.latitude is None:
-        raise ConfigError(["--map needs a position: map signals.latitude and signals.longitude"])
+        raise ConfigError([f"{option} needs a position: map signals.latitude and signals.longitude"])
 
 
 def soil_map(results: Iterable[WindowResult]) -> tuple[str, int]:

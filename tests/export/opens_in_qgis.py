@@ -1,4 +1,4 @@
-"""Does QGIS open a soil map as is?  `QT_QPA_PLATFORM=offscreen /usr/bin/python3 tests/report/opens_in_qgis.py MAP`.
+"""Does QGIS open a soil map as is?  `QT_QPA_PLATFORM=offscreen /usr/bin/python3 tests/export/opens_in_qgis.py MAP`.
 
 On demand, with Debian's python3-qgis: too heavy for every run of CI, where GDAL, by which QGIS
 reads, is asked instead (test_soil_map.py).

@@ -1,0 +1,85 @@
+"""What a window's record holds, key by key: kind and unit, for every file format that wants to know.
+
+    window_record -> flat_record -> row;    column(key) -> kind and unit of a row's entry
+
+A key is the path to a value, parts joined by dots, as in `soil.phi.value`; `*` stands for a wheel, an axle, a soil, a
+reason, or the place in a list.  tests/export holds that every key of a record is described here.
+"""
+
+from __future__ import annotations
+
+from fnmatch import fnmatchcase
+from functools import cache
+from typing import Literal, NamedTuple
+
+__all__ = ["SCHEMA_VERSION", "Column", "column"]
+
+SCHEMA_VERSION = "1"
+"""Version of the records' keys, kinds and units; a reader of another one must not assume this table."""
+
+Kind = Literal["text", "number", "integer", "truth"]
+
+
+class Column(NamedTuple):
+    """Kind of a value, and its unit: "1" of a ratio, count or probability, "" of what is no number."""
+
+    kind: Kind
+    unit: str
+
+
+_TEXT, _TRUTH, _COUNT, _RATIO = Column("text", ""), Column("truth", ""), Column("integer", "1"), Column("number", "1")
+_COLUMNS: tuple[tuple[str, Column], ...] = (
+    ("t", Column("number", "s")),
+    ("window", _COUNT),
+    ("samples", _COUNT),
+    ("rejected.*", _COUNT),
+    ("log", _TEXT),
+    ("status", _TEXT),
+    ("state", _TEXT),
+    ("reason", _TEXT),
+    ("traversability.state", _TEXT),
+    ("warning.state", _TEXT),
+    ("traversability.limit", _TEXT),
+    ("traversability.contradicted", _TEXT),
+    ("search_ended", _TRUTH),
+    ("bearing_pressure.extrapolates", _TRUTH),
+    ("soil.k_c.*", Column("number", "N/m^(n+1)")),
+    ("soil.k_phi.*", Column("number", "N/m^(n+2)")),
+    ("soil.n.*", _RATIO),
+    ("soil.phi.*", Column("number", "rad")),
+    ("soil.c.*", Column("number", "Pa")),
+    ("soil.K.*", Column("number", "m")),
+    ("bearing_pressure.?_ref", Column("number", "m")),
+    ("bearing_pressure.z_driven*", Column("number", "m")),
+    ("bearing_pressure.*", Column("number", "Pa")),
+    ("soil_class.*", _RATIO),
+    ("slip.*", _RATIO),
+    ("sinkage.*", Column("number", "m")),
+    ("traversability.probability", _RATIO),
+    ("traversability.torque_*", Column("number", "N m")),
+    ("traversability.max_draft.*", Column("number", "N")),
+    ("traversability.max_grade.*", Column("number", "rad")),
+    ("traversability.age", Column("number", "s")),
+    ("traversability.since_valid", Column("number", "s")),
+    ("gaps.*", _RATIO),
+    ("warning.time_left", Column("number", "s")),
+    ("warning.since", Column("number", "s")),
+    ("warning.begun*", Column("number", "s")),
+    ("capability.max_draft_here.*", Column("number", "N")),
+    ("capability.max_grade_with_draft.*", Column("number", "rad")),
+    ("capability.set_points.*", _RATIO),
+    ("capability.forecast.slip.*", _RATIO),
+    ("capability.forecast.torque.*", Column("number", "N m")),
+    ("capability.forecast.sinkage.*", Column("number", "m")),
+    ("capability.over_slip.slip*", _RATIO),
+    ("capability.over_slip.pull*", Column("number", "N")),
+    ("capability.over_slip.torque*", Column("number", "N m")),
+    ("chi2", _RATIO),
+)
+"""First match counts."""
+
+
+@cache
+def column(key: str) -> Column | None:
+    """Kind and unit of a key; None where it is no key of a record."""
+    return next((found for pattern, found in _COLUMNS if fnmatchcase(key, pattern)), None)

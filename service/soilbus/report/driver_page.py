@@ -1,0 +1,123 @@
+"""The driver's page: state in block letters, what to do, slip beside the best slip, draft beside the possible draft.
+
+It fills a terminal of any size; where there is too little room for charts the page is a few lines of text.
+"""
+
+from __future__ import annotations
+
+import textwrap
+
+from rich.text import Text
+
+from soilbus.report.block_letters import in_cells, in_half_cells
+from soilbus.report.dashboard import Dashboard, Verdict, force, percent
+from soilbus.report.text_charts import area, bar, place
+
+LEAST_WIDTH, LEAST_HEIGHT = 72, 20
+"""Columns and rows below which the page is text."""
+KEYS = "d driver  e engineer  q quit"
+AXIS = 11
+"""Columns beside the chart of the draft for its scale."""
+
+
+def driver_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
+    """At most `height` lines of at most `width` columns."""
+    if width < LEAST_WIDTH or height < LEAST_HEIGHT:
+        return small_page(dashboard, width, height)
+    verdict = dashboard.verdict()
+    lines = band(verdict, width, height // 3)
+    is_roomy = height > LEAST_HEIGHT + 4
+    lines += [Text()] if is_roomy else []
+    lines += _todo(verdict.todo, width, height // 10)
+    lines += _slip(dashboard, width, max(height // 16, 1))
+    lines += [Text()] if is_roomy else []
+    lines += _draft(dashboard, width, height - len(lines) - 1)
+    return [*lines, footer(dashboard, width)]
+
+
+def small_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
+    """State, what to do and the figures as wrapped text; what does not fit into `height` is left out."""
+    verdict = dashboard.verdict()
+    first, todo, *more = dashboard.sentences()
+    lines = [Text(line.center(width), style=verdict.style) for line in textwrap.wrap(first, width)]
+    lines += [Text(line, style="bold") for line in textwrap.wrap(todo, width)]
+    lines += [Text(line) for said in more for line in textwrap.wrap(said, width)]
+    return lines[:height]
+
+
+def band(verdict: Verdict, width: int, height: int) -> list[Text]:
+    """The state over the whole width: block letters, and under them the sentence."""
+    letters = in_cells(verdict.word, width - 2, height - 2) or [verdict.word]
+    above = (height - 1 - len(letters)) // 2
+    rows = ["", *[""] * (above - 1), *letters] if above else letters
+    rows += [""] * (height - 1 - len(rows)) + [textwrap.shorten(verdict.said, width, placeholder="…")]
+    block = max(map(len, letters))
+    centred = (row.ljust(block).center(width) if row in letters else row.center(width) for row in rows)
+    lines = [Text(row, style=verdict.style) for row in centred]
+    for line in lines:
+        line.highlight_regex("█+", verdict.block_style)
+    return lines
+
+
+def footer(dashboard: Dashboard, width: int) -> Text:
+    """Age of the data, or why there are none, and the keys."""
+    said = f"bus away: {dashboard.fault}" if dashboard.fault else dashboard.freshness()
+    said = textwrap.shorten(said, width - len(KEYS) - 2, placeholder="…")
+    return Text(f"{said:<{width - len(KEYS)}}{KEYS}")
+
+
+def _todo(todo: str, width: int, height: int) -> list[Text]:
+    """What to do as large as fits into `height` rows, in three rows at least, in two lines of them if need be."""
+    letters = in_cells(todo, width - 2, height) or in_half_cells(todo, width - 2)
+    lines = [letters] if letters else [in_half_cells(half, width - 2) or [half] for half in _halves(todo)]
+    rows = [row for line in lines for row in line]
+    return [Text(row.center(width).rstrip(), style="bold") for row in rows]
+
+
+def _halves(sentence: str) -> tuple[str, str]:
+    """The sentence in two lines of nearly equal length."""
+    words = sentence.split()
+    halves = ((" ".join(words[:i]), " ".join(words[i:])) for i in range(1, len(words)))
+    return min(halves, key=lambda pair: max(map(len, pair)))
+
+
+def _slip(dashboard: Dashboard, width: int, height: int) -> list[Text]:
+    """Title, bar of `height` rows and marks of the set-points."""
+    slip, top = dashboard.slip(), dashboard.vehicle.max_slip
+    value = "-" if slip.value is None else f"{percent(slip.value)} at wheel {slip.wheel}"
+    value += "" if slip.best is not None else "  best -"
+    scale = f"bar to {percent(top)}"
+    title = Text(f"{f'SLIP  {value}':<{width - len(scale)}}{scale}", style="bold")
+    filled = bar(slip.value, top, width).rstrip().ljust(width, "·")
+    marks = [" "] * width
+    for share, what in ((slip.best, "best"), (slip.most_pull, "most pull")):
+        if share is not None:
+            _mark(marks, place(share, top, width), f"{what} {percent(share)}")
+    return [title, *(Text(filled) for _ in range(height)), Text("".join(marks).rstrip())]
+
+
+def _mark(marks: list[str], at: int, label: str) -> None:
+    """Write an arrow with its label to the right, or to the left where there is more room; not over another mark."""
+    said = f"▲ {label}" if at + len(label) + 2 <= len(marks) else f"{label} ▲"
+    first = at if said.startswith("▲") else at - len(said) + 1
+    if first >= 0 and not "".join(marks[max(first - 1, 0) : first + len(said) + 1]).strip():
+        marks[first : first + len(said)] = said
+
+
+def _draft(dashboard: Dashboard, width: int, height: int) -> list[Text]:
+    """Title, chart of the last minute and axis, in `height` rows."""
+    now, possible = dashboard.known.number("PresentDemand", "Draft"), dashboard.max_draft()
+    said = "-" if now is None else force(now)
+    said += "  of possible -" if possible is None else f"  of possible {force(possible)}"
+    columns, rows = width - AXIS, height - 2
+    draft, limit = (dashboard.history(name, columns) for name in ("draft", "max_draft"))
+    top = 1.05 * max([abs(value) for value in (*draft, *limit) if value is not None], default=0.0)
+    chart = area(draft, rows, top or 1.0, limit)
+    scale = [f"{force(top) if top else '':>{AXIS - 2}} ┤", *[f"{'│':>{AXIS}}"] * (rows - 2), f"{'0 ┤':>{AXIS}}"]
+    axis = f"{'':{AXIS}}{f'{dashboard.span:.0f} s ago':<{columns - 3}}now"
+    legend = "█ draft  ─ possible"
+    return [
+        Text(f"{f'DRAFT  {said}':<{width - len(legend)}}{legend}", style="bold"),
+        *(Text(left + right) for left, right in zip(scale, chart, strict=True)),
+        Text(axis),
+    ]

@@ -1,0 +1,291 @@
+"""The engineer's page: every value of our frames, with history, chi-square of each channel and refused inputs.
+
+Grey figures have a Status other than valid: they are guesses that must not be acted on. "-" is a value that is not
+available or too old. Blocks are packed into as many columns as the width has room for; charts take the rows left.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+from rich.text import Text
+
+from soilbus.report.dashboard import Dashboard, percent
+from soilbus.report.driver_page import LEAST_HEIGHT, LEAST_WIDTH, footer, small_page
+from soilbus.report.received_frames import ReceivedFrames
+from soilbus.report.text_charts import area, sparkline
+
+COLUMN = 38
+"""Columns that a block needs at least."""
+GAP = 2
+"""Columns between two blocks."""
+PARAMETERS = {
+    "k_c": ("SoilCohesiveModulus", "kN/m^(n+1)"),
+    "k_φ": ("SoilFrictionalModulus", "kN/m^(n+2)"),
+    "n": ("SoilSinkageExponent", ""),
+    "φ": ("SoilFrictionAngle", "°"),
+    "c": ("SoilCohesion", "kPa"),
+    "K": ("SoilShearModulus", "mm"),
+}
+LIMITS = {"on the level": ("DraftCapability", "GradeCapability"), "here": ("TractionLimits", "TractionLimits")}
+"""Messages of draft and of slope, by what they hold for."""
+FAULTS_OF_BUS = {
+    "Overruns": "overruns",
+    "Dropped": "dropped",
+    "ForeignFrames": "foreign",
+    "ErrorFrames": "errors",
+    "Reopened": "reopened",
+}
+CHARTS = {
+    "slip": "slip, %",
+    "draft": "draft, kN",
+    "max_draft": "possible, kN",
+    "bearing": "bearing, kPa",
+    "chi2": "chi-square",
+    "rejected": "refused",
+}
+"""Histories, the most useful first."""
+IN_UNITS = {"slip": 100.0, "draft": 1e-3, "max_draft": 1e-3}
+LABEL = 22
+"""Columns for the name and the present value beside a chart."""
+LEAST_CHARTS = 4
+"""Rows for all charts, as sparklines."""
+
+Row = tuple[Text | str, ...]
+
+
+def engineer_page(dashboard: Dashboard, width: int, height: int) -> list[Text]:
+    """At most `height` lines of at most `width` columns."""
+    if width < LEAST_WIDTH or height < LEAST_HEIGHT:
+        return small_page(dashboard, width, height)
+    head = [_head(dashboard, width), fitted(Text("  ".join(_forecast(dashboard.known))), width)]
+    blocks = [block(dashboard) for block in BLOCKS]
+    columns = max(width // (COLUMN + GAP), 1)
+    room = height - len(head) - 1
+    body = [Text(), *packed(blocks, columns, width, 1), Text()]
+    if len(body) + LEAST_CHARTS > room:
+        body = packed(blocks, columns, width, 0)
+    lines = [*head, *body][: height - 1]
+    lines += _charts(dashboard, width, height - len(lines) - 1)
+    lines += [Text()] * (height - 1 - len(lines))
+    return [*lines, footer(dashboard, width)]
+
+
+def fitted(text: Text, width: int) -> Text:
+    """The text, with an ellipsis for what is beyond `width` columns."""
+    text.truncate(width, overflow="ellipsis")
+    return text
+
+
+def packed(blocks: list[list[Text]], columns: int, width: int, space: int) -> list[Text]:
+    """Blocks one below the other in `columns` of equal width, each put where the column is shortest so far."""
+    each = (width - GAP * (columns - 1)) // columns
+    stacks: list[list[Text]] = [[] for _ in range(columns)]
+    for block in blocks:
+        stack = min(stacks, key=len)
+        stack += [Text()] * (space if stack else 0) + [fitted(line, each) for line in block]
+    lines = []
+    for i in range(max(map(len, stacks))):
+        line = Text()
+        for column, stack in enumerate(stacks):
+            line.pad_right(column * (each + GAP) - line.cell_len)
+            line.append_text(stack[i] if i < len(stack) else Text())
+        lines.append(line)
+    return lines
+
+
+def grid(title: Row, *rows: Row) -> list[Text]:
+    """Rows in columns as wide as their widest cell, with a bold title."""
+    cells = [[Text(cell, style="bold") if isinstance(cell, str) else cell for cell in title]]
+    cells += [[Text(cell) if isinstance(cell, str) else cell for cell in row] for row in rows]
+    widths = [max(cell.cell_len for cell in column) for column in zip(*cells, strict=True)]
+    lines = []
+    for row in cells:
+        line = Text()
+        for cell, wide in zip(row, widths, strict=True):
+            line.append_text(cell)
+            line.pad_right(wide - cell.cell_len + GAP)
+        line.rstrip()
+        lines.append(line)
+    return lines
+
+
+def _head(dashboard: Dashboard, width: int) -> Text:
+    """State over the whole width, with the kind of soil."""
+    verdict, soil = dashboard.verdict(), "  ".join(_kind(dashboard.known))
+    said = f" {verdict.said}"
+    return Text(f"{said:<{max(width - len(soil) - 1, len(said) + 2)}}{soil} "[:width].ljust(width), style=verdict.style)
+
+
+def _kind(known: ReceivedFrames) -> Iterator[str]:
+    yield from _said(known, "SoilClass", "Kind", "soil: {}")
+    yield from _measured(known, "SoilClass", "Probability", "({:.2f})")
+
+
+def _forecast(known: ReceivedFrames) -> Iterator[str]:
+    """Torque that the present demand needs, and the slip and sinkage predicted for it."""
+    needed, there = (known.number("TorqueDemand", f"Torque{what}") for what in ("Required", "Available"))
+    if needed is not None or there is not None:
+        yield "torque {} of {} N m".format(*("-" if x is None else f"{x:.0f}" for x in (needed, there)))
+    slip = known.number("DemandForecast", "Slip")
+    if slip is not None:
+        yield f"slip to come {percent(slip)}"
+    yield from _measured(known, "DemandForecast", "Sinkage", "sinkage to come {:.0f} mm")
+
+
+def _soil(dashboard: Dashboard) -> list[Text]:
+    known = dashboard.known
+    rows: list[Row] = [("bearing", _pair(known, "SoilStrength", "BearingPressure"), "kPa")]
+    rows += [(name, _pair(known, message, "Value", "Std"), unit) for name, (message, unit) in PARAMETERS.items()]
+    return grid(("soil", "value ± std", "unit"), *rows)
+
+
+def _wheels(dashboard: Dashboard) -> list[Text]:
+    """One row for each wheel."""
+    rows: list[Row] = []
+    for i in dashboard.wheels():
+        slip, depth = dashboard.wheel_slip(i), dashboard.wheel_sinkage(i)
+        grey = "" if dashboard.known.is_valid("WheelSinkage" if i < 4 else "WheelSinkage2") else "dim"
+        shown = Text("-" if depth is None else f"{depth:.0f}", style=grey)
+        rows.append((dashboard.vehicle.name(i), "-" if slip is None else f"{100.0 * slip:+.1f}", shown))
+    return grid(("wheel", "slip, %", "sinkage, mm"), *rows)
+
+
+def _limits(dashboard: Dashboard) -> list[Text]:
+    """Largest draft and slope beside the present ones; a slope in per cent is 100 times its tangent."""
+    known = dashboard.known
+    rows: list[Row] = [
+        (name, _pair(known, draft, "MaxDraft"), _slope(known, slope)) for name, (draft, slope) in LIMITS.items()
+    ]
+    draft, pitch = (known.number("PresentDemand", name) for name in ("Draft", "Slope"))
+    now = ("now", "-" if draft is None else f"{draft:.0f}", "-" if pitch is None else f"{100.0 * math.tan(pitch):.1f}")
+    return grid(("largest", "draft, N", "slope, %"), *rows, now)
+
+
+def _slope(known: ReceivedFrames, message: str) -> Text:
+    angle, spread = known.number(message, "MaxGrade"), known.number(message, "MaxGradeStd")
+    style = "" if known.is_valid(message) else "dim"
+    if angle is None or spread is None or abs(angle) >= math.pi / 2.0:
+        return Text("-", style=style)
+    slope = math.tan(angle)
+    return Text(_figures(100.0 * slope, 100.0 * spread * (1.0 + slope**2)), style=style)
+
+
+def _advice(dashboard: Dashboard) -> list[Text]:
+    known = dashboard.known
+    rows: list[Row] = []
+    for name, signal in (("efficiency", "SlipForEfficiency"), ("most pull", "SlipForPull")):
+        rows.append((name, *(_percent(known, "TractionAdvice", f"{signal}{axle}") for axle in ("Front", "Rear"))))
+    return grid(("best slip, %, for", "front", "rear"), *rows)
+
+
+def _gap(dashboard: Dashboard) -> list[Text]:
+    known = dashboard.known
+    rows: list[Row] = [("window", _one(known, "SoilStrength", "Chi2", "{:.1f}"))]
+    rows += [(c.lower(), _one(known, "WindowQuality", f"Chi2{c}", "{:.2f}")) for c in ("Torque", "Draft", "Sinkage")]
+    return grid(("gap (chi-square)", "1 is noise"), *rows)
+
+
+def _refused(dashboard: Dashboard) -> list[Text]:
+    """Samples refused by the service, and frames of ours that we refused ourselves."""
+    known = dashboard.known
+    share = "".join(_measured(known, "SoilbusStatus", "RejectedShare", "{:.1f} % of samples")) or "-"
+    count, reason = known.number("WindowQuality", "Rejected"), known.value("WindowQuality", "RejectedReason")
+    window = "-" if count is None else f"{count:.0f}"
+    if count and isinstance(reason, str):
+        window += f", most {reason}"
+    missed = "".join(_measured(known, "SoilbusStatus", "DeadlineMisses", "{:.0f}")) or "-"
+    rows: list[Row] = [
+        ("inputs", share),
+        ("in window", window),
+        ("late windows", missed),
+        ("bad frames", str(known.bad_frames)),
+    ]
+    return grid(("refused", ""), *rows)
+
+
+def _service(dashboard: Dashboard) -> list[Text]:
+    """The service and its bus, by what the service says."""
+    known = dashboard.known
+    state = "  ".join((*_said(known, "SoilbusStatus", "State", "{}"), *_said(known, "SoilbusStatus", "Reason", "({})")))
+    version = [known.number("SoilbusIdentity", f"Version{part}") for part in ("Major", "Minor", "Patch")]
+    shown = "-" if None in version else ".".join(f"{part:.0f}" for part in version)
+    shown += "".join(_measured(known, "SoilbusIdentity", "Uptime", ", up {:.0f} s"))
+    bus = "".join(_said(known, "BusHealth", "BusState", "{}")) or "-"
+    counts = ((what, known.number("BusHealth", signal)) for signal, what in FAULTS_OF_BUS.items())
+    faults = [f"{what} {count:.0f}" for what, count in counts if count]
+    rows: list[Row] = [("state", state or "-"), ("version", shown), ("bus", bus)]
+    pairs = [" ".join(faults[i : i + 2]) for i in range(0, len(faults), 2)]
+    return grid(("service", ""), *rows, *(("", pair) for pair in pairs))
+
+
+BLOCKS: tuple[Callable[[Dashboard], list[Text]], ...] = (_soil, _wheels, _limits, _gap, _advice, _refused, _service)
+
+
+def _charts(dashboard: Dashboard, width: int, height: int) -> list[Text]:
+    """Histories of the last minute side by side in two columns, as tall as there is room."""
+    rows = [list(CHARTS)[i : i + 2] for i in range(0, len(CHARTS), 2)]
+    rows = rows[: max(height - 1, 0)]
+    if not rows:
+        return []
+    tall = (height - 1) // len(rows)
+    each = (width - GAP) // 2
+    lines = [Text(f"last {dashboard.span:.0f} s", style="bold")]
+    for names in rows:
+        charts = [_chart(dashboard, name, each, tall) for name in names]
+        charts += [[""] * tall] * (2 - len(charts))
+        lines += [Text(f"{left:<{each + GAP}}{right}") for left, right in zip(*charts, strict=True)]
+    return lines
+
+
+def _chart(dashboard: Dashboard, name: str, width: int, height: int) -> list[str]:
+    """Name and present value beside a sparkline, or beside a chart from zero where there are rows for one."""
+    values = dashboard.history(name, width - LABEL)
+    now = next((value for value in reversed(values) if value is not None), None)
+    said = "-" if now is None else f"{now * IN_UNITS.get(name, 1.0):.3g}"
+    label = f"{CHARTS[name]:<13}{said:>7}  "
+    if height < 2:
+        return [label + sparkline(values)]
+    top = max((value for value in values if value is not None), default=0.0)
+    rows = area(values, height - 1, top if top > 0.0 else 1.0)
+    high = f"{top * IN_UNITS.get(name, 1.0):.3g} ┤" if top > 0.0 else "┤"
+    left = [f"{high:>{LABEL}}", *[f"{'│':>{LABEL}}"] * (height - 2)]
+    left[0] = f"{CHARTS[name]:<{LABEL - len(high)}}{high}"
+    return [*(a + b for a, b in zip(left, rows, strict=True)), ""]
+
+
+def _said(known: ReceivedFrames, message: str, signal: str, form: str) -> Iterator[str]:
+    """A named value in words, nothing where it is not known."""
+    value = known.value(message, signal)
+    if value is not None and value != "none":
+        yield form.format(value)
+
+
+def _measured(known: ReceivedFrames, message: str, signal: str, form: str) -> Iterator[str]:
+    """A number in words, nothing where it is not known."""
+    value = known.number(message, signal)
+    if value is not None:
+        yield form.format(value)
+
+
+def _one(known: ReceivedFrames, message: str, signal: str, form: str) -> Text:
+    value = known.number(message, signal)
+    return Text("-" if value is None else form.format(value), style="" if known.is_valid(message) else "dim")
+
+
+def _percent(known: ReceivedFrames, message: str, signal: str) -> Text:
+    value = known.number(message, signal)
+    return Text("-" if value is None else f"{100.0 * value:.0f}", style="" if known.is_valid(message) else "dim")
+
+
+def _pair(known: ReceivedFrames, message: str, signal: str, std: str | None = None) -> Text:
+    value, spread = known.number(message, signal), known.number(message, std or f"{signal}Std")
+    figure = "-" if value is None or spread is None else f"{_figures(value, spread)}"
+    return Text(figure, style="" if known.is_valid(message) else "dim")
+
+
+def _figures(value: float, spread: float) -> str:
+    """Value and std, without powers of ten."""
+    large = max(abs(value), spread) >= 100.0
+    return f"{value:.0f} ± {spread:.0f}" if large and spread >= 1.0 else f"{value:.3g} ± {spread:.2g}"

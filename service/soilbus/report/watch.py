@@ -1,0 +1,272 @@
+"""`soilbus watch`: the dashboard on a terminal, of a live bus or of a recording of our frames.
+
+source (bus or log) -> ReceivedFrames -> Dashboard -> page, five times a second; keys change the page
+                                                   -> lines, for a screen reader and where there is no terminal
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+import termios
+import time
+import tty
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+from typing import Protocol
+
+import can
+from rich.console import Console, Group
+from rich.live import Live
+from rich.text import Text
+
+from soilbus.can.bus import LiveBus, open_bus
+from soilbus.can.dbc_files import filters_of, output_database
+from soilbus.can.wire import Received
+from soilbus.config.model import Config
+from soilbus.offline.replay import LogError, read_log
+from soilbus.report.dashboard import Dashboard, Vehicle
+from soilbus.report.driver_page import driver_page
+from soilbus.report.engineer_page import engineer_page
+from soilbus.report.received_frames import ReceivedFrames
+
+__all__ = ["PlayedLog", "Source", "page", "pressed_keys", "show", "watch", "watch_log"]
+
+REDRAW_PERIOD = 0.2
+"""Time [s] between two pictures."""
+LINE_PERIOD = 1.0
+"""Least time [s] between two lines of which only figures differ."""
+PAGES = {"driver": driver_page, "engineer": engineer_page}
+
+
+class Source(Protocol):
+    """Where frames come from."""
+
+    fault: str
+    """Why there are none; empty where it works."""
+
+    def receive(self, timeout: float, /) -> Received | can.Message | None:
+        """The next frame, or None after at most `timeout` [s]."""
+
+
+class PlayedLog:
+    """Frames of a recording, each when it is due.
+
+    Parameters
+    ----------
+    messages
+        Frames in the order of their stamps; one that goes back is due at once.
+    speed
+        Seconds of the recording per second.
+    clock, sleep
+        Monotonic time [s] and waiting by it.
+    """
+
+    fault = ""
+
+    def __init__(
+        self,
+        messages: Iterable[can.Message],
+        speed: float = 1.0,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._messages, self._speed, self._clock, self._sleep = iter(messages), speed, clock, sleep
+        self._next = next(self._messages, None)
+        self._first = 0.0 if self._next is None else self._next.timestamp
+        self._began = clock()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether all frames were handed out."""
+        return self._next is None
+
+    def now(self) -> float:
+        """Time [s] of the recording."""
+        return self._first + self._speed * (self._clock() - self._began)
+
+    def receive(self, timeout: float, /) -> can.Message | None:
+        """The next frame, or None after at most `timeout` [s]."""
+        message = self._next
+        if message is None:
+            return None
+        wait = (message.timestamp - self.now()) / self._speed
+        if wait > 0.0:
+            self._sleep(min(wait, timeout))
+            if wait > timeout:
+                return None
+        self._next = next(self._messages, None)
+        return message
+
+
+def watch(config: Config, names_wheels: bool = True, seconds: float | None = None, plain: bool = False) -> None:
+    """Show the dashboard of the configured bus until interrupted or for some seconds; wait for a bus that goes away.
+
+    Parameters
+    ----------
+    config
+        Of bus, output.dbc and vehicle.
+    names_wheels
+        Whether the configuration is that of the vehicle that is watched.
+    seconds
+        After which to stop; None for never.
+    plain
+        Lines, even on a terminal.
+
+    Raises
+    ------
+    BusError
+        The bus cannot be opened at the start.
+    """
+    database = output_database(config)
+    settings, filters = config.bus.model_dump(), filters_of(database)
+    with closing(LiveBus(lambda: open_bus(settings, filters), time.monotonic, time.sleep)) as bus:
+        bus.open()
+        until = None if seconds is None else time.monotonic() + seconds
+        dashboard = Dashboard(ReceivedFrames(database), Vehicle.of(config, names_wheels))
+        show(dashboard, bus, Console(), plain, lambda: until is not None and time.monotonic() >= until)
+
+
+def watch_log(
+    config: Config,
+    log: Path,
+    speed: float = 1.0,
+    names_wheels: bool = True,
+    seconds: float | None = None,
+    plain: bool = False,
+) -> None:
+    """Show the dashboard of a recording of our frames in its own time; the end of the recording ends it.
+
+    Parameters
+    ----------
+    config, names_wheels, seconds, plain
+        As of `watch`.
+    log
+        In any format that python-can reads.
+    speed
+        Seconds of the recording per second.
+
+    Raises
+    ------
+    LogError
+        It cannot be read, or has no frame of ours.
+    """
+    database = output_database(config)
+    ours = {message.frame_id for message in database.messages}
+    source = PlayedLog((m for m in read_log(log) if m.is_extended_id and m.arbitration_id in ours), speed)
+    if source.is_over:
+        raise LogError(f"{log}: no frame of soilbus in it; soilbus replay --frames writes such a log")
+    until = None if seconds is None else time.monotonic() + seconds
+    dashboard = Dashboard(ReceivedFrames(database, source.now), Vehicle.of(config, names_wheels))
+    show(
+        dashboard, source, Console(), plain,
+        lambda: source.is_over or (until is not None and time.monotonic() >= until),
+    )  # fmt: skip
+
+
+def page(dashboard: Dashboard, name: str, width: int, height: int) -> Group:
+    """A page's picture."""
+    lines = PAGES[name](dashboard, width, height)
+    for line in lines:
+        line.no_wrap, line.overflow = True, "crop"
+    return Group(*lines)
+
+
+def show(
+    dashboard: Dashboard,
+    source: Source,
+    console: Console,
+    plain: bool = False,
+    done: Callable[[], bool] = lambda: False,
+    clock: Callable[[], float] = time.monotonic,
+) -> None:
+    """Feed frames and show them until `done`, or until a key says so.
+
+    Parameters
+    ----------
+    dashboard
+        Takes the frames.
+    source
+        An open bus or a recording.
+    console
+        Where to draw; not a terminal, or one that moves no cursor: lines.
+    plain
+        Lines, even on a terminal.
+    done
+        Whether to stop, asked in every round.
+    clock
+        Monotonic time [s].
+    """
+    if plain or not console.is_terminal or console.is_dumb_terminal:
+        _show_lines(dashboard, source, console, done, clock)
+        return
+    name = "driver"
+    with pressed_keys() as keys, Live(console=console, auto_refresh=False, screen=True) as live:
+        redraw = clock()
+        while not done():
+            _take(dashboard, source, redraw - clock())
+            key = keys()
+            if key == "q":
+                return
+            chosen = {"d": "driver", "e": "engineer", "\t": "engineer" if name == "driver" else "driver"}.get(key, name)
+            if chosen != name or clock() >= redraw:
+                name, redraw = chosen, clock() + REDRAW_PERIOD
+                dashboard.sample()
+                live.update(page(dashboard, name, *console.size), refresh=True)
+
+
+def _show_lines(
+    dashboard: Dashboard, source: Source, console: Console, done: Callable[[], bool], clock: Callable[[], float]
+) -> None:
+    """A line at once when the state or what to do changes, else at most one a second and only where it differs."""
+    last, said, line_due, redraw = "", None, clock(), clock() + REDRAW_PERIOD
+    while not done():
+        _take(dashboard, source, redraw - clock())
+        if clock() < redraw:
+            continue
+        redraw = clock() + REDRAW_PERIOD
+        dashboard.sample()
+        verdict, line = dashboard.verdict(), ". ".join(dashboard.sentences()) + "."
+        if line != last and ((verdict.kind, verdict.todo) != said or clock() >= line_due):
+            last, said, line_due = line, (verdict.kind, verdict.todo), clock() + LINE_PERIOD
+            console.print(Text(line), soft_wrap=True)
+            console.file.flush()
+
+
+def _take(dashboard: Dashboard, source: Source, timeout: float) -> None:
+    message = source.receive(max(0.0, timeout))
+    dashboard.fault = source.fault
+    if message is not None:
+        dashboard.known.receive(message)
+        dashboard.sample()
+
+
+@contextmanager
+def pressed_keys() -> Iterator[Callable[[], str]]:
+    """A function that gives the next key pressed, or "" at once; always "" where standard input is no terminal of ours.
+
+    Keys come one by one and are not echoed until the end; Ctrl-C stays what it is.
+    """
+    try:
+        descriptor = sys.stdin.fileno()
+        is_ours = os.isatty(descriptor) and os.tcgetpgrp(descriptor) == os.getpgrp()
+    except (AttributeError, OSError, ValueError):
+        is_ours = False
+    if not is_ours:
+        yield lambda: ""
+        return
+
+    def key() -> str:
+        if not select.select([descriptor], [], [], 0.0)[0]:
+            return ""
+        return os.read(descriptor, 1).decode("ascii", "replace").lower()
+
+    before = termios.tcgetattr(descriptor)
+    tty.setcbreak(descriptor, termios.TCSANOW)
+    try:
+        yield key
+    finally:
+        with suppress(termios.error):
+            termios.tcsetattr(descriptor, termios.TCSANOW, before)
