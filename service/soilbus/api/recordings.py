@@ -12,7 +12,7 @@ from typing import Any
 from soilbus.can.dbc_files import load_databases
 from soilbus.can.log_writer import write_log
 from soilbus.config.edit import with_effects_text
-from soilbus.config.file import load_config
+from soilbus.config.file import found_configuration, load_config
 from soilbus.config.model import Config
 from soilbus.diagnosis.model_out import effect_tables
 from soilbus.estimation.assembly import with_effects
@@ -182,7 +182,7 @@ def diagnose(logs: PathLike | Sequence[PathLike], config: Config | PathLike) -> 
     >>> found
     an effect is missing, and the data tell which: slip_sinkage (gap 1.55 -> 1.02)
     """
-    path = None if isinstance(config, Config) else Path(config)
+    path = None if isinstance(config, Config) else found_configuration(str(config))
     return Diagnosis(diagnose_logs(_config(config), _paths(logs)), path)
 
 
@@ -244,7 +244,7 @@ def simulate(
 
 
 def _config(config: Config | PathLike) -> Config:
-    return config if isinstance(config, Config) else load_config(config)
+    return config if isinstance(config, Config) else load_config(found_configuration(str(config)))
 
 
 def _paths(files: PathLike | Sequence[PathLike]) -> list[Path]:

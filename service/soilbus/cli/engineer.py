@@ -1,4 +1,4 @@
-"""Commands of the controls engineer: replay, simulate, diagnose.
+"""Commands of the controls engineer: replay, simulate, diagnose, effects.
 
 Each function takes the parsed arguments, imports what it needs, does the work and writes the outputs asked for.
 """
@@ -192,9 +192,10 @@ def _need_plots() -> None:
 
 def _source(args: argparse.Namespace, config: Config) -> Source:
     """What a report is made from."""
+    from soilbus.config.file import found_configuration
     from soilbus.report.page import Source
 
-    return Source(config, Path(args.config), args.set, args.logs)
+    return Source(config, found_configuration(args.config), args.set, args.logs)
 
 
 def simulate(args: argparse.Namespace) -> None:
@@ -275,11 +276,29 @@ def _simulate_live(args: argparse.Namespace, config: Config, scenario: Scenario)
     return driven[-1].bogged_at
 
 
+def effects(args: argparse.Namespace) -> None:
+    """`soilbus effects`: the catalogue."""
+    from soilbus.cli.effects import effect_text, effects_json, overview
+    from soilbus.config.model import ConfigError
+    from soilbus.terra.effects.catalogue import CATALOGUE
+    from soilbus.words import did_you_mean
+
+    if args.name is not None and args.name not in CATALOGUE:
+        raise ConfigError([f"no effect {args.name}{did_you_mean(args.name, CATALOGUE)}"])
+    wanted = [CATALOGUE[args.name]] if args.name else list(CATALOGUE.values())
+    if args.json is not None:
+        with whole_file(args.json) as out:
+            out.write(effects_json(wanted) + "\n")
+    if str(args.json) != "-":
+        print(effect_text(wanted[0]) if args.name else overview(wanted), end="")
+
+
 def diagnose(args: argparse.Namespace) -> None:
     """`soilbus diagnose`: find, name, add, show, and say what to drive next."""
     import json
 
     from soilbus.config.edit import with_effects_text
+    from soilbus.config.file import found_configuration
     from soilbus.diagnosis.diagnose import NotFitted
     from soilbus.diagnosis.model_out import effect_tables
     from soilbus.diagnosis.records import TooLittle
@@ -305,7 +324,7 @@ def diagnose(args: argparse.Namespace) -> None:
         texts.append((args.report, diagnosis_report(findings, _source(args, config), args.model_out)))
     if args.model_out is not None:
         effects, notes = effect_tables(findings.diagnosis.completed)
-        text = with_effects_text(Path(args.config), args.set, effects, args.model_out.parent, notes)
+        text = with_effects_text(found_configuration(args.config), args.set, effects, args.model_out.parent, notes)
         texts.append((args.model_out, text))
     if args.manoeuvre_out is not None:
         if findings.plan is None:
