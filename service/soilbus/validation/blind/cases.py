@@ -208,7 +208,7 @@ def _scenario(kind: str, soil: str, rng: np.random.Generator) -> Scenario:
 
 @cache
 def _configuration(machine: str) -> Config:
-    return reference_configuration(machine=MACHINES[machine])
+    return reference_configuration(path=MACHINES[machine])
 
 
 @cache

@@ -28,7 +28,7 @@ LEAST_PULL = 0.02
 
 @lru_cache
 def _good(machine: str) -> tuple[Moment, TrackerOutput]:
-    config = reference_configuration(machine=MACHINES[machine])
+    config = reference_configuration(path=MACHINES[machine])
     return good_moment(config), good_tracked(config)
 
 
@@ -55,7 +55,7 @@ def real(seed: int, machine: str = TRACTOR.stem) -> Drive:
 @lru_cache
 def _largest_drafts(machine: str) -> dict[str, float]:
     """Draft [N] that the vehicle holds at the greatest slip, on these grounds the most, where that is enough."""
-    config = reference_configuration(machine=MACHINES[machine])
+    config = reference_configuration(path=MACHINES[machine])
     assert config.vehicle is not None
     slip, found = config.traversability.max_slip, {}
     for soil in GROUNDS:
