@@ -201,6 +201,8 @@ class Scenario:
             raise ValueError("soils: at least one, at ascending distances")
         if self.draft is not None and self.slip is not None:
             raise ValueError("one of draft and slip at most may be given")
+        if not np.isfinite(self.duration):
+            raise ValueError(f"duration: {self.duration} is no number of seconds")
         if self.duration * SAMPLE_RATE < 2.0:
             raise ValueError(f"duration: {self.duration} s is too short")
         if self.speed.low <= 0.0 or self.transition <= 0.0:
