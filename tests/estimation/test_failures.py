@@ -13,12 +13,14 @@ from soilbus.can.publish import Publisher
 from soilbus.decision.traversability import State, Status
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.multistart import fit_window
+from soilbus.estimation.posterior import Posterior
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.states import ServiceState, state_after
 from soilbus.report.windows import summary
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario
+from soilbus.terra.soils import SOILS
 from soilbus.validation import local_optima
 from soilbus.validation.driven_windows import tasks
 

@@ -16,7 +16,7 @@ REAR_DRIVE = machine("tractor-2wd")
 """One motor on the rear axle, front wheels that roll freely, a load cell of the rear axle."""
 AXLE_MOTORS = machine("tractor-axles")
 """A motor on each axle, no load cells, an inertial sensor."""
-MACHINES = {path.stem: path for path in (TRACTOR, REAR_DRIVE, AXLE_MOTORS)}
+REFERENCE_MACHINES = {path.stem: path for path in (TRACTOR, REAR_DRIVE, AXLE_MOTORS)}
 """All of them by name: tractor, tractor-2wd, tractor-axles."""
 
 
