@@ -31,7 +31,7 @@ PUBLIC = (
             "estimation.posterior", "estimation.multistart", "estimation.tracker", "diagnosis.diagnose",
             "diagnosis.records", "offline.replay", "offline.diagnose", "config.model", "config.file",
             "pipeline.pipeline", "decision.capability", "decision.traversability", "simulator.recording",
-            "simulator.scenario",
+            "simulator.scenario", "api.wheel", "api.estimate", "api.recordings", "api.paper",
         )
     ),
 )  # fmt: skip

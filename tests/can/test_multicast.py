@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from contextlib import closing, suppress
@@ -100,7 +101,6 @@ def test_three_processes_meet_on_a_group(pair):
         for process in (service, tractor, watch):
             process.terminate()
         said = service.communicate(timeout=30)[1]
-    assert "bearing pressure" in shown
-    assert "valid" in shown
-    assert "foreign" not in shown
+    last = shown.splitlines()[-1]
+    assert re.search(r"Slip .*, best \d+ %.* valid \d", last), last
     assert "another node" not in said

@@ -1,22 +1,19 @@
 """Frames carry the sensor series within their resolution, through logs of every format."""
 
-from pathlib import Path
-
 import can
 import cantools
 import numpy as np
 import pytest
 
-import soilbus.simulator
 from soilbus.can.checksum import frame_checksum
 from soilbus.can.log_writer import write_log
 from soilbus.can.mapping import channels_of, load_databases
 from soilbus.config.file import load_config, parse_config
 from soilbus.simulator.frames import START_TIME, encoded, frames
 from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import TRACTOR
 from soilbus.simulator.scenario import demo, excited
 
-TRACTOR = Path(soilbus.simulator.__file__).with_name("tractor.toml")
 CONFIG = load_config(TRACTOR)
 DATABASE = load_databases(CONFIG)
 PROTECTED = {"MotorFL", "MotorFR", "MotorRL", "MotorRR", "RideHeight", "Attitude", "DrawbarPin"}

@@ -1,19 +1,16 @@
 """Sensors are as noisy and as wrong as the configuration says."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-import soilbus.simulator
 from soilbus.config.file import load_config, parse_config
 from soilbus.config.model import Noise
 from soilbus.simulator.drive import drive
 from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import TRACTOR
 from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
 from soilbus.simulator.sensors import measure, noise_sd
 
-TRACTOR = Path(soilbus.simulator.__file__).with_name("tractor.toml")
 CONFIG = load_config(TRACTOR)
 
 

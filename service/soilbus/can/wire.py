@@ -55,7 +55,7 @@ class Received(NamedTuple):
 class MessageBus(Protocol):
     """What is used of an interface of python-can (can.BusABC)."""
 
-    def recv(self, timeout: float | None = None, /) -> can.Message | None:
+    def recv(self, timeout: float | None = None, /) -> Received | can.Message | None:
         """The next frame, or None after `timeout` [s]."""
 
     def send(self, message: can.Message, /) -> None:
@@ -173,7 +173,7 @@ class MessageWire:
     def __init__(self, bus: MessageBus) -> None:
         self._bus = bus
 
-    def recv(self, timeout: float) -> can.Message | None:
+    def recv(self, timeout: float) -> Received | can.Message | None:
         """As Wire."""
         return self._bus.recv(timeout)
 
@@ -206,7 +206,7 @@ class MulticastWire(MessageWire):
         super().__init__(bus)
         self._echoes: dict[tuple[int, bytes], list[float]] = {}
 
-    def recv(self, timeout: float) -> can.Message | None:
+    def recv(self, timeout: float) -> Received | can.Message | None:
         """As Wire; own frames are passed over."""
         message = super().recv(timeout)
         if message is None or not self._echoes:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from soilbus import __version__
@@ -43,6 +43,25 @@ def counted(text: str) -> int:
     return number
 
 
+EXAMPLES: Mapping[str, str] = {
+    "demo": "soilbus demo --picture dashboard.svg",
+    "init": "soilbus init --dbc vehicle.dbc --log drive.log -o soilbus.toml",
+    "run": "soilbus run --config soilbus.toml --set bus.channel=can1",
+    "check": "soilbus check --config soilbus.toml --log drive.log",
+    "replay": "soilbus replay --config soilbus.toml drive.log --json windows.jsonl --report drive.html",
+    "simulate": "soilbus simulate --config tractor-2wd --soil loam --effect slip_sinkage=0.4 --log drive.log",
+    "diagnose": "soilbus diagnose --config soilbus.toml drive.log --report findings.html --model-out better.toml",
+    "effects": "soilbus effects slip_sinkage",
+    "watch": "soilbus watch --config soilbus.toml",
+    "completion": "soilbus completion bash >/etc/bash_completion.d/soilbus",
+    "paper": "soilbus paper --sinkage 0.05",
+    "montecarlo": "soilbus montecarlo --windows 50 --json figures.json",
+    "decisions": "soilbus decisions --drives 20 --json figures.json",
+    "bench": "soilbus bench --json figures.json",
+}
+"""A line that works, for the end of each command's help."""
+
+
 def named(*suffixes: str) -> Callable[[str], Path]:
     """Parser of the path of a file to write, whose name must end in one of `suffixes`."""
 
@@ -60,10 +79,16 @@ def command_line() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"soilbus {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def command(name: str, text: str, config: str = "required") -> argparse.ArgumentParser:
-        sub = commands.add_parser(name, help=text, description=text)
+    def command(name: str, text: str, config: str = "found") -> argparse.ArgumentParser:
+        sub = commands.add_parser(
+            name, help=text, description=text, epilog=f"example:\n  {EXAMPLES[name]}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )  # fmt: skip
         if config:
-            sub.add_argument("--config", metavar="FILE", required=config == "required", help="TOML configuration")
+            default = "soilbus.toml in this folder" if config == "found" else "the simulated tractor"
+            sub.add_argument(
+                "--config", metavar="FILE", help=f"TOML configuration or a reference machine's name; default: {default}"
+            )
             sub.add_argument(
                 "--set", action="append", default=[], metavar="KEY=VALUE", help="override a value (dotted TOML path)"
             )
@@ -80,6 +105,16 @@ def command_line() -> argparse.ArgumentParser:
         "--picture", type=Path, metavar="OUT.svg",
         help="keep the dashboard's last state: the driver's page, and the engineer's in OUT-engineer.svg",
     )  # fmt: skip
+
+    sub = command("init", "propose a configuration from the vehicle's DBC, and from a log of a drive", "")
+    sub.add_argument(
+        "--dbc", action="append", type=Path, required=True, metavar="FILE", help="of the vehicle; repeat it for more"
+    )
+    sub.add_argument("--log", type=Path, metavar="LOG", help="a drive with varied load, to see what each signal does")
+    sub.add_argument(
+        "-o", "--out", type=Path, default=Path("-"), metavar="OUT.toml", help="file to write (default: stdout)"
+    )
+    sub.add_argument("--force", action="store_true", help="replace a file that is there already")
 
     sub = command("run", "the service on a live bus")
     sub.add_argument("--wait", action="store_true", help="wait for an interface that is not there yet")
@@ -147,8 +182,8 @@ def command_line() -> argparse.ArgumentParser:
         help="picks true mass (by vehicle.mass_std) and sensor gains; without it --seed picks the gains",
     )  # fmt: skip
     sub.add_argument(
-        "--truth", type=Path, metavar="OUT",
-        help="table of true values: soil, slip, draft, load, sinkage, torque (.csv, or .parquet with the extra tables)",
+        "--truth", type=named(".csv", ".parquet"), metavar="OUT",
+        help="true values as rows: soil, slip, draft, load, sinkage, torque: .csv, or .parquet (extra: tables)",
     )  # fmt: skip
     sub.add_argument("--manoeuvre", type=Path, metavar="FILE", help="drive what --manoeuvre-out has written")
     target = sub.add_mutually_exclusive_group(required=True)
@@ -175,6 +210,13 @@ def command_line() -> argparse.ArgumentParser:
     )
     sub.add_argument("--plain", action="store_true", help="lines of text, for a screen reader; also in a pipe")
     sub.add_argument("--seconds", type=float, metavar="S", help="stop after this time")
+
+    sub = command("effects", "the catalogue of effects: physics, parameters, ranges, source, what tells it apart", "")
+    sub.add_argument("name", nargs="?", metavar="NAME", help="one effect in full (default: a line for each)")
+    sub.add_argument("--json", type=Path, metavar="OUT", help="write them as JSON; - for stdout")
+
+    sub = command("completion", "completion of commands and options for a shell (extra: completion)", "")
+    sub.add_argument("shell", choices=("bash", "zsh"), help="the shell; its output belongs where that shell looks")
 
     sub = command("paper", "the tables of Xi et al. 2024 beside ours, and what holds of its method", "")
     sub.add_argument(
@@ -203,3 +245,8 @@ def command_line() -> argparse.ArgumentParser:
     )
     figures(sub)
     return parser
+
+
+def subcommands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """The parser of each command by its name."""
+    return next(dict(a.choices) for a in parser._actions if isinstance(a, argparse._SubParsersAction))

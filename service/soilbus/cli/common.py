@@ -15,10 +15,10 @@ class WorkError(Exception):
 
 
 def configured(args: argparse.Namespace) -> Config:
-    """The configuration that --config and --set name."""
-    from soilbus.config.file import load_config
+    """The configuration that --config and --set name, or soilbus.toml in the current folder."""
+    from soilbus.config.file import found_configuration, load_config
 
-    return load_config(args.config, args.set)
+    return load_config(found_configuration(args.config), args.set)
 
 
 def configured_or_reference(args: argparse.Namespace) -> Config:

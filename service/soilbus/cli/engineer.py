@@ -1,4 +1,4 @@
-"""Commands of the controls engineer: replay, simulate, diagnose.
+"""Commands of the controls engineer: replay, simulate, diagnose, effects.
 
 Each function takes the parsed arguments, imports what it needs, does the work and writes the outputs asked for.
 """
@@ -192,9 +192,10 @@ def _need_plots() -> None:
 
 def _source(args: argparse.Namespace, config: Config) -> Source:
     """What a report is made from."""
+    from soilbus.config.file import found_configuration
     from soilbus.report.page import Source
 
-    return Source(config, Path(args.config), args.set, args.logs)
+    return Source(config, found_configuration(args.config), args.set, args.logs)
 
 
 def simulate(args: argparse.Namespace) -> None:
@@ -205,10 +206,9 @@ def simulate(args: argparse.Namespace) -> None:
     from soilbus.simulator.drive import SimulationError
     from soilbus.simulator.play import scenario_over
 
-    if args.truth is not None:
-        check_folders(args.truth)
-        if args.truth.suffix.lower() in (".parquet", ".pq"):
-            need_extra("pyarrow", "tables", "--truth in Parquet")
+    check_folders(args.truth)
+    if args.truth is not None and args.truth.suffix == ".parquet":
+        need_extra("pyarrow", "tables", "--truth OUT.parquet")
     config = with_effects(configured_or_reference(args), args.effect)
     try:
         way = course(args.start, args.heading, args.rows)
@@ -276,16 +276,33 @@ def _simulate_live(args: argparse.Namespace, config: Config, scenario: Scenario)
     return driven[-1].bogged_at
 
 
+def effects(args: argparse.Namespace) -> None:
+    """`soilbus effects`: the catalogue."""
+    from soilbus.cli.effects import effect_text, effects_json, overview
+    from soilbus.config.model import ConfigError
+    from soilbus.terra.effects.catalogue import CATALOGUE
+    from soilbus.words import did_you_mean
+
+    if args.name is not None and args.name not in CATALOGUE:
+        raise ConfigError([f"no effect {args.name}{did_you_mean(args.name, CATALOGUE)}"])
+    wanted = [CATALOGUE[args.name]] if args.name else list(CATALOGUE.values())
+    if args.json is not None:
+        with whole_file(args.json) as out:
+            out.write(effects_json(wanted) + "\n")
+    if str(args.json) != "-":
+        print(effect_text(wanted[0]) if args.name else overview(wanted), end="")
+
+
 def diagnose(args: argparse.Namespace) -> None:
     """`soilbus diagnose`: find, name, add, show, and say what to drive next."""
     import json
 
     from soilbus.config.edit import with_effects_text
+    from soilbus.config.file import found_configuration
     from soilbus.diagnosis.diagnose import NotFitted
     from soilbus.diagnosis.model_out import effect_tables
     from soilbus.diagnosis.records import TooLittle
     from soilbus.offline.diagnose import diagnose_logs
-    from soilbus.offline.manoeuvre import what_to_drive
     from soilbus.offline.replay import LogError
     from soilbus.report.findings import findings_json, findings_text
     from soilbus.report.progress import phases
@@ -298,26 +315,23 @@ def diagnose(args: argparse.Namespace) -> None:
     try:
         with phases("diagnose") as say:
             findings = diagnose_logs(config, args.logs, say)
-            if say is not None:
-                say("finding what to drive next")
-            plan = what_to_drive(findings.diagnosis, config)
     except (LogError, NotFitted, TooLittle) as error:
         raise WorkError(str(error)) from None
     texts: list[tuple[Path, str]] = []
     if args.json is not None:
-        texts.append((args.json, findings_json(findings, plan)))
+        texts.append((args.json, findings_json(findings)))
     if args.report is not None:
         texts.append((args.report, diagnosis_report(findings, _source(args, config), args.model_out)))
     if args.model_out is not None:
         effects, notes = effect_tables(findings.diagnosis.completed)
-        text = with_effects_text(Path(args.config), args.set, effects, args.model_out.parent, notes)
+        text = with_effects_text(found_configuration(args.config), args.set, effects, args.model_out.parent, notes)
         texts.append((args.model_out, text))
     if args.manoeuvre_out is not None:
-        if plan is None:
+        if findings.plan is None:
             raise WorkError("--manoeuvre-out: no names are left to decide between that a drive would tell apart")
-        texts.append((args.manoeuvre_out, json.dumps(plan.as_json(), indent=1) + "\n"))
+        texts.append((args.manoeuvre_out, json.dumps(findings.plan.as_json(), indent=1) + "\n"))
     for path, text in texts:
         with whole_file(path) as out:
             out.write(text)
     if all(str(path) != "-" for path, _ in texts):
-        print(findings_text(findings, plan), end="")
+        print(findings_text(findings), end="")

@@ -19,8 +19,8 @@ from soilbus.process import output_fault, say
 DONE, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
 
 COMMANDS = {
-    "user": ("demo", "run", "check", "watch"),
-    "engineer": ("replay", "simulate", "diagnose"),
+    "user": ("demo", "init", "run", "check", "watch", "completion"),
+    "engineer": ("replay", "simulate", "diagnose", "effects"),
     "lab": ("paper", "montecarlo", "decisions", "bench"),
 }
 """Each file of commands, loaded when one of them is asked for; a command is the function of that name."""

@@ -1,4 +1,4 @@
-"""Commands of whoever runs soilbus on a vehicle: demo, run, check, watch.
+"""Commands of whoever runs soilbus on a vehicle: demo, init, run, check, watch, completion.
 
 Each function takes the parsed arguments and imports what it needs, so that `run` loads no simulator.
 """
@@ -10,10 +10,12 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from soilbus.allocator import loading
-from soilbus.cli.common import WorkError, configured, configured_or_reference
+from soilbus.cli.common import WorkError, check_folders, configured, configured_or_reference, need_extra
+from soilbus.files import whole_file
 from soilbus.process import say
 
 if TYPE_CHECKING:
@@ -27,6 +29,50 @@ def demo(args: argparse.Namespace) -> None:
     from soilbus.cli.demo import run_demo
 
     run_demo(args.duration, args.picture)
+
+
+def init(args: argparse.Namespace) -> None:
+    """`soilbus init`: a configuration proposed from DBC files and, with a log, from what its signals do."""
+    from soilbus.can.dbc_files import load_databases
+    from soilbus.can.role_matching import assigned, candidates
+    from soilbus.config.edit import named_from
+    from soilbus.config.file import located, parse_config
+    from soilbus.config.model import ConfigError
+    from soilbus.offline.replay import LogError, read_frames
+    from soilbus.report.progress import progress
+    from soilbus.report.proposal import proposal
+    from soilbus.sensors.role_evidence import Facts, facts_of, recording_of, weighed
+
+    to_stdout = str(args.out) == "-"
+    if not to_stdout and args.out.exists() and not args.force:
+        raise WorkError(f"{args.out} is there already; --force replaces it")
+    check_folders(None if to_stdout else args.out)
+    dbcs = [located(Path(), str(path)) for path in args.dbc]
+    try:
+        database = load_databases(parse_config({"dbc": {"input": [str(path.absolute()) for path in dbcs]}}))
+    except ConfigError as error:
+        raise ConfigError(fault.replace("dbc.input", "--dbc") for fault in error.faults) from None
+    found, facts = candidates(database), Facts()
+    if args.log is not None:
+        try:
+            with progress("init") as step:
+                recording = recording_of(found, database, _counted(read_frames(args.log), step))
+        except LogError as error:
+            raise WorkError(str(error)) from None
+        if not recording.columns:
+            raise WorkError(f"{args.log}: no frame of a signal in {', '.join(map(str, args.dbc))} that could be mapped")
+        found = weighed(found, recording)
+        facts = facts_of(assigned(found), recording)
+    files = [named_from(Path() if to_stdout else args.out.parent, path) for path in dbcs]
+    words = ["soilbus init", *(f"--dbc {path}" for path in args.dbc), *([f"--log {args.log}"] if args.log else [])]
+    made = proposal(database, assigned(found), facts, files, " ".join(words))
+    with whole_file(args.out) as out:
+        out.write(made.text)
+    log = f" --log {args.log}" if args.log else ""
+    say(
+        f'{made.mapped} signals mapped, {made.open} values open ("?"): fill them in, then'
+        f" soilbus check --config {'soilbus.toml' if to_stdout else args.out}{log}"
+    )
 
 
 def run(args: argparse.Namespace) -> None:
@@ -111,3 +157,18 @@ def watch(args: argparse.Namespace) -> None:
             watch_log(config, args.log, args.speed, is_named, args.seconds, args.plain)
     except (BusError, LogError) as error:
         raise WorkError(str(error)) from None
+
+
+def completion(args: argparse.Namespace) -> None:
+    """`soilbus completion`: a shell's completion of commands, options and files."""
+    need_extra("shtab", "completion", "completion")
+    import shtab
+
+    from soilbus.cli.arguments import command_line, subcommands
+
+    parser = command_line()
+    for command in subcommands(parser).values():
+        for action in command._actions:
+            if str(action.metavar).partition(".")[0] in ("FILE", "LOG", "OUT"):
+                action.complete = shtab.FILE  # type: ignore[attr-defined]
+    print(shtab.complete(parser, args.shell))

@@ -447,27 +447,26 @@ class Column(_Section):
 
 
 class Table(_Section):
-    """A test rig's table, each row one steady state: where its quantities stand.
+    """A test rig's table, each row one steady state: where its quantities stand, with an example in test-rig.md.
 
-    wheel_load [N], drawbar_pull [N] positive forward, torque [N m] about the axle, slip
-    (1 - V/(r omega)), sinkage [m], t [s].  The soil bed is the same in all rows, or in those
-    with the same value of the column `run`.  Only rows that equal `where` count.
+    At least one of drawbar_pull, torque and sinkage must be mapped.  The soil bed is the same in all rows, or in those
+    with the same value of the column `run`.
     """
 
     wheel_load: Column
-    """[N]."""
+    """Vertical load on the wheel [N]; a row without it is left out."""
     slip: Column
-    """1 - V/(r omega)."""
+    """1 - V/(r omega), r the wheel's rolling radius; a row without it is left out."""
     drawbar_pull: Column | None = None
-    """[N], positive forward."""
+    """Net pull [N], positive forward; its noise is that of `draft`."""
     torque: Column | None = None
-    """[N m] about the axle."""
+    """Torque about the axle [N m]."""
     sinkage: Column | None = None
-    """[m]."""
+    """Depth of the wheel's deepest point [m]."""
     t: Column | None = None
-    """[s]."""
+    """Time [s]; without it no effect of time is a candidate of a diagnosis."""
     run: Annotated[str, Field(min_length=1)] | None = None
-    """Column by which soil beds differ."""
+    """Name of the column by which soil beds differ."""
     where: dict[str, Any] = Field(default_factory=dict)
     """Only rows that equal these values count."""
 

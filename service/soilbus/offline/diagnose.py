@@ -21,6 +21,7 @@ from soilbus.diagnosis.diagnose import Diagnosis, NotFitted, diagnose
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.estimation.assembly import motors_of, possible_effects, prior_of
 from soilbus.estimation.posterior import Estimate, Posterior
+from soilbus.offline.manoeuvre import Plan, what_to_drive
 from soilbus.offline.recordings import Recordings, recordings_of
 from soilbus.offline.tables import candidates, recordings_of_tables
 from soilbus.pipeline.intake import ReportedLimits
@@ -42,12 +43,15 @@ class Findings:
         The configuration that it holds for.
     seconds
         Time [s] that the diagnosis took, without reading.
+    plan
+        What to drive next where the diagnosis is ambiguous; None where no drive would help.
     """
 
     diagnosis: Diagnosis
     recordings: Recordings
     config: Config
     seconds: float
+    plan: Plan | None = None
 
     def soils(self) -> list[tuple[str, Posterior, Posterior]]:
         """Name, soil before and soil after of the first part of each log."""
@@ -118,4 +122,7 @@ def diagnose_logs(config: Config, logs: Sequence[Path], say: Callable[[str], Non
         diagnosis = diagnose(recordings.records, prior_of(config), catalogue, report)
     except np.linalg.LinAlgError as error:
         raise NotFitted(f"the recordings do not determine the model: {error}") from None
-    return Findings(diagnosis, recordings, config, time.perf_counter() - begin)
+    seconds = time.perf_counter() - begin
+    if diagnosis.rivals:
+        report("finding what to drive next")
+    return Findings(diagnosis, recordings, config, seconds, what_to_drive(diagnosis, config))

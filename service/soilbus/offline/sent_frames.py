@@ -26,7 +26,7 @@ from soilbus.offline.replay import LogError, read_frames
 from soilbus.pipeline.outputs import check_cycle_times
 from soilbus.pipeline.pipeline import Pipeline
 
-__all__ = ["sent_frames"]
+__all__ = ["sent_beside", "sent_frames"]
 
 
 def sent_frames(config: Config, logs: Sequence[Path]) -> Iterator[can.Message]:
@@ -48,20 +48,24 @@ def sent_frames(config: Config, logs: Sequence[Path]) -> Iterator[can.Message]:
     ConfigError
         The configuration cannot work, or a frame would come less often than its DBC says.
     """
+    for log in logs:
+        yield from sent_beside(config, _readable(log))
+
+
+def sent_beside(config: Config, frames: Iterator[Frame]) -> Iterator[can.Message]:
+    """What the service sends while these frames are on its bus, as `sent_frames`; they may depend on what it sent."""
     database, ours = load_databases(config), output_database(config)
     check_cycle_times(config, ours)
-    for log in logs:
-        clock = PlayedClock()
-        pipeline = Pipeline(config, database)
-        played = PlayedBus(_readable(log), pipeline.admission.can_filters(), clock, config.bus.channel)
-        bus = LiveBus(lambda played=played: played, clock, clock.sleep)  # type: ignore[misc]
-        bus.open()
-        service = Service(
-            config, pipeline, bus, Publisher(ours), Notifier(), InlineExecutor(), clock, waiting=clock.wait_for
-        )
-        while not played.is_empty:
-            service.step()
-            yield from played.take_sent()
+    clock, pipeline = PlayedClock(), Pipeline(config, database)
+    played = PlayedBus(frames, pipeline.admission.can_filters(), clock, config.bus.channel)
+    bus = LiveBus(lambda: played, clock, clock.sleep)
+    bus.open()
+    service = Service(
+        config, pipeline, bus, Publisher(ours), Notifier(), InlineExecutor(), clock, waiting=clock.wait_for
+    )
+    while not played.is_empty:
+        service.step()
+        yield from played.take_sent()
 
 
 def _readable(log: Path) -> Iterator[Frame]:

@@ -26,6 +26,7 @@ from soilbus.report.findings import (
     size_text,
     soil_rows,
 )
+from soilbus.report.next_drive import hope_of
 from soilbus.report.page import Picture, Source, Table, page
 from soilbus.report.statement import (
     doubt,
@@ -151,6 +152,10 @@ def _steps(findings: Findings, source: Source, model_out: Path | None) -> Iterat
         yield "Nothing is to be added. Smaller effects show in longer recordings that vary the load more.", "", []
     for sentence, lines in to_tell_apart(diagnosis):
         yield sentence, "", lines
+    if findings.plan is not None:
+        command = f"{source.command('diagnose')} --manoeuvre-out drive.json"
+        sentence = f"Drive for {findings.plan.manoeuvre.duration:.0f} s what decides between these best:"
+        yield sentence, command, [findings.plan.manoeuvre.words, hope_of(findings.plan)]
     if not any(check.problem.with_sinkage for check in diagnosis.base.checks) and source.config.table is None:
         yield "Map a sinkage sensor (wheel.sinkage) if there is one: it tells many effects apart.", "", []
 

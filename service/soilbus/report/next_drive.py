@@ -12,17 +12,20 @@ from soilbus.simulator.manoeuvre import Manoeuvre
 
 def plan_lines(plan: Plan) -> list[str]:
     """What to drive next, and what it is expected to settle."""
-    if plan.repeats is None:
-        hope = f"even {MAX_REPEATS} such drives are not expected to settle it: rather take one of the sensors above"
-    else:
-        times = "once" if plan.repeats == 1 else f"{plan.repeats} times"
-        hope = f"driven {times} and diagnosed together with what there is, it is expected to settle the name"
     return [
         f"what to drive next, to decide between {', '.join(plan.between)} ({plan.manoeuvre.duration:.0f} s; "
         "--manoeuvre-out keeps it):",
         f"  {plan.manoeuvre.words}",
-        f"  {hope}",
+        f"  {hope_of(plan)}",
     ]
+
+
+def hope_of(plan: Plan) -> str:
+    """What a plan is expected to settle, and how often it must be driven."""
+    if plan.repeats is None:
+        return f"even {MAX_REPEATS} such drives are not expected to settle it: rather take one of the sensors above"
+    times = "once" if plan.repeats == 1 else f"{plan.repeats} times"
+    return f"driven {times} and diagnosed together with what there is, it is expected to settle the name"
 
 
 def excitation_lines(manoeuvre: Manoeuvre, expected: Posterior, now: Posterior, config: Config) -> list[str]:

@@ -13,7 +13,6 @@ import can
 from cantools.database import Database
 
 from soilbus.can.checksum import CHECKSUM, COUNTER, frame_checksum
-from soilbus.can.dbc_files import filters_of
 from soilbus.can.publish import value_codes
 from soilbus.config.file import shipped_dbc
 from soilbus.config.model import Config
@@ -37,21 +36,15 @@ class Commands:
 
     def __init__(self, config: Config) -> None:
         self._wheels = config.wheel[:4]
-        self._database = Database()
-        self._database.add_dbc_file(str(shipped_dbc("tractor.dbc")))
-        names = _DRIVE, _TORQUE_LIMIT
-        self._messages = {m.frame_id: m for name in names for m in [self._database.get_message_by_name(name)]}
+        database = Database()
+        database.add_dbc_file(str(shipped_dbc("tractor.dbc")))
+        self._messages = {m.frame_id: m for m in map(database.get_message_by_name, (_DRIVE, _TORQUE_LIMIT))}
         self._codes = {
             i: {s.name: value_codes(s) for s in m.signals if s.name not in (COUNTER, CHECKSUM)}
             for i, m in self._messages.items()
         }
         self._counter: dict[int, int] = {}
         self._values: dict[str, tuple[float, dict[str, float]]] = {}
-
-    @property
-    def filters(self) -> list[dict[str, Any]]:
-        """Filters for python-can that pass commands only."""
-        return [f for f in filters_of(self._database) if f["can_id"] in self._messages]
 
     def take(self, frame: can.Message, now: float) -> bool:
         """Note a frame that came at a time `now` [s]; whether it is a command and right."""

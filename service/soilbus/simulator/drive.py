@@ -13,7 +13,7 @@ sensors belong to simulator/sensors.py.
 duration. Where nobody lifts the implement, what the wheels cannot give slows the vehicle down:
 
     dv/dt = min(towards the wanted speed, (sum of drawbar pulls at the slip limit - draft - m g sin(pitch)) / m)
-    slip limit = 1 - v / (RIM_SPEED_RATIO wanted speed)     the rims turn no faster; at MAX_SLIP it has bogged down
+    slip limit = 1 - v / (RIM_SPEED_RATIO max(wanted speed, v))    the rims turn no faster; at MAX_SLIP it is stuck
 """
 
 from __future__ import annotations
@@ -425,7 +425,7 @@ def _situation(
 
     demand, slip_limit, least = plan.demand[part], plan.slip_limit[part], plan.least_draft[part]
     if not lifted:
-        rim = RIM_SPEED_RATIO * (plan.speed.value[part] if wanted is None else np.full(shape[1], wanted))
+        rim = RIM_SPEED_RATIO * np.maximum(plan.speed.value[part] if wanted is None else wanted, motion.speed)
         demand = demand if draft is None else np.full(shape[1], draft)
         slip_limit, least = np.minimum(1.0 - motion.speed / rim, MAX_SLIP), np.full(shape[1], -np.inf)
     limit = drivetrain.limit.copy()

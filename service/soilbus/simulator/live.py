@@ -23,6 +23,8 @@ from soilbus.simulator.sensors import Instruments
 
 __all__ = ["drive_live", "driven_frames"]
 
+MAX_FRAMES_PER_STEP = 1000
+"""Frames that are looked at in a step: those of a full bus of 500 kbit/s in 0.25 s."""
 Step = tuple[Drive, list[can.Message]]
 
 
@@ -88,10 +90,12 @@ def drive_live(config: Config, scenario: Scenario, seed: int, driven: MutableSeq
             driven.append(done)
             yield from frames
 
-    with open_bus(settings, commands.filters) as bus:
+    with open_bus(settings) as bus:  # without filters: python-can's own would end a look at the first other frame
 
         def commanded(t: float) -> Command:
-            while (frame := bus.recv(0.0)) is not None:
+            for _ in range(MAX_FRAMES_PER_STEP):
+                if (frame := bus.recv(0.0)) is None:
+                    break
                 commands.take(frame, time.monotonic())
             return commands.at(time.monotonic())
 

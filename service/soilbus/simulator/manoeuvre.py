@@ -17,6 +17,10 @@ from soilbus.simulator.scenario import Profile, Scenario
 
 __all__ = ["LARGEST", "Manoeuvre", "of_json"]
 
+COLUMNS = ("slip", "speed", "side_load", "slope")
+"""What a manoeuvre prescribes at its times."""
+GAP = 1.0
+"""Time [s] from the end of a manoeuvre to its start again."""
 LARGEST = 1 << 22
 """Bytes of a file that may be a manoeuvre."""
 
@@ -53,6 +57,11 @@ class Manoeuvre:
         """[s]."""
         return self.t[-1]
 
+    def repeated(self, times: int) -> Manoeuvre:
+        """The same several times in a row."""
+        t = tuple(round(i * (self.duration + GAP) + at, 6) for i in range(times) for at in self.t)
+        return replace(self, t=t, **{name: getattr(self, name) * times for name in COLUMNS})
+
     def over(self, scenario: Scenario, nothing_towed: bool = False) -> Scenario:
         """A scenario's ground driven so; a vehicle that tows nothing finds its own slopes for the slip."""
         t, speed = np.array(self.t), np.array(self.speed)
@@ -83,7 +92,7 @@ def of_json(text: str) -> Manoeuvre:
     """
     document = json.loads(text)
     table = document.get("manoeuvre", document) if isinstance(document, Mapping) else None
-    columns = ("t", "slip", "speed", "side_load", "slope")
+    columns = ("t", *COLUMNS)
     if not isinstance(table, Mapping) or not all(isinstance(table.get(name), list) for name in columns):
         raise ValueError(f"no manoeuvre in it: lists {', '.join(columns)}")
     rows = {name: tuple(float(x) for x in table[name]) for name in columns}

@@ -13,13 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from soilbus.files import whole_file
+from soilbus.files import whole_file, whole_file_of_bytes
 from soilbus.simulator.drive import Drive
 
-__all__ = ["PARQUET", "write_truth"]
-
-PARQUET = (".parquet", ".pq")
-"""Suffixes that ask for Parquet; any other means CSV."""
+__all__ = ["write_truth"]
 
 
 def write_truth(done: Drive, path: Path, start: float) -> None:
@@ -30,22 +27,23 @@ def write_truth(done: Drive, path: Path, start: float) -> None:
     done
         The drive.
     path
-        Of the table.
+        Of a .parquet file, or of a CSV file under any other name.
     start
         Stamp of the first instant [s].
 
     Raises
     ------
-    OSError, NotWritten
+    NotWritten
         The table cannot be written.
     """
     columns: dict[str, NDArray[Any]] = done.columns | {"t": start + done.columns["t"]}
     columns = {
         name: column for name, column in columns.items() if column.dtype.kind != "f" or np.isfinite(column).any()
     }
-    if path.suffix.lower() in PARQUET:
+    if path.suffix == ".parquet":
         arrow: Any = import_module("pyarrow")  # typed only in part
-        import_module("pyarrow.parquet").write_table(arrow.table(columns), path)
+        with whole_file_of_bytes(path) as binary:
+            import_module("pyarrow.parquet").write_table(arrow.table(columns), binary)
         return
     with whole_file(path) as out:
         rows = csv.writer(out, lineterminator="\n")
