@@ -72,8 +72,9 @@ def bare_debian() -> Path:
     root.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=root.parent) as tmp:
         made = Path(tmp) / "root"
-        include = f"--include={','.join(DEBIAN)}"
-        if fault := _call(["debootstrap", "--variant=minbase", include, release["VERSION_CODENAME"], made], Path(tmp)):
+        alone = ["unshare", "--mount"]  # what it mounts in there goes with it, however it ends
+        what = ["--variant=minbase", f"--include={','.join(DEBIAN)}", release["VERSION_CODENAME"], made]
+        if fault := _call([*alone, "debootstrap", *what], Path(tmp)):
             raise Unavailable(f"a bare Debian cannot be set up: {fault}")
         made.rename(root)
     return root

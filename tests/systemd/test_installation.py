@@ -43,9 +43,7 @@ def _in_the_guest(script: str, folder: Path, commands: Sequence[str], environmen
     for name in ("page.sh", script):
         shutil.copy(REPO / "tests/systemd" / name, folder)
     try:
-        done = guest.run(
-            ["env", *environment, "sh", script], rw=[folder], base=guest.bare_debian(), timeout=240.0
-        )  # fmt: skip
+        done = guest.run(["env", *environment, "sh", script], rw=[folder], base=guest.bare_debian(), timeout=400.0)
     except guest.Unavailable as reason:
         unavailable(str(reason))
         raise
@@ -109,8 +107,7 @@ def promised_status() -> list[str]:
 
 
 def test_it_takes_ten_commands_at_most() -> None:
-    assert len(BUILT) + len(WITH_THE_PACKAGE) <= 10
-    assert len(WITHOUT) <= 10
+    assert sum(line.count(" && ") + 1 for line in [*BUILT, *WITH_THE_PACKAGE]) <= 10
     assert BUILT[0].startswith("apt-get")  # satisfied beforehand, where the test runs
     assert WITH_THE_PACKAGE[-1] == WITHOUT[-1] == "systemctl status soilbus@can0"
 
