@@ -27,7 +27,12 @@ BUILT, WITH_THE_PACKAGE, WITHOUT = (
     for block in re.findall(r"^```sh\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)[:3]
 )
 """Commands of the page: on the machine that builds the package, on the ECU with it, and without it."""
-OF_US = "/opt/soilbus", "/usr/bin/soilbus", "/usr/lib/systemd/system/soilbus@.service", "/usr/lib/sysusers.d/soilbus.conf"
+OF_US = (
+    "/opt/soilbus",
+    "/usr/bin/soilbus",
+    "/usr/lib/systemd/system/soilbus@.service",
+    "/usr/lib/sysusers.d/soilbus.conf",
+)
 ENABLED = "/etc/systemd/system/multi-user.target.wants/soilbus@can0.service"
 LATER = "99.0.0"
 
@@ -87,7 +92,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.rmtree(folder / "venv")
     (reference,) = (REPO / "service/soilbus").rglob("tractor.toml")
     shutil.copy(reference, folder)
-    return _in_the_guest("page.sh", folder, WITHOUT, ["PIP_NO_INDEX=1", f"PIP_FIND_LINKS={folder}/wheels"])
+    of_pip = ["PIP_NO_INDEX=1", f"PIP_FIND_LINKS={folder}/wheels", "PIP_NO_COMPILE=1"]  # the guest is slow
+    return _in_the_guest("page.sh", folder, WITHOUT, of_pip)
 
 
 def shown(folder: Path) -> dict[str, str]:
