@@ -1264,7 +1264,8 @@ def shrunk_latents(fitted: Array, variance: Array) -> Array:
     """Latents (N, L) with their noise shrunk, from fitted ones (N, L) and the variance (N, L) of these.
 
     Best linear prediction from the window itself: a direction that varies no more than
-    noise does becomes the window's mean.  Latents without variance stay.
+    noise does becomes the window's mean, and so does such a latent, whose noise happens to
+    go with other latents by 1 / sqrt(N).  Latents without variance stay.
 
     References
     ----------
@@ -1280,6 +1281,8 @@ def shrunk_latents(fitted: Array, variance: Array) -> Array:
     kept[square <= (1.0 + np.sqrt(ratio)) ** 2] = 0.0
     shrunk = fitted.copy()
     shrunk[:, noisy] = mean[noisy] + (left * (size * kept)) @ right * scale[noisy]
+    still = noisy[fitted[:, noisy].var(0) <= (scale[noisy] * (1.0 + 1.0 / math.sqrt(n))) ** 2]
+    shrunk[:, still] = mean[still]
     return shrunk
 
 

@@ -254,7 +254,8 @@ def _plan(config: Config, scenario: Scenario, seed: int, effects: tuple[Active, 
     deviation = np.stack([realise(spread, t, rng).value for _ in config.wheel])
     deviation = np.where((drivetrain.leader < 0)[:, None], 0.0, deviation[drivetrain.leader])
     rear = np.array([wheel.axle == "rear" for wheel in config.wheel])
-    model, length = WheelModel(shear_law=config.model.shear_law), float(speed.integral[-1])
+    model = WheelModel(shear_law=config.model.shear_law, rollers=config.rollers)
+    length = float(speed.integral[-1])
     mechanics = Mechanics(model, rear, chassis.mass, scenario.duration, length, drivetrain, effects, climbs)
     return _Plan(config, scenario, t, speed, side, demand, slip_limit, least, deviation, chassis, mechanics)
 
