@@ -54,6 +54,7 @@ EXAMPLES: Mapping[str, str] = {
     "effects": "soilbus effects slip_sinkage",
     "watch": "soilbus watch --config soilbus.toml",
     "completion": "soilbus completion bash >/etc/bash_completion.d/soilbus",
+    "docs": "soilbus docs systemd",
     "paper": "soilbus paper --sinkage 0.05",
     "montecarlo": "soilbus montecarlo --windows 50 --json figures.json",
     "decisions": "soilbus decisions --drives 20 --json figures.json",
@@ -223,6 +224,9 @@ def command_line() -> argparse.ArgumentParser:
 
     sub = command("completion", "completion of commands and options for a shell (extra: completion)", "")
     sub.add_argument("shell", choices=("bash", "zsh"), help="the shell; its output belongs where that shell looks")
+
+    sub = command("docs", "the pages of this version, which need no network", "")
+    sub.add_argument("page", nargs="?", metavar="PAGE", help="print this one; without it: which there are, and where")
 
     sub = command("paper", "the tables of Xi et al. 2024 beside ours, and what holds of its method", "")
     sub.add_argument(

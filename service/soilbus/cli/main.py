@@ -19,7 +19,7 @@ from soilbus.process import output_fault, say
 DONE, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
 
 COMMANDS = {
-    "user": ("demo", "init", "run", "check", "watch", "completion"),
+    "user": ("demo", "init", "run", "check", "watch", "completion", "docs"),
     "engineer": ("replay", "simulate", "diagnose", "effects"),
     "lab": ("paper", "montecarlo", "decisions", "bench"),
 }

@@ -1,4 +1,4 @@
-"""Commands of whoever runs soilbus on a vehicle: demo, init, run, check, watch, completion.
+"""Commands of whoever runs soilbus on a vehicle: demo, init, run, check, watch, completion, docs.
 
 Each function takes the parsed arguments and imports what it needs, so that `run` loads no simulator.
 """
@@ -176,3 +176,15 @@ def completion(args: argparse.Namespace) -> None:
             if str(action.metavar).partition(".")[0] in ("FILE", "LOG", "OUT"):
                 action.complete = shtab.FILE  # type: ignore[attr-defined]
     print(shtab.complete(parser, args.shell))
+
+
+def docs(args: argparse.Namespace) -> None:
+    """`soilbus docs`: the pages that came with this version."""
+    from soilbus.cli.docs import overview, pages
+    from soilbus.config.model import ConfigError
+    from soilbus.words import did_you_mean
+
+    found = pages()
+    if args.page is not None and args.page not in found:
+        raise ConfigError([f"no page {args.page}{did_you_mean(args.page, found)}"])
+    print(found[args.page].read_text(encoding="utf-8") if args.page else overview(), end="")
