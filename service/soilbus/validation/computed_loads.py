@@ -25,7 +25,7 @@ from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import NORMAL_95
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
-from soilbus.simulator.reference import REFERENCE_MACHINES, TRACTOR, reference_configuration
+from soilbus.simulator.reference import REFERENCES, TRACTOR, reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario
 from soilbus.terra.soils import soil_named
 from soilbus.validation.monte_carlo import ROUGHLY_KNOWN, SLIP_RANGE, prior_about, processes
@@ -51,7 +51,7 @@ class Task:
 
 def configured(machine: str, cells: str) -> Config | None:
     """A reference machine with the load cells of CELLS, c and K known to 25 %; None where it has fewer."""
-    config = reference_configuration(ROUGHLY_KNOWN, REFERENCE_MACHINES[machine])
+    config = reference_configuration(ROUGHLY_KNOWN, REFERENCES[machine])
     if machine != TRACTOR.stem:
         own = "axle cells" if any(axle.load is not None for axle in config.axle) else "none"
         return config if cells == own else None
@@ -91,7 +91,7 @@ def errors(task: Task) -> Array | None:
 
 def tasks(drives: int, seed: int, bounces: Sequence[float]) -> Iterator[list[Task]]:
     """The drives of each line of the table."""
-    for machine, cells, soil, bounce in product(REFERENCE_MACHINES, CELLS, SOILS, bounces):
+    for machine, cells, soil, bounce in product(REFERENCES, CELLS, SOILS, bounces):
         if configured(machine, cells) is not None:
             key = [seed, zlib.crc32(f"{machine} {soil}".encode())]
             seeds = np.random.SeedSequence(key).generate_state(drives)

@@ -12,7 +12,7 @@ import numpy as np
 
 from soilbus.config.model import Config, Prior
 from soilbus.simulator.recording import Recording, simulate
-from soilbus.simulator.reference import REFERENCE_MACHINES, TRACTOR, reference_configuration
+from soilbus.simulator.reference import REFERENCES, TRACTOR, reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
@@ -62,7 +62,7 @@ class Case:
     hidden: names of the catalogue's effects in it, none for nulls and for what the catalogue
     lacks; forms: titles of the formulas used; imitable: only for the latter; far: all formulas are.  `config` is all
     that the diagnosis is given beside `recording.channels`; `soil` is the truth, at the
-    middle of the way where it changes.  machine: a name of REFERENCE_MACHINES.
+    middle of the way where it changes.  machine: a name of REFERENCES.
     """
 
     id: str
@@ -114,7 +114,7 @@ def half_of(title: str) -> str:
 
 
 def cases(kind: str, seed: int, machine: str = TRACTOR.stem) -> Iterator[Case]:
-    """The cases of one of KINDS on a machine of REFERENCE_MACHINES; the same for the same seed.  ValueError for another kind."""
+    """The cases of one of KINDS on one of REFERENCES; the same for the same seed.  ValueError for another kind."""
     if kind not in KINDS:
         raise ValueError(f"no kind is named {kind}; known: {', '.join(KINDS)}")
     if kind in ("single", "outside"):
@@ -208,7 +208,7 @@ def _scenario(kind: str, soil: str, rng: np.random.Generator) -> Scenario:
 
 @cache
 def _configuration(machine: str) -> Config:
-    return reference_configuration(path=REFERENCE_MACHINES[machine])
+    return reference_configuration(path=REFERENCES[machine])
 
 
 @cache

@@ -10,7 +10,7 @@ from typing import TextIO
 
 from soilbus.allocator import keep_freed_memory
 from soilbus.simulator.drive import SimulationError
-from soilbus.simulator.reference import REFERENCE_MACHINES, TRACTOR
+from soilbus.simulator.reference import REFERENCES, TRACTOR
 from soilbus.validation.blind.cases import KINDS, Case, cases
 from soilbus.validation.blind.table import HALVES, report, targets_are_met
 from soilbus.validation.blind.trial import Trial, tried
@@ -22,9 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m soilbus.validation.blind", description=__doc__)
     parser.add_argument("--seed", type=int, default=1, help="picks soils, sensors and drives (1)")
     parser.add_argument("--kind", choices=KINDS, action="append", help="repeatable; all by default")
-    parser.add_argument(
-        "--machine", choices=REFERENCE_MACHINES, default=TRACTOR.stem, help=f"what drives ({TRACTOR.stem})"
-    )
+    parser.add_argument("--machine", choices=REFERENCES, default=TRACTOR.stem, help=f"what drives ({TRACTOR.stem})")
     parser.add_argument("--half", choices=HALVES, help="all by default")
     parser.add_argument("--only", default="", help="only cases with this in their id")
     parser.add_argument("--every", type=int, metavar="N", default=1, help="take each N-th case only (1)")

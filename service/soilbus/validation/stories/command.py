@@ -11,7 +11,7 @@ import argparse
 import logging
 from collections.abc import Sequence
 
-from soilbus.simulator.reference import REFERENCE_MACHINES, TRACTOR
+from soilbus.simulator.reference import REFERENCES, TRACTOR
 from soilbus.validation.stories.drives import cheap, real
 from soilbus.validation.stories.story import TO_ALL, TO_SOME, drawn, played
 
@@ -25,9 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--stories", type=int, default=3000, help="how many (3000)")
     parser.add_argument("--real", type=int, default=30, help="how many with a real estimator (30)")
     parser.add_argument("--seed", type=int, default=1, help="of the first one (1)")
-    parser.add_argument(
-        "--machine", choices=REFERENCE_MACHINES, default=TRACTOR.stem, help=f"what drives ({TRACTOR.stem})"
-    )
+    parser.add_argument("--machine", choices=REFERENCES, default=TRACTOR.stem, help=f"what drives ({TRACTOR.stem})")
     chosen = parser.parse_args(arguments)
     logging.disable(logging.CRITICAL)
     seeds = range(chosen.seed, chosen.seed + max(chosen.stories, chosen.real))

@@ -12,7 +12,7 @@ from soilbus.estimation.tracker import TrackerOutput
 from soilbus.simulator.drive import drive as driven
 from soilbus.simulator.frames import START_TIME, frames
 from soilbus.simulator.recording import simulate
-from soilbus.simulator.reference import REFERENCE_MACHINES, TRACTOR, reference_configuration
+from soilbus.simulator.reference import REFERENCES, TRACTOR, reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.vehicle import GRAVITY
 from soilbus.validation.stories.onlooker import CYCLE, Drive, Moment, good_moment, good_tracked
@@ -28,21 +28,19 @@ LEAST_PULL = 0.02
 
 @lru_cache
 def _good(machine: str) -> tuple[Moment, TrackerOutput]:
-    config = reference_configuration(path=REFERENCE_MACHINES[machine])
+    config = reference_configuration(path=REFERENCES[machine])
     return good_moment(config), good_tracked(config)
 
 
 def cheap(machine: str = TRACTOR.stem) -> Drive:
     """On firm ground, with a tracker that says the truth."""
-    config = reference_configuration(
-        ["estimator.window=2.0", "traversability.max_age=2.0"], REFERENCE_MACHINES[machine]
-    )
+    config = reference_configuration(["estimator.window=2.0", "traversability.max_age=2.0"], REFERENCES[machine])
     return Drive(*_good(machine), config, 2.0 * CYCLE)
 
 
 def real(seed: int, machine: str = TRACTOR.stem) -> Drive:
     """A drive on one soil, measured and estimated; half of them ask for more than the ground can hold."""
-    config = reference_configuration(["estimator.window=6.0"], REFERENCE_MACHINES[machine])
+    config = reference_configuration(["estimator.window=6.0"], REFERENCES[machine])
     rng = random.Random(seed)
     most_on = _largest_drafts(machine)
     soil, firm = rng.choice(tuple(most_on)), rng.random() < 0.5
@@ -57,7 +55,7 @@ def real(seed: int, machine: str = TRACTOR.stem) -> Drive:
 @lru_cache
 def _largest_drafts(machine: str) -> dict[str, float]:
     """Draft [N] that the vehicle holds at the greatest slip, on these grounds the most, where that is enough."""
-    config = reference_configuration(path=REFERENCE_MACHINES[machine])
+    config = reference_configuration(path=REFERENCES[machine])
     assert config.vehicle is not None
     slip, found = config.traversability.max_slip, {}
     for soil in GROUNDS:
