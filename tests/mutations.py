@@ -150,7 +150,7 @@ MUTATIONS = (
     ),
     Mutation(
         "windows that overlap count as if they did not", "pipeline/model_gap.py",
-        "math.sqrt(2.0 * self._overlap / rows)", "math.sqrt(2.0 / rows)",
+        "math.sqrt(2.0 * self._overlap / known.rows)", "math.sqrt(2.0 / known.rows)",
         ("tests/daemon/test_gap.py::test_noise_alone_is_no_gap_however_few_residuals_there_are",),
     ),
     Mutation(

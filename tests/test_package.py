@@ -31,7 +31,7 @@ PUBLIC = (
             "estimation.posterior", "estimation.multistart", "estimation.tracker", "diagnosis.diagnose",
             "diagnosis.records", "offline.replay", "offline.diagnose", "config.model", "config.file",
             "pipeline.pipeline", "decision.capability", "decision.traversability", "simulator.recording",
-            "simulator.scenario",
+            "simulator.scenario", "api.wheel", "api.estimate", "api.recordings", "api.paper",
         )
     ),
 )  # fmt: skip
@@ -148,6 +148,33 @@ def test_the_wheel_has_the_types_the_version_and_its_own_requirements(built: Pat
     assert said["Version"] == soilbus.__version__
     needed = [text for text in said.get_all("Requires-Dist", []) if "extra ==" not in text]
     assert any(re.match(r"scipy\b", text) for text in needed)
+
+
+def test_the_installed_wheel_prints_its_own_pages_and_has_their_pictures(built: Path, tmp_path: Path) -> None:
+    (wheel,) = built.glob("*.whl")
+    with zipfile.ZipFile(wheel) as package:
+        package.extractall(tmp_path)
+
+    def docs(*page: str) -> str:
+        command = [sys.executable, "-m", "soilbus", "docs", *page]
+        environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60.0)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    overview = docs()
+    assert f"they lie in {tmp_path / 'soilbus/docs'}\n" in overview
+    pages = {path.stem for path in (REPO / "service/docs").glob("*.md")} | {"dbc", "systemd"}
+    assert {line.split()[0] for line in overview.partition("\n\n")[0].splitlines()} == pages
+    assert docs("json") == (REPO / "service/docs/json.md").read_text()
+    assert docs("systemd") == (REPO / "systemd/README.md").read_text()
+    pictures = {path.name for path in (REPO / "service/docs").iterdir() if path.suffix in (".svg", ".png")}
+    assert pictures <= {path.name for path in (tmp_path / "soilbus/docs").iterdir()}
+
+
+def test_a_page_that_is_not_there_is_one_line_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["docs", "jsn"]) == 2
+    assert capsys.readouterr().err == "soilbus: no page jsn; did you mean json?\n"
 
 
 def test_the_sdist_has_changelog_and_citation(built: Path) -> None:

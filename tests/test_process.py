@@ -63,18 +63,18 @@ def test_a_reader_that_has_seen_enough_is_no_failure(log):
 
 
 @pytest.mark.parametrize(
-    "words",
+    ("least", "words"),
     [
-        ("check", "--config", str(TRACTOR)),
-        ("watch", "--set", "bus.interface=virtual", "--seconds", "0.1"),
-        ("montecarlo", "--help"),
+        (6, ("check", "--config", str(TRACTOR))),
+        (1, ("watch", "--set", "bus.interface=virtual", "--seconds", "0.1")),  # one line for what stays the same
+        (6, ("montecarlo", "--help")),
     ],
 )
-def test_a_terminal_that_knows_only_ascii_gets_all_it_can_show(words):
+def test_a_terminal_that_knows_only_ascii_gets_all_it_can_show(least, words):
     done = run(*words, PYTHONUTF8="0", PYTHONCOERCECLOCALE="0", LC_ALL="C")
     assert (done.returncode, done.stderr) == (0, b"")
     assert done.stdout.isascii()
-    assert len(done.stdout.splitlines()) > 5
+    assert len(done.stdout.splitlines()) >= least
 
 
 def test_a_name_that_is_no_text_is_a_name(log, tmp_path):

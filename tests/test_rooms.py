@@ -76,3 +76,7 @@ def test_modules_outside_of_the_rooms_know_no_room_but_the_command_line() -> Non
         for room, file, module in imports()
         if room == "" and module.split(".")[1] in ROOMS and file != "__main__.py"
     ] == []
+
+
+def test_the_library_is_what_nothing_inside_rests_on() -> None:
+    assert not any(lower == "api" for _, lower in ARROWS)

@@ -93,6 +93,7 @@ def output_fault() -> OSError | None:
     """Why standard output does not take what was written to it, None where it does; from then on it loses all."""
     try:
         sys.stdout.flush()
+        os.write(1, b"")  # what is larger than the buffer is lost at once and leaves nothing to flush
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return error

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +24,7 @@ from soilbus.offline.diagnose import Findings
 from soilbus.offline.recordings import Recordings
 from soilbus.report.diagnosis import diagnosis_report
 from soilbus.report.findings import findings_json, findings_text
+from soilbus.report.page import Source
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -61,6 +64,22 @@ def unknown(findings: Findings) -> Findings:
     )
 
 
+def page_of(findings: Findings) -> str:
+    return diagnosis_report(
+        findings, Source(CONFIG, logs=[Path(record.name) for record in findings.recordings.records])
+    )
+
+
+@pytest.fixture(scope="module")
+def page(findings: Findings) -> str:
+    return page_of(findings)
+
+
+@pytest.fixture(scope="module")
+def page_of_unknown(findings: Findings) -> str:
+    return page_of(unknown(findings))
+
+
 def test_a_set_is_reported_with_probabilities_reason_and_what_would_separate_it(findings):
     text = findings_text(findings)
     assert "1. draft_offset, probability 0.60\n" in text
@@ -80,7 +99,7 @@ def test_a_set_in_json(findings):
     assert "alike" in effect["why_ambiguous"]
 
 
-def test_what_has_no_name_is_described_with_a_warning(findings):
+def test_what_has_no_name_is_described_with_a_warning(findings, page_of_unknown):
     text, reported = findings_text(unknown(findings)), json.loads(findings_json(unknown(findings)))
     assert text.startswith("unknown: ")
     line = "torque.RL: reading less model = +3 -120 sin(1 wheel angle) [N m] (83 % of the held-out excess)"
@@ -88,14 +107,18 @@ def test_what_has_no_name_is_described_with_a_warning(findings):
     assert WARNING in text
     assert reported["warning"] == WARNING
     assert reported["learned"][0]["terms"] == {"1": 3.0, "sin(1 wheel angle)": -120.0}
-    assert line in diagnosis_report(unknown(findings))
+    assert line in page_of_unknown
 
 
-def test_pages_show_names_as_text_and_one_picture_where_nothing_was_added(findings):
-    page, plain = diagnosis_report(findings), diagnosis_report(unknown(findings))
-    assert "<h1>&lt;a &amp; b&gt;.log</h1>" in page
+def test_pages_show_names_as_text_and_pictures_of_before_alone_where_nothing_was_added(page, page_of_unknown):
+    plain = page_of_unknown
+    assert "soilbus diagnose · &lt;a &amp; b&gt;.log</p>" in page
     assert "<a & b>" not in page
-    assert (page.count("<img"), plain.count("<img")) == (2, 1)
+    added, left = (re.findall('<img alt="([^"]*)"', text) for text in (page, plain))
+    assert [t.split(":")[0] for t in added if t.startswith(("Before", "After"))] == ["Before", "After"] * 3
+    assert not any(t.startswith(("Before", "After")) for t in left)
+    assert "Missing from the model: draft_offset, grade or bulldozing</h1>" in page
+    assert "Missing: something that the catalogue does not have</h1>" in plain
     rows = [name for name in OFFSET.falls if f"<td>{name}</td>" in page]
     assert rows == list(OFFSET.falls)
 
@@ -108,7 +131,7 @@ def test_what_is_not_finite_is_null(findings):
     assert json.loads(reported, parse_constant=pytest.fail)["where"][0]["size"] is None
 
 
-def test_page_text_and_json_say_the_same_of_what_could_be_seen(findings):
+def test_page_text_and_json_say_the_same_of_what_could_be_seen(findings, page):
     """And a page does not say 12 where 30 was asked."""
     soil_error = np.log(0.8) * np.array([[1.0, 1.0, 0.0, 0.0, 0.0, 0.0]])
     seen = (
@@ -117,7 +140,7 @@ def test_page_text_and_json_say_the_same_of_what_could_be_seen(findings):
     )
     base = findings.diagnosis.base
     none = with_verdict(findings, Verdict.NONE, additions=(), where=(), completed=base, detectable=seen)
-    reported, text, page = json.loads(findings_json(none)), findings_text(none), diagnosis_report(none)
+    reported, text, page_of_none = json.loads(findings_json(none)), findings_text(none), page_of(none)
     assert reported["could_show"] == [{"name": "torque_lag", "parameter": "delay", "unit": "s", "size": 0.04}]
     assert reported["could_not_show"] == ["slip_sinkage"]
     (feared,) = reported["unseen"]
@@ -130,12 +153,12 @@ def test_page_text_and_json_say_the_same_of_what_could_be_seen(findings):
         "could not have shown, at any usual size: slip_sinkage",
     ):
         assert line in text
-        assert line in page
+        assert line in page_of_none
     asked = json.loads(findings_json(findings))
     assert asked["could_show"] is asked["could_not_show"] is asked["unseen"] is None
-    assert "from a fall of 12 on" in diagnosis_report(findings)
+    assert "from a fall of 12 on" in page
     beside = dataclasses.replace(OFFSET, beside=frozenset({"lugs"}))
-    assert "from a fall of 30 on" in diagnosis_report(with_verdict(findings, Verdict.AMBIGUOUS, additions=(beside,)))
+    assert "from a fall of 30 on" in page_of(with_verdict(findings, Verdict.AMBIGUOUS, additions=(beside,)))
 
 
 def test_json_says_whether_a_gap_is_left_and_why_names_are_near_each_other(findings):

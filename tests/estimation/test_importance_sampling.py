@@ -36,7 +36,7 @@ def uncertain():
 
 def test_the_average_along_n_has_the_moments_of_the_sampled_posterior(uncertain):
     problem, prior, joint_prior, fit = uncertain
-    found = sample_posterior(problem, prior, joint_prior, fit, 500, np.random.default_rng(1))
+    found = sample_posterior(problem, prior, joint_prior, fit, 1500, np.random.default_rng(1))
     assert found.share.sum() == pytest.approx(1.0)
     assert found.effective > 60.0
     reported = with_nested_laplace(problem, prior, joint_prior, fit).reported
@@ -73,7 +73,7 @@ def test_without_deviation_along_k_c_s_share_the_draws_are_by_the_curvature(unce
         return node._replace(fit=replace(node.fit, gaussian=replace(node.fit.gaussian, covariance=covariance)))
 
     flat = along._replace(nodes=[without_deviation(node) for node in along.nodes])
-    first = sample_posterior(problem, prior, joint_prior, fit, 500, np.random.default_rng(1))
+    first = sample_posterior(problem, prior, joint_prior, fit, 1500, np.random.default_rng(1))
     monkeypatch.setattr(importance_sampling, "profile_over_n", lambda *_: flat)
     again = sample_posterior(problem, prior, joint_prior, fit, 500, np.random.default_rng(2))
     (mean, std), (other, _) = (moments(found) for found in (first, again))

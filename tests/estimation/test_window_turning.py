@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,6 +11,7 @@ from hypothesis import strategies as st
 
 from soilbus.estimation.measurements import Measurements
 from soilbus.estimation.window import Rig, SensorNoise, Window, forward, turning
+from soilbus.terra.vehicle import Chassis
 
 MAX_TURN, TRACK = 0.15, 1.14
 QUANTITIES = ("torque", "load", "speed", "sinkage", "ground_speed", "draft", "pitch", "acceleration", "yaw_rate")
@@ -45,6 +48,11 @@ def on_a_curve(radius, speed, slips, steer=0.0) -> tuple[np.ndarray, float]:
     sides = np.array([-1.0, 1.0, -1.0, 1.0]) * TRACK / 2.0
     paths = abs(yaw) * np.hypot(radius + sides, np.array([ahead, ahead, 0.0, 0.0]))
     return paths / (1.0 - np.asarray(slips)), yaw
+
+
+def skid_steered() -> Rig:
+    chassis = Chassis(mass=2000.0, wheelbase=1.6, cg_ahead_of_rear_axle=0.8, cg_height=0.6, hitch_height=0.4)
+    return replace(rig(TRACK), chassis=chassis, max_lateral=0.3)
 
 
 slips = st.floats(0.0, 0.6)
@@ -126,3 +134,25 @@ def test_diagonal_spin_before_a_vehicle_is_stuck_keeps_its_samples(yaw):
     assert kept.turning == 0
     assert len(kept.t) == n
     assert kept.usable.all()
+
+
+@given(yaw=st.floats(-0.1, 0.1), slip=st.floats(0.05, 0.6), speed=st.floats(0.5, 2.0), known=st.booleans())
+def test_of_a_skid_steered_vehicle_slip_counts_where_wheels_slide_along_more_than_sideways(yaw, slip, speed, known):
+    """Sideways: half the wheelbase times the yaw rate; along: r omega - V; the stress along is cos of their angle."""
+    rims = (speed - yaw * TRACK / 2.0 * np.array([1.0, -1.0, 1.0, -1.0])) / (1.0 - slip)
+    rate = abs(yaw) if known else abs(yaw) / (1.0 - slip)  # without a yaw rate the rims bound it
+    sideways, along = rate * 1.6 / 2.0, speed / (1.0 - slip) - speed
+    found = turning(drive(rims, speed, yaw if known else None), skid_steered(), MAX_TURN)[0]
+    if abs(sideways / along - 0.3) > 1e-6 and TRACK * rate < 0.9 * MAX_TURN * speed:
+        assert found == (sideways > 0.3 * along)
+        assert found or 1.0 / np.hypot(1.0, sideways / along) > 0.957
+
+
+def test_of_a_skid_steered_drive_the_straight_parts_are_used():
+    straight, yaw = np.full(4, 1.25), 0.2
+    turned = (1.0 - yaw * TRACK / 2.0 * np.array([1.0, -1.0, 1.0, -1.0])) / 0.8
+    window = drive(np.stack([straight, straight, turned, turned, straight]), 1.0, np.array([0.0, 0.0, yaw, yaw, 0.0]))
+    kept = Measurements(window, skid_steered(), 0.2, MAX_TURN)
+    assert kept.turning == 2
+    assert kept.t == pytest.approx([0.0, 0.1, 0.4])
+    assert Measurements(window, rig(3.0 * TRACK), 0.2, 0.9).turning == 0  # steered wheels roll along their paths

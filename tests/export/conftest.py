@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from soilbus.can.dbc_files import load_databases
+from soilbus.can.log_writer import write_log
 from soilbus.config.model import Config
 from soilbus.decision.immobilisation import Warnings
 from soilbus.decision.traversability import Status, Traversability
@@ -12,7 +13,8 @@ from soilbus.offline.replay import replay
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.course import course
-from soilbus.simulator.play import play, scenario_over
+from soilbus.simulator.frames import frames
+from soilbus.simulator.play import scenario_over
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 
@@ -26,7 +28,7 @@ def config() -> Config:
 def windows(config, tmp_path_factory) -> list[WindowResult]:
     way = course((-17.0, 179.9999), 60.0, None)
     log = tmp_path_factory.mktemp("drive") / "drive.log"
-    play(simulate(config, scenario_over(["loam"], 14.0, way), seed=3), config, log)
+    write_log(frames(simulate(config, scenario_over(["loam"], 14.0, way), seed=3), config), log)
     results = list(replay(Pipeline(config, load_databases(config)), [log]))
     assert [str(r.status) for r in results] == ["valid"] * 4
     last = results[-1]

@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
 """A guest kernel with vcan (Debian's User-Mode Linux): no KVM, an ordinary process.
 
-    guest.py setup                                       fetch the kernel, once
+    guest.py setup [--debian]                            fetch the kernel, once; also a bare Debian
     guest.py run [--rw DIR] [--unit FILE]... -- COMMAND  run COMMAND in it, vcan0 is up
 
 The guest sees this machine's files; what it writes is lost, except under --rw.
 With --unit it boots this machine's systemd as PID 1 (needs root) with these units.
+`run(base=bare_debian())` boots the systemd of a bare Debian instead, which has nothing of this machine.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import argparse
 import contextlib
 import hashlib
 import os
+import platform
 import shlex
 import shutil
 import subprocess
@@ -25,8 +27,10 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 PACKAGES = ("user-mode-linux", "busybox-static")
 MODULES = ("can", "can-raw", "can-bcm", "can-dev", "vcan", "overlay", "autofs4")  # in the order of loading
+DEBIAN = ("systemd", "python3-venv", "iproute2")  # what a bare one has besides apt; no network in there
 ENVIRONMENT = ("PATH", "HOME", "LANG", "VIRTUAL_ENV", "PYTHONPATH", "OMP_NUM_THREADS")
-MEMORY = 1024  # MiB
+OF_BARE_DEBIAN = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/root", "DEBIAN_FRONTEND": "noninteractive"}
+MEMORY = 1536  # MiB; half of it for what is written
 NO_STATUS = 125  # the guest ended without the command's exit status
 SYSTEMD = ("fstab=no", "systemd.gpt_auto=no", "systemd.getty_auto=no", "systemd.firstboot=off",
            "systemd.show_status=no", "systemd.mask=systemd-binfmt.service",
@@ -55,6 +59,25 @@ def prepare() -> Path:
             _build(Path(tmp))
             (Path(tmp) / "guest").rename(cache)
     return cache
+
+
+def bare_debian() -> Path:
+    """Root of a bare Debian of this machine's release, made if it is not there yet (needs root); raises Unavailable."""
+    release = platform.freedesktop_os_release()
+    root = cache_dir().parent / f"{release.get('VERSION_CODENAME')}-{'-'.join(DEBIAN)}"
+    if root.exists():
+        return root
+    if release["ID"] != "debian" or os.getuid() or not shutil.which("debootstrap"):
+        raise Unavailable("a bare Debian can only be set up on Debian, as root, with debootstrap")
+    root.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=root.parent) as tmp:
+        made = Path(tmp) / "root"
+        alone = ["unshare", "--mount"]  # what it mounts in there goes with it, however it ends
+        what = ["--variant=minbase", f"--include={','.join(DEBIAN)}", release["VERSION_CODENAME"], made]
+        if fault := _call([*alone, "debootstrap", *what], Path(tmp)):
+            raise Unavailable(f"a bare Debian cannot be set up: {fault}")
+        made.rename(root)
+    return root
 
 
 def _build(tmp: Path) -> None:
@@ -96,22 +119,29 @@ def run(
     *,
     rw: Iterable[Path] = (),
     units: Iterable[Path] = (),
+    base: Path = Path("/"),
     timeout: float = 120.0,
     capture: bool = True,
 ) -> subprocess.CompletedProcess[str]:
     """Run a command in the guest, in this working directory; its two outputs come as one.
 
+    Where `base` is not this machine's root, the guest sees those files alone and its own environment, the command
+    runs in the first folder of `rw`, and systemd is PID 1.
     The exit status is the command's, or NO_STATUS if it ended by time-out or crash.
     Raises Unavailable if the guest cannot be set up.
     """
     cache = prepare()
     with tempfile.TemporaryDirectory(prefix="guest-") as tmp:
         job = Path(tmp)
-        words = ["env", "-i", *(f"{k}={os.environ[k]}" for k in ENVIRONMENT if k in os.environ), *map(str, command)]
-        (job / "command").write_text(f"cd {shlex.quote(os.getcwd())} && exec {shlex.join(words)}\n")
-        (job / "rw").write_text("".join(f"{Path(d).resolve()}\n" for d in rw))
+        folders = [Path(d).resolve() for d in rw]
+        ours = base == Path("/")
+        environment = {k: os.environ[k] for k in ENVIRONMENT if k in os.environ} if ours else OF_BARE_DEBIAN
+        words = ["env", "-i", *(f"{k}={value}" for k, value in environment.items()), *map(str, command)]
+        here = os.getcwd() if ours else str(folders[0])
+        (job / "command").write_text(f"cd {shlex.quote(here)} && exec {shlex.join(words)}\n")
+        (job / "rw").write_text("".join(f"{folder}\n" for folder in folders))
         boot = ["rootfstype=hostfs", f"rootflags={cache / 'root'}", "ro", "init=/init", "loglevel=2", "panic=-1"]
-        if units := list(units):
+        if (units := list(units)) or not ours:
             (job / "units").mkdir()
             for unit in units:
                 shutil.copy(unit, job / "units")
@@ -121,7 +151,7 @@ def run(
                 ["cat"], stdin=subprocess.PIPE, stdout=captured if capture else None
             )
             kernel = subprocess.Popen(
-                ["sh", "-c", GUARDED, "sh", cache / "linux.uml", f"mem={MEMORY}M", *boot, f"job={job}",
+                ["sh", "-c", GUARDED, "sh", cache / "linux.uml", f"mem={MEMORY}M", *boot, f"base={base}", f"job={job}",
                  f"umid={job.name}", f"uml_dir={job}/", "lsm=capability", "con=null", "con0=null,fd:2",
                  f"con1=null,fd:{_fd(output)}"],
                 stdin=subprocess.PIPE, stdout=console, stderr=console, start_new_session=True,
@@ -162,7 +192,7 @@ def _memory_file() -> dict[str, str]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     verbs = parser.add_subparsers(dest="verb", required=True)
-    verbs.add_parser("setup")
+    verbs.add_parser("setup").add_argument("--debian", action="store_true")
     job = verbs.add_parser("run")
     job.add_argument("--rw", action="append", default=[], type=Path)
     job.add_argument("--unit", action="append", default=[], type=Path)
@@ -172,6 +202,8 @@ def main() -> int:
     try:
         if given.verb == "setup":
             print(prepare())
+            if given.debian:
+                print(bare_debian())
             return 0
         done = run(given.command, rw=given.rw, units=given.unit, timeout=given.timeout, capture=False)
         sys.stderr.write(done.stdout)

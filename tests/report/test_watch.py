@@ -214,8 +214,7 @@ def watched(*arguments: str) -> subprocess.CompletedProcess[str]:
 def test_a_recording_in_a_pipe_is_lines_that_name_the_configured_wheels(tmp_path: Path):
     log = tmp_path / "ours.asc"
     write_log(sent(20.0), log)
-    config = Path(__file__).resolve().parents[2] / "service" / "soilbus" / "simulator" / "tractor.toml"
-    done = watched(str(log), "--speed", "50", "--config", str(config))
+    done = watched(str(log), "--speed", "50", "--config", "tractor")
     assert (done.returncode, done.stderr) == (0, "")
     assert re.search(r"^GO, p = 0\.99\. Keep going\. Slip 1\d % at wheel FL\.", done.stdout, re.M)
     assert "\x1b" not in done.stdout

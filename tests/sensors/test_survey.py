@@ -26,7 +26,7 @@ from soilbus.sensors.survey import Survey, survey
 from soilbus.simulator.frames import frames
 from soilbus.simulator.play import scenario_over
 from soilbus.simulator.recording import simulate
-from soilbus.simulator.reference import TRACTOR, reference_configuration
+from soilbus.simulator.reference import REAR_DRIVE, TRACTOR, reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 
 FIELD = Path(__file__).resolve().parents[1] / "field/field.toml"
@@ -58,6 +58,14 @@ def clay_drive() -> list[Frame]:
 
 def beside(config: Config, heard: list[Frame]) -> Survey:
     return survey(config, load_databases(config), heard)
+
+
+@pytest.fixture(scope="module")
+def rear_drive() -> list[Frame]:
+    """20 s of the machine with one motor, free front wheels and a load cell of the rear axle."""
+    config = reference_configuration(path=REAR_DRIVE)
+    recording = simulate(config, scenario_over(["loam"], 20.0), 5)
+    return [frame_of(message) for message in frames(recording, config)]
 
 
 # --- nothing where there is nothing ---
@@ -389,3 +397,37 @@ def test_the_configured_bus_is_heard_for_some_time(clay_drive):
     finally:
         sender.shutdown()
     assert [(f[1], bytes(f[3])) for f in frames_heard] == [(m.arbitration_id, bytes(m.data)) for m in sent]
+
+
+# --- an axle's motor, free wheels, one axle's load cell ---
+
+
+def test_the_machine_with_one_motor_is_configured_without_fault(rear_drive):
+    assert beside(reference_configuration(path=REAR_DRIVE), rear_drive).findings == ()
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("axle.rear.gear_ratio=12.0", "MotorRear.ShaftSpeed turns 24"),
+        ("axle.rear.motor_speed.sign=-1", "axle.rear.motor_speed: turns backward"),
+        ("wheel.FL.radius=0.9", "wheel.FL: rolls freely, but its rim goes 1.8"),
+        ("vehicle.mass=2000.0", "the rear axle alone carries 2"),
+    ],
+)
+def test_a_mistake_about_an_axle_or_a_free_wheel_is_named(override, says, rear_drive):
+    found = beside(reference_configuration([override], path=REAR_DRIVE), rear_drive)
+    assert [fault for fault in found.faults if says in fault] == found.faults[:1]
+    assert len(found.faults) >= 1
+
+
+def test_a_draft_that_is_known_to_be_none_is_no_frozen_sensor(tmp_path):
+    text = re.sub(r"\[signals\.draft\][^\[]*", "", TRACTOR.read_text()).replace(
+        "[vehicle]", '[vehicle]\ntowing = "never"'
+    )
+    (tmp_path / "rover.toml").write_text(text)
+    config = load_config(tmp_path / "rover.toml")
+    scenario = Scenario(20.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.3))
+    recording = simulate(config, scenario, 5)
+    found = beside(config, [frame_of(message) for message in frames(recording, config)])
+    assert not [finding for finding in found.findings if "draft" in finding.text]

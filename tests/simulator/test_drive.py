@@ -1,20 +1,18 @@
 """The truth of a drive obeys mechanics, soil and driver at every instant."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.integrate import quad
 
-import soilbus.simulator
 from soilbus.config.file import load_config
 from soilbus.simulator.drive import SimulationError, drive
+from soilbus.simulator.reference import TRACTOR
 from soilbus.simulator.scenario import Patch, Scenario, Swing, demo, excited
 from soilbus.terra.soils import SOILS, soil_named
 from soilbus.terra.wheel import Soil
 
-TRACTOR = Path(soilbus.simulator.__file__).with_name("tractor.toml")
 GRAVITY, MASS = 9.80665, 2300.0
 WHEELS = {"FL": (0.50, 0.26), "FR": (0.50, 0.26), "RL": (0.62, 0.38), "RR": (0.62, 0.38)}
 HILLS = ((0.0, 0.0), (10.0, 0.08), (25.0, -0.05), (60.0, 0.02))

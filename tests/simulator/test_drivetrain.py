@@ -2,21 +2,19 @@
 
 import math
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.integrate import quad
 
-import soilbus.simulator
-from soilbus.config.file import load_config, parse_config
+from soilbus.config.file import MACHINES, load_config, parse_config
 from soilbus.simulator.drive import SimulationError, drive
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import soil_named
 
-FOLDER = Path(soilbus.simulator.__file__).parent
+FOLDER = MACHINES
 GRAVITY = 9.80665
 WHEELS = ("FL", "FR", "RL", "RR")
 SOILS = ("loam", "sandy_loam_23_michigan", "north_gower_clayey_loam_46")

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from soilbus.terra.earth import moved, wrapped
+from soilbus.terra.earth import moved, offset, wrapped
 
 
 @pytest.mark.parametrize(
@@ -26,6 +26,8 @@ def test_moved_agrees_with_geodesics_to_a_tenth_of_a_millimetre(latitude, longit
     end = moved(math.radians(latitude), math.radians(longitude), np.array([north]), np.array([east]))
     metres = 6371e3 * np.array([1.0, math.cos(end[0][0])]) * (np.ravel(end) - np.radians(expected))
     assert np.abs(metres).max() < 1e-4
+    back = offset(math.radians(latitude), math.radians(longitude), *end)
+    assert np.ravel(back) == pytest.approx([north, east], abs=1e-4)
 
 
 def test_a_minute_of_latitude_is_a_nautical_mile_on_average():

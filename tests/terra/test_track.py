@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from soilbus.terra.dual import Dual
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS
 from soilbus.terra.tangent import forces_along
-from soilbus.terra.track import MEAN_SHEAR
+from soilbus.terra.track import MEAN_SHEAR, modulated_shear
 from soilbus.terra.wheel import (
     INPUTS,
     SHAPE,
@@ -36,6 +37,9 @@ MODELS = {
     "rational": WheelModel("rational"),
     "between": WheelModel("rational", exponential_share=0.4),
     "pan": WheelModel(pan_depth=0.02, pan_stiffness=4.0),
+    "rollers": WheelModel(rollers=5, pan_depth=0.02, pan_stiffness=4.0),
+    "rollers, rational": WheelModel("rational", rollers=3),
+    "rollers, between": WheelModel("rational", exponential_share=0.4, rollers=4),
 }
 R, B, L = 0.3, 0.45, 2.2
 
@@ -74,12 +78,16 @@ def integrated(state: WheelState, model: WheelModel) -> list[float]:
         return math.copysign((1.0 - w) * law + w * LAWS["exponential"](x), slip)
 
     z = r - r * math.cos(theta)
-    p, kinks = pressure(z), [a for a in (model.pan_depth,) if 0.0 < a < z]
+    peak, kinks = pressure(z), [a for a in (model.pan_depth,) if 0.0 < a < z]
+    p, swing = (peak / 2.0, 1.0) if model.rollers else (peak, 0.0)
+
+    def stress(x: float) -> float:
+        here = p * (1.0 + swing * math.cos(2.0 * math.pi * model.rollers * x / length))
+        return (c + here * tan_phi) * share(abs(slip) * x / K)
+
     exact = {"epsabs": 0.0, "epsrel": 1e-12, "limit": 400}
-    depth = min(4.0 * K / abs(slip), length)
-    parts = ((0.0, depth), (depth, length))
-    stress = sum(quad(lambda x: share(abs(slip) * x / K), *part, **exact)[0] for part in parts if part[1] > part[0])
-    thrust = b * (c + p * tan_phi) * stress
+    ends = np.unique([0.0, min(4.0 * K / abs(slip), length), *np.linspace(0.0, length, 4 * model.rollers + 2)])
+    thrust = b * sum(quad(stress, *part, **exact)[0] for part in pairwise(ends))
     resistance = b * quad(pressure, 0.0, z, points=kinks, **exact)[0]
     return [b * length * p, thrust - resistance, thrust * r]
 
@@ -89,7 +97,8 @@ def test_forces_equal_adaptive_integration(model):
     found = wheel_forces(TRACKS, model)
     for i in range(len(TRACKS.slip)):
         expected = integrated(WheelState(*(a[i] for a in TRACKS)), model)
-        assert found[:, i] == pytest.approx(expected, rel=1e-9, abs=1e-10 * expected[0])
+        by_rule = model.rollers > 0 and model.shear_law == "rational"
+        assert found[:, i] == pytest.approx(expected, rel=2e-8 if by_rule else 1e-9, abs=1e-10 * expected[0])
 
 
 @pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
@@ -106,7 +115,13 @@ def test_derivatives_equal_differences(model, field):
 
 @pytest.mark.parametrize(
     ("model", "field"),
-    [(MODELS["between"], "exponential_share"), (MODELS["pan"], "pan_stiffness"), (MODELS["pan"], "pan_depth")],
+    [
+        (MODELS["between"], "exponential_share"),
+        (MODELS["rollers, between"], "exponential_share"),
+        (MODELS["pan"], "pan_stiffness"),
+        (MODELS["pan"], "pan_depth"),
+        (MODELS["rollers"], "pan_depth"),
+    ],
 )
 def test_derivatives_by_the_model_equal_differences(model, field):
     _, jacobian = wheel_forces_and_derivatives(TRACKS, model, (field,))
@@ -116,6 +131,31 @@ def test_derivatives_by_the_model_equal_differences(model, field):
     assert np.abs(jacobian[:, -1] - (up - down) / (2.0 * step)).max(axis=0) / scale == pytest.approx(
         np.zeros(24), abs=1e-6
     )
+
+
+@pytest.mark.parametrize("law", MEAN_SHEAR)
+@pytest.mark.parametrize("u", [1e-9, 1e-3, 0.3, 2.0, 20.0, 60.0])
+@pytest.mark.parametrize("rollers", [3, 7])
+def test_what_periods_of_pressure_add_equals_the_integral(law, u, rollers):
+    share, slope = modulated_shear(u, rollers, law)
+    by_u = {"exponential": lambda x: math.exp(-x), "rational": lambda x: (1.0 + x) ** -2}[law]
+    laws = {"exponential": lambda x: -math.expm1(-x), "rational": LAWS["rational"]}
+    exact = {"weight": "cos", "wvar": 2.0 * math.pi * rollers, "epsabs": 1e-14, "epsrel": 1e-12, "limit": 200}
+    assert float(share) == pytest.approx(quad(lambda y: laws[law](u * y), 0.0, 1.0, **exact)[0], rel=1e-9, abs=5e-8)
+    assert float(slope) == pytest.approx(quad(lambda y: y * by_u(u * y), 0.0, 1.0, **exact)[0], rel=1e-9, abs=5e-9)
+    skidding = modulated_shear(-u, rollers, law)
+    assert (float(skidding[0]), float(skidding[1])) == (-float(share), float(slope))
+
+
+def test_peaks_below_rollers_sink_a_track_deeper():
+    """A peak of twice the mean pressure presses 2^(1/n) as deep, and resists by 2^((n + 1) / n) as much."""
+    uniform, peaked = WheelModel(), WheelModel(rollers=5)
+    n, load = SOILS["loam"].n, 2e4
+    states = [on_loam(entry_angle_for_load(load, on_loam(np.nan, 0.0), m), 0.0) for m in (uniform, peaked)]
+    depth, deeper = (float(sinkage(s.entry_angle, R)) for s in states)
+    resistance, more = (-wheel_forces(s, m)[1] for s, m in zip(states, (uniform, peaked), strict=True))
+    assert deeper / depth == pytest.approx(2.0 ** (1.0 / n), rel=1e-6)
+    assert more / resistance == pytest.approx(2.0 ** ((n + 1.0) / n), rel=1e-6)
 
 
 def test_a_track_knows_no_peak_and_no_exit_angle():

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 
 import can
@@ -18,7 +19,7 @@ import can
 from soilbus.can.bus_state import BusState, state_told, tells_overflow
 from soilbus.can.outbox import Outbox
 from soilbus.can.publish import Frame
-from soilbus.can.wire import MessageBus, Received, Wire, error_number, wire_of
+from soilbus.can.wire import MessageBus, Received, Wire, error_number, is_multicast, wire_of
 from soilbus.words import one_line
 
 log = logging.getLogger(__name__)
@@ -69,6 +70,8 @@ def bus_fault(settings: Mapping[str, Any], error: Exception) -> BusError:
     number = getattr(error, "errno", None) or getattr(error, "error_code", None)
     if number in _KERNEL_WITHOUT_CAN:
         return BusError(f"bus {name}: this kernel has no SocketCAN", may_come=False)
+    if settings.get("interface") == "udp_multicast" and find_spec("msgpack") is None:
+        return BusError(f"bus {name}: needs the extra soilbus[udp]", may_come=False)
     is_there = isinstance(error, (OSError, can.CanError)) and not isinstance(error, can.CanInterfaceNotImplementedError)
     return BusError(f"bus {name}: {one_line(error)}", may_come=is_there)
 
@@ -98,6 +101,9 @@ def heard_for(settings: Mapping[str, Any], seconds: float) -> Iterator[tuple[flo
 
 def _prepare(bus: can.BusABC) -> None:
     """Raises OSError for an interface that is down: the kernel binds to it all the same."""
+    if is_multicast(bus):
+        with socket.socket(fileno=os.dup(bus.fileno())) as same:
+            ask_for_buffer(same)
     own = getattr(bus, "socket", None)
     if not isinstance(own, socket.socket):
         return

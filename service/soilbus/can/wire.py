@@ -23,6 +23,8 @@ GATHER = 0.005
 STAMPED = 0.001
 """Seconds within which the kernel puts a frame that it has stamped into our socket; a later one counts from the
 next window on."""
+ECHO_TIME, MAX_ECHOES = 1.0, 256
+"""Time [s] within which a multicast frame comes back to its sender, and the number that is waited for: ours of 4 s."""
 SMALL_SEND_BUFFER = 1
 """The kernel makes its least of it, about six frames: no more than these can go stale in a stuck queue."""
 
@@ -53,7 +55,7 @@ class Received(NamedTuple):
 class MessageBus(Protocol):
     """What is used of an interface of python-can (can.BusABC)."""
 
-    def recv(self, timeout: float | None = None, /) -> can.Message | None:
+    def recv(self, timeout: float | None = None, /) -> Received | can.Message | None:
         """The next frame, or None after `timeout` [s]."""
 
     def send(self, message: can.Message, /) -> None:
@@ -92,7 +94,12 @@ def wire_of(bus: MessageBus) -> Wire:
     own = getattr(bus, "socket", None)
     if isinstance(own, socket.socket) and own.family == socket.AF_CAN:
         return SocketWire(bus, own)
-    return MessageWire(bus)
+    return MulticastWire(bus) if is_multicast(bus) else MessageWire(bus)
+
+
+def is_multicast(bus: MessageBus) -> bool:
+    """Whether a bus is a multicast group of python-can (interface udp_multicast)."""
+    return type(bus).__module__.startswith("can.interfaces.udp_multicast")
 
 
 class SocketWire:
@@ -166,7 +173,7 @@ class MessageWire:
     def __init__(self, bus: MessageBus) -> None:
         self._bus = bus
 
-    def recv(self, timeout: float) -> can.Message | None:
+    def recv(self, timeout: float) -> Received | can.Message | None:
         """As Wire."""
         return self._bus.recv(timeout)
 
@@ -186,6 +193,37 @@ class MessageWire:
     def shutdown(self) -> None:
         """As Wire."""
         self._bus.shutdown()
+
+
+class MulticastWire(MessageWire):
+    """A multicast group: every frame that is sent comes back to its sender too.
+
+    All senders share one port, so the address does not tell whose a frame is. An own frame is known by identifier and
+    data (with our counter in them) within ECHO_TIME of its sending, as often as it was sent.
+    """
+
+    def __init__(self, bus: MessageBus) -> None:
+        super().__init__(bus)
+        self._echoes: dict[tuple[int, bytes], list[float]] = {}
+
+    def recv(self, timeout: float) -> Received | can.Message | None:
+        """As Wire; own frames are passed over."""
+        message = super().recv(timeout)
+        if message is None or not self._echoes:
+            return message
+        key, oldest = (message.arbitration_id, bytes(message.data)), time.monotonic() - ECHO_TIME
+        expected = [sent for sent in self._echoes.pop(key, []) if sent > oldest]
+        if len(expected) > 1:
+            self._echoes[key] = expected[1:]
+        return None if expected else message
+
+    def send(self, frame: Frame) -> None:
+        """As Wire."""
+        now = time.monotonic()
+        if len(self._echoes) >= MAX_ECHOES:  # of a group that this host does not hear
+            self._echoes = {key: times for key, times in self._echoes.items() if times[-1] > now - ECHO_TIME}
+        self._echoes.setdefault((frame.arbitration_id, frame.data), []).append(now)
+        super().send(frame)
 
 
 def error_number(error: Exception) -> int | None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from soilbus import __version__
@@ -43,6 +43,26 @@ def counted(text: str) -> int:
     return number
 
 
+EXAMPLES: Mapping[str, str] = {
+    "demo": "soilbus demo --picture dashboard.svg",
+    "init": "soilbus init --dbc vehicle.dbc --log drive.log -o soilbus.toml",
+    "run": "soilbus run --config soilbus.toml --set bus.channel=can1",
+    "check": "soilbus check --config soilbus.toml --log drive.log",
+    "replay": "soilbus replay --config soilbus.toml drive.log --json windows.jsonl --report drive.html",
+    "simulate": "soilbus simulate --config tractor-2wd --soil loam --effect slip_sinkage=0.4 --log drive.log",
+    "diagnose": "soilbus diagnose --config soilbus.toml drive.log --report findings.html --model-out better.toml",
+    "effects": "soilbus effects slip_sinkage",
+    "watch": "soilbus watch --config soilbus.toml",
+    "completion": "soilbus completion bash >/etc/bash_completion.d/soilbus",
+    "docs": "soilbus docs systemd",
+    "paper": "soilbus paper --sinkage 0.05",
+    "montecarlo": "soilbus montecarlo --windows 50 --json figures.json",
+    "decisions": "soilbus decisions --drives 20 --json figures.json",
+    "bench": "soilbus bench --json figures.json",
+}
+"""A line that works, for the end of each command's help."""
+
+
 def named(*suffixes: str) -> Callable[[str], Path]:
     """Parser of the path of a file to write, whose name must end in one of `suffixes`."""
 
@@ -60,10 +80,16 @@ def command_line() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"soilbus {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def command(name: str, text: str, config: str = "required") -> argparse.ArgumentParser:
-        sub = commands.add_parser(name, help=text, description=text)
+    def command(name: str, text: str, config: str = "found") -> argparse.ArgumentParser:
+        sub = commands.add_parser(
+            name, help=text, description=text, epilog=f"example:\n  {EXAMPLES[name]}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )  # fmt: skip
         if config:
-            sub.add_argument("--config", metavar="FILE", required=config == "required", help="TOML configuration")
+            default = "soilbus.toml in this folder" if config == "found" else "the simulated tractor"
+            sub.add_argument(
+                "--config", metavar="FILE", help=f"TOML configuration or a reference machine's name; default: {default}"
+            )
             sub.add_argument(
                 "--set", action="append", default=[], metavar="KEY=VALUE", help="override a value (dotted TOML path)"
             )
@@ -75,11 +101,23 @@ def command_line() -> argparse.ArgumentParser:
         sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
 
     sub = command("demo", "simulated tractor, service and dashboard; needs no hardware, ends by itself", "")
-    sub.add_argument("--duration", type=float, default=42.0, metavar="S", help="simulated seconds (default 42)")
+    sub.add_argument(
+        "--duration", type=between(1.0, 3600.0), default=42.0, metavar="S", help="simulated seconds (default 42)"
+    )
     sub.add_argument(
         "--picture", type=Path, metavar="OUT.svg",
         help="keep the dashboard's last state: the driver's page, and the engineer's in OUT-engineer.svg",
     )  # fmt: skip
+
+    sub = command("init", "propose a configuration from the vehicle's DBC, and from a log of a drive", "")
+    sub.add_argument(
+        "--dbc", action="append", type=Path, required=True, metavar="FILE", help="of the vehicle; repeat it for more"
+    )
+    sub.add_argument("--log", type=Path, metavar="LOG", help="a drive with varied load, to see what each signal does")
+    sub.add_argument(
+        "-o", "--out", type=Path, default=Path("-"), metavar="OUT.toml", help="file to write (default: stdout)"
+    )
+    sub.add_argument("--force", action="store_true", help="replace a file that is there already")
 
     sub = command("run", "the service on a live bus")
     sub.add_argument("--wait", action="store_true", help="wait for an interface that is not there yet")
@@ -96,6 +134,9 @@ def command_line() -> argparse.ArgumentParser:
     sub.add_argument("--json", type=Path, metavar="OUT", help="one JSON object a line per window; - for stdout")
     sub.add_argument("--report", type=Path, metavar="OUT.html", help="self-contained HTML with plots (extra: plots)")
     sub.add_argument(
+        "--frames", type=Path, metavar="OUT", help="log of the frames that the service sends (.log .log.gz .asc .blf)"
+    )
+    sub.add_argument(
         "--table", type=named(".csv", ".parquet"), metavar="OUT",
         help="windows as rows: .csv, or .parquet (extra: tables)",
     )  # fmt: skip
@@ -111,6 +152,9 @@ def command_line() -> argparse.ArgumentParser:
         "--isoxml", type=Path, metavar="FOLDER",
         help="ISO 11783-10 task data for farm software; needs a mapped position",
     )  # fmt: skip
+    sub.add_argument(
+        "--manoeuvre-out", type=Path, metavar="OUT.json", help="what to drive to know the soil better (see simulate)"
+    )
     sub.add_argument("--partial", action="store_true", help="keep the windows before the point where a log is damaged")
 
     sub = command("simulate", "simulated tractor, to a bus in real time or to a log", "optional")
@@ -119,15 +163,40 @@ def command_line() -> argparse.ArgumentParser:
         "--effect", action="append", default=[], metavar="NAME=VALUE",
         help="an effect on wheels or sensors; NAME.PARAMETER=VALUE for another than its first parameter; repeatable",
     )  # fmt: skip
-    sub.add_argument("--duration", type=float, default=120.0, metavar="S")
-    sub.add_argument("--seed", type=natural, default=1)
+    sub.add_argument(
+        "--duration", type=between(0.1, 1e6), default=120.0, metavar="S", help="of the drive (default 120)"
+    )
+    sub.add_argument("--seed", type=natural, default=1, help="of ground and sensor noise (default 1)")
     sub.add_argument("--start", nargs=2, type=float, metavar=("LAT", "LON"), help="where it starts [deg]")
-    sub.add_argument("--heading", type=float, default=0.0, metavar="DEG", help="clockwise from north (default 0)")
+    sub.add_argument(
+        "--heading", type=between(-360.0, 360.0), default=0.0, metavar="DEG", help="clockwise from north (default 0)"
+    )
     sub.add_argument(
         "--rows", nargs=2, type=float, metavar=("LENGTH", "SPACING"), help="up and down a field [m], not straight on"
     )
+    sub.add_argument(
+        "--draft", type=between(0.0, 128_000.0), metavar="N",
+        help="draft of an implement that nobody lifts; without it slip is swept from 0.05 to 0.40",
+    )  # fmt: skip
+    sub.add_argument(
+        "--slope", type=between(-60.0, 60.0), default=0.0, metavar="PERCENT", help="uphill is positive (default 0)"
+    )
+    sub.add_argument(
+        "--speed", type=between(0.2, 20.0), metavar="M_PER_S", help="over ground (default: swings from 1.0 to 1.8)"
+    )
+    sub.add_argument(
+        "--vehicle-seed", type=natural, metavar="N",
+        help="picks true mass (by vehicle.mass_std) and sensor gains; without it --seed picks the gains",
+    )  # fmt: skip
+    sub.add_argument(
+        "--truth", type=named(".csv", ".parquet"), metavar="OUT",
+        help="true values as rows: soil, slip, draft, load, sinkage, torque: .csv, or .parquet (extra: tables)",
+    )  # fmt: skip
+    sub.add_argument("--manoeuvre", type=Path, metavar="FILE", help="drive what --manoeuvre-out has written")
     target = sub.add_mutually_exclusive_group(required=True)
-    target.add_argument("--bus", action="store_true", help="send to the configured bus in real time")
+    target.add_argument(
+        "--bus", action="store_true", help="drive on the configured bus in real time, by its commands (dbc/tractor.dbc)"
+    )
     target.add_argument("--log", type=Path, metavar="OUT", help="write a log (.log .log.gz .asc .blf)")
 
     sub = command("diagnose", "what the model misses: find, name, add, show")
@@ -136,6 +205,9 @@ def command_line() -> argparse.ArgumentParser:
     sub.add_argument("--report", type=Path, metavar="OUT.html", help="self-contained HTML with plots (extra: plots)")
     sub.add_argument(
         "--model-out", type=Path, metavar="OUT.toml", help="the configuration with the effects found, for any command"
+    )
+    sub.add_argument(
+        "--manoeuvre-out", type=Path, metavar="OUT.json", help="of an ambiguous diagnosis, what to drive to settle it"
     )
 
     sub = command("batch", "many logs of many vehicles, on Dask (extra: batch)")
@@ -160,7 +232,17 @@ def command_line() -> argparse.ArgumentParser:
         "--speed", type=between(0.1, 1000.0), default=1.0, metavar="X", help="play LOG X times as fast (default 1)"
     )
     sub.add_argument("--plain", action="store_true", help="lines of text, for a screen reader; also in a pipe")
-    sub.add_argument("--seconds", type=float, metavar="S", help="stop after this time")
+    sub.add_argument("--seconds", type=between(0.0, 1e6), metavar="S", help="stop after this time")
+
+    sub = command("effects", "the catalogue of effects: physics, parameters, ranges, source, what tells it apart", "")
+    sub.add_argument("name", nargs="?", metavar="NAME", help="one effect in full (default: a line for each)")
+    sub.add_argument("--json", type=Path, metavar="OUT", help="write them as JSON; - for stdout")
+
+    sub = command("completion", "completion of commands and options for a shell (extra: completion)", "")
+    sub.add_argument("shell", choices=("bash", "zsh"), help="the shell; its output belongs where that shell looks")
+
+    sub = command("docs", "the pages of this version, which need no network", "")
+    sub.add_argument("page", nargs="?", metavar="PAGE", help="print this one; without it: which there are, and where")
 
     sub = command("paper", "the tables of Xi et al. 2024 beside ours, and what holds of its method", "")
     sub.add_argument(
@@ -189,3 +271,8 @@ def command_line() -> argparse.ArgumentParser:
     )
     figures(sub)
     return parser
+
+
+def subcommands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """The parser of each command by its name."""
+    return next(dict(a.choices) for a in parser._actions if isinstance(a, argparse._SubParsersAction))

@@ -1,4 +1,4 @@
-"""Commands of the controls engineer: replay, simulate, diagnose, batch.
+"""Commands of the controls engineer: replay, simulate, diagnose, effects, batch.
 
 Each function takes the parsed arguments, imports what it needs, does the work and writes the outputs asked for.
 """
@@ -10,18 +10,28 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from soilbus.cli.common import WorkError, check_folders, configured, configured_or_reference, need_extra
+from soilbus.cli.common import (
+    WorkError,
+    check_folders,
+    check_log_to_write,
+    configured,
+    configured_or_reference,
+    need_extra,
+)
 from soilbus.files import whole_file
 from soilbus.process import say
 
 if TYPE_CHECKING:
     from soilbus.config.model import Config
     from soilbus.pipeline.result import WindowResult
+    from soilbus.report.page import Source
+    from soilbus.simulator.scenario import Scenario
 
 
 def replay(args: argparse.Namespace) -> None:
     """`soilbus replay`: the daemon's pipeline over recorded logs, or over tables of a test rig."""
     from soilbus.can.dbc_files import load_databases
+    from soilbus.config.model import ConfigError
     from soilbus.offline.replay import LogError, estimator_beside, other_channel, replay
     from soilbus.pipeline.pipeline import Pipeline
     from soilbus.report.progress import progress
@@ -30,6 +40,10 @@ def replay(args: argparse.Namespace) -> None:
     config = configured(args)
     _check_outputs(args, config)
     if config.table is not None:
+        if args.frames is not None:
+            raise ConfigError(["--frames: a table of a test rig has no bus to send on"])
+        if args.manoeuvre_out is not None:
+            raise ConfigError(["--manoeuvre-out: a test rig is no vehicle to drive"])
         _replay_tables(args, config)
         return
     for line in other_channel(config, args.logs):
@@ -50,9 +64,52 @@ def replay(args: argparse.Namespace) -> None:
         say(f"{fault}; {fault.windows} windows before that are kept")
     text = summary(results, pipeline)
     _write_windows(args, config, results, text)
+    if args.frames is not None:
+        _write_frames(args, config)
+    drive = _what_to_drive(args, config, results)
     if "-" not in (str(args.json), str(args.map)):
-        print(text, end="")
+        print(text + drive, end="")
     _need_a_use(results, config)
+    if args.manoeuvre_out is not None and not drive:
+        raise WorkError("--manoeuvre-out: no manoeuvre of the table can be driven by this vehicle on this soil")
+
+
+def _what_to_drive(args: argparse.Namespace, config: Config, results: Sequence[WindowResult]) -> str:
+    """Where most windows are not excited, or on demand, what to drive to know the soil better: lines for the summary.
+
+    Written where --manoeuvre-out says.
+    """
+    import json
+
+    from soilbus.offline.manoeuvre import what_excites
+    from soilbus.report.advice import of_use
+    from soilbus.report.next_drive import excitation_lines
+
+    useful = of_use(results)
+    weak = sum(result.reason.startswith(("not_excited", "ambiguous")) for result in useful)
+    if not useful or (args.manoeuvre_out is None and 2 * weak < len(useful)):
+        return ""
+    now = useful[-1].posterior
+    assert now is not None  # of_use sees to it
+    found = what_excites(config, now.soil)
+    if found is None:
+        return ""
+    if args.manoeuvre_out is not None:
+        with whole_file(args.manoeuvre_out) as out:
+            out.write(json.dumps(found[0].as_json(), indent=1) + "\n")
+    return "\n".join(excitation_lines(*found, now, config)) + "\n"
+
+
+def _write_frames(args: argparse.Namespace, config: Config) -> None:
+    from soilbus.can.log_writer import write_log
+    from soilbus.offline.sent_frames import sent_frames
+
+    try:
+        write_log(sent_frames(config, args.logs), args.frames)
+    except OSError as error:
+        raise WorkError(f"{args.frames}: {error.strerror or error}") from None
+    except ValueError as error:
+        raise WorkError(f"{args.frames}: {error}") from None
 
 
 def _need_a_use(results: Sequence[WindowResult], config: Config) -> None:
@@ -90,15 +147,16 @@ def _write_windows(args: argparse.Namespace, config: Config, results: Sequence[W
     from soilbus.export.table import write_table
     from soilbus.export.task_data import write_task_data
     from soilbus.pipeline.outputs import json_line
-    from soilbus.report.windows import html_report
 
     if args.json is not None:
         with whole_file(args.json) as out:
             for result in results:
                 out.write(json_line(result, config) + "\n")
     if args.report is not None:
+        from soilbus.report.replay import replay_report
+
         with whole_file(args.report) as out:
-            out.write(html_report(results, text, args.logs))
+            out.write(replay_report(results, text, _source(args, config)))
     if args.table is not None:
         write_table(args.table, results, config)
     if args.mcap is not None:
@@ -124,14 +182,29 @@ def _check_outputs(args: argparse.Namespace, config: Config) -> None:
         if path is not None:
             check_position_is_mapped(config, option)
     if args.report is not None:
-        need_extra("matplotlib", "plots", "--report")
+        _need_plots()
     if args.table is not None and args.table.suffix == ".parquet":
         need_extra("pyarrow", "tables", "--table OUT.parquet")
     if args.mcap is not None:
         need_extra("mcap", "mcap", "--mcap")
     if args.map is not None and args.map.suffix == ".gpkg":
         need_extra("pyogrio", "geo", "--map OUT.gpkg")
-    check_folders(args.table, args.mcap, args.map)
+    check_log_to_write(args.frames)
+    check_folders(args.json, args.report, args.table, args.mcap, args.map, args.manoeuvre_out)
+
+
+def _need_plots() -> None:
+    """What --report needs."""
+    for module in ("jinja2", "matplotlib"):
+        need_extra(module, "plots", "--report")
+
+
+def _source(args: argparse.Namespace, config: Config) -> Source:
+    """What a report is made from."""
+    from soilbus.config.file import found_configuration
+    from soilbus.report.page import Source
+
+    return Source(config, found_configuration(args.config), args.set, args.logs)
 
 
 def simulate(args: argparse.Namespace) -> None:
@@ -140,25 +213,103 @@ def simulate(args: argparse.Namespace) -> None:
     from soilbus.estimation.assembly import with_effects
     from soilbus.simulator.course import course
     from soilbus.simulator.drive import SimulationError
-    from soilbus.simulator.play import play, scenario_over
-    from soilbus.simulator.recording import simulate
+    from soilbus.simulator.play import scenario_over
 
+    check_log_to_write(args.log)
+    check_folders(args.truth)
+    if args.truth is not None and args.truth.suffix == ".parquet":
+        need_extra("pyarrow", "tables", "--truth OUT.parquet")
     config = with_effects(configured_or_reference(args), args.effect)
     try:
         way = course(args.start, args.heading, args.rows)
-        recording = simulate(config, scenario_over(args.soil or ["loam"], args.duration, way), args.seed)
-        play(recording, config, args.log)
+        scenario = scenario_over(
+            args.soil or ["loam"], args.duration, way, args.draft, args.slope / 100.0, args.speed, args.vehicle_seed
+        )
+        if args.manoeuvre is not None:
+            scenario = _of_manoeuvre(args.manoeuvre, scenario, config)
+        bogged_at = _simulate_live(args, config, scenario) if args.bus else _simulate_log(args, config, scenario)
     except (SimulationError, KeyError, ValueError, BusError) as error:
         raise WorkError(str(error.args[0])) from None
+    if bogged_at is not None:
+        say(f"the tractor is stuck after {bogged_at:.1f} s")
+
+
+def _of_manoeuvre(path: Path, scenario: Scenario, config: Config) -> Scenario:
+    """The scenario's soils and vehicle, driven as a manoeuvre says."""
+    from soilbus.files import read_bounded
+    from soilbus.simulator.manoeuvre import LARGEST, of_json
+
+    try:
+        manoeuvre = of_json(read_bounded(path, LARGEST).decode())
     except OSError as error:
-        raise WorkError(f"{args.log or 'bus'}: {error.strerror or error}") from None
-    if recording.bogged_at is not None:
-        say(f"the tractor is stuck after {recording.bogged_at:.1f} s")
+        raise WorkError(f"{path}: {error.strerror or error}") from None
+    except ValueError as error:
+        raise WorkError(f"{path}: {error}") from None
+    nothing_towed = config.vehicle is not None and config.vehicle.towing == "never"
+    return manoeuvre.over(scenario, nothing_towed)
+
+
+def _simulate_log(args: argparse.Namespace, config: Config, scenario: Scenario) -> float | None:
+    """Write the log; when the tractor bogged down [s]."""
+    from soilbus.can.log_writer import write_log
+    from soilbus.simulator.drive import drive
+    from soilbus.simulator.frames import START_TIME, frames
+    from soilbus.simulator.recording import recorded
+    from soilbus.simulator.truth import write_truth
+
+    done = drive(config, scenario, args.seed)
+    try:
+        write_log(frames(recorded(done, config, scenario, args.seed), config), args.log)
+    except OSError as error:
+        raise WorkError(f"{args.log}: {error.strerror or error}") from None
+    if args.truth is not None:
+        write_truth(done, args.truth, START_TIME)
+    return done.bogged_at
+
+
+def _simulate_live(args: argparse.Namespace, config: Config, scenario: Scenario) -> float | None:
+    """Drive on the bus; when the tractor bogged down [s]. An interrupted drive leaves its true values too."""
+    import time
+    from collections import deque
+
+    from soilbus.simulator.drive import Drive, joined
+    from soilbus.simulator.live import drive_live
+    from soilbus.simulator.truth import write_truth
+
+    driven: deque[Drive] = deque(maxlen=1 if args.truth is None else None)
+    begin = time.time()
+    try:
+        begin = drive_live(config, scenario, args.seed, driven)
+    finally:
+        if args.truth is not None and driven:
+            write_truth(joined(driven), args.truth, begin)
+    return driven[-1].bogged_at
+
+
+def effects(args: argparse.Namespace) -> None:
+    """`soilbus effects`: the catalogue."""
+    from soilbus.cli.effects import effect_text, effects_json, overview
+    from soilbus.config.model import ConfigError
+    from soilbus.terra.effects.catalogue import CATALOGUE
+    from soilbus.words import did_you_mean
+
+    if args.name is not None and args.name not in CATALOGUE:
+        raise ConfigError([f"no effect {args.name}{did_you_mean(args.name, CATALOGUE)}"])
+    wanted = [CATALOGUE[args.name]] if args.name else list(CATALOGUE.values())
+    if args.json is not None:
+        with whole_file(args.json) as out:
+            out.write(effects_json(wanted) + "\n")
+    if str(args.json) != "-":
+        print(effect_text(wanted[0]) if args.name else overview(wanted), end="")
 
 
 def diagnose(args: argparse.Namespace) -> None:
-    """`soilbus diagnose`: find, name, add, show."""
+    """`soilbus diagnose`: find, name, add, show, and say what to drive next."""
+    import json
+
     from soilbus.config.edit import with_effects_text
+    from soilbus.config.file import found_configuration
+    from soilbus.config.model import ConfigError
     from soilbus.diagnosis.diagnose import NotFitted
     from soilbus.diagnosis.model_out import effect_tables
     from soilbus.diagnosis.records import TooLittle
@@ -168,10 +319,12 @@ def diagnose(args: argparse.Namespace) -> None:
     from soilbus.report.progress import phases
 
     config = configured(args)
+    if config.table is not None and args.manoeuvre_out is not None:
+        raise ConfigError(["--manoeuvre-out: a test rig is no vehicle to drive"])
     if args.report is not None:
-        need_extra("matplotlib", "plots", "--report")
+        _need_plots()
         from soilbus.report.diagnosis import diagnosis_report
-    check_folders(args.json, args.report, args.model_out)
+    check_folders(args.json, args.report, args.model_out, args.manoeuvre_out)
     try:
         with phases("diagnose") as say:
             findings = diagnose_logs(config, args.logs, say)
@@ -181,16 +334,20 @@ def diagnose(args: argparse.Namespace) -> None:
     if args.json is not None:
         texts.append((args.json, findings_json(findings)))
     if args.report is not None:
-        texts.append((args.report, diagnosis_report(findings)))
+        texts.append((args.report, diagnosis_report(findings, _source(args, config), args.model_out)))
     if args.model_out is not None:
         effects, notes = effect_tables(findings.diagnosis.completed)
-        text = with_effects_text(Path(args.config), args.set, effects, args.model_out.parent, notes)
+        text = with_effects_text(found_configuration(args.config), args.set, effects, args.model_out.parent, notes)
         texts.append((args.model_out, text))
+    if args.manoeuvre_out is not None and findings.plan is not None:
+        texts.append((args.manoeuvre_out, json.dumps(findings.plan.as_json(), indent=1) + "\n"))
     for path, text in texts:
         with whole_file(path) as out:
             out.write(text)
     if all(str(path) != "-" for path, _ in texts):
         print(findings_text(findings), end="")
+    if args.manoeuvre_out is not None and findings.plan is None:
+        raise WorkError("--manoeuvre-out: no names are left to decide between that a drive would tell apart")
 
 
 def batch(args: argparse.Namespace) -> None:

@@ -20,12 +20,13 @@ from typing import Any, get_args
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from soilbus.cli.arguments import command_line
+from soilbus.cli.arguments import EXAMPLES, command_line, subcommands
+from soilbus.cli.effects import HEAD, parameter_rows
 from soilbus.config import model
 from soilbus.config.model import Column, Config, Noise, Prior, Signal
 from soilbus.config.model import Effect as EffectTable
 from soilbus.terra.effects.catalogue import CATALOGUE
-from soilbus.terra.effects.effect import Effect, Parameter
+from soilbus.terra.effects.effect import Effect
 
 VALUES = (Signal, Noise, Prior, Column, EffectTable)
 """Sections that are values of many keys."""
@@ -130,18 +131,18 @@ def _attribute_docs(section: type[BaseModel]) -> dict[str, str]:
 
 def commands_page() -> str:
     """The help of every command."""
-    parser = command_line()
     text = (
         f"{GENERATED}# Commands\n\nExit codes: 0 done; 1 the work could not be done (one line on stderr); 2 wrong usage"
         " or configuration. `--set KEY=VALUE` (dotted path, as in `--set soil.c.value=5000` or"
         " `--set wheel.FL.radius=0.51`) overrides a value of the configuration in any command that takes `--config`."
-        " An output file is there whole or not at all; workers end with the command. Logs may be in any format that"
-        " python-can reads; MF4 needs the extra `mf4`, `--report` the extra `plots`, `bench` the extra `peers`.\n"
+        " Without `--config` it is `soilbus.toml` in the current folder; `tractor`, `tractor-2wd` and `tractor-axles`"
+        " name reference machines. An output file is there whole or not at all; workers end with the command. Logs may"
+        " be in any format that python-can reads; MF4 needs the extra `mf4`, `--report` the extra `plots`, `bench` the"
+        " extra `peers`, `completion` the extra of its name.\n"
     )
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            for name, command in action.choices.items():
-                text += f"\n## soilbus {name}\n\n{command.description}\n\n{_arguments(command)}"
+    for name, command in subcommands(command_line()).items():
+        text += f"\n## soilbus {name}\n\n{command.description}\n\n{_arguments(command)}"
+        text += f"\n```sh\n{EXAMPLES[name]}\n```\n"
     return text
 
 
@@ -167,18 +168,10 @@ def effects_page() -> str:
 
 
 def _effect(effect: Effect) -> str:
-    rows = "".join(_parameter(parameter) for parameter in effect.parameters)
+    rows = ([f"`{name}`", *others] for name, *others in parameter_rows(effect))
     return (
         f"\n## {effect.name}\n\n{effect.physics}\n\n*Shown by:* {effect.tells}\n\n*Source:* {effect.source}\n\n"
-        "| parameter | unit | absent at | prior std | range |\n| --- | --- | --- | --- | --- |\n" + rows
-    )
-
-
-def _parameter(parameter: Parameter) -> str:
-    unit = parameter.unit or "–"
-    return (
-        f"| `{parameter.name}` | {unit} | {parameter.neutral:g} | {parameter.std:g} | {parameter.low:g} to"
-        f" {parameter.high:g} |\n"
+        + "".join(f"| {' | '.join(row)} |\n" for row in (HEAD, ["---"] * len(HEAD), *rows))
     )
 
 

@@ -1,4 +1,4 @@
-"""Commands of whoever runs soilbus on a vehicle: demo, run, check, watch.
+"""Commands of whoever runs soilbus on a vehicle: demo, init, run, check, watch, completion, docs.
 
 Each function takes the parsed arguments and imports what it needs, so that `run` loads no simulator.
 """
@@ -10,10 +10,12 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from soilbus.allocator import loading
-from soilbus.cli.common import WorkError, configured, configured_or_reference
+from soilbus.cli.common import WorkError, check_folders, configured, configured_or_reference, need_extra
+from soilbus.files import whole_file
 from soilbus.process import say
 
 if TYPE_CHECKING:
@@ -26,7 +28,52 @@ def demo(args: argparse.Namespace) -> None:
     """`soilbus demo`: simulated tractor, service and dashboard."""
     from soilbus.cli.demo import run_demo
 
+    check_folders(args.picture)
     run_demo(args.duration, args.picture)
+
+
+def init(args: argparse.Namespace) -> None:
+    """`soilbus init`: a configuration proposed from DBC files and, with a log, from what its signals do."""
+    from soilbus.can.dbc_files import load_databases
+    from soilbus.can.role_matching import assigned, candidates
+    from soilbus.config.edit import named_from
+    from soilbus.config.file import located, parse_config
+    from soilbus.config.model import ConfigError
+    from soilbus.offline.replay import LogError, read_frames
+    from soilbus.report.progress import progress
+    from soilbus.report.proposal import proposal
+    from soilbus.sensors.role_evidence import Facts, facts_of, recording_of, weighed
+
+    to_stdout = str(args.out) == "-"
+    if not to_stdout and args.out.exists() and not args.force:
+        raise WorkError(f"{args.out} is there already; --force replaces it")
+    check_folders(None if to_stdout else args.out)
+    dbcs = [located(Path(), str(path)) for path in args.dbc]
+    try:
+        database = load_databases(parse_config({"dbc": {"input": [str(path.absolute()) for path in dbcs]}}))
+    except ConfigError as error:
+        raise ConfigError(fault.replace("dbc.input", "--dbc") for fault in error.faults) from None
+    found, facts = candidates(database), Facts()
+    if args.log is not None:
+        try:
+            with progress("init") as step:
+                recording = recording_of(found, database, _counted(read_frames(args.log), step))
+        except LogError as error:
+            raise WorkError(str(error)) from None
+        if not recording.columns:
+            raise WorkError(f"{args.log}: no frame of a signal in {', '.join(map(str, args.dbc))} that could be mapped")
+        found = weighed(found, recording)
+        facts = facts_of(assigned(found), recording)
+    files = [named_from(Path() if to_stdout else args.out.parent, path) for path in dbcs]
+    words = ["soilbus init", *(f"--dbc {path}" for path in args.dbc), *([f"--log {args.log}"] if args.log else [])]
+    made = proposal(database, assigned(found), facts, files, " ".join(words))
+    with whole_file(args.out) as out:
+        out.write(made.text)
+    log = f" --log {args.log}" if args.log else ""
+    say(
+        f'{made.mapped} signals mapped, {made.open} values open ("?"): fill them in, then'
+        f" soilbus check --config {'soilbus.toml' if to_stdout else args.out}{log}"
+    )
 
 
 def run(args: argparse.Namespace) -> None:
@@ -35,9 +82,12 @@ def run(args: argparse.Namespace) -> None:
     sys.modules.setdefault("asammdf", None)  # type: ignore[arg-type]
     with loading():
         from soilbus.can.bus import BusError
+        from soilbus.config.model import ConfigError
         from soilbus.daemon.start import start_service
 
         config = configured(args)
+        if config.table is not None:
+            raise ConfigError(["[table]: a table of a test rig has no bus; replay and diagnose read it"])
         wait = args.wait or "NOTIFY_SOCKET" in os.environ
         try:
             service = start_service(config, wait)
@@ -111,3 +161,30 @@ def watch(args: argparse.Namespace) -> None:
             watch_log(config, args.log, args.speed, is_named, args.seconds, args.plain)
     except (BusError, LogError) as error:
         raise WorkError(str(error)) from None
+
+
+def completion(args: argparse.Namespace) -> None:
+    """`soilbus completion`: a shell's completion of commands, options and files."""
+    need_extra("shtab", "completion", "completion")
+    import shtab
+
+    from soilbus.cli.arguments import command_line, subcommands
+
+    parser = command_line()
+    for command in subcommands(parser).values():
+        for action in command._actions:
+            if str(action.metavar).partition(".")[0] in ("FILE", "LOG", "OUT"):
+                action.complete = shtab.FILE  # type: ignore[attr-defined]
+    print(shtab.complete(parser, args.shell))
+
+
+def docs(args: argparse.Namespace) -> None:
+    """`soilbus docs`: the pages that came with this version."""
+    from soilbus.cli.docs import overview, pages
+    from soilbus.config.model import ConfigError
+    from soilbus.words import did_you_mean
+
+    found = pages()
+    if args.page is not None and args.page not in found:
+        raise ConfigError([f"no page {args.page}{did_you_mean(args.page, found)}"])
+    print(found[args.page].read_text(encoding="utf-8") if args.page else overview(), end="")

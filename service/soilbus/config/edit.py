@@ -69,6 +69,11 @@ def _inline(table: Mapping[str, Any]) -> Any:
 def _from(place: Path, folder: Path, name: str) -> str:
     """How a DBC file that a configuration in `folder` calls `name` is called by one in `place`."""
     file = located(folder, name)
-    if located(place, name).resolve() == file.resolve():
-        return name
+    return name if located(place, name).resolve() == file.resolve() else named_from(place, file)
+
+
+def named_from(place: Path, file: Path) -> str:
+    """How a configuration in a folder calls a DBC file: ours, or one beside it, by its name alone."""
+    if located(place, file.name).resolve() == file.resolve():
+        return file.name
     return os.path.relpath(file.resolve(), place.resolve())

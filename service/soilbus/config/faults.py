@@ -10,11 +10,13 @@ import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, Union, get_args, get_origin
 
-from pydantic import BaseModel, ValidationError
+from pydantic import AfterValidator, BaseModel, ValidationError
 
-from soilbus.config.model import Config
+from soilbus.config.model import Config, Usual
 from soilbus.words import did_you_mean
 
+OPEN = "?"
+"""A value that nobody has filled in yet, as `soilbus init` writes it."""
 MAX_SHOWN_CHARACTERS = 40
 """Characters of a wrong value that a line repeats."""
 
@@ -22,6 +24,38 @@ MAX_SHOWN_CHARACTERS = 40
 def fault_lines(raw: Mapping[str, Any], error: ValidationError) -> list[str]:
     """One line for each fault: the dotted key, wheels and effects by name, and what is wrong."""
     return [line for e in error.errors(include_url=False) for line in _lines(raw, e)]
+
+
+def open_lines(raw: Mapping[str, Any]) -> list[str]:
+    """One line for each open value: its dotted key and what belongs there."""
+
+    def walk(here: Any, location: tuple[Any, ...]) -> Iterator[str]:
+        if here == OPEN:
+            yield f'{".".join(_named(raw, location))}: still open: put {_wanted(location)} in place of "{OPEN}"'
+        elif isinstance(here, (Mapping, list)):
+            for key, value in here.items() if isinstance(here, Mapping) else enumerate(here):
+                yield from walk(value, (*location, key))
+
+    return list(walk(raw, ()))
+
+
+def _wanted(location: Sequence[Any]) -> str:
+    """What belongs at a place, in words."""
+    model = _model_at(location[:-1])
+    field = model.model_fields.get(str(location[-1])) if model is not None else None
+    if field is None:
+        return "its value"
+    if choices := _choices(location):
+        return f"one of {', '.join(map(str, choices))}"
+    if any(_is_model(kind) and "signal" in kind.model_fields for kind in _parts(field.annotation)):
+        return '"Message.Signal"'
+    if bool in _parts(field.annotation):
+        return "true or false"
+    known = [m.func for m in field.metadata if isinstance(m, AfterValidator) and isinstance(m.func, Usual)]
+    if known:
+        unit = f" {known[0].unit}" if known[0].unit else ""
+        return f"a number from {known[0].low:g} to {known[0].high:g}{unit}"
+    return "a number" if float in _parts(field.annotation) else "its value"
 
 
 def _lines(raw: Mapping[str, Any], error: Any) -> Iterator[str]:

@@ -9,11 +9,20 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from soilbus.config.faults import fault_lines
+from soilbus.config.faults import OPEN, fault_lines, open_lines
 from soilbus.config.model import Config, ConfigError
 from soilbus.files import read_bounded
 
-__all__ = ["load_config", "located", "overridden", "parse_config", "shipped_dbc"]
+__all__ = [
+    "OPEN",
+    "found_configuration",
+    "load_config",
+    "located",
+    "machine",
+    "overridden",
+    "parse_config",
+    "shipped_dbc",
+]
 
 MAX_FILE_BYTES = 2**20
 """Bytes of a configuration: a thousand times those of a tractor's."""
@@ -21,6 +30,10 @@ _MAX_SHOWN_CHARACTERS = 60
 """Characters of an override that a fault repeats."""
 
 _PACKAGE = Path(__file__).resolve().parents[1]
+MACHINES = Path(__file__).with_name("machines")
+"""Where the configurations of our reference machines are."""
+CONFIGURATION = "soilbus.toml"
+"""The configuration of a folder, for commands that are given none."""
 DBC_FOLDERS = (_PACKAGE / "dbc", _PACKAGE.parents[1] / "dbc")
 """Where our own DBC files are: in the installed package, in a checkout."""
 
@@ -50,10 +63,49 @@ def load_config(path: Path | str, overrides: Iterable[str] = ()) -> Config:
     return parse_config(overridden(raw, overrides), folder=path.parent, source=str(path))
 
 
+def machine(name: str) -> Path:
+    """Configuration of a reference machine: tractor, tractor-2wd, tractor-axles."""
+    return MACHINES / f"{name}.toml"
+
+
+def found_configuration(name: str | None) -> Path:
+    """The file that a command's --config means.
+
+    Parameters
+    ----------
+    name
+        A file, or else the name of a reference machine; None: `soilbus.toml` in the current folder.
+
+    Raises
+    ------
+    ConfigError
+        Where there is none.
+    """
+    if name is None:
+        path = Path(CONFIGURATION)
+        if not path.exists():
+            raise ConfigError(
+                [
+                    f"no --config and no {CONFIGURATION} here: soilbus init --dbc YOUR.dbc -o {CONFIGURATION} makes"
+                    " one; --config tractor is the simulated tractor's"
+                ]
+            )
+        return path
+    path = Path(name)
+    if path.exists() or "/" in name or path.suffix:
+        return path
+    if machine(name).is_file():
+        return machine(name)
+    known = ", ".join(sorted(file.stem for file in MACHINES.glob("*.toml")))
+    raise ConfigError([f"{name}: no such file, and no reference machine ({known})"])
+
+
 def parse_config(raw: Mapping[str, Any], folder: Path = Path("."), source: str = "configuration") -> Config:
     """Check a configuration given as nested mappings; ConfigError lists every fault."""
     if "folder" in raw:
         raise ConfigError([f"{source}: folder: unknown key"])
+    if left := open_lines(raw):
+        raise ConfigError(f"{source}: {line}" for line in left)
     try:
         return Config.model_validate({**raw, "folder": folder})
     except ValidationError as error:
@@ -103,6 +155,8 @@ def _child(here: Any, part: str, path: str, text: str) -> Any:
                 return item
         names = [item["name"] for item in here if isinstance(item, dict) and isinstance(item.get("name"), str)]
         raise ConfigError([f"--set {text}: no {path}; there are {', '.join(names)}"])
+    if path in ("wheel", "axle", "track") and part not in here:
+        raise ConfigError([f"--set {text}: the configuration has no [[{path}]]"])
     child = here.setdefault(part, {})
     if isinstance(child, str):  # "Message.Signal", or the name of a column, grows into its table form
         here[part] = {"column" if path.startswith("table.") else "signal": child}

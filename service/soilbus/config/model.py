@@ -353,7 +353,7 @@ class Wheel(_Section):
 
 
 class Track(_Section):
-    """One track and its sensors, the left one first; its pressure on the ground is uniform.
+    """One track and its sensors, the left one first; its pressure on the ground is uniform, or peaks below its rollers.
 
     Tracks alone carry the whole vehicle: its `wheelbase` is then their contact length, and it steers by `skid`, unless
     [vehicle] says otherwise.  With wheels, or on both axles, a track takes the place of the wheel of its axle.
@@ -367,8 +367,15 @@ class Track(_Section):
     """On the ground, from the first to the last roller [m]."""
     width: Annotated[PositiveFloat, AfterValidator(WIDTH)]
     """Of the track [m]."""
-    sprocket_radius: Annotated[PositiveFloat, AfterValidator(RADIUS)]
-    """Pitch radius of the driving sprocket [m]: pitch of the links times number of teeth over 2 pi."""
+    sprocket_radius: Annotated[PositiveFloat, AfterValidator(RADIUS)] | None = None
+    """Pitch radius of the driving sprocket [m]; without, it follows from pitch and sprocket_teeth."""
+    pitch: Annotated[PositiveFloat, AfterValidator(WIDTH)] | None = None
+    """Of the links [m]; radius of the sprocket: pitch times sprocket_teeth over 2 pi."""
+    sprocket_teeth: PositiveInt | None = None
+    """Links that one turn of the sprocket moves."""
+    roller_spacing: Annotated[PositiveFloat, AfterValidator(WIDTH)] | None = None
+    """From one road roller to the next [m], where pressure peaks below each: p (1 + cos(2 pi x / spacing)), as below
+    short links and rollers far apart (Wills 1963).  Without, pressure is uniform."""
     driven: bool = True
     """false: no motor drives it."""
     gear_ratio: Annotated[PositiveFloat, AfterValidator(GEAR_RATIO)] = 1.0
@@ -391,9 +398,33 @@ class Track(_Section):
     def as_wheel(self) -> Wheel:
         """The rigid wheel of the sprocket's radius that has its sensors, with the contact length."""
         same = {key: getattr(self, key) for key in type(self).model_fields if key in Wheel.model_fields}
-        wheel = Wheel(**same | {"axle": self.axle or "front"}, radius=self.sprocket_radius, tyre="rigid")
+        wheel = Wheel(**same | {"axle": self.axle or "front"}, radius=self.radius, tyre="rigid")
         wheel._contact_length = self.contact_length
         return wheel
+
+    @property
+    def radius(self) -> float:
+        """Pitch radius of the sprocket [m]."""
+        if self.sprocket_radius is not None:
+            return self.sprocket_radius
+        assert self.pitch is not None  # _has_radius sees to both
+        assert self.sprocket_teeth is not None
+        return self.pitch * self.sprocket_teeth / (2.0 * math.pi)
+
+    @property
+    def rollers(self) -> int:
+        """Periods of the pressure along the contact; 0: uniform."""
+        return 0 if self.roller_spacing is None else max(round(self.contact_length / self.roller_spacing), 1)
+
+    @model_validator(mode="after")
+    def _has_radius(self) -> Track:
+        if (self.pitch is None) != (self.sprocket_teeth is None) or (
+            (self.sprocket_radius is None) == (self.pitch is None)
+        ):
+            raise ValueError(f"track {self.name} needs sprocket_radius, or pitch and sprocket_teeth: one of the two")
+        if self.roller_spacing is not None and self.roller_spacing > self.contact_length:
+            raise ValueError(f"track {self.name}: roller_spacing is greater than contact_length")
+        return self
 
 
 class Signals(_Section):
@@ -447,27 +478,26 @@ class Column(_Section):
 
 
 class Table(_Section):
-    """A test rig's table, each row one steady state: where its quantities stand.
+    """A test rig's table, each row one steady state: where its quantities stand, with an example in test-rig.md.
 
-    wheel_load [N], drawbar_pull [N] positive forward, torque [N m] about the axle, slip
-    (1 - V/(r omega)), sinkage [m], t [s].  The soil bed is the same in all rows, or in those
-    with the same value of the column `run`.  Only rows that equal `where` count.
+    At least one of drawbar_pull, torque and sinkage must be mapped.  The soil bed is the same in all rows, or in those
+    with the same value of the column `run`.
     """
 
     wheel_load: Column
-    """[N]."""
+    """Vertical load on the wheel [N]; a row without it is left out."""
     slip: Column
-    """1 - V/(r omega)."""
+    """1 - V/(r omega), r the wheel's rolling radius; a row without it is left out."""
     drawbar_pull: Column | None = None
-    """[N], positive forward."""
+    """Net pull [N], positive forward; its noise is that of `draft`."""
     torque: Column | None = None
-    """[N m] about the axle."""
+    """Torque about the axle [N m]."""
     sinkage: Column | None = None
-    """[m]."""
+    """Depth of the wheel's deepest point [m]."""
     t: Column | None = None
-    """[s]."""
+    """Time [s]; without it no effect of time is a candidate of a diagnosis."""
     run: Annotated[str, Field(min_length=1)] | None = None
-    """Column by which soil beds differ."""
+    """Name of the column by which soil beds differ."""
     where: dict[str, Any] = Field(default_factory=dict)
     """Only rows that equal these values count."""
 
@@ -645,10 +675,6 @@ class Estimator(_Section):
     """Relative std of the bearing pressure up to which a window counts as excited."""
     max_tan_phi_std: PositiveFloat = 0.15
     """Relative std of tan phi up to which a window counts as excited."""
-    min_track_load_change: NonNegativeFloat = 0.05
-    """Relative sd of the load on a track, beyond noise, from which a window of a tracked vehicle counts as excited: at
-    one load a track shows the pressure at its own depth and A c + W tan phi only (after a minute at constant load on
-    simulated dry sand tan phi was 5 to 35 standard deviations off)."""
     max_chi2: PositiveFloat = 1.1
     """Reduced chi-square, beyond its own scatter, above which the model does not describe the data."""
     search_rate: NonNegativeFloat = 4.0
@@ -899,10 +925,19 @@ class Config(_Section):
         """`wheel` holds the tracks, too, behind the wheels: whatever runs on the ground."""
         if self.track and (self.wheel or len(self.track) == 1) and any(t.axle is None for t in self.track):
             raise ValueError("a [[track]] beside [[wheel]]s, or alone, needs its axle")
+        if len({t.rollers for t in self.track}) > 1:
+            raise ValueError(
+                "the [[track]]s of a vehicle need the same number of rollers: contact_length / roller_spacing"
+            )
         if len({t.axle is None for t in self.track}) > 1:
             raise ValueError("give the axle of all [[track]]s or, where they carry the whole vehicle, of none")
         object.__setattr__(self, "wheel", [*self.wheel, *(t.as_wheel() for t in self.track)])
         return self
+
+    @property
+    def rollers(self) -> int:
+        """Periods of the pressure along each track's contact; 0: uniform."""
+        return self.track[0].rollers if self.track else 0
 
     @property
     def on_tracks(self) -> bool:

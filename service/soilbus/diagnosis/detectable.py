@@ -24,7 +24,13 @@ from soilbus.arrays import Array
 from soilbus.diagnosis.evidence import mixture_neg2_log_evidence
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.score import NormalEquations, normal_equations, shifted_effects
+from soilbus.diagnosis.score import (
+    JointEquations,
+    NormalEquations,
+    joint_equations,
+    normal_equations,
+    shifted_effects,
+)
 from soilbus.diagnosis.verdict import required_fall
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.posterior import SoilPrior
@@ -71,10 +77,13 @@ def detectable(
     for effects in _with_further_starts(candidates):
         free = [f for effect in effects for f in parameters_of(effect, present.checks[0].problem.n_wheels)]
         equations = normal_equations(records, prior, present, effects, free)
+        joint = joint_equations(equations)
         for effect in effects:
             columns = [i for i, f in enumerate(free) if f.effect == effect.name]
             least = _sampling_delay(effect, records[-1])
-            one = _detectable(effect, columns, [free[i] for i in columns], equations, data_ratio, required, least)
+            one = _detectable(
+                effect, columns, [free[i] for i in columns], equations, joint, data_ratio, required, least
+            )
             if effect.name not in found or _size(one) < _size(found[effect.name]):
                 found[effect.name] = one
     return tuple(found[effect.name] for effect in candidates)
@@ -96,25 +105,27 @@ def _detectable(
     columns: Sequence[int],
     free: Sequence[Free],
     equations: Sequence[NormalEquations],
+    joint: JointEquations,
     data_ratio: float,
     required: float,
     least: float,
 ) -> Detectable:
     parameter = effect.parameters[0]
     block = np.ix_(columns, columns)
-    informations = [data_ratio * one.information[block] for one in equations]
     if effect.of_record:  # in one recording, while the others pay for parameters that they do not need
+        informations = [data_ratio * one.information[block] for one in equations]
         unneeded = [_expected_change(information, np.zeros(len(free)), free) for information in informations]
         cases = [(one, required + sum(unneeded) - own) for one, own in zip(informations, unneeded, strict=True)]
     else:
-        cases = [(np.sum(informations, axis=0), required)]
+        cases = [(data_ratio * joint.information[block], required)]
     first = [i for i, f in enumerate(free) if f.parameter is parameter]
     sizes = [min(_least_size(information, i, free, needed) for information, needed in cases) for i in first]
     size = max(*sizes, least)
     unseen = min(size, _max_size(parameter))
     u = np.zeros(len(free))
     u[first[sizes.index(max(sizes))]] = unseen / parameter.std
-    error = np.array([_soil_error(one, columns, u) for one in equations])
+    by_u = [-one.response for one in equations] if effect.of_record else [by_u for _, by_u in joint.follow]
+    error = np.array([_soil_error(one, of_one[:, columns] @ u) for one, of_one in zip(equations, by_u, strict=True)])
     return Detectable(effect, size if np.isfinite(size) else None, unseen, error)
 
 
@@ -147,9 +158,11 @@ def _expected_change(information: Array, u: Array, free: Sequence[Free]) -> floa
     return mixture_neg2_log_evidence(information, information @ u, free)
 
 
-def _soil_error(equations: NormalEquations, columns: Sequence[int], u: Array) -> Array:
-    """Error (6,) of the logarithms of the soil parameters, reported less true, of an effect with parameters u (P,)."""
-    follow = equations.response[:, list(columns)] @ u
+def _soil_error(equations: NormalEquations, follow: Array) -> Array:
+    """Error (6,) of the logarithms of the soil parameters, reported less true.
+
+    follow (C,): by how much an effect moves the present model's coordinates, if it is in the model.
+    """
     objective = equations.objective
     directions = objective.coordinates.log_directions(equations.iterate.soil)
-    return np.asarray(directions @ follow[: len(objective.free)])
+    return np.asarray(-directions @ follow[: len(objective.free)])

@@ -41,6 +41,8 @@ __all__ = ["Diagnosis", "NotFitted", "diagnose"]
 
 MAX_EFFECTS = 3
 """Effects that are added at most."""
+MAX_RIVALS = 2
+"""Alternatives that are fitted beside the effect that was added, to find what would tell them apart."""
 MAX_OVERLAP = 0.25
 """Share by which the sum of what effects explain alone may differ from what they explain together: of 9 blind pairs
 (seed 132) with nothing in common it was 0.96 to 1.08, of 5 that look alike 1.1 to 1.6."""
@@ -73,6 +75,9 @@ class Diagnosis:
         shares_alone()).
     detectable
         Where the verdict is none, what these recordings could have shown.
+    rivals
+        Where the verdict is ambiguous, the fitted models between which it is, the completed one first: they differ in
+        the effect of the least probable name.
     """
 
     verdict: Verdict
@@ -85,6 +90,7 @@ class Diagnosis:
     gap_after: Gap
     imitation: tuple[float, ...] = ()
     detectable: tuple[Detectable, ...] = ()
+    rivals: tuple[FittedModel, ...] = ()
 
     def soil_before(self, record: int) -> Posterior:
         """The soil of a recording under the present model."""
@@ -163,9 +169,38 @@ def diagnose(
     if verdict is Verdict.NONE:
         progress("finding what these recordings could have shown")
         shown = detectable(records, prior, base, [effect for effect in candidates if effect.name not in base.names])
+    rivals: tuple[FittedModel, ...] = ()
+    if verdict is Verdict.AMBIGUOUS:
+        progress("fitting the rivals")
+        rivals = rivals_of(full, present, additions, candidates)
     return Diagnosis(
-        verdict, tuple(where), tuple(additions), base, present, tuple(remaining), before, after, imitation, shown
+        verdict,
+        tuple(where),
+        tuple(additions),
+        base,
+        present,
+        tuple(remaining),
+        before,
+        after,
+        imitation,
+        shown,
+        rivals,
     )
+
+
+def rivals_of(
+    full: FitCache, present: FittedModel, additions: Sequence[Addition], candidates: Sequence[Effect]
+) -> tuple[FittedModel, ...]:
+    """The present model, and those with an alternative in the place of the effect of the least probable name."""
+    by_name = {effect.name: effect for effect in candidates}
+    contested = [addition for addition in additions if addition.alternatives]
+    if not contested:
+        return ()
+    least = min(contested, key=lambda addition: addition.probability)
+    others = [effect for effect in present.effects if effect.name != least.effect.name]
+    likeliest = sorted(least.alternatives, key=lambda name: -least.alternatives[name])[:MAX_RIVALS]
+    fits = [full.fit((*others, by_name[name])) for name in likeliest if name not in present.names]
+    return (present, *(fit for fit in fits if fit is not None))
 
 
 def shares_alone(

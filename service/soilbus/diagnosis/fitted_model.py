@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from soilbus.diagnosis.records import Record
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import DEFAULT_OPTIONS, DescentOptions, Fit, Start, fit_from, fit_window
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
-from soilbus.estimation.observation_model import Latents, Linearisation, ObservationModelWithEffects
+from soilbus.estimation.observation_model import RESIDUAL, Latents, Linearisation, ObservationModelWithEffects
 from soilbus.estimation.parametrization import at_bounds
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
 from soilbus.estimation.solver import Iterate, Objective
@@ -56,6 +57,32 @@ class HeldOutCheck:
     def rows(self) -> int:
         """Residuals that count."""
         return self.problem.n_rows
+
+
+class Series(NamedTuple):
+    """Held-out readings of one channel beside the model's, in SI, each (M,).
+
+    Attributes
+    ----------
+    channel, wheel
+        torque, draft or sinkage, and wheel or axle; empty for a channel of the vehicle.
+    measured, modelled
+        The reading, and the reading less the residual: what the model and the other sensors make of it.
+    standardised
+        The residual given the others of its instant, over its sd; standard normal where nothing is missing.
+    slip, load, speed, since
+        Of the wheel, of a channel of the vehicle the mean over its wheels; load [N], ground speed [m/s], time [s].
+    """
+
+    channel: str
+    wheel: str
+    measured: Array
+    modelled: Array
+    standardised: Array
+    slip: Array
+    load: Array
+    speed: Array
+    since: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +205,20 @@ class FittedModel:
         ]
         return np.concatenate([gains[:n_sensors], standardised])
 
+    def held_out_series(self) -> list[Series]:
+        """The held-out readings of each channel and wheel beside the model's, over all recordings.
+
+        Channels without a held-out reading are left out.
+        """
+        parts: dict[tuple[str, str], list[Series]] = {}
+        for held_out, fit in zip(self.checks, self.fits, strict=True):
+            for series in _series(held_out, fit):
+                parts.setdefault((series.channel, series.wheel), []).append(series)
+        return [
+            Series(*name, *(np.concatenate(columns) for columns in zip(*(part[2:] for part in of), strict=True)))
+            for name, of in parts.items()
+        ]
+
     def own_parameters(self, effect: Effect, data_ratio: float = 1.0) -> tuple[OwnParameters, ...]:
         """Likelihood of each later recording's own values of an effect of the record, as of data_ratio times its data.
 
@@ -189,6 +230,25 @@ class FittedModel:
             return ()
         n_sensors, free = self.checks[0].problem.n_sensors, [self.free[i] for i in own]
         return tuple(own_parameters(*_moments(fit, n_sensors, own), free, data_ratio) for fit in self.fits[1:])
+
+
+def _series(held_out: HeldOutCheck, fit: Fit) -> list[Series]:
+    """The readings of one recording by channel and wheel."""
+    problem, latents = held_out.problem, held_out.latents
+    standardised, _ = problem.standardised(held_out.at, fit.mode.gains)
+    measured = problem.readings
+    modelled = measured - held_out.at.rows[:, RESIDUAL].reshape(measured.shape)
+    slip = 1.0 - latents.ground_speed[:, None] / (problem.rig.radius * latents.speed)
+    wheels, found = list(problem.rig.wheels), []
+    for i, (channel, wheel) in enumerate(problem.row_channels):
+        known = np.isfinite(standardised[:, i])
+        one = wheels.index(wheel) if wheel in wheels else None
+        of_slip, of_load = (values.mean(1) if one is None else values[:, one] for values in (slip, latents.load))
+        of_row = measured[:, i], modelled[:, i], standardised[:, i]
+        columns = *of_row, of_slip, of_load, latents.ground_speed, problem.since
+        if known.any():
+            found.append(Series(channel, wheel, *(column[known] for column in columns)))
+    return found
 
 
 def fit_model(

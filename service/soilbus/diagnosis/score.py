@@ -6,6 +6,9 @@ u are the effect's parameters in units of their prior std, c the coordinates of 
 parameters of its effects).  The Schur complement H is the information on u that the present model cannot imitate.
 From H and g follow the fall of -2 log posterior if the effect were added, the change of -2 log evidence, and a start
 for the effect's fit (Rao's score test, Bayesian with the prior's precision).
+
+Of several recordings c holds the soil and the own parameters of each, and the gains that all share: each recording's
+own coordinates are eliminated, the equations in (gains, u) added up, and then the gains eliminated.
 """
 
 from __future__ import annotations
@@ -27,9 +30,9 @@ from soilbus.diagnosis.records import Record
 from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
 from soilbus.estimation.multistart import Start
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
-from soilbus.estimation.observation_model import Latents, Linearisation
-from soilbus.estimation.posterior import SoilPrior
-from soilbus.estimation.solver import Iterate, Objective
+from soilbus.estimation.observation_model import Latents
+from soilbus.estimation.posterior import PARAMETERS, SoilPrior
+from soilbus.estimation.solver import Iterate, Objective, QuadraticModel
 from soilbus.terra.effects.effect import Effect
 
 MAX_START_SD = 2.0
@@ -56,16 +59,24 @@ class NormalEquations:
 
     gradient (P,) and information (P, P) are of the data alone, without the parameters' prior.  response (C, P) is
     H_cc^-1 H_cu: the present coordinates follow a step u by -response u.  fitted is the present model.
+    is_own (C,): which present coordinates belong to this recording alone.
     """
 
     objective: Objective
     iterate: Iterate
-    at: Linearisation
+    quadratic: QuadraticModel
+    is_own: NDArray[np.bool_]
     gradient: Array
     information: Array
     response: Array
     held_out_latents: Latents
     fitted: FittedModel
+
+    @property
+    def shared_gains(self) -> NDArray[np.intp]:
+        """Indices (S,) of the gains that move and that all recordings share."""
+        present = self.objective.active[: len(self.objective.active) - len(self.gradient)]
+        return np.asarray(present[~self.is_own[len(self.objective.free) :]])
 
 
 def scores(
@@ -81,10 +92,11 @@ def scores(
     n_wheels = len(records[0].training.rig.wheels)
     free = [f for effect in candidates for f in parameters_of(effect, n_wheels)]
     equations = normal_equations(records, prior, present, candidates, free)
+    joint = joint_equations(equations)
     found = []
     for effect in candidates:
         columns = np.array([i for i, f in enumerate(free) if f.effect == effect.name])
-        found.append(_score(effect, columns, free, equations))
+        found.append(_score(effect, columns, free, equations, joint))
     return sorted(found, key=lambda score: score.neg2_log_evidence)
 
 
@@ -150,6 +162,84 @@ def normal_equations(
     return [_reduced(record, prior, present, i, candidates, free) for i, record in enumerate(records)]
 
 
+@dataclass(frozen=True, slots=True)
+class JointEquations:
+    """Normal equations of all recordings, reduced to the P parameters that they share.
+
+    gradient (P,) and information (P, P) are of the data alone.  follow: of each recording, how its present coordinates
+    (C,) change with no effect, and by u (C, P).
+    """
+
+    gradient: Array
+    information: Array
+    follow: tuple[tuple[Array, Array], ...]
+
+
+def joint_equations(equations: Sequence[NormalEquations]) -> JointEquations:
+    """The normal equations of all recordings together, in which the gains that they share are the same.
+
+    Each is taken about its own optimum; the first one has the prior of the gains, the others data alone.
+    """
+    parts = [_without_own(one, with_prior=i == 0) for i, one in enumerate(equations)]
+    at, shared = equations[-1].iterate.gains, equations[0].shared_gains
+    information, gradient = np.zeros_like(parts[0].information), np.zeros(len(parts[0].gradient))
+    moved = []
+    for one, part in zip(equations, parts, strict=True):
+        moved.append((at - one.iterate.gains)[shared])
+        information += part.information
+        gradient += part.gradient + part.information[:, : len(shared)] @ moved[-1]
+    gains, u = slice(None, len(shared)), slice(len(shared), None)
+    solved = np.linalg.solve(information[gains, gains], np.column_stack([gradient[gains], information[gains, u]]))
+    follow = []
+    for one, part, change in zip(equations, parts, moved, strict=True):
+        step = np.column_stack([change, np.zeros((len(shared), len(one.gradient)))]) - solved
+        present = np.zeros((len(one.is_own), step.shape[1]))
+        present[~one.is_own] = step
+        present[one.is_own] = -part.own_solved[:, : 1 + len(one.gradient)] - part.own_by_gains @ step
+        follow.append((present[:, 0], present[:, 1:]))
+    return JointEquations(
+        gradient[u] - information[u, gains] @ solved[:, 0],
+        information[u, u] - information[u, gains] @ solved[:, 1:],
+        tuple(follow),
+    )
+
+
+class _WithoutOwn(NamedTuple):
+    """Equations (S + P) of shared gains and u, a recording's own coordinates o eliminated.
+
+    own_solved (O, 1 + P): H_oo^-1 (g_o, H_ou); own_by_gains (O, S): H_oo^-1 H_og.
+    """
+
+    information: Array
+    gradient: Array
+    own_solved: Array
+    own_by_gains: Array
+
+
+def _without_own(equations: NormalEquations, with_prior: bool) -> _WithoutOwn:
+    """The equations of one recording's data, with the prior of its own coordinates; of the gains only `with_prior`."""
+    P, shared = len(equations.gradient), equations.shared_gains
+    H, g = equations.quadratic.information.copy(), equations.quadratic.gradient.copy()
+    own = np.concatenate([equations.is_own, np.zeros(P, bool)])
+    gains = np.concatenate([~equations.is_own, np.zeros(P, bool)])
+    H[-P:, -P:] -= np.eye(P)
+    if not with_prior:
+        prior = equations.objective.joint_prior
+        at = len(PARAMETERS) + shared
+        precision = np.linalg.inv(prior.covariance[np.ix_(at, at)])
+        H[np.ix_(gains, gains)] -= precision
+        g[gains] -= precision @ (equations.iterate.gains - prior.gains)[shared]
+    rest = ~own
+    K = np.linalg.solve(H[np.ix_(own, own)], np.column_stack([g[own], H[np.ix_(own, rest)]]))
+    cross, S = H[np.ix_(rest, own)], len(shared)
+    return _WithoutOwn(
+        H[np.ix_(rest, rest)] - cross @ K[:, 1:],
+        g[rest] - cross @ K[:, 0],
+        np.column_stack([K[:, 0], K[:, 1 + S :]]),
+        K[:, 1 : 1 + S],
+    )
+
+
 def _reduced(
     record: Record,
     prior: SoilPrior,
@@ -180,24 +270,42 @@ def _reduced(
     reduced = information[new, new] - np.eye(P) - information[new, present_columns] @ response
     gradient = quadratic.gradient[new] - response.T @ quadratic.gradient[present_columns]
     held_out = present.checks[i].latents
-    return NormalEquations(objective, iterate, quadratic.linearisation, gradient, reduced, response, held_out, present)
+    by_name = {effect.name: effect for effect in present.effects}
+    own = [
+        record.training.n_sensors + k
+        for k, f in enumerate(present.free)
+        if by_name[f.effect].own_in_each_record(f.parameter)
+    ]
+    is_own = np.concatenate([np.ones(len(objective.free), bool), np.isin(objective.active[:-P], own)])
+    return NormalEquations(objective, iterate, quadratic, is_own, gradient, reduced, response, held_out, present)
 
 
 def _score(
-    effect: Effect, columns: NDArray[np.intp], free: Sequence[Free], equations: Sequence[NormalEquations]
+    effect: Effect,
+    columns: NDArray[np.intp],
+    free: Sequence[Free],
+    equations: Sequence[NormalEquations],
+    joint: JointEquations,
 ) -> Score:
     """One effect's score over all recordings; an effect of the record has parameters of its own in each."""
     block = np.ix_(columns, columns)
     own = [free[i] for i in columns.tolist()]
-    parts = [(one.information[block], one.gradient[columns]) for one in equations]
-    if not effect.of_record:
-        information, gradient = (np.sum([part[i] for part in parts], axis=0) for i in (0, 1))
-        parts = [(information, gradient)]
-    solutions = [_bounded_minimum(information + np.eye(len(own)), gradient, own) for information, gradient in parts]
+    parts: Sequence[NormalEquations | JointEquations] = equations if effect.of_record else [joint]
+    solutions = [
+        _bounded_minimum(one.information[block] + np.eye(len(own)), one.gradient[columns], own) for one in parts
+    ]
     fall = sum(solution.fall for solution in solutions)
     neg2_log_evidence = sum(solution.neg2_log_evidence for solution in solutions)
-    steps = [solution.step for solution in solutions] * (1 if effect.of_record else len(equations))
-    starts = tuple(_start(one, columns, step) for one, step in zip(equations, steps, strict=True))
+    if effect.of_record:
+        starts = tuple(
+            _start(one, columns, solution.step, 0.0, -one.response)
+            for one, solution in zip(equations, solutions, strict=True)
+        )
+    else:
+        starts = tuple(
+            _start(one, columns, solutions[0].step, *follow)
+            for one, follow in zip(equations, joint.follow, strict=True)
+        )
     return Score(effect, fall, neg2_log_evidence, starts)
 
 
@@ -231,11 +339,16 @@ def _bounded_minimum(information: Array, gradient: Array, free: Sequence[Free]) 
     return _Minimum(step, fall, mixture + float(step[inside] @ vector) - fall)
 
 
-def _start(equations: NormalEquations, columns: NDArray[np.intp], step: Array) -> Start:
-    """Where a fit of one recording with the effect begins: at the step (P,), shortened to MAX_START_SD."""
+def _start(
+    equations: NormalEquations, columns: NDArray[np.intp], step: Array, offset: Array | float, by_u: Array
+) -> Start:
+    """Where a fit of one recording with the effect begins: at the step (P,), shortened to MAX_START_SD.
+
+    offset (C,) and by_u (C, P): what the present coordinates change by, and by each of all parameters.
+    """
     share = min(1.0, MAX_START_SD / max(float(np.abs(step).max(initial=0.0)), 1e-12))
     step = share * step
-    follow = -equations.response[:, columns] @ step
+    follow = offset + by_u[:, columns] @ step
     objective, iterate = equations.objective, equations.iterate
     n_free, n_present = len(objective.free), len(iterate.gains) - len(equations.information)
     soil = objective.coordinates.stepped(iterate.soil, follow[:n_free])
@@ -247,5 +360,5 @@ def _start(equations: NormalEquations, columns: NDArray[np.intp], step: Array) -
         return start
     change = np.zeros(len(iterate.gains))
     change[:n_present], change[n_present + columns] = gains - iterate.gains[:n_present], step
-    latents = objective.problem.updated(equations.at, iterate.latents, soil - iterate.soil, change)
+    latents = objective.problem.updated(equations.quadratic.linearisation, iterate.latents, soil - iterate.soil, change)
     return start._replace(near_optimum=True, latents=latents)

@@ -282,7 +282,7 @@ def prior_of(config: Config) -> SoilPrior:
 
 def model_of(config: Config) -> WheelModel:
     """The wheel-soil model of fits, without effects."""
-    return WheelModel(shear_law=config.model.shear_law, nodes=FAST_NODES)
+    return WheelModel(shear_law=config.model.shear_law, nodes=FAST_NODES, rollers=config.rollers)
 
 
 def form_of(config: Config) -> tuple[float, ...]:

@@ -82,22 +82,21 @@ def at_window_end(objective: Objective, fit: Fit, window: float, drift: float) -
         return fit
     step, covariance = _model_average(models)
     covariance[:free, :free] += np.eye(free) * drift**2 / (3.0 * PIECES)  # the end of the last piece is not its mean
-    gains = iterate.gains.copy()
-    gains[objective.active] -= step[free:]
-    at_end = replace(iterate, soil=objective.coordinates.stepped(iterate.soil, -step[:free]), gains=gains)
-    mode = objective.gaussian_with(at_end, covariance)
+    at_optimum, drift_covariance = (
+        objective.gaussian_with(iterate, constant.covariance),
+        covariance - constant.covariance,
+    )
 
     def shifted(gaussian: Gaussian) -> Gaussian:
-        return (
-            mode
-            if gaussian is fit.mode
-            else objective.shifted(gaussian, constant.step - step, covariance - constant.covariance)
-        )
+        if gaussian is fit.mode and fit.marginalised is None:
+            return objective.shifted(at_optimum, -step, drift_covariance)
+        return objective.shifted(gaussian, constant.step - step, drift_covariance)
 
+    mode = shifted(fit.mode)
     return replace(
         fit,
         mode=mode,
-        gaussian=shifted(fit.gaussian),
+        gaussian=mode if fit.gaussian is fit.mode else shifted(fit.gaussian),
         second_mode=None
         if fit.second_mode is None
         else fit.second_mode._replace(gaussian=shifted(fit.second_mode.gaussian)),

@@ -4,20 +4,25 @@ Equations.  With x = (log soil, gains), mean m and covariance C, the prior's res
 
     p = x - m,    -2 log prior = p' C^-1 p                                         (log-normal in all parameters)
 
-or, for a likelihood factor, which is Gaussian in k_c itself with offset e in units of the soil's k_c,
+or, for a likelihood factor, which is Gaussian in y = k_c, n, tan phi and c themselves and in log K_L in place of
+log k_phi (`deviations`), with offset e in units of their change with the logarithm at the soil y0,
 
-    p_k_c = k_c / k_c0 - 1 - e,    p_R = log k_c - log prior median
+    p_y = (y - y0) / (dy/dlog)_0 - e,    p_R = log parameter - log prior median
     -2 log prior = p' diag(C^-1, prior sd^-2) p - least value
 
 A window determines combinations of soil and gains, so its posterior is kept jointly.  Gains do not change from
 window to window; without their covariance with the soil the same ignorance would count as new information each
-time.  Forces are nearly linear in k_c, so several windows multiply as Gaussians of k_c and not of log k_c: a
-likelihood factor is a posterior with the prior of log k_c divided out, in that form.
+time.  Forces are linear in c and tan phi and nearly so in k_c, the logarithm of pressure is linear in n, so several
+windows multiply as Gaussians of these and not of their logarithms: a likelihood factor is a posterior with their
+log-normal priors divided out, in that form.  At one load a window determines A c + W tan phi alone, a straight line in
+(c, tan phi) and a curve in logarithms: two windows linearised at two points of the curve would seem to determine c
+where they cross.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -33,14 +38,45 @@ if TYPE_CHECKING:
 
 
 _SOIL = len(PARAMETERS)
-_K_C = PARAMETERS.index("k_c")
+_K_C, _K_PHI, _N, _PHI, _C = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "phi", "c"))
+LINEAR = np.array([_K_C, _N, _PHI, _C])
+"""Parameters in which forces, of n the logarithm of pressure, are linear, of phi in its tangent."""
+_TAN = 2
+"""Place of phi among LINEAR."""
 MIN_VARIANCE_REDUCTION = 1e-3
-"""Least share [1] of the prior variance of log k_c that data are taken to remove.
+"""Least share [1] of the prior variance of a linear parameter's logarithm that data are taken to remove.
 
 Keeps the likelihood factor finite where they remove none.  No evidence recorded.
 """
-LEAST_VALUE_SD, LEAST_VALUE_NODES = 4.0, 161
-"""Half width in prior sd of log k_c, and nodes, of the grid on which the least -2 log prior is looked for."""
+LEAST_VALUE_STEPS, LEAST_VALUE_TOLERANCE = 20, 1e-3
+"""Newton steps to the least -2 log prior, at most, and the length [1, of logarithms] below which they end."""
+
+
+def deviations(soil: Array, base: Array, width: float) -> tuple[Array, Array]:
+    """Changes (6,) from a base (6,) to a soil (6,) in which windows are linear, and derivatives by the logarithms.
+
+    Each is that of the parameter's logarithm at the base.  There and elsewhere the LINEAR parameters change linearly;
+    that of k_phi is log K_L less the part of k_c, K_L = k_c / width + k_phi; K changes by its logarithm.
+
+    Returns
+    -------
+    (6,), (6, 6)
+    """
+    free = base > 0.0  # a parameter that is held may be zero
+    soil, base = np.where(free, soil, 1.0), np.where(free, base, 1.0)
+    change, slopes = np.log(soil / base), np.eye(len(soil))
+    value, start, by_log, unit = soil[LINEAR], base[LINEAR], soil[LINEAR], base[LINEAR]
+    tan, tan_at_base = math.tan(soil[_PHI]), math.tan(base[_PHI])
+    value[_TAN], start[_TAN] = tan, tan_at_base
+    by_log[_TAN] *= 1.0 + tan**2
+    unit[_TAN] *= 1.0 + tan_at_base**2
+    change[LINEAR], slopes[LINEAR, LINEAR] = (value - start) / unit, by_log / unit
+    K_L, K_L_at_base = (s[_K_PHI] + s[_K_C] / width for s in (soil, base))
+    k_phi, ratio = base[_K_PHI], K_L_at_base / K_L
+    change[_K_PHI] = (-math.log(ratio) * K_L_at_base - (soil[_K_C] - base[_K_C]) / width) / k_phi
+    slopes[_K_PHI, _K_PHI] = ratio * soil[_K_PHI] / k_phi
+    slopes[_K_PHI, _K_C] = (ratio - 1.0) * soil[_K_C] / width / k_phi
+    return change, slopes
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +91,8 @@ class Gaussian:
         Relative errors of the sensors and standardised effect parameters.
     covariance : (6 + G, 6 + G)
         Of the soil's logarithms and the gains; rows of held ones are zero.
-    k_c_offset : float, optional
-        Only for a likelihood factor: Gaussian in k_c / soil's k_c, with mean 1 + k_c_offset.
+    offset : (6,), optional
+        Only for a likelihood factor: Gaussian in the `deviations` from this soil, with this mean.
     form : FormPosterior, optional
         What the model's form leaves open; everything else is of the configured form.
     """
@@ -64,7 +100,7 @@ class Gaussian:
     soil: Array
     gains: Array
     covariance: Array
-    k_c_offset: float | None = None
+    offset: Array | None = None
     form: FormPosterior | None = None
 
     @classmethod
@@ -84,18 +120,32 @@ class Gaussian:
 
     def shifted(self, step: Array, covariance: Array) -> Gaussian:
         """With its mean shifted by a step (6 + G,) of logarithms and gains, and another covariance."""
-        soil, gains = self.soil * np.exp(step[:_SOIL]), self.gains + step[_SOIL:]
-        if self.k_c_offset is None:
-            return Gaussian(soil, gains, covariance)
-        soil[_K_C] = self.soil[_K_C]
-        return Gaussian(soil, gains, covariance, self.k_c_offset + float(step[_K_C]))
+        gains = self.gains + step[_SOIL:]
+        if self.offset is None:
+            return Gaussian(self.soil * np.exp(step[:_SOIL]), gains, covariance)
+        return Gaussian(self.soil, gains, covariance, self.offset + step[:_SOIL])
 
     def conditioned_on(self, parameter: int, log: float) -> Gaussian:
         """Conditional on the logarithm of a free parameter, which is held from then on."""
         along = self.covariance[:, parameter] / self.covariance[parameter, parameter]
         covariance = self.covariance - np.outer(along, self.covariance[parameter])
         covariance[parameter] = covariance[:, parameter] = 0.0
-        return self.shifted(along * (log - np.log(self.soil[parameter])), covariance)
+        return self.shifted(along * self._deviation(parameter, log), covariance)
+
+    def neg2_log_marginal(self, parameter: int, log: float, prior: SoilPrior) -> float:
+        """-2 log of the marginal at the logarithm of a free parameter; of a likelihood factor with the prior."""
+        value = self._deviation(parameter, log) ** 2 / float(self.covariance[parameter, parameter])
+        if self.offset is None or parameter not in LINEAR:
+            return value
+        return value + ((log - math.log(prior.median[parameter])) / float(prior.log_std[parameter])) ** 2
+
+    def _deviation(self, parameter: int, log: float) -> float:
+        """Of a parameter with this logarithm from its mean: of the logarithm, or linear in a likelihood factor."""
+        base = float(self.soil[parameter])
+        if self.offset is None:
+            return log - math.log(base)
+        change = math.expm1(log - math.log(base)) if parameter in LINEAR else log - math.log(base)
+        return change - float(self.offset[parameter])
 
     def mixture(self, other: Gaussian, share: float) -> Gaussian:
         """This mean, with the second moment about it of a mixture: this with 1 - share, the other with share."""
@@ -119,7 +169,7 @@ class Gaussian:
         return Gaussian(prior.median, self.gains, covariance)
 
     def likelihood_factor(self, prior: SoilPrior) -> Gaussian:
-        """The posterior with the prior of log k_c divided out.
+        """The posterior with the priors of the logarithms of LINEAR divided out.
 
         Parameters
         ----------
@@ -128,21 +178,42 @@ class Gaussian:
 
         Notes
         -----
-        Windows multiply as Gaussians of k_c, and what compensates for k_c is proportional to it.  In log k_c,
-        of which a window may determine less than the prior does, neither holds: window after window would seem
-        to exclude large k_c.
+        Windows multiply as Gaussians of k_c, tan phi and c, and what compensates for k_c or c is proportional to it.
+        In logarithms, of which a window may determine less than the prior does, neither holds: window after window
+        would seem to exclude large k_c, and to determine c where only the strength at one pressure is measured.
         """
-        variance, along = float(prior.log_std[_K_C] ** 2), self.covariance[:, _K_C]
-        if variance == 0.0:
+        free, covariance = self._without_priors(prior)
+        if not len(free):
             return self
-        removed = max(variance - float(along[_K_C]), MIN_VARIANCE_REDUCTION * variance)
-        off = along * (math.log(self.soil[_K_C] / prior.median[_K_C]) / removed)
-        return replace(self, k_c_offset=0.0).shifted(off, self.covariance + np.outer(along, along) / removed)
+        off = covariance[:, free] @ (np.log(self.soil[free] / prior.median[free]) / prior.log_std[free] ** 2)
+        return replace(self, offset=np.zeros(_SOIL)).shifted(off, covariance)
+
+    def relinearised(self, soil: Array, gains: Array, prior: SoilPrior, width: float) -> Gaussian:
+        """About another mean, with the covariance that the same linear model and the prior have there.
+
+        What compensates for a LINEAR parameter is proportional to the parameter itself, and so more or less of its
+        logarithm; the prior stays that of the logarithm.
+        """
+        free, covariance = self._without_priors(prior)
+        by_deviations, of_soil = np.eye(len(covariance)), np.ix_(prior.free, prior.free)
+        by_deviations[of_soil] = np.linalg.inv(deviations(soil, self.soil, width)[1][of_soil])
+        covariance = by_deviations @ covariance @ by_deviations.T
+        along = covariance[:, free]
+        removed = np.linalg.solve(along[free] + np.diag(prior.log_std[free] ** 2), along.T)
+        return replace(self, soil=soil, gains=gains, covariance=covariance - along @ removed)
+
+    def _without_priors(self, prior: SoilPrior) -> tuple[NDArray[np.intp], Array]:
+        """Free parameters of LINEAR, and the covariance (6 + G, 6 + G) without the priors of their logarithms."""
+        free = LINEAR[prior.log_std[LINEAR] > 0.0]
+        unit, along = prior.log_std[free], self.covariance[:, free]
+        removed, axes = np.linalg.eigh(np.eye(len(free)) - along[free] / np.outer(unit, unit))
+        inverse = (axes / np.maximum(removed, MIN_VARIANCE_REDUCTION)) @ axes.T / np.outer(unit, unit)
+        return free, self.covariance + along @ inverse @ along.T
 
     def variance_of_k_c(self, prior: SoilPrior) -> float:
         """Variance of log k_c, the prior included."""
         own = float(self.covariance[_K_C, _K_C])
-        return own if self.k_c_offset is None else 1.0 / (1.0 / own + float(prior.log_std[_K_C] ** -2))
+        return own if self.offset is None else 1.0 / (1.0 / own + float(prior.log_std[_K_C] ** -2))
 
 
 class PriorQuadratic(NamedTuple):
@@ -157,8 +228,8 @@ class PriorQuadratic(NamedTuple):
     neg2_log_prior : float
         The value.
     gradient_of_data : (F + A,)
-        The part of the gradient that is Gaussian in k_c: without the prior of log k_c; 0 where all of it is
-        log-normal.
+        The part of the gradient that is Gaussian in the LINEAR parameters: without the priors of their logarithms; 0
+        where all of it is log-normal.
     """
 
     information: Array
@@ -178,14 +249,16 @@ class PriorFactor:
         The configured prior of the soil.
     active : (A,)
         Indices of the gains that are not held.
+    width
+        Mean width [m] of the tyres.
 
     Attributes
     ----------
     precision : (R, R)
-        Of the residuals.  R is F + A, and one more where the prior is a likelihood factor: its residual of k_c
-        itself comes with one of log k_c by the configured prior.
+        Of the residuals.  R is F + A, and one more for each free parameter of LINEAR where the prior is a likelihood
+        factor: besides the parameter's own residual there is one of its logarithm, by the configured prior.
     least_value : float
-        Least -2 log of likelihood factor and prior of log k_c together, which is subtracted from every value.
+        Least -2 log of likelihood factor and these priors together, which is subtracted from every value.
 
     Raises
     ------
@@ -193,7 +266,7 @@ class PriorFactor:
         Where `gaussian_prior` has no proper covariance.
     """
 
-    def __init__(self, gaussian_prior: Gaussian, prior: SoilPrior, active: NDArray[np.intp]) -> None:
+    def __init__(self, gaussian_prior: Gaussian, prior: SoilPrior, active: NDArray[np.intp], width: float) -> None:
         self._gaussian_prior, self._prior, self._free, self._active = gaussian_prior, prior, prior.free, active
         unknowns = np.concatenate([self._free, _SOIL + active])
         inverse = solve_with_inverse(gaussian_prior.covariance[unknowns[:, None], unknowns], np.zeros(len(unknowns)))
@@ -201,12 +274,18 @@ class PriorFactor:
             raise ValueError("the prior has no proper covariance")
         self.precision = inverse[1]
         self._mean = np.concatenate([np.log(gaussian_prior.soil[self._free]), gaussian_prior.gains[active]])
-        self._zero_gradient = np.zeros(len(unknowns))
+        self._zero_gradient, self._width = np.zeros(len(unknowns)), width
         self.least_value = 0.0
-        self._is_likelihood_factor = gaussian_prior.k_c_offset is not None and _K_C in self._free
+        self._offset = np.zeros(_SOIL) if gaussian_prior.offset is None else gaussian_prior.offset
+        self._is_likelihood_factor = gaussian_prior.offset is not None
         if self._is_likelihood_factor:
-            self.precision = np.pad(self.precision, (0, 1))
-            self.precision[-1, -1] = prior.log_std[_K_C] ** -2
+            self._linear = LINEAR[np.isin(LINEAR, self._free)]
+            self._place = np.searchsorted(self._free, self._linear)
+            n = len(self.precision)
+            self.precision = np.pad(self.precision, (0, len(self._linear)))
+            self.precision[range(n, len(self.precision)), range(n, len(self.precision))] = (
+                prior.log_std[self._linear] ** -2
+            )
             self.least_value = self._least()
 
     def quadratic_at(self, soil: Array, gains: Array, by_logs: Array) -> PriorQuadratic:
@@ -224,7 +303,7 @@ class PriorFactor:
         gradient, of_data = slopes.T @ weighted, self._zero_gradient
         if self._is_likelihood_factor:
             of_data = gradient.copy()
-            of_data[_K_C] -= weighted[-1]
+            of_data[self._place] -= weighted[len(by_logs) :]
         value = float(off @ weighted) - self.least_value
         return PriorQuadratic(slopes.T @ self.precision @ slopes, gradient, value, of_data)
 
@@ -233,11 +312,11 @@ class PriorFactor:
         off = np.concatenate([np.log(soil[self._free]), gains[self._active]]) - self._mean
         if not self._is_likelihood_factor:
             return np.asarray(off)
-        of_prior = np.log(soil[_K_C] / self._prior.median[_K_C])
-        off[_K_C] = soil[_K_C] / self._gaussian_prior.soil[_K_C] - 1.0 - self._gaussian_prior.k_c_offset
-        return np.append(off, of_prior)
+        changes, _ = deviations(soil, self._gaussian_prior.soil, self._width)
+        off[: len(self._free)] = (changes - self._offset)[self._free]
+        return np.append(off, np.log(soil[self._linear] / self._prior.median[self._linear]))
 
-    def jacobian(self, soil: Array, by_logs: Array, by_k_c: Array | None = None) -> Array:
+    def jacobian(self, soil: Array, by_logs: Array, by_values: Mapping[int, Array] | None = None) -> Array:
         """Derivatives (R, M) of the residuals by M unknowns.
 
         Parameters
@@ -246,31 +325,42 @@ class PriorFactor:
             In SI.
         by_logs : (F + A, M)
             Derivatives of logarithms and gains by the unknowns.
-        by_k_c : (M,), optional
-            Those of the relative change of k_c, where they are not those of log k_c.
+        by_values : {index of a parameter: (M,)}, optional
+            Those of the relative change of a LINEAR parameter, where they are not those of its logarithm.
         """
         if not self._is_likelihood_factor:
             return by_logs
-        slopes = np.vstack([by_logs, by_logs[_K_C]])
-        slopes[_K_C] = by_logs[_K_C] if by_k_c is None else by_k_c
-        slopes[_K_C] *= soil[_K_C] / self._gaussian_prior.soil[_K_C]
-        return slopes
+        free, changes = len(self._free), by_logs[: len(self._free)].copy()
+        for parameter, row in (by_values or {}).items():
+            changes[np.searchsorted(self._free, parameter)] = row
+        slopes = deviations(soil, self._gaussian_prior.soil, self._width)[1][np.ix_(self._free, self._free)]
+        return np.vstack([slopes @ changes, by_logs[free:], by_logs[self._place]])
 
     def jacobian_by_mean(self, soil: Array, gains: Array, shift: Array) -> tuple[Array, Array, Array]:
         """Derivatives (R, M) of the residuals by M shifts (6 + G, M) of the mean, with precision and residuals."""
         by_mean = -shift[np.concatenate([self._free, _SOIL + self._active])]
-        if self._is_likelihood_factor:
-            by_mean[_K_C] *= 1.0 + (self._gaussian_prior.k_c_offset or 0.0)
-            by_mean = np.vstack([by_mean, np.zeros((1, by_mean.shape[1]))])  # the prior of log k_c does not shift
+        if self._is_likelihood_factor:  # the priors of the logarithms do not shift
+            by_mean = np.vstack([by_mean, np.zeros((len(self._linear), by_mean.shape[1]))])
         return by_mean, self.precision, self.residuals(soil, gains)
 
     def _least(self) -> float:
-        """Least -2 log of the likelihood factor of k_c and the prior of log k_c together, on a grid."""
-        gaussian_prior, spread = self._gaussian_prior, self._prior.log_std[_K_C]
-        deviation = np.linspace(-LEAST_VALUE_SD, LEAST_VALUE_SD, LEAST_VALUE_NODES)
-        k_c = self._prior.median[_K_C] * np.exp(spread * deviation) / gaussian_prior.soil[_K_C]
-        off = k_c - 1.0 - gaussian_prior.k_c_offset
-        return float(np.min(off**2 / gaussian_prior.covariance[_K_C, _K_C] + deviation**2))
+        """Least -2 log of the likelihood factor of LINEAR and the priors of their logarithms together."""
+        base, prior, linear = self._gaussian_prior.soil, self._prior, self._linear
+        precision = np.linalg.inv(self._gaussian_prior.covariance[np.ix_(linear, linear)])
+        of_prior, soil, least = prior.log_std[linear] ** -2, base.copy(), math.inf
+        for _ in range(LEAST_VALUE_STEPS):
+            changes, by_logs = deviations(soil, base, self._width)
+            off, slopes = (changes - self._offset)[linear], by_logs[linear, linear]
+            log = np.log(soil[linear] / prior.median[linear])
+            weighted = precision @ off
+            least = min(least, float(off @ weighted + log @ (of_prior * log)))
+            curved = slopes[:, None] * precision * slopes + np.diag(of_prior + np.maximum(weighted * slopes, 0.0))
+            step = -np.linalg.solve(curved, slopes * weighted + of_prior * log)
+            step *= min(1.0, 1.0 / float(np.abs(step).max()))
+            soil[linear] *= np.exp(step)
+            if np.abs(step).max() < LEAST_VALUE_TOLERANCE:
+                break
+        return least
 
 
 def solve_with_inverse(information: Array, gradient: Array) -> tuple[Array, Array] | None:

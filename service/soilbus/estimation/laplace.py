@@ -43,6 +43,9 @@ from soilbus.terra.wheel import Soil
 
 DETERMINED_N_SD = 0.05
 """Sd of log n [1] below which a posterior with one mode counts as Gaussian.  No evidence recorded."""
+MIN_LOAD_SIGNAL = 4.0
+"""Variance of the loads over that of their noise [1] below which noise passes for much of the information: at 1 all of
+it is noise, at 4 a quarter is."""
 FIRST_NODE_STEP = 0.1
 """Longest first step of log n [1] from the mode.  No evidence recorded."""
 NODE_STEP_GROWTH = 1.4
@@ -106,10 +109,10 @@ class ProfileOverN(NamedTuple):
 def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, found: Fit) -> Fit:
     """The fit with mean and covariance of the whole posterior where its mode does not describe it.
 
-    That is where the sd of log n exceeds DETERMINED_N_SD or there is a second mode.  There the noise of loads
-    and speeds may have added false information on n, so the denoised window is fitted
+    That is where the sd of log n exceeds DETERMINED_N_SD or there is a second mode.  There, and where loads hardly
+    vary, the noise of loads and speeds may have added false information on n or c, so the denoised window is fitted
     (`DenoisedObservationModel`).  Where k_c, k_phi and n are free and tyres differ in width, its posterior is
-    averaged along n.
+    averaged along n, unless n is determined.
 
     Parameters
     ----------
@@ -125,10 +128,11 @@ def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, joint_prior
         where there is nothing to average.
     """
     spread = math.sqrt(max(found.mode.covariance[_N, _N], found.gaussian.covariance[_N, _N]))
-    if spread < DETERMINED_N_SD and found.second_mode is None:
+    is_determined = spread < DETERMINED_N_SD and found.second_mode is None
+    if is_determined and load_signal(problem, found) > MIN_LOAD_SIGNAL:
         return found
     with np.errstate(all="ignore"):
-        along = profile_over_n(problem, prior, joint_prior, found)
+        along = profile_over_n(problem, prior, joint_prior, found, not is_determined)
         if along is None:
             return found
         coordinates = Coordinates(prior, float(problem.rig.width.mean()))
@@ -150,17 +154,24 @@ def cold_fit(problem: ObservationModel, prior: SoilPrior) -> Fit | None:
     return with_nested_laplace(problem, prior, Gaussian.of(prior, problem.gain_std), fit)
 
 
+def load_signal(problem: ObservationModel, fit: Fit) -> float:
+    """Variance of the fitted loads over the window by that of their noise; the largest of all observations of loads."""
+    loads = problem.layout.loads
+    fitted, noise = problem.observed(fit.optimum.latents.joined())[:, loads], fit.optimum.at.variance[:, loads].mean(0)
+    return float(np.max(np.divide(fitted.var(0), noise, out=np.full(len(noise), np.inf), where=noise > 0.0)))
+
+
 def profile_over_n(
-    problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, found: Fit
+    problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, found: Fit, has_nodes: bool = True
 ) -> ProfileOverN | None:
-    """Fits of the denoised window along n, through its optimum near `found`; None where there is no such optimum."""
+    """Fits of the denoised window through its optimum near `found`, with nodes along n; None without an optimum."""
     optimum = found.optimum
     denoised = DenoisedObservationModel(problem, optimum)
     start = Iterate(optimum.soil, optimum.gains, denoised.latents, np.inf, 1)
     top = _converged(Objective(denoised, prior, joint_prior), start)
     if top is None:
         return None
-    if not prior.log_std[[_K_C, _K_PHI, _N]].all() or np.ptp(problem.rig.width) == 0.0:
+    if not has_nodes or not prior.log_std[[_K_C, _K_PHI, _N]].all() or np.ptp(problem.rig.width) == 0.0:
         return ProfileOverN(denoised, top, [])
     first = _node(denoised, prior, joint_prior, top, math.log(top.mode.soil[_N]), None)
     if first is None:
@@ -298,13 +309,14 @@ def _node(
         soil[free] = Coordinates(prior, float(problem.rig.width.mean())).within(np.exp(predicted[:_SOIL]))[free]
         gains = problem.allowed(predicted[_SOIL:])
     soil[_N] = n
-    deviation = (u - math.log(joint_prior.soil[_N])) / math.sqrt(joint_prior.covariance[_N, _N])
     median, log_std = prior.median.copy(), prior.log_std.copy()
     median[_N], log_std[_N] = n, 0.0
     objective = Objective(problem, SoilPrior(median, log_std), joint_prior.conditioned_on(_N, u))
     latents = problem.with_entry_angles(near.optimum.latents, Soil(*soil.tolist()), gains)
     fit = _converged(objective, Iterate(soil, gains, latents, np.inf, 1))
-    return None if fit is None else Node(u, fit, deviation**2 + objective.prior_factor.least_value)
+    if fit is None:
+        return None
+    return Node(u, fit, joint_prior.neg2_log_marginal(_N, u, prior) + objective.prior_factor.least_value)
 
 
 def _converged(objective: Objective, start: Iterate) -> Fit | None:

@@ -245,6 +245,12 @@ class Measurements:
         return names + ([("sinkage", wheel) for wheel in self.rig.wheels] if self.with_sinkage else [])
 
     @property
+    def readings(self) -> Array:
+        """What the sensors read in the rows of an instant (N, m): torques [N m], draft [N], sinkages [m]."""
+        parts = [self.torque, self.draft[:, None]] + ([self.sinkage] if self.with_sinkage else [])
+        return np.concatenate(parts, axis=1)
+
+    @property
     def _n_residuals(self) -> int:
         """Number m of residuals of an instant."""
         return int(self._row_var.shape[1])

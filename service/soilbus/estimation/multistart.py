@@ -192,7 +192,7 @@ class Fit:
     Attributes
     ----------
     gaussian
-        Soil and gains by their moments along k_c's share; as `mode` where these do not apply.
+        Soil and gains by their moments along k_c's share and c; as `mode` where these do not apply.
     mode
         Soil and gains at the minimum, with the inverse of the information as covariance.
     sinkage : (W,)

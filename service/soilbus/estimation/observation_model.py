@@ -1264,7 +1264,8 @@ def shrunk_latents(fitted: Array, variance: Array) -> Array:
     """Latents (N, L) with their noise shrunk, from fitted ones (N, L) and the variance (N, L) of these.
 
     Best linear prediction from the window itself: a direction that varies no more than
-    noise does becomes the window's mean.  Latents without variance stay.
+    noise does becomes the window's mean, and so does such a latent, whose noise happens to
+    go with other latents by 1 / sqrt(N).  Latents without variance stay.
 
     References
     ----------
@@ -1280,7 +1281,13 @@ def shrunk_latents(fitted: Array, variance: Array) -> Array:
     kept[square <= (1.0 + np.sqrt(ratio)) ** 2] = 0.0
     shrunk = fitted.copy()
     shrunk[:, noisy] = mean[noisy] + (left * (size * kept)) @ right * scale[noisy]
+    still = noisy[fitted[:, noisy].var(0) <= (scale[noisy] * (1.0 + 1.0 / math.sqrt(n))) ** 2]
+    shrunk[:, still] = mean[still]
     return shrunk
+
+
+SINGULAR_RIDGE = 1e-10
+"""Added to the squares of rows in their sd where these are linearly dependent within rounding (eps m = 1e-15)."""
 
 
 def inverse_covariance(A: Array, variance: Array, row_var: Array) -> Array:
@@ -1295,13 +1302,19 @@ def inverse_covariance(A: Array, variance: Array, row_var: Array) -> Array:
 
     Notes
     -----
-    Rows are in N m, N and m; they are scaled by their sd before the inversion.
+    Rows are in N m, N and m; they are scaled by their sd before the inversion.  At a trial point far from any soil one
+    latent may swamp all rows, which then differ by rounding only: SINGULAR_RIDGE keeps that a point of finite cost.
     """
     S = (A * variance[:, None, :]) @ A.swapaxes(1, 2)
     diagonals(S)[:] += row_var
     scale = 1.0 / np.sqrt(diagonals(S))
     S *= scale[:, :, None] * scale[:, None, :]
-    return np.asarray(np.linalg.inv(S) * (scale[:, :, None] * scale[:, None, :]))
+    try:
+        inverse = np.linalg.inv(S)
+    except np.linalg.LinAlgError:
+        diagonals(S)[:] += SINGULAR_RIDGE
+        inverse = np.linalg.inv(S)
+    return np.asarray(inverse * (scale[:, :, None] * scale[:, None, :]))
 
 
 def diagonals(blocks: Array) -> Array:

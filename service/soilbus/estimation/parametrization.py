@@ -34,6 +34,8 @@ TYPICAL_DEPTH = 0.03
 """Sinkage [m] at which the bearing pressure is a coordinate.  No evidence recorded."""
 MAX_LOG_STEP = 0.7
 """Longest step of a coordinate [1, a logarithm]: a factor of two.  No evidence recorded."""
+MIN_TAN_RATIO = 0.2
+"""Least ratio [1] of tan phi after a step to that before."""
 BOUND_SD = 4.0
 """Bound of a free parameter's logarithm about the prior median [prior sd].  No evidence recorded."""
 BOUND_TOLERANCE = 1e-4
@@ -52,7 +54,7 @@ MAX_SHARE = 0.99
 """Upper end of that integral: share of k_c in K_L [1]."""
 
 _LOG_DEPTH = math.log(TYPICAL_DEPTH)
-_K_C, _K_PHI, _N, _PHI = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "phi"))
+_K_C, _K_PHI, _N, _PHI, _C = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "phi", "c"))
 
 
 @dataclass(frozen=True)
@@ -126,15 +128,32 @@ class Coordinates:
         return curvature
 
     def stepped(self, soil: Array, step: Array) -> Array:
-        """The soil (6,) after a step (F,), which is shortened to MAX_LOG_STEP."""
+        """The soil (6,) after a step (F,), which is shortened to MAX_LOG_STEP.
+
+        c and tan phi change linearly: along c + p tan phi, which a window at one pressure p measures alone, a step in
+        logarithms would leave the valley.
+        """
         step = step * min(1.0, MAX_LOG_STEP / max(float(np.max(np.abs(step), initial=0.0)), 1e-12))
-        return self.soil_at(self.position(soil) + step)
+        new = self.soil_at(self.position(soil) + step)
+        if _C in self._column:
+            new[_C] = soil[_C] * (1.0 + step[self._column[_C]])
+        if _PHI in self._column:
+            phi, tan = float(soil[_PHI]), math.tan(soil[_PHI])
+            change = phi * (1.0 + tan**2) * float(step[self._column[_PHI]])
+            new[_PHI] = math.atan(max(tan + change, MIN_TAN_RATIO * tan))
+        return self.within(new)
 
     def step_fraction(self, soil: Array, step: Array) -> float:
         """Fraction of a step (F,) from a soil (6,) within the bounds and MAX_LOG_STEP, 1 at most."""
         low, high = self._log_bounds
         change = self.log_directions(soil)[self.free] @ step
         room = np.where(change > 0.0, high, low) - np.log(soil[self.free])
+        if _C in self._column:  # changes linearly, see `stepped`
+            room[self._column[_C]] = np.expm1(room[self._column[_C]])
+        if _PHI in self._column:
+            column, tan = self._column[_PHI], math.tan(soil[_PHI])
+            bound = math.tan(soil[_PHI] * math.exp(room[column]))
+            room[column] = (bound - tan) / (soil[_PHI] * (1.0 + tan**2))
         longest = MAX_LOG_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-12)
         return min(longest, step_fraction_within(room, change))
 

@@ -94,7 +94,9 @@ OTHER_OPTIMUM_SD = 10.0
 """Posterior sd on a few instants [1] beyond which the end of a descent is another optimum.  No evidence recorded."""
 
 _SOIL = len(PARAMETERS)
-_K_C, _K_PHI, _N = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n"))
+_K_C, _K_PHI, _N, _C = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "c"))
+SMALL_SHARE = 1e-12
+"""Share [1] that stands for one whose complement does not change."""
 _SHARE, _LOG_SHARE, _LOG_REST, _OTHERS = 0, 1, 2, 3
 """Columns of changes for the moments along k_c's share s: of s, log s and log (1 - s); the others follow."""
 
@@ -261,7 +263,7 @@ class Objective:
         self._gain_directions = np.zeros((FIRST_GAIN + len(joint_prior.gains), len(self._identity)))
         self._gain_directions[FIRST_GAIN + self.active] = self._identity[len(self.free) :]
         self._by_sensors = with_gains and first_gain == 0
-        self.prior_factor = PriorFactor(joint_prior, prior, self.active)
+        self.prior_factor = PriorFactor(joint_prior, prior, self.active, self.coordinates.width)
         self._prior_cache: tuple[Array, Array, PriorQuadratic] | None = None
         self._approximation: tuple[Optimum, GaussianApproximation | None] | None = None
 
@@ -453,7 +455,7 @@ class Objective:
         return self._approximation[1]
 
     def gaussians_at(self, iterate: Iterate, model: QuadraticModel, base: Array) -> tuple[Gaussian, Gaussian] | None:
-        """Gaussians of the posterior at an optimum: by its moments along k_c's share, and by its curvature.
+        """Gaussians of the posterior at an optimum: by its moments along k_c's share and c, and by its curvature.
 
         Parameters
         ----------
@@ -467,37 +469,81 @@ class Objective:
         Returns
         -------
         moments, mode
-            Both by the curvature where there are no finite moments, or k_c and k_phi are not both free, or
-            the sd of log K_L exceeds MAX_MODULUS_SD.  None where the information is singular.
+            By the curvature where there are no finite moments; along k_c's share also where k_c and k_phi are not
+            both free, or the sd of log K_L exceeds MAX_MODULUS_SD.  None where the information is singular.
         """
         inverse = solve_with_inverse(model.information, model.gradient)
         if inverse is None:
             return None
         covariance = inverse[1]
         mode = self._gaussian(iterate.soil, iterate.gains, covariance, base)
-        if not {_K_C, _K_PHI} <= set(self.free.tolist()) or covariance[_K_PHI, _K_PHI] > MAX_MODULUS_SD**2:
+        free, has_share = len(self.free), {_K_C, _K_PHI} <= set(self.free.tolist())
+        has_share = has_share and bool(covariance[_K_PHI, _K_PHI] <= MAX_MODULUS_SD**2)
+        along_share = self._moments(iterate, model, base) if has_share else None
+        along_c = self._moments_along_c(iterate, model, base)
+        if along_share is None and along_c is None:
             return mode, mode
-        moments = self._moments(iterate, model)
-        if moments is None:
-            return mode, mode
-        free, gains = len(self.free), iterate.gains.copy()
-        step = self._by_share(iterate.soil) @ moments.mean
-        soil = self.coordinates.soil_at(self.coordinates.position(iterate.soil) + step[:free])
-        gains[self.active] += step[free:]
-        by_share = self._by_share(soil)
-        return self._gaussian(soil, gains, by_share @ moments.covariance @ by_share.T), mode
+        soil, gains, own = iterate.soil, iterate.gains.copy(), covariance
+        if along_share is not None:
+            step = self._by_share(iterate.soil) @ along_share.mean
+            soil = self.coordinates.soil_at(self.coordinates.position(iterate.soil) + step[:free])
+            gains[self.active] += step[free:]
+            by_share = self._by_share(soil)
+            own = by_share @ along_share.covariance @ by_share.T
+        if along_c is not None:  # about the optimum, at which c and tan phi make the strength that was measured
+            square = along_c.covariance + np.outer(along_c.mean, along_c.mean)
+            to_square = _root_of(square) @ np.linalg.inv(_root_of(covariance))
+            own = to_square @ own @ to_square.T
+            place, prior_sd = int(np.searchsorted(self.free, _C)), float(self.coordinates.prior.log_std[_C])
+            scale = np.ones(len(own))
+            scale[place] = min(1.0, prior_sd / math.sqrt(own[place, place]))  # c is known no less than beforehand
+            own = scale[:, None] * own * scale
+        return self._gaussian(soil, gains, own), mode
 
-    def _moments(self, iterate: Iterate, model: QuadraticModel) -> Moments | None:
-        """Moments of log s, s = k_c's share in K_L, of the other coordinates and of the gains, about the optimum."""
+    def _moments_along_c(self, iterate: Iterate, model: QuadraticModel, base: Array) -> Moments | None:
+        """Moments (F + A) of coordinates and gains about the optimum, c being log-normal and the forces linear in it.
+
+        As along a share of k_c that is small, whose complement does not change.  The prior is linearised at the model's
+        soil `base`, too: at another c what compensates for c is another share of tan phi.
+        """
+        if _C not in self.free:
+            return None
+        place, n = int(np.searchsorted(self.free, _C)), len(model.gradient)
+        others = np.delete(np.arange(n), place)
+        by_changes = np.zeros((n, n - 1 + _OTHERS))
+        by_changes[others, _OTHERS + np.arange(n - 1)] = 1.0
+        by_value = by_changes[place].copy()
+        by_changes[place, _LOG_SHARE], by_value[_SHARE] = 1.0, 1.0
+        by_logs = by_changes.copy()
+        by_logs[: len(self.free)] = self._log_directions(base)[self.free] @ by_changes[: len(self.free)]
+        slopes = self.prior_factor.jacobian(base, by_logs, {_C: by_value})
+        weighted = self.prior_factor.precision @ slopes
+        quadratic = slopes.T @ weighted
+        of_data, order = np.concatenate([[_SHARE], _OTHERS + np.arange(n - 1)]), np.concatenate([[place], others])
+        quadratic[of_data[:, None], of_data] += (model.information - model.prior_information)[order[:, None], order]
+        gradient = np.zeros(len(quadratic))  # at the optimum the data's gradient is minus the prior's
+        gradient[_LOG_SHARE] = weighted[:, _LOG_SHARE] @ self.prior_factor.residuals(iterate.soil, iterate.gains)
+        gradient[_SHARE] = -gradient[_LOG_SHARE]
+        found = moments_along_share(quadratic, gradient, SMALL_SHARE)
+        if found is None:
+            return None
+        back = np.argsort(order)
+        return Moments(found.mean[back], found.covariance[back[:, None], back])
+
+    def _moments(self, iterate: Iterate, model: QuadraticModel, base: Array) -> Moments | None:
+        """Moments of log s, s = k_c's share in K_L, of the other coordinates and of the gains, about the optimum.
+
+        Linearised at the model's soil `base`, as in `_moments_along_c`.
+        """
         others = np.arange(1, len(model.gradient))
-        by_share = self._by_share(iterate.soil)
+        by_share = self._by_share(base)
         by_changes = np.zeros((len(others) + 1, len(others) + _OTHERS))  # of log k_c = log s K_L b, log (1 - s) K_L, ..
         by_changes[others, others + _OTHERS - 1] = 1.0
         by_changes[[_K_C, _K_PHI], _OTHERS:] = by_share[_K_C, 1:]
         by_changes[[_K_C, _K_PHI], [_LOG_SHARE, _LOG_REST]] = 1.0
         by_k_c = by_changes[_K_C].copy()
         by_k_c[[_SHARE, _LOG_SHARE]] = 1.0, 0.0
-        slopes = self.prior_factor.jacobian(iterate.soil, by_changes, by_k_c)
+        slopes = self.prior_factor.jacobian(base, by_changes, {_K_C: by_k_c})
         quadratic = slopes.T @ self.prior_factor.precision @ slopes
         of_data = np.concatenate([[_SHARE], others + _OTHERS - 1])
         quadratic[of_data[:, None], of_data] += by_share.T @ (model.information - model.prior_information) @ by_share
@@ -516,11 +562,15 @@ class Objective:
         return by_share
 
     def _gaussian(self, soil: Array, gains: Array, covariance: Array, base: Array | None = None) -> Gaussian:
-        """The Gaussian with this covariance (F + A, F + A) of coordinates and active gains, taken at soil `base`."""
+        """The Gaussian with this covariance (F + A, F + A) of coordinates and active gains, linearised at `base`."""
         free = len(self.free)
         jacobian = self._gain_directions[1:].copy()
         jacobian[:_SOIL, :free] = self._log_directions(soil if base is None else base)
-        return Gaussian(soil, gains, jacobian @ covariance @ jacobian.T)
+        logs = jacobian @ covariance @ jacobian.T
+        if base is None:
+            return Gaussian(soil, gains, logs)
+        of_base, prior = Gaussian(base, gains, logs), self.coordinates.prior
+        return of_base.relinearised(soil, gains, prior, self.coordinates.width)
 
     def gaussian_with(self, iterate: Iterate, covariance: Array) -> Gaussian:
         """The Gaussian at an iterate with this covariance (F + A, F + A) of coordinates and active gains."""
@@ -530,11 +580,20 @@ class Objective:
         """A Gaussian shifted by a step (F + A,), with this covariance (F + A, F + A) of the step added."""
         free, gains = len(self.free), gaussian.gains.copy()
         gains[self.active] += step[free:]
-        added = self._gaussian(self.coordinates.stepped(gaussian.soil, step[:free]), gains, covariance)
-        return replace(added, covariance=gaussian.covariance + added.covariance)
+        soil = self.coordinates.stepped(gaussian.soil, step[:free])
+        added = self._gaussian(gaussian.soil, gains, covariance).covariance
+        wider = replace(gaussian, covariance=gaussian.covariance + added)
+        return wider.relinearised(soil, gains, self.coordinates.prior, self.coordinates.width)
 
     def _log_directions(self, soil: Array) -> Array:
         return self.coordinates.log_directions(soil)
+
+
+def _root_of(covariance: Array) -> Array:
+    """R (M, M) with R R' = a covariance (M, M), whose variances may differ by many decades."""
+    scale = np.sqrt(covariance.diagonal())
+    variance, axes = np.linalg.eigh(covariance / np.outer(scale, scale))
+    return np.asarray(scale[:, None] * (axes * np.sqrt(np.maximum(variance, 1e-300))) @ axes.T)
 
 
 class Descent(NamedTuple):

@@ -5,8 +5,8 @@
         soil   covariance += drift^2 elapsed D D'     (random walk of the coordinates, D their log directions)
         gains  variance   += gain_std^2 min((elapsed + 1) / 60, 1)
 
-    so that no sample counts twice.  Of k_c the likelihood factor is carried, apart from its prior, since
-    likelihoods add up in k_c and not in its logarithm (`Gaussian.likelihood_factor`).
+    so that no sample counts twice.  Of k_c, n, phi and c the likelihood factor is carried, apart from their priors,
+    since likelihoods add up in k_c, n, tan phi and c and not in their logarithms (`Gaussian.likelihood_factor`).
 
 A window starts from the optimum of the last one (warm start).  The change detector compares the newest data
 with this prediction by a generalised log likelihood ratio (GLR, see change_detection).  The states:

@@ -15,11 +15,16 @@ import numpy as np
 
 from soilbus.can.dbc_files import load_databases
 from soilbus.config.model import Config
+from soilbus.decision.capability import assess
+from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.diagnosis.diagnose import Diagnosis, NotFitted, diagnose
-from soilbus.estimation.assembly import possible_effects, prior_of
-from soilbus.estimation.posterior import Posterior
+from soilbus.diagnosis.fitted_model import FittedModel
+from soilbus.estimation.assembly import motors_of, possible_effects, prior_of
+from soilbus.estimation.posterior import Estimate, Posterior
+from soilbus.offline.manoeuvre import Plan, what_to_drive
 from soilbus.offline.recordings import Recordings, recordings_of
 from soilbus.offline.tables import candidates, recordings_of_tables
+from soilbus.pipeline.intake import ReportedLimits
 
 __all__ = ["Findings", "diagnose_logs"]
 
@@ -38,17 +43,48 @@ class Findings:
         The configuration that it holds for.
     seconds
         Time [s] that the diagnosis took, without reading.
+    plan
+        What to drive next where the diagnosis is ambiguous; None where no drive would help.
     """
 
     diagnosis: Diagnosis
     recordings: Recordings
     config: Config
     seconds: float
+    plan: Plan | None = None
 
     def soils(self) -> list[tuple[str, Posterior, Posterior]]:
         """Name, soil before and soil after of the first part of each log."""
         names, found = [record.name for record in self.recordings.records], self.diagnosis
         return [(names[i], found.soil_before(i), found.soil_after(i)) for i in self.recordings.first]
+
+    def largest_drafts(self) -> list[tuple[str, Estimate | None, Estimate | None]]:
+        """Name, and largest steady draft [N] on the level before and after, of the first part of each log.
+
+        Within the torque limits that the configuration names; None without a vehicle and where none is within limits.
+        """
+        found, soils = self.diagnosis, self.soils()
+        drafts = []
+        for i, (name, soil_before, soil_after) in zip(self.recordings.first, soils, strict=True):
+            before = largest_draft(found.base, i, soil_before, self.config)
+            after = largest_draft(found.completed, i, soil_after, self.config)
+            drafts.append((name, before, after))
+        return drafts
+
+
+def largest_draft(fitted: FittedModel, record: int, soil: Posterior, config: Config) -> Estimate | None:
+    """Largest steady draft [N] on the level under a fitted model, on the soil of one of its recordings."""
+    problem, latents = fitted.checks[record].problem, fitted.checks[record].latents
+    if problem.rig.chassis is None:
+        return None
+    model = UncertainModel.of(
+        problem.model, fitted.effects, fitted.free, fitted.fits[record].reported, len(problem.rig.wheels),
+        float(latents.ground_speed.mean()),
+    )  # fmt: skip
+    limit = ReportedLimits(motors_of(config, problem.rig)).at(0.0)
+    settings = config.traversability
+    capability, _ = assess(soil, problem.rig, model, None, limit, settings.max_slip, settings.max_sinkage)
+    return None if capability is None else capability.max_draft
 
 
 def diagnose_logs(config: Config, logs: Sequence[Path], say: Callable[[str], None] | None = None) -> Findings:
@@ -86,4 +122,7 @@ def diagnose_logs(config: Config, logs: Sequence[Path], say: Callable[[str], Non
         diagnosis = diagnose(recordings.records, prior_of(config), catalogue, report)
     except np.linalg.LinAlgError as error:
         raise NotFitted(f"the recordings do not determine the model: {error}") from None
-    return Findings(diagnosis, recordings, config, time.perf_counter() - begin)
+    seconds = time.perf_counter() - begin
+    if diagnosis.rivals:
+        report("finding what to drive next")
+    return Findings(diagnosis, recordings, config, seconds, what_to_drive(diagnosis, config))

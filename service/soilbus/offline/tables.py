@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -43,7 +43,7 @@ ROW_PERIOD = 1.0
 """Time [s] from one row to the next where the table has no times."""
 RIM_SPEED_RATIO = 100.0
 """Rim speed of the stand-in over the least speed at which slip is judged, so that no slip counts as a standstill."""
-MISSING_CELLS = frozenset({"", "nan", "na", "n/a", "null", "none"})
+MISSING_CELLS = frozenset({"", "nan", "na", "n/a", "<na>", "null", "none"})
 """Texts, in small letters, of a cell without a value."""
 OF_TRUE_SPEED = frozenset({"rate_stiffening", "inertia"})
 """Effects that depend on the true speed, which a table does not hold."""
@@ -54,7 +54,7 @@ OF_SEVERAL_WHEELS = frozenset({"multipass"})
 
 
 class TableError(LogError):
-    """A table cannot be read; the text says in one line where and why."""
+    """A table cannot be used; the text says in one line where and why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ class Run:
     rejected: dict[str, int]
 
 
-def runs_of(config: Config, path: Path) -> list[Run]:
+def runs_of(config: Config, path: Path, name: str | None = None) -> list[Run]:
     """The runs of a CSV or Parquet file, in the order of their first rows.
 
     Parameters
@@ -75,6 +75,8 @@ def runs_of(config: Config, path: Path) -> list[Run]:
         Its [table] maps the columns.
     path
         The file.
+    name
+        What its runs are called by, with the soil bed where [table] run is given; by default the file's name.
 
     Returns
     -------
@@ -86,34 +88,62 @@ def runs_of(config: Config, path: Path) -> list[Run]:
     TableError
         The file cannot be read, a column is missing, a cell is no number, or no row is left.
     """
-    table = config.table
-    if table is None:
-        raise TableError(f"{path}: the configuration has no [table] that maps its columns")
-    columns = _columns(path, _needed(table))
-    chosen = _chosen(path, columns, table.where)
+    return _runs(config, _columns(path, _needed(_table_of(config, str(path)))), str(path), name or path.name)
+
+
+def runs_of_columns(config: Config, columns: Columns, source: str) -> list[Run]:
+    """The runs of columns in memory; as runs_of(), with cells in place of a file's and None missing, too.
+
+    Parameters
+    ----------
+    config
+        Its [table] maps the columns.
+    columns
+        Cells (N,) of each column by its name.
+    source
+        What messages and the only run are called by.
+    """
+    _check_columns(source, list(columns), _needed(_table_of(config, source)))
+    return _runs(config, columns, source, source)
+
+
+def _table_of(config: Config, source: str) -> Table:
+    if config.table is None:
+        raise TableError(f"{source}: the configuration has no [table] that maps its columns")
+    return config.table
+
+
+def _runs(config: Config, columns: Columns, source: str, name: str) -> list[Run]:
+    """The runs of the needed columns of a table; `source` stands in messages, `name` in the runs' names."""
+    table = _table_of(config, source)
+    chosen = _chosen(columns, table.where)
     if not chosen:
-        raise TableError(f"{path}: no row in it" + (" that [table] where asks for" if table.where else ""))
-    values = {role: _numbers(path, columns, column, chosen) for role, column in table.columns.items()}
-    names = [path.name] * len(chosen)
+        raise TableError(f"{source}: no row in it" + (" that [table] where asks for" if table.where else ""))
+    values = {role: _numbers(source, columns, column, chosen) for role, column in table.columns.items()}
+    names = [name] * len(chosen)
     if table.run is not None:
-        names = [f"{path.name}, {str(columns[table.run][row]).strip()}" for row in chosen]
+        names = [f"{name}, {str(columns[table.run][row]).strip()}" for row in chosen]
     rig, runs = rig_of(config), []
-    for name in dict.fromkeys(names):
-        members = np.array([i for i, other in enumerate(names) if other == name])
-        runs.append(_run(name, {role: v[members] for role, v in values.items()}, rig, config))
+    for bed in dict.fromkeys(names):
+        members = np.array([i for i, other in enumerate(names) if other == bed])
+        runs.append(_run(bed, {role: v[members] for role, v in values.items()}, rig, config))
     if not any(len(run.window.t) for run in runs):
         reasons = ", ".join(sorted({reason for run in runs for reason in run.rejected}))
-        raise TableError(f"{path}: no usable row in it ({reasons})")
+        raise TableError(f"{source}: no usable row in it ({reasons})")
     return runs
 
 
 def replay_tables(config: Config, paths: Sequence[Path]) -> Iterator[WindowResult]:
     """Each run as one window of the daemon's own estimator; t is its last row's. TableError as runs_of()."""
-    estimator = WindowEstimator(config)
     named = zip(paths, log_names(paths), strict=True)
-    runs = ((name, run) for path, name in named for run in runs_of(config, path) if len(run.window.t))
-    for index, (name, run) in enumerate(runs):
-        yield replace(estimator.solve(_task(index, run, estimator.rig)), log=name)
+    return replay_runs(config, (run for path, name in named for run in runs_of(config, path, name)))
+
+
+def replay_runs(config: Config, runs: Iterable[Run]) -> Iterator[WindowResult]:
+    """Each run as one window of the daemon's own estimator, `log` its name; runs without rows are left out."""
+    estimator = WindowEstimator(config)
+    for index, run in enumerate(run for run in runs if len(run.window.t)):
+        yield replace(estimator.solve(_task(index, run, estimator.rig)), log=run.name)
 
 
 def _task(index: int, run: Run, rig: Rig) -> WindowTask:
@@ -268,14 +298,14 @@ def _parquet(path: Path, needed: Sequence[str]) -> Columns:
     return {name: table.column(name).to_pylist() for name in needed}
 
 
-def _check_columns(path: Path, header: Sequence[str], needed: Sequence[str]) -> None:
+def _check_columns(source: Path | str, header: Sequence[str], needed: Sequence[str]) -> None:
     if missing := [name for name in needed if name not in header]:
-        raise TableError(f"{path}: no column {', '.join(missing)}; it has {', '.join(header) or 'none'}")
+        raise TableError(f"{source}: no column {', '.join(missing)}; it has {', '.join(header) or 'none'}")
     if twice := [name for name in needed if header.count(name) > 1]:
-        raise TableError(f"{path}: two columns are named {', '.join(twice)}")
+        raise TableError(f"{source}: two columns are named {', '.join(twice)}")
 
 
-def _chosen(path: Path, columns: Columns, where: Mapping[str, Any]) -> list[int]:
+def _chosen(columns: Columns, where: Mapping[str, Any]) -> list[int]:
     """Numbers of the rows that `where` asks for."""
     n = len(next(iter(columns.values())))
     return [i for i in range(n) if all(_equal(columns[name][i], wanted) for name, wanted in where.items())]
@@ -290,13 +320,13 @@ def _equal(cell: Any, wanted: Any) -> bool:
         return False
 
 
-def _numbers(path: Path, columns: Columns, column: Column, rows: Sequence[int]) -> Array:
+def _numbers(source: str, columns: Columns, column: Column, rows: Sequence[int]) -> Array:
     """A column's numbers in SI at these rows, nan where missing."""
     cells = columns[column.column]
-    return np.array([_number(path, column.column, row, cells[row]) for row in rows]) * column.factor
+    return np.array([_number(source, column.column, row, cells[row]) for row in rows]) * column.factor
 
 
-def _number(path: Path, column: str, row: int, cell: Any) -> float:
+def _number(source: str, column: str, row: int, cell: Any) -> float:
     if cell is None or str(cell).strip().lower() in MISSING_CELLS:
         return math.nan
     try:
@@ -304,5 +334,5 @@ def _number(path: Path, column: str, row: int, cell: Any) -> float:
     except (TypeError, ValueError):
         value = math.inf
     if not math.isfinite(value):
-        raise TableError(f"{path}: row {row + 1}, column {column}: {cell!r} is not a number")
+        raise TableError(f"{source}: row {row + 1}, column {column}: {cell!r} is not a number")
     return value

@@ -45,7 +45,7 @@ from soilbus.estimation.posterior import Estimate, Posterior, SoilPrior
 from soilbus.estimation.soil_classes import SoilClasses, guessed
 from soilbus.estimation.tracker import MIN_ROWS, Settings, Tracker, TrackerOutput, TrackerState
 from soilbus.estimation.window import Rig, Window
-from soilbus.pipeline.excitation import excitation_of, load_change
+from soilbus.pipeline.excitation import excitation_of
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.model_gap import GapWatch, squares
 from soilbus.pipeline.result import WindowResult, as_of
@@ -360,8 +360,6 @@ class WindowEstimator:
             "load_range": bearing.std > self._settings.max_bearing_std * bearing.value,
             "slip_range": tan_phi.std > self._settings.max_tan_phi_std * tan_phi.value,
         }
-        if self.rig.lengths is not None and load_change(task.window) < self._settings.min_track_load_change:
-            lacking["load_range"] = True
         if any(lacking.values()):
             return Status.NOT_EXCITED, " ".join(
                 ["not_excited", *(name for name, is_lacking in lacking.items() if is_lacking)]

@@ -41,16 +41,6 @@ def excitation_of(window: Window, rig: Rig, min_speed: float) -> Excitation:
     return Excitation(*_spread(window.draft, window.variance["draft"]), *_spread(mean, variance))
 
 
-def load_change(window: Window) -> float:
-    """Relative standard deviation of the loads over a window, beyond their noise; the largest of all wheels."""
-    load, variance = window.load, window.variance["load"]
-    known = (np.isfinite(load) & np.isfinite(variance)).all(axis=1)
-    if np.count_nonzero(known) < 2:
-        return 0.0
-    of_load = load[known].var(axis=0, ddof=1) - variance[known].mean(axis=0)
-    return float(np.max(np.sqrt(np.maximum(of_load, 0.0)) / np.abs(load[known].mean(axis=0))))
-
-
 def _spread(value: Array, variance: Array) -> tuple[float | None, float | None]:
     known = np.isfinite(value) & np.isfinite(variance)
     if np.count_nonzero(known) < 2:

@@ -103,8 +103,8 @@ def _measured(config: Config) -> Iterator[str]:
 def survey_report(found: Survey) -> str:
     """Received values of every mapped signal beside the configuration, and what the recording cannot show."""
     rows = [_heard_row(seen, found) for seen in found.seen]
-    text = "\n" + table(("role", "values", "every", "from", "to", "refused", "beside the configuration"), rows)
-    return text + "".join(f"cannot be decided: {line}\n" for line in found.open)
+    head = ("role", "values", "every", "from", "median", "to", "unit", "refused", "beside the configuration")
+    return "\n" + table(head, rows) + "".join(f"cannot be decided: {line}\n" for line in found.open)
 
 
 def _heard_row(seen: Seen, found: Survey) -> tuple[str, ...]:
@@ -117,7 +117,9 @@ def _heard_row(seen: Seen, found: Survey) -> tuple[str, ...]:
         str(seen.count),
         f"{1e3 / seen.rate:.0f} ms" if math.isfinite(seen.rate) else "-",
         f"{seen.low:.4g}" if seen.count else "-",
+        f"{seen.median:.4g}" if seen.count else "-",
         f"{seen.high:.4g}" if seen.count else "-",
+        seen.unit,
         str(sum(seen.refused.values())),
         status,
     )

@@ -1,17 +1,21 @@
-"""A diagnosis as a self-contained HTML page; needs matplotlib (extra: plots)."""
+"""A diagnosis as a self-contained HTML page; needs jinja2 and matplotlib (extra: plots)."""
 
 from __future__ import annotations
 
-import html
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from soilbus.arrays import Array
-from soilbus.diagnosis.fitted_model import FittedModel
-from soilbus.diagnosis.verdict import FALL_REQUIRED_ALONE, FALL_REQUIRED_BESIDE
+from soilbus.diagnosis.verdict import FALL_REQUIRED_ALONE, FALL_REQUIRED_BESIDE, Verdict
 from soilbus.offline.diagnose import Findings
+from soilbus.report.diagnosis_pictures import (
+    BINS,
+    agreement_pictures,
+    agreements,
+    draft_picture,
+    gap_picture,
+    residual_picture,
+)
 from soilbus.report.findings import (
     admission_line,
     chance_text,
@@ -22,138 +26,165 @@ from soilbus.report.findings import (
     size_text,
     soil_rows,
 )
-from soilbus.report.page import html_table, page, picture
-from soilbus.report.statement import doubt, shown_lines, statement, why_probabilities
+from soilbus.report.next_drive import hope_of
+from soilbus.report.page import Picture, Source, Table, page
+from soilbus.report.statement import (
+    doubt,
+    headline,
+    plain_gap,
+    shown_lines,
+    statement,
+    to_tell_apart,
+    why_probabilities,
+)
 
-REGRESSORS = ("slip", "load of a wheel, kN", "time, s")
-"""Columns of the pictures."""
-MAX_POINTS = 3000
-"""Residuals of a channel that a picture shows; the means are of all."""
-BINS = 12
-"""Equally filled bins of a picture's means."""
-PLOT_RANGE_SD = 5.0
-"""Standard deviations that a picture shows."""
 
+def diagnosis_report(findings: Findings, source: Source, model_out: Path | None = None) -> str:
+    """The whole page: verdict and pictures first, then soil, what to do next, and the statistics folded away.
 
-def diagnosis_report(findings: Findings) -> str:
-    """The whole page: verdict, effects, candidates, places, residuals and soil before and after."""
+    Parameters
+    ----------
+    findings
+        The diagnosis.
+    source
+        Configuration and logs.
+    model_out
+        Where the completed model was written to; None where it was not.
+    """
     diagnosis = findings.diagnosis
+    added = diagnosis.completed is not diagnosis.base
+    channels = agreements(diagnosis.base, diagnosis.completed)
+    pictures = [pair for channel in channels for pair in agreement_pictures(channel, added)]
+    sums = list(_sums(findings))
+    lead = 2 if added else 1
     return page(
-        "soilbus diagnose",
-        ", ".join(record.name for record in findings.recordings.records),
-        f"<p><b>{diagnosis.verdict}</b>: {html.escape(statement(diagnosis))}</p>",
-        *(f"<p>{html.escape(line)}</p>" for line in filter(None, [doubt(diagnosis)])),
-        f"<p>{html.escape(gap_line(findings))}</p>",
-        *(f"<p>{html.escape(line)}</p>" for line in shown_lines(diagnosis, findings.config)),
-        *_effects(findings),
-        *_candidates(findings),
-        "<h2>Where model and data disagreed</h2>",
-        _places(findings),
-        "<h2>Residuals of the held-out blocks</h2>",
-        "<p>Each residual given the others of its instant, in standard deviations of the whole noise. "
-        f"Lines: means over {BINS} equally filled bins; where nothing is missing they stay near 0.</p>",
-        *_pictures(findings),
-        *_residual_terms(findings),
-        "<h2>Soil</h2>",
-        *_soils(findings),
-        f"<p>{html.escape(admission_line(findings))}</p>",
+        "diagnosis.html",
+        source,
+        verdict=str(diagnosis.verdict),
+        headline=headline(diagnosis),
+        statement=statement(diagnosis),
+        doubt=doubt(diagnosis),
+        consequence=_consequence(findings),
+        plain_gap=plain_gap(diagnosis),
+        pair=pictures[:2] if added else [*pictures[:1], *sums[:1]],
+        added=added,
+        sums=sums if added else sums[1:],
+        pictures=pictures[lead:],
+        effects=list(_effects(findings)),
+        shown=list(shown_lines(diagnosis, findings.config)),
+        steps=list(_steps(findings, source, model_out)),
+        soils=list(_soils(findings)),
+        gap_line=gap_line(findings),
+        candidates=list(_candidates(findings)),
+        places=_places(findings),
+        no_places=place_lines(findings)[0],
+        residual_terms="\n".join(residual_lines(diagnosis.residual_terms)) if diagnosis.residual_terms else "",
+        residuals=_residuals(findings),
+        bins=BINS,
+        admission=admission_line(findings),
     )
 
 
-def _effects(findings: Findings) -> Iterator[str]:
+def _sums(findings: Findings) -> Iterator[tuple[str, Picture]]:
+    """Caption and picture of the gaps, and of the largest draft."""
+    diagnosis = findings.diagnosis
+    gaps = gap_picture(diagnosis.base, diagnosis.completed)
+    yield "How far each channel is from the model: 1 is as near as the sensors’ noise allows.", gaps
+    drafts = draft_picture(findings)
+    if drafts is not None:
+        yield "Largest steady draft on the level, by the soil of each recording.", drafts
+
+
+def _consequence(findings: Findings) -> str:
+    """What the effects change of the soil and the largest draft of the first recording."""
+    if findings.diagnosis.completed is findings.diagnosis.base:
+        return ""
+    settings = findings.config.estimator
+    name, before, after = findings.soils()[0]
+    pressures = [p.bearing_pressure(settings.z_ref, settings.b_ref).value / 1e3 for p in (before, after)]
+    of = f" of {name}" if len(findings.soils()) > 1 else ""
+    it = "it" if len(findings.diagnosis.additions) == 1 else "them"
+    text = f"With {it} the bearing pressure{of} is {pressures[1]:.3g} kPa, not {pressures[0]:.3g}"
+    _, draft_before, draft_after = findings.largest_drafts()[0]
+    if draft_before is not None and draft_after is not None:
+        text += f"; the largest draft {draft_after.value / 1e3:.2f} kN, not {draft_before.value / 1e3:.2f}"
+    return text + "."
+
+
+def _soils(findings: Findings) -> Iterator[tuple[str, Table]]:
+    """Name and table of each recording's soil: before and after, or one column where nothing was added."""
+    added = findings.diagnosis.completed is not findings.diagnosis.base
+    head = ("", "before", "after") if added else ("", "value")
+    for name, before, after in findings.soils():
+        rows = soil_rows(before, after, findings.config)
+        yield name, Table(head, [[cell.replace("+-", "±") for cell in row[: len(head)]] for row in rows])
+
+
+def _effects(findings: Findings) -> Iterator[dict[str, Any]]:
+    """Name, physics, how sure, and all figures of each effect added."""
     for number, addition in enumerate(findings.diagnosis.additions, 1):
+        others = ", ".join(f"{name} {_per_cent(p)}" for name, p in addition.alternatives.items())
         lines = effect_lines(number, addition, findings.diagnosis.completed)
-        source = f"   source: {addition.effect.source}"
-        yield f"<pre>{html.escape(chr(10).join([*lines, source]))}</pre>"
+        yield {
+            "name": addition.effect.name,
+            "physics": addition.effect.physics,
+            "sure": _per_cent(addition.probability) + (f"; else {others}" if others else ""),
+            "lines": "\n".join([*lines, f"   source: {addition.effect.source}"]),
+        }
 
 
-def _candidates(findings: Findings) -> Iterator[str]:
-    """A table for each round that added an effect."""
+def _per_cent(probability: float) -> str:
+    return "over 99 %" if probability > 0.99 else f"{100.0 * probability:.0f} %"
+
+
+def _steps(findings: Findings, source: Source, model_out: Path | None) -> Iterator[tuple[str, str, list[str]]]:
+    """What to do next: a sentence, a command that does it or nothing, and more lines."""
+    diagnosis = findings.diagnosis
+    if diagnosis.additions and model_out is None:
+        yield "Write a configuration that has what was found:", f"{source.command('diagnose')} --model-out new.toml", []
+    if diagnosis.additions:
+        file = "new.toml" if model_out is None else str(model_out)
+        command = f"{source.command('replay', file)} --report replay.html"
+        yield "See what the service makes of the recording with it:", command, []
+    if diagnosis.verdict is Verdict.UNKNOWN:
+        yield "Check mass, radii, gear ratios, signs and mounting of the channels that disagree most.", "", []
+    if diagnosis.verdict is Verdict.NONE:
+        yield "Nothing is to be added. Smaller effects show in longer recordings that vary the load more.", "", []
+    for sentence, lines in to_tell_apart(diagnosis):
+        yield sentence, "", lines
+    if findings.plan is not None:
+        command = f"{source.command('diagnose')} --manoeuvre-out drive.json"
+        sentence = f"Drive for {findings.plan.manoeuvre.duration:.0f} s what decides between these best:"
+        yield sentence, command, [findings.plan.manoeuvre.words, hope_of(findings.plan)]
+    if not any(check.problem.with_sinkage for check in diagnosis.base.checks) and source.config.table is None:
+        yield "Map a sinkage sensor (wheel.sinkage) if there is one: it tells many effects apart.", "", []
+
+
+def _candidates(findings: Findings) -> Iterator[tuple[int, Table, str]]:
+    """Number, table and words of each round that added an effect."""
     for number, addition in enumerate(findings.diagnosis.additions, 1):
         chances = {addition.effect.name: addition.probability} | addition.alternatives
         rows = [
             (name, f"{fall:.1f}", f"{chances[name]:.3f}" if name in chances else "-")
             for name, fall in sorted(addition.falls.items(), key=lambda item: -item[1])
         ]
-        yield f"<h2>Candidates for effect {number}</h2>"
-        yield html_table(("effect", "fall of -2 log evidence", "probability"), rows)
         why = why_probabilities(addition)
         least = FALL_REQUIRED_BESIDE if addition.beside else FALL_REQUIRED_ALONE
-        yield f"<p>An effect is added from a fall of {least:g} on." + (f" {html.escape(why)}.</p>" if why else "</p>")
+        words = f"An effect is added from a fall of {least:g} on." + (f" {why}." if why else "")
+        yield number, Table(("effect", "fall of -2 log evidence", "probability"), rows, frozenset({1, 2})), words
 
 
-def _places(findings: Findings) -> str:
-    where = findings.diagnosis.where
-    if not where:
-        return f"<p>{html.escape(place_lines(findings)[0])}</p>"
-    rows = [(p.channel, p.wheel or "-", p.region, size_text(p), chance_text(p.significance)) for p in where]
-    return html_table(("channel", "wheel", "region", "size", "chance that noise does it"), rows)
+def _places(findings: Findings) -> Table | None:
+    rows = [
+        (p.channel, p.wheel or "-", p.region, size_text(p), chance_text(p.significance))
+        for p in findings.diagnosis.where
+    ]
+    return Table(("channel", "wheel", "region", "size", "chance that noise does it"), rows) if rows else None
 
 
-def _residual_terms(findings: Findings) -> Iterator[str]:
-    if findings.diagnosis.residual_terms:
-        yield "<h2>What is left, described</h2>"
-        yield f"<pre>{html.escape(chr(10).join(residual_lines(findings.diagnosis.residual_terms)))}</pre>"
-
-
-def _soils(findings: Findings) -> Iterator[str]:
-    for name, before, after in findings.soils():
-        yield f"<h3>{html.escape(name)}</h3>"
-        yield html_table(("", "before", "after"), soil_rows(before, after, findings.config))
-
-
-def _pictures(findings: Findings) -> Iterator[str]:
-    base, completed = findings.diagnosis.base, findings.diagnosis.completed
-    before, after = findings.diagnosis.gap_before, findings.diagnosis.gap_after
-    yield picture(_residuals(base, f"before: gap {before.value:.3f}"), "residuals before")
-    if completed is not base:
-        yield picture(_residuals(completed, f"after: gap {after.value:.3f}"), "residuals after")
-
-
-def _residuals(fitted: FittedModel, title: str) -> Any:
-    """Standardised residuals by channel (rows) over slip, load and time (columns); a colour for each wheel."""
-    from matplotlib.figure import Figure
-
-    clouds = _clouds(fitted)
-    figure = Figure(figsize=(10, 2.4 * len(clouds)), layout="constrained")
-    figure.suptitle(title)
-    axes: Any = figure.subplots(len(clouds), len(REGRESSORS), sharey=True, sharex="col", squeeze=False)
-    for row, (channel, of_wheels) in zip(axes, clouds.items(), strict=True):
-        for wheel, table in of_wheels.items():
-            for i, axis in enumerate(row):
-                _cloud(axis, table[:, i], table[:, -1], wheel)
-        row[0].set_ylabel(f"{channel}, σ")
-        row[0].set_ylim(-PLOT_RANGE_SD, PLOT_RANGE_SD)
-        if len(of_wheels) > 1:
-            row[-1].legend(ncols=4, fontsize="x-small")
-    for axis, name in zip(axes[-1], REGRESSORS, strict=True):
-        axis.set_xlabel(name)
-    return figure
-
-
-def _cloud(axis: Any, x: Array, z: Array, label: str) -> None:
-    step = max(len(x) // MAX_POINTS, 1)
-    colour = axis.plot(x[::step], z[::step], ".", ms=2, alpha=0.3)[0].get_color()
-    parts = np.array_split(np.argsort(x, kind="stable"), BINS)
-    means = np.array([(x[part].mean(), z[part].mean()) for part in parts if len(part)]).reshape(-1, 2)
-    axis.plot(*means.T, "-", color=colour, label=label)
-    axis.axhline(0.0, color="grey", lw=0.5)
-
-
-def _clouds(fitted: FittedModel) -> dict[str, dict[str, Array]]:
-    """Columns slip, load [kN], time [s], residual (M, 4) of the held-out blocks by channel and wheel."""
-    found: dict[str, dict[str, list[Array]]] = {}
-    for check, fit in zip(fitted.checks, fitted.fits, strict=True):
-        problem, latents = check.problem, check.latents
-        z, _ = problem.standardised(check.at, fit.gains)
-        slip = 1.0 - latents.ground_speed[:, None] / (problem.rig.radius * latents.speed)
-        wheels = list(problem.rig.wheels)
-        for i, (channel, wheel) in enumerate(problem.row_channels):
-            one = wheels.index(wheel) if wheel else None
-            of_slip, of_load = (
-                (slip.mean(1), latents.load.mean(1)) if one is None else (slip[:, one], latents.load[:, one])
-            )
-            table = np.column_stack([of_slip, of_load / 1e3, problem.since, z[:, i]])[np.isfinite(z[:, i])]
-            found.setdefault(channel, {}).setdefault(wheel, []).append(table)
-    tables = {c: {w: np.concatenate(t) for w, t in of_wheels.items()} for c, of_wheels in found.items()}
-    return {c: known for c, of_wheels in tables.items() if (known := {w: t for w, t in of_wheels.items() if len(t)})}
+def _residuals(findings: Findings) -> list[Picture]:
+    diagnosis = findings.diagnosis
+    shown = [residual_picture(diagnosis.base, f"before: gap {diagnosis.gap_before.value:.3f}")]
+    if diagnosis.completed is not diagnosis.base:
+        shown.append(residual_picture(diagnosis.completed, f"after: gap {diagnosis.gap_after.value:.3f}"))
+    return shown

@@ -9,7 +9,6 @@ before and after, and the soil of each recording before and after.  The sentence
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -22,6 +21,8 @@ from soilbus.diagnosis.where import Disagreement
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.offline.diagnose import Findings
 from soilbus.pipeline.outputs import known
+from soilbus.report.next_drive import plan_lines
+from soilbus.report.soil_prior import SHOWN
 from soilbus.report.statement import (
     doubt,
     is_open,
@@ -42,10 +43,12 @@ UNITS = {"torque": "N m", "draft": "N", "sinkage": "m"}
 
 
 def findings_json(findings: Findings) -> str:
-    """All findings as one JSON object, with null for numbers that are not finite.
+    """All findings as one JSON object (docs/json.md), with null for numbers that are not finite."""
+    return json.dumps(findings_record(findings), indent=1, allow_nan=False) + "\n"
 
-    Its keys are listed in DESIGN.md.
-    """
+
+def findings_record(findings: Findings) -> dict[str, Any]:
+    """The same as nested dicts and lists, None for numbers that are not finite."""
     diagnosis, recordings = findings.diagnosis, findings.recordings
     soils = [
         {"log": name, "before": _soil(b, findings), "after": _soil(a, findings)} for name, b, a in findings.soils()
@@ -69,6 +72,7 @@ def findings_json(findings: Findings) -> str:
         "soil_after": soils[0]["after"],
         "soils": soils,
         "model": {name: _estimates(values) for name, values in findings.diagnosis.completed.parameters().items()},
+        "manoeuvre": None if findings.plan is None else findings.plan.as_json(),
         "learned": [_residual_terms(description) for description in diagnosis.residual_terms],
         "warning": WARNING if diagnosis.residual_terms else None,
         "samples": recordings.samples,
@@ -76,7 +80,8 @@ def findings_json(findings: Findings) -> str:
         "too_short": list(recordings.too_short),
         "seconds": round(findings.seconds, 3),
     }
-    return json.dumps(known(document), indent=1, allow_nan=False) + "\n"
+    record: dict[str, Any] = known(document)
+    return record
 
 
 def _shown(findings: Findings) -> dict[str, Any]:
@@ -162,6 +167,8 @@ def findings_text(findings: Findings) -> str:
     lines += shown_lines(diagnosis, findings.config)
     for number, addition in enumerate(diagnosis.additions, 1):
         lines += ["", *effect_lines(number, addition, findings.diagnosis.completed)]
+    if findings.plan is not None:
+        lines += ["", *plan_lines(findings.plan)]
     if diagnosis.residual_terms:
         lines += ["", "what is left, described:", *(f"  {line}" for line in residual_lines(diagnosis.residual_terms))]
     lines += ["", *_soil_lines(findings), "", admission_line(findings)]
@@ -249,11 +256,9 @@ def soil_rows(before: Posterior, after: Posterior, config: Config) -> list[tuple
     """Name and unit, value and std before and after, of the bearing pressure and each soil parameter."""
     z_ref, b_ref = config.estimator.z_ref, config.estimator.b_ref
     both = [{"bearing pressure, kPa": _scaled(p.bearing_pressure(z_ref, b_ref), 1e3)} for p in (before, after)]
-    units = {"k_c": ("kN/m^(n+1)", 1e3), "k_phi": ("kN/m^(n+2)", 1e3), "n": ("", 1.0)}
-    units |= {"phi": ("deg", math.pi / 180.0), "c": ("kPa", 1e3), "K": ("mm", 1e-3)}
     for row, posterior in zip(both, (before, after), strict=True):
         for name, estimate in posterior.parameters().items():
-            unit, size = units[name]
+            unit, size = SHOWN[name]
             row[f"{name}, {unit}".rstrip(", ")] = _scaled(estimate, size)
     return [(name, both[0][name], both[1][name]) for name in both[0]]
 

@@ -1,48 +1,188 @@
-"""The frame that all HTML pages share: head and style, tables, pictures inside the file.
+"""The frame that all HTML reports share: template, pictures inside the file, and what a report was made from.
 
-A page needs nothing but itself: pictures are PNG in base64, no script and no font is loaded.
+A report needs nothing but itself: pictures are PNG in base64, no script and no font is loaded, and a content security
+policy tells the browser to ask for nothing.  Needs jinja2 and matplotlib (extra: plots).
 """
 
 from __future__ import annotations
 
 import base64
-import html
+import hashlib
 import io
-from collections.abc import Iterable, Sequence
-from typing import Any
+import shlex
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import cache
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-STYLE = (
-    "body{font:15px system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem}"
-    "table{border-collapse:collapse;font-size:13px}td,th{padding:.15rem .6rem;border-bottom:1px solid #ddd;"
-    "text-align:left}img{max-width:100%}pre{background:#f6f6f6;padding:1rem;white-space:pre-wrap}"
+from soilbus import __version__
+from soilbus.config.file import MAX_FILE_BYTES
+from soilbus.config.model import Config, Wheel
+from soilbus.files import read_bounded
+from soilbus.offline.replay import log_names
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+TEMPLATES = Path(__file__).with_name("templates")
+WIDTH = 5.6
+"""Width [inch] of a picture: two fill a page of 70 rem; type of 11 points in it is 10 pixels high on a telephone."""
+DPI = 160
+"""Pixels per inch of a picture: sharp on screens of 1.5 pixels per CSS pixel and in print."""
+STYLE = {
+    "font.size": 11, "axes.titlesize": 11, "axes.spines.top": False, "axes.spines.right": False,
+    "axes.grid": True, "grid.color": "0.9", "axes.axisbelow": True, "legend.fontsize": 9.5, "legend.framealpha": 0.9,
+    "hatch.linewidth": 0.8,
+}  # fmt: skip
+DIGEST_DIGITS = 16
+"""Hexadecimal digits of a configuration's SHA-256 that a report shows."""
+CITATION = (
+    "the soilbus authors. soilbus: soil parameters of tractors estimated from their CAN bus (version {version}). "
+    "The method follows Xi et al., Estimation of Soil Characteristic Parameters for Electric Mountain Tractor Based on "
+    "Gauss–Newton Iteration Method. World Electric Vehicle Journal 15(5), 217, 2024. doi:10.3390/wevj15050217"
 )
+"""CITATION.cff as a sentence."""
 
 
-def page(title: str, heading: str, *parts: str) -> str:
+class Picture(NamedTuple):
+    """A picture: what it shows in words, for whoever cannot see it, and PNG in base64."""
+
+    words: str
+    png: str
+
+
+class Table(NamedTuple):
+    """A table of plain texts; `numbers` are the columns to be aligned to the right."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    numbers: frozenset[int] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """What a report was made from.
+
+    Attributes
+    ----------
+    config
+        The vehicle and the settings.
+    file
+        The configuration's file; None for one that is in no file.
+    overrides
+        KEY=VALUE that were in force over it.
+    logs
+        The recordings.
+    made
+        When.
+    """
+
+    config: Config
+    file: Path | None = None
+    overrides: Sequence[str] = ()
+    logs: Sequence[Path] = ()
+    made: datetime = field(default_factory=lambda: datetime.now(UTC))
+
+    @property
+    def names(self) -> list[str]:
+        """Of the recordings, as short as tells them apart."""
+        return log_names(self.logs)
+
+    def rows(self) -> Iterator[tuple[str, str]]:
+        """Name and text of each line of a report's foot."""
+        yield "soilbus", f"version {__version__}"
+        yield "Recordings", ", ".join(self.names)
+        yield "Configuration", self._configuration()
+        yield from _vehicle_rows(self.config)
+        yield "Made", f"{self.made:%Y-%m-%d %H:%M} {self.made.tzname() or ''}".strip()
+        yield "How to cite", CITATION.format(version=__version__)
+
+    def command(self, name: str, file: Path | str | None = None) -> str:
+        """A command over the same logs, to be typed: with another configuration, else with the same."""
+        overrides = [] if file else [word for override in self.overrides for word in ("--set", override)]
+        return shlex.join(
+            ["soilbus", name, "--config", str(file or self.file or "FILE"), *overrides, *map(str, self.logs)]
+        )
+
+    def _configuration(self) -> str:
+        if self.file is None:
+            return "of the reference tractor"
+        try:
+            digest = hashlib.sha256(read_bounded(self.file, MAX_FILE_BYTES)).hexdigest()[:DIGEST_DIGITS]
+            text = f"{self.file.name} (SHA-256 {digest}…)"
+        except OSError:  # a pipe has been read already
+            text = self.file.name
+        return text + (f", with {', '.join(self.overrides)}" if self.overrides else "")
+
+
+def _vehicle_rows(config: Config) -> Iterator[tuple[str, str]]:
+    vehicle = config.vehicle
+    if vehicle is not None:
+        mass = f"{vehicle.mass:g} kg" + (f" ± {vehicle.mass_std:g} kg" if vehicle.mass_std else "")
+        yield (
+            "Vehicle",
+            (
+                f"{mass}, wheelbase {vehicle.wheelbase:g} m, centre of gravity {vehicle.cg_ahead_of_rear_axle:g} m "
+                f"ahead of the rear axle and {vehicle.cg_height:g} m high, hitch {vehicle.hitch_height:g} m high"
+            ),
+        )
+    alike = groupby(config.wheel, _wheel_text)
+    yield "Wheels", "; ".join(f"{', '.join(wheel.name for wheel in wheels)}: {text}" for text, wheels in alike)
+
+
+def _wheel_text(wheel: Wheel) -> str:
+    track = f", {wheel.contact_length:g} m of track on the ground" if wheel.contact_length else ""
+    return f"radius {wheel.radius:g} m, width {wheel.width:g} m{track}" + ("" if wheel.driven else ", not driven")
+
+
+def page(template: str, source: Source, **content: Any) -> str:
     """One page.
 
     Parameters
     ----------
-    title, heading
-        Plain text.
-    parts
-        HTML.
+    template
+        A file of the folder `templates`; it escapes every text.
+    source
+        What the page was made from, for its foot.
+    content
+        What the template asks for.
     """
-    return (
-        f"<!doctype html><html lang=en><meta charset=utf-8><title>{html.escape(title)}</title>"
-        f"<style>{STYLE}</style><h1>{html.escape(heading)}</h1>{''.join(parts)}</html>\n"
-    )
+    return _environment().get_template(template).render(source=source, **content) + "\n"
 
 
-def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table of plain texts."""
-    cells = "".join("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in rows)
-    return "<table><tr>" + "".join(f"<th>{html.escape(h)}</th>" for h in head) + f"</tr>{cells}</table>"
+@cache
+def _environment() -> Environment:
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    return Environment(
+        loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
 
 
-def picture(figure: Any, words: str) -> str:
-    """A matplotlib figure as an image inside the page; `words` say what it shows."""
+def picture(draw: Callable[[Any], None], height: float, words: str, width: float = WIDTH, dpi: int = DPI) -> Picture:
+    """A picture for a page.
+
+    Parameters
+    ----------
+    draw
+        Draws into an empty matplotlib figure.
+    height, width
+        [inch].
+    words
+        What it shows.
+    dpi
+        Pixels per inch.
+    """
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
     png = io.BytesIO()
-    figure.savefig(png, format="png", dpi=110)
-    data = base64.b64encode(png.getvalue()).decode()
-    return f"<img alt='{html.escape(words, quote=True)}' src='data:image/png;base64,{data}'>"
+    with mpl.rc_context(STYLE):  # type: ignore[arg-type]
+        figure = Figure(figsize=(width, height), layout="constrained")
+        draw(figure)
+        figure.savefig(png, format="png", dpi=dpi)
+    return Picture(words, base64.b64encode(png.getvalue()).decode())

@@ -17,8 +17,9 @@ from soilbus.diagnosis.detectable import Detectable
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.search import Addition
-from soilbus.diagnosis.verdict import P_LARGE_FORMULA_ERROR, Verdict, gap_limit
+from soilbus.diagnosis.verdict import NAMED_PROBABILITY, P_LARGE_FORMULA_ERROR, Verdict, gap_limit
 from soilbus.estimation.posterior import Posterior, bearing_pressure
+from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.vehicle import GRADE_BESIDE_PITCH
 from soilbus.terra.vehicle import GRAVITY
 
@@ -39,6 +40,49 @@ def statement(diagnosis: Diagnosis) -> str:
         limit = gap_limit(diagnosis.gap_after.rows)
         text += f"; something is left besides: the gap of {diagnosis.gap_after.value:.2f} is above {limit:.2f}"
     return text
+
+
+def headline(diagnosis: Diagnosis) -> str:
+    """The diagnosis in a few words: what is missing."""
+    names = [_named(addition) for addition in diagnosis.additions]
+    if diagnosis.verdict is Verdict.NONE:
+        return "No effect is found missing" if diagnosis.where else "Model and data agree"
+    if diagnosis.verdict is Verdict.UNKNOWN:
+        return " and ".join(["Missing: something that the catalogue does not have", *names])
+    return f"Missing from the model: {' and '.join(names)}"
+
+
+def _named(addition: Addition) -> str:
+    """The name of an effect, or of the first of a set, as in "grade, lugs or one of 2 others"."""
+    names = [addition.effect.name, *addition.alternatives]
+    if addition.probability >= NAMED_PROBABILITY or len(names) == 1:
+        return names[0]
+    if len(names) == 2:
+        return " or ".join(names)
+    others = names[2] if len(names) == 3 else f"one of {len(names) - 2} others"
+    return f"{names[0]}, {names[1]} or {others}"
+
+
+def plain_gap(diagnosis: Diagnosis) -> str:
+    """The gap before and after in words, as a multiple of the noise: the root of the reduced chi-square."""
+    before, after = math.sqrt(diagnosis.gap_before.value), math.sqrt(diagnosis.gap_after.value)
+    text = f"On readings that it was not fitted to, the model is off by {before:.2f} times the sensors’ noise"
+    if diagnosis.additions:
+        text += f", with {' and '.join(a.effect.name for a in diagnosis.additions)} by {after:.2f} times"
+    return f"{text} (noise alone makes 1)."
+
+
+def to_tell_apart(diagnosis: Diagnosis) -> Iterator[tuple[str, list[str]]]:
+    """What to drive or measure next: a sentence, and a line for each effect."""
+    sure = [addition.effect.name for addition in diagnosis.additions if not addition.alternatives]
+    if sure:
+        yield f"What would confirm {'it' if len(sure) == 1 else 'them'}:", [f"{n}: {CATALOGUE[n].tells}" for n in sure]
+    for addition in diagnosis.additions:
+        if addition.alternatives:
+            names = [addition.effect.name, *addition.alternatives]
+            yield "What would tell these apart:", [f"{name}: {CATALOGUE[name].tells}" for name in names]
+    if hidden := [found.effect for found in diagnosis.detectable if found.size is None]:
+        yield "What these recordings could not show, and what would:", [f"{e.name}: {e.tells}" for e in hidden]
 
 
 def _found(verdict: Verdict, names: Sequence[str], disagree: bool) -> str:

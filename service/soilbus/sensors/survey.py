@@ -27,7 +27,7 @@ from soilbus.arrays import Array, Mask
 from soilbus.can.admission import Admission
 from soilbus.can.channels import Channel, Reason
 from soilbus.can.dbc_files import checked_messages
-from soilbus.can.mapping import OPTIONAL_ROLES, POSITION_ROLES, channels_of
+from soilbus.can.mapping import LOCK, OPTIONAL_ROLES, POSITION_ROLES, channels_of
 from soilbus.can.units import SI, unit_of
 from soilbus.config.model import Config, ConfigError, Signal
 from soilbus.estimation.assembly import rig_of
@@ -35,14 +35,8 @@ from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.window import Rig, Window, forward, pairs, pull_given, turning
 from soilbus.sensors.bins import Bins
 from soilbus.sensors.consistency import change, implausible, median, resolution_of, without
+from soilbus.sensors.recorded import Columns, Frame, longest_part
 from soilbus.terra.vehicle import GRAVITY, axle_loads, slip_ratio
-
-Frame = tuple[float, int, bool, bytes | bytearray, bool, bool]
-
-BATCH_SIZE = 5000
-"""Number of frames that are decoded at a time."""
-LONGEST_SILENCE = 60.0
-"""Time [s] without a frame, or jump back, after which another part begins; the part with most samples is compared."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +68,9 @@ class Limits:
     """Slip exceeded in 95 % of a drive, from which the speeds are implausible."""
     wheel_apart: float = 0.15
     """Difference of one wheel's median slip from the median of all."""
+    free: float = 0.25
+    """Largest median slip, either way, of a wheel that rolls freely: wheels towed through soft soil skid by 0.1 to 0.2
+    (Wong 2008, ch. 4); simulated ones on loam by 0.02."""
     scale: tuple[float, float] = (0.6, 1.3)
     """Range of the regression slope of thrust on draft."""
     excited: float = 0.008
@@ -109,14 +106,20 @@ class Finding(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """One mapped signal: number of values, rate [1/s], range (SI), refused values by reason; nan without values."""
+    """One mapped signal: number of values, rate [1/s], range and median (SI), refused values by reason; nan without."""
 
     channel: Channel
     count: int
     rate: float
     low: float
     high: float
+    median: float
     refused: Mapping[Reason, int]
+
+    @property
+    def unit(self) -> str:
+        """SI unit of its values; "" of a code."""
+        return "" if self.channel.quantity == LOCK else SI.get(_dimension(self.channel), "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +149,7 @@ class Facts(NamedTuple):
     """A recording in N bins.
 
     raw, window: as measured, and turned forward; straight (N,): where the vehicle drives straight on; motor (N, W):
-    motor speeds [rad/s]; mapped: names of the mapped channels.
+    motor speeds [rad/s]; shaft: those of motors of axles (N,), by axle; mapped: names of the mapped channels.
     """
 
     config: Config
@@ -155,6 +158,7 @@ class Facts(NamedTuple):
     window: Window
     straight: Mask
     motor: Array
+    shaft: Mapping[str, Array]
     mapped: frozenset[str]
 
     @property
@@ -206,8 +210,7 @@ def survey(config: Config, database: Database, frames: Iterable[Frame], limits: 
     except ConfigError:  # of a speed that nobody mapped
         with_motors, channels = config, channels_of(config, database)
     admission = Admission(channels, database, checked_messages(config))
-    parts, refused, n = _decoded(admission, frames)
-    longest = max(parts, key=lambda part: sum(len(t) for t, _ in part.values()))
+    longest, refused, n = longest_part(admission, frames)
     seen = tuple(_seen(c, longest, refused) for c in channels if c.name in mapped)
     if not sum(admission.counts.received.values()):
         text = f"none of the {n} frames heard is of a mapped message: another bus or channel, or the wrong DBC?"
@@ -250,53 +253,12 @@ def _rotation(text: str | None) -> bool:
     return unit is not None and unit.dimension == "rotation"
 
 
-Columns = dict[str, tuple[Array, Array]]
-
-
-def _decoded(admission: Admission, frames: Iterable[Frame]) -> tuple[list[Columns], Counter[tuple[str, Reason]], int]:
-    """Samples by channel for each part of the recording with one clock, refusals, and the number of frames."""
-    pieces: list[list[Columns]] = [[]]
-    refused: Counter[tuple[str, Reason]] = Counter()
-    last, n, steps = math.nan, 0, 0
-
-    def take() -> None:
-        decoded = admission.take()
-        refused.update({key: len(t) for key, t in decoded.refused.items()})
-        pieces[-1].append({name: (c.t, c.value) for name, c in decoded.columns.items() if len(c.t)})
-
-    for t, identifier, extended, data, remote, error in frames:
-        n += 1
-        if error:
-            continue
-        if abs(t - last) > LONGEST_SILENCE:
-            take()
-            pieces.append([])
-        last = t
-        admission.feed(t, identifier, extended, data, remote)
-        if n % BATCH_SIZE == 0:
-            if admission.counts.clock_steps != steps:
-                steps = admission.counts.clock_steps
-                pieces.append([])
-            take()
-    take()
-    return [_joined(piece) for piece in pieces], refused, n
-
-
-def _joined(pieces: list[Columns]) -> Columns:
-    names = {name for piece in pieces for name in piece}
-    joined: Columns = {}
-    for name in names:
-        parts = [piece[name] for piece in pieces if name in piece]
-        joined[name] = (np.concatenate([t for t, _ in parts]), np.concatenate([v for _, v in parts]))
-    return joined
-
-
 def _seen(channel: Channel, heard: Columns, refused: Mapping[tuple[str, Reason], int]) -> Seen:
     t, value = heard.get(channel.name, (np.empty(0), np.empty(0)))
     rate = (len(t) - 1) / (t[-1] - t[0]) if len(t) > 1 and t[-1] > t[0] else math.nan
-    low, high = (float(value.min()), float(value.max())) if len(value) else (math.nan, math.nan)
+    low, middle, high = np.quantile(value, [0.0, 0.5, 1.0]).tolist() if len(value) else [math.nan] * 3
     why = {reason: n for (name, reason), n in refused.items() if name == channel.name}
-    return Seen(channel, len(t), float(rate), low, high, why)
+    return Seen(channel, len(t), float(rate), low, high, middle, why)
 
 
 def _facts(config: Config, mapped: Iterable[str], heard: Columns) -> Facts | None:
@@ -317,9 +279,13 @@ def _facts(config: Config, mapped: Iterable[str], heard: Columns) -> Facts | Non
     for i, wheel in enumerate(rig.wheels):
         if f"motor_speed.{wheel}" in heard:
             motor[:, i] = _binned(*heard[f"motor_speed.{wheel}"], start, bin_length, len(raw.t))
+    of_axles: dict[str, tuple[Array, Array]] = {
+        a.name: heard[f"speed.{a.name}"] for a in config.axle if f"speed.{a.name}" in heard
+    }
+    shaft = {name: _binned(*column, start, bin_length, len(raw.t)) for name, column in of_axles.items()}
     moving = np.abs(window.ground_speed) > config.estimator.min_speed
     straight = moving & ~turning(window, rig, config.estimator.max_turn)
-    return Facts(config, rig, raw, window, straight, motor, frozenset(mapped))
+    return Facts(config, rig, raw, window, straight, motor, shaft, frozenset(mapped))
 
 
 def _binned(t: Array, value: Array, start: float, bin_length: float, n: int) -> Array:
@@ -455,7 +421,7 @@ def _compared(
         ]
     findings: list[Finding] = []
     questions: list[str] = []
-    for check in (_weight, _directions, _gears, _slips, _balance, _levels, _sides, _yaw):
+    for check in (_weight, _directions, _gears, _axle_gears, _free_wheels, _slips, _balance, _levels, _sides, _yaw):
         try:
             found = list(check(facts, limits))
         except UndecidableError as reason:
@@ -494,6 +460,15 @@ def _weight(facts: Facts, limits: Limits) -> Iterator[Finding]:
     draft, acceleration = (np.where(np.isfinite(a), a, 0.0) for a in (window.draft, window.acceleration))
     due = [median(np.broadcast_to(a, window.t.shape)) for a in axle_loads(chassis, draft, pitch, acceleration)]
     has = [median(window.load[:, rig.front].sum(axis=1)), median(window.load[:, ~rig.front].sum(axis=1))]
+    if max(has) > (1.0 + limits.weight) * weight:
+        axle = "front" if has[0] > has[1] else "rear"
+        yield Finding(
+            f"the {axle} axle alone carries {max(has) / 1e3:.1f} kN, more than the weight of vehicle.mass ="
+            f" {chassis.mass:g} kg: mass, or unit or scale of the load?",
+            True,
+            names,
+        )
+        return
     if abs(has[0] - due[0]) > limits.axle * weight:
         swapped = abs(has[0] - due[1]) < limits.axle * weight
         yield Finding(
@@ -566,6 +541,42 @@ def _gears(facts: Facts, limits: Limits) -> Iterator[Finding]:
             True,
             (f"torque.{wheel}", f"motor_speed.{wheel}"),
         )
+
+
+def _axle_gears(facts: Facts, limits: Limits) -> Iterator[Finding]:
+    """The speed of an axle's motor against the mean of its wheels, which any differential keeps."""
+    for axle in facts.config.axle:
+        names = [w.name for w in facts.config.wheel if w.axle == axle.name and w.speed is not None]
+        own = [facts.rig.wheels.index(name) for name in names if name in facts.rig.wheels]
+        if axle.name not in facts.shaft or axle.motor_speed is None or len(own) != 2:
+            continue
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = median((facts.shaft[axle.name] / facts.raw.speed[:, own].mean(axis=1))[facts.straight])
+        channels = (f"torque.{axle.name}", f"speed.{axle.name}")
+        if ratio < 0.0:
+            text = f"axle.{axle.name}.motor_speed: turns backward while its wheels turn forward: sign = -1?"
+            yield Finding(text, True, channels)
+        elif math.isfinite(ratio) and abs(math.log(ratio)) > limits.gear:
+            yield Finding(
+                f"axle.{axle.name}.gear_ratio = {axle.gear_ratio:g}, but {axle.motor_speed.signal} turns"
+                f" {axle.gear_ratio * ratio:.4g} times as fast as the mean of its wheels: gear ratio, or unit or byte"
+                " order of one of the speeds?",
+                True,
+                channels,
+            )
+
+
+def _free_wheels(facts: Facts, limits: Limits) -> Iterator[Finding]:
+    """Rims of wheels that roll freely against the ground."""
+    for i, wheel in enumerate(facts.rig.wheels):
+        slip = median(facts.slip[:, i])
+        if not next(w for w in facts.config.wheel if w.name == wheel).driven and abs(slip) > limits.free:
+            yield Finding(
+                f"wheel.{wheel}: rolls freely, but its rim goes {1.0 / (1.0 - slip):.2f} times as fast as the ground:"
+                " radius, or unit of its speed or of the ground speed?",
+                True,
+                (f"speed.{wheel}",),
+            )
 
 
 def _slips(facts: Facts, limits: Limits) -> Iterator[Finding]:

@@ -8,12 +8,19 @@ solve these balances with the wheel-soil model and the drive line (simulator/equ
 A vehicle that never tows anything drives over the given slopes, or, where slip is prescribed, up and down slopes that
 take it. Turning is not modelled; a side slope only shifts load. Effects on forces take part in the balance; effects on
 sensors belong to simulator/sensors.py.
+
+`steps` drives a step of time after the other, each with the command of its beginning; `drive` is one step of the whole
+duration. Where nobody lifts the implement, what the wheels cannot give slows the vehicle down:
+
+    dv/dt = min(towards the wanted speed, (sum of drawbar pulls at the slip limit - draft - m g sin(pitch)) / m)
+    slip limit = 1 - v / (RIM_SPEED_RATIO max(wanted speed, v))    the rims turn no faster; at MAX_SLIP it is stuck
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -23,15 +30,35 @@ from soilbus.arrays import Array
 from soilbus.config.model import Config, Wheel
 from soilbus.estimation.assembly import UNKNOWN_SHARE, chassis_of, effects_of
 from soilbus.simulator.course import positions
-from soilbus.simulator.drivetrain import Drivetrain, drivetrain_of
-from soilbus.simulator.equilibrium import Equilibrium, Mechanics, Situation, sinkages, solve, surroundings, wheel_slips
-from soilbus.simulator.scenario import SAMPLE_RATE, Scenario, Swing, realise, soil_along, soil_names
+from soilbus.simulator.drivetrain import drivetrain_of
+from soilbus.simulator.equilibrium import (
+    MAX_SLIP,
+    Equilibrium,
+    Mechanics,
+    Situation,
+    sinkages,
+    solve,
+    surroundings,
+    wheel_slips,
+)
+from soilbus.simulator.scenario import SAMPLE_RATE, Scenario, Swing, Wave, oscillation, realise, soil_along, soil_names
 from soilbus.terra.effects.effect import Active, Surroundings
 from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads, pull_required
 from soilbus.terra.wheel import WheelModel
 
-_MASS_STREAM = 3
-"""Names the random numbers of the true mass, which disturb no others."""
+STEP = 0.1
+"""Length [s] of a step where the drive depends on what happened before."""
+LEAST_SPEED = 0.2
+"""Least ground speed [m/s] that can be wanted: the simulated vehicle drives, it does not park."""
+MAX_ACCELERATION = 0.5
+"""Greatest rate [m/s^2] at which the vehicle nears another wanted speed: a driver with an implement in the ground."""
+RIM_SPEED_RATIO = 3.0
+"""Speed of the rims over the wanted ground speed that the motors do not pass. How long bogging down takes hardly
+depends on it, as past a slip of 0.6 the pull changes little with slip."""
+_MASS_STREAM, _BOUNCE_STREAM = 3, 4
+"""Name the random numbers of the true mass and of bouncing wheels, which disturb no others."""
+_LARGEST_LOSS = 0.9
+"""Share of its load that a bouncing wheel loses at most: quasi-static wheels do not jump."""
 
 
 class SimulationError(Exception):
@@ -67,12 +94,64 @@ class Drive:
 
 
 @dataclass(frozen=True, slots=True)
+class Command:
+    """What the vehicle is told to do; where it says nothing the scenario holds.
+
+    Attributes
+    ----------
+    draft
+        Of the implement [N], as it is set: nobody lifts it.
+    speed
+        Ground speed [m/s].
+    torque_limit
+        At the wheel [N m], by wheel with a motor of its own.
+    """
+
+    draft: float | None = None
+    speed: float | None = None
+    torque_limit: Mapping[str, float] = field(default_factory=dict)
+
+
+NO_COMMAND = Command()
+
+
+@dataclass(frozen=True, slots=True)
 class _Motion:
     t: Array
     distance: Array
     speed: Array
     acceleration: Array
     pitch: Array
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """The scenario's waves over the whole duration, each (N,), and what does not change on the way.
+
+    deviation: each motor's slip beyond the common one (M, N); bounce: of the wheels' loads over these (W, N).
+    """
+
+    config: Config
+    scenario: Scenario
+    t: Array
+    speed: Wave
+    side: Array
+    demand: Array
+    slip_limit: Array
+    least_draft: Array
+    deviation: Array
+    bounce: Array
+    chassis: Chassis
+    mechanics: Mechanics
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where a step begins: speed [m/s], distance [m], both None as the scenario has them, and the last equilibrium."""
+
+    speed: float | None = None
+    distance: float | None = None
+    last: Equilibrium | None = None
 
 
 def drive(config: Config, scenario: Scenario, seed: int, effects: Sequence[Active] = ()) -> Drive:
@@ -98,37 +177,162 @@ def drive(config: Config, scenario: Scenario, seed: int, effects: Sequence[Activ
     ConfigError
         An effect cannot be.
     """
+    step = math.inf if scenario.lifted else STEP
+    return joined(list(steps(config, scenario, seed, effects, step)))
+
+
+def steps(
+    config: Config,
+    scenario: Scenario,
+    seed: int,
+    effects: Sequence[Active] = (),
+    step: float = STEP,
+    commanded: Callable[[float], Command] = lambda t: NO_COMMAND,
+) -> Iterator[Drive]:
+    """A drive, a step after the other; it ends with the scenario or where the vehicle has bogged down.
+
+    Parameters
+    ----------
+    config, scenario, seed, effects
+        As of `drive`.
+    step
+        Length of a step [s]; inf for one step.
+    commanded
+        Asked at the beginning of each step, with the time since the start [s]; it goes before the scenario.
+
+    Yields
+    ------
+    True values of each step; the last one says when it bogged down.
+
+    Raises
+    ------
+    SimulationError, KeyError, ConfigError
+        As `drive`.
+    """
+    plan = _plan(config, scenario, seed, (*effects_of(config), *effects))
+    n = len(plan.t) if math.isinf(step) else max(round(step * SAMPLE_RATE), 1)
+    place = _Place()
+    for first in range(0, len(plan.t), n):
+        part = slice(first, min(first + n, len(plan.t)))
+        done, place = _driven(plan, part, place, commanded(float(plan.t[first])))
+        if done.bogged_at is not None and first == 0 and len(done.columns["t"]) < 2:
+            soil = soil_names(scenario.soils, plan.speed.integral[:1])[0]
+            raise SimulationError(f"the tractor cannot drive on {soil}: no slip lets it move")
+        yield done
+        if done.bogged_at is not None:
+            return
+
+
+def joined(drives: Sequence[Drive]) -> Drive:
+    """One drive of several that follow one another."""
+    if len(drives) == 1:
+        return drives[0]
+    last = drives[-1]
+    columns = {name: np.concatenate([d.columns[name] for d in drives]) for name in last.columns}
+    around: Any = zip(*(d.surroundings for d in drives), strict=True)
+    whole: Any = (np.concatenate(a) if np.ndim(a[0]) > 1 else a[-1] for a in around)
+    return replace(last, columns=columns, surroundings=Surroundings(*whole))
+
+
+def latest(done: Drive, n: int) -> Drive:
+    """The last n instants of a drive."""
+    around: Any = done.surroundings
+    return replace(
+        done,
+        columns={name: column[-n:] for name, column in done.columns.items()},
+        surroundings=Surroundings(*(a[-n:] if np.ndim(a) > 1 else a for a in around)),
+    )
+
+
+def _plan(config: Config, scenario: Scenario, seed: int, effects: tuple[Active, ...]) -> _Plan:
     chassis = _chassis(config, scenario, seed)
-    present = (*effects_of(config), *effects)
     rng = np.random.default_rng(seed)
     t = np.arange(round(scenario.duration * SAMPLE_RATE)) / SAMPLE_RATE
     speed = realise(scenario.speed, t, rng)
-    knots = np.array(scenario.slope, float)
     climbs = _climbs(config, scenario)
-    pitch = np.zeros_like(t) if climbs else np.interp(speed.integral, knots[:, 0], knots[:, 1])
-    motion = _Motion(t, speed.integral, speed.value, speed.rate, pitch)
     drivetrain = drivetrain_of(config)
-    situation, side = _situation(config.wheel, chassis, scenario, motion, drivetrain, climbs, rng)
+    side = realise(scenario.side_shift, t, rng).value
+    demand, slip_limit, least = _driver(scenario, t, rng)
+    spread = Swing(-scenario.slip_spread, scenario.slip_spread)
+    deviation = np.stack([realise(spread, t, rng).value for _ in config.wheel])
+    deviation = np.where((drivetrain.leader < 0)[:, None], 0.0, deviation[drivetrain.leader])
+    bounce = _bounce(config.wheel, scenario, t, seed)
     rear = np.array([wheel.axle == "rear" for wheel in config.wheel])
-    model, length = WheelModel(shear_law=config.model.shear_law), float(motion.distance[-1])
-    mechanics = Mechanics(model, rear, chassis.mass, scenario.duration, length, drivetrain, present, climbs)
-    result = solve(_with_resisting_effects(situation, mechanics), mechanics)
-    stuck = np.flatnonzero(~result.found)
+    model = WheelModel(shear_law=config.model.shear_law, rollers=config.rollers)
+    length = float(speed.integral[-1])
+    mechanics = Mechanics(model, rear, chassis.mass, scenario.duration, length, drivetrain, effects, climbs)
+    return _Plan(config, scenario, t, speed, side, demand, slip_limit, least, deviation, bounce, chassis, mechanics)
+
+
+def _driven(plan: _Plan, part: slice, place: _Place, command: Command) -> tuple[Drive, _Place]:
+    """One step, and where the next one begins."""
+    draft = None if plan.mechanics.climbs else command.draft
+    lifted = draft is None and plan.scenario.lifted
+    wanted = None if command.speed is None else max(command.speed, LEAST_SPEED)
+    motion, end = _motion(plan, part, place, wanted, math.inf)
+    situation = _situation(plan, part, motion, draft, lifted, wanted, command.torque_limit)
+    result = solve(situation, plan.mechanics, place.last)
+    lacking = 0.0 if lifted else float(np.mean(situation.demand - result.draft))
+    if lacking > 1e-6 * plan.chassis.mass * GRAVITY:
+        possible = float(motion.acceleration.mean()) - lacking / plan.chassis.mass
+        motion, end = _motion(plan, part, place, wanted, possible)
+        situation = _situation(plan, part, motion, draft, lifted, wanted, command.torque_limit)
+        result = solve(situation, plan.mechanics, result)
+    lost = ~result.found if lifted else ~result.found | (situation.slip_limit >= MAX_SLIP)
+    stuck = np.flatnonzero(lost)
+    return _as_drive(plan, part, motion, situation, result, stuck), replace(end, last=result)
+
+
+def _motion(plan: _Plan, part: slice, place: _Place, wanted: float | None, possible: float) -> tuple[_Motion, _Place]:
+    """Motion in a step, and speed and distance at its end.
+
+    Parameters
+    ----------
+    wanted
+        Ground speed [m/s]; None as the scenario has it.
+    possible
+        Greatest acceleration [m/s^2] that the wheels can give; inf where that is no question.
+    """
+    t, planned = plan.t[part], Wave(*(a[part] for a in plan.speed))
+    begun = planned.value[0] if place.speed is None else place.speed
+    begin = planned.integral[0] if place.distance is None else place.distance
+    span = len(t) / SAMPLE_RATE
+    if wanted is None and place.speed is None and math.isinf(possible):
+        offset = 0.0 if place.distance is None else place.distance - float(plan.speed.integral[part.start])
+        motion = planned.value, planned.rate, planned.integral + offset
+        following = plan.speed.integral[part.stop] + offset if part.stop < len(plan.t) else None
+        end = _Place(None, None if place.distance is None or following is None else float(following))
+    else:
+        aim = float(plan.speed.value[min(part.stop, len(plan.t) - 1)]) if wanted is None else wanted
+        rate = min(np.clip((aim - begun) / span, -MAX_ACCELERATION, MAX_ACCELERATION), possible)
+        rate = max(rate, -begun / span)
+        since = t - t[0]
+        motion = begun + rate * since, np.full_like(t, rate), begin + begun * since + rate * since**2 / 2.0
+        speed = float(begun + rate * span)
+        follows = wanted is None and math.isclose(speed, aim)
+        end = _Place(None if follows else speed, float(begin + begun * span + rate * span**2 / 2.0))
+    speed_now, acceleration, distance = motion
+    knots = np.array(plan.scenario.slope, float)
+    pitch = np.zeros_like(t) if plan.mechanics.climbs else np.interp(distance, knots[:, 0], knots[:, 1])
+    return _Motion(t, distance, speed_now, acceleration, pitch), end
+
+
+def _as_drive(
+    plan: _Plan, part: slice, motion: _Motion, situation: Situation, result: Equilibrium, stuck: NDArray[np.intp]
+) -> Drive:
+    config, scenario, mechanics, t = plan.config, plan.scenario, plan.mechanics, motion.t
     end = int(stuck[0]) if len(stuck) else len(t)
-    if end < 2:
-        soil = soil_names(scenario.soils, motion.distance[:1])[0]
-        raise SimulationError(f"the tractor cannot drive on {soil}: no slip lets it move")
     columns = _columns(config.wheel, scenario, motion, situation, result, sinkages(situation, mechanics, result))
-    columns |= {"roll": _roll(config, side)}
-    if climbs:
-        columns |= {"pitch": np.arcsin(result.draft / (chassis.mass * GRAVITY)), "draft": np.zeros_like(t)}
+    columns |= {"roll": _roll(config, plan.side[part])}
+    if mechanics.climbs:
+        columns |= {"pitch": np.arcsin(result.draft / (plan.chassis.mass * GRAVITY)), "draft": np.zeros_like(t)}
     around: tuple[Any, ...] = surroundings(situation, mechanics, wheel_slips(situation, result), result.draft)
     return Drive(
         {name: column[:end] for name, column in columns.items()},
         float(t[end]) if len(stuck) else None,
-        present,
+        tuple(mechanics.effects),
         Surroundings(*(a if np.ndim(a) < 2 else a[:end] for a in around)),
-        chassis,
+        plan.chassis,
     )
 
 
@@ -165,9 +369,24 @@ def _chassis(config: Config, scenario: Scenario, seed: int) -> Chassis:
     usual = UNKNOWN_SHARE if any(wheel.load is None for wheel in config.wheel) else 0.0
     mass_std = usual * vehicle.mass if vehicle.mass_std is None else vehicle.mass_std
     cg_std = usual * vehicle.wheelbase if vehicle.cg_std is None else vehicle.cg_std
-    drawn = np.random.default_rng([seed, _MASS_STREAM]).standard_normal(2) * (mass_std, cg_std)
+    of_vehicle = seed if scenario.vehicle_seed is None else scenario.vehicle_seed
+    drawn = np.random.default_rng([of_vehicle, _MASS_STREAM]).standard_normal(2) * (mass_std, cg_std)
     ahead = np.clip(chassis.cg_ahead_of_rear_axle + drawn[1], 0.0, chassis.wheelbase)
     return replace(chassis, mass=chassis.mass + float(drawn[0]), cg_ahead_of_rear_axle=float(ahead))
+
+
+def _bounce(wheels: Sequence[Wheel], scenario: Scenario, t: Array, seed: int) -> Array:
+    """What bounce and roll of each axle add to the loads of its wheels (W, N), over these."""
+    if not scenario.bounce:
+        return np.zeros((len(wheels), len(t)))
+    rng = np.random.default_rng([seed, _BOUNCE_STREAM])
+    modes = {axle: (oscillation(t, rng), oscillation(t, rng)) for axle in ("front", "rear")}
+    of_wheels = []
+    for wheel in wheels:
+        up, roll = modes[str(wheel.axle)]
+        mates = [w.name for w in wheels if w.axle == wheel.axle]
+        of_wheels.append(up + (roll if mates.index(wheel.name) < len(mates) / 2.0 else -roll))
+    return np.asarray(np.maximum(scenario.bounce * np.sqrt(0.5) * np.stack(of_wheels), -_LARGEST_LOSS))
 
 
 def _roll(config: Config, side: Array) -> Array:
@@ -179,18 +398,31 @@ def _roll(config: Config, side: Array) -> Array:
 
 
 def _situation(
-    wheels: list[Wheel],
-    chassis: Chassis,
-    scenario: Scenario,
+    plan: _Plan,
+    part: slice,
     motion: _Motion,
-    drivetrain: Drivetrain,
-    climbs: bool,
-    rng: np.random.Generator,
-) -> tuple[Situation, Array]:
-    """What is given, and the share (N,) of its axle's load that a side slope shifts to the left."""
+    draft: float | None,
+    lifted: bool,
+    wanted: float | None,
+    torque_limit: Mapping[str, float],
+) -> Situation:
+    """What is given in a step, with the forces of effects that resist.
+
+    Parameters
+    ----------
+    draft
+        Of the implement [N]; None as the scenario has it.
+    lifted
+        Whether the driver lifts the implement at his slip limit.
+    wanted
+        Ground speed [m/s]; None as the scenario has it.
+    torque_limit
+        At the wheel [N m], by name of the wheel.
+    """
+    chassis, wheels, drivetrain = plan.chassis, plan.config.wheel, plan.mechanics.drivetrain
+    climbs, side = plan.mechanics.climbs, plan.side[part]
     shape = (len(wheels), len(motion.t))
-    side = realise(scenario.side_shift, motion.t, rng).value
-    share = np.stack([_load_share(wheels, i, side) for i in range(len(wheels))])
+    share = np.stack([_load_share(wheels, i, side) for i in range(len(wheels))]) * (1.0 + plan.bounce[:, part])
 
     def loads(draft: float, inertia: float = 0.0) -> Array:
         front, rear = axle_loads(chassis, draft, motion.pitch, motion.acceleration + inertia)
@@ -205,15 +437,19 @@ def _situation(
     if chassis.on_tracks:
         ahead["front"] = 0.0
     position = np.stack([motion.distance + ahead[str(wheel.axle)] for wheel in wheels])
-    soil = soil_along(scenario.soils, position, scenario.transition)
-    spread = Swing(-scenario.slip_spread, scenario.slip_spread)
+    soil = soil_along(plan.scenario.soils, position, plan.scenario.transition)
 
     def each_wheel(values: list[float]) -> Array:
         return np.broadcast_to(np.array(values)[:, None], shape)
 
-    demand, slip_limit, least = _driver(scenario, motion.t, rng)
-    deviation = np.stack([realise(spread, motion.t, rng).value for _ in wheels])
-    deviation = np.where((drivetrain.leader < 0)[:, None], 0.0, deviation[drivetrain.leader])
+    demand, slip_limit, least = plan.demand[part], plan.slip_limit[part], plan.least_draft[part]
+    if not lifted:
+        rim = RIM_SPEED_RATIO * np.maximum(plan.speed.value[part] if wanted is None else wanted, motion.speed)
+        demand = demand if draft is None else np.full(shape[1], draft)
+        slip_limit, least = np.minimum(1.0 - motion.speed / rim, MAX_SLIP), np.full(shape[1], -np.inf)
+    limit = drivetrain.limit.copy()
+    for i, wheel in enumerate(wheels):
+        limit[i] = min(limit[i], torque_limit.get(wheel.name, math.inf))
     given = Situation(
         motion.t,
         motion.distance,
@@ -223,17 +459,17 @@ def _situation(
         level,
         (drawn - level) / test_draft,
         upright,
-        deviation,
+        plan.deviation[:, part],
         each_wheel([wheel.radius for wheel in wheels]),
         each_wheel([wheel.width for wheel in wheels]),
         each_wheel([wheel.contact_length for wheel in wheels]),
         np.array(soil),
         demand,
         slip_limit,
-        np.broadcast_to(drivetrain.limit[:, None], (len(drivetrain.limit), len(motion.t))),
+        np.broadcast_to(limit[:, None], (len(limit), len(motion.t))),
         least,
     )
-    return given, side
+    return _with_resisting_effects(given, plan.mechanics)
 
 
 def _load_share(wheels: list[Wheel], index: int, side: Array) -> Array:
@@ -249,7 +485,7 @@ def _driver(scenario: Scenario, t: Array, rng: np.random.Generator) -> tuple[Arr
         unbounded = np.full(len(t), np.inf)
         return unbounded, realise(scenario.slip, t, rng).value, -unbounded
     demand = np.zeros_like(t) if scenario.draft is None else realise(scenario.draft, t, rng).value
-    return demand, realise(scenario.lift_slip, t, rng).value, np.minimum(demand, 0.0)
+    return demand, realise(scenario.lift_slip or Swing(1.0, 1.0), t, rng).value, np.minimum(demand, 0.0)
 
 
 def _columns(

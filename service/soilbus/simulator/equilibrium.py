@@ -183,7 +183,7 @@ class Equilibrium(NamedTuple):
     found: NDArray[np.bool_]
 
 
-def solve(situation: Situation, mechanics: Mechanics) -> Equilibrium:
+def solve(situation: Situation, mechanics: Mechanics, near: Equilibrium | None = None) -> Equilibrium:
     """The equilibrium at each instant.
 
     Parameters
@@ -192,6 +192,8 @@ def solve(situation: Situation, mechanics: Mechanics) -> Equilibrium:
         N instants of M wheels.
     mechanics
         Model and effects.
+    near
+        An equilibrium whose last instant is next to these; all of them start from it.
 
     Returns
     -------
@@ -199,9 +201,13 @@ def solve(situation: Situation, mechanics: Mechanics) -> Equilibrium:
 
     Notes
     -----
-    Every tenth instant is solved first; the others start from values interpolated between them.
+    Without `near` every tenth instant is solved first; the others start from values interpolated between them.
     """
     n_instants = len(situation.demand)
+    if near is not None:
+        slip, draft = (np.full(n_instants, a[-1]) for a in (near.slip, near.draft))
+        lead, angles = (np.repeat(a[:, -1:], n_instants, axis=1) for a in (near.lead, near.entry_angle))
+        return _from_near(situation, mechanics, _Guess(slip, draft, lead, angles))
     coarse = np.unique(np.append(np.arange(0, n_instants, _COARSE_STRIDE), n_instants - 1))
     knots = _from_scratch(_at(situation, coarse), mechanics)
     good = coarse[knots.found]
@@ -212,7 +218,11 @@ def solve(situation: Situation, mechanics: Mechanics) -> Equilibrium:
         return np.interp(np.arange(n_instants), good, values[knots.found])
 
     lead, angles = (np.stack([between(row) for row in rows]) for rows in (knots.lead, knots.entry_angle))
-    guess = _Guess(between(knots.slip), between(knots.draft), lead, angles)
+    return _from_near(situation, mechanics, _Guess(between(knots.slip), between(knots.draft), lead, angles))
+
+
+def _from_near(situation: Situation, mechanics: Mechanics, guess: _Guess) -> Equilibrium:
+    """The equilibrium from a guess, and from scratch where that does not lead to one."""
     result = _newton(situation, mechanics.drivetrain, guess, _forces_of(mechanics))
     lost = np.flatnonzero(~result.found)
     if len(lost):

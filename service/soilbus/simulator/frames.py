@@ -9,7 +9,9 @@ available", save those that follow from the drive. Frames of all messages come i
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
 
 import can
 import numpy as np
@@ -18,7 +20,7 @@ from cantools.database.can import Message, Signal
 from numpy.typing import NDArray
 
 from soilbus.arrays import Array
-from soilbus.can.channels import Channel
+from soilbus.can.channels import Channel, Column
 from soilbus.can.checksum import COUNTER, column_checksums
 from soilbus.can.mapping import channels_of, load_databases
 from soilbus.can.publish import checksum_byte, value_codes
@@ -26,7 +28,7 @@ from soilbus.config.model import Config
 from soilbus.simulator.recording import Recording
 from soilbus.simulator.sensors import channel_rng, true_speed
 
-__all__ = ["START_TIME", "Payload", "encoded", "frames"]
+__all__ = ["START_TIME", "Encoder", "Payload", "encoded", "frames"]
 
 START_TIME = 1_700_000_000.0
 """Stamp [s, Unix] of a recording's first instant: logs hold wall clock time."""
@@ -66,20 +68,57 @@ def frames(
     -----
     Each message has a phase of its own and up to 1 ms of jitter; a slower channel of it repeats its last value.
     """
-    database = database if database is not None else load_databases(config)
-    times: list[Array] = []
-    payloads: list[Payload] = []
-    messages: list[Message] = []
-    for number, (name, channels) in enumerate(_by_message(channels_of(config, database)).items()):
-        message = database.get_message_by_name(name)
-        t, values = _sampled(recording, channels)
-        values |= _unmapped_signals(recording, config, message, channels, t)
-        jitter = channel_rng(recording.seed, name).uniform(0.0, _MAX_JITTER, len(t))
-        times.append(start + t + _PHASE_STEP * (number % _PHASES) + jitter)
-        payloads.append(encoded(message, _raw_codes(message, channels, values, len(t))))
-        messages.append(message)
-    if times:
-        yield from _in_order(times, payloads, messages, str(config.bus.channel))
+    encoder = Encoder(config, recording.seed, database, start)
+    yield from encoder.frames(recording.channels, recording.truth)
+
+
+class Encoder:
+    """The vehicle's frames, for a drive that comes step by step: counters and jitter go on from step to step.
+
+    Parameters
+    ----------
+    config, database, start
+        As of `frames`.
+    seed
+        Of the recording; picks the jitter.
+    """
+
+    def __init__(self, config: Config, seed: int, database: Database | None = None, start: float = START_TIME) -> None:
+        database = database if database is not None else load_databases(config)
+        self._config, self._start = config, start
+        self._messages = [
+            (database.get_message_by_name(name), channels, channel_rng(seed, name))
+            for name, channels in _by_message(channels_of(config, database)).items()
+        ]
+        self._sent: Counter[str] = Counter()
+        self._last: dict[str, Column] = {}
+
+    def frames(self, channels: Mapping[str, Column], truth: Mapping[str, NDArray[Any]]) -> Iterator[can.Message]:
+        """The frames of the next step, from its samples and its true values by channel and column name."""
+        held = {name: _after(self._last.get(name), column) for name, column in channels.items()}
+        times: list[Array] = []
+        payloads: list[Payload] = []
+        messages: list[Message] = []
+        for number, (message, mapped, rng) in enumerate(self._messages):
+            t = max((channels[channel.name].t for channel in mapped), key=len)
+            values = _sampled(held, mapped, t)
+            values |= _unmapped_signals(truth, self._config, message, mapped, t)
+            jitter = rng.uniform(0.0, _MAX_JITTER, len(t))
+            times.append(self._start + t + _PHASE_STEP * (number % _PHASES) + jitter)
+            codes = _raw_codes(message, mapped, values, len(t), self._sent[message.name])
+            payloads.append(encoded(message, codes))
+            messages.append(message)
+            self._sent[message.name] += len(t)
+        self._last = {name: Column(column.t[-1:], column.value[-1:]) for name, column in held.items()}
+        if times:
+            yield from _in_order(times, payloads, messages, str(self._config.bus.channel))
+
+
+def _after(last: Column | None, column: Column) -> Column:
+    """A column with the sample before it, which slower channels hold."""
+    if last is None:
+        return column
+    return Column(np.append(last.t, column.t), np.append(last.value, column.value))
 
 
 def encoded(message: Message, codes: Mapping[str, NDArray[np.int64]]) -> Payload:
@@ -127,22 +166,21 @@ def _by_message(channels: Iterable[Channel]) -> dict[str, list[Channel]]:
     return groups
 
 
-def _sampled(recording: Recording, channels: list[Channel]) -> tuple[Array, dict[str, Array]]:
-    """Sample times [s] of one message and its mapped signals in the DBC's units."""
-    columns = [recording.channels[channel.name] for channel in channels]
-    t = max((column.t for column in columns), key=len)
+def _sampled(columns: Mapping[str, Column], channels: list[Channel], t: Array) -> dict[str, Array]:
+    """The mapped signals of one message at its sample times t [s], in the DBC's units."""
     values = {}
-    for channel, column in zip(channels, columns, strict=True):
+    for channel in channels:
+        column = columns[channel.name]
         latest = np.maximum(np.searchsorted(column.t, t + 1e-9) - 1, 0)
         values[channel.signal] = (column.value[latest] - channel.offset) / channel.factor
-    return t, values
+    return values
 
 
 def _unmapped_signals(
-    recording: Recording, config: Config, message: Message, channels: list[Channel], t: Array
+    truth: Mapping[str, NDArray[Any]], config: Config, message: Message, channels: list[Channel], t: Array
 ) -> dict[str, Array]:
     """Values of unmapped signals that follow from the drive, found by their names in the DBC."""
-    truth, mapped = recording.truth, {channel.signal for channel in channels}
+    mapped = {channel.signal for channel in channels}
     gears = {wheel.name: wheel.gear_ratio for wheel in config.wheel} | {a.name: a.gear_ratio for a in config.axle}
     motor = next((c.wheel for c in channels if c.quantity == "torque"), None)
     known = {
@@ -156,7 +194,7 @@ def _unmapped_signals(
 
 
 def _raw_codes(
-    message: Message, channels: list[Channel], values: Mapping[str, Array], n_frames: int
+    message: Message, channels: list[Channel], values: Mapping[str, Array], n_frames: int, sent: int
 ) -> dict[str, NDArray[np.int64]]:
     codes: dict[str, NDArray[np.int64]] = {}
     for signal in message.signals:
@@ -167,7 +205,7 @@ def _raw_codes(
             codes[channel.valid_signal] = np.full(n_frames, channel.valid_values[0])
     for signal in message.signals:
         if signal.name == COUNTER:
-            codes[COUNTER] = np.arange(n_frames) % (1 << signal.length)
+            codes[COUNTER] = np.arange(sent, sent + n_frames) % (1 << signal.length)
     return codes
 
 

@@ -1,29 +1,49 @@
-"""Play a recording: onto a bus in real time, or into a log."""
+"""What `soilbus simulate` drives, and its frames sent in real time."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 
 import can
 
-from soilbus.can.bus import bus_fault, open_bus
-from soilbus.can.log_writer import write_log
-from soilbus.config.model import Config
 from soilbus.simulator.course import NORTHWARD, Course
-from soilbus.simulator.frames import frames
-from soilbus.simulator.recording import Recording
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import SOILS
 from soilbus.words import did_you_mean
 
-_ASSUMED_SPEED = 1.4
-"""Ground speed [m/s] by which time becomes distance: the middle of a scenario's default speeds."""
+_USUAL_SPEED = Swing(1.0, 1.8)
+"""Ground speed [m/s] where none is given."""
 
 
-def scenario_over(soils: Sequence[str], duration: float, course: Course = NORTHWARD) -> Scenario:
-    """A scenario over several soils, each for an equal part of the time, with slip swept from 0.05 to 0.40.
+def scenario_over(
+    soils: Sequence[str],
+    duration: float,
+    course: Course = NORTHWARD,
+    draft: float | None = None,
+    grade: float = 0.0,
+    speed: float | None = None,
+    vehicle_seed: int | None = None,
+) -> Scenario:
+    """A scenario over several soils, each for an equal part of the time.
+
+    Parameters
+    ----------
+    soils
+        Their names.
+    duration
+        [s].
+    course
+        Where on the earth.
+    draft
+        Of the implement [N], which nobody lifts; None sweeps slip from 0.05 to 0.40.
+    grade
+        Slope, rise over run; uphill is positive.
+    speed
+        Wanted ground speed [m/s]; None lets it swing from 1.0 to 1.8.
+    vehicle_seed
+        Picks true mass and sensor gains (see Scenario).
 
     Raises
     ------
@@ -33,33 +53,20 @@ def scenario_over(soils: Sequence[str], duration: float, course: Course = NORTHW
     for name in soils:
         if name not in SOILS:
             raise KeyError(f"no soil is named {name}{did_you_mean(name, SOILS)}; known: {', '.join(SOILS)}")
-    length = duration * _ASSUMED_SPEED / len(soils)
-    patches = tuple(Patch(i * length, name) for i, name in enumerate(soils))
-    return Scenario(duration, patches, slip=Swing(0.05, 0.40), course=course)
-
-
-def play(recording: Recording, config: Config, log: Path | None) -> None:
-    """Write the recording's frames to a log, or send them to the configured bus in real time.
-
-    Raises
-    ------
-    BusError
-        The bus cannot be opened, or goes away.
-    OSError
-        The log cannot be written.
-    ValueError
-        The log's format is unknown.
-    """
-    messages = frames(recording, config)
-    if log is not None:
-        write_log(messages, log)
-        return
-    settings = config.bus.model_dump()
-    with open_bus(settings) as bus:
-        try:
-            send_in_time(messages, bus.send)
-        except (can.CanError, OSError) as error:
-            raise bus_fault(settings, error) from None
+    swing = _USUAL_SPEED if speed is None else Swing(speed, speed)
+    length = duration * (swing.low + swing.high) / 2.0 / len(soils)
+    return Scenario(
+        duration,
+        tuple(Patch(i * length, name) for i, name in enumerate(soils)),
+        swing,
+        draft=None if draft is None else Swing(draft, draft),
+        slip=Swing(0.05, 0.40) if draft is None else None,
+        lift_slip=None,
+        slope=((0.0, math.atan(grade)),),
+        course=course,
+        drawn_mass=vehicle_seed is not None,
+        vehicle_seed=vehicle_seed,
+    )
 
 
 def send_in_time(

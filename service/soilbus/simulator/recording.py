@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from soilbus.can.channels import Column
 from soilbus.config.model import Config
-from soilbus.simulator.drive import drive
+from soilbus.simulator.drive import Drive, drive
 from soilbus.simulator.scenario import Scenario
 from soilbus.simulator.sensors import measure
 from soilbus.terra.effects.effect import Active
 
-__all__ = ["Recording", "simulate"]
+__all__ = ["Recording", "recorded", "simulate"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,5 +59,9 @@ def simulate(config: Config, scenario: Scenario, seed: int, effects: Sequence[Ac
     SimulationError, KeyError, ConfigError
         As `drive.drive`.
     """
-    done = drive(config, scenario, seed, effects)
-    return Recording(done.columns, measure(done, config, seed), seed, done.bogged_at)
+    return recorded(drive(config, scenario, seed, effects), config, scenario, seed)
+
+
+def recorded(done: Drive, config: Config, scenario: Scenario, seed: int) -> Recording:
+    """The recording of a drive through a scenario, by the sensors of `config` (as `simulate`)."""
+    return Recording(done.columns, measure(done, config, seed, scenario.vehicle_seed), seed, done.bogged_at)

@@ -5,19 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from soilbus.config.file import load_config
+from soilbus.config.file import load_config, machine
 from soilbus.config.model import Config
 
-__all__ = ["AXLE_MOTORS", "REAR_DRIVE", "TRACTOR", "reference_configuration"]
+__all__ = ["AXLE_MOTORS", "REAR_DRIVE", "REFERENCES", "TRACTOR", "reference_configuration"]
 
-TRACTOR = Path(__file__).with_name("tractor.toml")
+TRACTOR = machine("tractor")
 """Four motors, four load cells."""
-REAR_DRIVE = TRACTOR.with_name("tractor-2wd.toml")
+REAR_DRIVE = machine("tractor-2wd")
 """One motor on the rear axle, front wheels that roll freely, a load cell of the rear axle."""
-AXLE_MOTORS = TRACTOR.with_name("tractor-axles.toml")
+AXLE_MOTORS = machine("tractor-axles")
 """A motor on each axle, no load cells, an inertial sensor."""
+REFERENCES = {path.stem: path for path in (TRACTOR, REAR_DRIVE, AXLE_MOTORS)}
+"""All of them by name: tractor, tractor-2wd, tractor-axles."""
 
 
-def reference_configuration(overrides: Iterable[str] = (), machine: Path = TRACTOR) -> Config:
+def reference_configuration(overrides: Iterable[str] = (), path: Path = TRACTOR) -> Config:
     """Configuration of the reference tractor or another machine; ConfigError for a wrong override."""
-    return load_config(machine, overrides)
+    return load_config(path, overrides)

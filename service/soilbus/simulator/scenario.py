@@ -27,6 +27,7 @@ __all__ = [
     "Wave",
     "demo",
     "excited",
+    "oscillation",
     "realise",
     "soil_along",
     "soil_names",
@@ -35,6 +36,10 @@ __all__ = [
 SAMPLE_RATE = 50.0
 """Samples of the true values a second [Hz]."""
 _N_SINES = 4
+_BOUNCE_BAND = (1.5, 3.0)
+"""Natural frequencies [Hz] of a tractor's bounce and of an axle's roll on its tyres (Wong 2008, ch. 7)."""
+_BOUNCE_DAMPING = 0.12
+"""Damping ratio of these: tyres without dampers."""
 _REFERENCE_TIME = 60.0
 """Time [s] in which a wave touches its bounds; a shorter scenario shows a part of the wave, not a steeper one."""
 
@@ -69,6 +74,11 @@ class Profile:
     def low(self) -> float:
         """The least value."""
         return min(self.value)
+
+    @property
+    def high(self) -> float:
+        """The greatest value."""
+        return max(self.value)
 
 
 class Wave(NamedTuple):
@@ -144,11 +154,14 @@ class Scenario:
         One at most is given: the draft that the implement asks for [N], or the common slip of all driven wheels.
         Without both nothing is towed: slope and acceleration alone take pull.
     lift_slip
-        With `draft`: the driver lifts the implement as far as needed to keep slip below this, and never pushes.
+        With `draft`: the driver lifts the implement as far as needed to keep slip below this, and never pushes. None:
+        nobody lifts it; what the wheels cannot give slows the vehicle down.
     slip_spread
         Greatest deviation of a single wheel from the common slip.
     side_shift
         Share of an axle's load that a side slope moves to its left wheel; negative to the right.
+    bounce
+        Rms of a wheel's load about its steady one, over it: axles that bounce and roll on their tyres.
     slope
         Knots (distance [m], pitch [rad]), straight lines between them.
     transition
@@ -157,20 +170,29 @@ class Scenario:
         Where on the earth.
     drawn_mass
         The true mass and centre of gravity are drawn about the configured ones, by `mass_std` and `cg_std`.
+    vehicle_seed
+        Picks true mass and gain errors of the sensors: the same vehicle in several drives; None: the drive's seed does.
     """
 
     duration: float
     soils: Sequence[Patch]
     speed: Swing | Profile = Swing(1.0, 1.8)
     draft: Swing | Profile | None = None
-    slip: Swing | None = None
-    lift_slip: Swing = Swing(0.45, 0.45)
+    slip: Swing | Profile | None = None
+    lift_slip: Swing | None = Swing(0.45, 0.45)
     slip_spread: float = 0.015
-    side_shift: Swing = Swing(-0.15, 0.15)
+    side_shift: Swing | Profile = Swing(-0.15, 0.15)
+    bounce: float = 0.0
     slope: Sequence[tuple[float, float]] = ((0.0, 0.0),)
     transition: float = 1.0
     course: Course = NORTHWARD
     drawn_mass: bool = False
+    vehicle_seed: int | None = None
+
+    @property
+    def lifted(self) -> bool:
+        """Whether slip is limited by a driver who lifts the implement, or prescribed."""
+        return self.slip is not None or self.lift_slip is not None
 
     def __post_init__(self) -> None:
         """Raise ValueError for a scenario that cannot be driven."""
@@ -179,10 +201,29 @@ class Scenario:
             raise ValueError("soils: at least one, at ascending distances")
         if self.draft is not None and self.slip is not None:
             raise ValueError("one of draft and slip at most may be given")
+        if not np.isfinite(self.duration):
+            raise ValueError(f"duration: {self.duration} is no number of seconds")
         if self.duration * SAMPLE_RATE < 2.0:
             raise ValueError(f"duration: {self.duration} s is too short")
         if self.speed.low <= 0.0 or self.transition <= 0.0:
             raise ValueError("speed and transition must be above zero")
+
+
+def oscillation(t: Array, rng: np.random.Generator) -> Array:
+    """A lightly damped mode of an axle on its tyres, driven by random ground; (N,) at SAMPLE_RATE, of unit rms.
+
+    x'' + 2 zeta w x' + w^2 x = white noise, sampled without error: an autoregression of second order
+    """
+    from scipy.signal import lfilter  # not needed without
+
+    w = 2.0 * np.pi * rng.uniform(*_BOUNCE_BAND)
+    decay, turn = np.exp(-_BOUNCE_DAMPING * w / SAMPLE_RATE), w * np.sqrt(1.0 - _BOUNCE_DAMPING**2) / SAMPLE_RATE
+    settled = round(10.0 * SAMPLE_RATE)
+    noise = rng.standard_normal(len(t) + settled)
+    a, b = 2.0 * decay * np.cos(turn), -(decay**2)
+    mode = lfilter([1.0], [1.0, -a, -b], noise)[settled:]
+    variance = (1.0 - b) / ((1.0 + b) * ((1.0 - b) ** 2 - a**2))
+    return np.asarray(mode / np.sqrt(variance))
 
 
 def soil_along(patches: Sequence[Patch], position: Array, transition: float) -> Soil:

@@ -21,7 +21,7 @@ from soilbus.arrays import Array
 from soilbus.can.channels import Column
 from soilbus.can.mapping import AXLE_ROLES, LOCK, POSITION_ROLES, SHARED_ROLES, VEHICLE_ROLES, WHEEL_ROLES
 from soilbus.config.model import Axle, Config, Noise, Signal, Wheel
-from soilbus.simulator.drive import Drive
+from soilbus.simulator.drive import Drive, joined, latest
 from soilbus.simulator.scenario import SAMPLE_RATE
 from soilbus.terra.earth import SEMI_MAJOR_AXIS, wrapped
 from soilbus.terra.effects.sensors import read_late
@@ -29,6 +29,8 @@ from soilbus.terra.vehicle import GRAVITY
 
 _RATE_DIVIDERS = {"ground_speed": 2, "latitude": 5, "longitude": 5}
 """Samples of the truth (50 Hz) per sample of the sensor: radars give 25 Hz, position receivers 10 Hz, others 50."""
+HISTORY = 10.0
+"""Time [s] before a step that is kept: five of the longest time constants of `torque_lag` and `channel_lag`."""
 POSITION_SD = 0.02
 """Standard deviation of a position, north and east [m]: a receiver with real-time corrections."""
 _MEASURED_QUANTITY = {"motor_speed": "speed"}
@@ -107,7 +109,7 @@ def fitted(config: Config) -> Iterator[tuple[str, str]]:
         yield sensor.quantity, sensor.part
 
 
-def measure(drive: Drive, config: Config, seed: int) -> dict[str, Column]:
+def measure(drive: Drive, config: Config, seed: int, vehicle_seed: int | None = None) -> dict[str, Column]:
     """Noisy samples of every mapped channel.
 
     Parameters
@@ -118,32 +120,82 @@ def measure(drive: Drive, config: Config, seed: int) -> dict[str, Column]:
         Maps channels; [noise] gives gain errors and noise, `delay` of a signal its delay [s].
     seed
         Picks gain errors and noise.
+    vehicle_seed
+        Picks gain errors in its place.
 
     Returns
     -------
     SI, by channel name (can.channels).
     """
-    columns: dict[str, Column] = {}
-    t = drive.columns["t"]
-    true_columns = drive.columns | _with_sensor_effects(drive, config)
-    limits = {axle.name: axle.max_torque or np.nan for axle in config.axle}
-    for sensor in sensors(config):
-        quantity = sensor.quantity
-        every = slice(None, None, _RATE_DIVIDERS.get(quantity, 1))
-        measured, rng = _MEASURED_QUANTITY.get(quantity, quantity), channel_rng(seed, sensor.name)
-        if quantity == "torque_limit" and sensor.part in limits:
-            truth = np.full_like(t, limits[sensor.part])
+    return Instruments(config, seed, vehicle_seed).measure(drive)
+
+
+class Instruments:
+    """The sensors of one vehicle, for a drive that comes step by step.
+
+    Parameters
+    ----------
+    config, seed, vehicle_seed
+        As of `measure`.
+
+    Notes
+    -----
+    Gain errors are drawn once and noise goes on from step to step. What delays and low passes need of the time before a
+    step is kept for HISTORY seconds.
+    """
+
+    def __init__(self, config: Config, seed: int, vehicle_seed: int | None = None) -> None:
+        self._config = config
+        self._limits = {axle.name: axle.max_torque or np.nan for axle in config.axle}
+        self._sensors = list(sensors(config))
+        self._noise = {sensor.name: channel_rng(seed, sensor.name) for sensor in self._sensors}
+        self._gain = {
+            sensor.name: _noise_of(config, sensor).gain
+            * (self._noise[sensor.name] if vehicle_seed is None else channel_rng(vehicle_seed, sensor.name))
+            .standard_normal()
+            for sensor in self._sensors
+            if sensor.quantity not in POSITION_ROLES and sensor.quantity not in _NOISELESS
+        }  # fmt: skip
+        self._before: Drive | None = None
+        self._seen = 0
+
+    def measure(self, step: Drive) -> dict[str, Column]:
+        """Samples of the next step of a drive, as `measure`."""
+        n = len(step.columns["t"])
+        known = step if self._before is None else joined([self._before, step])
+        self._before = latest(known, round(HISTORY * SAMPLE_RATE))
+        t, true_columns = known.columns["t"], known.columns | _with_sensor_effects(known, self._config)
+        columns: dict[str, Column] = {}
+        for sensor in self._sensors:
+            divider = _RATE_DIVIDERS.get(sensor.quantity, 1)
+            every = slice(-self._seen % divider, None, divider)
+            read = self._read(sensor, t, true_columns, n)
+            columns[sensor.name] = Column(t[len(t) - n :][every].copy(), read[every].copy())
+        self._seen += n
+        return columns
+
+    def _read(self, sensor: Sensor, t: Array, true_columns: Mapping[str, NDArray[Any]], n: int) -> Array:
+        """The last n readings at 50 Hz."""
+        quantity, rng, new = sensor.quantity, self._noise[sensor.name], slice(len(t) - n, None)
+        if quantity == "torque_limit" and sensor.part in self._limits:
+            truth = np.full_like(t, self._limits[sensor.part])
         else:
-            truth = _true_reading(true_columns, measured, sensor.weight)
+            truth = _true_reading(true_columns, _MEASURED_QUANTITY.get(quantity, quantity), sensor.weight)
         if sensor.mapped.delay != 0.0:
             truth = np.interp(t - sensor.mapped.delay, t, truth)
+        if quantity in _NOISELESS:
+            return truth[new]
         if quantity in POSITION_ROLES:
-            parallel = 1.0 if quantity == "latitude" else np.cos(drive.columns["latitude"])
-            truth = wrapped(truth + POSITION_SD / (SEMI_MAJOR_AXIS * parallel) * rng.standard_normal(len(t)))
-        elif quantity not in _NOISELESS:
-            truth = disturbed(truth, getattr(config.noise, measured), config.estimator.window, rng)
-        columns[sensor.name] = Column(t[every].copy(), truth[every].copy())
-    return columns
+            parallel = 1.0 if quantity == "latitude" else np.cos(true_columns["latitude"][new])
+            return wrapped(truth[new] + POSITION_SD / (SEMI_MAJOR_AXIS * parallel) * rng.standard_normal(n))
+        noise, window = _noise_of(self._config, sensor), self._config.estimator.window
+        sd = noise_sd(truth, noise, window)[new]
+        return np.asarray((1.0 + self._gain[sensor.name]) * truth[new] + sd * rng.standard_normal(n))
+
+
+def _noise_of(config: Config, sensor: Sensor) -> Noise:
+    noise: Noise = getattr(config.noise, _MEASURED_QUANTITY.get(sensor.quantity, sensor.quantity))
+    return noise
 
 
 def true_speed(true_columns: Mapping[str, NDArray[Any]], config: Config, part: str) -> Array:
@@ -195,8 +247,8 @@ def _late(drive: Drive, true_columns: dict[str, NDArray[Any]], wheels: list[str]
     return changed
 
 
-def disturbed(truth: Array, noise: Noise, window: float, rng: np.random.Generator) -> Array:
-    """Truth with a gain error and noise.
+def noise_sd(truth: Array, noise: Noise, window: float) -> Array:
+    """Standard deviation of the noise of each reading.
 
     Parameters
     ----------
@@ -206,13 +258,9 @@ def disturbed(truth: Array, noise: Noise, window: float, rng: np.random.Generato
         Its sd; `of_mean` refers to the mean over the window.
     window
         [s].
-    rng
-        Picks gain error and noise.
     """
-    gain = 1.0 + noise.gain * rng.standard_normal()
     mean = _running_mean(np.abs(truth), round(window * SAMPLE_RATE))
-    sd = np.sqrt(noise.absolute**2 + (noise.relative * truth) ** 2 + (noise.of_mean * mean) ** 2)
-    return np.asarray(gain * truth + sd * rng.standard_normal(len(truth)))
+    return np.sqrt(noise.absolute**2 + (noise.relative * truth) ** 2 + (noise.of_mean * mean) ** 2)
 
 
 def _running_mean(values: Array, width: int) -> Array:

@@ -31,6 +31,13 @@ def moved(latitude: float, longitude: float, north: Array, east: Array) -> tuple
     return latitude + change, wrapped(longitude + east / (across * np.cos(middle)))
 
 
+def offset(latitude: float, longitude: float, latitudes: Array, longitudes: Array) -> tuple[Array, Array]:
+    """How far north and east [m] of a point others (N,) are; the inverse of `moved`."""
+    along_meridian, across = _radii((latitude + latitudes) / 2.0)
+    east = across * np.cos((latitude + latitudes) / 2.0) * wrapped(longitudes - longitude)
+    return along_meridian * (latitudes - latitude), east
+
+
 def _radii(latitude: Array) -> tuple[Array, Array]:
     """Radii of curvature [m] along the meridian and across it."""
     w = 1.0 - _ECCENTRICITY_SQUARED * np.sin(latitude) ** 2

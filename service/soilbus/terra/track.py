@@ -13,6 +13,14 @@ the contact is a function g of u = s L / K alone:
     exponential   f = 1 - exp(-j/K)     g = 1 - (1 - exp(-u)) / u
     rational      f = (j/K) / (1 + j/K) g = 1 - log(1 + u) / u
 
+Where links are short and rollers far apart, pressure peaks below the rollers.  With N of them, one each L / N, it is
+
+    pressure      p(x) = p (1 + cos(2 pi N x / L)),    p = W / (b L) its mean,    K_L z^n = 2 p its peak
+    thrust        F = b L c g(u) + W tan phi (g(u) + h(u)),    h = int_0^1 cos(2 pi N y) f(u y) dy
+    exponential   h = -u (1 - exp(-u)) / (u^2 + (2 pi N)^2);    rational: by Gauss' rule in each period
+
+and the rut is as deep as the peaks press it; so is the resistance.
+
 A track is described by the same state as a wheel: r is the pitch radius of the sprocket, slip s = 1 - V / (r omega),
 and the angle theta stands for the sinkage.  Losses inside the track are those of a drivetrain (effect
 drivetrain_loss).  A hard pan below the depth d adds pan_stiffness K_L (z^n - d^n) to the pressure.
@@ -21,12 +29,14 @@ References
 ----------
 Bekker 1956, Theory of Land Locomotion, and 1969, Introduction to Terrain-Vehicle Systems: compaction resistance.
 Wong, Theory of Ground Vehicles (4th ed. 2008), ch. 2: thrust and slip of a track with uniform pressure.
+Wills 1963 (J. Agric. Eng. Res. 8:115): thrust of tracks with sinusoidal and other pressures; taken up by Wong, ch. 2.
 Janosi & Hanamoto 1961 (1st Int. Conf. Mechanics of Soil-Vehicle Systems, Turin): exponential law, j = s x.
 Le, Rye & Durrant-Whyte 1997 (IEEE Int. Conf. Robotics and Automation, 2:1388): soil estimated from a track.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -39,6 +49,7 @@ __all__ = [
     "MEAN_SHEAR",
     "mean_exponential_shear",
     "mean_rational_shear",
+    "modulated_shear",
     "track_forces",
     "track_forces_and_jacobian",
     "track_forces_and_slopes",
@@ -49,6 +60,8 @@ SERIES_BELOW = 0.02
 """u below which g and its derivative are power series: above, rounding costs them less than 1e-13 of their value."""
 SERIES_TERMS = 9
 """Terms of these: the first one left out is below 1e-16 of the sum."""
+NODES_PER_PERIOD = 32
+"""Gauss nodes in each period of the pressure: 1e-8 of the thrust where j grows to 200 K on three rollers."""
 
 
 def _from_series(u: Array, near: Array, by_u: Array, coefficients: Sequence[float]) -> tuple[Array, Array]:
@@ -107,6 +120,28 @@ def mean_rational_shear(u: Any) -> tuple[Array, Array]:
     return _from_series(u, 1.0 - log / x, (log - x / (1.0 + x)) / x**2, _OF_RATIONAL)
 
 
+def modulated_shear(u: Any, rollers: int, law: str) -> tuple[Array, Array]:
+    """What the periods of the pressure add to the mean of a shear law, h(u), and its derivative by u; odd in u.
+
+    Examples
+    --------
+    >>> share, slope = modulated_shear(10.0, 5, "exponential")
+    >>> round(float(share), 6), round(float(slope), 6)
+    (-0.0092, -0.000751)
+    """
+    u, wave = np.asarray(u, float), 2.0 * math.pi * rollers
+    x = np.abs(u)
+    if law == "exponential":
+        risen, square = -np.expm1(-x), x**2 + wave**2
+        share = -x * risen / square
+        return np.copysign(share, -u), -(risen + x * np.exp(-x)) / square + 2.0 * x**2 * risen / square**2
+    node, weight = np.polynomial.legendre.leggauss(NODES_PER_PERIOD)
+    y = ((node + 1.0) / 2.0 + np.arange(rollers)[:, None]).ravel() / rollers
+    weight = np.tile(weight, rollers) / (2.0 * rollers) * np.cos(wave * y)
+    mobilised = 1.0 + x[..., None] * y
+    return np.copysign(1.0, u) * ((1.0 - 1.0 / mobilised) @ weight), (y / mobilised**2) @ weight
+
+
 MEAN_SHEAR: dict[str, Callable[[Any], tuple[Array, Array]]] = {
     "exponential": mean_exponential_shear,
     "rational": mean_rational_shear,
@@ -162,46 +197,72 @@ def _pressed(state: WheelState, model: WheelModel) -> _Pressed:
     )
 
 
-def _mean_mobilised(u: Array, model: WheelModel) -> tuple[Array, Array]:
-    """Mean of the mobilised share of the shear strength along the track, and its derivative by u = s L / K."""
-    share, slope = MEAN_SHEAR[model.shear_law](u)
+class _Mobilised(NamedTuple):
+    """Mean share of the strength c + p tan phi that is mobilised along a track: of c, of p tan phi, each (N,)."""
+
+    of_c: Array
+    of_load: Array
+
+    def mixed(self, other: _Mobilised, share: Any) -> _Mobilised:
+        """This with 1 - share, the other with share."""
+        return _Mobilised(*((1.0 - share) * one + share * two for one, two in zip(self, other, strict=True)))
+
+
+def _by_law(u: Array, law: str, rollers: int) -> tuple[_Mobilised, _Mobilised]:
+    """What a law mobilises at u = s L / K, and its derivative by u."""
+    share, slope = MEAN_SHEAR[law](u)
+    if not rollers:
+        return _Mobilised(share, share), _Mobilised(slope, slope)
+    more, more_slope = modulated_shear(u, rollers, law)
+    return _Mobilised(share, share + more), _Mobilised(slope, slope + more_slope)
+
+
+def _mean_mobilised(u: Array, model: WheelModel) -> tuple[_Mobilised, _Mobilised]:
+    """What is mobilised along the track, and its derivative by u = s L / K."""
+    share, slope = _by_law(u, model.shear_law, model.rollers)
     if not model.exponential_share:
         return share, slope
-    w, (other, other_slope) = model.exponential_share, MEAN_SHEAR["exponential"](u)
-    return (1.0 - w) * share + w * other, (1.0 - w) * slope + w * other_slope
+    other, other_slope = _by_law(u, "exponential", model.rollers)
+    return share.mixed(other, model.exponential_share), slope.mixed(other_slope, model.exponential_share)
 
 
 def _columns(state: WheelState, model: WheelModel, shape: Sequence[str]) -> Iterator[tuple[Any, Any, Any]]:
     """Load, thrust and resistance (N,), then their derivatives by wheel.INPUTS and by some of wheel.SHAPE."""
     _, slip, _, width, K_L, _, tan_phi, c, K, length = state
     at, area, u = _pressed(state, model), width * length, slip * length / K
+    mean = area * K_L / (2.0 if model.rollers else 1.0)  # load for a peak pressure of 1, over K_L
     share, slope = _mean_mobilised(u, model)
-    load, resistance = area * K_L * at.pressure, width * K_L * at.integral
-    strength = area * c + load * tan_phi
+    load, resistance = mean * at.pressure, width * K_L * at.integral
+
+    def strength(mobilised: _Mobilised) -> Any:
+        return area * c * mobilised.of_c + load * tan_phi * mobilised.of_load
 
     def pressing(pressure: Any, integral: Any) -> tuple[Any, Any, Any]:
         """Of a change of pressure and of its integral over the depth, both over K_L."""
-        more = area * K_L * pressure
-        return more, tan_phi * share * more, width * K_L * integral
+        more = mean * pressure
+        return more, tan_phi * share.of_load * more, width * K_L * integral
 
     none = np.zeros_like(load)
-    yield load, strength * share, resistance
+    thrust, by_u = strength(share), strength(slope)
+    yield load, thrust, resistance
     yield pressing(*at.by_angle)
-    yield none, strength * slope * length / K, none
-    yield load / K_L, tan_phi * share * load / K_L, resistance / K_L
+    yield none, by_u * length / K, none
+    yield load / K_L, tan_phi * share.of_load * load / K_L, resistance / K_L
     yield pressing(*at.by_n)
-    yield none, load * share, none
-    yield none, area * share, none
-    yield none, -strength * slope * u / K, none
+    yield none, load * share.of_load, none
+    yield none, area * share.of_c, none
+    yield none, -by_u * u / K, none
     for name in shape:
         if name == "exponential_share":
-            yield none, strength * (MEAN_SHEAR["exponential"](u)[0] - MEAN_SHEAR[model.shear_law](u)[0]), none
+            other = (_by_law(u, law, model.rollers)[0] for law in ("exponential", model.shear_law))
+            exponential, own = map(strength, other)
+            yield none, exponential - own, none
         elif name == "pan_stiffness":
             yield pressing(at.over, at.over_integral)
         elif name == "pan_depth":
             yield pressing(*at.by_depth)
         elif name == "length":
-            yield load / length, strength * (share + slope * u) / length, none
+            yield load / length, (thrust + by_u * u) / length, none
         else:  # where the stress of a rim peaks and where it ends
             yield none, none, none
 

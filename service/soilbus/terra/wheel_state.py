@@ -34,8 +34,9 @@ class WheelModel:
     not recover; behind the axle all are negative), but no farther behind than LONGEST times
     the entry angle.  exponential_share of the shear strength is mobilised by the exponential law
     whatever shear_law says.  From the depth pan_depth [m] on the pressure grows by
-    pan_stiffness times what the soil alone would add (0: no hard pan).  one_off: a model
-    whose shape no other call will share, so that nothing of it is kept.
+    pan_stiffness times what the soil alone would add (0: no hard pan).  A track's pressure has
+    rollers periods along its contact (0: it is uniform).  one_off: a model whose shape no other
+    call will share, so that nothing of it is kept.
     """
 
     shear_law: str = "exponential"
@@ -49,6 +50,7 @@ class WheelModel:
     exit_angle: float = 0.0
     exit_slip: float = 0.0
     peak_bend: float = 0.0
+    rollers: int = 0
     one_off: bool = False
 
     @property

@@ -17,12 +17,17 @@ from soilbus.config.model import Config
 from soilbus.daemon.notify import Notifier
 from soilbus.daemon.service import Service
 from soilbus.daemon.state_persistence import StatePersistence
+from soilbus.offline.played_bus import InlineExecutor, PlayedClock
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
+
+__all__ = ["Bench", "FakeClock", "HeldExecutor", "InlineExecutor", "ScriptedBus", "drive_messages", "feed_message"]
+
+FakeClock = PlayedClock
 
 
 def drive_messages(config: Config, seconds: float, seed: int = 3) -> list[can.Message]:
@@ -35,36 +40,6 @@ def feed_message(admission: Admission, message: can.Message) -> None:
     admission.feed(
         message.timestamp, message.arbitration_id, message.is_extended_id, message.data, message.is_remote_frame
     )
-
-
-class FakeClock:
-    """Monotonic time that passes only when somebody waits."""
-
-    def __init__(self) -> None:
-        self.now = 1000.0
-
-    def __call__(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.now += max(seconds, 0.0)
-
-    def wait_for(self, future: Future[Any], longest: float) -> None:
-        """Waits for what is never done while somebody waits."""
-        if not future.done():
-            self.sleep(longest)
-
-
-class InlineExecutor(Executor):
-    """Does the work at once, in the caller's thread."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:
-            future.set_exception(error)
-        return future
 
 
 class HeldExecutor(InlineExecutor):

@@ -6,7 +6,9 @@ import math
 import textwrap
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 from scipy.optimize import brentq
 
@@ -44,9 +46,12 @@ from soilbus.validation.paper_tables import (
 
 WIDTH = 118
 """Characters of a line."""
-PARAMETERS = ("phi [deg]", "K_L", "n")
-DECIMALS = (4, 3, 5)
-"""Decimals of phi, K_L and n."""
+DECIMALS = {"phi [deg]": 4, "K_L": 3, "n": 5}
+"""Decimals of each parameter."""
+PAPER_HEAD = (
+    "parameter", "on", "start", "paper", "error %", "recomputed %", "ours", "error %", "steps", "its s", "our s",
+)  # fmt: skip
+"""Columns of the tables of estimates."""
 REPEATS = 20
 """Timed runs, of which the shortest counts."""
 SINKAGE_MARGIN = 1e-6
@@ -65,7 +70,7 @@ def paper_report(sinkage: float, seed: int) -> str:
             f"k_c in kN/m^(n+1)."
         ),
         _title("What holds") + "".join(_item(text) for text in what_holds(sinkage)),
-        *(_table(number, sinkage) for number in START_ERRORS),
+        *(repr(paper_table(number, sinkage)) for number in START_ERRORS),
         _left_over(sinkage),
         _widths(sinkage),
         _other_data(sinkage),
@@ -182,25 +187,73 @@ def _seconds(work: Callable[[], object]) -> float:
     return min(times)
 
 
-def _table(number: int, sinkage: float) -> str:
+class PaperRow(NamedTuple):
+    """One parameter on one soil: what the paper prints and what its iteration gives; None where it finds no soil.
+
+    Units as printed: phi [deg], K_L [kN/m^(n+2)], errors in per cent, times in s.  recomputed_error: of the printed
+    result against the paper's own soil.
+    """
+
+    parameter: str
+    on: str
+    start: float
+    printed: float
+    printed_error: float
+    recomputed_error: float
+    ours: float | None
+    our_error: float | None
+    steps: int
+    printed_seconds: float
+    our_seconds: float
+
+
+@dataclass(frozen=True, repr=False)
+class PaperTable:
+    """One of the paper's tables of estimates, beside ours; prints itself."""
+
+    number: int
+    rows: tuple[PaperRow, ...]
+
+    def __repr__(self) -> str:
+        title = _title(f"Table {self.number}: start values {START_ERRORS[self.number]} % off")
+        return title + table(PAPER_HEAD, [_cells(row) for row in self.rows])
+
+
+def _cells(row: PaperRow) -> tuple[str, ...]:
+    found = ("none", "-", "-")
+    if row.ours is not None:
+        found = (f"{row.ours:.{DECIMALS[row.parameter]}f}", f"{row.our_error:.0e}", str(row.steps))
+    return (
+        row.parameter, row.on, f"{row.start:g}", f"{row.printed:g}", f"{row.printed_error:g}",
+        f"{row.recomputed_error:.3g}", *found, f"{row.printed_seconds:g}", f"{row.our_seconds:.1e}",
+    )  # fmt: skip
+
+
+def paper_table(number: int, sinkage: float) -> PaperTable:
+    """A table of the paper with ours beside it.
+
+    Parameters
+    ----------
+    number
+        One of START_ERRORS.
+    sinkage
+        Of the simulated wheels [m].
+    """
     runs = [run for run in RUNS if run.table == number]
     ours = [(_newton(run, sinkage), _seconds(partial(_newton, run, sinkage))) for run in runs]
     rows = []
-    for i, name in enumerate(PARAMETERS):
+    for i, name in enumerate(DECIMALS):
         for run, (end, seconds) in zip(runs, ours, strict=True):
             again = errors_in_percent(from_print(run.result), run.trial.truth)[i]
-            found = ("none", "-", "-")
-            if end.soil is not None:
-                error = errors_in_percent(end.soil, run.trial.truth)[i]
-                found = (f"{as_print(end.soil)[i]:.{DECIMALS[i]}f}", f"{error:.0e}", str(end.iterations))
-            rows.append((
-                name, run.on, f"{run.start[i]:g}", f"{run.result[i]:g}", f"{run.errors[i]:g}", f"{again:.3g}", *found,
-                f"{run.seconds:g}", f"{seconds:.1e}",
-            ))  # fmt: skip
-    head = (
-        "parameter", "on", "start", "paper", "error %", "recomputed %", "ours", "error %", "steps", "its s", "our s",
-    )  # fmt: skip
-    return _title(f"Table {number}: start values {START_ERRORS[number]} % off") + table(head, rows)
+            found = None if end.soil is None else as_print(end.soil)[i]
+            error = None if end.soil is None else errors_in_percent(end.soil, run.trial.truth)[i]
+            rows.append(
+                PaperRow(
+                    name, run.on, run.start[i], run.result[i], run.errors[i], again, found, error, end.iterations,
+                    run.seconds, seconds,
+                )
+            )  # fmt: skip
+    return PaperTable(number, tuple(rows))
 
 
 def _left_over(sinkage: float) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.simulator.scenario import Patch, Scenario, Swing
+from soilbus.simulator.scenario import Patch, Scenario
 from soilbus.terra.effects.effect import Surroundings
 from soilbus.terra.wheel import Soil, WheelModel, WheelState
 from soilbus.validation.blind.form import Form, Hidden, Setting, Sizes, by_hooks
@@ -121,7 +121,6 @@ def _ramp(size: float, setting: Setting) -> Hidden:
     ends = [_scaled(setting.soil, sign * size / 2.0) for sign in (-1.0, 1.0)]
 
     def way(scenario: Scenario) -> Scenario:
-        assert isinstance(scenario.speed, Swing)
         length = scenario.duration * (scenario.speed.low + scenario.speed.high) / 2.0
         return replace(scenario, soils=(Patch(-1.0, "start", ends[0]), Patch(0.0, "end", ends[1])), transition=length)
 

@@ -1,0 +1,55 @@
+"""A traction controller on soilbus's frames: it sets the draft so that the rear wheels slip as advised (control.md)."""
+
+import sys
+from pathlib import Path
+
+import can
+import cantools
+
+DBC = Path(__file__).parents[2] / "dbc"
+OURS, TRACTOR = (cantools.database.load_file(DBC / name) for name in ("soilbus.dbc", "tractor.dbc"))
+NAMES = {message.frame_id: message.name for message in OURS.messages}
+COMMAND = TRACTOR.get_message_by_name("DriveCommand")
+NO_SPEED = 65.535  # not available: the speed is the driver's
+OWN_SLIP, LEAST_DRAFT, NO_LIMIT = 0.15, 300.0, 1e5  # what holds without advice; drafts in N
+
+
+def crc(identifier: int, data: bytes) -> int:
+    """Checksum of dbc/README.md."""
+    value = 0xFF
+    for byte in identifier.to_bytes(4, "little") + bytes(data[:7]):
+        value ^= byte
+        for _ in range(8):
+            value = (value << 1 & 0xFF) ^ (0x1D if value & 0x80 else 0)
+    return value ^ 0xFF
+
+
+def follow(bus: can.BusABC) -> None:
+    """Command a draft with each WheelSlip frame, for as long as frames come."""
+    draft, wanted, limit, advised, counter = LEAST_DRAFT, OWN_SLIP, NO_LIMIT, -1e9, 0
+    for frame in bus:
+        name, now = NAMES.get(frame.arbitration_id), frame.timestamp
+        if name is None or crc(frame.arbitration_id, frame.data) != frame.data[7]:
+            continue
+        values = OURS.decode_message(frame.arbitration_id, frame.data)
+        is_valid = values.get("Status") == "valid"
+        known = {signal: value for signal, value in values.items() if isinstance(value, (int, float))}
+        if name == "TractionAdvice" and is_valid and "SlipForEfficiencyRear" in known:
+            wanted, advised = known["SlipForEfficiencyRear"], now
+        elif name == "TractionLimits" and is_valid and {"MaxDraft", "MaxDraftStd"} <= known.keys():
+            limit = max(known["MaxDraft"] - 2.0 * known["MaxDraftStd"], LEAST_DRAFT)
+        elif name == "WheelSlip":
+            if now - advised > 3.0:  # no valid advice for three cycles
+                wanted, limit = OWN_SLIP, NO_LIMIT
+            slip = max((known[wheel] for wheel in ("SlipWheel3", "SlipWheel4") if wheel in known), default=wanted)
+            draft *= 1.0 + min(max(0.5 * (wanted - slip), -0.3), 0.05)
+            draft = min(max(draft, LEAST_DRAFT), limit)
+            command = {"Draft": draft, "Speed": NO_SPEED, "Counter": counter % 16, "Checksum": 0}
+            data = COMMAND.encode(command, strict=False, padding=True)[:7]
+            bus.send(can.Message(arbitration_id=COMMAND.frame_id, data=data + bytes([crc(COMMAND.frame_id, data)])))
+            counter += 1
+
+
+if __name__ == "__main__":
+    with can.Bus(interface=sys.argv[1], channel=sys.argv[2]) as bus:
+        follow(bus)

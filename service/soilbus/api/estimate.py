@@ -1,0 +1,296 @@
+"""From the rows of a single-wheel test rig to a soil: the estimator of the service on data in memory.
+
+columns -> rows of one soil bed (offline/tables.py) -> posterior (estimation) -> SoilEstimate
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from soilbus.arrays import Array
+from soilbus.config.file import load_config, parse_config
+from soilbus.config.model import Config
+from soilbus.diagnosis.diagnose import NotFitted
+from soilbus.estimation.posterior import PARAMETERS, Estimate, Posterior
+from soilbus.offline.tables import Run, TableError, replay_runs, runs_of_columns
+from soilbus.report.soil_prior import SHOWN
+from soilbus.terra.wheel import Soil
+from soilbus.words import did_you_mean
+
+__all__ = ["SingleWheelRig", "SoilEstimate", "estimate"]
+
+SOURCE = "data"
+"""What messages call the columns."""
+ROLES = ("wheel_load", "slip", "drawbar_pull", "torque", "sinkage", "t", "run")
+"""Columns that a rig's table can have."""
+CHANNELS = {"wheel_load": "load", "slip": "slip", "drawbar_pull": "draft", "torque": "torque", "sinkage": "sinkage"}
+"""Section of [noise] for each of them."""
+LEAST_CORRELATION = 0.5
+"""Correlations below it are not printed; an offset of half a std in one parameter moves the other by a quarter."""
+
+
+@dataclass(frozen=True)
+class SingleWheelRig:
+    """A test rig with one wheel; lengths in m.
+
+    Attributes
+    ----------
+    radius, width
+        Of the wheel [m].
+    noise
+        Standard deviation of each column (wheel_load, slip, drawbar_pull, torque, sinkage) in SI, or a mapping with
+        `absolute`, `relative`, `of_mean` and `gain` as in [noise] of a configuration, whose defaults hold for others.
+    soil
+        Prior (value, std) of soil parameters in SI, std = 0 holds one; by default that of a configuration.
+    tyre
+        "rigid", or "flexible" for a wheel with a tyre.
+    shear_law
+        "exponential" (Janosi & Hanamoto) or "rational".
+
+    Examples
+    --------
+    >>> rig = SingleWheelRig(radius=0.3, width=0.2, noise={"torque": 3.0, "wheel_load": {"relative": 0.01}})
+    >>> rig.configuration(["wheel_load", "slip", "torque"]).noise.torque.absolute
+    3.0
+    """
+
+    radius: float
+    width: float
+    noise: Mapping[str, float | Mapping[str, float]] = field(default_factory=dict)
+    soil: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    tyre: str = "rigid"
+    shear_law: str = "exponential"
+
+    def configuration(self, columns: Iterable[str]) -> Config:
+        """The configuration of this rig for a table with these columns, named by their roles; others are not used.
+
+        Raises
+        ------
+        TableError
+            wheel_load or slip is missing, or a name is nearly one of a role that is.
+        ConfigError
+            A value that the configuration does not take, or a column without noise.
+        """
+        names = list(columns)
+        absent = [role for role in ROLES if role not in names]
+        for name in (name for name in names if name not in ROLES):
+            if meant := did_you_mean(name, absent):
+                raise TableError(f"{SOURCE}: no column of a rig is named {name}{meant}")
+        if needed := [role for role in ("wheel_load", "slip") if role in absent]:
+            raise TableError(f"{SOURCE}: no column {' and '.join(needed)}; it has {', '.join(names) or 'none'}")
+        if unknown := [name for name in self.noise if name not in CHANNELS]:
+            raise TableError(f"noise of {unknown[0]}{did_you_mean(unknown[0], CHANNELS)}; known: {', '.join(CHANNELS)}")
+        raw = {
+            "wheel": [{"name": "wheel", "radius": self.radius, "width": self.width, "tyre": self.tyre}],
+            "table": {role: role for role in ROLES if role in names},
+            "noise": {CHANNELS[name]: _noise(sd) for name, sd in self.noise.items()},
+            "soil": {name: {"value": value, "std": std} for name, (value, std) in self.soil.items()},
+            "model": {"shear_law": self.shear_law},
+        }
+        return parse_config(raw, source="rig")
+
+
+@dataclass(frozen=True, repr=False)
+class SoilEstimate:
+    """The soil that rows of a test rig determine; prints itself as a report.
+
+    Attributes
+    ----------
+    posterior
+        Log-normal, of all six parameters.
+    prior
+        Value and std of each parameter beforehand, SI.
+    bearing_pressure
+        (k_c/b_ref + k_phi) z_ref^n [Pa], the combination that data determine best.
+    z_ref, b_ref
+        Depth and plate width [m] that it holds for.
+    status, reason
+        As of a window of `soilbus replay`: `valid`, `degraded`, `not_excited`.
+    chi2
+        Reduced chi-square: 1 where model and noise describe the data.
+    rows
+        Used.
+    left_out
+        Rows that were not, by reason.
+    """
+
+    posterior: Posterior
+    prior: Mapping[str, tuple[float, float]]
+    bearing_pressure: Estimate
+    z_ref: float
+    b_ref: float
+    status: str
+    reason: str
+    chi2: float | None
+    rows: int
+    left_out: Mapping[str, int]
+
+    @property
+    def soil(self) -> Soil:
+        """The values as a soil, for `wheel_forces`."""
+        return self.posterior.soil
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Value of each parameter, SI."""
+        return {name: e.value for name, e in self.posterior.parameters().items()}
+
+    @property
+    def std(self) -> dict[str, float]:
+        """Standard deviation of each parameter, SI; 0 of a held one."""
+        return {name: e.std for name, e in self.posterior.parameters().items()}
+
+    @property
+    def correlation(self) -> Array:
+        """Of the parameters' logarithms (6, 6); nan in rows of held ones."""
+        covariance = self.posterior.log_covariance
+        sd = np.sqrt(np.diag(covariance))
+        with np.errstate(invalid="ignore"):
+            return np.asarray(covariance / np.outer(sd, sd))
+
+    def __repr__(self) -> str:
+        left_out = ", ".join(f"{reason} {n}" for reason, n in self.left_out.items()) or "none"
+        pressure = _quantity(self.bearing_pressure, 1e3)
+        return "\n".join([
+            "[[Fit]]",
+            f"    rows used          = {self.rows} (left out: {left_out})",
+            f"    reduced chi-square = {'-' if self.chi2 is None else format(self.chi2, '.3g')}",
+            f"    status             = {self.status}" + (f" ({self.reason})" if self.reason != "none" else ""),
+            "[[Soil]]",
+            *(f"    {line}" for line in self._parameter_lines()),
+            f"[[Bearing pressure]] (at {1e3 * self.z_ref:g} mm under a plate {self.b_ref:g} m wide)",
+            f"    {pressure} kPa",
+            f"[[Correlations]] (of logarithms; below {LEAST_CORRELATION:g} not shown)",
+            *(f"    {line}" for line in self._correlation_lines()),
+        ])  # fmt: skip
+
+    def _parameter_lines(self) -> Iterator[str]:
+        for name, found in self.posterior.parameters().items():
+            unit, size = SHOWN[name]
+            before = _plus_minus(Estimate(*self.prior[name]), size)
+            yield f"{name + ':':<7}{_quantity(found, size):<26} {unit:<12} (prior {before})"
+
+    def _correlation_lines(self) -> Iterator[str]:
+        table = self.correlation
+        pairs = [(float(table[i, j]), i, j) for i, j in combinations(range(len(PARAMETERS)), 2)]
+        strong = [pair for pair in pairs if abs(pair[0]) >= LEAST_CORRELATION]  # nan is not
+        for r, i, j in sorted(strong, key=lambda pair: -abs(pair[0])):
+            yield f"C({PARAMETERS[i]}, {PARAMETERS[j]}) = {r:+.2f}"
+
+
+def estimate(data: Any, rig: SingleWheelRig | Config | Path | str, *, run: str | None = None) -> SoilEstimate:
+    """Estimate the soil in which a single wheel was tested.
+
+    Parameters
+    ----------
+    data
+        Columns of equal length by name, each row one steady state: a mapping of arrays or a pandas DataFrame. Of a
+        SingleWheelRig the names are wheel_load [N] and slip [1] with at least one of drawbar_pull [N], torque [N m]
+        and sinkage [m], and optionally t [s] and run; others are not used. nan and None are missing.
+    rig
+        The rig; or a configuration with a [table] that maps the columns, or the path of one.
+    run
+        Soil bed to estimate, where the data hold several.
+
+    Returns
+    -------
+    SoilEstimate
+
+    Raises
+    ------
+    TableError
+        A column is missing, a cell is not a number, no row can be used, or no soil bed is named `run`, or `run` is
+        None and there are several.
+    ConfigError
+        The rig's values cannot be used.
+    NotFitted
+        No soil describes the rows.
+
+    Examples
+    --------
+    A wheel of 0.3 m radius at two loads and ten slips on a soil that we choose, without noise:
+
+    >>> import numpy as np
+    >>> import soilbus
+    >>> slip, load = (a.ravel() for a in np.meshgrid(np.linspace(0.05, 0.6, 10), [800.0, 1500.0]))
+    >>> true = soilbus.wheel_forces("loam", load, slip, radius=0.3, width=0.2)
+    >>> columns = {"wheel_load": load, "slip": slip, "drawbar_pull": true.drawbar_pull, "torque": true.torque}
+    >>> rig = soilbus.SingleWheelRig(0.3, 0.2, noise={"drawbar_pull": 8.0, "torque": 3.0})
+    >>> found = soilbus.estimate(columns, rig)
+    >>> found.status
+    'valid'
+    >>> soil = soilbus.soil_named("loam")
+    >>> all(abs(found.values[name] - true) < 2.0 * found.std[name] for name, true in soil._asdict().items())
+    True
+    """
+    columns = {str(name): np.asarray(data[name]).tolist() for name in data}
+    lengths = {len(cells) for cells in columns.values() if isinstance(cells, list)}
+    if len(lengths) > 1 or not all(isinstance(cells, list) for cells in columns.values()):
+        raise TableError(f"{SOURCE}: its columns are not of one length")
+    config = _configuration(rig, columns)
+    found = _of_bed(runs_of_columns(config, columns, SOURCE), run)
+    (result,) = replay_runs(config, [found])
+    if result.posterior is None or result.bearing is None:
+        raise NotFitted(f"no soil describes the {len(found.window.t)} rows ({result.reason})")
+    settings = config.estimator
+    return SoilEstimate(
+        posterior=result.posterior,
+        prior={name: (p.value, p.std) for name, p in config.soil_prior.items()},
+        bearing_pressure=result.bearing,
+        z_ref=settings.z_ref,
+        b_ref=settings.b_ref,
+        status=str(result.status),
+        reason=result.reason,
+        chi2=result.chi2,
+        rows=len(found.window.t),
+        left_out=found.rejected,
+    )
+
+
+def _configuration(rig: SingleWheelRig | Config | Path | str, columns: Iterable[str]) -> Config:
+    if isinstance(rig, SingleWheelRig):
+        return rig.configuration(columns)
+    return rig if isinstance(rig, Config) else load_config(rig)
+
+
+def _of_bed(runs: Sequence[Run], bed: str | None) -> Run:
+    """The run of one soil bed, or the only one."""
+    beds = {run.name.removeprefix(f"{SOURCE}, "): run for run in runs}
+    if bed is None and len(beds) > 1:
+        raise TableError(f"{SOURCE}: rows of {len(beds)} soil beds: say which by run: {', '.join(beds)}")
+    if bed is not None and SOURCE in beds:
+        raise TableError(f"{SOURCE}: no column says which rows are of the soil bed {bed}")
+    wanted = next(iter(beds)) if bed is None else str(bed)
+    if wanted not in beds:
+        raise TableError(f"{SOURCE}: no soil bed {wanted}{did_you_mean(wanted, beds)}; it has {', '.join(beds)}")
+    if not len(beds[wanted].window.t):
+        raise TableError(f"{SOURCE}: no usable row of the soil bed {wanted} ({', '.join(beds[wanted].rejected)})")
+    return beds[wanted]
+
+
+def _noise(sd: float | Mapping[str, float]) -> Mapping[str, float]:
+    return sd if isinstance(sd, Mapping) else {"absolute": sd}
+
+
+def _quantity(found: Estimate, unit: float) -> str:
+    """Value and std, and the std in per cent."""
+    if found.std == 0.0:
+        return f"{_plus_minus(found, unit)} (held)"
+    share = 100.0 * found.std / found.value
+    return f"{_plus_minus(found, unit)} ({share:.{int(share < 10.0)}f} %)"
+
+
+def _plus_minus(found: Estimate, unit: float) -> str:
+    """Value and std with two digits of the std."""
+    value, std = found.value / unit, found.std / unit
+    if std == 0.0:
+        return f"{value:.4g}"
+    decimals = max(1 - math.floor(math.log10(std)), 0)
+    return f"{value:.{decimals}f} +/- {std:.{decimals}f}"

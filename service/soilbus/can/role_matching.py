@@ -1,0 +1,401 @@
+"""Signals of a vehicle's DBC matched to roles of the configuration, by unit, name, comment and range.
+
+    score(signal, role) = base of the unit + sum over words of weight * share(where the word stands)
+    assignment          = argmax of the sum of scores, each signal and each slot at most once
+
+A slot is a role at a place ("torque" at "FL", "load" at "rear", "draft").  A match is asserted where its score reaches
+ASSERTED and beats the next free candidate of its slot by MARGIN; anything else stays open and lists its candidates.
+The weights are judgement, held by the share of roles right, wrong and open on the DBCs of tests/proposal.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from cantools.database.can import Database, Message, Signal
+
+from soilbus.can.j1939 import pgn_of
+from soilbus.can.units import Unit, unit_of
+
+__all__ = [
+    "ASSERTED",
+    "AXLES",
+    "WHEELS",
+    "Assignment",
+    "Candidate",
+    "Slot",
+    "assigned",
+    "candidates",
+    "is_word_in",
+    "shown",
+]
+
+WHEELS = ("FL", "FR", "RL", "RR")
+"""Places of wheels: front or rear, left or right."""
+AXLES = ("front", "rear", "both")
+"""Places of axles; `both` for one motor that drives front and rear."""
+ASSERTED = 1.0
+"""Score from which a match is asserted: the unit fits and at least one strong word of the role stands in a name."""
+MARGIN = 0.3
+"""Score by which it must beat the next candidate: less than one word."""
+LISTED = 0.25
+"""Score from which a candidate is worth a line."""
+IN_MESSAGE, IN_COMMENT = 0.7, 0.5
+"""Share of a word's weight where it stands in the message's name or in the comment, not in the signal's own name."""
+
+HINT = 0.25
+"""The same of a word against a role, where the signal's own name speaks for it."""
+
+_ABBREVIATIONS: Mapping[str, str] = {
+    "torque": "tq trq trque torq", "speed": "spd vel velocity rpm sog revolution",
+    "motor": "mot mtr mcu inv inverter emotor drv",
+    "shaft": "rotor", "wheel": "whl wh tyre tire", "axle": "axl", "load": "ld wgt weight fz",
+    "draft": "drft draught dft", "pull": "tow traction drawbar", "hitch": "htch linkage implement impl pin",
+    "ground": "gnd radar gps gnss sog doppler overground", "sinkage": "sink rut", "height": "hgt ride",
+    "pitch": "ptch", "slope": "grade inclination incline", "roll": "bank", "yaw": "gz", "rate": "rt",
+    "acceleration": "acc accel accelerometer", "longitudinal": "lgt lon long along forward x ax",
+    "lateral": "lat y ay", "vertical": "vert z az", "steering": "steer str eps mdps", "angle": "ang",
+    "latitude": "lat", "longitude": "lon long lng", "position": "pos gps gnss",
+    "differential": "diff", "lock": "locked lck",
+    "limit": "lim max maximum avail available avl greatest", "least": "min minimum",
+    "request": "req requested cmd command commanded demand dmd setpoint setpt sp target tgt desired des ref reference",
+    "actual": "act fbk feedback fb measured meas estimated est real", "pto": "powertakeoff", "engine": "eng ice",
+    "brake": "brk braking", "vehicle": "veh machine motion", "odometer": "odo", "valid": "ok qualifier vld",
+    "state": "status stat", "current": "curr cur amps iq",
+    "front": "frnt frt fnt fwd", "rear": "re rer back hind", "left": "lft lh", "right": "rght rgt rh",
+}  # fmt: skip
+_OTHER = (
+    "force specific hand column pump fan cruise gravity course cog fraction coverage distance direction travel steady"
+    " temperature voltage counter checksum percent rated loss friction north east up down link lift position"
+)
+_WORDS: dict[str, frozenset[str]] = {}
+for _word, _short in _ABBREVIATIONS.items():
+    for _spelling in (_word, *_short.split()):
+        _WORDS[_spelling] = _WORDS.get(_spelling, frozenset()) | {_word}
+for _spelling in _OTHER.split():
+    _WORDS.setdefault(_spelling, frozenset({_spelling}))
+
+_CORNERS = {"fl": "FL", "lf": "FL", "fr": "FR", "rf": "FR", "rl": "RL", "lr": "RL", "rr": "RR"}
+_GROUPS: Mapping[int, frozenset[str]] = {
+    65093: frozenset({"draft", "rear"}), 65094: frozenset({"draft", "front"}), 65096: frozenset({"wheel"}),
+    65097: frozenset({"ground"}), 65265: frozenset({"wheel"}), 65267: frozenset({"position"}),
+    127251: frozenset({"yaw"}), 129025: frozenset({"position"}),
+}  # fmt: skip
+"""What the standards say of a parameter group, whatever its signals are called."""
+_ASKED = frozenset({"request", "least", "rated"})
+_OTHER_MACHINES = frozenset({"pto", "engine", "brake", "pump", "fan", "steering"})
+_ROLES: Mapping[str, tuple[tuple[str, ...], float, Mapping[str, float], frozenset[str]]] = {
+    "torque": (
+        ("torque",), 0.6,
+        {"motor": 0.4, "shaft": 0.2, "wheel": 0.2, "axle": 0.2, "torque": 0.3, "actual": 0.4},
+        _ASKED | _OTHER_MACHINES | {"limit", "loss", "friction", "lock", "differential"},
+    ),
+    "torque_limit": (("torque",), 0.0, {"limit": 1.2}, _ASKED | _OTHER_MACHINES),
+    "motor_speed": (
+        ("rotation",), 0.3, {"motor": 0.7, "shaft": 0.5, "speed": 0.2, "actual": 0.2},
+        _ASKED | _OTHER_MACHINES | {"wheel", "yaw", "roll", "pitch", "limit"},
+    ),
+    "speed": (
+        ("rotation", "speed"), 0.1, {"wheel": 0.8, "speed": 0.2},
+        _ASKED | _OTHER_MACHINES | {"motor", "shaft", "limit", "yaw", "ground"},
+    ),
+    "load": (
+        ("force", "mass"), 0.2, {"load": 0.8, "wheel": 0.3, "axle": 0.3, "vertical": 0.4},
+        _ASKED | {"draft", "hitch", "pull", "lateral", "limit", "link"},
+    ),
+    "sinkage": (("length",), 0.0, {"sinkage": 1.2, "height": 0.3}, _ASKED | {"distance", "travel", "hitch", "limit"}),
+    "ground_speed": (
+        ("speed",), 0.1, {"ground": 0.85, "speed": 0.3, "vehicle": 0.1},
+        _ASKED | {"wheel", "odometer", "cruise", "limit", "lateral", "vertical", "north", "east", "motor", "coverage"},
+    ),
+    "draft": (
+        ("force",), 0.1, {"draft": 1.0, "pull": 0.6, "hitch": 0.3, "force": 0.1},
+        _ASKED | {"lateral", "vertical", "wheel", "axle", "limit", "lift", "front"},
+    ),
+    "pitch": (
+        ("angle",), 0.1, {"pitch": 1.0, "slope": 0.6, "longitudinal": 0.4},
+        _ASKED | {"rate", "roll", "lateral", "steering", "hitch"},
+    ),
+    "roll": (
+        ("angle",), 0.1, {"roll": 1.0, "slope": 0.6, "lateral": 0.4},
+        _ASKED | {"rate", "pitch", "longitudinal", "steering", "hitch"},
+    ),
+    "yaw_rate": (
+        ("rotation",), 0.1, {"yaw": 1.0, "rate": 0.2},
+        _ASKED | {"pitch", "roll", "motor", "shaft", "wheel", "longitudinal", "lateral", "acceleration"},
+    ),
+    "acceleration": (
+        ("acceleration",), 0.1, {"longitudinal": 0.9, "acceleration": 0.3, "specific": 0.6, "force": 0.3},
+        _ASKED | {"lateral", "vertical", "limit"},
+    ),
+    "steering_angle": (
+        ("angle",), 0.1, {"steering": 0.8, "angle": 0.2, "front": 0.3},
+        _ASKED | {"hand", "column", "rate", "limit", "fraction"},
+    ),
+    "latitude": (("angle",), 0.1, {"latitude": 0.8, "position": 0.4}, frozenset({"slope", "acceleration", "pitch"})),
+    "longitude": (("angle",), 0.1, {"longitude": 0.8, "position": 0.4}, frozenset({"slope", "acceleration", "pitch"})),
+    "differential_lock": (("",), 0.0, {"differential": 0.6, "lock": 0.6}, _ASKED),
+}  # fmt: skip
+"""Of each role: dimensions of its unit, score of a fitting unit, weights of words, words that speak against it."""
+FEWEST_BITS = 7
+"""Length of the shortest signal that measures anything; shorter ones are codes and flags."""
+COARSEST_POSITION = 2e-5
+"""Resolution [rad] up to which a signal alone can be a latitude: 130 m."""
+_AGAINST = 1.5
+"""Score that a word against a role costs."""
+_NO_UNIT = 0.4
+"""Score that a missing unit costs."""
+WHEEL_AND_AXLE = frozenset({"torque", "torque_limit", "motor_speed", "load"})
+WHEEL_ONLY = frozenset({"speed", "sinkage"})
+
+
+class Slot(NamedTuple):
+    """A role and the wheel or axle that it is of; "" for the whole vehicle, or where the place is not known."""
+
+    role: str
+    place: str
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """One signal as one slot's value: its score, and in words what speaks against it."""
+
+    slot: Slot
+    message: str
+    signal: str
+    score: float
+    unit: str
+    factor: float
+    """SI value of one unit of the DBC; 1 without a unit."""
+    dimension: str
+    notes: tuple[str, ...] = ()
+
+    @property
+    def path(self) -> str:
+        """`Message.Signal`."""
+        return f"{self.message}.{self.signal}"
+
+    def changed(self, by: float, note: str = "") -> Candidate:
+        """The same with another score, and a note on why."""
+        return replace(self, score=self.score + by, notes=(*self.notes, note) if note else self.notes)
+
+
+@dataclass(frozen=True, slots=True)
+class Assignment:
+    """What is asserted by slot, the candidates of slots that stay open, best first, and rivals of asserted ones."""
+
+    asserted: dict[Slot, Candidate] = field(default_factory=dict)
+    open: dict[Slot, list[Candidate]] = field(default_factory=dict)
+    rivals: list[Candidate] = field(default_factory=list)
+
+
+def candidates(database: Database) -> list[Candidate]:
+    """Every signal as a value of every slot that it may fill, with a score from LISTED up.
+
+    Parameters
+    ----------
+    database
+        Messages of the vehicle's bus.
+    """
+    return [c for m in database.messages for s in m.signals for c in _of_signal(m, s)]
+
+
+def assigned(found: Iterable[Candidate]) -> Assignment:
+    """Each signal to one slot, by the largest sum of scores; what is not clear stays open.
+
+    Returns
+    -------
+    Assignment
+        Slots of a role that can belong to wheels or axles without a place are open always.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    best: dict[tuple[Slot, str], Candidate] = {}
+    for c in found:
+        known = best.get((c.slot, c.path))
+        if c.score >= LISTED and (known is None or c.score > known.score):
+            best[c.slot, c.path] = c
+    slots = sorted({slot for slot, _ in best})
+    paths = sorted({path for _, path in best})
+    score = np.zeros((len(slots), len(paths)))
+    for (slot, path), c in best.items():
+        score[slots.index(slot), paths.index(path)] = c.score * (c.score >= ASSERTED)
+    taken = {(slots[i], paths[j]) for i, j in zip(*linear_sum_assignment(-score), strict=True) if score[i, j] > 0.0}
+    out = Assignment()
+    for slot in slots:
+        elsewhere = {path for other, path in taken if other != slot}
+        of_slot = [c for (s, path), c in best.items() if s == slot and path not in elsewhere]
+        of_slot.sort(key=lambda c: -c.score)
+        chosen = next((c for c in of_slot if (slot, c.path) in taken), None)
+        rivals = [c for c in of_slot if c is not chosen]
+        if chosen is not None and all(chosen.score - c.score >= MARGIN for c in rivals):
+            out.asserted[slot] = chosen
+            out.rivals.extend(c for c in rivals if c.score >= ASSERTED)
+        elif of_slot:
+            out.open[slot] = of_slot
+    return out
+
+
+def shown(candidate: Candidate) -> str:
+    """A candidate for a comment: path, unit and what speaks against it."""
+    said = [candidate.unit] * bool(candidate.unit) + list(candidate.notes)
+    return f"{candidate.path} ({', '.join(said)})" if said else candidate.path
+
+
+def is_word_in(name: Candidate | str, *words: str) -> bool:
+    """Whether a signal's name, or a candidate's with that of its message, has one of these words, however spelt."""
+    texts = (name,) if isinstance(name, str) else (name.signal, name.message)
+    return any(word in _words(text) for text in texts for word in words)
+
+
+# --- one signal ---
+
+
+def _of_signal(message: Message, signal: Signal) -> list[Candidate]:
+    try:
+        unit = unit_of(signal.unit)
+    except ValueError:
+        return _indirect(message, signal)
+    group = pgn_of(message.frame_id) if message.is_extended_frame else 0
+    comment = signal.comment or ""
+    own, around = _words(signal.name), _words(message.name) | _GROUPS.get(group, frozenset())
+    texts = (signal.name, message.name, *(message.senders or ()), comment)
+    place = next((p for text in texts if (p := _place(text))), "")
+    found = []
+    for role, (dimensions, *_) in _ROLES.items():
+        if unit is not None and unit.dimension not in dimensions:
+            continue
+        if signal.length < FEWEST_BITS and dimensions != ("",):
+            continue
+        score = _score(role, own, around, _words(comment), unit) + _by_range(role, signal, unit, own)
+        slot = Slot(role, _place_of(role, place))
+        notes: tuple[str, ...] = ("no unit in the DBC: SI assumed",) if unit is None and dimensions != ("",) else ()
+        if role in WHEEL_ONLY and slot.place not in WHEELS:
+            notes += ("not of one wheel",)
+        if score >= LISTED:
+            factor, dimension = (unit.factor, unit.dimension) if unit is not None else (1.0, dimensions[0])
+            found.append(Candidate(slot, message.name, signal.name, score, signal.unit or "", factor, dimension, notes))
+    return found
+
+
+def _indirect(message: Message, signal: Signal) -> list[Candidate]:
+    """A percentage or a current, which is a torque with a number that the DBC does not have: never asserted."""
+    own, around, unit = _words(signal.name), _words(message.name), (signal.unit or "").strip()
+    if own & _ASKED or "limit" in own:
+        return []
+    note = ""
+    if unit == "%" and "torque" in own:
+        note = "with reference_torque"
+    elif unit in ("A", "mA", "kA") and "current" in own and "motor" in own | around:
+        note = "with torque_constant"
+    place = next((p for text in (signal.name, message.name) if (p := _place(text))), "")
+    slot, score = Slot("torque", place), (LISTED + ASSERTED) / 2.0
+    return [Candidate(slot, message.name, signal.name, score, unit, 1.0, "torque", (note,))] if note else []
+
+
+def _score(role: str, own: frozenset[str], around: frozenset[str], comment: frozenset[str], unit: Unit | None) -> float:
+    dimensions, base, weights, against = _ROLES[role]
+    is_bare = not own - {"front", "rear"}  # a name that only says where: the message says what
+    score = base if unit is not None or dimensions == ("",) else -_NO_UNIT
+    for word, weight in weights.items():
+        share = 1.0 if word in own else (1.0 if is_bare else IN_MESSAGE) if word in around else 0.0
+        score += weight * max(share, IN_COMMENT if word in comment else 0.0)
+    for word in against:
+        if word in own:
+            score -= _AGAINST
+        elif word in around:
+            is_hint = own & weights.keys() and word not in _ASKED
+            score -= _AGAINST * (HINT if is_hint else IN_MESSAGE)
+        elif word in comment & _ASKED:
+            score -= _AGAINST * HINT
+    return score
+
+
+def _by_range(role: str, signal: Signal, unit: Unit | None, own: frozenset[str]) -> float:
+    """What the range of the DBC, in SI, adds to a score."""
+    low, high = (
+        math.nan if limit is None else float(limit) * (unit.factor if unit else 1.0)
+        for limit in (signal.minimum, signal.maximum)
+    )
+    extent = max(abs(low), abs(high)) if math.isfinite(low) and math.isfinite(high) else math.nan
+    if role == "steering_angle":
+        # the hand wheel turns further, and is what "steering angle" means on a car
+        return -1.0 if extent > 1.6 or {"steering", "wheel"} <= own else 0.0 if extent > 0.0 else -0.3
+    if role in ("latitude", "longitude"):
+        least = (math.pi / 2.0 if role == "latitude" else math.pi) - 1e-6
+        is_part = float(signal.scale) * (unit.factor if unit else 1.0) > COARSEST_POSITION  # minutes stand elsewhere
+        return -1.0 if extent < least or low >= 0.0 or is_part else 0.0
+    if role in ("pitch", "roll"):
+        return -1.0 if extent > 2.0 * math.pi - 0.1 or low >= 0.0 else 0.0  # a course
+    if role in ("torque", "draft", "acceleration", "yaw_rate") and low >= 0.0:
+        return -0.2 if role == "torque" else -0.1  # braking or pushing cannot be said
+    if role == "torque_limit" and low < 0.0 and high <= 0.0:
+        return -2.0  # of the generator
+    return 0.0
+
+
+def _place_of(role: str, place: str) -> str:
+    if role in WHEEL_ONLY:
+        return place if place in WHEELS else ""
+    return place if role in WHEEL_AND_AXLE else ""
+
+
+# --- words ---
+
+
+@cache
+def _tokens(text: str) -> tuple[str, ...]:
+    """Pieces of a name: at underscores, capitals and digits, and whole words run together."""
+    pieces = re.findall(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+", text)
+    return tuple(part for piece in pieces for part in _parted(_singular(piece.casefold())))
+
+
+def _singular(piece: str) -> str:
+    return piece[:-1] if piece not in _WORDS and piece[:-1] in _WORDS and piece.endswith("s") else piece
+
+
+def _parted(piece: str) -> tuple[str, ...]:
+    """A piece as known words, where it is made of nothing else ("wheelspeed", "whlspdfl")."""
+    if piece in _WORDS or piece in _CORNERS or len(piece) < 5:
+        return (piece,)
+    for n in range(len(piece) - 2, 1, -1):
+        head, rest = piece[:n], piece[n:]
+        if (head in _WORDS and n > 2) or head in _CORNERS:
+            parts = _parted(rest)
+            if all(p in _WORDS or p in _CORNERS for p in parts):
+                return (head, *parts)
+    return (piece,)
+
+
+def _words(text: str) -> frozenset[str]:
+    """What a text speaks of, places left out but for front, which says which wheels steer."""
+    found = frozenset[str]().union(*(_WORDS.get(token, frozenset()) for token in _tokens(text)))
+    return found - {"left", "right"}
+
+
+def _place(text: str) -> str:
+    """FL, FR, RL, RR; front, rear, both; or "" where a text says no place, or several."""
+    tokens = _tokens(text)
+    along = {w for t in tokens for w in _WORDS.get(t, ()) if w in ("front", "rear")}
+    across = {w for t in tokens for w in _WORDS.get(t, ()) if w in ("left", "right")}
+    if across and not along and "fr" in tokens:  # "FrLft"
+        along = {"front"}
+    if len(along) == len(across) == 1:
+        return {"front": "F", "rear": "R"}[min(along)] + {"left": "L", "right": "R"}[min(across)]
+    corners = {_CORNERS[t] for t in tokens if t in _CORNERS}
+    letters = (a + b for a, b in pairwise(tokens) if len(a) == len(b) == 1)
+    corners |= {_CORNERS[pair] for pair in letters if pair in _CORNERS}
+    if len(corners) == 1 and not along and not across:
+        return min(corners)
+    if corners or across:
+        return ""
+    if "both" in tokens or len(along) == 2:
+        return "both"
+    return min(along) if along else ""

@@ -1,0 +1,60 @@
+"""The catalogue of effects as rows, text and JSON: what `soilbus effects` and the page effects.md show."""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from collections.abc import Iterable
+
+from soilbus.report.table import table
+from soilbus.terra.effects.effect import Effect
+
+WIDTH = 100
+"""Characters of a line."""
+HEAD = ("parameter", "unit", "absent at", "prior std", "range")
+"""Of each column of parameter_rows()."""
+
+
+def parameter_rows(effect: Effect) -> list[tuple[str, ...]]:
+    """Each parameter of an effect: name, unit, value at which the effect is absent, prior std, range."""
+    return [
+        (p.name, p.unit or "–", f"{p.neutral:g}", f"{p.std:g}", f"{p.low:g} to {p.high:g}") for p in effect.parameters
+    ]
+
+
+def effect_text(effect: Effect) -> str:
+    """One effect in full."""
+    parts = [f"{effect.name}\n", _wrapped(effect.physics), table(HEAD, parameter_rows(effect))]
+    parts += [_wrapped(f"Shown by: {effect.tells}"), _wrapped(f"Source: {effect.source}")]
+    return "\n".join(parts)
+
+
+def overview(effects: Iterable[Effect]) -> str:
+    """A row for each effect: name and physics."""
+    rows = [(effect.name, effect.physics.partition(": ")[0].rstrip(".")) for effect in effects]
+    more = "\nsoilbus effects NAME: parameters, units, ranges, what tells it apart, source; --json OUT: all of them\n"
+    return table(("effect", "physics"), rows) + more
+
+
+def effects_json(effects: Iterable[Effect]) -> str:
+    """All that the catalogue says of effects, a list of objects."""
+    return json.dumps(
+        [
+            {
+                "name": effect.name,
+                "physics": effect.physics,
+                "parameters": [
+                    {"name": p.name, "unit": p.unit, "absent_at": p.neutral, "std": p.std, "range": [p.low, p.high]}
+                    for p in effect.parameters
+                ],
+                "shown_by": effect.tells,
+                "source": effect.source,
+            }
+            for effect in effects
+        ],
+        indent=1,
+    )
+
+
+def _wrapped(text: str) -> str:
+    return textwrap.fill(text, WIDTH) + "\n"

@@ -1,0 +1,129 @@
+"""A recording played to the live service: a bus and a clock that follow the frames' stamps.
+
+    now = now at the last frame + (its stamp - the last one's)    time passes only while somebody waits
+
+Stamps that go back take no time, and a silence takes LONGEST_GAP at most, after which another recording begins anyway.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future
+from typing import Any
+
+import can
+
+from soilbus.can.admission import LONGEST_GAP
+from soilbus.can.candump import Frame
+from soilbus.can.wire import Received
+
+LEAST_WAIT = 1e-4
+"""Time [s] that a look at an empty bus takes at least: a loop that only looks comes to an end."""
+
+
+class PlayedClock:
+    """Monotonic time [s] that passes only when somebody waits."""
+
+    def __init__(self, now: float = 1000.0) -> None:
+        self.now = now
+
+    def __call__(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass."""
+        self.now += max(seconds, 0.0)
+
+    def wait_for(self, future: Future[Any], longest: float) -> None:
+        """Wait for what is never done while somebody waits."""
+        if not future.done():
+            self.sleep(longest)
+
+
+class InlineExecutor(Executor):
+    """Does the work at once, in the caller's thread and in no time of a PlayedClock."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """The work, done."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+class PlayedBus:
+    """The frames of a recording that pass the filters, and what is sent meanwhile.
+
+    Parameters
+    ----------
+    frames
+        In the order of the recording.
+    filters
+        As for python-can, of the messages that the service would hear.
+    clock
+        Goes on with the frames.
+    channel
+        Name of the channel of what is sent.
+    """
+
+    def __init__(
+        self, frames: Iterator[Frame], filters: Sequence[dict[str, Any]], clock: PlayedClock, channel: str
+    ) -> None:
+        self._frames, self._filters, self._clock, self._channel = frames, filters, clock, channel
+        self._passes: dict[tuple[int, bool], bool] = {}
+        self._stamp, self._taken_at = math.nan, clock.now
+        self._sent: list[can.Message] = []
+        self._next = self._following()
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether the recording has ended."""
+        return self._next is None
+
+    def recv(self, timeout: float | None = None) -> Received | None:
+        """The next frame, or None after `timeout` [s]."""
+        now, longest = self._clock.now, timeout or 0.0
+        if self._next is None or (due := self._due(self._next.timestamp)) > now + longest:
+            self._clock.sleep(max(longest, LEAST_WAIT))
+            return None
+        frame = self._next
+        self._clock.now = max(now, due)
+        self._stamp, self._taken_at = frame.timestamp, self._clock.now
+        self._next = self._following()
+        return frame
+
+    def send(self, message: can.Message) -> None:
+        """Keep a frame, stamped with the bus's time."""
+        message.timestamp = self._stamp + self._clock.now - self._taken_at
+        message.channel = self._channel
+        self._sent.append(message)
+
+    def take_sent(self) -> list[can.Message]:
+        """What was sent since the last call; not what went out before the first frame, which has no time."""
+        sent, self._sent = self._sent, []
+        return [message for message in sent if math.isfinite(message.timestamp)]
+
+    def shutdown(self) -> None:
+        """Nothing to let go of."""
+
+    def _due(self, stamp: float) -> float:
+        """When a frame comes, by the clock [s]."""
+        since = stamp - self._stamp
+        return self._taken_at + (min(max(since, 0.0), LONGEST_GAP) if math.isfinite(since) else 0.0)
+
+    def _following(self) -> Received | None:
+        for t, identifier, extended, data, remote, error in self._frames:
+            if error or self._is_heard(identifier, extended):
+                return Received(t, identifier, extended, remote, error, bytes(data))
+        return None
+
+    def _is_heard(self, identifier: int, extended: bool) -> bool:
+        key = identifier, bool(extended)
+        if key not in self._passes:
+            self._passes[key] = any(
+                f["extended"] == key[1] and (identifier ^ f["can_id"]) & f["can_mask"] == 0 for f in self._filters
+            )
+        return self._passes[key]

@@ -1,0 +1,76 @@
+"""The frames that the service sends beside a recording: the daemon itself, on a bus that plays the recording.
+
+    log -> PlayedBus -> Service (daemon) -> frames stamped with the recording's time
+
+Nothing of what is sent when is written here: the loop, the schedule, counters and checksums are the daemon's. Windows
+are solved in no time; a real service sends the frames of a hop later by that time. Frames of soilbus itself in the
+recording are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import can
+
+from soilbus.can.bus import LiveBus
+from soilbus.can.candump import Frame
+from soilbus.can.dbc_files import load_databases, output_database
+from soilbus.can.publish import Publisher
+from soilbus.config.model import Config
+from soilbus.daemon.notify import Notifier
+from soilbus.daemon.service import Service
+from soilbus.offline.played_bus import InlineExecutor, PlayedBus, PlayedClock
+from soilbus.offline.replay import LogError, read_frames
+from soilbus.pipeline.outputs import check_cycle_times
+from soilbus.pipeline.pipeline import Pipeline
+
+__all__ = ["sent_beside", "sent_frames"]
+
+
+def sent_frames(config: Config, logs: Sequence[Path]) -> Iterator[can.Message]:
+    """What the service sends while each log is on its bus; it starts anew with each log.
+
+    Parameters
+    ----------
+    config
+        The vehicle's configuration.
+    logs
+        Recordings, one after the other; one that is damaged ends where it is.
+
+    Yields
+    ------
+    Frames of output.dbc, stamped with the time of the recording [s].
+
+    Raises
+    ------
+    ConfigError
+        The configuration cannot work, or a frame would come less often than its DBC says.
+    """
+    for log in logs:
+        yield from sent_beside(config, _readable(log))
+
+
+def sent_beside(config: Config, frames: Iterator[Frame]) -> Iterator[can.Message]:
+    """What the service sends while these frames are on its bus, as `sent_frames`; they may depend on what it sent."""
+    database, ours = load_databases(config), output_database(config)
+    check_cycle_times(config, ours)
+    clock, pipeline = PlayedClock(), Pipeline(config, database)
+    played = PlayedBus(frames, pipeline.admission.can_filters(), clock, config.bus.channel)
+    bus = LiveBus(lambda: played, clock, clock.sleep)
+    bus.open()
+    service = Service(
+        config, pipeline, bus, Publisher(ours), Notifier(), InlineExecutor(), clock, waiting=clock.wait_for
+    )
+    while not played.is_empty:
+        service.step()
+        yield from played.take_sent()
+
+
+def _readable(log: Path) -> Iterator[Frame]:
+    """The frames before the place where a log is damaged."""
+    try:
+        yield from read_frames(log)
+    except LogError:
+        return

@@ -1,0 +1,310 @@
+"""Pictures of a diagnosis: readings beside the model's before and after, the gap of each channel, the largest draft.
+
+All readings are of held-out blocks, which the model was not fitted to.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from soilbus.arrays import Array
+from soilbus.diagnosis.fitted_model import FittedModel, Series
+from soilbus.estimation.posterior import Estimate
+from soilbus.offline.diagnose import Findings
+from soilbus.report.page import Picture, picture
+
+MAX_POINTS = 1500
+"""Readings of a wheel that a picture shows; the means are of all."""
+FEW_POINTS = 100
+"""Readings of a wheel up to which their dots are large."""
+BINS = 10
+"""Equally filled bins of a picture's means."""
+PLOT_RANGE_SD = 5.0
+"""Standard deviations that a picture of standardised residuals shows."""
+POINTS_SHOWN = 99.5
+"""Per cent of the differences that a picture's range holds."""
+MARKERS = "o^sDvP*X"
+"""Of the wheels, one after the other."""
+LOOKS = {"before": ("#b9b9b9", "///"), "after": ("#1f6fb4", "")}
+"""Colour and hatch of bars."""
+
+
+class Quantity(NamedTuple):
+    """Symbolic name's unit on pictures, its SI value, and the unit of its picture."""
+
+    unit: str
+    si: float
+
+
+QUANTITIES = {"torque": Quantity("N m", 1.0), "draft": Quantity("N", 1.0), "sinkage": Quantity("mm", 1e-3)}
+"""Unit of each channel in pictures."""
+REGRESSORS = {
+    "slip": Quantity("%", 0.01), "load": Quantity("kN", 1e3), "speed": Quantity("m/s", 1.0), "since": Quantity("s", 1.0)
+}  # fmt: skip
+"""What differences are plotted over, with its unit."""
+REGRESSOR_NAMES = {"slip": "slip", "load": "load of a wheel", "speed": "ground speed", "since": "time"}
+
+
+class Agreement(NamedTuple):
+    """One channel before and after: each wheel's readings, and the regressor over which most has become better."""
+
+    channel: str
+    regressor: str
+    gain: float
+    before: tuple[Series, ...]
+    after: tuple[Series, ...]
+
+
+def agreements(base: FittedModel, completed: FittedModel) -> list[Agreement]:
+    """The channels, the one first that shows best what the effects explain.
+
+    Of each channel that regressor is taken over whose bins' mean differences have come nearest to zero, in chi-square;
+    with nothing added, over whose bins they are largest.
+    """
+    of_base, of_completed = base.held_out_series(), completed.held_out_series()
+    found = []
+    for channel in dict.fromkeys(series.channel for series in of_base):
+        before, after = ([s for s in series if s.channel == channel] for series in (of_base, of_completed))
+        left = 0.0 if completed is base else 1.0
+        gains = {
+            name: sum(_trend(b, a, name) - left * _trend(a, a, name) for b, a in zip(before, after, strict=True))
+            for name in REGRESSORS
+        }
+        name = max(gains, key=lambda name: gains[name])
+        found.append(Agreement(channel, name, gains[name], tuple(before), tuple(after)))
+    return sorted(found, key=lambda agreement: -agreement.gain)
+
+
+def _trend(series: Series, reference: Series, regressor: str) -> float:
+    """Chi-square of the mean differences over bins, with the scatter of the reference's."""
+    variance = float(np.var(reference.measured - reference.modelled)) or 1.0
+    difference = series.measured - series.modelled
+    parts = _bins(getattr(series, regressor))
+    return sum(len(part) * float(difference[part].mean()) ** 2 for part in parts) / variance
+
+
+def _bins(values: Array) -> list[Any]:
+    """Indices of equally filled bins."""
+    return [part for part in np.array_split(np.argsort(values, kind="stable"), BINS) if len(part)]
+
+
+def agreement_pictures(of: Agreement, added: bool) -> Iterator[tuple[str, Picture]]:
+    """Caption and picture of a channel before and, where anything was added, after; in the same scales."""
+    unit, name = QUANTITIES[of.channel], f"{of.channel} measured against modelled"
+    shown = {"Before: ": of.before, "After: ": of.after} if added else {"": of.before}
+    scales = _Scales.of(of)
+    for when, series in shown.items():
+        difference = np.concatenate([s.measured - s.modelled for s in series]) / unit.si
+        typical = float(np.sqrt(np.mean(difference**2)))
+        caption = f"{when}{name}; typical difference {typical:.3g} {unit.unit}."
+        yield caption[0].upper() + caption[1:], _agreement_picture(of, series, scales, f"{when}{name}")
+
+
+class _Scales(NamedTuple):
+    """Ends of the axes, in the units of the picture: readings, regressor, and the largest difference."""
+
+    readings: tuple[float, float]
+    regressor: tuple[float, float]
+    difference: float
+
+    @classmethod
+    def of(cls, shown: Agreement) -> _Scales:
+        """Scales that hold what is before and after."""
+        both = shown.before + shown.after
+        readings = np.concatenate([values for s in both for values in (s.measured, s.modelled)])
+        regressor = np.concatenate([getattr(s, shown.regressor) for s in both])
+        difference = np.concatenate([s.measured - s.modelled for s in both])
+        unit = QUANTITIES[shown.channel].si
+        return cls(
+            _ends(readings / unit), _ends(regressor / REGRESSORS[shown.regressor].si),
+            float(np.percentile(np.abs(difference), POINTS_SHOWN)) / unit,
+        )  # fmt: skip
+
+
+def _ends(values: Array) -> tuple[float, float]:
+    """Ends of an axis that holds nearly all of the values."""
+    low, high = np.percentile(values, (100.0 - POINTS_SHOWN, POINTS_SHOWN)).tolist()
+    space = 0.05 * (high - low) or 1.0
+    return low - space, high + space
+
+
+def _agreement_picture(of: Agreement, series: Sequence[Series], scales: _Scales, words: str) -> Picture:
+    return picture(lambda figure: _draw_agreement(figure, of, series, scales), 4.6, words)
+
+
+def _draw_agreement(figure: Any, of: Agreement, series: Sequence[Series], scales: _Scales) -> None:
+    """Above: measured over modelled. Below: the difference over the regressor, with means over bins."""
+    whole, part = figure.subplots(2, 1, height_ratios=[1.1, 1.0])
+    unit, regressor = QUANTITIES[of.channel], REGRESSORS[of.regressor]
+    for i, one in enumerate(series):
+        step = max(len(one.measured) // MAX_POINTS, 1)
+        measured, modelled = one.measured / unit.si, one.modelled / unit.si
+        x, difference = getattr(one, of.regressor) / regressor.si, measured - modelled
+        look = {"color": f"C{i}", "marker": MARKERS[i % len(MARKERS)]}
+        points = look | {"ls": "", "mew": 0}
+        size = 2.5 if len(measured) > FEW_POINTS else 5.0
+        whole.plot(modelled[::step], measured[::step], ms=size, alpha=0.35, label=one.wheel or of.channel, **points)
+        part.plot(x[::step], difference[::step], ms=2, alpha=0.15, **points)
+        means = np.array([(x[b].mean(), difference[b].mean()) for b in _bins(x)])
+        part.plot(*means.T, ls="-", ms=5, lw=1.6, mec="white", mew=0.6, **look)
+    whole.plot(scales.readings, scales.readings, "-", color="black", lw=1.0, zorder=0.5)
+    whole.set(xlim=scales.readings, ylim=scales.readings)
+    whole.set_xlabel(f"modelled {of.channel}, {unit.unit}")
+    whole.set_ylabel(f"measured, {unit.unit}")
+    if len(series) > 1:
+        legend = whole.legend(ncols=2, loc="upper left", markerscale=2.5)
+        for handle in legend.legend_handles:
+            handle.set_alpha(1.0)
+    part.axhline(0.0, color="black", lw=1.0)
+    part.set(xlim=scales.regressor, ylim=(-scales.difference, scales.difference))
+    part.set_xlabel(f"{REGRESSOR_NAMES[of.regressor]}, {regressor.unit}")
+    part.set_ylabel(f"difference, {unit.unit}")
+
+
+def channel_gaps(fitted: FittedModel) -> dict[str, float]:
+    """Mean square of the standardised residuals of each channel's held-out readings; 1 is noise."""
+    found: dict[str, list[Array]] = {}
+    for series in fitted.held_out_series():
+        found.setdefault(series.channel, []).append(series.standardised)
+    return {channel: float(np.mean(np.concatenate(parts) ** 2)) for channel, parts in found.items()}
+
+
+def gap_picture(base: FittedModel, completed: FittedModel) -> Picture:
+    """Root of the gap of each channel, before and after, as bars."""
+    models = _before_and_after(base, completed)
+    bars = {when: {c: gap**0.5 for c, gap in channel_gaps(model).items()} for when, model in models.items()}
+    words = "; ".join(
+        " ".join([when, *(f"{channel} {size:.2f}" for channel, size in of.items())]).strip()
+        for when, of in bars.items()
+    )
+    height = 1.2 + 0.62 * len(bars["before"]) * (1.0 if len(bars) > 1 else 0.7)
+    return picture(lambda figure: _draw_gaps(figure, bars), height, f"error of the model over noise: {words}")
+
+
+def _before_and_after(before: FittedModel, after: FittedModel) -> dict[str, FittedModel]:
+    """Both by name, or what was before alone where nothing was added."""
+    return {"before": before} if before is after else {"before": before, "after": after}
+
+
+def _bars(
+    axis: Any, bars: Mapping[str, Sequence[float]], height: float, labels: Sequence[str],
+    sd: Mapping[str, Sequence[float]] | None = None,
+) -> list[Any]:  # fmt: skip
+    """Draw groups of horizontal bars, before above after, each with a label at its end; returns one for each look."""
+    words = iter(labels)
+    drawn = []
+    for i, (when, sizes) in enumerate(bars.items()):
+        colour, hatch = LOOKS[when] if len(bars) > 1 else LOOKS["after"]
+        y = np.arange(len(sizes)) + (i - (len(bars) - 1) / 2.0) * height
+        error = {} if sd is None else {"xerr": 2.0 * np.array(sd[when]), "capsize": 3}
+        drawn.append(
+            axis.barh(y, sizes, 0.92 * height, color=colour, hatch=hatch, edgecolor="0.3", lw=0.4, label=when, **error)
+        )
+        spread = [0.0] * len(sizes) if sd is None else sd[when]
+        for place, size, std in zip(y, sizes, spread, strict=True):
+            axis.annotate(
+                next(words), (np.nan_to_num(size + 2.0 * std), place), (5, 0), textcoords="offset points", va="center",
+                fontsize=10, bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.8},
+            )  # fmt: skip
+    axis.invert_yaxis()
+    axis.set_xlim(min(0.0, axis.get_xlim()[0]), 1.16 * axis.get_xlim()[1])
+    axis.grid(axis="y", visible=False)
+    return drawn
+
+
+def _draw_gaps(figure: Any, bars: Mapping[str, Mapping[str, float]]) -> None:
+    axis = figure.subplots()
+    channels = list(bars["before"])
+    noise = axis.axvline(1.0, color="black", lw=1.2, ls="--", label="noise alone")
+    sizes = {when: list(of.values()) for when, of in bars.items()}
+    labels = [f"{size:.2f}" for of in sizes.values() for size in of]
+    drawn = _bars(axis, sizes, 0.8 / len(bars) if len(bars) > 1 else 0.6, labels)
+    axis.set_yticks(range(len(channels)), channels)
+    axis.set_xlabel("model’s error, × noise of the sensors")
+    handles = [*(drawn if len(bars) > 1 else []), noise]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
+
+
+def draft_picture(findings: Findings) -> Picture | None:
+    """Largest draft on each log's soil before and after, beside the drafts that were pulled; None without a vehicle."""
+    drafts = findings.largest_drafts()
+    if all(before is None and after is None for _, before, after in drafts):
+        return None
+    names = [name for name, _, _ in drafts]
+    bars = {"before": [before for _, before, _ in drafts]}
+    if findings.diagnosis.completed is not findings.diagnosis.base:
+        bars["after"] = [after for _, _, after in drafts]
+    parts = [findings.diagnosis.base.checks[i].problem for i in findings.recordings.first]
+    measured = findings.config.signals.draft is not None
+    pulled = [part.draft[part.has_balance] / 1e3 if measured else part.draft[:0] for part in parts]
+    words = "; ".join(
+        " ".join([name, *(f"{when} {_kilonewtons(of[i])}" for when, of in bars.items())])
+        for i, name in enumerate(names)
+    )
+    return picture(
+        lambda figure: _draw_drafts(figure, names, bars, pulled), 1.6 + 0.75 * len(drafts), f"largest draft: {words}"
+    )
+
+
+def _kilonewtons(draft: Estimate | None) -> str:
+    return "none within the limits" if draft is None else f"{draft.value / 1e3:.2f} kN"
+
+
+def _draw_drafts(
+    figure: Any, names: Sequence[str], bars: Mapping[str, Sequence[Estimate | None]], pulled: Sequence[Array]
+) -> None:
+    axis = figure.subplots()
+    none = Estimate(math.nan, math.nan)
+    sizes, sds = (
+        {when: [getattr(e or none, part) / 1e3 for e in of] for when, of in bars.items()} for part in ("value", "std")
+    )
+    drawn = _bars(axis, sizes, 0.55 / len(bars), [_kilonewtons(e) for of in bars.values() for e in of], sds)
+    handles = drawn if len(bars) > 1 else []
+    known = [(i, *np.percentile(draft, (2.5, 97.5))) for i, draft in enumerate(pulled) if len(draft)]
+    for i, low, high in known:
+        line = axis.plot([low, high], [i + 0.38] * 2, "-", color="black", lw=3.0, label="pulled, 95 % of the time")
+        handles = [*(drawn if len(bars) > 1 else []), *line]
+    axis.set_yticks(range(len(names)), [name if len(name) <= 14 else name[:13] + "…" for name in names])
+    axis.set_xlabel("draft, kN")
+    if handles:
+        figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
+
+
+def residual_picture(fitted: FittedModel, title: str) -> Picture:
+    """Standardised residuals by channel (rows) over slip, load and time (columns)."""
+    channels: dict[str, list[Series]] = {}
+    for series in fitted.held_out_series():
+        channels.setdefault(series.channel, []).append(series)
+    return picture(
+        lambda figure: _draw_residuals(figure, channels, title),
+        0.6 + 2.2 * len(channels),
+        f"residuals {title}",
+        10.0,
+        100,
+    )
+
+
+def _draw_residuals(figure: Any, channels: Mapping[str, Sequence[Series]], title: str) -> None:
+    figure.suptitle(title)
+    names = ("slip", "load", "since")
+    axes = figure.subplots(len(channels), len(names), sharey=True, sharex="col", squeeze=False)
+    for row, (channel, of_wheels) in zip(axes, channels.items(), strict=True):
+        for one in of_wheels:
+            step = max(len(one.since) // MAX_POINTS, 1)
+            for axis, name in zip(row, names, strict=True):
+                x, z = getattr(one, name) / REGRESSORS[name].si, one.standardised
+                colour = axis.plot(x[::step], z[::step], ".", ms=2, alpha=0.3)[0].get_color()
+                means = np.array([(x[part].mean(), z[part].mean()) for part in _bins(x)])
+                axis.plot(*means.T, "-", color=colour, label=one.wheel)
+        for axis in row:
+            axis.axhline(0.0, color="grey", lw=0.5)
+        row[0].set_ylabel(f"{channel}, σ")
+        row[0].set_ylim(-PLOT_RANGE_SD, PLOT_RANGE_SD)
+        if len(of_wheels) > 1:
+            row[-1].legend(ncols=4, fontsize="x-small")
+    for axis, name in zip(axes[-1], names, strict=True):
+        axis.set_xlabel(f"{REGRESSOR_NAMES[name]}, {REGRESSORS[name].unit}")

@@ -1,0 +1,387 @@
+"""Text of a configuration that `soilbus init` proposes: what is matched, what stays open, what nobody can know.
+
+An open value is "?"; `soilbus check` refuses the file with one line for each.  Candidates and what a log says of a
+value stand in comments beside it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from cantools.database.can import Database, Message
+
+from soilbus.can.mapping import VEHICLE_ROLES
+from soilbus.can.role_matching import AXLES, WHEELS, Assignment, Candidate, Slot, is_word_in, shown
+from soilbus.config.file import OPEN
+from soilbus.sensors.role_evidence import Facts, is_absent
+
+__all__ = ["Proposal", "proposal"]
+
+COLUMN = 34
+"""Column in which comments beside a value begin."""
+MOST_STATE_BITS = 8
+"""Length of a signal that can be the state of a drive."""
+MOST_LISTED = 4
+"""Candidates that one comment lists."""
+
+
+class Proposal(NamedTuple):
+    """The text of a configuration; how many signals it maps and how many values it leaves open."""
+
+    text: str
+    mapped: int
+    open: int
+
+
+@dataclass
+class _Draft:
+    """What is known of the vehicle, the lines so far, and the signals that they map or name."""
+
+    database: Database
+    assignment: Assignment
+    facts: Facts
+    lines: list[str] = field(default_factory=list)
+    used: set[str] = field(default_factory=set)
+    named: set[str] = field(default_factory=set)
+    axles: tuple[str, ...] = ()
+
+    def put(self, key: str, value: str, comment: str = "") -> None:
+        line = f"{key} = {value}"
+        self.lines.append(f"{line:<{COLUMN - 2}}  # {comment}" if comment else line)
+
+    def put_open(self, key: str, comment: str) -> None:
+        self.put(key, f'"{OPEN}"', comment)
+
+    def put_choice(self, key: str, found: Sequence[Candidate], else_text: str) -> None:
+        """An open role with its candidates."""
+        self.named.update(c.path for c in found)
+        self.put_open(key, _listed(found) or else_text)
+
+    def note(self, text: str) -> None:
+        self.lines.append(f"# {text}")
+
+    def section(self, name: str) -> None:
+        self.lines += ["", name]
+
+    def matched(self, role: str, place: str = "") -> Candidate | None:
+        return self.assignment.asserted.get(Slot(role, place))
+
+    def put_signal(self, key: str, c: Candidate, **more: str) -> None:
+        """The line that maps a role to a signal, with its sign and what vouches for it."""
+        self.used.add(c.path)
+        message = self.database.get_message_by_name(c.message)
+        short = [s.name for s in message.signals if s.length <= MOST_STATE_BITS]
+        state = next((name for name in short if is_word_in(name, "state")), "")
+        if valid := _valid_signal(message, c):
+            more["valid"] = valid
+        back = self.facts.backward.get(c.path)
+        said = _said_backward(message, c)
+        parts = [f'signal = "{c.path}"', *(f'{k} = "{v}"' for k, v in more.items())]
+        parts += ["sign = -1"] * bool(back or said)
+        value = f"{{ {', '.join(parts)} }}" if len(parts) > 1 else f'"{c.path}"'
+        remarks = [f"negative in {back} in the log"] if back else [f"the DBC: {said}"] if said else []
+        if state and c.slot.role == "torque":
+            remarks.append(f'does {state} vouch for it? then valid = "{state}", valid_values = [...]')
+        remarks += ["no unit in the DBC: SI assumed"] if not c.unit and c.dimension else []
+        self.put(key, value, "; ".join(remarks))
+
+
+def proposal(database: Database, assignment: Assignment, facts: Facts, files: Sequence[str], origin: str) -> Proposal:
+    """A configuration of four wheels from what was matched.
+
+    Parameters
+    ----------
+    database
+        The vehicle's messages.
+    assignment, facts
+        Signals by slot, and what a recording says; `Facts()` without one.
+    files
+        DBC files as the configuration shall name them.
+    origin
+        The command, for the first line.
+    """
+    draft = _Draft(database, _one_layout(assignment), facts)
+    draft.lines += [
+        f"# Proposed by `{' '.join(origin.split())}`: read each line.",
+        f'# "{OPEN}" is open: put the value in its place. `soilbus check` names every line that is still open.',
+        "", "[bus]", 'interface = "socketcan"', 'channel = "can0"',
+        "", "[dbc]", f"input = [{', '.join(_quoted(name) for name in files)}]",
+    ]  # fmt: skip
+    _put_vehicle(draft)
+    layout = _layout_of(draft)
+    draft.axles = layout.axles
+    for axle in layout.axles:
+        _put_axle(draft, axle)
+    for wheel in WHEELS:
+        _put_wheel(draft, wheel, layout)
+    _put_signals(draft)
+    _put_rest(draft)
+    text = "\n".join(draft.lines) + "\n"
+    return Proposal(text, len(draft.used), sum(f'"{OPEN}"' in line for line in draft.lines if not line.startswith("#")))
+
+
+# --- which motor drives what ---
+
+
+class _Layout(NamedTuple):
+    """Axles that have a section, "" for one motor of an unknown axle; wheels and axles with a torque."""
+
+    axles: tuple[str, ...]
+    wheels_driven: frozenset[str]
+    axles_driven: frozenset[str]
+
+
+def _one_layout(assignment: Assignment) -> Assignment:
+    """Torques of wheels and of axles, or of both axles and of one, are different machines: open unless one is left."""
+    places = {slot.place for slot in assignment.asserted if slot.role == "torque"}
+    kinds = [places & set(WHEELS), places & {"front", "rear"}, places & {"both"}, places & {""}]
+    if sum(map(bool, kinds)) <= 1:
+        return assignment
+    asserted, left = dict(assignment.asserted), dict(assignment.open)
+    for slot in assignment.asserted:
+        if slot.role in ("torque", "torque_limit", "motor_speed"):
+            left[slot] = [asserted.pop(slot)]
+    return Assignment(asserted, left, assignment.rivals)
+
+
+def _layout_of(draft: _Draft) -> _Layout:
+    asserted = draft.assignment.asserted
+    at = {place for role, place in asserted if role == "torque"}
+    loads = {place for role, place in asserted if role == "load" and place in AXLES}
+    if all(draft.matched("load", wheel) for wheel in WHEELS):
+        loads = set()  # one measurement, not two
+    driven = at & set(AXLES)
+    axles = [axle for axle in AXLES if axle in driven | loads]
+    if "" in at:
+        if draft.facts.axle:
+            driven = {draft.facts.axle}
+            axles = [axle for axle in AXLES if axle in driven | loads]
+        else:
+            axles.append("")
+    return _Layout(tuple(axles), frozenset(at & set(WHEELS)), frozenset(driven))
+
+
+# --- sections ---
+
+
+def _put_vehicle(draft: _Draft) -> None:
+    draft.section("[vehicle]")
+    mass = f"; the loads sum to {draft.facts.mass:.0f} kg in the log" if math.isfinite(draft.facts.mass) else ""
+    draft.put_open("mass", f"kg with ballast, tank and driver{mass}")
+    draft.put_open("wheelbase", "m, front to rear axle")
+    draft.put_open("cg_ahead_of_rear_axle", "m, centre of gravity: wheelbase * load of the front axle / weight")
+    draft.put_open("cg_height", "m, centre of gravity above the ground")
+    if draft.matched("draft"):
+        draft.put_open("hitch_height", "m, line of draft above the ground")
+    else:
+        draft.put_open("towing", '"never", "unknown", or "measured" with signals.draft mapped')
+    if draft.matched("yaw_rate"):
+        draft.note("track = 1.5  # m, left to right wheel: turns the yaw rate into a difference of speeds")
+    if lock := draft.matched("differential_lock"):
+        draft.put_signal("differential_lock", lock)
+
+
+def _put_axle(draft: _Draft, axle: str) -> None:
+    draft.section("[[axle]]")
+    place = axle
+    if axle:
+        draft.put("name", _quoted(axle))
+    else:
+        above = "; where that stands above, move its load here" if len(draft.axles) > 1 else ""
+        draft.put_open("name", f'axle that this motor drives: "front", "rear" or "both"{above}')
+    if axle == "" or (axle == draft.facts.axle and not draft.matched("torque", axle)):
+        place = ""  # the motor of no name
+        if axle:
+            draft.note("the motor turns with this axle's wheels in the log")
+    if torque := draft.matched("torque", place):
+        speed = _beside(draft, torque, draft.matched("motor_speed", place))
+        if speed is not None or not _is_at_wheel(torque):
+            _put_gear(draft, axle)
+        draft.put_open("differential", '"open", "locked" or "limited"')
+        draft.put_signal("torque", torque, **_side(torque))
+        _put_limit(draft, torque, "axle")
+        if speed is not None:
+            draft.put_signal("motor_speed", speed)
+    if axle and (load := draft.matched("load", axle)):
+        draft.put_signal("load", load)
+
+
+def _put_wheel(draft: _Draft, wheel: str, layout: _Layout) -> None:
+    axle = "front" if wheel.startswith("F") else "rear"
+    draft.section("[[wheel]]")
+    draft.put("name", _quoted(wheel))
+    draft.put("axle", _quoted(axle))
+    radius = draft.facts.radius.get(wheel)
+    seen = f"; radius * (1 - slip) is {radius:.2f} in the log" if radius else ""
+    draft.put_open("radius", f"m, rolling radius{seen}")
+    draft.put_open("width", "m, of the tyre")
+    torque, speed = draft.matched("torque", wheel), draft.matched("speed", wheel)
+    motor = draft.matched("motor_speed", wheel)
+    by_axle = bool(layout.axles_driven & {axle, "both"})
+    if motor is not None or (torque is not None and not _is_at_wheel(torque)):
+        _put_gear(draft, wheel)
+    if torque is not None:
+        draft.put_signal("torque", torque, **_side(torque))
+        _put_limit(draft, torque, "wheel")
+    elif not by_axle and (layout.wheels_driven or layout.axles_driven or "" in layout.axles):
+        draft.put_open("driven", "true or false: no torque of it was found")
+    elif not by_axle:
+        known = _of_role(draft, "torque", wheel)
+        draft.put_choice("torque", known, '"Message.Signal" of its motor, here or in [[axle]]')
+        if motor is None:
+            _put_gear(draft, wheel)
+    if speed is not None:
+        draft.put_signal("speed", speed)
+        if motor is not None:
+            draft.put_signal("motor_speed", motor)
+    elif motor is not None:
+        draft.put_signal("speed", motor, at="shaft")
+    elif not (by_axle and any(draft.matched("motor_speed", a) for a in (axle, "both", ""))):
+        draft.put_choice("speed", _of_role(draft, "speed", wheel), '"Message.Signal" of its rotation')
+    for role in ("load", "sinkage"):
+        if c := draft.matched(role, wheel):
+            draft.put_signal(role, c)
+
+
+def _put_gear(draft: _Draft, place: str) -> None:
+    ratio = draft.facts.gear_ratio.get(place)
+    if ratio is not None:
+        draft.put("gear_ratio", _rounded(ratio), "motor over wheel speed in the log")
+        return
+    per_metre = draft.facts.per_metre.get(place)
+    text = "motor shaft to wheel; 1.0 where torque is measured at the wheel"
+    if place in ("both", ""):
+        text += "; of both axles: to their shafts, where [[axle]] front and rear have ratios of their own"
+    draft.put_open("gear_ratio", f"{text}; {per_metre:.4g} * radius by the log" if per_metre else text)
+
+
+def _put_limit(draft: _Draft, torque: Candidate, at: str) -> None:
+    limit = _beside(draft, torque, draft.matched("torque_limit", torque.slot.place))
+    if limit is not None:
+        draft.put_signal("torque_limit", limit)
+    else:
+        draft.note(f"max_torque = 5000.0  # N m at the {at}: the motor's limit")
+
+
+def _beside(draft: _Draft, torque: Candidate, c: Candidate | None) -> Candidate | None:
+    """A signal that belongs to a torque: of its place or, where no name says a place, of its message or sender."""
+    if c is None or torque.slot.place or c.message == torque.message:
+        return c
+    one, other = (draft.database.get_message_by_name(name).senders for name in (c.message, torque.message))
+    return c if set(one) & set(other) - {"Vector__XXX"} else None
+
+
+def _is_at_wheel(torque: Candidate) -> bool:
+    return is_word_in(torque, "wheel") and not is_word_in(torque, "motor", "shaft")
+
+
+def _side(torque: Candidate) -> dict[str, str]:
+    return {"at": "wheel"} if _is_at_wheel(torque) else {}
+
+
+def _put_signals(draft: _Draft) -> None:
+    draft.section("[signals]")
+    draft.note("positive: ground speed and torque forward, draft backward, pitch nose up, yaw left, roll left side up")
+    for role in VEHICLE_ROLES:
+        c = draft.matched(role)
+        if c is None:
+            if role == "ground_speed":
+                known = _of_role(draft, role, "")
+                draft.put_choice(role, known, '"Message.Signal" of a radar or receiver, not of the wheels')
+            continue
+        if role == "acceleration":
+            kind = draft.facts.kind or _kind_by_words(draft.database, c)
+            if kind != "kinematic":
+                draft.put_signal(role, c, kind=kind or OPEN)
+            else:
+                draft.put_signal(role, c)
+            if not kind:
+                draft.note('kind: "kinematic" is dv/dt, "specific_force" what an inertial sensor feels, slope included')
+        else:
+            draft.put_signal(role, c)
+
+
+def _put_rest(draft: _Draft) -> None:
+    """Noise, and candidates that no line names."""
+    draft.lines += [
+        "",
+        "# [noise]: sd of each sensor, from data sheets or a drive on the road; else the defaults hold",
+    ]
+    known = draft.assignment
+    found = [*(c for cs in known.open.values() for c in cs), *known.asserted.values(), *known.rivals]
+    rest = {c.path: c for c in found if c.path not in draft.used | draft.named}
+    perhaps: dict[str, list[Candidate]] = {}
+    for c in rest.values():
+        if not is_absent(c):
+            perhaps.setdefault(c.slot.role, []).append(c)
+    if perhaps:
+        draft.lines += ["", "# Not used, but perhaps:"]
+        draft.lines += [f"#   {role}: {_listed(cs)}" for role, cs in perhaps.items()]
+    if absent := sorted(path for path, c in rest.items() if is_absent(c)):
+        text = textwrap.fill(", ".join(absent), 116, break_long_words=False)
+        draft.lines += ["", "# In the DBC, but never in the log:", *(f"#   {line}" for line in text.splitlines())]
+
+
+# --- words ---
+
+
+def _of_role(draft: _Draft, role: str, place: str) -> list[Candidate]:
+    """Candidates of an open slot, else those of the role wherever they are."""
+    own = draft.assignment.open.get(Slot(role, place))
+    anywhere = (c for slot, cs in draft.assignment.open.items() if slot.role == role for c in cs)
+    loose = (c for slot, c in draft.assignment.asserted.items() if slot.role == role and not slot.place)
+    return own or sorted([*anywhere, *loose], key=lambda c: -c.score)
+
+
+def _listed(found: Iterable[Candidate]) -> str:
+    known = list(found)
+    more = f", and {len(known) - MOST_LISTED} more" if len(known) > MOST_LISTED else ""
+    return ", ".join(shown(c) for c in known[:MOST_LISTED]) + more
+
+
+def _kind_by_words(database: Database, c: Candidate) -> str:
+    comment = (database.get_message_by_name(c.message).get_signal_by_name(c.signal).comment or "").casefold()
+    if "without gravity" in comment:
+        return "kinematic"
+    is_force = is_word_in(c, "force") or is_word_in(c, "specific")
+    return "specific_force" if is_force or "specific force" in comment else ""
+
+
+_OTHER_WAY: Mapping[str, str] = {
+    "yaw_rate": r"(?:to the )?right|clockwise|(?:to )?starboard", "steering_angle": r"(?:to the )?right|clockwise",
+    "roll": r"right side up|left side down", "pitch": r"(?:nose|bow) down", "acceleration": r"backward|rearward",
+    "draft": r"forward", "ground_speed": r"backward", "sinkage": r"up",
+}  # fmt: skip
+"""What a comment says after "positive" where a signal reads the other way round than its role."""
+
+
+def _said_backward(message: Message, c: Candidate) -> str:
+    """The words of a comment by which the signal needs sign = -1; "" without."""
+    comment = message.get_signal_by_name(c.signal).comment or ""
+    pattern = rf"positive (?:{_OTHER_WAY.get(c.slot.role, '(?!)')})\b"
+    return found[0] if (found := re.search(pattern, comment, re.IGNORECASE)) else ""
+
+
+def _valid_signal(message: Message, c: Candidate) -> str:
+    """The one signal of the message that vouches for another; "" where there is none, or several."""
+    found = [s.name for s in message.signals if s.name != c.signal and s.length <= 2 and is_word_in(s.name, "valid")]
+    return found[0] if len(found) == 1 else ""
+
+
+def _rounded(ratio: float) -> str:
+    short = f"{ratio:.3g}"
+    text = short if abs(float(short) / ratio - 1.0) < ROUNDING else f"{ratio:.4g}"
+    return text if "." in text else f"{text}.0"
+
+
+ROUNDING = 0.001
+"""Relative change by which a measured gear ratio may be rounded: gain errors of two speed sensors."""
+
+
+def _quoted(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -1,0 +1,176 @@
+"""A replay as a self-contained HTML page; needs jinja2 and matplotlib (extra: plots)."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from soilbus.arrays import Array
+from soilbus.config.model import Config
+from soilbus.decision.traversability import State, Status
+from soilbus.pipeline.result import WindowResult
+from soilbus.report.advice import advice, of_use
+from soilbus.report.page import Picture, Source, Table, page
+from soilbus.report.replay_pictures import (
+    STATES,
+    clock_text,
+    curve_pictures,
+    dates,
+    decision_picture,
+    is_clock,
+    map_pictures,
+    run_pictures,
+)
+from soilbus.report.windows import grouped, why_of_no_use
+
+
+def replay_report(results: Sequence[WindowResult], text: str, source: Source) -> str:
+    """The whole page.
+
+    Parameters
+    ----------
+    results
+        Every window.
+    text
+        Their summary.
+    source
+        Configuration and logs.
+    """
+    config = source.config
+    shown = list(_pictures(results, config))
+    return page(
+        "replay.html",
+        source,
+        headline=headline(results, config),
+        sentences=list(sentences(results)),
+        pair=shown[:2],
+        pictures=shown[2:],
+        logs=_by_log(results),
+        steps=list(next_steps(results, source)),
+        config=config,
+        windows=_windows(results),
+        summary=text,
+    )
+
+
+def _pictures(results: Sequence[WindowResult], config: Config) -> Iterator[tuple[str, Picture]]:
+    """Captions and pictures, those of the first screen first."""
+    if not results:
+        return
+    if config.table is not None:
+        yield from run_pictures(results)
+        return
+    yield "May the tractor go on, and how much could it pull?", decision_picture(results, config)
+    yield from map_pictures(results)
+    yield from curve_pictures(results, config)
+
+
+def headline(results: Sequence[WindowResult], config: Config) -> str:
+    """What the decisions come to, in one sentence."""
+    known = of_use(results)
+    if not known:
+        text = why_of_no_use(results, config.estimator.window)
+        return text[0].upper() + text[1:]
+    states = Counter(r.traversability.state for r in results)
+    if states[State.UNKNOWN] == len(results):
+        what = "windows" if config.table is None else "runs"
+        return f"The soil is known in {len(known)} of {len(results)} {what}"
+    (name, n), *others = [(look.name, states[state]) for state, look in STATES.items() if states[state]]
+    return ", ".join([f"{name} in {n} of {len(results)} windows", *(f"{name} in {n}" for name, n in others)])
+
+
+def sentences(results: Sequence[WindowResult]) -> Iterator[str]:
+    """Soil and draft in numbers, in words of the field."""
+    used = of_use(results)
+    pressures = [(r.bearing.value / 1e3, r.bearing.std / 1e3) for r in used if r.bearing is not None]
+    if pressures:
+        value, std = np.array(pressures).T
+        yield (
+            f"The ground carried {_range(value, 'kPa')} (bearing pressure, in each window known to about "
+            f"± {2.0 * float(np.median(std)):.2g} kPa)."
+        )
+    drafts = [d.value / 1e3 for r in used if (d := r.traversability.max_draft) is not None]
+    pulled = [r.excitation.draft / 1e3 for r in results if r.excitation.draft is not None]
+    if drafts:
+        of_windows = f"; the windows’ mean draft was {_range(pulled, 'kN')}" if pulled else ""
+        yield f"The largest possible draft was {_range(drafts, 'kN')}{of_windows}."
+    warnings = [t for r in results for t in r.warnings.begun]
+    if warnings:
+        times = {1: "once", 2: "twice"}.get(len(warnings), f"{len(warnings)} times")
+        yield f"A warning that the vehicle may get stuck began {times}, first at {clock_text(warnings[0])}."
+
+
+def _range(values: Sequence[float] | Array, unit: str) -> str:
+    """Such as "22 to 99 kPa": from the 5 % to the 95 % quantile; one number where both are written alike."""
+    low, high = (f"{float(f'{q:.2g}'):g}" if abs(q) < 99.5 else f"{q:.0f}" for q in np.percentile(values, (5.0, 95.0)))
+    return f"{low} {unit}" if low == high else f"{low} to {high} {unit}"
+
+
+def next_steps(results: Sequence[WindowResult], source: Source) -> Iterator[tuple[str, str]]:
+    """What to do about windows of no or little use, and what to map: a sentence, and a command or nothing."""
+    config = source.config
+    good = [r for r in results if r.status is Status.VALID]
+    for (status, reason), group in grouped(results):
+        what = advice(group, good)
+        if what is not None:
+            why = reason.removeprefix(f"{status} ").replace("_", " ")
+            yield f"{len(group)} of {len(results)} windows were {str(status).replace('_', ' ')} ({why}): {what}.", ""
+    if any(r.reason in ("model_mismatch", "no_convergence") for r in results):
+        yield "Find what the model misses:", f"{source.command('diagnose')} --report diagnosis.html"
+    if config.table is not None:
+        return
+    if config.signals.latitude is None:
+        yield "For a map of the route, map a position: signals.latitude and signals.longitude.", ""
+    if not any(wheel.sinkage is not None for wheel in config.wheel):
+        yield "A sinkage sensor (wheel.sinkage) narrows the error bars of the soil; none is mapped.", ""
+
+
+def _by_log(results: Sequence[WindowResult]) -> Table | None:
+    """A row for each of several logs."""
+    logs: dict[str, list[WindowResult]] = {}
+    for r in results:
+        logs.setdefault(r.log or "-", []).append(r)
+    if len(logs) < 2:
+        return None
+    rows = []
+    for log, of in logs.items():
+        used = of_use(of)
+        bearing = [r.bearing.value / 1e3 for r in used if r.bearing]
+        draft = [d.value / 1e3 for r in used if (d := r.traversability.max_draft)]
+        go = sum(r.traversability.state is State.GO for r in of)
+        valid = sum(r.status is Status.VALID for r in of)
+        rows.append((
+            log, f"{dates(of)} {clock_text(of[0].t)}".strip(), str(len(of)), str(valid), str(go),
+            f"{np.median(bearing):.3g}" if bearing else "-", f"{np.median(draft):.2g}" if draft else "-",
+        ))  # fmt: skip
+    head = ("log", "first window ends", "windows", "valid", "GO", "bearing pressure, kPa", "largest draft, kN")
+    return Table(head, rows, frozenset(range(2, 7)))
+
+
+def _windows(results: Sequence[WindowResult]) -> Table:
+    rows = [
+        (
+            r.log or "-",
+            clock_text(r.t, "%H:%M:%S.%f")[:-5] if is_clock(r.t) else f"{r.t:.1f}",
+            str(r.status) + ("" if r.reason == "none" else f" ({r.reason})"),
+            "-" if r.bearing is None else f"{r.bearing.value / 1e3:.2f} ± {r.bearing.std / 1e3:.2f}",
+            "-" if r.traversability.max_draft is None else f"{r.traversability.max_draft.value / 1e3:.2f}",
+            "-" if r.chi2 is None else f"{r.chi2:.2f}",
+            str(r.traversability.state),
+            ", ".join(f"{k} {v}" for k, v in r.rejected.items()) or "-",
+        )
+        for r in results
+    ]
+    head = (
+        "log",
+        "end",
+        "estimate",
+        "bearing pressure, kPa",
+        "largest draft, kN",
+        "chi²",
+        "may go on",
+        "refused samples",
+    )
+    return Table(head, rows)

@@ -1,0 +1,418 @@
+"""Pictures of a replay: the decision as a ribbon over time, curves of soil and draft, a map of the route.
+
+Recordings follow one another on the time axis, each with its own clock.  No line goes across two recordings, and none
+across windows without an estimate of the soil.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from datetime import UTC, datetime
+from itertools import groupby
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from soilbus.arrays import Array
+from soilbus.can.admission import LONGEST_GAP
+from soilbus.config.model import Config
+from soilbus.decision.traversability import State, Status
+from soilbus.estimation.posterior import Estimate
+from soilbus.pipeline.result import WindowResult
+from soilbus.report.advice import of_use
+from soilbus.report.page import Picture, picture
+from soilbus.terra.earth import offset
+
+FIRST_CLOCK, LAST_CLOCK = 946684800.0, 4102444800.0
+"""Stamps [s] from 2000 to 2100 are times of day; others count from some start."""
+SPACE_BETWEEN = 0.03
+"""Space between two recordings in a picture, as a share of the time of all."""
+TICK_STEPS = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 21600, 43200, 86400)
+"""Distances [s] of ticks that are easy to read on a clock."""
+MAX_TICKS = 5
+"""Ticks of a time axis: as many clock times as fit side by side."""
+LABELLED_SHARE = 0.13
+"""Share of a ribbon's length from which a segment has its name in it."""
+FEW_WINDOWS = 200
+"""Windows up to which each has its dot on a curve."""
+BAND_SD = 2.0
+"""Standard deviations of the band around a curve, each way."""
+
+
+class Look(NamedTuple):
+    """Name, colour, hatch and marker of a state: to be told apart in grey, too."""
+
+    name: str
+    colour: str
+    hatch: str
+    marker: str
+
+
+STATES = {
+    State.GO: Look("GO", "#2e9f6b", "", "o"),
+    State.CAUTION: Look("CAUTION", "#f2b632", "///", "^"),
+    State.NO_GO: Look("NO-GO", "#cf3f2e", "xxx", "X"),
+    State.UNKNOWN: Look("unknown", "#c9c9c9", "...", "s"),
+}
+STATUSES = {
+    Status.VALID: Look("valid", "#5b8fc7", "", "o"),
+    Status.DEGRADED: Look("degraded", "#d9c27a", "\\\\\\", "o"),
+    Status.NOT_EXCITED: Look("not excited", "#d5d9de", "...", "o"),
+    Status.INVALID: Look("invalid", "#ffffff", "xx", "o"),
+}
+
+
+def stretches(results: Sequence[WindowResult]) -> list[list[WindowResult]]:
+    """The windows cut where another log, or another time of its clock, begins."""
+    cut: list[list[WindowResult]] = []
+    for r in results:
+        if not cut or r.log != cut[-1][-1].log or not 0.0 < r.t - cut[-1][-1].t <= LONGEST_GAP:
+            cut.append([])
+        cut[-1].append(r)
+    return cut
+
+
+def is_clock(t: float) -> bool:
+    """Whether a stamp [s] is a time of day, not seconds from some start."""
+    return FIRST_CLOCK <= t < LAST_CLOCK
+
+
+def clock_text(t: float, form: str = "%H:%M:%S") -> str:
+    """A stamp [s] as a time of day (UTC), or in seconds where it is none."""
+    return f"{datetime.fromtimestamp(t, UTC):{form}}" if is_clock(t) else f"{t:g} s"
+
+
+def dates(results: Sequence[WindowResult]) -> str:
+    """The days of the windows, as in "2026-05-04 to 2026-05-05"; empty where their stamps are no times of day."""
+    known = sorted(r.t for r in results if is_clock(r.t))
+    days = dict.fromkeys(clock_text(t, "%Y-%m-%d") for t in (known[0], known[-1])) if known else {}
+    return " to ".join(days)
+
+
+class TimeAxis:
+    """Recordings one after the other.
+
+    Parameters
+    ----------
+    results
+        Every window, at least one.
+    hop
+        [s], for which a window's decision stands.
+    """
+
+    def __init__(self, results: Sequence[WindowResult], hop: float) -> None:
+        self.parts = stretches(results)
+        self.hop, self._results = hop, results
+        lengths = [part[-1].t - part[0].t + hop for part in self.parts]
+        self.length = sum(lengths)
+        space = SPACE_BETWEEN * self.length
+        begins = np.concatenate([[0.0], np.cumsum(lengths) + space * np.arange(1, len(lengths) + 1)])
+        self.shift = [begin - (part[0].t - hop) for begin, part in zip(begins.tolist(), self.parts, strict=False)]
+        self.end = float(begins[-1] - space)
+
+    def curve(self, of: Callable[[WindowResult], Any], columns: int = 1) -> Array:
+        """Columns time and values (N, 1 + columns) of all windows; nan breaks the line where a value is None."""
+        rows: list[list[float]] = []
+        for part, shift in zip(self.parts, self.shift, strict=True):
+            last = -math.inf
+            for r in part:
+                if r.t - last > 1.5 * self.hop:
+                    rows.append([r.t + shift] + [math.nan] * columns)
+                value = of(r)
+                known = [math.nan] * columns if value is None else np.atleast_1d(value).tolist()
+                rows.append([r.t + shift, *known])
+                last = r.t
+        return np.array(rows)
+
+    def segments(self, of: Callable[[WindowResult], Any]) -> Iterator[tuple[Any, float, float]]:
+        """Value, begin and length of each run of windows with the same value."""
+        for part, shift in zip(self.parts, self.shift, strict=True):
+            for value, group in groupby(part, of):
+                members = list(group)
+                begin = members[0].t - self.hop + shift
+                yield value, begin, members[-1].t + shift - begin
+
+    def dress(self, axis: Any) -> None:
+        """Ticks with clock times, and a rule between recordings."""
+        step = next((s for s in TICK_STEPS if self.length / s <= MAX_TICKS), TICK_STEPS[-1])
+        day = dates(self._results)
+        places, labels = self._ticks(step)
+        labels = labels if day else [label.removesuffix(" s") for label in labels]
+        axis.set_xlim(0.0, 1.01 * self.end)
+        axis.set_xticks(places, labels)
+        for shift, part in list(zip(self.shift, self.parts, strict=True))[1:]:
+            axis.axvline(part[0].t - self.hop + shift - SPACE_BETWEEN * self.length / 2.0, color="0.4", lw=0.8, ls=":")
+        axis.set_xlabel(f"UTC, {day}" if day else "time of the log, s")
+
+    def _ticks(self, step: float) -> tuple[list[float], list[str]]:
+        form = "%H:%M" if step % 60 == 0 else "%H:%M:%S"
+        places: list[float] = []
+        labels: list[str] = []
+        for part, shift in zip(self.parts, self.shift, strict=True):
+            first, last = part[0].t - self.hop, part[-1].t
+            times = np.arange(math.ceil(first / step) * step, last + 1e-6, step).tolist() or [first]
+            for t in times:
+                if not places or t + shift - places[-1] >= 0.8 * self.end / (MAX_TICKS + 1):
+                    places.append(t + shift)
+                    labels.append(clock_text(t, form))
+        return places, labels
+
+    def name_recordings(self, axis: Any) -> None:
+        """Write the name of each of several recordings above its begin, as far as there is room."""
+        if len({part[0].log for part in self.parts}) < 2:
+            return
+        last = None
+        for shift, part in zip(self.shift, self.parts, strict=True):
+            share = (part[-1].t - part[0].t + self.hop) / self.end
+            if part[0].log != last and part[0].log:
+                room = max(int(share * 62), 4)
+                name = part[0].log if len(part[0].log) <= room else part[0].log[: room - 1] + "…"
+                place = (part[0].t - self.hop + shift, 1.0)
+                axis.annotate(
+                    name, place, (0, 3), xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=9
+                )
+            last = part[0].log
+
+
+def decision_picture(results: Sequence[WindowResult], config: Config) -> Picture:
+    """The decision as a ribbon, the estimate's quality below, and the draft pulled beside the largest possible."""
+    time = TimeAxis(results, config.estimator.hop)
+
+    def draw(figure: Any) -> None:
+        state, status, axis = figure.subplots(3, 1, sharex=True, height_ratios=[0.16, 0.1, 1.0])
+        unnamed = _ribbon(state, time, lambda r: STATES[r.traversability.state], True)
+        unnamed |= _ribbon(status, time, lambda r: STATUSES[r.status], True)
+        state.set_ylabel("may go on", rotation=0, ha="right", va="center", fontsize=9.5)
+        status.set_ylabel("estimate", rotation=0, ha="right", va="center", fontsize=9.5)
+        if any(r.traversability.max_draft for r in of_use(results)):
+            _band(axis, time, lambda r: r.traversability.max_draft, 1e3, "largest possible, on the level")
+        pulled = time.curve(lambda r: r.excitation.draft)
+        if np.isfinite(pulled[:, 1]).any():
+            axis.plot(pulled[:, 0], pulled[:, 1] / 1e3, "-", color="black", lw=1.3, label="pulled")
+        warnings = [t + shift for part, shift in zip(time.parts, time.shift, strict=True) for t in _begun(part)]
+        if warnings:
+            axis.plot(
+                warnings, np.full(len(warnings), 0.97), "v", color=STATES[State.NO_GO].colour, clip_on=False,
+                transform=axis.get_xaxis_transform(), label="warning: may get stuck",
+            )  # fmt: skip
+        axis.set_ylabel("draft, kN")
+        axis.set_ylim(bottom=min(0.0, 1.1e-3 * float(np.nanmin(pulled[:, 1], initial=0.0))))
+        if axis.get_legend_handles_labels()[1]:
+            axis.legend(loc="best")
+        else:
+            axis.text(0.5, 0.5, "no draft is known", ha="center", va="center", transform=axis.transAxes)
+            axis.set_yticks([])
+        time.dress(axis)
+        time.name_recordings(state)
+        _legend(figure, [look for look in (*STATES.values(), *STATUSES.values()) if look in unnamed])
+
+    words = "over time: may the tractor go on, quality of the estimate, draft pulled and largest possible draft"
+    return picture(draw, 4.0, words)
+
+
+def curve_pictures(results: Sequence[WindowResult], config: Config) -> Iterator[tuple[str, Picture]]:
+    """Caption and picture of each quantity over time that is known anywhere, the bearing pressure first."""
+    time = TimeAxis(results, config.estimator.hop)
+    plate = f"a plate of {100 * config.estimator.b_ref:g} cm at {1e3 * config.estimator.z_ref:g} mm depth"
+    wheels = list(results[0].slip)
+
+    def drawn(label: str, draw: Callable[[Any], None], words: str) -> Picture:
+        return _over_time(time, label, draw, words)
+
+    if of_use(results):
+        yield (
+            f"How firm is the ground? Pressure that carries {plate}.",
+            drawn("bearing pressure, kPa", lambda a: _band(a, time, lambda r: r.bearing, 1e3), "bearing pressure"),
+        )
+        yield (
+            "How well does the ground hold against shearing off?",
+            drawn("friction angle, °", lambda a: _band(a, time, _friction, math.radians(1.0)), "friction angle"),
+        )
+        yield (
+            "How well do model and sensors agree? At 1 as well as the sensors’ noise allows.",
+            drawn("model’s error, × noise", lambda a: _draw_gap(a, time), "misfit of the model"),
+        )
+    if any(slip is not None for r in results for slip in r.slip.values()):
+        yield (
+            "How much does each wheel slip?",
+            drawn("slip, %", lambda a: _draw_wheels(a, time, wheels, "slip", 0.01), "slip of each wheel"),
+        )
+    if any(z is not None for r in results for z in r.sinkage.values()):
+        yield (
+            "How deep does each wheel sink, by the estimated soil?",
+            drawn("sinkage, mm", lambda a: _draw_wheels(a, time, wheels, "sinkage", 1e-3), "sinkage of each wheel"),
+        )
+
+
+def run_pictures(results: Sequence[WindowResult]) -> Iterator[tuple[str, Picture]]:
+    """Caption and picture of the soil in each run of a test rig."""
+
+    def drawn(label: str, of: Callable[[WindowResult], Estimate | None], unit: float) -> Picture:
+        return picture(lambda figure: _draw_runs(figure, results, of, unit, label), 3.2, f"{label} of each run")
+
+    yield "How firm was the ground in each run?", drawn("bearing pressure, kPa", lambda r: r.bearing, 1e3)
+    yield "How well did it hold against shearing off?", drawn("friction angle, °", _friction, math.radians(1.0))
+
+
+def _draw_runs(
+    figure: Any, results: Sequence[WindowResult], of: Callable[[WindowResult], Estimate | None], unit: float, label: str
+) -> None:
+    axis = figure.subplots()
+    known = [(i + 1, e.value / unit, e.std / unit) for i, r in enumerate(results) if (e := of(r)) is not None]
+    if known:
+        x, y, sd = np.array(known).T
+        axis.errorbar(x, y, BAND_SD * sd, fmt="o", capsize=3)
+    axis.set_xlim(0.5, len(results) + 0.5)
+    axis.xaxis.get_major_locator().set_params(integer=True)
+    axis.set_xlabel("run")
+    axis.set_ylabel(label)
+
+
+def map_pictures(results: Sequence[WindowResult]) -> Iterator[tuple[str, Picture]]:
+    """Caption and picture of the route, by decision and by largest draft; none without positions."""
+    placed = [r for r in results if r.position is not None]
+    if len(placed) < 2:
+        return
+    yield (
+        "The route by decision.",
+        picture(lambda figure: _draw_map(figure, placed, _by_state), 4.0, "map of the route, coloured by decision"),
+    )
+    if any(r.traversability.max_draft for r in of_use(placed)):
+        yield (
+            "The route by the largest possible draft.",
+            picture(
+                lambda figure: _draw_map(figure, placed, _by_draft), 4.0, "map of the route, coloured by largest draft"
+            ),
+        )
+
+
+def _begun(part: Sequence[WindowResult]) -> list[float]:
+    """When warnings of immobilisation began [s]."""
+    return [t for r in part for t in r.warnings.begun]
+
+
+def _friction(result: WindowResult) -> Estimate | None:
+    return None if result.posterior is None else result.posterior.parameters()["phi"]
+
+
+def _over_time(time: TimeAxis, label: str, draw_curve: Callable[[Any], None], words: str) -> Picture:
+    """A curve under a thin ribbon of the decision."""
+
+    def draw(figure: Any) -> None:
+        ribbon, axis = figure.subplots(2, 1, sharex=True, height_ratios=[0.07, 1.0])
+        _ribbon(ribbon, time, lambda r: STATES[r.traversability.state], False)
+        draw_curve(axis)
+        axis.set_ylabel(label)
+        time.dress(axis)
+        time.name_recordings(ribbon)
+
+    return picture(draw, 3.2, f"{words} over time")
+
+
+def _ribbon(axis: Any, time: TimeAxis, look_of: Callable[[WindowResult], Look], named: bool) -> set[Look]:
+    """Draw segments, each with its name where there is room for it; returns the looks that are named nowhere."""
+    seen: set[Look] = set()
+    written: set[Look] = set()
+    for look, begin, length in time.segments(look_of):
+        axis.broken_barh([(begin, length)], (0, 1), facecolor=look.colour, hatch=look.hatch, edgecolor="0.25", lw=0.4)
+        seen.add(look)
+        if named and length > LABELLED_SHARE * time.end:
+            written.add(look)
+            axis.text(
+                begin + length / 2.0, 0.47, look.name, ha="center", va="center", fontsize=9.5,
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.2, "alpha": 0.85},
+            )  # fmt: skip
+    axis.set_ylim(0, 1)
+    axis.set_yticks([])
+    axis.grid(False)
+    axis.spines[:].set_visible(False)
+    axis.tick_params(bottom=False, labelbottom=False)
+    return seen - written
+
+
+def _legend(figure: Any, looks: Sequence[Look]) -> None:
+    from matplotlib.patches import Patch
+
+    if not looks:
+        return
+    handles = [
+        Patch(facecolor=look.colour, hatch=look.hatch, edgecolor="0.25", lw=0.4, label=look.name) for look in looks
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 4), frameon=False)
+
+
+def _band(
+    axis: Any, time: TimeAxis, of: Callable[[WindowResult], Estimate | None], unit: float, label: str | None = None
+) -> None:
+    """A curve with its band where windows have an estimate."""
+
+    def known(r: WindowResult) -> tuple[float, float] | None:
+        estimate = of(r) if of_use([r]) else None
+        return None if estimate is None else (estimate.value / unit, estimate.std / unit)
+
+    t, value, std = time.curve(known, 2).T
+    axis.plot(t, value, ".-" if len(t) <= FEW_WINDOWS else "-", color="#1f6fb4", ms=4, lw=1.4, label=label)
+    axis.fill_between(t, value - BAND_SD * std, value + BAND_SD * std, color="#1f6fb4", alpha=0.25, lw=0)
+    if not (value < 0.0).any():
+        axis.set_ylim(bottom=max(axis.get_ylim()[0], 0.0))
+
+
+def _draw_gap(axis: Any, time: TimeAxis) -> None:
+    t, chi2 = time.curve(lambda r: r.chi2 if of_use([r]) else None).T
+    axis.plot(t, np.sqrt(chi2), ".-" if len(t) <= FEW_WINDOWS else "-", color="#1f6fb4", ms=4, lw=1.4)
+    axis.axhline(1.0, color="0.3", lw=1.0, ls="--")
+    low, high = axis.get_ylim()
+    axis.set_ylim(min(low, 0.5), max(high, 1.5))
+
+
+def _draw_wheels(axis: Any, time: TimeAxis, wheels: Sequence[str], quantity: str, unit: float) -> None:
+    styles = ("-", "--", "-.", ":")
+    for i, wheel in enumerate(wheels):
+        t, value = time.curve(lambda r, wheel=wheel: getattr(r, quantity)[wheel]).T  # type: ignore[misc]
+        axis.plot(t, value / unit, styles[i % 4], color=f"C{i}", lw=1.4, label=wheel)
+    axis.legend(ncols=4, loc="best")
+
+
+def _draw_map(
+    figure: Any, placed: Sequence[WindowResult], draw_points: Callable[[Any, Any, Sequence[WindowResult], Array], None]
+) -> None:
+    axis = figure.subplots()
+    latitude, longitude = np.array([r.position for r in placed]).T
+    first = float(latitude[0]), float(longitude[0])
+    north, east = offset(*first, latitude, longitude)
+    begin = 0
+    for part in stretches(placed):
+        members = slice(begin, begin + len(part))
+        axis.plot(east[members], north[members], "-", color="0.6", lw=0.8, zorder=1)
+        begin += len(part)
+    draw_points(figure, axis, placed, np.column_stack([east, north]))
+    axis.annotate("start", (east[0], north[0]), (-8, -4), textcoords="offset points", fontsize=10, ha="right")
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.margins(0.08)
+    place = ", ".join(
+        f"{abs(math.degrees(angle)):.5f}° {'SN'[angle >= 0] if i == 0 else 'WE'[angle >= 0]}"
+        for i, angle in enumerate(first)
+    )
+    axis.set_xlabel(f"m east of the start ({place})")
+    axis.set_ylabel("m north")
+
+
+def _by_state(figure: Any, axis: Any, placed: Sequence[WindowResult], at: Array) -> None:
+    for state, look in STATES.items():
+        here = at[[r.traversability.state is state for r in placed]]
+        if len(here):
+            axis.scatter(
+                *here.T, s=34, c=look.colour, marker=look.marker, edgecolors="0.25", linewidths=0.5, label=look.name
+            )
+    axis.legend(loc="best")
+
+
+def _by_draft(figure: Any, axis: Any, placed: Sequence[WindowResult], at: Array) -> None:
+    drafts = np.array(
+        [d.value / 1e3 if (d := r.traversability.max_draft) and of_use([r]) else math.nan for r in placed]
+    )
+    known = np.isfinite(drafts)
+    axis.plot(*at[~known].T, "x", color="0.5", ms=4)
+    points = axis.scatter(*at[known].T, s=34, c=drafts[known], cmap="viridis", edgecolors="0.25", linewidths=0.3)
+    figure.colorbar(points, ax=axis, label="largest draft, kN")

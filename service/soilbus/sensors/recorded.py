@@ -1,0 +1,75 @@
+"""A recording decoded whole: the samples of its channels, from the part in which most of them stand."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable
+
+import numpy as np
+
+from soilbus.arrays import Array
+from soilbus.can.admission import Admission
+from soilbus.can.channels import Reason
+
+Frame = tuple[float, int, bool, bytes | bytearray, bool, bool]
+"""Time [s], identifier, extended, data, remote, error."""
+Columns = dict[str, tuple[Array, Array]]
+"""Times [s] and values (SI) by channel name."""
+
+BATCH_SIZE = 5000
+"""Number of frames that are decoded at a time."""
+LONGEST_SILENCE = 60.0
+"""Time [s] without a frame, or jump back, after which another part begins; the part with most samples is compared."""
+
+
+def longest_part(admission: Admission, frames: Iterable[Frame]) -> tuple[Columns, Counter[tuple[str, Reason]], int]:
+    """Samples of the part with most of them, refused values by channel and reason, and the number of frames.
+
+    Parameters
+    ----------
+    admission
+        Of the channels wanted; it is fed and emptied.
+    frames
+        Of one recording.
+    """
+    parts, refused, n = _parts(admission, frames)
+    return max(parts, key=lambda part: sum(len(t) for t, _ in part.values())), refused, n
+
+
+def _parts(admission: Admission, frames: Iterable[Frame]) -> tuple[list[Columns], Counter[tuple[str, Reason]], int]:
+    """Samples by channel for each part of the recording with one clock, refusals, and the number of frames."""
+    pieces: list[list[Columns]] = [[]]
+    refused: Counter[tuple[str, Reason]] = Counter()
+    last, n, steps = math.nan, 0, 0
+
+    def take() -> None:
+        decoded = admission.take()
+        refused.update({key: len(t) for key, t in decoded.refused.items()})
+        pieces[-1].append({name: (c.t, c.value) for name, c in decoded.columns.items() if len(c.t)})
+
+    for t, identifier, extended, data, remote, error in frames:
+        n += 1
+        if error:
+            continue
+        if abs(t - last) > LONGEST_SILENCE:
+            take()
+            pieces.append([])
+        last = t
+        admission.feed(t, identifier, extended, data, remote)
+        if n % BATCH_SIZE == 0:
+            if admission.counts.clock_steps != steps:
+                steps = admission.counts.clock_steps
+                pieces.append([])
+            take()
+    take()
+    return [_joined(piece) for piece in pieces], refused, n
+
+
+def _joined(pieces: list[Columns]) -> Columns:
+    names = {name for piece in pieces for name in piece}
+    joined: Columns = {}
+    for name in names:
+        parts = [piece[name] for piece in pieces if name in piece]
+        joined[name] = (np.concatenate([t for t, _ in parts]), np.concatenate([v for _, v in parts]))
+    return joined

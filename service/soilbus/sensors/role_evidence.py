@@ -1,0 +1,283 @@
+"""What a recording says of candidate signals: seen or not, and what moves with what.
+
+slip against the wheels     relative sd of v / omega over 0.2 s bins: next to none for a speed made of wheels'
+gear ratio                  median(|omega_motor / omega_wheel|)
+accelerometer               a - dv/dt = k g sin(pitch): k = 1 feels gravity, k = 0 does not
+mass                        median(sum of loads) / g
+radius less slip            median(v / omega)
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from cantools.database.can import Database
+
+from soilbus.arrays import Array
+from soilbus.can.admission import Admission
+from soilbus.can.channels import Channel, Reason
+from soilbus.can.decode import check_decodable
+from soilbus.can.role_matching import ASSERTED, AXLES, WHEELS, Assignment, Candidate, Slot
+from soilbus.can.units import STANDARD_GRAVITY
+from soilbus.sensors.recorded import Columns, Frame, longest_part
+
+__all__ = ["Facts", "Recording", "facts_of", "is_absent", "recording_of", "weighed"]
+
+BIN = 0.2
+"""Time [s] over which samples are averaged before they are compared: a few frames of each sensor."""
+LEAST_BINS = 50
+"""Bins in which the vehicle moves, from which anything is compared: 10 s."""
+MOVING = 0.2
+"""Ground speed [m/s] from which the vehicle moves: `estimator.min_speed`."""
+RIGID = 0.006
+"""Relative sd of the ratio of two speeds up to which they belong to parts that turn together.  Three simulated
+machines, five soils and the field vehicle gave 0.000 to 0.0024 for motor over wheel, 0.07 to 0.25 for ground speed
+over wheels."""
+SAME_GEAR = 0.02
+"""Relative difference of two measured gear ratios up to which they are one: gain errors; gear steps are larger."""
+ABSENT, REFUSED = 0.9, 0.6
+"""Score that a signal loses that is never seen, or never available: it is then open, not asserted."""
+MOVES_WITH = 0.7
+"""Score that a ground speed gains which follows the wheels but slips against them."""
+
+
+NO_FRAME, NEVER_AVAILABLE = "no frame of it in the log", "never available"
+"""Notes on a candidate without a value."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """Samples (SI, no gear) and refused values of candidate signals by `Message.Signal`; its length [s]."""
+
+    columns: Columns
+    refused: Counter[str]
+    seconds: float
+
+    def mean(self, path: str, edges: Array) -> Array:
+        """Means over the bins between edges [s]; nan where there is no sample."""
+        t, value = self.columns.get(path, (np.empty(0), np.empty(0)))
+        count, total = np.histogram(t, edges)[0], np.histogram(t, edges, weights=value)[0]
+        return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+
+    @property
+    def edges(self) -> Array:
+        """Of bins over the whole recording [s]."""
+        ends = [(t[0], t[-1]) for t, _ in self.columns.values()]
+        start, end = (min(a for a, _ in ends), max(b for _, b in ends)) if ends else (0.0, 0.0)
+        return np.asarray(np.arange(start, end + BIN, BIN))
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What a recording says of the machine; an empty entry is not known.
+
+    gear_ratio, radius [m] less the usual slip: by place; per_metre: motor speed over wheel speed [1/m] where the
+    latter is in m/s; backward: signals that read the other way round, and for how much of the drive; kind of the
+    accelerometer; mass [kg]: sum of the loads; axle of a motor whose place no name says.
+    """
+
+    gear_ratio: dict[str, float] = field(default_factory=dict)
+    per_metre: dict[str, float] = field(default_factory=dict)
+    radius: dict[str, float] = field(default_factory=dict)
+    backward: dict[str, str] = field(default_factory=dict)
+    kind: str = ""
+    mass: float = math.nan
+    axle: str = ""
+
+
+def recording_of(found: Iterable[Candidate], database: Database, frames: Iterable[Frame]) -> Recording:
+    """The samples of all candidates' signals in one recording."""
+    channels: dict[str, Channel] = {}
+    owner: dict[tuple[int, bool], str] = {}
+    for c in found:
+        message = database.get_message_by_name(c.message)
+        if owner.setdefault((message.frame_id, message.is_extended_frame), c.message) != c.message:
+            continue
+        try:
+            check_decodable(message, c.signal)
+        except ValueError:
+            continue
+        channels[c.path] = Channel(c.path, "", c.message, c.signal, c.factor, 0.0, -math.inf, math.inf)
+    columns, by_reason, _ = longest_part(Admission(channels.values(), database), frames)
+    refused = Counter[str]()
+    for (path, reason), n in by_reason.items():
+        if reason != Reason.BAD_TIME:
+            refused[path] += n
+    ends = [t for t, _ in columns.values()]
+    seconds = max(float(t[-1]) for t in ends) - min(float(t[0]) for t in ends) if ends else 0.0
+    return Recording(columns, refused, seconds)
+
+
+def weighed(found: Iterable[Candidate], recording: Recording) -> list[Candidate]:
+    """The candidates with what the recording says for or against each."""
+    out = []
+    known = list(found)
+    turning = _turning(known, recording)
+    for c in known:
+        if c.path not in recording.columns:
+            refused = recording.refused[c.path]
+            what = f"{NEVER_AVAILABLE} in {refused} frames" if refused else NO_FRAME
+            out.append(c.changed(-REFUSED if refused else -ABSENT, what))
+            continue
+        t, value = recording.columns[c.path]
+        rate = f"{(len(t) - 1) / max(float(t[-1] - t[0]), 1e-9):.3g}/s" if len(t) > 1 else "once"
+        low, high = float(value.min()), float(value.max())
+        c = c.changed(0.0, f"{rate}, {low:.4g} all along" if low == high else f"{rate}, {low:.4g} to {high:.4g} SI")
+        out.append(_as_ground_speed(c, recording, turning) if c.slot.role == "ground_speed" else c)
+    return out
+
+
+def is_absent(c: Candidate) -> bool:
+    """Whether the recording has no value of a candidate."""
+    return any(note.startswith((NO_FRAME, NEVER_AVAILABLE)) for note in c.notes)
+
+
+def facts_of(assignment: Assignment, recording: Recording) -> Facts:
+    """Gear ratios, signs, kind of the accelerometer, mass and radii, from what is asserted."""
+    asserted, edges = assignment.asserted, recording.edges
+
+    def read(role: str, place: str = "") -> Array:
+        c = asserted.get(Slot(role, place))
+        if c is None:
+            return np.full(max(len(edges) - 1, 0), np.nan)
+        return recording.mean(c.path, edges) * (STANDARD_GRAVITY if c.dimension == "mass" else 1.0)
+
+    ground = read("ground_speed")
+    moving = np.abs(ground) > MOVING
+    if moving.sum() < LEAST_BINS:
+        moving = np.ones(len(ground), bool)
+    forward = _one(np.sign(ground))
+    speed = {w: read("speed", w) for w in WHEELS}
+    speed["front"], speed["rear"] = ((speed[a] + speed[b]) / 2.0 for a, b in (("FL", "FR"), ("RL", "RR")))
+    cells = [[read("load", p) for p in places if Slot("load", p) in asserted] for places in (WHEELS, AXLES[:2])]
+    whole = [loads for loads, n in zip(cells, (4, 2), strict=True) if len(loads) == n]
+    facts = Facts(
+        kind=_kind(read("acceleration"), ground, read("pitch")),
+        mass=_median(np.sum(whole[0], axis=0)) / STANDARD_GRAVITY if whole else math.nan,
+        axle=_driven_axle(read("motor_speed")[moving], speed["front"][moving], speed["rear"][moving]),
+    )
+    for place, wheel in speed.items():
+        own = "" if place == facts.axle else place
+        motor = read("motor_speed", own if Slot("motor_speed", own) in asserted else place)
+        _gear(facts, assignment, place, motor[moving], wheel[moving])
+        own_speed = asserted.get(Slot("speed", place))
+        if own_speed is not None and own_speed.dimension == "rotation":
+            _keep(facts.radius, place, np.abs(ground / wheel)[moving])
+    _pool(facts.gear_ratio)
+    for slot, c in asserted.items():
+        if slot.role in ("speed", "motor_speed", "torque"):
+            _sign(facts, c, (read(*slot) * forward)[moving])
+        elif slot.role == "draft":
+            _sign(facts, c, read(*slot)[moving])
+    return facts
+
+
+# --- one question each ---
+
+
+def _turning(found: Iterable[Candidate], recording: Recording) -> Array:
+    """A mean of wheels or motors, whose speed each is divided by its own median (bins,)."""
+    paths = {
+        c.path: None
+        for c in found
+        if c.slot.role in ("speed", "motor_speed")
+        and c.slot.place
+        and c.score >= ASSERTED
+        and c.path in recording.columns
+    }
+    edges = recording.edges
+    parts = [recording.mean(path, edges) for path in paths]
+    scaled = [part / size for part in parts if (size := _median(np.abs(part))) > 0.0]
+    return np.asarray(np.mean(scaled, axis=0)) if scaled else np.full(max(len(edges) - 1, 0), np.nan)
+
+
+def _as_ground_speed(c: Candidate, recording: Recording, turning: Array) -> Candidate:
+    """A ground speed slips against the wheels; one that does not is computed from them."""
+    ground = np.abs(recording.mean(c.path, recording.edges))
+    known = (ground > MOVING) & (np.abs(turning) > 0.1)
+    if known.sum() < LEAST_BINS:
+        return c
+    scatter = _scatter(ground[known], turning[known])
+    if scatter < RIGID:
+        return c.changed(-MOVES_WITH, "turns with the wheels: no slip in it, or a drive on a road")
+    pair = np.stack([ground[known], np.abs(turning[known])])
+    if pair.std(axis=1).all() and float(np.corrcoef(pair)[0, 1]) > 0.5:
+        return c.changed(MOVES_WITH, "follows the wheels and slips against them")
+    return c
+
+
+def _gear(facts: Facts, assignment: Assignment, place: str, motor: Array, wheel: Array) -> None:
+    own = assignment.asserted.get(Slot("speed", place if place in WHEELS else {"front": "FL", "rear": "RL"}[place]))
+    if own is not None and _scatter(motor, wheel) < 5.0 * RIGID:
+        _keep(facts.gear_ratio if own.dimension == "rotation" else facts.per_metre, place, np.abs(motor / wheel))
+
+
+def _pool(ratios: dict[str, float]) -> None:
+    """Gears of one kind on all wheels have one ratio: its median, free of each sensor's gain error."""
+    wheels = [ratios[place] for place in WHEELS if place in ratios]
+    if wheels and max(wheels) < (1.0 + SAME_GEAR) * min(wheels):
+        ratios.update({place: float(np.median(wheels)) for place in WHEELS if place in ratios})
+
+
+def _sign(facts: Facts, c: Candidate, value: Array) -> None:
+    if np.isfinite(value).sum() >= LEAST_BINS and _median(np.sign(value)) < 0.0:
+        facts.backward[c.path] = f"{np.mean(value[np.isfinite(value)] < 0.0):.0%} of the drive"
+
+
+def _kind(acceleration: Array, ground: Array, pitch: Array) -> str:
+    """kinematic or specific_force, "" where the slope varies too little to say."""
+    width = round(1.0 / BIN)
+    slope = _smooth(pitch, width)
+    rest = _smooth(acceleration, width) - np.gradient(_smooth(ground, width), BIN)
+    known = np.isfinite(slope) & np.isfinite(rest)
+    if known.sum() < LEAST_BINS or slope[known].std() < 0.004:
+        return ""
+    x = STANDARD_GRAVITY * (np.sin(slope[known]) - np.sin(slope[known]).mean())
+    y = rest[known] - rest[known].mean()
+    k = float(x @ y / (x @ x))
+    sd = float(np.sqrt(((y - k * x) ** 2).sum() / (x @ x) / max(len(x) / width - 2.0, 1.0)))
+    if sd > 0.12 or not (-0.35 < k < 1.35) or 0.35 < k < 0.65:
+        return ""
+    return "specific_force" if k > 0.5 else "kinematic"
+
+
+def _driven_axle(motor: Array, front: Array, rear: Array) -> str:
+    """The axle that turns with a motor whose place no name says, where the other one does not."""
+    scatter = {"front": _scatter(motor, front), "rear": _scatter(motor, rear)}
+    near, far = sorted(scatter, key=lambda axle: scatter[axle])
+    return near if scatter[near] < RIGID and scatter[far] > 3.0 * scatter[near] else ""
+
+
+def _scatter(one: Array, other: Array) -> float:
+    """Relative sd of the ratio of two speeds, without the widest tenth; inf where hardly known together."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = np.abs(one / other)
+    ratio = ratio[np.isfinite(ratio) & (ratio > 0.0)]
+    if len(ratio) < LEAST_BINS:
+        return math.inf
+    middle = float(np.median(ratio))
+    low, high = np.quantile(ratio, [0.16, 0.84])
+    return float((high - low) / 2.0 / middle)
+
+
+def _keep(into: dict[str, float], place: str, values: Array) -> None:
+    if math.isfinite(value := _median(values)):
+        into[place] = value
+
+
+def _one(values: Array) -> Array:
+    """Values, 1 where they are not known."""
+    return np.where(np.isfinite(values), values, 1.0)
+
+
+def _smooth(values: Array, width: int) -> Array:
+    return np.convolve(values, np.full(width, 1.0 / width), "same") if len(values) >= width else values
+
+
+def _median(values: Array) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else math.nan

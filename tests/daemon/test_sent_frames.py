@@ -1,0 +1,165 @@
+"""`soilbus replay --frames`: our frames beside a recording are those that the live service sends."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import threading
+import time
+from collections import defaultdict
+from pathlib import Path
+
+import can
+import pytest
+
+from soilbus.can.dbc_files import output_database
+from soilbus.can.log_writer import write_log
+from soilbus.cli.main import main
+from soilbus.config.model import Config
+from soilbus.daemon.start import start_service
+from soilbus.offline.replay import read_log
+from soilbus.offline.sent_frames import sent_frames
+from soilbus.simulator.play import send_in_time
+from soilbus.simulator.reference import TRACTOR, reference_configuration
+from soilbus.validation.fakes import drive_messages
+
+DURATION = 16.0
+DATABASE = output_database(reference_configuration())
+Decoded = tuple[float, dict[str, object]]
+
+
+def crc_of(message: can.Message) -> int:
+    """The README's checksum, a bit at a time."""
+    crc = 0xFF
+    for byte in message.arbitration_id.to_bytes(4, "little") + bytes(message.data[:7]):
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc << 1 ^ 0x1D) & 0xFF if crc & 0x80 else crc << 1
+    return crc ^ 0xFF
+
+
+def by_name(messages: list[can.Message]) -> dict[str, list[Decoded]]:
+    """Time and values of each message of ours."""
+    found: dict[str, list[Decoded]] = defaultdict(list)
+    for message in messages:
+        name = DATABASE.get_message_by_frame_id(message.arbitration_id).name
+        found[name].append((message.timestamp, DATABASE.decode_message(message.arbitration_id, message.data)))
+    return found
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    """A folder with a drive, its JSON lines and our frames as the command writes them."""
+    folder = tmp_path_factory.mktemp("frames")
+    write_log(drive_messages(reference_configuration(), DURATION), folder / "drive.log")
+    outputs = ["--json", str(folder / "out.jsonl"), "--frames", str(folder / "frames.blf")]
+    assert main(["replay", "--config", str(TRACTOR), str(folder / "drive.log"), *outputs]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def sent(place) -> list[can.Message]:
+    return list(can.LogReader(place / "frames.blf"))
+
+
+def test_every_frame_decodes_with_the_right_checksum_and_counter(sent):
+    counters: dict[int, list[int]] = defaultdict(list)
+    for message in sent:
+        assert message.data[7] == crc_of(message)
+        counters[message.arbitration_id].append(message.data[6] >> 4)
+    assert len(counters) == len(DATABASE.messages) - 2  # a vehicle of four wheels has no second four
+    for counter in counters.values():
+        assert counter == [i % 16 for i in range(len(counter))]
+
+
+def test_the_frames_of_a_hop_say_what_the_json_line_of_that_time_says(place, sent):
+    lines = [json.loads(line) for line in (place / "out.jsonl").read_text().splitlines()]
+    frames = by_name(sent)
+    units = {
+        ("SoilStrength", "BearingPressure"): lambda line: line["bearing_pressure"]["value"] / 1e3,
+        ("SoilStrength", "BearingPressureStd"): lambda line: line["bearing_pressure"]["std"] / 1e3,
+        ("SoilFrictionAngle", "Value"): lambda line: line["soil"]["phi"]["value"] * 180.0 / 3.141592653589793,
+        ("DraftCapability", "MaxDraft"): lambda line: line["traversability"]["max_draft"]["value"],
+        ("TractionAdvice", "SlipForPullRear"): lambda line: line["capability"]["set_points"]["rear"]["pull"]["value"],
+        ("WheelSinkage", "SinkageWheel3"): lambda line: line["sinkage"]["RL"] * 1e3,
+    }
+    for (name, signal), value in units.items():
+        scale = DATABASE.get_message_by_name(name).get_signal_by_name(signal).scale
+        assert len(frames[name]) == len(lines) >= 6
+        for line, (t, values) in zip(lines, frames[name], strict=True):
+            assert line["t"] <= t < line["t"] + 0.25
+            assert values[signal] == pytest.approx(value(line), abs=0.51 * scale)
+            assert values["Window"] == line["window"]
+            assert values["Status"] == line["status"]
+
+
+def test_fast_frames_keep_their_cycle_and_carry_the_decision_of_the_last_window(place, sent):
+    lines = [json.loads(line) for line in (place / "out.jsonl").read_text().splitlines()]
+    verdicts = by_name(sent)["Traversability"]
+    gaps = [b - a for (a, _), (b, _) in itertools.pairwise(verdicts)]
+    assert min(gaps) > 0.094
+    assert max(gaps) < 0.13
+    for line in lines:
+        after = next(values for t, values in verdicts if t > line["t"] + 0.1)
+        assert after["State"] == line["traversability"]["state"]
+        assert after["Probability"] == pytest.approx(line["traversability"]["probability"], abs=0.01)
+    assert {str(values["State"]) for t, values in verdicts if t < lines[0]["t"]} == {"unknown"}
+
+
+def test_a_live_service_sends_the_same_series(tmp_path):
+    """In real time on python-can's virtual bus: what it heard, replayed, gives what it sent."""
+    config = reference_configuration(
+        ["bus.interface=virtual", "bus.channel=frames", "estimator.window=2.0", "estimator.hop=0.5"]
+    )
+    heard, ours = run_live(config, seconds=4.8)
+    write_log(heard, tmp_path / "heard.log")
+    live, replayed = by_name(ours), by_name(list(sent_frames(config, [tmp_path / "heard.log"])))
+    windows = [{values["Window"]: (t, values) for t, values in of["SoilStrength"]} for of in (live, replayed)]
+    both = windows[0].keys() & windows[1].keys()
+    assert len(both) >= 4
+    for window in both:
+        (t_live, said), (t_replayed, again) = windows[0][window], windows[1][window]
+        assert {k: v for k, v in said.items() if k not in ("Counter", "Checksum")} == {
+            k: v for k, v in again.items() if k not in ("Counter", "Checksum")
+        }
+        assert t_replayed == pytest.approx(t_live, abs=0.5)  # a busy machine's window may take long, never a hop
+    states = [[(t, v["SlipWheel3"]) for t, v in of["WheelSlip"] if v["SlipWheel3"] != "not_available"] for of in
+              (live, replayed)]  # fmt: skip
+    pairs = [(slip, min(states[1], key=lambda other: abs(other[0] - t))) for t, slip in states[0]]
+    close = [abs(float(slip) - float(other)) < 0.02 for slip, (_, other) in pairs]
+    assert len(close) > 30
+    assert sum(close) > 0.9 * len(close)
+
+
+def run_live(config: Config, seconds: float) -> tuple[list[can.Message], list[can.Message]]:
+    """What a live service heard and what it sent, both with the bus's stamps."""
+    settings = {"interface": config.bus.interface, "channel": config.bus.channel}
+    with can.Bus(**settings) as tractor, can.Bus(**settings) as tap:
+        service = start_service(config, wait=False, rehearse=False)
+        worker = threading.Thread(target=service.run, daemon=True)
+        worker.start()
+        send_in_time(drive_messages(config, seconds), tractor.send)
+        time.sleep(0.4)
+        service.stop()
+        worker.join(timeout=5.0)
+        messages = []
+        while (message := tap.recv(0.0)) is not None:
+            messages.append(message)
+    own = {message.frame_id for message in DATABASE.messages}
+    heard = [m for m in messages if m.arbitration_id not in own]
+    return heard, [m for m in messages if m.arbitration_id in own]
+
+
+def test_frames_of_soilbus_in_the_recording_are_not_taken_for_another_sender(place, tmp_path):
+    mixed = sorted([*read_log(place / "drive.log"), *can.LogReader(place / "frames.blf")], key=lambda m: m.timestamp)
+    write_log(mixed, tmp_path / "mixed.log")
+    again = by_name(list(sent_frames(reference_configuration(), [tmp_path / "mixed.log"])))
+    assert {values["ForeignFrames"] for _, values in again["BusHealth"]} == {0}
+    assert "go" in {str(values["State"]) for _, values in again["Traversability"]}
+
+
+def test_a_log_of_an_unknown_format_is_one_line(place, tmp_path, capsys):
+    out = tmp_path / "out.nonsense"
+    assert main(["replay", "--config", str(TRACTOR), str(place / "drive.log"), "--frames", str(out)]) == 1
+    assert "out.nonsense" in capsys.readouterr().err.splitlines()[-1]
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,78 @@
+"""dbc/sample.log is a minute of our frames, and the C reader of dbc/README.md reads it as cantools does."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from collections import defaultdict
+from pathlib import Path
+
+import can
+import cantools
+import pytest
+
+from availability import unavailable
+from soilbus.can.checksum import frame_checksum
+
+DBC = Path(__file__).resolve().parents[2] / "dbc"
+PAGE = (DBC / "README.md").read_text(encoding="utf-8")
+DATABASE = cantools.database.load_file(DBC / "soilbus.dbc", strict=True)
+SAMPLE = list(can.LogReader(DBC / "sample.log"))
+
+
+@pytest.fixture(scope="module")
+def reader(tmp_path_factory) -> Path:
+    """The page's C blocks, compiled as the page says."""
+    if shutil.which("gcc") is None:
+        unavailable("no gcc")
+    folder = tmp_path_factory.mktemp("verdict")
+    (folder / "verdict.c").write_text("\n".join(re.findall(r"```c\n(.*?)```", PAGE, re.S)), encoding="utf-8")
+    command = re.search(r"`(gcc [^`]*?) && \./verdict < sample\.log`", PAGE)[1]
+    subprocess.run([*command.split(), "-Wextra", "-pedantic"], cwd=folder, check=True)
+    return folder / "verdict"
+
+
+def read(program: Path, log: str) -> list[str]:
+    return subprocess.run([program], input=log, text=True, capture_output=True, check=True).stdout.splitlines()
+
+
+def test_the_sample_is_a_minute_of_every_frame_of_a_vehicle_with_four_wheels():
+    assert SAMPLE[-1].timestamp - SAMPLE[0].timestamp == pytest.approx(60.0, abs=1.0)
+    assert (DBC / "sample.log").stat().st_size < 250_000
+    counters: dict[str, list[int]] = defaultdict(list)
+    for message in SAMPLE:
+        name = DATABASE.get_message_by_frame_id(message.arbitration_id).name
+        assert message.data[7] == frame_checksum(message.arbitration_id, bytes(message.data), 7)
+        counters[name].append(message.data[6] >> 4)
+    assert counters.keys() == {m.name for m in DATABASE.messages} - {"WheelSlip2", "WheelSinkage2"}
+    for name, counter in counters.items():
+        assert counter == [i % 16 for i in range(len(counter))], name
+
+
+def test_the_reader_says_what_cantools_decodes(reader):
+    verdicts = [
+        (message.timestamp, str(DATABASE.decode_message(message.arbitration_id, message.data)["State"]))
+        for message in SAMPLE
+        if message.arbitration_id == DATABASE.get_message_by_name("Traversability").frame_id
+    ]
+    changes, before = [], "unknown"
+    for t, state in verdicts:
+        if state != before:
+            changes.append(f"{t:.6f} {state}")
+        before = state
+    assert {change.split()[1] for change in changes} >= {"go", "caution", "no_go"}
+    assert read(reader, (DBC / "sample.log").read_text()) == [*changes, f"{len(verdicts)} good, 0 refused"]
+
+
+def test_the_reader_refuses_what_is_broken_or_repeated_and_forgets_what_is_stale(reader):
+    ident = DATABASE.get_message_by_name("Traversability").frame_id
+
+    def line(t: float, counter: int, spoil: int = 0, length: int = 8) -> str:
+        data = bytes([0x33, 0x28, 0xFF, 4, 4, 7, 0x0F | counter << 4])
+        crc = frame_checksum(ident, data + b"\0", 7)
+        return f"({t:.6f}) can0 {ident:08X}#{(data + bytes([crc ^ spoil]))[:length].hex().upper()}\n"
+
+    other = "(2.000000) can0 123#00\n"
+    log = line(1.0, 1) + line(1.1, 1) + line(1.2, 2, spoil=1) + line(1.25, 2, length=7) + other + line(2.1, 2)
+    assert read(reader, log) == ["1.000000 go", "2.000000 unknown", "2.100000 go", "2 good, 3 refused"]

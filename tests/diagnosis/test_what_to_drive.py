@@ -1,0 +1,129 @@
+"""What to drive next: the manoeuvre tells rivals apart, can be driven, and more recordings do not mislead the score."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from soilbus.diagnosis.diagnose import Diagnosis, diagnose
+from soilbus.diagnosis.fitted_model import fit_model
+from soilbus.diagnosis.records import Record
+from soilbus.diagnosis.score import scores
+from soilbus.diagnosis.verdict import Verdict
+from soilbus.estimation.assembly import prior_of
+from soilbus.offline.manoeuvre import Plan, record_of_recording, what_excites, what_to_drive
+from soilbus.simulator.manoeuvre import of_json
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario, Swing, excited
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.effects.effect import Active
+from soilbus.terra.soils import SOILS
+
+CONFIG = reference_configuration()
+PRIOR = prior_of(CONFIG)
+
+
+def active(name: str, **values: float) -> Active:
+    return Active(CATALOGUE[name], CATALOGUE[name].neutral | values)
+
+
+LOSS, MORE_LOSS, PUSH = (
+    active("drivetrain_loss", share=0.03),
+    active("drivetrain_loss", share=0.05),
+    active("draft_offset", offset=300.0),
+)
+
+
+def recorded(scenario: Scenario, seed: int, *effects: Active) -> Record:
+    return record_of_recording("drive", simulate(CONFIG, replace(scenario, vehicle_seed=7), seed, effects), CONFIG)
+
+
+@cache
+def ambiguous() -> Diagnosis:
+    found = diagnose([recorded(excited("dry_sand", 60.0), 4, LOSS)], PRIOR, list(CATALOGUE.values()))
+    assert found.verdict is Verdict.AMBIGUOUS
+    return found
+
+
+@cache
+def planned() -> Plan:
+    plan = what_to_drive(ambiguous(), CONFIG)
+    assert plan is not None
+    return plan
+
+
+def test_the_plan_is_within_the_vehicles_limits_and_reads_back():
+    plan = planned()
+    assert set(plan.between) <= {rival.names[0] for rival in ambiguous().rivals}
+    assert "drivetrain_loss" in plan.between
+    assert max(plan.manoeuvre.slip) < CONFIG.traversability.max_slip
+    assert min(s for row in plan.separations.values() for s in row.values()) > 0.0
+    again = of_json(json.dumps(plan.as_json()))
+    assert again == plan.manoeuvre == of_json(json.dumps({"manoeuvre": plan.as_json()}))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x",
+        '{"t": [0, 1]}',
+        "[]",
+        '{"t":[0,0],"slip":[0,0],"speed":[1,1],"side_load":[0,0],"slope":[0,0]}',
+        '{"t":[0,1e9],"slip":[0,0],"speed":[1,1],"side_load":[0,0],"slope":[0,0]}',
+        '{"t":[0,9],"slip":[0,5],"speed":[1,1],"side_load":[0,0],"slope":[0,0]}',
+        '{"t":[0,9],"slip":[0,0],"speed":[1,NaN],"side_load":[0,0],"slope":[0,0]}',
+        '{"t":[0,9],"slip":[0,0],"speed":[1,-1],"side_load":[0,0],"slope":[0,0]}',
+        '{"t":[0,9],"slip":[0,"a"],"speed":[1,1],"side_load":[0,0],"slope":[0,0]}',
+    ],
+)
+def test_what_is_no_manoeuvre_is_refused(text):
+    with pytest.raises(ValueError, match="manoeuvre"):
+        of_json(text)
+
+
+def test_the_predicted_separation_is_what_a_drive_then_adds():
+    """S predicts the difference of chi-squares that the rival, fitted to both, keeps over the truth: by simulation."""
+    plan = planned()
+    first = recorded(excited("dry_sand", 60.0), 4, LOSS)
+    ground = Scenario(plan.manoeuvre.duration, (Patch(0.0, "dry_sand"),))
+    gained = {name: [] for name in plan.separations["drivetrain_loss"]}
+    for seed in (11, 12):
+        further = recorded(plan.manoeuvre.over(ground), seed, LOSS)
+        for name, found in gained.items():
+            alone, both = (
+                [fit_model(records, PRIOR, (CATALOGUE[n],)).neg2_log_evidence for n in (name, "drivetrain_loss")]
+                for records in ([first], [first, further])
+            )
+            found.append((both[0] - both[1]) - (alone[0] - alone[1]))
+    for name, predicted in plan.separations["drivetrain_loss"].items():
+        assert predicted > 20.0
+        assert np.mean(gained[name]) == pytest.approx(predicted, abs=2.0 * 2.0 * np.sqrt(predicted / 2.0))
+
+
+def test_what_excites_determines_a_soil_better_than_steady_driving():
+    found = what_excites(CONFIG, SOILS["loam"])
+    assert found is not None
+    manoeuvre, expected = found
+    assert max(manoeuvre.slip) - min(manoeuvre.slip) > 0.3
+    steady = Scenario(48.0, (Patch(0.0, "loam"),), slip=Swing(0.15, 0.15), side_shift=Swing(0.0, 0.0), slip_spread=0.0)
+    fits = [fit_model([recorded(drive, 5)], PRIOR, ()) for drive in (steady, manoeuvre.over(excited("loam", 48.0)))]
+    plain, driven = (fit.fits[-1].posterior.parameters()["n"].std for fit in fits)
+    assert driven < 0.3 * plain
+    assert driven == pytest.approx(expected.parameters()["n"].std, rel=0.5)
+
+
+@pytest.mark.parametrize("hidden", [PUSH, MORE_LOSS], ids=["draft_offset", "drivetrain_loss"])
+def test_of_two_recordings_the_score_predicts_what_the_fit_then_finds(hidden):
+    """Gains are shared: what the first recording has put into them is not lost at the second."""
+    records = [recorded(excited("loam", 40.0), seed, hidden) for seed in (1, 2)]
+    base = fit_model(records, PRIOR, ())
+    (score,) = scores(records, PRIOR, base, [hidden.effect])
+    fitted = fit_model(records, PRIOR, (hidden.effect,), score.starts)
+    fall = base.neg2_log_posterior - fitted.neg2_log_posterior
+    assert fall > 100.0
+    assert score.fall == pytest.approx(fall, rel=0.25)

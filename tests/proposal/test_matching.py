@@ -1,0 +1,160 @@
+"""Signals matched to roles on DBCs of several naming styles: what is right, what is wrong, what stays open."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from soilbus.cli.main import main
+from soilbus.config.file import machine, shipped_dbc
+
+HERE = Path(__file__).resolve().parent
+FIELD = HERE.parent / "field"
+CORNERS = {"lf": "FL", "rf": "FR", "lr": "RL", "rr": "RR"}
+ORCHARD = {
+    "axle.?.torque": "INV_Actual.InvTrqAct", "axle.?.motor_speed": "INV_Actual.InvSpdAct",
+    "axle.?.torque_limit": "INV_Actual.InvTrqMaxAvl", "axle.front.load": "EBS_AxlLd.AxlLdFrnt",
+    "axle.rear.load": "EBS_AxlLd.AxlLdRe", "wheel.FL.speed": "EBS_WhlSpd.WhlSpdFrntLft",
+    "wheel.FR.speed": "EBS_WhlSpd.WhlSpdFrntRght", "wheel.RL.speed": "EBS_WhlSpd.WhlSpdReLft",
+    "wheel.RR.speed": "EBS_WhlSpd.WhlSpdReRght", "signals.ground_speed": "INS_Motion.GpsSog",
+    "signals.draft": "HCU_Hitch.HtchDrft", "signals.pitch": "INS_Angles.ImuPtch", "signals.roll": "INS_Angles.ImuRoll",
+    "signals.yaw_rate": "INS_Angles.ImuGz", "signals.acceleration": "INS_Motion.ImuAx",
+    "signals.latitude": "INS_Pos.GpsLat", "signals.longitude": "INS_Pos.GpsLon",
+}  # fmt: skip
+"""One motor of an axle that no name says, axle loads in kg, wheel speeds in km/h; requests and a PTO beside."""
+HUBS = {
+    "signals.ground_speed": "nav_state.ground_spd", "signals.draft": "implement.pull_force",
+    "signals.pitch": "nav_state.slope_long", "signals.roll": "nav_state.slope_lat",
+    "signals.acceleration": "nav_imu.acc_lon", "signals.yaw_rate": "nav_imu.yaw_rt",
+    "signals.steering_angle": "implement.front_steer_angle",
+    **{f"wheel.{w}.torque": f"mcu_{c}_status.tq_fbk" for c, w in CORNERS.items()},
+    **{f"wheel.{w}.speed": f"mcu_{c}_status.rpm_fbk" for c, w in CORNERS.items()},
+    **{f"wheel.{w}.torque_limit": f"mcu_limits.tq_lim_{c}" for c, w in CORNERS.items()},
+    **{f"wheel.{w}.load": f"susp_force.fz_{c}" for c, w in CORNERS.items()},
+}  # fmt: skip
+"""Four motors whose shafts alone have a speed, vertical forces, an odometer, suspension travel that is no sinkage."""
+ISO = {
+    "signals.ground_speed": "GroundBasedSpeedAndDistance.GroundBasedMachineSpeed",
+    "signals.draft": "RearHitchStatus.RearDraft", "signals.latitude": "VehiclePosition.Latitude",
+    "signals.longitude": "VehiclePosition.Longitude",
+    "signals.acceleration": "AccelerationSensor.LongitudinalAccelerationExtendedRange",
+}  # fmt: skip
+"""Of pitch, roll and yaw rate there are two signals each; torque is a percentage."""
+
+
+def mapped(raw: Mapping[str, Any]) -> dict[str, str]:
+    """Signal of each role of a configuration, by dotted key."""
+    parts = {"signals": raw.get("signals", {})}
+    parts |= {f"{kind}.{item['name']}": item for kind in ("wheel", "axle") for item in raw.get(kind, [])}
+    found = {f"{part}.{role}": value for part, table in parts.items() for role, value in table.items()}
+    signals = {key: value["signal"] if isinstance(value, Mapping) else value for key, value in found.items()}
+    return {key: signal for key, signal in signals.items() if isinstance(signal, str) and "." in signal}
+
+
+def proposed(capsys: pytest.CaptureFixture[str], *dbcs: Path, log: Path | None = None) -> dict[str, Any]:
+    """What `soilbus init` prints for these DBCs."""
+    capsys.readouterr()
+    words = [word for dbc in dbcs for word in ("--dbc", str(dbc))]
+    assert main(["init", *words, *(["--log", str(log)] if log else [])]) == 0
+    return tomllib.loads(capsys.readouterr().out)
+
+
+def checked(found: Mapping[str, str], truth: Mapping[str, str]) -> float:
+    """Share of the true roles that are mapped; none may be wrong, nor one mapped that is not there."""
+    spare = {key: signal for key, signal in found.items() if key.endswith("motor_speed")}  # only compared with speeds
+    wrong = {key: signal for key, signal in found.items() if truth.get(key) != signal and key not in spare}
+    assert wrong == {}
+    return len(truth.keys() & found.keys()) / len(truth)
+
+
+@pytest.mark.parametrize(
+    ("dbc", "truth"),
+    [
+        (HERE / "orchard.dbc", ORCHARD),
+        (HERE / "hubs.dbc", HUBS),
+        (shipped_dbc("iso11783.dbc"), ISO),
+        (shipped_dbc("tractor.dbc"), mapped(tomllib.loads(machine("tractor").read_text()))),
+        (FIELD / "field.dbc", mapped(tomllib.loads((FIELD / "field.toml").read_text()))),
+    ],
+    ids=["orchard", "hubs", "iso11783", "tractor", "field"],
+)
+def test_names_units_and_ranges_alone_find_every_role(dbc, truth, capsys):
+    assert checked(mapped(proposed(capsys, dbc)), truth) == 1.0
+
+
+def test_motors_of_wheels_and_of_axles_in_one_dbc_are_a_question(capsys):
+    assert main(["init", "--dbc", "tractor.dbc", "--dbc", "axles.dbc"]) == 0
+    text = capsys.readouterr().out
+    found = mapped(tomllib.loads(text))
+    assert "#   acceleration: Attitude.LongAccel (m/s^2)" in text  # there is another accelerometer
+    assert [key for key in found if key.endswith("torque")] == []
+    assert "wheel.FL.speed" in found
+
+
+def test_two_signals_of_a_kind_and_a_percentage_are_questions(capsys):
+    assert main(["init", "--dbc", "iso11783.dbc"]) == 0
+    text = capsys.readouterr().out
+    assert "#   pitch: SlopeSensorInformation.PitchAngle (deg), SlopeSensorInformation2.PitchAngleExtended" in text
+    assert "# ElectronicEngineController1.ActualEnginePercentTorque (%, with reference_torque)\n" in text
+
+
+def test_a_comment_on_the_direction_sets_the_sign(capsys):
+    signals = proposed(capsys, shipped_dbc("nmea2000.dbc"))["signals"]
+    assert signals["yaw_rate"] == {"signal": "RateOfTurn.Rate", "sign": -1}  # "positive to the right"
+    assert [signals["pitch"], signals["roll"]] == ["Attitude.Pitch", "Attitude.Roll"]
+    assert "sign" not in proposed(capsys, HERE / "hubs.dbc")["signals"]["draft"]  # "positive backward" is the role's
+
+
+def test_what_a_log_does_not_hold_is_not_mapped(field_recording, capsys):
+    truth = mapped(tomllib.loads((FIELD / "field.toml").read_text()))
+    found = proposed(capsys, FIELD / "field.dbc", log=field_recording("clay.log.gz"))  # without RideHeight
+    assert checked(mapped(found), {k: s for k, s in truth.items() if not k.endswith("sinkage")}) == 1.0
+    assert [wheel["gear_ratio"] for wheel in found["wheel"]] == [24.0] * 4
+
+
+def renamed(tmp_path: Path, *swaps: tuple[str, str]) -> Path:
+    text = (HERE / "hubs.dbc").read_text()
+    for old, new in swaps:
+        assert old in text
+        text = text.replace(old, new)
+    path = tmp_path / "renamed.dbc"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("swaps", "open_keys"),
+    [
+        ([("ground_spd", "v_a"), ("odo_spd", "v_b"), ("Doppler radar", ""), ("Odometer from the wheels", "")],
+         ["signals.ground_speed"]),
+        ([("mcu_lf", "mcu_1"), ("mcu_rf", "mcu_2"), ("mcu_lr", "mcu_3"), ("mcu_rr", "mcu_4"), ("MCU_LF", "M1"),
+          ("MCU_RF", "M2"), ("MCU_LR", "M3"), ("MCU_RR", "M4")], ["wheel.FL.torque", "wheel.RR.torque"]),
+        ([('"rad/s" CHS', '"furlong" CHS')], ["signals.yaw_rate"]),
+        ([("acc_lon", "acc_1"), ("acc_lat", "acc_2"), ("acc_vert", "acc_3")], ["signals.acceleration"]),
+    ],
+    ids=["two unnamed speeds", "numbered motors", "unknown unit", "numbered axes"],
+)  # fmt: skip
+def test_what_no_name_says_stays_open(swaps, open_keys, tmp_path, capsys):
+    found = mapped(proposed(capsys, renamed(tmp_path, *swaps)))
+    assert [key for key in open_keys if key in found] == []
+    assert {key: signal for key, signal in found.items() if HUBS.get(key) not in (signal, None)} == {}
+
+
+def test_a_shaft_without_a_torque_still_asks_for_its_gear(tmp_path, capsys):
+    units = [('"N*m" CHS', '"furlong" CHS')]  # every actual torque and limit
+    for wheel in proposed(capsys, renamed(tmp_path, *units))["wheel"]:
+        assert wheel["speed"]["at"] == "shaft"
+        assert [wheel["torque"], wheel["gear_ratio"]] == ["?", "?"]
+
+
+def test_the_remains_of_a_dbc_without_any_role_are_all_open(tmp_path, capsys):
+    path = tmp_path / "doors.dbc"
+    path.write_text('VERSION ""\nBU_: A\nBO_ 1 Doors: 8 A\n SG_ LeftOpen : 0|1@1+ (1,0) [0|1] "" A\n')
+    found = proposed(capsys, path)
+    assert mapped(found) == {}
+    assert found["signals"]["ground_speed"] == "?"
+    assert [wheel["speed"] for wheel in found["wheel"]] == ["?"] * 4

@@ -1,0 +1,164 @@
+"""From a bare Debian to a running service by the commands of systemd/README.md, run as they are written.
+
+A guest boots the systemd of a Debian that has nothing of this machine and no network: what `apt-get install` of a page
+wants from Debian is there beforehand (guest.DEBIAN); pip finds the wheels of others in a folder.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from installation import REPO
+
+import guest
+import soilbus
+from availability import unavailable
+
+PAGE = (REPO / "systemd/README.md").read_text()
+BUILT, WITH_THE_PACKAGE, WITHOUT = (
+    [line for line in block.splitlines() if not line.startswith("#")]
+    for block in re.findall(r"^```sh\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)[:3]
+)
+"""Commands of the page: on the machine that builds the package, on the ECU with it, and without it."""
+OF_US = (
+    "/opt/soilbus",
+    "/usr/bin/soilbus",
+    "/usr/lib/systemd/system/soilbus@.service",
+    "/usr/lib/sysusers.d/soilbus.conf",
+)
+ENABLED = "/etc/systemd/system/multi-user.target.wants/soilbus@can0.service"
+LATER = "99.0.0"
+
+
+def _run(words: Sequence[str | Path], where: Path = REPO) -> None:
+    done = subprocess.run(words, cwd=where, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=300.0)
+    assert done.returncode == 0, done.stdout
+
+
+def _in_the_guest(script: str, folder: Path, commands: Sequence[str], environment: Sequence[str] = ()) -> Path:
+    """The folder, with what the script leaves there."""
+    (folder / "commands").write_text("".join(f"{line}\n" for line in commands))
+    for name in ("page.sh", script):
+        shutil.copy(REPO / "tests/systemd" / name, folder)
+    try:
+        done = guest.run(["env", *environment, "sh", script], rw=[folder], base=guest.bare_debian(), timeout=400.0)
+    except guest.Unavailable as reason:
+        unavailable(str(reason))
+        raise
+    assert done.returncode == 0, done.stdout
+    return folder
+
+
+@pytest.fixture(scope="module")
+def package(tool, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What package.sh leaves of the package that the page's command builds, and of a later version."""
+    tool("dpkg-deb")
+    folder = tmp_path_factory.mktemp("package")
+    checkout = tmp_path_factory.mktemp("checkout") / "soilbus"
+    shutil.copytree(REPO, checkout, ignore=shutil.ignore_patterns(".git", ".venv", "tests", "dist", "__pycache__"))
+    try:
+        guest.prepare()
+        guest.bare_debian()
+    except guest.Unavailable as reason:
+        unavailable(str(reason))
+    _run(["sh", "-c", BUILT[1]], checkout)
+    (built,) = (checkout / "dist").glob("*.deb")
+    shutil.copy(built, folder)
+    _run(["dpkg-deb", "-R", built, folder / "tree"])
+    control = (folder / "tree/DEBIAN/control").read_text()
+    (folder / "tree/DEBIAN/control").write_text(control.replace(f"Version: {soilbus.__version__}", f"Version: {LATER}"))
+    (folder / "tree/etc/soilbus/can0.link").write_text("# as a later version has it\n")
+    (folder / "later").mkdir()
+    _run(["dpkg-deb", "--root-owner-group", "-Zzstd", "-z1", "--build", folder / "tree", folder / "later"])
+    shutil.rmtree(folder / "tree")
+    return _in_the_guest("package.sh", folder, WITH_THE_PACKAGE)
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What page.sh leaves of the commands without the package."""
+    folder = tmp_path_factory.mktemp("wheel")
+    _run(["/usr/bin/python3", "-m", "venv", folder / "venv"])
+    _run([folder / "venv/bin/pip", "wheel", "-q", "-w", folder / "wheels", "."])
+    (ours,) = (folder / "wheels").glob("soilbus-*.whl")
+    ours.rename(folder / ours.name)
+    shutil.rmtree(folder / "venv")
+    (reference,) = (REPO / "service/soilbus").rglob("tractor.toml")
+    shutil.copy(reference, folder)
+    of_pip = ["PIP_NO_INDEX=1", f"PIP_FIND_LINKS={folder}/wheels", "PIP_NO_COMPILE=1"]  # the guest is slow
+    return _in_the_guest("page.sh", folder, WITHOUT, of_pip)
+
+
+def shown(folder: Path) -> dict[str, str]:
+    """What `systemctl show` said then."""
+    return dict(line.split("=", 1) for line in (folder / "show").read_text().splitlines())
+
+
+def there(folder: Path) -> set[str]:
+    """Files and folders of soilbus at the time."""
+    return set((folder / "files").read_text().splitlines())
+
+
+def promised_status() -> list[str]:
+    """The lines that the page shows of `systemctl status`."""
+    (block,) = re.findall(r"The last command says.*?\n```\n(.*?)```", PAGE, re.DOTALL)
+    return [line.strip() for line in block.splitlines()]
+
+
+def test_it_takes_ten_commands_at_most() -> None:
+    assert sum(line.count(" && ") + 1 for line in [*BUILT, *WITH_THE_PACKAGE]) <= 10
+    assert BUILT[0].startswith("apt-get")  # satisfied beforehand, where the test runs
+    assert WITH_THE_PACKAGE[-1] == WITHOUT[-1] == "systemctl status soilbus@can0"
+
+
+@pytest.mark.systemd
+@pytest.mark.parametrize("way", ["package", "wheel"])
+def test_the_service_runs_as_the_page_says(way: str, request: pytest.FixtureRequest) -> None:
+    folder: Path = request.getfixturevalue(way)
+    status = (folder / "status").read_text()
+    assert len(promised_status()) == 2
+    assert [line for line in promised_status() if line not in status] == []
+    assert shown(folder / "running")["UnitFileState"] == "enabled"
+    assert (folder / "running/user").read_text().startswith("soilbus:")
+    settings = (REPO / "systemd/soilbus.sysctl").read_text()
+    assert (folder / "running/rmem_max").read_text().strip() == settings.split(" = ")[1].strip()
+
+
+@pytest.mark.systemd
+def test_the_package_alone_starts_nothing(package: Path) -> None:
+    assert set(OF_US) <= there(package / "1")
+    assert ENABLED not in there(package / "1")
+    assert shown(package / "1")["ActiveState"] == "inactive"
+    assert (package / "1/user").read_text().startswith("soilbus:")
+    assert os.listdir(package / "1/etc") == ["can0.link"]
+
+
+@pytest.mark.systemd
+def test_an_upgrade_keeps_the_configuration_and_restarts_what_runs(package: Path) -> None:
+    before, after = shown(package / "before"), shown(package / "upgraded")
+    assert (package / "upgraded/version").read_text() == LATER
+    assert (after["ActiveState"], after["UnitFileState"]) == ("active", "enabled")
+    assert after["MainPID"] != before["MainPID"] != "0"
+    assert (package / "upgraded/etc/can0.link").read_text() == "BITRATE=500000\n"
+    assert (package / "upgraded/etc/can0.toml").read_text().endswith("# ours\n")
+
+
+@pytest.mark.systemd
+def test_a_removal_keeps_configuration_and_state_and_nothing_else(package: Path) -> None:
+    assert shown(package / "removed")["ActiveState"] == "inactive"
+    assert there(package / "removed") == {"/etc/soilbus", "/var/lib/soilbus", ENABLED}
+    assert (package / "removed/etc/can0.toml").read_text().endswith("# ours\n")
+    assert json.loads((package / "removed/state.json").read_text())["state"]["starts"] == 2
+
+
+@pytest.mark.systemd
+def test_a_purge_leaves_nothing_but_the_user(package: Path) -> None:
+    assert there(package / "purged") == set()
+    assert (package / "purged/user").read_text().startswith("soilbus:")
