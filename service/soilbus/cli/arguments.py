@@ -52,6 +52,7 @@ EXAMPLES: Mapping[str, str] = {
     "simulate": "soilbus simulate --config tractor-2wd --soil loam --effect slip_sinkage=0.4 --log drive.log",
     "diagnose": "soilbus diagnose --config soilbus.toml drive.log --report findings.html --model-out better.toml",
     "effects": "soilbus effects slip_sinkage",
+    "batch": "soilbus batch --config soilbus.toml logs/ --out results --diagnose",
     "watch": "soilbus watch --config soilbus.toml",
     "completion": "soilbus completion bash >/etc/bash_completion.d/soilbus",
     "docs": "soilbus docs systemd",

@@ -2,13 +2,13 @@
 
     expected share of false names in a set S = mean over S of (1 - P),  P = probability that the vehicle has the effect
     S = the largest set, taken in the order of P, whose expected share is at most FALSE_DISCOVERY_RATE
-    -2 log evidence(effect from log k on) = sum of E0 before k + sum of E1 from k on
+    -2 log evidence(effect from log k on) = -2 log integral of prod(i >= k) L_i(u) dp(u),  u = the effect's size
 
 Naming each vehicle's best effect would give a fleet of 10 000 hundreds of false names.  The set S bounds their expected
-share (Newton et al. 2004, Biostatistics 5:155).  A fault of a sensor begins at some day: E0 and E1 are the -2 log
-evidences of each log alone, without and with the effect, its size free in each; the soil is each log's own in any case.
-That no log has it is one more case, and its probability is taken from the name's: what all logs together seem to show,
-and none of them by itself, may be a difference between them that is none of the vehicle's.
+share (Newton et al. 2004, Biostatistics 5:155).  A fault of a sensor begins at some day and then has one size: L_i is
+the likelihood of that size by log i alone (Gaussian around its fit), whose soil is its own; the integral is that of
+`evidence`, relative to an effect that is absent.  That no log has it is one more case, and its probability is taken
+from the name's: what all logs together seem to show, and none of them by itself, may be no fault of the vehicle.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 from scipy.special import softmax
 
 from soilbus.diagnosis.diagnose import Diagnosis, diagnose
+from soilbus.diagnosis.evidence import OwnParameters, mixture_neg2_log_evidence
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.verdict import TEMPERATURE, Verdict
@@ -143,15 +144,29 @@ def onset_of(records: Sequence[Record], prior: SoilPrior, effect: Effect, beside
     beside
         Other effects of the model.
     """
-    falls: list[float] = []
+    shown: list[OwnParameters | None] = []
     sizes: list[Mapping[str, Estimate] | None] = []
     for record in records:
-        present = (*record.training.effects, *beside)
-        base, full = (fit_model([record], prior, effects) for effects in (present, (*present, effect)))
-        falls.append(np.nan if base is None or full is None else base.neg2_log_evidence - full.neg2_log_evidence)
-        sizes.append(None if full is None else full.parameters()[effect.name])
-    *probabilities, never = onset_probabilities(falls)
+        fitted = fit_model([record], prior, (*record.training.effects, *beside, effect))
+        shown.append(None if fitted is None else fitted.shared_parameters(effect))
+        sizes.append(None if fitted is None else fitted.parameters()[effect.name])
+    *probabilities, never = onset_probabilities([_fall(shown[k:]) for k in range(len(records))])
     return Onset(int(np.argmax(probabilities)), tuple(probabilities), never, tuple(sizes))
+
+
+def _fall(shown: Sequence[OwnParameters | None]) -> float:
+    """Fall of -2 log evidence by an effect of one size in all of these logs; a fit that failed says nothing.
+
+    A parameter that some log's fit holds at the edge of its range is left out.
+    """
+    known = [each for each in shown if each is not None]
+    common = set.intersection(*({f.name for f in each.free} for each in known)) if known else set()
+    if not common:
+        return 0.0
+    kept = [[i for i, f in enumerate(each.free) if f.name in common] for each in known]
+    information = np.sum([each.information[np.ix_(at, at)] for each, at in zip(known, kept, strict=True)], axis=0)
+    vector = np.sum([each.information_vector[at] for each, at in zip(known, kept, strict=True)], axis=0)
+    return -mixture_neg2_log_evidence(information, vector, [known[0].free[i] for i in kept[0]])
 
 
 def onset_probabilities(falls: Sequence[float]) -> list[float]:
@@ -160,15 +175,13 @@ def onset_probabilities(falls: Sequence[float]) -> list[float]:
     Parameters
     ----------
     falls
-        Fall of -2 log evidence by the effect in each log alone; not finite where a fit failed, which counts as 0.
+        Fall of -2 log evidence by an effect that all logs from this one on have.
 
     Returns
     -------
     Probabilities; beforehand each case is as likely as any other, and evidences are tempered as in `verdict`.
     """
-    known = np.where(np.isfinite(falls), falls, 0.0)
-    explained = np.append(np.cumsum(known[::-1])[::-1], 0.0)
-    return [float(p) for p in softmax(explained / (2.0 * TEMPERATURE))]
+    return [float(p) for p in softmax(np.array([*falls, 0.0]) / (2.0 * TEMPERATURE))]
 
 
 def named(probabilities: Sequence[float], rate: float = FALSE_DISCOVERY_RATE) -> list[bool]:

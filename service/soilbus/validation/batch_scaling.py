@@ -22,9 +22,11 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from soilbus import __version__
+from soilbus.can.log_writer import write_log
 from soilbus.offline.batch import done_in_turn
 from soilbus.offline.parts import Job, Outcome, part_of, setup_of
-from soilbus.simulator.play import play, scenario_over
+from soilbus.simulator.frames import frames
+from soilbus.simulator.play import scenario_over
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 
@@ -35,7 +37,7 @@ def jobs_in(folder: Path, logs: int, seconds: float) -> list[Job]:
     setup = setup_of(config, "tractor.toml")
     paths = [folder / f"{n}.log" for n in range(logs)]
     for seed, path in enumerate(paths, 1):
-        play(simulate(config, scenario_over(["loam"], seconds), seed), config, path)
+        write_log(frames(simulate(config, scenario_over(["loam"], seconds), seed), config), path)
     return [Job(str(path), "tractor", setup) for path in paths]
 
 
