@@ -234,6 +234,8 @@ class FittedModel:
     def shared_parameters(self, effect: Effect) -> OwnParameters:
         """Likelihood, by the first recording, of an effect's parameters that are the vehicle's; without held ones."""
         shared = [i for i in _not_held(effect, self.free) if not effect.own_in_each_record(self.free[i].parameter)]
+        if not shared:
+            return OwnParameters(np.zeros((0, 0)), np.zeros(0), ())
         n_sensors, free = self.checks[0].problem.n_sensors, [self.free[i] for i in shared]
         return own_parameters(*_moments(self.fits[0], n_sensors, shared), free)
 

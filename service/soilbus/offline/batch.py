@@ -220,7 +220,7 @@ def _is_log(name: str, suffixes: Sequence[str]) -> bool:
 
 
 @contextmanager
-def cluster(address: str | None, say: Callable[[str], None]) -> Iterator[Any]:
+def cluster(address: str | None, say: Callable[[str], None], processes: int | None = None) -> Iterator[Any]:
     """A Dask client: of the scheduler at an address, or of one process for each core of this machine.
 
     Parameters
@@ -229,6 +229,8 @@ def cluster(address: str | None, say: Callable[[str], None]) -> Iterator[Any]:
         Such as tcp://10.0.0.1:8786; None for this machine.
     say
         Called with a line for the user.
+    processes
+        Of this machine; one for each core by default.
 
     Raises
     ------
@@ -242,13 +244,14 @@ def cluster(address: str | None, say: Callable[[str], None]) -> Iterator[Any]:
     settings = {
         "distributed.comm.timeouts.connect": CONNECT_TIMEOUT,
         "distributed.client.scheduler-info-interval": 2000,
+        "distributed.worker.profile.enabled": False,  # it looks at the worker's threads a hundred times a second
     }
     with dask.config.set(settings):
         if address is None:
             options = {"threads_per_worker": 1, "processes": True, "silence_logs": logging.CRITICAL}
             here = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
             with (
-                distributed.LocalCluster(**options, **here) as local,
+                distributed.LocalCluster(processes, **options, **here) as local,
                 distributed.Client(local) as client,
             ):
                 _announce(client, say)

@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from soilbus import __version__
 from soilbus.diagnosis.diagnose import NotFitted
 from soilbus.diagnosis.fleet import FALSE_DISCOVERY_RATE, Onset, diagnose_vehicle, named
 from soilbus.diagnosis.records import Record, TooLittle
 from soilbus.estimation.assembly import possible_effects, prior_of
-from soilbus.offline.parts import Job, OtherVersion, local_log, unpacked
+from soilbus.offline.parts import Job, check_version, local_log, unpacked
 from soilbus.offline.recordings import recordings_of
 from soilbus.offline.replay import LogError
 from soilbus.words import one_line
@@ -49,8 +48,7 @@ def findings_of(jobs: Sequence[Job], version: str) -> dict[str, Any]:
     OtherVersion
         This soilbus is of another version.
     """
-    if version != __version__:
-        raise OtherVersion(f"a worker has soilbus {__version__}, this is {version}: install the same everywhere")
+    check_version(version)
     config, database = unpacked(jobs[0].setup.content)
     record = no_findings(jobs[0].vehicle, "no log of it can be diagnosed")
     if database is None:

@@ -127,6 +127,12 @@ class OtherVersion(Exception):
     """A worker has another version of soilbus than the command."""
 
 
+def check_version(version: str) -> None:
+    """Raises OtherVersion where the soilbus that asks is of another version than this one."""
+    if version != __version__:
+        raise OtherVersion(f"a worker has soilbus {__version__}, this is {version}: install the same everywhere")
+
+
 def setup_of(config: Config, name: str) -> Setup:
     """The setup of a configuration.
 
@@ -167,8 +173,7 @@ def part_of(job: Job, version: str) -> Outcome:
     OtherVersion
         This soilbus is of another version.
     """
-    if version != __version__:
-        raise OtherVersion(f"a worker has soilbus {__version__}, this is {version}: install the same everywhere")
+    check_version(version)
     begin = time.thread_time()
     try:
         with local_log(job) as path:

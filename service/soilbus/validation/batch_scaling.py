@@ -16,14 +16,12 @@ import os
 import sys
 import time
 from collections.abc import Sequence
-from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from soilbus import __version__
 from soilbus.can.log_writer import write_log
-from soilbus.offline.batch import done_in_turn
+from soilbus.offline.batch import cluster, done_in_turn
 from soilbus.offline.parts import Job, Outcome, part_of, setup_of
 from soilbus.simulator.frames import frames
 from soilbus.simulator.play import scenario_over
@@ -65,15 +63,7 @@ def by_multiprocessing(jobs: Sequence[Job], workers: int) -> tuple[float, list[O
 
 def by_dask(jobs: Sequence[Job], workers: int) -> tuple[float, list[Outcome]]:
     """The same with Dask's processes."""
-    distributed: Any = import_module("distributed")
-    options = {
-        "threads_per_worker": 1,
-        "processes": True,
-        "host": "127.0.0.1",
-        "dashboard_address": "127.0.0.1:0",
-        "silence_logs": 50,
-    }
-    with distributed.LocalCluster(workers, **options) as local, distributed.Client(local) as client:
+    with cluster(None, print, workers) as client:
         client.run(replayed, jobs[0])
         begin = time.perf_counter()
         results = dict(done_in_turn(client, part_of, ((job.digest, (job, __version__)) for job in jobs)))
