@@ -44,6 +44,9 @@ CONNECT_TIMEOUT = 10.0
 """Seconds in which a scheduler must answer."""
 TASKS_PER_THREAD = 3
 """Tasks that are handed out for each thread: one in work, one to follow, one on its way."""
+WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": 1}
+"""Of the processes started here.  Dask's own has MALLOC_TRIM_THRESHOLD_ = 64 KiB too: glibc then gives memory back to
+the kernel all the time and has it zeroed again."""
 MAX_SENT_BYTES = 256 * 2**20
 """Bytes of a log that is sent along; it is in memory on its way."""
 
@@ -245,6 +248,7 @@ def cluster(address: str | None, say: Callable[[str], None], processes: int | No
         "distributed.comm.timeouts.connect": CONNECT_TIMEOUT,
         "distributed.client.scheduler-info-interval": 2000,
         "distributed.worker.profile.enabled": False,  # it looks at the worker's threads a hundred times a second
+        "distributed.nanny.pre-spawn-environ": WORKER_ENVIRONMENT,
     }
     with dask.config.set(settings):
         if address is None:
