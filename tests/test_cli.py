@@ -338,3 +338,67 @@ def test_a_bus_that_goes_away_ends_simulate_with_one_line(tractor, capsys, monke
     assert len(err) == 1
     assert "virtual:gone" in err[0]
     assert "Network is down" in err[0]
+
+
+@pytest.mark.parametrize("option", ["--json", "--report", "--frames", "--table"])
+def test_replay_asks_for_the_folder_before_the_work(option, tractor, tmp_path, capsys):
+    out = tmp_path / "no/such" / {"--frames": "x.log", "--table": "x.csv"}.get(option, "x")
+    assert main(["replay", "--config", str(tractor), str(tmp_path / "not-read.log"), option, str(out)]) == 1
+    assert lines(capsys) == ([], [f"soilbus: {out}: no folder {out.parent}"])
+
+
+def test_a_log_of_an_unknown_format_is_refused_before_the_work(tractor, tmp_path, capsys):
+    out = tmp_path / "x.odt"
+    assert main(["replay", "--config", str(tractor), str(tmp_path / "not-read.log"), "--frames", str(out)]) == 1
+    assert main(["simulate", "--log", str(out)]) == 1
+    assert (
+        lines(capsys)[1]
+        == [f"soilbus: {out}: no format of a log is known by this ending; .log .log.gz .asc .blf are"] * 2
+    )
+
+
+def test_a_picture_asks_for_its_folder_before_the_demo(tmp_path, capsys):
+    assert main(["demo", "--picture", str(tmp_path / "no/x.svg")]) == 1
+    assert lines(capsys) == ([], [f"soilbus: {tmp_path / 'no/x.svg'}: no folder {tmp_path / 'no'}"])
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "simulate --log x.log --duration nan",
+        "simulate --log x.log --duration -5",
+        "simulate --log x.log --heading nan",
+        "watch --seconds -3",
+        "demo --duration nan",
+    ],
+)
+def test_a_number_that_cannot_be_is_wrong_usage(words, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(words.split())
+    assert stop.value.code == 2
+    assert "is not a number from" in lines(capsys)[1][-1]
+
+
+def test_a_test_rig_has_no_bus_and_no_drive(capsys):
+    rig = FIELD.parents[2] / "service/docs/notebooks/rig.toml"
+    table = str(rig.with_name("rig.csv"))
+    assert main(["run", "--config", str(rig)]) == 2
+    assert main(["replay", "--config", str(rig), table, "--manoeuvre-out", "x.json"]) == 2
+    assert main(["diagnose", "--config", str(rig), table, "--manoeuvre-out", "x.json"]) == 2
+    err = lines(capsys)[1]
+    assert err[0] == "soilbus: [table]: a table of a test rig has no bus; replay and diagnose read it"
+    assert err[1:] == ["soilbus: --manoeuvre-out: a test rig is no vehicle to drive"] * 2
+
+
+def test_a_broken_line_is_named_in_words(log, tractor, tmp_path, capsys):
+    text = log.read_text()
+    cut = tmp_path / "cut.log"
+    cut.write_text(text[: text.rindex("#", 0, len(text) // 2)])
+    assert main(["replay", "--config", str(tractor), str(cut)]) == 1
+    (line,) = lines(capsys)[1]
+    assert "(a line that is no frame)" in line
+
+
+def test_a_part_that_the_configuration_has_not_cannot_be_set(tractor, capsys):
+    assert main(["check", "--config", str(tractor), "--set", "axle.rear.gear_ratio=3"]) == 2
+    assert lines(capsys) == ([], ["soilbus: --set axle.rear.gear_ratio=3: the configuration has no [[axle]]"])

@@ -120,6 +120,7 @@ def test_what_is_not_known_or_not_carried_stays_unknown():
         ({"radius": 0.0}, "radius must be above 0"),
         ({"width": [0.3, -0.3]}, "width must be above 0"),
         ({"slip": 20.0}, "is it in per cent"),
+        ({"load": [6000.0, -1.0]}, "a load of -1 N is below 0"),
         ({"load": None}, "either the load or the sinkage"),
         ({"sinkage": 0.05}, "either the load or the sinkage"),
         ({"load": None, "sinkage": 0.5}, "sinkage must be above 0 and below"),
@@ -223,6 +224,11 @@ def test_wrong_data_or_a_wrong_rig_is_refused_in_a_line(columns, change, more, e
     with pytest.raises(error, match=complaint) as refused:
         soilbus.estimate(data, soilbus.SingleWheelRig(**{"radius": RADIUS, "width": WIDTH} | more))
     assert "\n" not in str(refused.value)
+
+
+def test_a_table_without_columns_names_those_that_are_needed():
+    with pytest.raises(TableError, match="no column wheel_load"):
+        soilbus.estimate({}, soilbus.SingleWheelRig(RADIUS, WIDTH))
 
 
 def test_replay_is_the_json_lines_as_a_table(tmp_path, drive):

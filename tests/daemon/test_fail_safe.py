@@ -9,7 +9,7 @@ from __future__ import annotations
 import pytest
 
 from soilbus.decision.traversability import Status
-from soilbus.validation.stories.onlooker import CONFIG, MOMENTS, NEEDED, Drive, good_moment, good_tracked
+from soilbus.validation.stories.onlooker import CONFIG, MOMENTS, Drive, good_moment, good_tracked
 
 LEAD = 6.5
 """Seconds of good frames after which go is due."""
@@ -33,7 +33,7 @@ def test_a_good_drive_is_go_and_comes_back_to_go(moment, tracked):
         if fault == "clock":
             drive.step_clock(-5.0)
         else:
-            setattr(drive.wire, fault, frozenset(NEEDED) if fault == "deaf" else True)
+            setattr(drive.wire, fault, frozenset(drive.needed) if fault == "deaf" else True)
         drive.run(2.0)
         drive.wire.deaf, drive.wire.lost = frozenset(), False
         drive.run(7.0)

@@ -213,3 +213,15 @@ def test_mistakes_are_reported_before_any_work(diagnosed, capsys, arguments, cod
     assert reported.out == ""
     assert len(reported.err.splitlines()) == 1
     assert message in reported.err
+
+
+def test_where_no_drive_is_needed_the_other_outputs_are_written_all_the_same(tmp_path, capsys):
+    log = simulated(tmp_path / "short.log", 3, seconds=24)
+    out, drive = tmp_path / "out.json", tmp_path / "drive.json"
+    capsys.readouterr()
+    assert main(["diagnose", "--config", "tractor", str(log), "--json", str(out), "--manoeuvre-out", str(drive)]) == 1
+    assert json.loads(out.read_text())["verdict"] == "named"
+    text, error = capsys.readouterr()
+    assert text.startswith("named: ")
+    assert error.splitlines()[-1].startswith("soilbus: --manoeuvre-out: no names are left")
+    assert not drive.exists()

@@ -68,7 +68,18 @@ def test_the_plan_is_within_the_vehicles_limits_and_reads_back():
 
 
 @pytest.mark.parametrize(
-    "text", ['{"t": [0, 1]}', "[]", '{"t":[0,0],"slip":[0,0],"speed":[1,1],"side_load":[0,0],"slope":[0,0]}']
+    "text",
+    [
+        "x",
+        '{"t": [0, 1]}',
+        "[]",
+        '{"t":[0,0],"slip":[0,0],"speed":[1,1],"side_load":[0,0],"slope":[0,0]}',
+        '{"t":[0,1e9],"slip":[0,0],"speed":[1,1],"side_load":[0,0],"slope":[0,0]}',
+        '{"t":[0,9],"slip":[0,5],"speed":[1,1],"side_load":[0,0],"slope":[0,0]}',
+        '{"t":[0,9],"slip":[0,0],"speed":[1,NaN],"side_load":[0,0],"slope":[0,0]}',
+        '{"t":[0,9],"slip":[0,0],"speed":[1,-1],"side_load":[0,0],"slope":[0,0]}',
+        '{"t":[0,9],"slip":[0,"a"],"speed":[1,1],"side_load":[0,0],"slope":[0,0]}',
+    ],
 )
 def test_what_is_no_manoeuvre_is_refused(text):
     with pytest.raises(ValueError, match="manoeuvre"):

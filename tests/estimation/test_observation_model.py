@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from soilbus.estimation.measurements import GAIN_QUANTITIES, differentiated_speed
-from soilbus.estimation.observation_model import Latents, ObservationModel
+from soilbus.estimation.observation_model import Latents, ObservationModel, inverse_covariance
 from soilbus.estimation.window import Rig, Window, window_of_samples
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import SOILS
@@ -208,3 +208,12 @@ def test_acceleration_from_speed_and_its_variance():
     step = np.where(t < 5.0, 1.0, 2.0)
     assert differentiated_speed(t, step, np.full(100, 1e-4))[1][50] > 10.0 * variance[50]
     assert (differentiated_speed(t[:2], step[:2], np.full(2, 1e-4))[1] >= 1.0).all()
+
+
+def test_rows_that_one_latent_swamps_have_a_finite_inverse():
+    """As at a trial point of the search on a rover's window: derivatives by speeds of 1e15, five rows alike."""
+    A = np.zeros((1, 5, 9))
+    A[0, :, 8] = [3.4e15, 3.3e15, 3.8e15, 2.8e15, 5.1e16]
+    inverse = inverse_covariance(A, np.full((1, 9), 0.05**2), np.full((1, 5), 25.0))
+    assert np.isfinite(inverse).all()
+    assert (np.linalg.eigvalsh(inverse[0]) > -1e-20).all()

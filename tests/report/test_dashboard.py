@@ -468,3 +468,20 @@ def test_charts_are_to_scale_and_blank_where_nothing_is_known():
     assert sparkline([5.0, 5.0]) == "▄▄"
     assert area([0.0, 4.0, None, 8.0], 2, 8.0) == ["   █", " █ █"]
     assert area([1.0, 1.0], 2, 8.0, [8.0, None]) == ["─ ", "▂▂"]
+
+
+@pytest.mark.parametrize(
+    ("slip", "says"), [(0.09, "getting stuck now"), (0.97, "NO-GO: stuck"), (None, "NO-GO: stuck")]
+)
+def test_a_vehicle_whose_wheels_hardly_slip_is_not_called_stuck(slip, says):
+    desk = Desk()
+    desk.send("Traversability", State="no_go", LimitingCause="slip", Probability=0.0)
+    desk.send("DemandForecast", Warning="immobilisation", TimeLeft=0.0)
+    desk.send("WheelSlip", SlipWheel1=slip, SlipWheel2=slip)
+    assert says in desk.dashboard.verdict().said
+
+
+def test_before_a_status_was_heard_no_estimate_is_called_old():
+    desk = Desk()
+    desk.send("Traversability", State="unknown")
+    assert desk.dashboard.verdict().said == "UNKNOWN: no status of soilbus"

@@ -419,3 +419,15 @@ def test_a_mistake_about_an_axle_or_a_free_wheel_is_named(override, says, rear_d
     found = beside(reference_configuration([override], path=REAR_DRIVE), rear_drive)
     assert [fault for fault in found.faults if says in fault] == found.faults[:1]
     assert len(found.faults) >= 1
+
+
+def test_a_draft_that_is_known_to_be_none_is_no_frozen_sensor(tmp_path):
+    text = re.sub(r"\[signals\.draft\][^\[]*", "", TRACTOR.read_text()).replace(
+        "[vehicle]", '[vehicle]\ntowing = "never"'
+    )
+    (tmp_path / "rover.toml").write_text(text)
+    config = load_config(tmp_path / "rover.toml")
+    scenario = Scenario(20.0, (Patch(0.0, "loam"),), slip=Swing(0.05, 0.3))
+    recording = simulate(config, scenario, 5)
+    found = beside(config, [frame_of(message) for message in frames(recording, config)])
+    assert not [finding for finding in found.findings if "draft" in finding.text]

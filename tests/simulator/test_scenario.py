@@ -59,6 +59,7 @@ def test_soil_changes_over_the_transition():
         ({"soils": (Patch(5.0, "loam"), Patch(0.0, "loam"))}, "ascending"),
         ({"slip": Swing(0.1, 0.2)}, "one of draft and slip at most"),
         ({"duration": 0.01}, "too short"),
+        ({"duration": float("nan")}, "no number of seconds"),
         ({"speed": Swing(0.0, 1.0)}, "above zero"),
         ({"transition": 0.0}, "above zero"),
     ],

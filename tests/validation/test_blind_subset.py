@@ -58,3 +58,14 @@ def test_what_the_catalogue_lacks_is_unknown():
     trial = tried(the_case("outside/outside:torque_ripple/medium/"))
     assert trial.verdict == "unknown"
     assert trial.named == ()
+
+
+@pytest.mark.parametrize("machine", ["tractor-2wd", "tractor-axles"])
+def test_machines_without_load_cells_or_with_one_motor_are_diagnosed_too(machine):
+    for case in islice(cases("plain", 1, machine), 6, 8):
+        trial = tried(case)
+        assert (trial.verdict, trial.named) == ("none", ()), case.id
+    shown = next(case for case in cases("single", 1, machine) if case.id.startswith("single/soil_drift:ramp/large/"))
+    trial = tried(shown)
+    assert trial.named[:1] == shown.hidden
+    assert trial.gap_after < trial.gap_before

@@ -16,6 +16,7 @@ from soilbus.validation.stories.story import TO_ALL, TO_SOME, Event, begin, draw
 
 AT_A_TIME, HEALED = 25, 10
 SEEDS = [range(first, first + AT_A_TIME) for first in range(0, 125, AT_A_TIME)]
+CASES = [("tractor", seeds) for seeds in SEEDS] + [(other, range(10)) for other in ("tractor-2wd", "tractor-axles")]
 
 
 @pytest.fixture(autouse=True)
@@ -26,20 +27,26 @@ def quiet():
     logging.disable(logging.NOTSET)
 
 
-@pytest.mark.parametrize("seeds", SEEDS, ids=str)
-def test_go_is_said_where_the_truth_allows_it_and_nowhere_else(seeds):
+@pytest.mark.parametrize(("machine", "seeds"), CASES, ids=str)
+def test_go_is_said_where_the_truth_allows_it_and_nowhere_else(machine, seeds):
     go = 0
     for seed in seeds:
-        drive = played(cheap(), drawn(seed), healed=seed % HEALED == 0)
-        assert drive.faults == [], f"story {seed}: {drawn(seed)}"
+        drive = cheap(machine)
+        story = drawn(seed, drive.needed)
+        played(drive, story, healed=seed % HEALED == 0)
+        assert drive.faults == [], f"story {seed}: {story}"
         go += drive.go
     assert go > 10 * len(seeds)
 
 
-def test_an_estimator_that_is_given_nothing_says_no_more_than_the_truth():
+@pytest.mark.parametrize(
+    ("machine", "seeds"), [("tractor", range(4)), ("tractor-2wd", (0, 4)), ("tractor-axles", (0, 4))]
+)
+def test_an_estimator_that_is_given_nothing_says_no_more_than_the_truth(machine, seeds):
     go = 0
-    for seed in range(4):
-        drive = played(real(seed), drawn(seed, (*TO_SOME, *TO_ALL)))
+    for seed in seeds:
+        drive = real(seed, machine)
+        played(drive, drawn(seed, drive.needed, (*TO_SOME, *TO_ALL)))
         assert drive.faults == [], f"real story {seed}"
         go += drive.go
     assert go
@@ -74,7 +81,7 @@ def with_the_verdict_of_the_run_before(monkeypatch):
 )
 def test_a_service_without_a_check_is_found_out(mutation, monkeypatch):
     mutation(monkeypatch)
-    assert any(played(cheap(), drawn(seed)).faults for seed in range(60))
+    assert any(played(drive := cheap(), drawn(seed, drive.needed)).faults for seed in range(60))
 
 
 def test_a_window_that_is_solved_when_it_is_too_old_is_no_go():

@@ -232,7 +232,7 @@ def estimate(data: Any, rig: SingleWheelRig | Config | Path | str, *, run: str |
     """
     columns = {str(name): np.asarray(data[name]).tolist() for name in data}
     lengths = {len(cells) for cells in columns.values() if isinstance(cells, list)}
-    if len(lengths) != 1 or not all(isinstance(cells, list) for cells in columns.values()):
+    if len(lengths) > 1 or not all(isinstance(cells, list) for cells in columns.values()):
         raise TableError(f"{SOURCE}: its columns are not of one length")
     config = _configuration(rig, columns)
     found = _of_bed(runs_of_columns(config, columns, SOURCE), run)

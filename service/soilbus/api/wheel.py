@@ -92,7 +92,7 @@ def wheel_forces(
     ------
     ValueError
         No such soil, shear law or effect; load and sinkage both given, or neither, or a sinkage with effects; a radius
-        or width that is not above 0; a slip above 1; a sinkage that no wheel of this radius rolls at.
+        or width that is not above 0; a load below 0; a slip above 1; a sinkage that no wheel of this radius rolls at.
 
     Examples
     --------
@@ -124,6 +124,8 @@ def wheel_forces(
         raise ValueError(f"a slip of {np.max(slip):g} is above 1: is it in per cent?")
     if (load is None) == (sinkage is None):
         raise ValueError("give either the load or the sinkage, and None for the other")
+    if load is not None and np.any(np.asarray(load, float) < 0.0):
+        raise ValueError(f"a load of {np.min(load):g} N is below 0: it counts downwards")
     completed = CompletedModel.of(model, active := _active(effects or {}), ground_speed=1.0)
     if active and sinkage is not None:
         raise ValueError("effects need the load: leave out the sinkage")

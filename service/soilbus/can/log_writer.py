@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import can
+from can.io.logger import MESSAGE_WRITERS
 
 from soilbus.files import placed
 
@@ -20,6 +21,14 @@ _WRITERS: dict[str, Callable[[Any], Any]] = {
     ".blf": can.BLFWriter,
 }
 """Those that write into a file that is open."""
+
+
+def check_is_a_format(path: Path) -> None:
+    """Raise ValueError with one line where no writer knows the file's suffix: long work asks first."""
+    suffixes = [suffix.lower() for suffix in path.suffixes]
+    kind = suffixes[-2] if suffixes[-1:] == [".gz"] and len(suffixes) > 1 else "".join(suffixes[-1:])
+    if kind not in MESSAGE_WRITERS:
+        raise ValueError(f"{path}: no format of a log is known by this ending; .log .log.gz .asc .blf are")
 
 
 def write_log(messages: Iterable[can.Message], path: Path) -> None:

@@ -101,7 +101,9 @@ def command_line() -> argparse.ArgumentParser:
         sub.add_argument("--json", type=Path, metavar="OUT", help="write the figures as JSON")
 
     sub = command("demo", "simulated tractor, service and dashboard; needs no hardware, ends by itself", "")
-    sub.add_argument("--duration", type=float, default=42.0, metavar="S", help="simulated seconds (default 42)")
+    sub.add_argument(
+        "--duration", type=between(1.0, 3600.0), default=42.0, metavar="S", help="simulated seconds (default 42)"
+    )
     sub.add_argument(
         "--picture", type=Path, metavar="OUT.svg",
         help="keep the dashboard's last state: the driver's page, and the engineer's in OUT-engineer.svg",
@@ -161,10 +163,14 @@ def command_line() -> argparse.ArgumentParser:
         "--effect", action="append", default=[], metavar="NAME=VALUE",
         help="an effect on wheels or sensors; NAME.PARAMETER=VALUE for another than its first parameter; repeatable",
     )  # fmt: skip
-    sub.add_argument("--duration", type=float, default=120.0, metavar="S")
-    sub.add_argument("--seed", type=natural, default=1)
+    sub.add_argument(
+        "--duration", type=between(0.1, 1e6), default=120.0, metavar="S", help="of the drive (default 120)"
+    )
+    sub.add_argument("--seed", type=natural, default=1, help="of ground and sensor noise (default 1)")
     sub.add_argument("--start", nargs=2, type=float, metavar=("LAT", "LON"), help="where it starts [deg]")
-    sub.add_argument("--heading", type=float, default=0.0, metavar="DEG", help="clockwise from north (default 0)")
+    sub.add_argument(
+        "--heading", type=between(-360.0, 360.0), default=0.0, metavar="DEG", help="clockwise from north (default 0)"
+    )
     sub.add_argument(
         "--rows", nargs=2, type=float, metavar=("LENGTH", "SPACING"), help="up and down a field [m], not straight on"
     )
@@ -210,7 +216,7 @@ def command_line() -> argparse.ArgumentParser:
         "--speed", type=between(0.1, 1000.0), default=1.0, metavar="X", help="play LOG X times as fast (default 1)"
     )
     sub.add_argument("--plain", action="store_true", help="lines of text, for a screen reader; also in a pipe")
-    sub.add_argument("--seconds", type=float, metavar="S", help="stop after this time")
+    sub.add_argument("--seconds", type=between(0.0, 1e6), metavar="S", help="stop after this time")
 
     sub = command("effects", "the catalogue of effects: physics, parameters, ranges, source, what tells it apart", "")
     sub.add_argument("name", nargs="?", metavar="NAME", help="one effect in full (default: a line for each)")

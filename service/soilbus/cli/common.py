@@ -41,3 +41,16 @@ def check_folders(*paths: Path | None) -> None:
     for path in paths:
         if path is not None and not path.parent.is_dir():
             raise WorkError(f"{path}: no folder {path.parent}")
+
+
+def check_log_to_write(path: Path | None) -> None:
+    """The same of a log: a format that can be written, in a folder that is there."""
+    from soilbus.can.log_writer import check_is_a_format
+
+    if path is None:
+        return
+    try:
+        check_is_a_format(path)
+    except ValueError as error:
+        raise WorkError(str(error)) from None
+    check_folders(path)

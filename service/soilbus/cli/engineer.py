@@ -10,7 +10,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from soilbus.cli.common import WorkError, check_folders, configured, configured_or_reference, need_extra
+from soilbus.cli.common import (
+    WorkError,
+    check_folders,
+    check_log_to_write,
+    configured,
+    configured_or_reference,
+    need_extra,
+)
 from soilbus.files import whole_file
 from soilbus.process import say
 
@@ -35,9 +42,10 @@ def replay(args: argparse.Namespace) -> None:
     if config.table is not None:
         if args.frames is not None:
             raise ConfigError(["--frames: a table of a test rig has no bus to send on"])
+        if args.manoeuvre_out is not None:
+            raise ConfigError(["--manoeuvre-out: a test rig is no vehicle to drive"])
         _replay_tables(args, config)
         return
-    check_folders(args.frames, args.manoeuvre_out)
     for line in other_channel(config, args.logs):
         say(line)
     pipeline = Pipeline(config, load_databases(config))
@@ -58,10 +66,12 @@ def replay(args: argparse.Namespace) -> None:
     _write_windows(args, config, results, text)
     if args.frames is not None:
         _write_frames(args, config)
-    text += _what_to_drive(args, config, results)
+    drive = _what_to_drive(args, config, results)
     if "-" not in (str(args.json), str(args.map)):
-        print(text, end="")
+        print(text + drive, end="")
     _need_a_use(results, config)
+    if args.manoeuvre_out is not None and not drive:
+        raise WorkError("--manoeuvre-out: no manoeuvre of the table can be driven by this vehicle on this soil")
 
 
 def _what_to_drive(args: argparse.Namespace, config: Config, results: Sequence[WindowResult]) -> str:
@@ -83,8 +93,6 @@ def _what_to_drive(args: argparse.Namespace, config: Config, results: Sequence[W
     assert now is not None  # of_use sees to it
     found = what_excites(config, now.soil)
     if found is None:
-        if args.manoeuvre_out is not None:
-            raise WorkError("--manoeuvre-out: no manoeuvre of the table can be driven by this vehicle on this soil")
         return ""
     if args.manoeuvre_out is not None:
         with whole_file(args.manoeuvre_out) as out:
@@ -181,7 +189,8 @@ def _check_outputs(args: argparse.Namespace, config: Config) -> None:
         need_extra("mcap", "mcap", "--mcap")
     if args.map is not None and args.map.suffix == ".gpkg":
         need_extra("pyogrio", "geo", "--map OUT.gpkg")
-    check_folders(args.table, args.mcap, args.map)
+    check_log_to_write(args.frames)
+    check_folders(args.json, args.report, args.table, args.mcap, args.map, args.manoeuvre_out)
 
 
 def _need_plots() -> None:
@@ -206,6 +215,7 @@ def simulate(args: argparse.Namespace) -> None:
     from soilbus.simulator.drive import SimulationError
     from soilbus.simulator.play import scenario_over
 
+    check_log_to_write(args.log)
     check_folders(args.truth)
     if args.truth is not None and args.truth.suffix == ".parquet":
         need_extra("pyarrow", "tables", "--truth OUT.parquet")
@@ -299,6 +309,7 @@ def diagnose(args: argparse.Namespace) -> None:
 
     from soilbus.config.edit import with_effects_text
     from soilbus.config.file import found_configuration
+    from soilbus.config.model import ConfigError
     from soilbus.diagnosis.diagnose import NotFitted
     from soilbus.diagnosis.model_out import effect_tables
     from soilbus.diagnosis.records import TooLittle
@@ -308,6 +319,8 @@ def diagnose(args: argparse.Namespace) -> None:
     from soilbus.report.progress import phases
 
     config = configured(args)
+    if config.table is not None and args.manoeuvre_out is not None:
+        raise ConfigError(["--manoeuvre-out: a test rig is no vehicle to drive"])
     if args.report is not None:
         _need_plots()
         from soilbus.report.diagnosis import diagnosis_report
@@ -326,12 +339,12 @@ def diagnose(args: argparse.Namespace) -> None:
         effects, notes = effect_tables(findings.diagnosis.completed)
         text = with_effects_text(found_configuration(args.config), args.set, effects, args.model_out.parent, notes)
         texts.append((args.model_out, text))
-    if args.manoeuvre_out is not None:
-        if findings.plan is None:
-            raise WorkError("--manoeuvre-out: no names are left to decide between that a drive would tell apart")
+    if args.manoeuvre_out is not None and findings.plan is not None:
         texts.append((args.manoeuvre_out, json.dumps(findings.plan.as_json(), indent=1) + "\n"))
     for path, text in texts:
         with whole_file(path) as out:
             out.write(text)
     if all(str(path) != "-" for path, _ in texts):
         print(findings_text(findings), end="")
+    if args.manoeuvre_out is not None and findings.plan is None:
+        raise WorkError("--manoeuvre-out: no names are left to decide between that a drive would tell apart")

@@ -28,6 +28,7 @@ def demo(args: argparse.Namespace) -> None:
     """`soilbus demo`: simulated tractor, service and dashboard."""
     from soilbus.cli.demo import run_demo
 
+    check_folders(args.picture)
     run_demo(args.duration, args.picture)
 
 
@@ -81,9 +82,12 @@ def run(args: argparse.Namespace) -> None:
     sys.modules.setdefault("asammdf", None)  # type: ignore[arg-type]
     with loading():
         from soilbus.can.bus import BusError
+        from soilbus.config.model import ConfigError
         from soilbus.daemon.start import start_service
 
         config = configured(args)
+        if config.table is not None:
+            raise ConfigError(["[table]: a table of a test rig has no bus; replay and diagnose read it"])
         wait = args.wait or "NOTIFY_SOCKET" in os.environ
         try:
             service = start_service(config, wait)

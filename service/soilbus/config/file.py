@@ -155,6 +155,8 @@ def _child(here: Any, part: str, path: str, text: str) -> Any:
                 return item
         names = [item["name"] for item in here if isinstance(item, dict) and isinstance(item.get("name"), str)]
         raise ConfigError([f"--set {text}: no {path}; there are {', '.join(names)}"])
+    if path in ("wheel", "axle", "track") and part not in here:
+        raise ConfigError([f"--set {text}: the configuration has no [[{path}]]"])
     child = here.setdefault(part, {})
     if isinstance(child, str):  # "Message.Signal", or the name of a column, grows into its table form
         here[part] = {"column" if path.startswith("table.") else "signal": child}

@@ -195,8 +195,8 @@ class Gaussian:
         logarithm; the prior stays that of the logarithm.
         """
         free, covariance = self._without_priors(prior)
-        by_deviations = np.eye(len(covariance))
-        by_deviations[:_SOIL, :_SOIL] = np.linalg.inv(deviations(soil, self.soil, width)[1])
+        by_deviations, of_soil = np.eye(len(covariance)), np.ix_(prior.free, prior.free)
+        by_deviations[of_soil] = np.linalg.inv(deviations(soil, self.soil, width)[1][of_soil])
         covariance = by_deviations @ covariance @ by_deviations.T
         along = covariance[:, free]
         removed = np.linalg.solve(along[free] + np.diag(prior.log_std[free] ** 2), along.T)

@@ -41,6 +41,9 @@ LOCKED_STD = 1e-3
 """Relative sd of speeds that a shaft makes equal: backlash and twist."""
 LEAST_TORQUE = 0.05
 """Torque over load and radius that a differential's friction counts at least, and that of a coasting vehicle."""
+UNKNOWN_SIDE_SHARE = 0.4
+"""Sd of the difference of an axle's loads over that axle's load where no roll is measured: a side slope of 3 degrees
+(sd) shifts 6 %, and lasts for seconds, so that a window holds few independent ones; 0.06 sqrt(2 x 2 s / 0.1 s bin)."""
 LEAST_WEIGHT = 1e-12
 """Weight below which an entry of an inverse is rounding: its rows hold ones, halves and gear ratios' shares."""
 
@@ -309,9 +312,12 @@ def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Arr
             lever = 0.0 if rig.track is None else chassis.cg_height / rig.track
             load[:, i] = -2.0 * axle * lever * np.sin(roll)
             scale[:, i] = axle
-            variance[:, i] = (given.load_noise * axle) ** 2 / 2.0 + (2.0 * axle * lever) ** 2 * _known_var(
-                window, "roll"
+            of_slope = np.where(
+                np.isfinite(window.roll),
+                (2.0 * axle * lever) ** 2 * _known_var(window, "roll"),
+                (UNKNOWN_SIDE_SHARE * axle) ** 2,
             )
+            variance[:, i] = (given.load_noise * axle) ** 2 / 2.0 + of_slope
     return _solved(given.load, load), scale, variance
 
 

@@ -1286,6 +1286,10 @@ def shrunk_latents(fitted: Array, variance: Array) -> Array:
     return shrunk
 
 
+SINGULAR_RIDGE = 1e-10
+"""Added to the squares of rows in their sd where these are linearly dependent within rounding (eps m = 1e-15)."""
+
+
 def inverse_covariance(A: Array, variance: Array, row_var: Array) -> Array:
     """Inverse covariance (A V A' + R)^-1 (N, m, m) of the residuals of every instant.
 
@@ -1298,13 +1302,19 @@ def inverse_covariance(A: Array, variance: Array, row_var: Array) -> Array:
 
     Notes
     -----
-    Rows are in N m, N and m; they are scaled by their sd before the inversion.
+    Rows are in N m, N and m; they are scaled by their sd before the inversion.  At a trial point far from any soil one
+    latent may swamp all rows, which then differ by rounding only: SINGULAR_RIDGE keeps that a point of finite cost.
     """
     S = (A * variance[:, None, :]) @ A.swapaxes(1, 2)
     diagonals(S)[:] += row_var
     scale = 1.0 / np.sqrt(diagonals(S))
     S *= scale[:, :, None] * scale[:, None, :]
-    return np.asarray(np.linalg.inv(S) * (scale[:, :, None] * scale[:, None, :]))
+    try:
+        inverse = np.linalg.inv(S)
+    except np.linalg.LinAlgError:
+        diagonals(S)[:] += SINGULAR_RIDGE
+        inverse = np.linalg.inv(S)
+    return np.asarray(inverse * (scale[:, :, None] * scale[:, None, :]))
 
 
 def diagonals(blocks: Array) -> Array:

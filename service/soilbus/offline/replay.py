@@ -92,7 +92,8 @@ def _read(path: Path, batches: Callable[[Any], Iterator[list[_T]]]) -> Iterator[
         raise LogError(f"{path}: this format needs soilbus[mf4]") from None
     except Exception as error:  # python-can's readers raise all kinds on a damaged file
         what = "not a CAN log that can be read" if n == 0 else f"cut off or damaged after {n} frames"
-        raise LogError(f"{path}: {what} ({one_line(error, 100)})") from None
+        why = "a line that is no frame" if "to unpack" in str(error) else one_line(error, 100)
+        raise LogError(f"{path}: {what} ({why})") from None
     if n == 0:
         raise LogError(f"{path}: no frame in it")
 

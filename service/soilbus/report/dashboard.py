@@ -75,6 +75,8 @@ REASONS = {
     "internal": ("soilbus has a defect", GONE_TODO),
 }
 """What the service's reason means, and what to do while the state is unknown for it."""
+CARRYING_SLIP = 0.6
+"""Slip [1] below which wheels still carry the vehicle on: the default of traversability.max_slip."""
 
 
 class Verdict(NamedTuple):
@@ -215,7 +217,9 @@ class Dashboard:
         state = str(known.value("Traversability", "State"))
         state = state if state in NAMES else "unknown"
         if known.value("DemandForecast", "Warning") == "immobilisation":
-            is_stuck = state == "no_go" and known.number("Traversability", "Probability") == 0.0
+            slip = self.slip().value
+            moves = slip is not None and slip < CARRYING_SLIP
+            is_stuck = state == "no_go" and known.number("Traversability", "Probability") == 0.0 and not moves
             left = known.number("DemandForecast", "TimeLeft")
             when = "" if left is None or left >= TOP_TIME_LEFT else " now" if left < 0.5 else f" in {left:.0f} s"
             what = "stuck" if is_stuck else f"getting stuck{when}"
@@ -245,6 +249,8 @@ class Dashboard:
         left = self.until_first_window()
         if left is not None and reason in ("none", "None", "not_excited", "model_gap"):
             return left, MEASURING
+        if known.value("SoilbusStatus", "State") is None:
+            return "no status of soilbus", MEASURING
         if known.value("SoilbusStatus", "State") == "starting":
             return "soilbus is starting", MEASURING
         return REASONS.get(reason, ("the estimate is too old", MEASURING))

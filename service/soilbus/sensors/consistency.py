@@ -296,7 +296,9 @@ def _stuck(value: float, variance: Array, noise: SensorNoise, resolution: Resolu
     in it with the chance erf(step / (2 sqrt(2) sd)).
     """
     of_sample = noise.absolute**2 + (noise.relative**2 + noise.of_mean**2) * value**2
-    if of_sample == 0.0 or (resolution.rests_at_zero and abs(value) <= resolution.step):
+    if of_sample == 0.0 or not np.all(variance > 0.0):  # exact: no sensor's, such as a draft that is known to be 0
+        return False
+    if resolution.rests_at_zero and abs(value) <= resolution.step:
         return False
     samples = float((of_sample / variance).sum())
     same = math.erf(resolution.step / (2.0 * math.sqrt(2.0 * of_sample)))

@@ -41,7 +41,7 @@ from soilbus.simulator.equilibrium import (
     surroundings,
     wheel_slips,
 )
-from soilbus.simulator.scenario import SAMPLE_RATE, Scenario, Swing, Wave, realise, soil_along, soil_names
+from soilbus.simulator.scenario import SAMPLE_RATE, Scenario, Swing, Wave, oscillation, realise, soil_along, soil_names
 from soilbus.terra.effects.effect import Active, Surroundings
 from soilbus.terra.vehicle import GRAVITY, Chassis, axle_loads, pull_required
 from soilbus.terra.wheel import WheelModel
@@ -55,8 +55,10 @@ MAX_ACCELERATION = 0.5
 RIM_SPEED_RATIO = 3.0
 """Speed of the rims over the wanted ground speed that the motors do not pass. How long bogging down takes hardly
 depends on it, as past a slip of 0.6 the pull changes little with slip."""
-_MASS_STREAM = 3
-"""Names the random numbers of the true mass, which disturb no others."""
+_MASS_STREAM, _BOUNCE_STREAM = 3, 4
+"""Name the random numbers of the true mass and of bouncing wheels, which disturb no others."""
+_LARGEST_LOSS = 0.9
+"""Share of its load that a bouncing wheel loses at most: quasi-static wheels do not jump."""
 
 
 class SimulationError(Exception):
@@ -126,7 +128,7 @@ class _Motion:
 class _Plan:
     """The scenario's waves over the whole duration, each (N,), and what does not change on the way.
 
-    deviation: each motor's slip beyond the common one (M, N).
+    deviation: each motor's slip beyond the common one (M, N); bounce: of the wheels' loads over these (W, N).
     """
 
     config: Config
@@ -138,6 +140,7 @@ class _Plan:
     slip_limit: Array
     least_draft: Array
     deviation: Array
+    bounce: Array
     chassis: Chassis
     mechanics: Mechanics
 
@@ -253,11 +256,12 @@ def _plan(config: Config, scenario: Scenario, seed: int, effects: tuple[Active, 
     spread = Swing(-scenario.slip_spread, scenario.slip_spread)
     deviation = np.stack([realise(spread, t, rng).value for _ in config.wheel])
     deviation = np.where((drivetrain.leader < 0)[:, None], 0.0, deviation[drivetrain.leader])
+    bounce = _bounce(config.wheel, scenario, t, seed)
     rear = np.array([wheel.axle == "rear" for wheel in config.wheel])
     model = WheelModel(shear_law=config.model.shear_law, rollers=config.rollers)
     length = float(speed.integral[-1])
     mechanics = Mechanics(model, rear, chassis.mass, scenario.duration, length, drivetrain, effects, climbs)
-    return _Plan(config, scenario, t, speed, side, demand, slip_limit, least, deviation, chassis, mechanics)
+    return _Plan(config, scenario, t, speed, side, demand, slip_limit, least, deviation, bounce, chassis, mechanics)
 
 
 def _driven(plan: _Plan, part: slice, place: _Place, command: Command) -> tuple[Drive, _Place]:
@@ -371,6 +375,20 @@ def _chassis(config: Config, scenario: Scenario, seed: int) -> Chassis:
     return replace(chassis, mass=chassis.mass + float(drawn[0]), cg_ahead_of_rear_axle=float(ahead))
 
 
+def _bounce(wheels: Sequence[Wheel], scenario: Scenario, t: Array, seed: int) -> Array:
+    """What bounce and roll of each axle add to the loads of its wheels (W, N), over these."""
+    if not scenario.bounce:
+        return np.zeros((len(wheels), len(t)))
+    rng = np.random.default_rng([seed, _BOUNCE_STREAM])
+    modes = {axle: (oscillation(t, rng), oscillation(t, rng)) for axle in ("front", "rear")}
+    of_wheels = []
+    for wheel in wheels:
+        up, roll = modes[str(wheel.axle)]
+        mates = [w.name for w in wheels if w.axle == wheel.axle]
+        of_wheels.append(up + (roll if mates.index(wheel.name) < len(mates) / 2.0 else -roll))
+    return np.asarray(np.maximum(scenario.bounce * np.sqrt(0.5) * np.stack(of_wheels), -_LARGEST_LOSS))
+
+
 def _roll(config: Config, side: Array) -> Array:
     """Roll [rad] (N,), left side up, of a side slope that shifts this share of the load to the left."""
     assert config.vehicle is not None  # _chassis sees to it
@@ -404,7 +422,7 @@ def _situation(
     chassis, wheels, drivetrain = plan.chassis, plan.config.wheel, plan.mechanics.drivetrain
     climbs, side = plan.mechanics.climbs, plan.side[part]
     shape = (len(wheels), len(motion.t))
-    share = np.stack([_load_share(wheels, i, side) for i in range(len(wheels))])
+    share = np.stack([_load_share(wheels, i, side) for i in range(len(wheels))]) * (1.0 + plan.bounce[:, part])
 
     def loads(draft: float, inertia: float = 0.0) -> Array:
         front, rear = axle_loads(chassis, draft, motion.pitch, motion.acceleration + inertia)

@@ -23,6 +23,14 @@ GAP = 1.0
 """Time [s] from the end of a manoeuvre to its start again."""
 LARGEST = 1 << 22
 """Bytes of a file that may be a manoeuvre."""
+RANGES = {
+    "t": (0.0, 86_400.0),
+    "slip": (-1.0, 1.0),
+    "speed": (0.05, 20.0),
+    "side_load": (-1.0, 1.0),
+    "slope": (-0.6, 0.6),
+}
+"""What a table from a file may hold: a day, what slip and a moved share of a load are, slopes that `--slope` takes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,13 +98,23 @@ def of_json(text: str) -> Manoeuvre:
     ValueError
         The text is no JSON, or has no manoeuvre.
     """
-    document = json.loads(text)
+    try:
+        document = json.loads(text)
+    except ValueError:
+        raise ValueError("no manoeuvre in it: it is no JSON") from None
     table = document.get("manoeuvre", document) if isinstance(document, Mapping) else None
     columns = ("t", *COLUMNS)
     if not isinstance(table, Mapping) or not all(isinstance(table.get(name), list) for name in columns):
         raise ValueError(f"no manoeuvre in it: lists {', '.join(columns)}")
-    rows = {name: tuple(float(x) for x in table[name]) for name in columns}
+    rows = {name: tuple(_number(x, name) for x in table[name]) for name in columns}
     t = rows["t"]
     if {len(row) for row in rows.values()} != {len(t)} or len(t) < 2 or any(b <= a for a, b in pairwise(t)):
         raise ValueError("lists of a manoeuvre are of one length, at ascending times")
     return Manoeuvre(**rows, words=str(table.get("words", "")))
+
+
+def _number(value: object, column: str) -> float:
+    low, high = RANGES[column]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise ValueError(f"{column} of a manoeuvre: {value!r} is not a number from {low:g} to {high:g}")
+    return float(value)

@@ -8,7 +8,7 @@ from pathlib import Path
 from soilbus.config.file import load_config, machine
 from soilbus.config.model import Config
 
-__all__ = ["AXLE_MOTORS", "REAR_DRIVE", "TRACTOR", "reference_configuration"]
+__all__ = ["AXLE_MOTORS", "REAR_DRIVE", "REFERENCES", "TRACTOR", "reference_configuration"]
 
 TRACTOR = machine("tractor")
 """Four motors, four load cells."""
@@ -16,6 +16,8 @@ REAR_DRIVE = machine("tractor-2wd")
 """One motor on the rear axle, front wheels that roll freely, a load cell of the rear axle."""
 AXLE_MOTORS = machine("tractor-axles")
 """A motor on each axle, no load cells, an inertial sensor."""
+REFERENCES = {path.stem: path for path in (TRACTOR, REAR_DRIVE, AXLE_MOTORS)}
+"""All of them by name: tractor, tractor-2wd, tractor-axles."""
 
 
 def reference_configuration(overrides: Iterable[str] = (), path: Path = TRACTOR) -> Config:

@@ -27,6 +27,7 @@ __all__ = [
     "Wave",
     "demo",
     "excited",
+    "oscillation",
     "realise",
     "soil_along",
     "soil_names",
@@ -35,6 +36,10 @@ __all__ = [
 SAMPLE_RATE = 50.0
 """Samples of the true values a second [Hz]."""
 _N_SINES = 4
+_BOUNCE_BAND = (1.5, 3.0)
+"""Natural frequencies [Hz] of a tractor's bounce and of an axle's roll on its tyres (Wong 2008, ch. 7)."""
+_BOUNCE_DAMPING = 0.12
+"""Damping ratio of these: tyres without dampers."""
 _REFERENCE_TIME = 60.0
 """Time [s] in which a wave touches its bounds; a shorter scenario shows a part of the wave, not a steeper one."""
 
@@ -155,6 +160,8 @@ class Scenario:
         Greatest deviation of a single wheel from the common slip.
     side_shift
         Share of an axle's load that a side slope moves to its left wheel; negative to the right.
+    bounce
+        Rms of a wheel's load about its steady one, over it: axles that bounce and roll on their tyres.
     slope
         Knots (distance [m], pitch [rad]), straight lines between them.
     transition
@@ -175,6 +182,7 @@ class Scenario:
     lift_slip: Swing | None = Swing(0.45, 0.45)
     slip_spread: float = 0.015
     side_shift: Swing | Profile = Swing(-0.15, 0.15)
+    bounce: float = 0.0
     slope: Sequence[tuple[float, float]] = ((0.0, 0.0),)
     transition: float = 1.0
     course: Course = NORTHWARD
@@ -193,10 +201,29 @@ class Scenario:
             raise ValueError("soils: at least one, at ascending distances")
         if self.draft is not None and self.slip is not None:
             raise ValueError("one of draft and slip at most may be given")
+        if not np.isfinite(self.duration):
+            raise ValueError(f"duration: {self.duration} is no number of seconds")
         if self.duration * SAMPLE_RATE < 2.0:
             raise ValueError(f"duration: {self.duration} s is too short")
         if self.speed.low <= 0.0 or self.transition <= 0.0:
             raise ValueError("speed and transition must be above zero")
+
+
+def oscillation(t: Array, rng: np.random.Generator) -> Array:
+    """A lightly damped mode of an axle on its tyres, driven by random ground; (N,) at SAMPLE_RATE, of unit rms.
+
+    x'' + 2 zeta w x' + w^2 x = white noise, sampled without error: an autoregression of second order
+    """
+    from scipy.signal import lfilter  # not needed without
+
+    w = 2.0 * np.pi * rng.uniform(*_BOUNCE_BAND)
+    decay, turn = np.exp(-_BOUNCE_DAMPING * w / SAMPLE_RATE), w * np.sqrt(1.0 - _BOUNCE_DAMPING**2) / SAMPLE_RATE
+    settled = round(10.0 * SAMPLE_RATE)
+    noise = rng.standard_normal(len(t) + settled)
+    a, b = 2.0 * decay * np.cos(turn), -(decay**2)
+    mode = lfilter([1.0], [1.0, -a, -b], noise)[settled:]
+    variance = (1.0 - b) / ((1.0 + b) * ((1.0 - b) ** 2 - a**2))
+    return np.asarray(mode / np.sqrt(variance))
 
 
 def soil_along(patches: Sequence[Patch], position: Array, transition: float) -> Soil:

@@ -2,10 +2,11 @@
 
     lead = time at which slip passes its limit - time at which the last warning began
 
-A drive into trouble (validation/boggings.py) counts as predictable if MIN_LEAD_TIME + REACTION_TIME pass, or the
-distance that belongs to them is driven, between the first perceptible loss of draft and the moment when slip passes
-its limit. On firm ground
-(validation/firm_drives.py) every warning is false. Drives with even seeds are reported; thresholds are set on odd ones.
+The warning is that of the service: by the known soil's curve (decision/immobilisation.py) or by what wheels and
+vehicle do (decision/traction_loss.py). A drive into trouble (validation/boggings.py) counts as predictable if
+MIN_LEAD_TIME + REACTION_TIME pass, or the distance that belongs to them is driven, between the first perceptible loss
+of draft and the moment when slip passes its limit. On firm ground (validation/firm_drives.py) every warning is false.
+Drives with even seeds are reported; thresholds are set on odd ones.
 """
 
 from __future__ import annotations
@@ -22,9 +23,13 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.decision.capability import OverSlip
-from soilbus.decision.immobilisation import Alert, Moment, Watch, moments, watched
+from soilbus.decision.immobilisation import BINS_OF_A_MOMENT, Alert, Moment, Watch, moments, watched, with_loss
+from soilbus.decision.traction_loss import NO_LOSS, TractionLoss, motion_of
+from soilbus.decision.traction_loss import observed as loss_after
 from soilbus.decision.traversability import Status
 from soilbus.estimation.assembly import rig_of
+from soilbus.estimation.instrumentation import completed
+from soilbus.estimation.window import forward
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import drive
@@ -140,6 +145,8 @@ class Observation(NamedTuple):
         Times [s] and distances driven [m] (N,).
     felt
         Time [s] of the first perceptible loss of draft.
+    losses
+        What wheels and vehicle do at each look, without any soil; empty where it is not looked at.
     """
 
     moments: list[Moment]
@@ -150,6 +157,7 @@ class Observation(NamedTuple):
     t: Array
     distance: Array
     felt: float
+    losses: Sequence[TractionLoss] = ()
 
 
 def trial(task: Task) -> WarningTrial:
@@ -159,7 +167,7 @@ def trial(task: Task) -> WarningTrial:
 
 def observed(task: Task) -> Observation:
     """Simulate one drive and estimate every hop."""
-    config, rig = task.config, rig_of(task.config)
+    config = task.config
     rng = np.random.default_rng([task.seed, 3])
     if task.kind in FIRM_KINDS:
         trouble = BoggingDrive(firm_ground(config, task.kind, rng))
@@ -167,14 +175,14 @@ def observed(task: Task) -> Observation:
         trouble = bogging(config, task.kind, rng)
     recording = simulate(config, trouble.scenario, task.seed, trouble.effects)
     truth = recording.truth
-    slip = np.mean([truth[f"slip.{wheel}"] for wheel in rig.wheels], axis=0)
+    slip = np.mean([truth[f"slip.{wheel.name}"] for wheel in config.wheel if wheel.driven], axis=0)
     start = config.estimator.window
     passed = truth["t"][(slip > config.traversability.max_slip) & (truth["t"] > start)]
     end = float(passed[0]) if len(passed) else float(truth["t"][-1])
-    looks, curves = _moments_and_curves(recording, config, end)
+    looks, losses, curves = _looks_and_curves(recording, config, end)
     felt = _first_perceptible(task, trouble, end) if len(passed) else end
     return Observation(
-        looks, curves, start, end, len(passed) > 0, truth["t"], truth["distance"], felt
+        looks, curves, start, end, len(passed) > 0, truth["t"], truth["distance"], felt, losses
     )  # fmt: skip
 
 
@@ -217,19 +225,20 @@ def watch(observation: Observation) -> tuple[Array, NDArray[np.bool_]]:
     """Times [s] (N,) of the looks, and whether each warned."""
     state, curve, curves, out = Watch(), None, iter(observation.curves), []
     due = next(curves, None)
-    for moment in observation.moments:
+    losses = observation.losses or [NO_LOSS] * len(observation.moments)
+    for moment, loss in zip(observation.moments, losses, strict=True):
         while due is not None and moment.t >= due[0]:
             curve, due = due[1], next(curves, None)
         state = watched(state, moment.t, moment.slip, moment.pull, curve, moment.inertia)
-        out.append((moment.t, state.warning is Alert.IMMOBILISATION))
+        out.append((moment.t, with_loss(state, loss).warning is Alert.IMMOBILISATION))
     t, warned = np.array(out, float).reshape(-1, 2).T
     return t, warned > 0.5
 
 
-def _moments_and_curves(
+def _looks_and_curves(
     recording: Recording, config: Config, end: float
-) -> tuple[list[Moment], list[tuple[float, OverSlip]]]:
-    """The moments until the end [s], and from their times on the curves of windows that the service calls valid."""
+) -> tuple[list[Moment], list[TractionLoss], list[tuple[float, OverSlip]]]:
+    """What is seen until the end [s], and from their times on the curves of windows that the service calls valid."""
     rig, settings = rig_of(config), config.estimator
     estimator, no_limit = WindowEstimator(config), np.full(len(rig.radius), np.nan)
     store = Bins(rig, LOOK_PERIOD, 0.0)
@@ -241,7 +250,14 @@ def _moments_and_curves(
         able = result.traversability.capability
         if able is not None and result.status is Status.VALID:
             curves.append((due, able.over_slip))
-    return list(moments(store.window(0.0, end), rig, 0.0, settings.min_speed)), curves
+    seen = completed(forward(store.window(0.0, end)), rig)
+    losses, loss = [], NO_LOSS
+    for i in range(len(seen.t)):
+        few = seen.rows(np.arange(max(i + 1 - BINS_OF_A_MOMENT, 0), i + 1))
+        motion = motion_of(few, rig, no_limit, config.traversability)
+        loss = loss if motion is None else loss_after(loss, motion, config)
+        losses.append(loss)
+    return list(moments(seen, rig, 0.0, settings.min_speed)), losses, curves
 
 
 def half_of(seed: int) -> str:

@@ -18,6 +18,7 @@ from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.estimation.assembly import rig_of
 from soilbus.simulator.drive import SimulationError, drive
+from soilbus.simulator.drivetrain import drivetrain_of
 from soilbus.simulator.scenario import Patch, Profile, Scenario, Swing, realise
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Active
@@ -101,7 +102,10 @@ def largest_draft(config: Config, soil: str) -> float:
     """Largest draft [N] on a soil of the table within the allowed slip, without a torque limit."""
     rig = rig_of(config)
     no_limit = np.full(len(rig.radius), np.nan)
-    return true_largest_draft(soil_named(soil), rig, no_limit, config.traversability.max_slip, WheelModel())
+    drivetrain = drivetrain_of(config)
+    drivetrain = replace(drivetrain, limit=np.full_like(drivetrain.limit, np.inf))
+    slip = config.traversability.max_slip
+    return true_largest_draft(soil_named(soil), rig, no_limit, slip, WheelModel(), drivetrain=drivetrain)
 
 
 def _growing(rng: np.random.Generator, most: float, swing: float) -> Profile:
@@ -138,7 +142,7 @@ def _digging(config: Config, firm: str, most: float, start: float, rng: np.rando
     truth = drive(config, first, seed, effects).columns
     if len(truth["t"]) < 2:
         raise SimulationError(f"the tractor cannot drive on {firm}")
-    slip = np.mean([truth[f"slip.{wheel.name}"] for wheel in config.wheel], axis=0)
+    slip = np.mean([truth[f"slip.{wheel.name}"] for wheel in config.wheel if wheel.driven], axis=0)
     speed = np.maximum(rim * (1.0 - slip), MIN_SPEED)
     t = np.concatenate([[0.0], np.cumsum(np.diff(truth["distance"]) * 2.0 / (speed[1:] + speed[:-1]))])
     even = np.arange(0.0, max(float(t[-1]), DRIVE_TIME), 0.1)

@@ -12,7 +12,7 @@ import numpy as np
 
 from soilbus.config.model import Config, Prior
 from soilbus.simulator.recording import Recording, simulate
-from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.reference import REFERENCES, TRACTOR, reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.entry_angle import entry_angle_for_load
 from soilbus.terra.soils import soil_named
@@ -62,7 +62,7 @@ class Case:
     hidden: names of the catalogue's effects in it, none for nulls and for what the catalogue
     lacks; forms: titles of the formulas used; imitable: only for the latter; far: all formulas are.  `config` is all
     that the diagnosis is given beside `recording.channels`; `soil` is the truth, at the
-    middle of the way where it changes.
+    middle of the way where it changes.  machine: a name of REFERENCES.
     """
 
     id: str
@@ -79,6 +79,7 @@ class Case:
     scenario: Scenario
     seed: int
     parts: tuple[Hidden, ...]
+    machine: str = TRACTOR.stem
 
     @property
     def how(self) -> Hidden:
@@ -112,8 +113,8 @@ def half_of(title: str) -> str:
     return "tune" if (first + _order(title)) % 2 else "report"
 
 
-def cases(kind: str, seed: int) -> Iterator[Case]:
-    """The cases of one of KINDS; the same for the same seed.  ValueError for another kind."""
+def cases(kind: str, seed: int, machine: str = TRACTOR.stem) -> Iterator[Case]:
+    """The cases of one of KINDS on one of REFERENCES; the same for the same seed.  ValueError for another kind."""
     if kind not in KINDS:
         raise ValueError(f"no kind is named {kind}; known: {', '.join(KINDS)}")
     if kind in ("single", "outside"):
@@ -124,7 +125,7 @@ def cases(kind: str, seed: int) -> Iterator[Case]:
     else:
         chosen = itertools.repeat(((), ""), NULLS)
     for number, (forms_of_case, size) in enumerate(chosen):
-        yield _case(kind, seed, number, forms_of_case, size)
+        yield _case(kind, seed, number, forms_of_case, size, machine)
 
 
 def _pairs(seed: int) -> Iterator[tuple[tuple[Form, ...], str]]:
@@ -140,17 +141,18 @@ def _pairs(seed: int) -> Iterator[tuple[tuple[Form, ...], str]]:
                 yield (one, other), str(rng.choice(SIZES[1:]))
 
 
-def _case(kind: str, seed: int, number: int, forms: tuple[Form, ...], size: str) -> Case:
+def _case(kind: str, seed: int, number: int, forms: tuple[Form, ...], size: str, machine: str) -> Case:
     titles = tuple(form.title for form in forms)
     rng = np.random.default_rng([seed, zlib.crc32("/".join([kind, *titles, size, str(number)]).encode())])
     name = str(rng.choice(SOILS))
     soil, with_sinkage = soil_named(name), bool(rng.integers(2)) or any(form.by_sinkage for form in forms)
-    config = _configured(kind, soil, with_sinkage, rng)
-    setting = Setting(soil, _plain_sinkage(soil), rng)
+    with_sinkage &= all(wheel.sinkage is not None for wheel in _configuration(machine).wheel)
+    config = _configured(kind, _configuration(machine), soil, with_sinkage, rng)
+    setting = Setting(soil, _plain_sinkage(soil, machine), rng)
     parts = tuple(form.hide(form.size(size, with_sinkage), setting) for form in forms)
-    sensors = "sinkage" if with_sinkage else "bare"
+    sensors, other = "sinkage" if with_sinkage else "bare", machine if machine != TRACTOR.stem else ""
     return Case(
-        id="/".join(part for part in (kind, "+".join(titles), size, name, sensors, f"{seed}.{number}") if part),
+        id="/".join(part for part in (kind, "+".join(titles), size, name, sensors, other, f"{seed}.{number}") if part),
         kind=kind,
         hidden=tuple(form.effect for form in forms if form.effect),
         forms=titles,
@@ -164,17 +166,19 @@ def _case(kind: str, seed: int, number: int, forms: tuple[Form, ...], size: str)
         scenario=_scenario(kind, name, rng),
         seed=int(rng.integers(2**31)),
         parts=parts,
+        machine=machine,
     )
 
 
-def _configured(kind: str, soil: Soil, with_sinkage: bool, rng: np.random.Generator) -> Config:
+def _configured(kind: str, config: Config, soil: Soil, with_sinkage: bool, rng: np.random.Generator) -> Config:
     """The configuration that the diagnosis has: sensors, and c and K off by 20 to 25 %.
 
-    Hard: c and K off by 30 to 40 %, three times the gain errors, and half the time no accelerometer.
+    Hard: c and K off by 30 to 40 %, three times the gain errors, and half the time no accelerometer, unless it is all
+    that measures the slope.
     """
     hard = kind == "hard"
     low, high = (0.30, 0.40) if hard else (0.20, 0.25)
-    config, prior = _tractor(), {}
+    prior = {}
     for parameter in ("c", "K"):
         value = float(getattr(soil, parameter) * (1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(low, high)))
         prior[parameter] = Prior(value=value, std=high * value)
@@ -183,7 +187,7 @@ def _configured(kind: str, soil: Soil, with_sinkage: bool, rng: np.random.Genera
         channels = {q: getattr(config.noise, q) for q in type(config.noise).model_fields}
         louder = {q: noise.model_copy(update={"gain": 3.0 * noise.gain}) for q, noise in channels.items()}
         config = config.model_copy(update={"noise": config.noise.model_copy(update=louder)})
-        if rng.integers(2):
+        if rng.integers(2) and config.signals.pitch is not None:
             config = config.model_copy(update={"signals": config.signals.model_copy(update={"acceleration": None})})
     if not with_sinkage:
         wheels = [wheel.model_copy(update={"sinkage": None}) for wheel in config.wheel]
@@ -203,14 +207,14 @@ def _scenario(kind: str, soil: str, rng: np.random.Generator) -> Scenario:
 
 
 @cache
-def _tractor() -> Config:
-    return reference_configuration()
+def _configuration(machine: str) -> Config:
+    return reference_configuration(path=REFERENCES[machine])
 
 
 @cache
-def _plain_sinkage(soil: Soil) -> float:
+def _plain_sinkage(soil: Soil, machine: str) -> float:
     """Sinkage [m] of a rear wheel under a quarter of the tractor at a slip of 0.2."""
-    config = _tractor()
+    config = _configuration(machine)
     assert config.vehicle is not None
     wheel = next(w for w in config.wheel if w.axle == "rear")
     state = state_on(soil, np.nan, 0.2, wheel.radius, wheel.width)

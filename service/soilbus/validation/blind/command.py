@@ -10,6 +10,7 @@ from typing import TextIO
 
 from soilbus.allocator import keep_freed_memory
 from soilbus.simulator.drive import SimulationError
+from soilbus.simulator.reference import REFERENCES, TRACTOR
 from soilbus.validation.blind.cases import KINDS, Case, cases
 from soilbus.validation.blind.table import HALVES, report, targets_are_met
 from soilbus.validation.blind.trial import Trial, tried
@@ -21,6 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m soilbus.validation.blind", description=__doc__)
     parser.add_argument("--seed", type=int, default=1, help="picks soils, sensors and drives (1)")
     parser.add_argument("--kind", choices=KINDS, action="append", help="repeatable; all by default")
+    parser.add_argument("--machine", choices=REFERENCES, default=TRACTOR.stem, help=f"what drives ({TRACTOR.stem})")
     parser.add_argument("--half", choices=HALVES, help="all by default")
     parser.add_argument("--only", default="", help="only cases with this in their id")
     parser.add_argument("--every", type=int, metavar="N", default=1, help="take each N-th case only (1)")
@@ -31,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     wanted = [
         case
         for kind in chosen.kind or KINDS
-        for case in cases(kind, chosen.seed)
+        for case in cases(kind, chosen.seed, chosen.machine)
         if chosen.half in (None, case.half) and chosen.only in case.id
     ][:: max(chosen.every, 1)]
     if chosen.list:
@@ -64,17 +66,17 @@ def trials_of(wanted: Sequence[Case], count: int) -> Iterator[tuple[Case, Trial 
     """Each case with its trial, None where it cannot be driven, in `count` processes."""
     if count < 2:
         for case in wanted:
-            yield case, _trial((case.kind, case.id))
+            yield case, _trial((case.kind, case.id, case.machine))
         return
     with workers(count, "spawn", keep_freed_memory) as pool:
-        yield from zip(wanted, pool.map(_trial, [(case.kind, case.id) for case in wanted]), strict=True)
+        yield from zip(wanted, pool.map(_trial, [(case.kind, case.id, case.machine) for case in wanted]), strict=True)
 
 
-def _trial(key: tuple[str, str]) -> Trial | None:
-    """The case of this kind and id; forms are functions and do not travel between processes."""
-    kind, name = key
+def _trial(key: tuple[str, str, str]) -> Trial | None:
+    """The case of this kind, id and machine; forms are functions and do not travel between processes."""
+    kind, name, machine = key
     seed = int(name.rpartition("/")[2].partition(".")[0])
-    case = next(case for case in cases(kind, seed) if case.id == name)
+    case = next(case for case in cases(kind, seed, machine) if case.id == name)
     try:
         return tried(case)
     except SimulationError:

@@ -103,7 +103,7 @@ def _channels(change: Callable[[str, Array, Recording, float], Array | None]) ->
 
 def _tooth(name: str, t: Array, recording: Recording, size: float) -> Array | None:
     """A toothed wheel that runs out of true: its teeth pass too fast and too slowly once a turn."""
-    if not name.startswith("speed."):
+    if not name.startswith("speed.") or name not in recording.truth:  # a motor has no such wheel
         return None
     turned = _turned(recording.truth[name])
     return np.asarray(1.0 + size * np.sin(np.interp(t, recording.truth["t"], turned)))

@@ -11,10 +11,9 @@ import numpy as np
 
 from soilbus.diagnosis.diagnose import NotFitted, diagnose
 from soilbus.diagnosis.records import Record, record_of
-from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.assembly import model_of, possible_effects, prior_of, rig_of
 from soilbus.estimation.posterior import Estimate, Posterior
 from soilbus.sensors.bins import Bins
-from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.effect import Effect
 from soilbus.validation.blind.cases import Case
 from soilbus.validation.blind.visible import Shown, shown
@@ -76,12 +75,14 @@ def record_of_case(case: Case) -> Record:
     return record_of(case.id, store.window(0.0, end), rig, model_of(config), settings.min_speed, settings.max_turn)
 
 
-def tried(case: Case, candidates: Sequence[Effect] = tuple(CATALOGUE.values()), truth: Shown | None = None) -> Trial:
+def tried(case: Case, candidates: Sequence[Effect] | None = None, truth: Shown | None = None) -> Trial:
     """The case diagnosed; SimulationError if it cannot be driven.
 
+    candidates: by default all that the machine can have.
     truth: what the recording shows of the effect; None: worked out, which takes longer than the diagnosis.
     """
     record, prior = record_of_case(case), prior_of(case.config)
+    candidates = possible_effects(case.config) if candidates is None else candidates
     if truth is None:
         truth = shown(case) if case.parts else NOTHING
     begin = time.process_time()

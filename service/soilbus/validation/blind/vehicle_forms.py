@@ -79,7 +79,9 @@ def _hill(size: float, setting: Setting) -> Hidden:
         return replace(scenario, slope=tuple(zip(at.tolist(), slope.tolist(), strict=True)))
 
     def after(recording: Recording) -> Recording:
-        column = recording.channels["pitch"]
+        column = recording.channels.get("pitch")
+        if column is None:
+            return recording
         x = np.interp(column.t, recording.truth["t"], recording.truth["distance"])
         unseen = replace(column, value=column.value - np.interp(x, at, pitch(at)))
         return replace(recording, channels=recording.channels | {"pitch": unseen})

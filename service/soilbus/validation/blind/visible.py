@@ -14,7 +14,7 @@ formula of the generator.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,9 +22,11 @@ import numpy as np
 
 from soilbus.arrays import Array
 from soilbus.config.model import Config
+from soilbus.estimation.assembly import chassis_of, rig_of
+from soilbus.estimation.instrumentation import UNKNOWN_SIDE_SHARE, Row, unit
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import SAMPLE_RATE
-from soilbus.terra.vehicle import GRAVITY
+from soilbus.terra.vehicle import GRAVITY, axle_loads
 from soilbus.terra.wheel import Soil, state_on
 from soilbus.validation.blind.cases import Case
 from soilbus.validation.blind.form import Hidden, together
@@ -46,8 +48,8 @@ ENOUGH = 0.01
 """Share of the energy by which a round must lower it, else it was the last."""
 OTHER = 1.0
 """Sd of the share by which another effect may be greater or less than it is."""
-ABOUT_THE_SOIL = ("torque", "draft", "sinkage")
-"""Quantities whose residuals make up the gap."""
+BEARING = 0.004
+"""Torque of a free wheel's bearing over load and radius."""
 
 
 class Shown(NamedTuple):
@@ -88,16 +90,52 @@ def _quiet(config: Config) -> Config:
     return config.model_copy(update={"noise": config.noise.model_copy(update=none)})
 
 
+class _Reading(NamedTuple):
+    """What a channel reads or, where no channel is left, what is known without one (`instrumentation.Row`).
+
+    channel: its name, or that of the row; kind: "vehicle", else that of the row; weight: of the wheels (W,).
+    gain: sd of its error, and scale [N]: what that is of, where nothing is measured; bias: of a differential.
+    """
+
+    quantity: str
+    channel: str
+    kind: str
+    weight: Array
+    gain: float
+    scale: float = 0.0
+    bias: float = 0.0
+
+
+def _readings(config: Config, with_sinkage: bool) -> Iterator[_Reading]:
+    """Load, torque and speed of each wheel, sinkage where measured, then what the vehicle has."""
+    rig, W = rig_of(config), len(config.wheel)
+    given, chassis = rig.instrumentation, rig.chassis
+    assert chassis is not None
+    static = np.where(rig.front, *axle_loads(chassis, 0.0, 0.0, 0.0)) / 2.0
+    for quantity in ("load", "torque", "speed", *["sinkage"] * with_sinkage):
+        rows: Sequence[Row] = () if given is None else getattr(given, quantity, ())
+        for i, wheel in enumerate(config.wheel):
+            row = rows[i] if rows else Row(unit(W, i), "channel", i, wheel.name, getattr(config.noise, quantity).gain)
+            weight = np.array(row.weight)
+            scale = float(static @ np.abs(weight)) if row.kind in ("weight", "transfer", "side") else 0.0
+            bias = given.couplings[row.at].bias if given is not None and row.kind == "coupling" else 0.0
+            yield _Reading(quantity, f"{quantity}.{row.name}", row.kind, weight, row.gain, scale, bias)
+    for quantity in ("ground_speed", "draft", "pitch", "acceleration"):
+        if getattr(config.signals, quantity) is not None:
+            yield _Reading(quantity, quantity, "vehicle", np.zeros(W), getattr(config.noise, quantity).gain)
+
+
 @dataclass(frozen=True)
 class _Instants:
-    """A drive in bins: readings (N, R) of the channels `names`, and the true latents (N, X).
+    """A drive in bins: what the readings are of, their values (N, R), and the true latents (N, X).
 
     Latents: entry angle and slip of each wheel, ground speed, pitch, acceleration; those of the last two that no
     sensor measures are known to be those of steady speed on level ground.  unknown: columns of the others.
+    Specific force without a pitch sensor is a steady vehicle's acceleration on level ground: the balances ask no more.
     """
 
     config: Config
-    names: list[str]
+    of: tuple[_Reading, ...]
     readings: Array
     latents: Array
     unknown: list[int]
@@ -135,26 +173,45 @@ class _Instants:
 
     def _rows(self, latents: Array, forces: Array) -> Array:
         """Readings (N, R) of wheels with these forces."""
-        wheels, vehicle = self.config.wheel, self.config.vehicle
-        assert vehicle is not None
+        wheels, chassis = self.config.wheel, chassis_of(self.config)
+        assert chassis is not None
         W = len(wheels)
         angle, slip, (speed, pitch, rate) = latents[:, :W], latents[:, W : 2 * W], latents[:, 2 * W :].T
         radius, (load, pull, torque) = np.array([wheel.radius for wheel in wheels]), forces
-        draft = pull.sum(axis=1) - vehicle.mass * (GRAVITY * np.sin(pitch) + rate)
+        draft = pull.sum(axis=1) - chassis.mass * (GRAVITY * np.sin(pitch) + rate)
         of_wheels = {"load": load, "torque": torque, "speed": speed[:, None] / (radius * (1.0 - slip))}
         of_wheels["sinkage"] = radius * (1.0 - np.cos(angle))
-        whole = {"ground_speed": speed, "draft": draft, "pitch": pitch, "acceleration": rate}
-        index = {wheel.name: i for i, wheel in enumerate(wheels)}
-        split = [name.partition(".") for name in self.names]
-        return np.stack([of_wheels[q][:, index[wheel]] if wheel else whole[q] for q, _, wheel in split], axis=1)
+        felt = rate + GRAVITY * np.sin(pitch) * _feels_gravity(self.config)
+        whole = {"ground_speed": speed, "draft": draft, "pitch": pitch, "acceleration": felt}
+        on_axles = np.stack(axle_loads(chassis, draft, pitch, rate), axis=1)
+        front = np.array([wheel.axle == "front" for wheel in wheels])
+        columns = []
+        for row in self.of:
+            column = whole[row.quantity] if row.kind == "vehicle" else of_wheels[row.quantity] @ row.weight
+            if row.kind in ("weight", "transfer"):
+                column = column - on_axles @ [row.weight[front].mean(), row.weight[~front].mean()]
+            columns.append(column + row.scale)
+        return np.stack(columns, axis=1)
 
     def noise(self, value: Array) -> Array:
         """Sd of each reading (N, R) of these values."""
-        sd = np.empty_like(value)
-        for k, name in enumerate(self.names):
-            noise = getattr(self.config.noise, name.partition(".")[0])
+        sd, computed = np.empty_like(value), self.config.noise.computed_load.relative
+        of_slope = UNKNOWN_SIDE_SHARE * (self.config.signals.roll is None)
+        load, _, torque = self._forces(self.latents, self.log_soil)
+        grip = load * [wheel.radius for wheel in self.config.wheel]
+        for k, row in enumerate(self.of):
+            if row.kind not in ("channel", "vehicle"):
+                of_row = {
+                    "weight": computed / 2.0 * row.scale, "transfer": computed / 2.0 * row.scale,
+                    "side": np.hypot(computed / np.sqrt(2.0), of_slope) * row.scale,
+                    "free": BEARING * grip @ np.abs(row.weight),
+                    "coupling": row.bias * np.abs(torque) @ np.abs(row.weight),
+                }  # fmt: skip
+                sd[:, k] = of_row[row.kind] / np.sqrt(EVERY)
+                continue
+            noise = getattr(self.config.noise, row.quantity)
             of_mean = noise.of_mean * np.abs(value[:, k]).mean()
-            samples = EVERY * BIN * SAMPLE_RATE / (2.0 if name == "ground_speed" else 1.0)
+            samples = EVERY * BIN * SAMPLE_RATE / (2.0 if row.quantity == "ground_speed" else 1.0)
             sd[:, k] = np.sqrt((noise.absolute**2 + (noise.relative * value[:, k]) ** 2 + of_mean**2) / samples)
         return sd
 
@@ -162,27 +219,37 @@ class _Instants:
         """Sd of the logarithms of the soil's parameters (6,), and of the gain errors (R,)."""
         priors = [self.config.soil_prior[name] for name in Soil._fields]
         soil = [float(np.sqrt(np.log1p((prior.std / prior.value) ** 2))) for prior in priors]
-        gains = [getattr(self.config.noise, name.partition(".")[0]).gain for name in self.names]
-        return np.array(soil), np.array(gains)
+        return np.array(soil), np.array([row.gain for row in self.of])
 
 
 def _instants(case: Case, recording: Recording, count: int) -> _Instants:
     config, wheels = case.config, [wheel.name for wheel in case.config.wheel]
-    of_wheels = ["load", "torque", "speed"] + ["sinkage"] * case.with_sinkage
-    mapped = [q for q in ("pitch", "acceleration") if getattr(config.signals, q) is not None]
-    names = [f"{quantity}.{wheel}" for quantity in of_wheels for wheel in wheels] + ["ground_speed", "draft", *mapped]
+    of = tuple(_readings(config, case.with_sinkage))
 
     def truth(name: str) -> Array:
         return _binned(recording.truth["t"], np.asarray(recording.truth[name], float), count)
 
     latents = [truth(f"{quantity}.{wheel}") for quantity in ("entry_angle", "slip") for wheel in wheels]
     latents += [truth("ground_speed")]
-    latents += [truth(q) if q in mapped else np.zeros(count) for q in ("pitch", "acceleration")]
-    last = len(latents) - 2
-    unknown = [*range(last), *(last + k for k, q in enumerate(("pitch", "acceleration")) if q in mapped)]
-    channels = [recording.channels[name] for name in names]
-    readings = np.stack([_binned(channel.t, channel.value, count) for channel in channels], axis=1)
-    return _Instants(config, names, readings, np.stack(latents, axis=1), unknown, np.log(np.array(case.soil, float)))
+    mapped = [getattr(config.signals, q) is not None for q in ("pitch", "acceleration")]
+    latents += [truth(q) * there for q, there in zip(("pitch", "acceleration"), mapped, strict=True)]
+    if _feels_gravity(config) and not mapped[0]:
+        latents[-1] = latents[-1] + GRAVITY * np.sin(truth("pitch"))
+    unknown = np.flatnonzero([True] * (len(latents) - 2) + mapped).tolist()
+    readings = []
+    for row in of:
+        if row.kind in ("channel", "vehicle"):
+            channel = recording.channels[row.channel]
+            readings.append(_binned(channel.t, channel.value, count))
+        else:
+            readings.append(np.full(len(latents[0]), row.scale))
+    log_soil = np.log(np.array(case.soil, float))
+    return _Instants(config, of, np.stack(readings, axis=1), np.stack(latents, axis=1), unknown, log_soil)
+
+
+def _feels_gravity(config: Config) -> bool:
+    mapped = config.signals.acceleration
+    return mapped is not None and mapped.kind == "specific_force"
 
 
 def _binned(t: Array, value: Array, count: int) -> Array:
@@ -245,8 +312,8 @@ class _Fit:
 
     def gap(self) -> float:
         """Reduced chi-square."""
-        of_soil = [name.partition(".")[0] in ABOUT_THE_SOIL for name in self.drive.names]
-        return 1.0 + float(np.sum(self.residuals(self.at) ** 2)) / (EVERY * len(self.S) * sum(of_soil))
+        freedom = self.S.shape[1] - len(self.drive.unknown)
+        return float(1.0 + np.sum(self.residuals(self.at) ** 2) / (EVERY * len(self.S) * freedom))
 
     def relaxed(self, at: _Unknowns) -> _Unknowns:
         """The same with the likeliest latents, each instant for itself."""

@@ -11,6 +11,7 @@ import argparse
 import logging
 from collections.abc import Sequence
 
+from soilbus.simulator.reference import REFERENCES, TRACTOR
 from soilbus.validation.stories.drives import cheap, real
 from soilbus.validation.stories.story import TO_ALL, TO_SOME, drawn, played
 
@@ -24,18 +25,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--stories", type=int, default=3000, help="how many (3000)")
     parser.add_argument("--real", type=int, default=30, help="how many with a real estimator (30)")
     parser.add_argument("--seed", type=int, default=1, help="of the first one (1)")
+    parser.add_argument("--machine", choices=REFERENCES, default=TRACTOR.stem, help=f"what drives ({TRACTOR.stem})")
     chosen = parser.parse_args(arguments)
     logging.disable(logging.CRITICAL)
     seeds = range(chosen.seed, chosen.seed + max(chosen.stories, chosen.real))
     bad = go = go_of_real = 0
     for seed in seeds[: chosen.stories]:
-        story = drawn(seed)
-        drive = played(cheap(), story, healed=seed % HEALED == 0)
+        drive = cheap(chosen.machine)
+        story = drawn(seed, drive.needed)
+        played(drive, story, healed=seed % HEALED == 0)
         go += drive.go
         bad += _wrong(f"story {seed}", story, drive.faults)
     for seed in seeds[: chosen.real]:
-        story = drawn(seed, (*TO_SOME, *TO_ALL))
-        drive = played(real(seed), story)
+        drive = real(seed, chosen.machine)
+        story = drawn(seed, drive.needed, (*TO_SOME, *TO_ALL))
+        played(drive, story)
         go_of_real += drive.go
         bad += _wrong(f"real story {seed}", story, drive.faults)
     print(f"{chosen.stories} stories, {go} times go; {chosen.real} with a real estimator, {go_of_real}; {bad} wrong")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import errno
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import partial
@@ -40,6 +40,7 @@ from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.sensors import sensors
 from soilbus.terra.soils import SOILS
 from soilbus.validation.fakes import FakeClock, InlineExecutor, drive_messages, feed_message
 
@@ -47,7 +48,6 @@ __all__ = [
     "CONFIG",
     "CYCLE",
     "MOMENTS",
-    "NEEDED",
     "WEAK",
     "Drive",
     "Handed",
@@ -60,20 +60,17 @@ __all__ = [
     "fit_of",
     "good_moment",
     "good_tracked",
+    "needed_messages",
     "of_soft_ground",
     "tracked_at",
 ]
 
 CONFIG = reference_configuration(["estimator.window=4.0", "traversability.max_age=2.0"])
 OUT = output_database(CONFIG)
-IN = load_databases(CONFIG)
 OWN = [(message.frame_id, message.is_extended_frame) for message in OUT.messages]
 VERDICT = OUT.get_message_by_name("Traversability").frame_id
-NEEDED = (
-    "MotorFL", "MotorFR", "MotorRL", "MotorRR", "WheelSpeeds", "WheelLoads", "DrawbarPin", "Attitude",
-    "GroundBasedSpeedAndDistance",
-)  # fmt: skip
-MOTORS = NEEDED[:4]
+NEEDED = ("torque", "speed", "load", "ground_speed", "draft", "pitch", "acceleration")
+"""Quantities without which there is no go, where they are mapped."""
 CYCLE, TICK = 0.1, 0.1
 TIMEOUT = 1.0
 SLACK = TICK + 0.06
@@ -91,9 +88,14 @@ BUS_OFF = 0x040
 Moment = dict[int, list[can.Message]]
 
 
-def good_moment(seed: int = 3) -> Moment:
+def needed_messages(config: Config, quantities: Sequence[str] = NEEDED) -> tuple[str, ...]:
+    """The messages that bring these quantities, in the order of the configuration."""
+    mapped = [sensor.mapped.signal for sensor in sensors(config) if sensor.quantity in quantities]
+    return tuple(dict.fromkeys(signal.partition(".")[0] for signal in mapped))
+
+
+def good_moment(config: Config = CONFIG, seed: int = 3) -> Moment:
     """The last frames of each message in a good drive."""
-    config = reference_configuration()
     found: Moment = {}
     for message in drive_messages(config, 10.0, seed):
         found.setdefault(message.arbitration_id, []).append(message)
@@ -104,7 +106,7 @@ class MadePipeline(Pipeline):
     """A pipeline whose estimators are made by the caller."""
 
     def __init__(self, config: Config, make: Callable[[], WindowEstimator]) -> None:
-        super().__init__(config, IN)
+        super().__init__(config, load_databases(config))
         self.make = make
 
     def new_estimator(self) -> WindowEstimator:
@@ -129,9 +131,9 @@ def fit_of(tracked: TrackerOutput) -> Fit:
     return tracked.fit
 
 
-def good_tracked(seed: int = 3) -> TrackerOutput:
+def good_tracked(config: Config = CONFIG, seed: int = 3) -> TrackerOutput:
     """What the tracker says of a window of a good drive."""
-    config = reference_configuration()
+    config = config.model_copy(update={"estimator": reference_configuration().estimator})
     found: list[TrackerOutput] = []
     pipeline = MadePipeline(config, lambda: WindowEstimator(config, partial(NotingTracker, found)))
     messages = drive_messages(config, 12.0, seed)
@@ -179,6 +181,7 @@ class Wire:
 
     clock: FakeClock
     moment: Moment
+    config: Config = CONFIG
     cycle: float = CYCLE
     offset: float = 1.7e9 - 1000.0
     step: float = 0.0
@@ -214,9 +217,11 @@ class Wire:
     verdicts: list[tuple[float, dict[str, Any]]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        names = {m.frame_id: m.name for m in IN.messages}
+        database = load_databases(self.config)
+        names = {m.frame_id: m.name for m in database.messages}
         self.known = [(names.get(i, "?"), m) for i, m in sorted(self.moment.items())]
-        self.checked = {m.name for m in IN.messages if "Checksum" in {s.name for s in m.signals}}
+        self.motors = needed_messages(self.config, ["torque_limit"])
+        self.checked = {m.name for m in database.messages if "Checksum" in {s.name for s in m.signals}}
         self.counter = self.next = self.life = 0
         self.base, self.halted_at, self.newest = self.clock.now, math.nan, -math.inf
         self.off_reported = False
@@ -269,7 +274,7 @@ class Wire:
             self.good, self.stamps, self.heard = {}, {}, []
             self.set_back()
         self.newest = max(self.newest, stamp)
-        weak = len(self.powers) == len(MOTORS) and max(max(sent) for sent in self.powers.values()) <= WEAK
+        weak = len(self.powers) == len(self.motors) and max(max(sent) for sent in self.powers.values()) <= WEAK
         firm = not (self.soft or weak)
         self.heard.append(Known(stamp, self.clock.now, self.soft, firm, self.blind, self.raises))
         return stamp
@@ -289,7 +294,7 @@ class Wire:
     def frame(self, name: str, message: can.Message) -> can.Message:
         data, checked = bytearray(message.data), name in self.checked
         good = name not in self.spoilt
-        if name in MOTORS:
+        if name in self.motors:
             limit = int.from_bytes(data[4:6], "little")
             data[4:6] = (
                 b"\xff\xff" if self.clock.now >= self.mute_from else int(limit * self.power).to_bytes(2, "little")
@@ -305,7 +310,7 @@ class Wire:
         stamp = self.stamp(listened=True)
         if good and stamp >= self.stamps.get(name, -math.inf):
             self.good[name], self.stamps[name] = self.clock.now, stamp
-            if name in MOTORS and self.clock.now < self.mute_from:
+            if name in self.motors and self.clock.now < self.mute_from:
                 self.powers[name] = self.powers.get(name, (1.0, 1.0))[1], self.power
         return can.Message(
             timestamp=stamp, arbitration_id=message.arbitration_id, is_extended_id=message.is_extended_id, data=data
@@ -408,9 +413,10 @@ class Drive:
     ) -> None:
         self.clock, self.config = FakeClock(), config
         self.max_age = config.traversability.max_age
+        self.needed = needed_messages(config)
         self.tracked = tracked
         self.of_soft = None if tracked is None else of_soft_ground(tracked)
-        self.wire = Wire(self.clock, moment, cycle, set_back=self.forget)
+        self.wire = Wire(self.clock, moment, config, cycle, set_back=self.forget)
         self.folder = TemporaryDirectory()
         self.faults: list[str] = []
         self.result: WindowResult | None = None
@@ -424,7 +430,7 @@ class Drive:
     def start(self) -> None:
         """A service that begins with the state that the one before has left behind."""
         pipeline = MadePipeline(self.config, self.estimator)
-        owner = Owner.of(self.config, pipeline.intake.channels, IN)
+        owner = Owner.of(self.config, pipeline.intake.channels, load_databases(self.config))
         persistence = StatePersistence(
             Path(self.folder.name), owner, InlineExecutor(), lambda: self.clock.now + self.wire.offset
         )
@@ -505,7 +511,7 @@ class Drive:
         if self.wire.halted:
             self.halted_until = now + SLACK
         patience = self.max_age if now < self.halted_until else TIMEOUT  # stamps that stand cannot say what is late
-        stale = any(not self.wire.unheard(name) <= patience + SLACK for name in NEEDED)
+        stale = any(not self.wire.unheard(name) <= patience + SLACK for name in self.needed)
         if stale or self.wire.lost or self.wire.off:
             self.interrupted = now
         self.interrupted = max(self.interrupted, self.wire.forged_at)

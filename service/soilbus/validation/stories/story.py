@@ -7,7 +7,7 @@ import random
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from soilbus.validation.stories.onlooker import NEEDED, WEAK, Drive
+from soilbus.validation.stories.onlooker import WEAK, Drive
 
 __all__ = [
     "TO_ALL",
@@ -40,21 +40,21 @@ class Event(NamedTuple):
     seconds: float
 
 
-def drawn(seed: int, kinds: Sequence[str] = (*TO_SOME, *TO_ALL, *TO_GROUND)) -> list[Event]:
-    """One to three events, of which each has none, one or two faults at a time."""
+def drawn(seed: int, messages: Sequence[str], kinds: Sequence[str] = (*TO_SOME, *TO_ALL, *TO_GROUND)) -> list[Event]:
+    """One to three events, of which each has none, one or two faults at a time; some hit a part of the messages."""
     rng = random.Random(seed)
-    return [_event(rng, kinds) for _ in range(rng.randint(1, 3))]
+    return [_event(rng, messages, kinds) for _ in range(rng.randint(1, 3))]
 
 
-def _event(rng: random.Random, kinds: Sequence[str]) -> Event:
+def _event(rng: random.Random, messages: Sequence[str], kinds: Sequence[str]) -> Event:
     chosen = rng.sample(kinds, rng.choice((0, 1, 1, 1, 2, 2)))
     seconds = rng.choice((rng.uniform(0.1, 1.0), rng.uniform(1.0, 2.0), rng.uniform(2.0, 3.5)))
-    return Event({kind: _argument(rng, kind) for kind in chosen}, seconds)
+    return Event({kind: _argument(rng, kind, messages) for kind in chosen}, seconds)
 
 
-def _argument(rng: random.Random, kind: str) -> Any:
+def _argument(rng: random.Random, kind: str, messages: Sequence[str]) -> Any:
     if kind in TO_SOME:
-        return frozenset(rng.sample(NEEDED, rng.choice((1, 1, 2, len(NEEDED)))))
+        return frozenset(rng.sample(messages, rng.choice((1, 1, 2, len(messages)))))
     return {"clock": rng.choice(STEPS), "late": rng.uniform(0.2, 2.6)}.get(kind, True)
 
 

@@ -1,0 +1,129 @@
+"""`python -m soilbus.validation.computed_loads`: are intervals honest where loads are not measured?
+
+Each drive has its own mass and centre of gravity, drawn by their priors, loads that shake by the given rms, and a
+window of the estimator's length, whose prior of the soil is drawn about the truth. The table: share of 95 % intervals
+that hold the truth, and rms of the errors in reported standard deviations, for bearing pressure, tan phi and n.
+"""
+
+from __future__ import annotations
+
+import argparse
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from soilbus.arrays import Array
+from soilbus.config.model import Axle, Config, Signal
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.laplace import with_nested_laplace
+from soilbus.estimation.multistart import fit_window
+from soilbus.estimation.observation_model import ObservationModel
+from soilbus.estimation.posterior import NORMAL_95
+from soilbus.sensors.bins import Bins
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import REFERENCES, TRACTOR, reference_configuration
+from soilbus.simulator.scenario import Patch, Scenario
+from soilbus.terra.soils import soil_named
+from soilbus.validation.monte_carlo import ROUGHLY_KNOWN, SLIP_RANGE, prior_about, processes
+
+CELLS = ("cells", "axle cells", "none")
+"""Load cells of the wheels, of the axles, of neither."""
+SOILS = ("loam", "clayey_soil_38")
+BOUNCES = (0.03, 0.12)
+"""Rms of a wheel's load about its steady one, over it: a smooth field, and the assumed one (noise.computed_load)."""
+QUANTITIES = ("pressure", "tan phi", "n")
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One drive."""
+
+    machine: str
+    cells: str
+    soil: str
+    bounce: float
+    seed: int
+
+
+def configured(machine: str, cells: str) -> Config | None:
+    """A reference machine with the load cells of CELLS, c and K known to 25 %; None where it has fewer."""
+    config = reference_configuration(ROUGHLY_KNOWN, REFERENCES[machine])
+    if machine != TRACTOR.stem:
+        own = "axle cells" if any(axle.load is not None for axle in config.axle) else "none"
+        return config if cells == own else None
+    if cells == "cells":
+        return config
+    wheels = [wheel.model_copy(update={"load": None, "sinkage": None}) for wheel in config.wheel]
+    axles = [Axle(name=name, load=Signal(signal=f"AxleLoads.{name}")) for name in ("front", "rear")]
+    return config.model_copy(update={"wheel": wheels, "axle": axles if cells == "axle cells" else []})
+
+
+def errors(task: Task) -> Array | None:
+    """Errors of QUANTITIES in reported standard deviations; None where the window is not solved."""
+    config = configured(task.machine, task.cells)
+    assert config is not None
+    soil, window = soil_named(task.soil), config.estimator.window
+    config = config.model_copy(update={"wheel": [wheel.model_copy(update={"sinkage": None}) for wheel in config.wheel]})
+    scenario = Scenario(window, (Patch(0.0, task.soil),), slip=SLIP_RANGE, bounce=task.bounce, drawn_mass=True)
+    recording, rig = simulate(config, scenario, task.seed), rig_of(config)
+    store = Bins(rig, config.estimator.bin, 0.0)
+    store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
+    settings = config.estimator
+    problem = ObservationModel(store.window(0.0, window), rig, model_of(config), settings.min_speed, settings.max_turn)
+    prior = prior_about(prior_of(config), soil, np.random.default_rng([task.seed, 1]))
+    fit = fit_window(problem, prior)
+    if fit is None or not fit.converged:
+        return None
+    posterior = with_nested_laplace(problem, prior, Gaussian.of(prior, problem.gain_std), fit).reported.posterior
+    pressure, tan_phi = posterior.bearing_pressure(settings.z_ref, settings.b_ref), posterior.tan_phi()
+    log_n = np.log(posterior.soil.n / soil.n) / np.sqrt(posterior.log_covariance[2, 2])
+    true = soil.bearing_pressure(settings.z_ref, settings.b_ref)
+    return np.array([
+        np.log(pressure.value / true) * pressure.value / pressure.std,
+        (tan_phi.value - np.tan(soil.phi)) / tan_phi.std,
+        log_n,
+    ])  # fmt: skip
+
+
+def tasks(drives: int, seed: int, bounces: Sequence[float]) -> Iterator[list[Task]]:
+    """The drives of each line of the table."""
+    for machine, cells, soil, bounce in product(REFERENCES, CELLS, SOILS, bounces):
+        if configured(machine, cells) is not None:
+            key = [seed, zlib.crc32(f"{machine} {soil}".encode())]
+            seeds = np.random.SeedSequence(key).generate_state(drives)
+            yield [Task(machine, cells, soil, bounce, int(s)) for s in seeds]
+
+
+def line(of: Sequence[Task], found: Sequence[Array | None]) -> str:
+    """Of the table."""
+    off = np.array([one for one in found if one is not None]).reshape(-1, len(QUANTITIES))
+    held, rms = np.mean(np.abs(off) < NORMAL_95, axis=0), np.sqrt(np.mean(off**2, axis=0))
+    first, scatter = of[0], np.sqrt(0.95 * 0.05 / max(len(off), 1))
+    figures = "  ".join(f"{100.0 * h:5.1f} {r:4.2f}" for h, r in zip(held, rms, strict=True))
+    return (
+        f"{first.machine:14}{first.cells:12}{first.soil:16}{first.bounce:6.0%}  {figures}"
+        f"  {len(off):5d} +- {100.0 * scatter:.1f}"
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse, drive, print."""
+    parser = argparse.ArgumentParser(prog="python -m soilbus.validation.computed_loads", description=__doc__)
+    parser.add_argument("--drives", type=int, default=100, help="of each line (100)")
+    parser.add_argument("--seed", type=int, default=1, help="of drives, noise and priors (1)")
+    parser.add_argument("--bounce", type=float, action="append", help="rms of the loads over themselves; repeatable")
+    parser.add_argument("--processes", type=int, default=1)
+    chosen = parser.parse_args(arguments)
+    print(f"{'machine':14}{'loads':12}{'soil':16}bounce  " + "  ".join(f"{q:>10}" for q in QUANTITIES) + "  drives")
+    with processes(chosen.processes) as each:
+        for of in tasks(chosen.drives, chosen.seed, chosen.bounce or BOUNCES):
+            print(line(of, list(each(errors, of))), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
