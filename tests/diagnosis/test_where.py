@@ -21,7 +21,7 @@ RIG = rig_of(CONFIG)
 SOILS = ("loam", "wet_clay", "dry_sand")
 
 
-def recorded(soil: str, seconds: float, seed: int, channel: str = "", error=None) -> Record:
+def recorded(soil: str, seconds: float, seed: int, channel: str = "", error=None, rig=RIG) -> Record:
     """A drive; `error` gives what a channel reads too much from times, slips and speeds of the truth."""
     recording = simulate(CONFIG, excited(soil, seconds), seed=seed)
     columns = {n: (c.t, c.value) for n, c in recording.channels.items() if n in RIG.channels}
@@ -29,9 +29,9 @@ def recorded(soil: str, seconds: float, seed: int, channel: str = "", error=None
         t, value = columns[channel]
         truth = {n: np.interp(t, recording.truth["t"], recording.truth[n]) for n in ("slip.RL", "ground_speed")}
         columns[channel] = t, value + error(t, truth["slip.RL"], truth["ground_speed"])
-    store = Bins(RIG, 0.1, 0.0)
+    store = Bins(rig, 0.1, 0.0)
     store.add(columns)
-    return record_of("drive", store.window(0.0, seconds), RIG, model_of(CONFIG), 0.2, 0.15)
+    return record_of("drive", store.window(0.0, seconds), rig, model_of(CONFIG), 0.2, 0.15)
 
 
 def places(record: Record) -> list[Disagreement]:
@@ -44,6 +44,12 @@ def test_where_nothing_is_missing_no_place_is_reported():
     """Of a hundred tests a drive one is beyond 1 % by chance: all of them together must not be."""
     reported = {seed: places(recorded(SOILS[seed % 3], 40.0, seed)) for seed in range(8)}
     assert {seed: found for seed, found in reported.items() if found} == {}
+
+
+def test_residuals_smaller_than_the_noise_are_no_disagreement():
+    """The draft sensor is ten times as good as its data sheet says."""
+    modest = rig_of(reference_configuration(["noise.draft.absolute=400"]))
+    assert places(recorded("loam", 40.0, 2, rig=modest)) == []
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -13,7 +13,7 @@ import pytest
 import shaking
 from soilbus.can.channels import Column, Decoded
 from soilbus.can.mapping import load_databases
-from soilbus.config.file import load_config
+from soilbus.config.file import found_configuration, load_config
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.instrumentation import channel_value, completed
 from soilbus.estimation.measurements import Measurements
@@ -22,6 +22,7 @@ from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.window import NoiseTable, forward, made_window
 from soilbus.pipeline.modelled_drive import modelled_drive
 from soilbus.pipeline.pipeline import Pipeline
+from soilbus.report.configuration import load_lines
 from soilbus.terra.soils import soil_named
 from soilbus.terra.vehicle import GRAVITY
 
@@ -306,3 +307,11 @@ def estimated(config, drive):
         pipeline.intake.add(Decoded(part))
         results += pipeline.advance(since + 1.0)
     return results
+
+
+@pytest.mark.parametrize("name", ["tractor-2wd", "tractor-axles"])
+def test_check_says_that_a_missing_load_cell_costs_precision(name):
+    (line,) = [line for line in load_lines(load_config(found_configuration(name))) if "with load cells" in line]
+    pressure, with_cells, tan_phi, tan_phi_with_cells = (float(x) for x in re.findall(r"([\d.]+)%", line))
+    assert with_cells < pressure < 2.0 * with_cells
+    assert tan_phi > 0.95 * tan_phi_with_cells

@@ -42,32 +42,34 @@ def _run(words: Sequence[str | Path], where: Path = REPO) -> None:
     assert done.returncode == 0, done.stdout
 
 
-def _in_the_guest(script: str, folder: Path, commands: Sequence[str], environment: Sequence[str] = ()) -> Path:
+def _in_the_guest(debian: Path, script: str, folder: Path, commands: Sequence[str], *environment: str) -> Path:
     """The folder, with what the script leaves there."""
     (folder / "commands").write_text("".join(f"{line}\n" for line in commands))
     for name in ("page.sh", script):
         shutil.copy(REPO / "tests/systemd" / name, folder)
-    try:
-        done = guest.run(["env", *environment, "sh", script], rw=[folder], base=guest.bare_debian(), timeout=400.0)
-    except guest.Unavailable as reason:
-        unavailable(str(reason))
-        raise
+    done = guest.run(["env", *environment, "sh", script], rw=[folder], base=debian, timeout=400.0)
     assert done.returncode == 0, done.stdout
     return folder
 
 
 @pytest.fixture(scope="module")
-def package(tool, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def debian() -> Path:
+    """Root of a bare Debian that the guest can boot."""
+    try:
+        guest.prepare()
+        return guest.bare_debian()
+    except guest.Unavailable as reason:
+        unavailable(str(reason))
+        raise
+
+
+@pytest.fixture(scope="module")
+def package(debian: Path, tool, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What package.sh leaves of the package that the page's command builds, and of a later version."""
     tool("dpkg-deb")
     folder = tmp_path_factory.mktemp("package")
     checkout = tmp_path_factory.mktemp("checkout") / "soilbus"
     shutil.copytree(REPO, checkout, ignore=shutil.ignore_patterns(".git", ".venv", "tests", "dist", "__pycache__"))
-    try:
-        guest.prepare()
-        guest.bare_debian()
-    except guest.Unavailable as reason:
-        unavailable(str(reason))
     _run(["sh", "-c", BUILT[1]], checkout)
     (built,) = (checkout / "dist").glob("*.deb")
     shutil.copy(built, folder)
@@ -78,11 +80,11 @@ def package(tool, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "later").mkdir()
     _run(["dpkg-deb", "--root-owner-group", "-Zzstd", "-z1", "--build", folder / "tree", folder / "later"])
     shutil.rmtree(folder / "tree")
-    return _in_the_guest("package.sh", folder, WITH_THE_PACKAGE)
+    return _in_the_guest(debian, "package.sh", folder, WITH_THE_PACKAGE)
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def wheel(debian: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What page.sh leaves of the commands without the package."""
     folder = tmp_path_factory.mktemp("wheel")
     _run(["/usr/bin/python3", "-m", "venv", folder / "venv"])
@@ -93,7 +95,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (reference,) = (REPO / "service/soilbus").rglob("tractor.toml")
     shutil.copy(reference, folder)
     of_pip = ["PIP_NO_INDEX=1", f"PIP_FIND_LINKS={folder}/wheels", "PIP_NO_COMPILE=1"]  # the guest is slow
-    return _in_the_guest("page.sh", folder, WITHOUT, of_pip)
+    return _in_the_guest(debian, "page.sh", folder, WITHOUT, *of_pip)
 
 
 def shown(folder: Path) -> dict[str, str]:

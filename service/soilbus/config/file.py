@@ -14,6 +14,7 @@ from soilbus.config.model import Config, ConfigError
 from soilbus.files import read_bounded
 
 __all__ = [
+    "MACHINES",
     "OPEN",
     "found_configuration",
     "load_config",

@@ -114,7 +114,8 @@ def _tests(check: HeldOutCheck, fitted: FittedModel, record: int) -> Iterator[_T
             )  # of I + M: M's trace, and that of M^2
             expected, of_squares = float(uncertain.trace()), float((uncertain @ uncertain).trace())
             sd = math.sqrt(2.0 * (n + 2.0 * expected + of_squares)) / n
-            yield _Test(channel, wheel, "scatter", math.sqrt(square), (square - 1.0 - expected / n) / sd)
+            larger = max((square - 1.0 - expected / n) / sd, 0.0)  # smaller than noise is no disagreement
+            yield _Test(channel, wheel, "scatter", math.sqrt(square), larger)
 
 
 def _regions(regressors: dict[str, Array], known: NDArray[np.bool_]) -> Iterator[tuple[str, NDArray[np.intp]]]:
