@@ -52,6 +52,7 @@ EXAMPLES: Mapping[str, str] = {
     "simulate": "soilbus simulate --config tractor-2wd --soil loam --effect slip_sinkage=0.4 --log drive.log",
     "diagnose": "soilbus diagnose --config soilbus.toml drive.log --report findings.html --model-out better.toml",
     "effects": "soilbus effects slip_sinkage",
+    "batch": "soilbus batch --config soilbus.toml logs/ --out results --diagnose",
     "watch": "soilbus watch --config soilbus.toml",
     "completion": "soilbus completion bash >/etc/bash_completion.d/soilbus",
     "docs": "soilbus docs systemd",
@@ -208,6 +209,22 @@ def command_line() -> argparse.ArgumentParser:
     )
     sub.add_argument(
         "--manoeuvre-out", type=Path, metavar="OUT.json", help="of an ambiguous diagnosis, what to drive to settle it"
+    )
+
+    sub = command("batch", "many logs of many vehicles, on Dask (extra: batch)")
+    sub.add_argument(
+        "logs", nargs="+", metavar="LOG",
+        help="log, folder, glob, URL, or manifest: a CSV or Parquet file with log, vehicle, configuration, start",
+    )  # fmt: skip
+    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
+    sub.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="of Dask, such as tcp://10.0.0.1:8786; by default processes of this machine",
+    )
+    sub.add_argument("--resume", action="store_true", help="go on with DIR: logs that are done are not read again")
+    sub.add_argument(
+        "--diagnose", action="store_true", help="and say which vehicles have which fault, in DIR/diagnosis.json"
     )
 
     sub = command("watch", "terminal dashboard that reads only our frames, of the bus or of a recording", "optional")

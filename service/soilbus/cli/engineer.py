@@ -1,4 +1,4 @@
-"""Commands of the controls engineer: replay, simulate, diagnose, effects.
+"""Commands of the controls engineer: replay, simulate, diagnose, effects, batch.
 
 Each function takes the parsed arguments, imports what it needs, does the work and writes the outputs asked for.
 """
@@ -348,3 +348,28 @@ def diagnose(args: argparse.Namespace) -> None:
         print(findings_text(findings), end="")
     if args.manoeuvre_out is not None and findings.plan is None:
         raise WorkError("--manoeuvre-out: no names are left to decide between that a drive would tell apart")
+
+
+def batch(args: argparse.Namespace) -> None:
+    """`soilbus batch`: many logs, on Dask."""
+    from soilbus.config.file import load_config
+
+    config = configured(args)
+    for module in ("distributed", "pyarrow"):
+        need_extra(module, "batch", "batch")
+    from soilbus.offline.batch import BatchError, check_new, cluster, jobs_of, run_batch
+    from soilbus.report.batch import batch_text
+    from soilbus.report.progress import phases
+
+    check_folders(args.out)
+    if not args.resume:
+        check_new(args.out)
+    try:
+        jobs = jobs_of(config, Path(args.config).name, args.logs, lambda path: load_config(path, args.set))
+        with phases("batch") as progress, cluster(args.scheduler, say) as client:
+            done = run_batch(client, jobs, args.out, progress or (lambda _: None), args.diagnose)
+    except BatchError as error:
+        raise WorkError(str(error)) from None
+    print(batch_text(done, args.out), end="")
+    if not done.windows:
+        raise WorkError(f"no log gave a window; each with its reason in {args.out / 'errors.parquet'}")

@@ -231,6 +231,14 @@ class FittedModel:
         n_sensors, free = self.checks[0].problem.n_sensors, [self.free[i] for i in own]
         return tuple(own_parameters(*_moments(fit, n_sensors, own), free, data_ratio) for fit in self.fits[1:])
 
+    def shared_parameters(self, effect: Effect) -> OwnParameters:
+        """Likelihood, by the first recording, of an effect's parameters that are the vehicle's; without held ones."""
+        shared = [i for i in _not_held(effect, self.free) if not effect.own_in_each_record(self.free[i].parameter)]
+        if not shared:
+            return OwnParameters(np.zeros((0, 0)), np.zeros(0), ())
+        n_sensors, free = self.checks[0].problem.n_sensors, [self.free[i] for i in shared]
+        return own_parameters(*_moments(self.fits[0], n_sensors, shared), free)
+
 
 def _series(held_out: HeldOutCheck, fit: Fit) -> list[Series]:
     """The readings of one recording by channel and wheel."""

@@ -94,7 +94,7 @@ class Observations(NamedTuple):
     value: Array
     variance: Array
 
-    def rows(self, keep: NDArray[np.intp]) -> Observations:
+    def rows(self, keep: NDArray[np.intp] | slice) -> Observations:
         """Those of the given instants."""
         return Observations(*(a[keep] for a in self))
 

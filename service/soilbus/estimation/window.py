@@ -164,8 +164,8 @@ class Window:
             if len(getattr(self, quantity)) != len(self.t):
                 object.__setattr__(self, quantity, np.full(len(self.t), np.nan))
 
-    def rows(self, keep: NDArray[np.intp]) -> Window:
-        """The window with the given bins only."""
+    def rows(self, keep: NDArray[np.intp] | slice) -> Window:
+        """The window with the given bins only; a slice copies nothing."""
         values: dict[str, Any] = {q: getattr(self, q)[keep] for q in (*WHEEL_QUANTITIES, *VEHICLE_QUANTITIES)}
         return replace(
             self,

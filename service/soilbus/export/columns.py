@@ -17,11 +17,14 @@ __all__ = ["SCHEMA_VERSION", "Column", "column"]
 SCHEMA_VERSION = "1"
 """Version of the records' keys, kinds and units; a reader of another one must not assume this table."""
 
-Kind = Literal["text", "number", "integer", "truth"]
+Kind = Literal["text", "number", "integer", "truth", "time"]
 
 
 class Column(NamedTuple):
-    """Kind of a value, and its unit: "1" of a ratio, count or probability, "" of what is no number."""
+    """Kind of a value, and its unit: "1" of a ratio, count or probability, "" of what is no number.
+
+    A `time` is an integer, milliseconds since 1970 (UTC).
+    """
 
     kind: Kind
     unit: str
@@ -75,8 +78,22 @@ _COLUMNS: tuple[tuple[str, Column], ...] = (
     ("capability.over_slip.pull*", Column("number", "N")),
     ("capability.over_slip.torque*", Column("number", "N m")),
     ("chi2", _RATIO),
+    ("time", Column("time", "")),
+    ("longitude", Column("number", "deg")),
+    ("latitude", Column("number", "deg")),
+    ("vehicle", _TEXT),
+    ("day", _TEXT),
+    ("configuration", _TEXT),
+    ("fault", _TEXT),
+    ("begin", Column("time", "")),
+    ("end", Column("time", "")),
+    ("duration", Column("number", "s")),
+    ("logs.*", _COUNT),
+    ("windows", _COUNT),
+    ("windows.*", _COUNT),
+    ("frames.*", _COUNT),
 )
-"""First match counts."""
+"""First match counts.  From `time` on: what `soilbus batch` adds to windows, and its summaries of logs and vehicles."""
 
 
 @cache

@@ -49,19 +49,33 @@ def write_csv(out: Any, rows: Rows) -> None:
 
 def parquet_of(rows: Rows) -> bytes:
     """The bytes of a Parquet file; what is not known is null."""
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
-    types = {"text": pa.string(), "number": pa.float64(), "integer": pa.int64(), "truth": pa.bool_()}
-    fields, arrays = [], []
-    for name in column_names(rows):
+    out = io.BytesIO()
+    pq.write_table(arrow_table(rows, arrow_schema(column_names(rows))), out)
+    return out.getvalue()
+
+
+def arrow_schema(names: Iterable[str]) -> Any:
+    """The pyarrow schema of these columns, each with its unit, and with the versions of schema and soilbus."""
+    import pyarrow as pa
+
+    types = {
+        "text": pa.string(), "number": pa.float64(), "integer": pa.int64(), "truth": pa.bool_(),
+        "time": pa.timestamp("ms", tz="UTC"),
+    }  # fmt: skip
+    fields = []
+    for name in names:
         kind, unit = _described(name)
         fields.append(pa.field(name, types[kind], metadata={"unit": unit} if unit else None))
-        arrays.append(pa.array([row.get(name) for row in rows], types[kind]))
-    metadata = {"soilbus_version": __version__, "soilbus_schema": SCHEMA_VERSION}
-    out = io.BytesIO()
-    pq.write_table(pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=metadata)), out)
-    return out.getvalue()
+    return pa.schema(fields, metadata={"soilbus_version": __version__, "soilbus_schema": SCHEMA_VERSION})
+
+
+def arrow_table(rows: Rows, schema: Any) -> Any:
+    """A pyarrow table of rows under a schema; null where a row has no value of that name."""
+    import pyarrow as pa
+
+    return pa.Table.from_arrays([pa.array([row.get(f.name) for row in rows], f.type) for f in schema], schema=schema)
 
 
 def _described(name: str) -> tuple[Kind, str]:

@@ -6,6 +6,7 @@ left out and named.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -47,7 +48,11 @@ class Recordings:
 
 
 def recordings_of(
-    config: Config, database: Database, logs: Sequence[Path], progress: Callable[[int, float], None] | None = None
+    config: Config,
+    database: Database,
+    logs: Sequence[Path],
+    progress: Callable[[int, float], None] | None = None,
+    longest: float = math.inf,
 ) -> Recordings:
     """Read logs.
 
@@ -59,6 +64,8 @@ def recordings_of(
         Files.
     progress
         Called with the number of frames read and the time in the recording [s].
+    longest
+        Time [s] at the beginning of each log after which no more of it is read.
 
     Raises
     ------
@@ -77,7 +84,7 @@ def recordings_of(
         intake = Intake(config, database, {})
         first.append(len(records))
         fault: TooLittle | None = None
-        for i, window in enumerate(parts(intake, path, progress)):
+        for i, window in enumerate(parts(intake, path, progress, longest)):
             samples += window.samples
             name = log if i == 0 else f"{log}, part {i + 1}"
             try:
@@ -93,7 +100,12 @@ def recordings_of(
     return Recordings(tuple(records), tuple(first), samples, dict(rejected.most_common()), tuple(too_short))
 
 
-def parts(intake: Intake, log: Path, progress: Callable[[int, float], None] | None = None) -> Iterator[Window]:
+def parts(
+    intake: Intake,
+    log: Path,
+    progress: Callable[[int, float], None] | None = None,
+    longest: float = math.inf,
+) -> Iterator[Window]:
     """The windows of a log, one for each stretch in which its clock was not set and it was not silent for long.
 
     Raises
@@ -110,10 +122,14 @@ def parts(intake: Intake, log: Path, progress: Callable[[int, float], None] | No
             whole.append(window)
 
     intake.admission.at_break = end
+    first = math.nan
     for now in fed(intake, log, progress):
         yield from whole
         whole.clear()
         intake.ingest(now)
+        first = now if math.isnan(first) else first
+        if now - first > longest:
+            break
     end()
     yield from whole
 

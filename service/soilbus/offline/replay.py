@@ -36,7 +36,7 @@ from soilbus.pipeline.result import WindowResult
 from soilbus.words import one_line
 from soilbus.workers import workers
 
-__all__ = ["LogError", "estimator_beside", "fed", "log_names", "read_frames", "read_log", "replay"]
+__all__ = ["LogError", "OtherBus", "estimator_beside", "fed", "log_names", "read_frames", "read_log", "replay"]
 
 _T = TypeVar("_T")
 
@@ -52,6 +52,10 @@ class LogError(Exception):
     """A log cannot be read, or not to its end; the text says where and why; `windows` ended before that place."""
 
     windows = 0
+
+
+class OtherBus(LogError):
+    """No frame of a log is in the DBC: of another bus, or of another vehicle than the configuration's."""
 
 
 def read_log(path: Path) -> Iterator[can.Message]:
@@ -251,7 +255,7 @@ def fed(intake: Intake, log: Path, progress: Callable[[int, float], None] | None
     t, identifier, extended, data, remote, error = frame
     yield _plausible_time(admission, t)
     if counts.unknown + counts.error_frames == unheard + n:
-        raise LogError(f"{log}: none of its {n} frames is in the DBC: a log of another bus?")
+        raise OtherBus(f"{log}: none of its {n} frames is in the DBC: a log of another bus?")
     message = None if remote or error else admission.cut_short(identifier, extended, data)
     if message is not None:
         raise LogError(f"{log}: cut off in its last frame ({len(data)} of {message.length} bytes of {message.name})")

@@ -258,7 +258,7 @@ class WindowEstimator:
         driven = window.driven
         looks = list(moments(driven, self.rig, since, self._settings.min_speed))
         for i, moment in zip(np.flatnonzero(driven.t > since).tolist(), looks, strict=bool(looks)):
-            few = driven.rows(np.arange(max(i + 1 - BINS_OF_A_MOMENT, 0), i + 1))
+            few = driven.rows(slice(max(i + 1 - BINS_OF_A_MOMENT, 0), i + 1))
             if (motion := motion_of(few, self.rig, window.torque_limit, self.config.traversability)) is not None:
                 self._loss = observed(self._loss, motion, self.config)
             self._watch = watched(self._watch, moment.t, moment.slip, moment.pull, self._curve, moment.inertia)

@@ -1,0 +1,528 @@
+"""Many logs on Dask: each log its own task, its result on disk at once, what is done never done again.
+
+    LOG...  ->  jobs  ->  parts/DIGEST.gz (one a log)  ->  windows, summaries, errors, map
+
+Only logs that have no part yet are replayed, so a run that was stopped, whatever stopped it, loses the logs in work
+and no more.  Workers need neither the configuration nor the DBC files nor the output folder: settings travel with a
+job, and parts come back.  Workers open a log by its path or URL; where they do not see the path, it is sent along.
+"""
+
+from __future__ import annotations
+
+import csv
+import glob
+import hashlib
+import json
+import logging
+import math
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from importlib import import_module
+from importlib.util import find_spec
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from soilbus import __version__
+from soilbus.config.model import Config, ConfigError
+from soilbus.offline import dataset
+from soilbus.offline.fleet import chosen, findings_of, judged, no_findings
+from soilbus.offline.parts import Job, OtherVersion, Outcome, Setup, part_of, setup_of, summary_of_part
+from soilbus.pipeline.outputs import known
+from soilbus.words import one_line
+
+__all__ = ["Batch", "BatchError", "check_new", "cluster", "jobs_of", "run_batch"]
+
+LOG_SUFFIXES = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")
+"""Of logs that python-can reads; each may have .gz behind it."""
+TABLE_SUFFIXES = (".csv", ".parquet", ".pq")
+CONNECT_TIMEOUT = 10.0
+"""Seconds in which a scheduler must answer."""
+TASKS_PER_THREAD = 3
+"""Tasks that are handed out for each thread: one in work, one to follow, one on its way."""
+WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": 1}
+"""Of the processes started here.  Dask's own has MALLOC_TRIM_THRESHOLD_ = 64 KiB too: glibc then gives memory back to
+the kernel all the time and has it zeroed again."""
+MAX_SENT_BYTES = 256 * 2**20
+"""Bytes of a log that is sent along; it is in memory on its way."""
+
+
+class BatchError(Exception):
+    """The batch cannot be done, or not to its end; the text is one line."""
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """What came of a batch.
+
+    Attributes
+    ----------
+    vehicles
+        Rows of vehicles.parquet.
+    errors
+        Rows of errors.parquet.
+    windows
+        Windows of all logs.
+    resumed
+        Logs that were done before this run.
+    fleet
+        Content of diagnosis.json; None where it was not asked for.
+    cpu_seconds, log_bytes, duration
+        Cost of the logs of this run: processor time [s] and bytes, for recordings of `duration` [s].
+    """
+
+    vehicles: list[dict[str, Any]]
+    errors: list[dict[str, Any]]
+    windows: int
+    resumed: int
+    fleet: dict[str, Any] | None
+    cpu_seconds: float
+    log_bytes: int
+    duration: float
+
+
+# --- from what the user names to jobs
+
+
+def jobs_of(config: Config, name: str, logs: Sequence[str], load: Callable[[Path], Config]) -> list[Job]:
+    """The jobs that the arguments of the command stand for, in the order of vehicle and log.
+
+    Parameters
+    ----------
+    config, name
+        The configuration for logs that have none of their own, and its file's name.
+    logs
+        Logs, folders, globs, URLs, or manifests: tables (CSV, Parquet) with a column `log`, and optionally `vehicle`,
+        `configuration` and `start` (ISO 8601, or seconds since 1970).
+    load
+        Reads another configuration.
+
+    Returns
+    -------
+    One job for each log.  Where no manifest names the vehicle, it is that of the folder in which the log lies.
+
+    Raises
+    ------
+    ConfigError
+        A configuration is wrong.
+    BatchError
+        There is no log, or a manifest cannot be read.
+    """
+    setups: dict[Path | None, Setup] = {}
+
+    def setup(path: Path | None) -> Setup:
+        if path not in setups:
+            setups[path] = setup_of(config, name) if path is None else setup_of(load(path), path.name)
+        return setups[path]
+
+    suffixes = TABLE_SUFFIXES if config.table is not None else LOG_SUFFIXES
+    setup(None)
+    jobs: dict[str, Job] = {}
+    for argument in logs:
+        for entry in _entries(argument):
+            found = _files(entry["log"], suffixes)
+            if not found:
+                raise BatchError(f"{entry['log']}: no log there")
+            for log in found:
+                vehicle = entry.get("vehicle") or log.rpartition("/")[0].rpartition("/")[2] or "unknown"
+                own = entry.get("configuration")
+                job = Job(log, vehicle, setup(Path(own) if own else None), _start(entry.get("start"), argument))
+                jobs[job.digest] = job
+    return sorted(jobs.values(), key=lambda job: (job.vehicle, job.log, job.digest))
+
+
+def _entries(argument: str) -> list[dict[str, str]]:
+    """Rows of a manifest, or one row that names the argument itself."""
+    path = Path(argument)
+    if path.suffix not in (".csv", ".parquet") or not path.is_file():
+        return [{"log": argument}]
+    try:
+        if path.suffix == ".csv":
+            with path.open(newline="", encoding="utf-8-sig") as text:
+                table = csv.DictReader(text)
+                rows = [dict(row) for row in table] if "log" in (table.fieldnames or ()) else []
+        else:
+            rows = _parquet_rows(path)
+    except (OSError, ValueError, csv.Error) as error:
+        raise BatchError(f"{argument}: not a table that can be read ({one_line(error, 100)})") from None
+    if not rows:
+        return [{"log": argument}]
+    return [_entry(path, row) for row in rows]
+
+
+def _entry(manifest: Path, row: Mapping[str, Any]) -> dict[str, str]:
+    """A row's texts; paths in it begin at the manifest's folder."""
+    texts = {name: str(value).strip() for name, value in row.items() if value is not None}
+    if not texts.get("log"):
+        raise BatchError(f"{manifest}: a row without a log")
+    for name in ("log", "configuration"):
+        if texts.get(name) and "://" not in texts[name]:
+            texts[name] = str(manifest.parent / texts[name])
+    return texts
+
+
+def _parquet_rows(path: Path) -> list[dict[str, Any]]:
+    import pyarrow.parquet as pq
+
+    names = pq.read_schema(path).names
+    wanted = [name for name in ("log", "vehicle", "configuration", "start") if name in names]
+    rows: list[dict[str, Any]] = pq.read_table(path, columns=wanted).to_pylist() if "log" in names else []
+    return rows
+
+
+def _start(text: str | None, manifest: str) -> float | None:
+    if not text:
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    try:
+        when = datetime.fromisoformat(text)
+    except ValueError:
+        raise BatchError(f"{manifest}: start {text} is neither ISO 8601 nor seconds since 1970") from None
+    return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
+
+
+def _files(log: str, suffixes: Sequence[str]) -> list[str]:
+    """The logs that a path, a folder, a glob or a URL stands for; of a folder all below it that can be logs."""
+    if "://" in log:
+        return _remote_files(log, suffixes)
+    path = Path(log)
+    if path.is_dir():
+        return sorted(str(each.resolve()) for each in path.rglob("*") if _is_log(each.name, suffixes))
+    if glob.has_magic(log) and not path.exists():
+        return sorted(str(Path(each).resolve()) for each in glob.glob(log, recursive=True) if Path(each).is_file())
+    return [str(path.resolve())]
+
+
+def _remote_files(url: str, suffixes: Sequence[str]) -> list[str]:
+    from fsspec.core import url_to_fs
+
+    try:
+        files, name = url_to_fs(url)
+        if glob.has_magic(name):
+            return sorted(str(files.unstrip_protocol(each)) for each in files.glob(name))
+        if files.isdir(name):
+            found = [each for each in files.find(name) if _is_log(each, suffixes)]
+            return sorted(str(files.unstrip_protocol(each)) for each in found)
+    except (ImportError, OSError, ValueError) as error:
+        raise BatchError(f"{url}: {one_line(error, 150)}") from None
+    return [url]
+
+
+def _is_log(name: str, suffixes: Sequence[str]) -> bool:
+    return Path(name.lower().removesuffix(".gz")).suffix in suffixes
+
+
+# --- Dask
+
+
+@contextmanager
+def cluster(address: str | None, say: Callable[[str], None], processes: int | None = None) -> Iterator[Any]:
+    """A Dask client: of the scheduler at an address, or of one process for each core of this machine.
+
+    Parameters
+    ----------
+    address
+        Such as tcp://10.0.0.1:8786; None for this machine.
+    say
+        Called with a line for the user.
+    processes
+        Of this machine; one for each core by default.
+
+    Raises
+    ------
+    BatchError
+        There is no scheduler, it has no workers, or these have another soilbus.
+    """
+    dask: Any = import_module("dask")
+    distributed: Any = import_module("distributed")  # typed only in part
+    # Dask speaks of every worker that is lost; what it means for a log we say ourselves
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    settings = {
+        "distributed.comm.timeouts.connect": CONNECT_TIMEOUT,
+        "distributed.client.scheduler-info-interval": 2000,
+        "distributed.worker.profile.enabled": False,  # it looks at the worker's threads a hundred times a second
+        "distributed.nanny.pre-spawn-environ": WORKER_ENVIRONMENT,
+    }
+    with dask.config.set(settings):
+        if address is None:
+            options = {"threads_per_worker": 1, "processes": True, "silence_logs": logging.CRITICAL}
+            here = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
+            with (
+                distributed.LocalCluster(processes, **options, **here) as local,
+                distributed.Client(local) as client,
+            ):
+                _announce(client, say)
+                yield client
+            return
+        try:
+            client = distributed.Client(address, timeout=CONNECT_TIMEOUT)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise BatchError(f"{address}: no Dask scheduler there ({one_line(error, 100)})") from None
+        with client:
+            _check_workers(client, address)
+            _announce(client, say)
+            yield client
+
+
+def _announce(client: Any, say: Callable[[str], None]) -> None:
+    """Where Dask's own dashboard is, if there is one."""
+    if find_spec("bokeh") and client.scheduler_info().get("services", {}).get("dashboard"):
+        say(f"Dask's dashboard: {client.dashboard_link}")
+
+
+def worker_version() -> str:
+    """Version of soilbus on a worker."""
+    return __version__
+
+
+def _check_workers(client: Any, address: str) -> None:
+    try:
+        versions = set(client.run(worker_version).values())
+    except ModuleNotFoundError:
+        raise BatchError(f"{address}: its workers have no soilbus: install soilbus {__version__} there") from None
+    except Exception as error:  # of an older soilbus, in which this function is missing
+        raise BatchError(
+            f"{address}: its workers have another soilbus than {__version__} ({one_line(error, 100)})"
+        ) from None
+    if not versions:
+        raise BatchError(f"{address}: the scheduler has no workers")
+    if others := sorted(versions - {__version__}):
+        raise BatchError(
+            f"{address}: workers have soilbus {', '.join(others)}, this is {__version__}: install the same everywhere"
+        )
+
+
+def done_in_turn(
+    client: Any, function: Callable[..., Any], tasks: Iterable[tuple[str, tuple[Any, ...]]]
+) -> Iterator[tuple[str, Any]]:
+    """Results as they come, by key; the exception itself where a task failed.
+
+    Tasks are drawn one by one as others end, so that what travels with them is never in memory all at once.
+
+    Raises
+    ------
+    BatchError
+        The scheduler is lost.
+    """
+    as_completed: Any = import_module("distributed").as_completed
+    waiting = iter(tasks)
+    threads = sum(client.nthreads().values()) or 1
+    name = function.__name__
+
+    def submit(key: str, arguments: tuple[Any, ...]) -> Any:
+        return client.submit(function, *arguments, key=f"{name}-{key}", pure=False)
+
+    first = [submit(*task) for task in islice(waiting, TASKS_PER_THREAD * threads)]
+    running = as_completed(first)
+    del first  # Dask keeps the result of a task for as long as somebody holds its future
+    for future in running:
+        key = future.key.removeprefix(f"{name}-")
+        if future.status == "cancelled":
+            raise BatchError("the Dask scheduler is lost; --resume goes on from here")
+        try:
+            result = future.result() if future.status == "finished" else future.exception()
+        except (CancelledError, OSError, TimeoutError):
+            raise BatchError("the Dask scheduler is lost; --resume goes on from here") from None
+        yield key, result
+        future.release()
+        for task in islice(waiting, 1):
+            running.add(submit(*task))
+
+
+# --- the batch
+
+
+def check_new(out: Path) -> None:
+    """Raises ConfigError where a folder holds parts of an earlier run."""
+    if any((out / "parts").glob("*")):
+        raise ConfigError([f"--out {out}: it holds results: go on with --resume, or take another folder"])
+
+
+def run_batch(
+    client: Any,
+    jobs: Sequence[Job],
+    out: Path,
+    progress: Callable[[str], None] = lambda _: None,
+    diagnose: bool = False,
+) -> Batch:
+    """Replay all logs that are not done yet, then write the results of all.
+
+    Parameters
+    ----------
+    client
+        Of `cluster`.
+    jobs
+        The logs.
+    out
+        Folder for the results.
+    progress
+        Called with what is done.
+    diagnose
+        Whether to diagnose each vehicle over its logs, and the fleet.
+
+    Raises
+    ------
+    ConfigError
+        The configuration fits no log.
+    BatchError
+        The scheduler is lost, or workers have another version.
+    NotWritten
+        A file cannot be written.
+    """
+    parts = out / "parts"
+    outcomes = _replay_all(client, jobs, parts, progress)
+    if jobs and all(outcome.other_bus for outcome in outcomes.values()) and len(outcomes) == len(jobs):
+        first = next(iter(outcomes.values())).fault
+        names = ", ".join(sorted({job.setup.name for job in jobs}))
+        raise ConfigError([f"{names}: fits no log: none of {len(jobs)} logs has a frame that its DBC knows ({first})"])
+    summaries = {
+        job.digest: summary for job in jobs if (summary := summary_of_part(_part_path(parts, job.digest))) is not None
+    }
+    errors = [
+        {"vehicle": job.vehicle, "log": job.log, "windows": summary["windows.all"] if summary else 0, "fault": fault}
+        for job in jobs
+        for summary in [summaries.get(job.digest)]
+        if (fault := summary["fault"] if summary else outcomes[job.digest].fault)
+    ]
+    logs = dataset.log_rows(summaries.values())
+    vehicles = dataset.vehicle_rows(logs, errors)
+    _write_windows(client, jobs, summaries, out, progress)
+    dataset.write_rows(out / "errors.parquet", errors, dataset.ERROR_COLUMNS)
+    if logs:
+        dataset.write_rows(out / "logs.parquet", logs)
+    dataset.write_rows(out / "vehicles.parquet", vehicles)
+    return Batch(
+        vehicles,
+        errors,
+        sum(summary["windows.all"] for summary in summaries.values()),
+        len(jobs) - len(outcomes),
+        _diagnose_all(client, jobs, summaries, out, progress) if diagnose else None,
+        math.fsum(outcome.cpu_seconds for outcome in outcomes.values()),
+        sum(outcome.log_bytes for outcome in outcomes.values()),
+        math.fsum(summary["duration"] for digest, summary in summaries.items() if digest in outcomes),
+    )
+
+
+def _part_path(parts: Path, digest: str) -> Path:
+    return parts / f"{digest}.gz"
+
+
+def _replay_all(client: Any, jobs: Sequence[Job], parts: Path, progress: Callable[[str], None]) -> dict[str, Outcome]:
+    """Outcomes, by digest, of the logs that had no part, or one of a damaged log: it may be whole now."""
+    known = {job.digest: summary_of_part(_part_path(parts, job.digest)) for job in jobs}
+    left = {job.digest: job for job in jobs if (summary := known[job.digest]) is None or summary["fault"]}
+    outcomes: dict[str, Outcome] = {}
+    unseen = _unseen_folders(client, left.values())
+    tasks = ((digest, (_carrying(job, unseen), __version__)) for digest, job in left.items())
+    failed = 0
+    for digest, result in done_in_turn(client, part_of, tasks):
+        outcome = _outcome(left[digest], result)
+        outcomes[digest] = replace(outcome, part=None)
+        if outcome.part is not None:
+            dataset.put(_part_path(parts, digest), outcome.part)
+        failed += outcome.part is None
+        done = len(jobs) - len(left) + len(outcomes)
+        progress(f"{done} of {len(jobs)} logs" + (f", {failed} failed" if failed else ""))
+    return outcomes
+
+
+def _outcome(job: Job, result: Outcome | BaseException) -> Outcome:
+    """The outcome of a task; of one that ended with an exception, what it says."""
+    if isinstance(result, Outcome):
+        return result
+    if isinstance(result, OtherVersion):
+        raise BatchError(str(result))
+    if type(result).__name__ == "KilledWorker":
+        return Outcome(None, f"{job.log}: its worker died each time it was tried (out of memory?)")
+    return Outcome(None, f"{job.log}: {one_line(Exception(str(result)), 200)} ({type(result).__name__})")
+
+
+def unseen_of(folders: Sequence[str]) -> list[str]:
+    """Those of the folders that are not on this machine."""
+    return [folder for folder in folders if not Path(folder).is_dir()]
+
+
+def _unseen_folders(client: Any, jobs: Iterable[Job]) -> set[str]:
+    """Folders of logs that are here and that some worker does not see."""
+    folders = sorted({str(Path(job.log).parent) for job in jobs if "://" not in job.log})
+    here = [folder for folder in folders if Path(folder).is_dir()]
+    return {folder for unseen in client.run(unseen_of, here).values() for folder in unseen} if here else set()
+
+
+def _carrying(job: Job, unseen: set[str]) -> Job:
+    """The job with its log, where workers do not see it and it is not too large."""
+    if "://" in job.log or str(Path(job.log).parent) not in unseen:
+        return job
+    path = Path(job.log)
+    try:
+        if path.stat().st_size <= MAX_SENT_BYTES:
+            return replace(job, content=path.read_bytes())
+    except OSError:
+        pass
+    return job
+
+
+def _write_windows(
+    client: Any,
+    jobs: Sequence[Job],
+    summaries: Mapping[str, Mapping[str, Any]],
+    out: Path,
+    progress: Callable[[str], None],
+) -> None:
+    """The parts as tables by vehicle and day, and the map of them."""
+    new, windows, vehicles = out / ".windows", out / "windows", {job.digest: job.vehicle for job in jobs}
+    if not summaries:
+        return
+    shutil.rmtree(new, ignore_errors=True)  # of a run that was stopped
+    columns = dataset.window_columns(summaries.values())
+    tasks = ((digest, (_part_path(out / "parts", digest).read_bytes(), columns)) for digest in summaries)
+    for n, (digest, files) in enumerate(done_in_turn(client, dataset.day_files, tasks), 1):
+        if isinstance(files, BaseException):
+            raise BatchError(f"the part {digest} cannot be converted ({one_line(Exception(str(files)), 100)})")
+        for day, content in files.items():
+            dataset.put(dataset.folder_of(new, vehicles[digest], day) / f"{digest}.parquet", content)
+        progress(f"tables of {n} of {len(summaries)} logs")
+    dataset.replace_folder(new, windows)
+    progress("map")
+    dataset.write_map(out / "map.parquet", windows)
+
+
+def _diagnose_all(
+    client: Any,
+    jobs: Sequence[Job],
+    summaries: Mapping[str, Mapping[str, Any]],
+    out: Path,
+    progress: Callable[[str], None],
+) -> dict[str, Any]:
+    """Findings of every vehicle, kept one by one, and the fleet's diagnosis of them."""
+    groups: dict[tuple[str, str], list[Job]] = {}
+    for job in sorted(jobs, key=lambda job: (summaries.get(job.digest, {}).get("begin") or 0, job.log)):
+        if job.digest in summaries:
+            groups.setdefault((job.vehicle, job.setup.digest), []).append(job)
+    together = {_digest_of(group): chosen(group) for _, group in sorted(groups.items())}
+    kept = {digest: out / "parts" / f"{digest}.json" for digest in together}
+    left = {digest: group for digest, group in together.items() if not kept[digest].exists()}
+    unseen = _unseen_folders(client, (job for group in left.values() for job in group))
+    tasks = ((digest, ([_carrying(job, unseen) for job in group], __version__)) for digest, group in left.items())
+    for n, (digest, found) in enumerate(done_in_turn(client, findings_of, tasks), 1):
+        if isinstance(found, OtherVersion):
+            raise BatchError(str(found))
+        if isinstance(found, BaseException):
+            fault = f"{one_line(Exception(str(found)), 200)} ({type(found).__name__})"
+            found = no_findings(together[digest][0].vehicle, fault)
+        dataset.put(kept[digest], json.dumps(known(found), indent=1, allow_nan=False).encode())
+        progress(f"{n} of {len(left)} vehicles diagnosed")
+    fleet = judged([json.loads(path.read_bytes()) for path in kept.values()])
+    dataset.put(out / "diagnosis.json", (json.dumps(fleet, indent=1, allow_nan=False) + "\n").encode())
+    return fleet
+
+
+def _digest_of(jobs: Sequence[Job]) -> str:
+    return hashlib.sha256(" ".join(job.digest for job in jobs).encode()).hexdigest()[:24]

@@ -1,0 +1,218 @@
+"""The parts of a batch -> its results: windows by vehicle and day, summaries, errors, map.
+
+    windows/vehicle=V/day=D/DIGEST.parquet      rows of one log on one day (UTC), the same columns in every file
+    logs.parquet, vehicles.parquet              counts and means; a row for each log, for each vehicle
+    errors.parquet                              logs that failed or were damaged, each with its line
+    map.parquet                                 GeoParquet 1.1: a point (WKB, WGS84) for each window with a position
+
+Everything follows from the parts, in the order of vehicle, log and digest: the same parts give the same bytes.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote, unquote
+
+import numpy as np
+
+from soilbus.export.table import arrow_schema, arrow_table
+from soilbus.files import whole_file_of_bytes
+from soilbus.offline.parts import rows_of_part
+from soilbus.pipeline.outputs import column_names
+
+ROW_GROUP = 2000
+"""Rows that are converted at once: 2 MB of columns."""
+NO_DAY = "unknown"
+"""Day of windows whose log has no dates; Hive's name for null is not taken, as pandas cannot read it beside others."""
+MAP_COLUMNS = (
+    "vehicle", "log", "window", "t", "time", "status", "reason", "bearing_pressure.value", "bearing_pressure.std",
+    "soil.phi.value", "soil.phi.std", "traversability.state", "traversability.probability",
+    "traversability.max_draft.value", "traversability.max_draft.std", "traversability.limit",
+)  # fmt: skip
+"""Columns of the windows that the map repeats."""
+ERROR_COLUMNS = ("vehicle", "log", "windows", "fault")
+GEO = {
+    "version": "1.1.0",
+    "primary_column": "geometry",
+    "columns": {"geometry": {"encoding": "WKB", "geometry_types": ["Point"]}},
+}
+"""Metadata `geo` of GeoParquet 1.1; without a `crs` coordinates are longitude and latitude in WGS84 (OGC:CRS84)."""
+_WKB_POINT = np.dtype([("order", "u1"), ("kind", "<u4"), ("x", "<f8"), ("y", "<f8")])
+
+
+def day_files(part: bytes, columns: Sequence[str]) -> dict[str, bytes]:
+    """Parquet files of one part, by day.
+
+    Parameters
+    ----------
+    part
+        As parts.part_of() makes it.
+    columns
+        Of all windows of the batch.
+    """
+    import pyarrow.parquet as pq
+
+    schema = arrow_schema(columns)
+    files: dict[str, BytesIO] = {}
+    writers: dict[str, Any] = {}
+    for rows in rows_of_part(part, ROW_GROUP):
+        days = [_day(row["time"]) for row in rows]
+        for day in dict.fromkeys(days):
+            if day not in writers:
+                files[day] = BytesIO()
+                writers[day] = pq.ParquetWriter(files[day], schema)
+            writers[day].write_table(arrow_table([r for r, d in zip(rows, days, strict=True) if d == day], schema))
+    for writer in writers.values():
+        writer.close()
+    return {day: file.getvalue() for day, file in files.items()}
+
+
+def _day(milliseconds: int | None) -> str:
+    return NO_DAY if milliseconds is None else datetime.fromtimestamp(milliseconds / 1e3, UTC).date().isoformat()
+
+
+def window_columns(summaries: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Columns of all windows: those of every part; the vehicle is in the folder's name."""
+    return [c for c in column_names(dict.fromkeys(s["columns"]) for s in summaries) if c != "vehicle"]
+
+
+def folder_of(windows: Path, vehicle: str, day: str) -> Path:
+    """Folder of a vehicle's windows of one day."""
+    return windows / f"vehicle={quote(vehicle, safe=' ')}" / f"day={day}"
+
+
+def put(path: Path, content: bytes) -> None:
+    """A file that is there whole or not at all, in a folder that may have to be made; NotWritten."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file_of_bytes(path) as out:
+        out.write(content)
+
+
+def replace_folder(new: Path, old: Path) -> None:
+    """Let a folder take the place of another."""
+    if old.exists():
+        shutil.rmtree(old)
+    new.rename(old)
+
+
+def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> None:
+    """Rows as a Parquet file with units and versions; by default with the columns that occur. NotWritten."""
+    import pyarrow.parquet as pq
+
+    out = BytesIO()
+    pq.write_table(arrow_table(rows, arrow_schema(columns or column_names(rows))), out)
+    put(path, out.getvalue())
+
+
+def log_rows(summaries: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of logs.parquet: the summaries; a reason of refusal that a log does not have was counted 0 times."""
+    rows = [{name: value for name, value in summary.items() if name != "columns"} for summary in summaries]
+    reasons = sorted({name for row in rows for name in row if name.startswith("rejected.")})
+    return [row | {reason: row.get(reason, 0) for reason in reasons} for row in rows]
+
+
+def vehicle_rows(logs: Sequence[Mapping[str, Any]], errors: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of vehicles.parquet.
+
+    Parameters
+    ----------
+    logs, errors
+        Rows of logs.parquet and errors.parquet.
+
+    Returns
+    -------
+    One row for each vehicle: counts added up, the mean bearing pressure over valid windows, first begin and last end.
+    """
+    rows = []
+    for vehicle, (own, faults) in sorted(_by_vehicle(logs, errors).items()):
+        row: dict[str, Any] = {
+            "vehicle": vehicle,
+            "logs.all": len({str(each["log"]) for each in (*own, *faults)}),
+            "logs.failed": sum(not fault["windows"] for fault in faults),
+            "logs.damaged": sum(bool(fault["windows"]) for fault in faults),
+            "begin": min((each["begin"] for each in own if each["begin"] is not None), default=None),
+            "end": max((each["end"] for each in own if each["end"] is not None), default=None),
+        }
+        for name in column_names(own):
+            values = [each[name] for each in own if each.get(name) is not None]
+            if name not in row and all(isinstance(value, int | float) for value in values):
+                row[name] = sum(values) if values else None
+        weights = [(each["bearing_pressure.mean"], each["windows.valid"]) for each in own]
+        known = [(mean, n) for mean, n in weights if mean is not None]
+        row["bearing_pressure.mean"] = sum(m * n for m, n in known) / sum(n for _, n in known) if known else None
+        rows.append({name: value for name, value in row.items() if name not in ("fault", "log", "configuration")})
+    return rows
+
+
+def _by_vehicle(*tables: Sequence[Mapping[str, Any]]) -> dict[str, tuple[list[Mapping[str, Any]], ...]]:
+    """The rows of each table that are of one vehicle."""
+    found: dict[str, tuple[list[Mapping[str, Any]], ...]] = {}
+    for i, rows in enumerate(tables):
+        for row in rows:
+            found.setdefault(str(row["vehicle"]), tuple([] for _ in tables))[i].append(row)
+    return found
+
+
+def write_map(path: Path, windows: Path) -> int:
+    """GeoParquet of all windows with a position.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    windows
+        Folder of the windows.
+
+    Returns
+    -------
+    Number of points; 0 without a file where there is none.
+
+    Raises
+    ------
+    NotWritten
+        The file cannot be written.
+    """
+    import pyarrow as pa
+    import pyarrow.compute as pc
+    import pyarrow.parquet as pq
+
+    files = sorted(windows.rglob("*.parquet"))
+    columns = [name for name in MAP_COLUMNS if name == "vehicle" or name in pq.read_schema(files[0]).names]
+    plain = arrow_schema(columns)
+    schema = plain.append(pa.field("geometry", pa.binary()))
+    schema = schema.with_metadata({**plain.metadata, b"geo": json.dumps(GEO).encode()})
+    points = 0
+    path.unlink(missing_ok=True)
+    with whole_file_of_bytes(path) as out, pq.ParquetWriter(out, schema) as writer:
+        for file in files:
+            batches = pq.ParquetFile(file).iter_batches(ROW_GROUP, columns=[*columns[1:], "longitude", "latitude"])
+            for batch in batches:
+                placed = batch.filter(pc.is_valid(batch.column("longitude")))
+                if placed.num_rows:
+                    vehicle = pa.array([_vehicle_of(file)] * placed.num_rows, pa.string())
+                    geometry = _points(placed.column("longitude"), placed.column("latitude"))
+                    arrays = [vehicle, *(placed.column(name) for name in columns[1:]), geometry]
+                    writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
+                    points += placed.num_rows
+    if not points:
+        path.unlink()
+    return points
+
+
+def _vehicle_of(file: Path) -> str:
+    return unquote(file.parent.parent.name.removeprefix("vehicle="))
+
+
+def _points(longitude: Any, latitude: Any) -> Any:
+    """Points as a pyarrow array of well-known binary (OGC 06-103r4)."""
+    import pyarrow as pa
+
+    points = np.empty(len(longitude), _WKB_POINT)
+    points["order"], points["kind"], points["x"], points["y"] = 1, 1, longitude.to_numpy(), latitude.to_numpy()
+    return pa.array([point.tobytes() for point in points], pa.binary())

@@ -1,0 +1,144 @@
+"""Logs of a fleet -> which vehicles have which fault: read, diagnosed vehicle by vehicle, then judged together.
+
+logs of a vehicle -> records -> diagnosis/fleet.py -> findings of a vehicle;   findings of all -> diagnosis.json
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from soilbus.diagnosis.diagnose import NotFitted
+from soilbus.diagnosis.fleet import FALSE_DISCOVERY_RATE, Onset, diagnose_vehicle, named
+from soilbus.diagnosis.records import Record, TooLittle
+from soilbus.estimation.assembly import possible_effects, prior_of
+from soilbus.offline.parts import Job, check_version, local_log, unpacked
+from soilbus.offline.recordings import recordings_of
+from soilbus.offline.replay import LogError
+from soilbus.words import one_line
+
+MAX_LOGS = 12
+"""Logs of a vehicle that are diagnosed together, evenly over its dates: the time grows with their number."""
+LONGEST = 600.0
+"""Time [s] of each log that is diagnosed, from its beginning; a diagnosis of some minutes finds what it can find."""
+
+
+def chosen(jobs: Sequence[Job]) -> list[Job]:
+    """At most MAX_LOGS of a vehicle's logs in the order of their dates: the first, the last, and evenly between."""
+    if len(jobs) <= MAX_LOGS:
+        return list(jobs)
+    return [jobs[i] for i in np.linspace(0, len(jobs) - 1, MAX_LOGS).round().astype(int)]
+
+
+def findings_of(jobs: Sequence[Job], version: str) -> dict[str, Any]:
+    """What the logs of one vehicle show together; what cannot be diagnosed is said in `fault`.
+
+    Parameters
+    ----------
+    jobs
+        Logs of one vehicle with one configuration, in the order of their dates.
+    version
+        Of the soilbus that asks for it.
+
+    Raises
+    ------
+    OtherVersion
+        This soilbus is of another version.
+    """
+    check_version(version)
+    config, database = unpacked(jobs[0].setup.content)
+    record = no_findings(jobs[0].vehicle, "no log of it can be diagnosed")
+    if database is None:
+        return record | {"fault": "tables of a test rig are no vehicle"}
+    records: list[Record] = []
+    for job in jobs:
+        try:
+            with local_log(job) as path:
+                read = recordings_of(config, database, [path], longest=LONGEST).records
+        except (LogError, TooLittle, OSError) as error:
+            record["left_out"].append({"log": job.log, "fault": one_line(error, 200)})
+            continue
+        records += read
+        record["logs"] += [job.log] * len(read)
+    if not records:
+        return record
+    try:
+        found = diagnose_vehicle(records, prior_of(config), possible_effects(config))
+    except (NotFitted, np.linalg.LinAlgError) as error:
+        return record | {"fault": one_line(error, 200)}
+    diagnosis = found.diagnosis
+    record |= {
+        "fault": None,
+        "verdict": str(diagnosis.verdict),
+        "gap": {"before": diagnosis.gap_before.value, "after": diagnosis.gap_after.value},
+    }
+    values = diagnosis.completed.parameters()
+    record["effects"] = [
+        {
+            "name": name,
+            "probability": p,
+            "parameters": _estimates(values.get(name, {})),
+            "onset": _onset(found.onsets[name], record["logs"]) if name in found.onsets else None,
+        }
+        for name, p in found.probabilities.items()
+    ]
+    return record
+
+
+def _onset(onset: Onset, logs: Sequence[str]) -> dict[str, Any]:
+    """The first log with an effect, and the size in each log alone."""
+    by_log = zip(logs, onset.probabilities, onset.sizes, strict=True)
+    return {
+        "log": logs[onset.first],
+        "probability": onset.probabilities[onset.first],
+        "never": onset.never,
+        "by_log": [{"log": log, "probability": p, "parameters": _estimates(s or {})} for log, p, s in by_log],
+    }
+
+
+def no_findings(vehicle: str, fault: str) -> dict[str, Any]:
+    """Findings of a vehicle that cannot be diagnosed, and why."""
+    return {"vehicle": vehicle, "logs": [], "left_out": [], "verdict": None, "effects": [], "fault": fault}
+
+
+def _estimates(values: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+    return {name: {"value": each.value, "std": each.std} for name, each in values.items()}
+
+
+def judged(findings: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The fleet's diagnosis.
+
+    Parameters
+    ----------
+    findings
+        Of each vehicle, as findings_of() gives them.
+
+    Returns
+    -------
+    The findings, `named` with each effect, and for each effect the share of vehicles that are expected to have it: an
+    effect that nearly all vehicles of a type have is none of a machine, but of the model or the configuration.
+    """
+    effects = [effect for each in findings for effect in each["effects"]]
+    for effect, given in zip(effects, named([effect["probability"] for effect in effects]), strict=True):
+        effect["named"] = given
+    diagnosed = sum(each["verdict"] is not None for each in findings)
+    expected, names = Counter[str](), Counter[str]()
+    for effect in effects:
+        expected[effect["name"]] += effect["probability"]
+        names[effect["name"]] += effect["named"]
+    return {
+        "false_discovery_rate": FALSE_DISCOVERY_RATE,
+        "vehicles_diagnosed": diagnosed,
+        "effects": [
+            {
+                "name": name,
+                "vehicles_named": names[name],
+                "expected_share": expected[name] / diagnosed,
+            }
+            for name in sorted(expected)
+        ],
+        "vehicles": list(findings),
+    }

@@ -1,0 +1,336 @@
+"""One log of a batch -> its part: all of its windows and a summary, whole or not at all.
+
+    log -> replay -> part = gzip(summary) + gzip(a line of JSON for each window)
+
+A part depends on the log, the configuration and the version of soilbus alone: the same log gives the same bytes on
+every machine.  The replay yields one window at a time and its line goes to a temporary file, so memory does not grow
+with the log; at the end the part is in memory as a whole, about 1 kB a window.
+"""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+import math
+import pickle
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from io import BytesIO
+from itertools import islice
+from pathlib import Path
+from tempfile import TemporaryDirectory, TemporaryFile
+from typing import IO, Any
+
+from cantools.database.can import Database
+
+from soilbus import __version__
+from soilbus.can.dbc_files import load_databases
+from soilbus.config.file import located
+from soilbus.config.model import Config
+from soilbus.decision.traversability import State, Status
+from soilbus.export.columns import SCHEMA_VERSION
+from soilbus.offline.replay import LogError, OtherBus, replay
+from soilbus.offline.tables import replay_tables
+from soilbus.pipeline.outputs import flat_record, window_record
+from soilbus.pipeline.pipeline import Pipeline
+from soilbus.pipeline.result import WindowResult
+from soilbus.words import one_line
+
+EARLIEST_DATE = 946684800.0
+"""1 January 2000 [s]: smaller stamps count from the start of a log or of a logger, and are no dates."""
+LATEST_DATE = 4102444800.0
+"""1 January 2100 [s]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """A configuration with its databases, as it travels to a worker.
+
+    Attributes
+    ----------
+    name
+        File that it came from.
+    content
+        Pickled Config and Database (None for tables of a test rig).
+    digest
+        Of the settings and the DBC files.
+    """
+
+    name: str
+    content: bytes
+    digest: str
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A log to replay.
+
+    Attributes
+    ----------
+    log
+        Absolute path, or URL that fsspec opens.
+    vehicle
+        That recorded it.
+    setup
+        Configuration of the vehicle.
+    start
+        Time [s] of the first sample, for logs whose stamps are no dates; None: stamps count as they are.
+    content
+        The log itself, where workers do not see the file.
+    """
+
+    log: str
+    vehicle: str
+    setup: Setup
+    start: float | None = None
+    content: bytes | None = field(default=None, repr=False)
+
+    @property
+    def digest(self) -> str:
+        """Names the part: of log, vehicle, start, configuration, and the versions of soilbus and schema."""
+        of = (self.log, self.vehicle, self.start, self.setup.digest, __version__, SCHEMA_VERSION)
+        return hashlib.sha256(json.dumps(of).encode()).hexdigest()[:24]
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What came of a log.
+
+    Attributes
+    ----------
+    part
+        None where there is none.
+    fault
+        Why the log was not read, or not to its end, in one line; None where it was.
+    windows
+        Windows of the part.
+    other_bus
+        Whether no frame of the log is in the DBC.
+    cpu_seconds, log_bytes
+        Cost: processor time, size of the log.
+    """
+
+    part: bytes | None
+    fault: str | None
+    windows: int = 0
+    other_bus: bool = False
+    cpu_seconds: float = 0.0
+    log_bytes: int = 0
+
+
+class OtherVersion(Exception):
+    """A worker has another version of soilbus than the command."""
+
+
+def check_version(version: str) -> None:
+    """Raises OtherVersion where the soilbus that asks is of another version than this one."""
+    if version != __version__:
+        raise OtherVersion(f"a worker has soilbus {__version__}, this is {version}: install the same everywhere")
+
+
+def setup_of(config: Config, name: str) -> Setup:
+    """The setup of a configuration.
+
+    Raises
+    ------
+    ConfigError
+        A DBC file is missing or does not fit the configuration.
+    """
+    database, texts = None, []
+    if config.table is None:
+        database = load_databases(config)
+        Pipeline(config, database)
+        texts = [located(config.folder, dbc).read_bytes() for dbc in config.dbc.input]
+    digest = hashlib.sha256(config.model_dump_json().encode())
+    for text in texts:
+        digest.update(hashlib.sha256(text).digest())
+    return Setup(name, pickle.dumps((config, database)), digest.hexdigest())
+
+
+@lru_cache(maxsize=16)
+def unpacked(content: bytes) -> tuple[Config, Database | None]:
+    config, database = pickle.loads(content)
+    return config, database
+
+
+def part_of(job: Job, version: str) -> Outcome:
+    """Replay one log; whatever is wrong with it is in the outcome.
+
+    Parameters
+    ----------
+    job
+        The log.
+    version
+        Of the soilbus that asks for it.
+
+    Raises
+    ------
+    OtherVersion
+        This soilbus is of another version.
+    """
+    check_version(version)
+    begin = time.thread_time()
+    try:
+        with local_log(job) as path:
+            size = path.stat().st_size if path.exists() else 0
+            outcome = _replayed(job, path)
+    except LogError as error:
+        return Outcome(None, str(error))
+    except MemoryError:
+        return Outcome(None, f"{job.log}: not enough memory")
+    except Exception as error:  # a defect of ours, or of a library on a file that it never met
+        return Outcome(None, f"{job.log}: {one_line(error, 200)} ({type(error).__name__})")
+    return replace(outcome, cpu_seconds=time.thread_time() - begin, log_bytes=size)
+
+
+@contextmanager
+def local_log(job: Job) -> Iterator[Path]:
+    """Path of the log on this machine; of a URL, and of a log sent along, as long as the context lasts."""
+    if job.content is None and "://" not in job.log:
+        yield Path(job.log)
+        return
+    with TemporaryDirectory(prefix="soilbus-") as folder:
+        path = Path(folder, job.log.rpartition("/")[2])
+        if job.content is not None:
+            path.write_bytes(job.content)
+        else:
+            from fsspec.core import url_to_fs
+
+            files, name = url_to_fs(job.log)
+            try:
+                files.get_file(name, str(path))
+            except FileNotFoundError:
+                raise LogError(f"{job.log}: no such file") from None
+        yield path
+
+
+def _replayed(job: Job, path: Path) -> Outcome:
+    config, database = unpacked(job.setup.content)
+    with TemporaryFile() as lines:
+        return _part_by_way_of(lines, job, config, database, path)
+
+
+def _part_by_way_of(lines: IO[bytes], job: Job, config: Config, database: Database | None, path: Path) -> Outcome:
+    """The outcome; `lines` is an empty file that holds the windows until the summary, which goes before, is known."""
+    summary = _Summary(job, config)
+    fault: LogError | None = None
+    with gzip.GzipFile(filename="", fileobj=lines, mode="wb", mtime=0) as out:
+        pipeline = None if database is None else Pipeline(config, database)
+        try:
+            for result in replay_tables(config, [path]) if pipeline is None else replay(pipeline, [path]):
+                row = summary.row(replace(result, log=job.log))
+                out.write(json.dumps(row, allow_nan=False).encode() + b"\n")
+        except LogError as error:
+            fault = error
+    text = None if fault is None else str(fault).replace(str(path), job.log)
+    if fault is not None and not summary.windows:
+        return Outcome(None, text, other_bus=isinstance(fault, OtherBus))
+    if not summary.windows:
+        return Outcome(None, f"{job.log}: no recording in it lasts the {config.estimator.window:g} s of a window")
+    head = json.dumps(summary.record(pipeline, text), allow_nan=False).encode() + b"\n"
+    lines.seek(0)
+    return Outcome(b"".join((gzip.compress(head, mtime=0), lines.read())), text, summary.windows)
+
+
+class _Summary:
+    """Counts of one log, window by window."""
+
+    def __init__(self, job: Job, config: Config) -> None:
+        self.job, self.config = job, config
+        self.windows = 0
+        self._shift: float | None = None
+        self._columns: dict[str, None] = {}
+        self._counts: Counter[str] = Counter()
+        self._bearing: list[float] = []
+        self._rejected: Counter[str] = Counter()
+        self._times: list[int] = []
+        self._newest = -math.inf
+        self._duration = 0.0
+
+    def row(self, result: WindowResult) -> dict[str, Any]:
+        """The window as a row, counted."""
+        record = flat_record(window_record(result, self.config))
+        longitude, latitude = (None, None) if result.position is None else map(math.degrees, reversed(result.position))
+        when = self._time(result.t)
+        row = {"vehicle": self.job.vehicle, "time": when, "longitude": longitude, "latitude": latitude} | record
+        self._columns.update(dict.fromkeys(row))
+        self.windows += 1
+        settings = self.config.estimator
+        follows = 0.0 < result.t - self._newest < 1.5 * settings.hop
+        self._duration += settings.hop if follows else settings.window
+        self._newest = result.t
+        self._counts[f"windows.{result.status}"] += 1
+        self._counts[f"windows.{result.traversability.state}"] += 1
+        if result.bearing is not None and result.status is Status.VALID:
+            self._bearing.append(result.bearing.value)
+        if self.config.table is not None:
+            self._rejected += Counter(result.rejected)
+        self._times = [self._times[0] if self._times else when, when] if when is not None else self._times
+        return row
+
+    def _time(self, t: float) -> int | None:
+        """Milliseconds since 1970; None where the stamp is no date."""
+        if self._shift is None:
+            self._shift = 0.0 if self.job.start is None else self.job.start - (t - self.config.estimator.window)
+        t += self._shift
+        return round(t * 1e3) if EARLIEST_DATE <= t < LATEST_DATE else None
+
+    def record(self, pipeline: Pipeline | None, fault: str | None) -> dict[str, Any]:
+        """The whole log in one row, with the names of its windows' columns."""
+        frames: dict[str, int] = {}
+        used, rejected = None, self._rejected
+        if pipeline is not None:
+            counts, refusals = pipeline.admission.counts, pipeline.intake.refusals
+            frames = {
+                "frames.mapped": sum(counts.received.values()),
+                "frames.unknown": counts.unknown,
+                "frames.error": counts.error_frames,
+            }
+            used, rejected = refusals.used, refusals.total
+        n = len(self._bearing)
+        return {
+            "vehicle": self.job.vehicle,
+            "log": self.job.log,
+            "configuration": self.job.setup.name,
+            "begin": self._times[0] if self._times else None,
+            "end": self._times[-1] if self._times else None,
+            "duration": self._duration,
+            "windows.all": self.windows,
+            **{f"windows.{each}": self._counts[f"windows.{each}"] for each in (*Status, *State)},
+            "bearing_pressure.mean": math.fsum(self._bearing) / n if n else None,
+            **frames,
+            "samples": used,
+            **{f"rejected.{reason}": n for reason, n in sorted(rejected.items())},
+            "fault": fault,
+            "columns": list(self._columns),
+        }
+
+
+def summary_of_part(path: Path) -> dict[str, Any] | None:
+    """The summary in a part; None where there is no part."""
+    try:
+        with gzip.open(path) as lines:
+            summary: dict[str, Any] = json.loads(next(lines))
+    except (OSError, EOFError, StopIteration, ValueError):
+        return None
+    summary["columns"] = _shared(tuple(summary["columns"]))
+    return summary
+
+
+@lru_cache(maxsize=256)
+def _shared(columns: tuple[str, ...]) -> tuple[str, ...]:
+    """The same columns as one object: a fleet's summaries are in memory at once, and most have the same."""
+    return columns
+
+
+def rows_of_part(part: bytes, at_once: int) -> Iterator[list[dict[str, Any]]]:
+    """The windows of a part as rows of a table, `at_once` or fewer at a time."""
+    with gzip.GzipFile(fileobj=BytesIO(part)) as lines:
+        next(lines)
+        while rows := [json.loads(line) for line in islice(lines, at_once)]:
+            yield rows

@@ -1,0 +1,66 @@
+"""A batch as text: one table, a row for each vehicle, then what failed and what it cost."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from soilbus.offline.batch import Batch
+from soilbus.report.table import table
+
+MAX_ROWS = 40
+"""Vehicles that the table lists; all are in vehicles.parquet."""
+MAX_FAULTS = 5
+"""Faults that the text lists; all are in errors.parquet."""
+
+
+def batch_text(batch: Batch, out: Path) -> str:
+    """The table and the lines below it."""
+    head = ("vehicle", "logs", "failed", "damaged", "hours", "windows", "valid", "pressure, kPa", "refused samples")
+    text = table(head, [_row(row) for row in batch.vehicles[:MAX_ROWS]])
+    if len(batch.vehicles) > MAX_ROWS:
+        text += f"and {len(batch.vehicles) - MAX_ROWS} more vehicles in {out / 'vehicles.parquet'}\n"
+    logs, failed = sum(row["logs.all"] for row in batch.vehicles), sum(row["logs.failed"] for row in batch.vehicles)
+    text += f"{logs - failed} of {logs} logs done, {batch.windows} windows"
+    text += f"; {batch.resumed} logs were done before\n" if batch.resumed else "\n"
+    for error in batch.errors[:MAX_FAULTS]:
+        kept = f" (the {error['windows']} windows before that are kept)" if error["windows"] else ""
+        text += f"  {error['fault']}{kept}\n"
+    if len(batch.errors) > MAX_FAULTS:
+        text += f"  and {len(batch.errors) - MAX_FAULTS} more in {out / 'errors.parquet'}\n"
+    if batch.duration:
+        hours = batch.duration / 3600.0
+        text += (
+            f"cost of an hour of log: {batch.cpu_seconds / hours:.0f} CPU s, {batch.log_bytes / hours / 1e6:.1f} MB\n"
+        )
+    return text + (fleet_text(batch.fleet) if batch.fleet else "")
+
+
+def fleet_text(fleet: Mapping[str, Any]) -> str:
+    """Which vehicles have which fault, since when; content of diagnosis.json in words."""
+    lines = [
+        f"{fleet['vehicles_diagnosed']} of {len(fleet['vehicles'])} vehicles diagnosed; of the names given, "
+        f"{fleet['false_discovery_rate']:.0%} are expected to be false"
+    ]
+    for vehicle in fleet["vehicles"]:
+        for effect in vehicle["effects"]:
+            if effect["named"]:
+                since, onset = "", effect["onset"]
+                if onset and onset["log"] != vehicle["logs"][0]:
+                    since = f", since {onset['log']} (probability {onset['probability']:.2f})"
+                sizes = ", ".join(f"{n} {e['value']:.4g} ± {e['std']:.2g}" for n, e in effect["parameters"].items())
+                lines.append(f"  {vehicle['vehicle']}: {effect['name']} ({sizes}){since}")
+        if vehicle["fault"]:
+            lines.append(f"  {vehicle['vehicle']}: not diagnosed: {vehicle['fault']}")
+    return "\n".join(lines) + "\n"
+
+
+def _row(row: Mapping[str, Any]) -> tuple[str, ...]:
+    pressure = row.get("bearing_pressure.mean")
+    refused = sum(value or 0 for name, value in row.items() if name.startswith("rejected."))
+    return (
+        str(row["vehicle"]), str(row["logs.all"]), str(row["logs.failed"]), str(row["logs.damaged"]),
+        f"{(row.get('duration') or 0.0) / 3600.0:.2f}", str(row.get("windows.all") or 0),
+        str(row.get("windows.valid") or 0), "-" if pressure is None else f"{pressure / 1e3:.1f}", str(refused),
+    )  # fmt: skip

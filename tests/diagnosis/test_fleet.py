@@ -1,0 +1,93 @@
+"""A fleet's diagnosis: few of the names are false, and a fault is found where it is and from its first log on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from soilbus.diagnosis.fleet import diagnose_vehicle, named, onset_probabilities
+from soilbus.diagnosis.records import Record, record_of
+from soilbus.estimation.assembly import model_of, prior_of, rig_of, with_effects
+from soilbus.offline.fleet import judged, no_findings
+from soilbus.sensors.bins import Bins
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import excited
+from soilbus.terra.effects.catalogue import CATALOGUE
+
+CONFIG = reference_configuration()
+
+
+def test_of_the_names_given_as_many_are_false_as_was_said():
+    rng = np.random.default_rng(7)
+    false, given, surest = 0, 0, 0
+    for _ in range(300):
+        chances = rng.beta(0.4, 0.4, 60)  # many sure either way, some in between
+        true = rng.random(60) < chances  # calibrated
+        chosen = np.array(named(chances.tolist(), 0.05))
+        false, given = false + int((chosen & ~true).sum()), given + int(chosen.sum())
+        surest += int((chances >= 0.95).sum())
+    assert 0.04 < false / given < 0.06
+    assert given > 1.1 * surest  # a threshold of 0.95 on each gives fewer names than the rate allows
+
+
+def test_no_name_is_given_where_none_is_sure():
+    assert named([]) == []
+    assert named([0.6, 0.9]) == [False, False]
+    assert named([0.5, 1.0, 1.0, 0.96]) == [False, True, True, True]
+
+
+def test_the_onset_is_where_the_evidence_begins():
+    chances = onset_probabilities([90.0, 130.0, 150.0, 65.0])
+    assert np.argmax(chances) == 2
+    assert sum(chances) == pytest.approx(1.0)
+    assert onset_probabilities([-30.0, -30.0, -30.0])[-1] > 0.7  # none has it
+    assert onset_probabilities([0.0, 0.0]) == pytest.approx([1 / 3, 1 / 3, 1 / 3])  # logs that show nothing
+
+
+def record(seed: int, soil: str, *effects: str) -> Record:
+    recording = simulate(with_effects(CONFIG, list(effects)), excited(soil, 40.0), seed=seed)
+    rig, settings = rig_of(CONFIG), CONFIG.estimator
+    store = Bins(rig, settings.bin, 0.0)
+    columns = {name: (c.t, c.value) for name, c in recording.channels.items() if name in rig.channels}
+    store.add(columns)
+    end = max(float(t[-1]) for t, _ in columns.values())
+    window = store.window(0.0, end)
+    return record_of(str(seed), window, rig, model_of(CONFIG), settings.min_speed, settings.max_turn)
+
+
+def test_a_load_cell_that_drifted_is_found_from_the_log_on_and_a_sound_vehicle_is_left_alone():
+    offset = "wheel_load_offset.offset=800"
+    drifted = [record(1, "loam"), record(2, "dry_sand", offset), record(3, "loam", offset)]
+    sound = [record(4, "loam"), record(5, "dry_sand")]
+    catalogue = [CATALOGUE[name] for name in ("wheel_load_offset", "draft_offset", "slip_sinkage", "rolling_radius")]
+    faulty, healthy = (diagnose_vehicle(records, prior_of(CONFIG), catalogue) for records in (drifted, sound))
+    assert not any(named(list(healthy.probabilities.values())))
+    assert max(faulty.probabilities, key=faulty.probabilities.__getitem__) == "wheel_load_offset"
+    assert named(list(faulty.probabilities.values()))[0]
+    onset = faulty.onsets["wheel_load_offset"]
+    assert onset.first == 1
+    assert onset.probabilities[1] > 0.95
+    assert onset.never < 0.01
+    for sizes, wanted in zip(onset.sizes, (0.0, 800.0, 800.0), strict=True):
+        assert sizes is not None
+        for wheel in rig_of(CONFIG).wheels:
+            estimate = sizes[f"offset_{wheel}"]
+            assert abs(estimate.value - wanted) < 4.0 * estimate.std + 60.0
+
+
+def test_the_fleet_names_what_is_sure_and_says_how_common_it_is():
+    def vehicle(name: str, **chances: float) -> dict:
+        effects = [{"name": effect, "probability": p, "parameters": {}, "onset": None} for effect, p in chances.items()]
+        return no_findings(name, "") | {"fault": None, "verdict": "named", "effects": effects}
+
+    fleet = judged([
+        vehicle("a", draft_offset=0.99, slip_sinkage=0.98), vehicle("b", slip_sinkage=0.97),
+        vehicle("c", slip_sinkage=0.5), no_findings("d", "no log of it can be diagnosed"),
+    ])  # fmt: skip
+    assert [[e["name"] for e in v["effects"] if e["named"]] for v in fleet["vehicles"]] == [
+        ["draft_offset", "slip_sinkage"], ["slip_sinkage"], [], [],
+    ]  # fmt: skip
+    shares = {effect["name"]: (effect["vehicles_named"], effect["expected_share"]) for effect in fleet["effects"]}
+    assert shares["slip_sinkage"] == (2, pytest.approx(2.45 / 3))
+    assert fleet["vehicles_diagnosed"] == 3
