@@ -30,7 +30,7 @@ __all__ = ["sent_beside", "sent_frames"]
 
 
 def sent_frames(config: Config, logs: Sequence[Path]) -> Iterator[can.Message]:
-    """What the service sends while each log is on its bus; it starts anew with each log.
+    """What the service sends while each log is on its bus; it begins again with each log.
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ WHEELS = 8
 """Wheels of which our frames can speak."""
 
 NAMES = {"go": "GO", "caution": "CAUTION", "no_go": "NO-GO", "unknown": "UNKNOWN"}
-TODO = {
+ADVICE = {
     ("go", None): "Keep going",
     ("caution", "torque"): "Less draft, motor limit",
     ("caution", "traction"): "Less draft, more load",
@@ -43,8 +43,8 @@ TODO = {
     ("no_go", None): "Stop, lift the implement",
 }
 """What to do by state and limiting cause, in at most five words."""
-WARNED_TODO = "Stop, lift, add no torque"
-GONE_TODO = "Rely on your own judgement"
+WARNED_ADVICE = "Stop, lift, add no torque"
+GONE_ADVICE = "Rely on your own judgement"
 MEASURING = "Go slowly, still measuring"
 COLOURS = {
     "go": ("#000000", "#00d700"),
@@ -69,10 +69,10 @@ REASONS = {
     "input_rejected": ("an input is refused", "Check the sensors"),
     "implausible": ("a sensor contradicts the others", "Check the sensors"),
     "foreign_sender": ("another node sends our frames", "Remove the second soilbus"),
-    "model_mismatch": ("the model does not fit", GONE_TODO),
-    "no_convergence": ("no soil fits", GONE_TODO),
-    "overload": ("soilbus is too slow", GONE_TODO),
-    "internal": ("soilbus has a defect", GONE_TODO),
+    "model_mismatch": ("the model does not fit", GONE_ADVICE),
+    "no_convergence": ("no soil fits", GONE_ADVICE),
+    "overload": ("soilbus is too slow", GONE_ADVICE),
+    "internal": ("soilbus has a defect", GONE_ADVICE),
 }
 """What the service's reason means, and what to do while the state is unknown for it."""
 CARRYING_SLIP = 0.6
@@ -213,7 +213,7 @@ class Dashboard:
             if silence is None:
                 said = f"no frame of soilbus yet, {known.now - self._began:.0f} s"
                 return Verdict("WAIT", f"UNKNOWN: {said}", "Check that soilbus runs", "gone")
-            return Verdict("GONE", f"UNKNOWN: soilbus is gone, for {silence:.0f} s", GONE_TODO, "gone")
+            return Verdict("GONE", f"UNKNOWN: soilbus is gone, for {silence:.0f} s", GONE_ADVICE, "gone")
         state = str(known.value("Traversability", "State"))
         state = state if state in NAMES else "unknown"
         if known.value("DemandForecast", "Warning") == "immobilisation":
@@ -223,12 +223,12 @@ class Dashboard:
             left = known.number("DemandForecast", "TimeLeft")
             when = "" if left is None or left >= TOP_TIME_LEFT else " now" if left < 0.5 else f" in {left:.0f} s"
             what = "stuck" if is_stuck else f"getting stuck{when}"
-            return Verdict("STUCK", f"{NAMES[state]}: {what}", WARNED_TODO, "warned")
+            return Verdict("STUCK", f"{NAMES[state]}: {what}", WARNED_ADVICE, "warned")
         if state == "unknown":
             why, todo = self._unknown()
             return Verdict("UNKNOWN", f"UNKNOWN: {why}", todo, "unknown")
         limit = known.value("Traversability", "LimitingCause")
-        todo = TODO.get((state, str(limit)), TODO[state, None])
+        todo = ADVICE.get((state, str(limit)), ADVICE[state, None])
         return Verdict(NAMES[state], ", ".join((NAMES[state], *self._because())), todo, state)
 
     def _because(self) -> Iterator[str]:
@@ -244,7 +244,7 @@ class Dashboard:
         """Why the state is unknown, and what to do."""
         known = self.known
         if known.is_stale("Traversability"):
-            return "its frames stopped", GONE_TODO
+            return "its frames stopped", GONE_ADVICE
         reason = str(known.value("SoilbusStatus", "Reason"))
         left = self.until_first_window()
         if left is not None and reason in ("none", "None", "not_excited", "model_gap"):

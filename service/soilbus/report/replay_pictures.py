@@ -41,7 +41,7 @@ BAND_SD = 2.0
 
 
 class Look(NamedTuple):
-    """Name, colour, hatch and marker of a state: to be told apart in grey, too."""
+    """Name, colour, hatch and marker of a state: which differ in grey, too."""
 
     name: str
     colour: str

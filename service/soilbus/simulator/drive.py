@@ -95,7 +95,7 @@ class Drive:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What the vehicle is told to do; where it says nothing the scenario holds.
+    """Commands to the vehicle; where there is none the scenario holds.
 
     Attributes
     ----------

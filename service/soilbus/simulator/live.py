@@ -1,4 +1,4 @@
-"""The simulated tractor on a bus, step by step: it drives as it is told, and its frames go out in real time.
+"""The simulated tractor on a bus, step by step: it drives by commands, and its frames go out in real time.
 
 commands -> one step of the drive -> readings -> frames, sent while the next step is computed
 """
