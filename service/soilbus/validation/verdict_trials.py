@@ -23,6 +23,7 @@ from scipy.special import ndtri
 from scipy.stats import binomtest
 
 from soilbus.arrays import Array
+from soilbus.can.channels import Column
 from soilbus.config.model import Config, Prior
 from soilbus.config.model import Traversability as Settings
 from soilbus.decision.capability import Demand
@@ -32,13 +33,14 @@ from soilbus.decision.traversability import State, Traversability
 from soilbus.estimation.assembly import prior_of, rig_of
 from soilbus.estimation.parametrization import MAX_PHI
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-from soilbus.estimation.window import Rig, Window
+from soilbus.estimation.window import VEHICLE_QUANTITIES, Rig, Window
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import KINDS, soil_named
+from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import Soil, WheelModel
 from soilbus.validation.draft_trials import true_largest_draft
 from soilbus.validation.monte_carlo import Each, prior_about
@@ -232,12 +234,20 @@ def _ground(config: Config, rng: np.random.Generator) -> Ground:
 
 
 def _window(recording: Recording, config: Config, rig: Rig, of_truth: bool) -> Window:
-    """The window as measured, or as it truly was at the times of the samples."""
-    truth, duration = recording.truth, config.estimator.window
+    """The window as measured, or as the vehicle's own quantities truly were at the times of the samples."""
     columns = {n: c for n in rig.channels if (c := recording.channels.get(n)) is not None}
+    if of_truth:
+        truth, mapped = dict(recording.truth), config.signals.acceleration
+        if mapped is not None and mapped.kind == "specific_force":
+            truth["acceleration"] = truth["acceleration"] + GRAVITY * np.sin(truth["pitch"])
+        columns = {
+            n: Column(c.t, np.interp(c.t, truth["t"], truth[n]))
+            for n, c in columns.items()
+            if n in VEHICLE_QUANTITIES and n in truth
+        }
     store = Bins(rig, config.estimator.bin, 0.0)
-    store.add({n: (c.t, np.interp(c.t, truth["t"], truth[n]) if of_truth else c.value) for n, c in columns.items()})
-    return store.window(0.0, duration)
+    store.add({n: (c.t, c.value) for n, c in columns.items()})
+    return store.window(0.0, config.estimator.window)
 
 
 def reliability(calls: Sequence[Call]) -> Reliability:
