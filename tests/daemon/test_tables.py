@@ -379,7 +379,13 @@ def test_nothing_is_known_less_than_beforehand_however_badly_the_model_fits(quie
     config, degraded = parse_config(raw), 0
     prior = prior_of(config)
     beforehand = Posterior(Soil(*prior.median.tolist()), np.diag(prior.log_std**2)).parameters()
-    for seed, truth in enumerate((TRUTH, Soil(5e3, 6e5, 0.5, 0.4, 4e3, 0.03), Soil(1e3, 3e6, 1.1, 0.6, 500.0, 0.01))):
+    soils = (
+        TRUTH,
+        Soil(5e3, 6e5, 0.5, 0.4, 4e3, 0.03),
+        Soil(1e3, 3e6, 1.1, 0.6, 500.0, 0.01),
+        Soil(2e3, 1.2e6, 0.8, 0.45, 1500.0, 0.02),
+    )
+    for seed, truth in enumerate(soils):
         path = write_csv(tmp_path / "t.csv", noisy(sweep(truth, LOADS, SLIPS), np.random.default_rng(seed)))
         (result,) = replay_tables(config, [path])
         window = json.loads(json_line(result, config), parse_constant=pytest.fail)

@@ -136,7 +136,7 @@ def good_tracked(config: Config = CONFIG, seed: int = 3) -> TrackerOutput:
     config = config.model_copy(update={"estimator": reference_configuration().estimator})
     found: list[TrackerOutput] = []
     pipeline = MadePipeline(config, lambda: WindowEstimator(config, partial(NotingTracker, found)))
-    messages = drive_messages(config, 12.0, seed)
+    messages = drive_messages(config, 20.0, seed)
     for message in messages:
         feed_message(pipeline.admission, message)
     results = pipeline.finish(messages[-1].timestamp)
