@@ -86,6 +86,13 @@ def test_it_pulls_more_than_at_the_constant_slip_that_it_holds_without_advice(fo
         assert mean_draft(followed, soil) > mean_draft(constant, soil) + 300.0
 
 
+@pytest.mark.parametrize("slip", [0.10, 0.20, 0.26])
+def test_over_both_soils_it_pulls_more_than_at_a_constant_slip_that_suits_neither_best(followed, slip):
+    constant = drive(CONFIG, replace(ONTO_CLAY, draft=None, slip=Swing(slip, slip)), SEED)
+    assert mean_draft(followed) > mean_draft(constant) + 100.0
+    assert mean_draft(followed, "wet_clay") > mean_draft(constant, "wet_clay") + 100.0
+
+
 def test_a_constant_draft_bogs_down_there_or_pulls_less(followed):
     mean = mean_draft(followed)
     as_much = drive(CONFIG, replace(ONTO_CLAY, draft=Swing(mean, mean)), SEED)

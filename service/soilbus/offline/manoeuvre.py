@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -60,7 +60,12 @@ def _brisk(low: float, high: float) -> Callable[[float], float]:
     return lambda t: low + (high - low) * (0.5 - 0.5 * float(np.cos(2.0 * np.pi * t / BRISK_PERIOD)))
 
 
-Pattern = tuple[str, Callable[[float], float]]
+class Pattern(NamedTuple):
+    """Words, values by time, and whether these swing within a step."""
+
+    words: str
+    at: Callable[[float], float]
+    is_brisk: bool = False
 
 
 def patterns(max_slip: float) -> dict[str, list[Pattern]]:
@@ -68,31 +73,34 @@ def patterns(max_slip: float) -> dict[str, list[Pattern]]:
     top = 0.75 * max_slip
     return {
         "slip": [
-            (f"slip in steps from 0.03 to {top:.2f}", _steps([0.03, 0.10, 0.20, top])),
-            ("slip in steps from 0.02 to 0.12", _steps([0.02, 0.05, 0.08, 0.12])),
-            ("slip up and down between 0.05 and 0.30 every two seconds", _brisk(0.05, 0.30)),
+            Pattern(f"slip in steps from 0.03 to {top:.2f}", _steps([0.03, 0.10, 0.20, top])),
+            Pattern("slip in steps from 0.02 to 0.12", _steps([0.02, 0.05, 0.08, 0.12])),
+            Pattern("slip up and down between 0.05 and 0.30 every two seconds", _brisk(0.05, 0.30), True),
         ],
         "speed": [
-            ("steady speed", _steps([1.2])),
-            ("speed in steps from 0.5 to 2 m/s", _steps([0.5, 1.0, 1.5, 2.0, 1.5, 1.0])),
-            ("speed up and down between 0.9 and 1.5 m/s every two seconds", _brisk(0.9, 1.5)),
+            Pattern("steady speed", _steps([1.2])),
+            Pattern("speed in steps from 0.5 to 2 m/s", _steps([0.5, 1.0, 1.5, 2.0, 1.5, 1.0])),
+            Pattern("speed up and down between 0.9 and 1.5 m/s every two seconds", _brisk(0.9, 1.5), True),
         ],
         "side_load": [
-            ("on the level", _steps([0.0])),
-            ("along a side slope, one way and back", _steps([0.3, 0.3, -0.3, -0.3])),
+            Pattern("on the level", _steps([0.0])),
+            Pattern("along a side slope, one way and back", _steps([0.3, 0.3, -0.3, -0.3])),
         ],
-        "slope": [("", _steps([0.0])), ("uphill and downhill by 5 per cent", _steps([0.05, 0.05, -0.05, -0.05]))],
+        "slope": [
+            Pattern("", _steps([0.0])),
+            Pattern("uphill and downhill by 5 per cent", _steps([0.05, 0.05, -0.05, -0.05])),
+        ],
     }
 
 
 def _manoeuvre(chosen: Mapping[str, Pattern]) -> Manoeuvre:
     """The table of these patterns: knots at steps and ramps, and eight a period where one is brisk."""
     knots = {0.0, STEPS * STEP, *(i * STEP for i in range(STEPS)), *((i + 1) * STEP - RAMP for i in range(STEPS))}
-    if any("every two seconds" in words for words, _ in chosen.values()):
+    if any(pattern.is_brisk for pattern in chosen.values()):
         knots |= set(np.arange(0.0, STEPS * STEP, BRISK_PERIOD / 8.0).tolist())
     t = tuple(sorted(knots))
-    columns = {name: tuple(round(of_time(at), 4) for at in t) for name, (_, of_time) in chosen.items()}
-    return Manoeuvre(t, **columns, words=", ".join(words for words, _ in chosen.values() if words))
+    columns = {name: tuple(round(pattern.at(time), 4) for time in t) for name, pattern in chosen.items()}
+    return Manoeuvre(t, **columns, words=", ".join(pattern.words for pattern in chosen.values() if pattern.words))
 
 
 @dataclass(frozen=True, slots=True)

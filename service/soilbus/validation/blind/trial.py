@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from soilbus.diagnosis.diagnose import NotFitted, diagnose
-from soilbus.diagnosis.records import Record, record_of
-from soilbus.estimation.assembly import model_of, possible_effects, prior_of, rig_of
+from soilbus.diagnosis.records import Record
+from soilbus.estimation.assembly import possible_effects, prior_of
 from soilbus.estimation.posterior import Estimate, Posterior
-from soilbus.sensors.bins import Bins
+from soilbus.offline.manoeuvre import record_of_recording
 from soilbus.terra.effects.effect import Effect
 from soilbus.validation.blind.cases import Case
 from soilbus.validation.blind.visible import Shown, shown
@@ -66,13 +66,7 @@ class Trial:
 
 def record_of_case(case: Case) -> Record:
     """What the diagnosis is given."""
-    config, recording = case.config, case.recording
-    rig, settings = rig_of(config), case.config.estimator
-    store = Bins(rig, settings.bin, 0.0)
-    columns = {n: (c.t, c.value) for n, c in recording.channels.items() if n in rig.channels}
-    store.add(columns)
-    end = max(float(t[-1]) for t, _ in columns.values())
-    return record_of(case.id, store.window(0.0, end), rig, model_of(config), settings.min_speed, settings.max_turn)
+    return record_of_recording(case.id, case.recording, case.config)
 
 
 def tried(case: Case, candidates: Sequence[Effect] | None = None, truth: Shown | None = None) -> Trial:
