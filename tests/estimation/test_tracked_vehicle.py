@@ -275,7 +275,7 @@ def test_a_crawler_at_constant_load_has_a_valid_estimate():
 @pytest.mark.parametrize("name", ["loam", "dry_sand"])
 @pytest.mark.parametrize("cells", [(), WITH_CELLS], ids=["weight alone", "load cells"])
 def test_a_draft_that_hardly_moves_is_enough_for_strength_and_thrust(cells, name):
-    """The draft moves by 3 %: c and tan phi cannot be separated, c + p tan phi at the pressure of the tracks is determined."""
+    """The draft moves by 3 %: c + p tan phi at the tracks' pressure is determined, its two parts are not."""
     soil, pressure = SOILS[name], WEIGHT / (2.0 * B * L)
     ground = replace(pulling(name, 20.0), draft=Swing(0.97 * 18e3, 1.03 * 18e3))
     results = results_of(crawler(*cells), ground)
