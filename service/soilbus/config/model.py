@@ -675,9 +675,11 @@ class Estimator(_Section):
     b_ref: PositiveFloat = 0.3
     """Plate width of the reported bearing pressure [m]."""
     max_bearing_std: PositiveFloat = 0.10
-    """Relative std of the bearing pressure up to which a window counts as excited."""
+    """Relative std of the bearing pressure up to which a window counts as excited; at z_ref, or at the nearest depth
+    that carries load."""
     max_tan_phi_std: PositiveFloat = 0.15
-    """Relative std of tan phi up to which a window counts as excited."""
+    """Relative std of tan phi, or of the strength c + p tan phi at the pressure p of the contact, up to which a window
+    counts as excited."""
     max_chi2: PositiveFloat = 1.1
     """Reduced chi-square, beyond its own scatter, above which the model does not describe the data."""
     search_rate: NonNegativeFloat = 4.0
