@@ -26,6 +26,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.decision.traction_loss import TractionLoss
@@ -401,8 +402,8 @@ class Warnings(NamedTuple):
         return self if self.since is not None else Warnings(t, (*self.begun, t))
 
 
-def moments(window: Window, rig: Rig, since: float, min_speed: float) -> Iterator[Moment]:
-    """Means of slip and pull over BINS_OF_A_MOMENT bins, one for each bin after `since`.
+def moments(window: Window, rig: Rig, chosen: NDArray[np.intp], min_speed: float) -> Iterator[Moment]:
+    """Means of slip and pull over BINS_OF_A_MOMENT bins, one at each of some bins.
 
     Parameters
     ----------
@@ -410,8 +411,8 @@ def moments(window: Window, rig: Rig, since: float, min_speed: float) -> Iterato
         A forward window.
     rig
         With a chassis, else there are no moments.
-    since
-        [s], the end of the last moment already used.
+    chosen
+        (M,), the bins at which each mean ends.
     min_speed
         [m/s], ground speed up to which slip is nan.
     """
@@ -420,7 +421,6 @@ def moments(window: Window, rig: Rig, since: float, min_speed: float) -> Iterato
     ground = window.ground_speed[:, None]
     slip = np.where(ground > min_speed, slip_ratio(rig.radius, window.speed, ground), np.nan)
     of_bins = np.column_stack([slip, pull_given(window, rig.chassis), inertia_of(window, rig.chassis)])
-    chosen = np.flatnonzero(window.t > since)
     place = chosen[:, None] + np.arange(1 - BINS_OF_A_MOMENT, 1)
     there = place >= 0
     total = np.where(there[:, :, None], of_bins[np.maximum(place, 0)], 0.0).sum(axis=1)
