@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -76,8 +75,7 @@ class Motion(NamedTuple):
     reserve: Sequence[bool] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class TractionLoss:
+class TractionLoss(NamedTuple):
     """State carried from one moment to the next by `observed`.  All times in s.
 
     Attributes
@@ -108,7 +106,7 @@ class TractionLoss:
     last: float = -math.inf
     slip: float = math.nan
     pull: float = math.nan
-    ahead: StallForecast = StallForecast()  # noqa: RUF009, immutable
+    ahead: StallForecast = StallForecast()
 
     @property
     def warns(self) -> bool:
@@ -140,14 +138,13 @@ def observed(before: TractionLoss, motion: Motion, config: Config) -> TractionLo
     settings, min_speed, ahead = config.traversability, config.estimator.min_speed, before.ahead
     if motion.last is not None:
         ahead = forecast(ahead, motion.last, min_speed, config.warning, settings)
-    before = replace(before, ahead=ahead)
     if not 0.0 <= motion.t - before.t <= LONGEST_GAP:
-        fresh = before if motion.t > before.t else TractionLoss(ahead=ahead)
-        before = replace(fresh, spins=math.inf, sticks=math.inf, moves=math.inf)
+        fresh = before if motion.t > before.t else TractionLoss()
+        before = fresh._replace(spins=math.inf, sticks=math.inf, moves=math.inf)
     beside = motion.beside or [0.0] * len(motion.rim)
     known = [rim for rim in motion.rim if math.isfinite(rim)]
     if not known or not math.isfinite(motion.ground):
-        return replace(before, t=motion.t, slip=math.nan, pull=math.nan)
+        return before._replace(t=motion.t, slip=math.nan, pull=math.nan, ahead=ahead)
     spin_now = [
         rim - (motion.ground + more) > max(min_speed, settings.max_slip * rim)
         for rim, more in zip(motion.rim, beside, strict=True)  # nor nan
