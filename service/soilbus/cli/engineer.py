@@ -81,9 +81,7 @@ def _what_to_drive(args: argparse.Namespace, config: Config, results: Sequence[W
     """
     import json
 
-    from soilbus.offline.manoeuvre import what_excites
     from soilbus.report.advice import of_use
-    from soilbus.report.next_drive import excitation_lines
 
     useful = of_use(results)
     weak = sum(result.reason.startswith(("not_excited", "ambiguous")) for result in useful)
@@ -91,6 +89,9 @@ def _what_to_drive(args: argparse.Namespace, config: Config, results: Sequence[W
         return ""
     now = useful[-1].posterior
     assert now is not None  # of_use sees to it
+    from soilbus.offline.manoeuvre import what_excites  # the diagnosis and scipy, which few replays need
+    from soilbus.report.next_drive import excitation_lines
+
     found = what_excites(config, now.soil)
     if found is None:
         return ""
