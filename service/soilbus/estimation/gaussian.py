@@ -278,6 +278,7 @@ class PriorFactor:
         self.least_value = 0.0
         self._offset = np.zeros(_SOIL) if gaussian_prior.offset is None else gaussian_prior.offset
         self._is_likelihood_factor = gaussian_prior.offset is not None
+        self._last_deviations: tuple[Array, tuple[Array, Array]] | None = None
         if self._is_likelihood_factor:
             self._linear = LINEAR[np.isin(LINEAR, self._free)]
             self._place = np.searchsorted(self._free, self._linear)
@@ -312,7 +313,7 @@ class PriorFactor:
         off = np.concatenate([np.log(soil[self._free]), gains[self._active]]) - self._mean
         if not self._is_likelihood_factor:
             return np.asarray(off)
-        changes, _ = deviations(soil, self._gaussian_prior.soil, self._width)
+        changes, _ = self._deviations(soil)
         off[: len(self._free)] = (changes - self._offset)[self._free]
         return np.append(off, np.log(soil[self._linear] / self._prior.median[self._linear]))
 
@@ -333,8 +334,15 @@ class PriorFactor:
         free, changes = len(self._free), by_logs[: len(self._free)].copy()
         for parameter, row in (by_values or {}).items():
             changes[np.searchsorted(self._free, parameter)] = row
-        slopes = deviations(soil, self._gaussian_prior.soil, self._width)[1][np.ix_(self._free, self._free)]
+        slopes = self._deviations(soil)[1][self._free[:, None], self._free]
         return np.vstack([slopes @ changes, by_logs[free:], by_logs[self._place]])
+
+    def _deviations(self, soil: Array) -> tuple[Array, Array]:
+        """`deviations` from the mean to a soil (6,), kept for the next call with the same one."""
+        last = self._last_deviations
+        if last is None or last[0] is not soil:
+            last = self._last_deviations = soil, deviations(soil, self._gaussian_prior.soil, self._width)
+        return last[1]
 
     def jacobian_by_mean(self, soil: Array, gains: Array, shift: Array) -> tuple[Array, Array, Array]:
         """Derivatives (R, M) of the residuals by M shifts (6 + G, M) of the mean, with precision and residuals."""
