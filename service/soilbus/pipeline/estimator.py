@@ -298,10 +298,10 @@ class WindowEstimator:
     def _sinkage_range(self, fit: Fit) -> tuple[float, float] | None:
         """The 5 % and 95 % quantiles of the sinkage [m] over wheels and instants."""
         depth = sinkage(fit.optimum.latents.entry_angle, self.rig.radius)
-        known = depth[np.isfinite(depth)]
+        known = np.sort(depth[np.isfinite(depth)])
         if not len(known):
             return None
-        low, high = np.percentile(known, (5.0, 95.0)).tolist()
+        low, high = np.interp((0.05, 0.95), np.linspace(0.0, 1.0, len(known)), known).tolist()
         return low, high
 
     def _soil_class(self, posterior: Posterior | None) -> dict[str, float] | None:

@@ -59,16 +59,19 @@ class GapWatch:
     def __init__(self, window: float, hop: float) -> None:
         self._overlap = window / hop
         self._seen: deque[tuple[float, Mapping[str, Square]]] = deque()
+        self._kept: dict[str, Square] = {}
 
     def forget(self) -> None:
         """Begin afresh."""
         self._seen.clear()
+        self._kept = {}
 
     def take(self, end: float, found: Mapping[str, Square]) -> None:
         """Add one window that ended at `end` [s]."""
         self._seen.append((end, found))
         while self._seen[0][0] < end - SPAN:
             self._seen.popleft()
+        self._kept = self._sums()
 
     def gaps(self) -> dict[str, float]:
         """Reduced chi-square of the channels that have not fitted for minutes, the worst first."""
@@ -76,14 +79,14 @@ class GapWatch:
             return {}
         out = {
             channel: known.total / known.rows
-            for channel, known in self._sums().items()
+            for channel, known in self._kept.items()
             if known.total / known.rows > max(LIMIT, 1.0 + DEVIATIONS * math.sqrt(2.0 * self._overlap / known.rows))
         }
         return dict(sorted(out.items(), key=lambda item: -item[1]))
 
     def chi2(self) -> dict[str, float]:
         """Reduced chi-square of every channel, whether it fits or not."""
-        return {channel: known.total / known.rows for channel, known in self._sums().items()}
+        return {channel: known.total / known.rows for channel, known in self._kept.items()}
 
     def _sums(self) -> dict[str, Square]:
         """Of each channel over the windows kept."""
