@@ -2,8 +2,8 @@
 
 real-time factor = length of the recording / time of its replay
 
-The time is what passes with reading and estimating in two processes, and for one core the processor time of one process,
-as each worker of `soilbus batch` is one; neither has the start in it.
+The time is what passes with reading and estimating in two processes; for one core it is the processor time of one
+process, as each worker of `soilbus batch` is one.  Neither has the start in it.
 """
 
 from __future__ import annotations
