@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from soilbus.allocator import loading
 from soilbus.cli.common import (
     WorkError,
     check_folders,
@@ -30,12 +31,13 @@ if TYPE_CHECKING:
 
 def replay(args: argparse.Namespace) -> None:
     """`soilbus replay`: the daemon's pipeline over recorded logs, or over tables of a test rig."""
-    from soilbus.can.dbc_files import load_databases
-    from soilbus.config.model import ConfigError
-    from soilbus.offline.replay import LogError, estimator_beside, other_channel, replay
-    from soilbus.pipeline.pipeline import Pipeline
-    from soilbus.report.progress import progress
-    from soilbus.report.windows import summary
+    with loading():
+        from soilbus.can.dbc_files import load_databases
+        from soilbus.config.model import ConfigError
+        from soilbus.offline.replay import LogError, estimator_beside, other_channel, replay
+        from soilbus.pipeline.pipeline import Pipeline
+        from soilbus.report.progress import progress
+        from soilbus.report.windows import summary
 
     config = configured(args)
     _check_outputs(args, config)

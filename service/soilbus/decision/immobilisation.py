@@ -434,7 +434,7 @@ def _restarted(before: Watch, t: float) -> Watch:
 
 def _look_from(recent: Sequence[Look], t: float) -> Look | None:
     """The first look from the time t [s] on; None where it came SCATTER_LAG later or more."""
-    place = bisect_left(recent, t, key=lambda look: look.t)
+    place = bisect_left(recent, (t,))  # a look begins with its time
     return recent[place] if place < len(recent) and recent[place].t - t < SCATTER_LAG else None
 
 

@@ -145,8 +145,9 @@ def observed(before: TractionLoss, motion: Motion, config: Config) -> TractionLo
     known = [rim for rim in motion.rim if math.isfinite(rim)]
     if not known or not math.isfinite(motion.ground):
         return before._replace(t=motion.t, slip=math.nan, pull=math.nan, ahead=ahead)
+    ground, max_slip = motion.ground, settings.max_slip
     spin_now = [
-        rim - (motion.ground + more) > max(min_speed, settings.max_slip * rim)
+        rim - (ground + more) > max(min_speed, max_slip * rim)
         for rim, more in zip(motion.rim, beside, strict=True)  # nor nan
     ]
     spinning, stands = sum(spin_now), motion.ground < min_speed
