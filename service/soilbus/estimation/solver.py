@@ -43,6 +43,10 @@ No evidence recorded.
 """
 MAX_ANGLE_CHANGE_WITH_EFFECTS = 0.1
 """The same [1] where effects have a part in the load: they may be curved where the soil alone is not."""
+SLOW_RATIO = 0.5
+"""Length of a step over that of the last, along it [1], above which steps are extrapolated.  No evidence recorded."""
+MAX_EXTRAPOLATION = 8.0
+"""Largest multiple of a full step [1] by extrapolation.  No evidence recorded."""
 
 _SOIL = len(PARAMETERS)
 
@@ -493,20 +497,24 @@ def minimise(
     if here is None or lowest is None:
         return Solution(start, start, None, math.nan, 1, Termination.NOT_FINITE)
     evaluations, n_rejected, damping, fraction = 1, 0, options.damping, 1.0
-    decrease = math.inf
+    decrease, last_step, last_fraction = math.inf, None, 1.0
     while (ended := _termination(options, here, last_decrease, decrease, evaluations, n_rejected)) is None:
+        if last_step is not None and fraction == 1.0:
+            fraction = _extrapolation(here, last_step, last_fraction)
         step = here.model.step(damping) if damping else fraction * here.step
         there = None if step is None else _expanded(objective, objective.stepped(here.iterate, here.model, step))
         evaluations += 1
         if there is None or not there.value <= here.value + options.max_rise * (here.value + 1.0):
             n_rejected, last_decrease = n_rejected + 1, 0.0
-            damping, fraction = damping * options.damping_factor, fraction * options.shortening
+            damping, fraction = damping * options.damping_factor, min(fraction, 1.0) * options.shortening
+            last_step = None
             if n_rejected == 2:
                 here = _expanded(objective, objective.with_entry_angles(here.iterate)) or here
                 evaluations += 1
             continue
         last_decrease = here.decrease if fraction == 1.0 and not damping else 0.0
         decrease = (here.value - there.value) / here.value
+        last_step, last_fraction = None if damping else here.step, fraction
         here, n_rejected = there, 0
         damping, fraction = damping / options.damping_factor, min(2.0 * fraction, 1.0)
         if here.value < lowest.value:
@@ -515,6 +523,16 @@ def minimise(
         here = lowest
     end = objective.stepped(here.iterate, here.model, here.step)
     return Solution(end, here.iterate, here.model, here.decrease, evaluations, ended)
+
+
+def _extrapolation(here: _Expansion, last_step: Array, last_fraction: float) -> float:
+    """Multiple of a full step to take, from the last one (F + A,) and the fraction of it that was taken.
+
+    Aitken's extrapolation: above 1 where steps shrink slowly, below 1 where they turn back, else 1.
+    """
+    along = float(last_step @ here.model.information @ here.step) / here.model.squared_length(last_step)
+    ratio = 1.0 - (1.0 - along) / last_fraction
+    return min(1.0 / max(1.0 - ratio, 1.0 / MAX_EXTRAPOLATION), MAX_EXTRAPOLATION) if abs(ratio) > SLOW_RATIO else 1.0
 
 
 def _expanded(objective: Objective, iterate: Iterate) -> _Expansion | None:
