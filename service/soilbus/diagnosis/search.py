@@ -68,9 +68,7 @@ FULL_FIT_SHARE = 0.2
 """Share of the required fall, and of the best predicted fall, from which a candidate gets a full fit where the
 predicted falls are small: below it the score is as good."""
 
-FULL_OPTIONS = replace(COMPARED, max_evaluations=24)
-"""Descent of a full fit that is compared with others."""
-TRIAL_OPTIONS = replace(FULL_OPTIONS, step_tolerance=0.1)
+TRIAL_OPTIONS = replace(COMPARED, step_tolerance=0.1)
 """Descent of trial fits: looser, as they only choose the candidates for full fits."""
 GIVE_UP_SHARE = 0.3
 """Share of the required fall that the training blocks must show, for a full fit after one that fell short of it."""
@@ -274,7 +272,7 @@ def full_fits(
         if at_hand is not None and present.names | {effect.name} == set(at_hand.names):
             fit: FittedModel | None = at_hand
         else:
-            options = replace(FULL_OPTIONS, give_up_above=min(dominated, insufficient))
+            options = replace(COMPARED, give_up_above=min(dominated, insufficient))
             fit = full.fit((*present.effects, effect), [starts], options)
         if fit is None:
             bounds[effect.name] = max(present.neg2_log_posterior - min(dominated, insufficient), 0.0)
@@ -388,7 +386,7 @@ def _without_addition(
     without = _fit_without(thinned, present, effect, TRIAL_OPTIONS)
     fall = 0.0 if with_it is None or without is None else predicted_fall(without, with_it, rows)
     if with_it is None or without is None or fall < CLEAR_FALL:
-        fitted = _fit_without(full, present, effect, FULL_OPTIONS)
+        fitted = _fit_without(full, present, effect, COMPARED)
         return None if fitted is None else PresentModel.of(fitted, full, thinned)
     explained = base.neg2_log_evidence - present.neg2_log_evidence
     if _has_competitor(thinned, without, addition, candidates, with_it, explained, rows):

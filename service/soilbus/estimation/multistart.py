@@ -453,7 +453,9 @@ def _best(objective: Objective, ends: Sequence[_End]) -> tuple[Fit | None, _End 
     for end in distinct[:MAX_JOINT_DESCENTS]:
         is_plausible = end.value < IMPLAUSIBLE * THINNED
         options = COLD if is_plausible else replace(COLD, max_evaluations=MAX_IMPLAUSIBLE_EVALUATIONS)
-        fit = fit_at(objective, minimise(objective, objective.start(end.soil, gains=end.gains), options), end.evaluations)
+        fit = fit_at(
+            objective, minimise(objective, objective.start(end.soil, gains=end.gains), options), end.evaluations
+        )
         if fit is not None and (
             best is None or (fit.converged, -fit.neg2_log_posterior) > (best.converged, -best.neg2_log_posterior)
         ):

@@ -405,7 +405,8 @@ class SolverOptions:
         Squared length of the next step in posterior sd, predicted from the ratio of the last two, from which a
         descent has converged.  With 1e-5, 1 of 100 descents stopped in a curved valley, 0.2 of -2 log too high.
     decrease_tolerance
-        Relative decrease of the objective [1] by a step, from which a descent has converged; 0: none.
+        Decrease of the objective by a step, relative to the objective and one [1], from which a descent has converged;
+        0: none.
     damping
         Of the first step, as a share of the diagonal [1].  With 0 steps are not damped but shortened.
     damping_factor
@@ -414,7 +415,8 @@ class SolverOptions:
         Factor [1] on the fraction of the step after a rejected step, without damping; 0.3 to 0.5 do the same.
     max_rise
         Rise of the objective that an accepted step may bring, relative to the objective and one [1].  Without
-        damping steps that overshoot in a curved valley return by themselves: 0.2 to 1 do the same.
+        damping steps that overshoot in a curved valley return by themselves: 0.2 to 1 do the same.  It is multiplied by
+        `shortening` after each rise, so that a descent does not overshoot for ever.
     max_rejected
         Rejected steps in a row.
     give_up_above
@@ -460,7 +462,7 @@ class Solution(NamedTuple):
 
 
 class _Expansion(NamedTuple):
-    """An iterate, the quadratic model there, its full step and the predicted decrease."""
+    """An iterate, the quadratic model there, its step with the present damping and the predicted decrease."""
 
     iterate: Iterate
     model: QuadraticModel
@@ -493,28 +495,34 @@ def minimise(
     -------
     Solution
     """
-    here = lowest = _expanded(objective, start)
+    here = lowest = _expanded(objective, start, options.damping)
     if here is None or lowest is None:
         return Solution(start, start, None, math.nan, 1, Termination.NOT_FINITE)
     evaluations, n_rejected, damping, fraction = 1, 0, options.damping, 1.0
-    decrease, last_step, last_fraction = math.inf, None, 1.0
+    max_rise, decrease, last_step, last_fraction = options.max_rise, math.inf, None, 1.0
     while (ended := _termination(options, here, last_decrease, decrease, evaluations, n_rejected)) is None:
         if last_step is not None and fraction == 1.0:
             fraction = _extrapolation(here, last_step, last_fraction)
-        step = here.model.step(damping) if damping else fraction * here.step
-        there = None if step is None else _expanded(objective, objective.stepped(here.iterate, here.model, step))
+        new = objective.stepped(here.iterate, here.model, fraction * here.step)
+        there = _expanded(objective, new, damping / options.damping_factor)
         evaluations += 1
-        if there is None or not there.value <= here.value + options.max_rise * (here.value + 1.0):
+        if there is None or not there.value <= here.value + max_rise * (here.value + 1.0):
             n_rejected, last_decrease = n_rejected + 1, 0.0
-            damping, fraction = damping * options.damping_factor, min(fraction, 1.0) * options.shortening
-            last_step = None
-            if n_rejected == 2:
-                here = _expanded(objective, objective.with_entry_angles(here.iterate)) or here
+            if damping:
+                damping *= options.damping_factor
+                here = _with_step(here.iterate, here.model, damping) or here
+            else:
+                fraction = min(fraction, 1.0) * options.shortening
+            if n_rejected == 2:  # they were predicted
+                here = _expanded(objective, objective.with_entry_angles(here.iterate), damping) or here
                 evaluations += 1
+            last_step = None
             continue
         last_decrease = here.decrease if fraction == 1.0 and not damping else 0.0
-        decrease = (here.value - there.value) / here.value
+        decrease = (here.value - there.value) / (here.value + 1.0)
         last_step, last_fraction = None if damping else here.step, fraction
+        if decrease < 0.0:
+            max_rise *= options.shortening
         here, n_rejected = there, 0
         damping, fraction = damping / options.damping_factor, min(2.0 * fraction, 1.0)
         if here.value < lowest.value:
@@ -535,11 +543,15 @@ def _extrapolation(here: _Expansion, last_step: Array, last_fraction: float) -> 
     return min(1.0 / max(1.0 - ratio, 1.0 / MAX_EXTRAPOLATION), MAX_EXTRAPOLATION) if abs(ratio) > SLOW_RATIO else 1.0
 
 
-def _expanded(objective: Objective, iterate: Iterate) -> _Expansion | None:
+def _expanded(objective: Objective, iterate: Iterate, damping: float) -> _Expansion | None:
     """The quadratic model at an iterate with its step; None where these are not finite."""
     model = objective.quadratic_model(iterate)
-    step = None if model is None else model.step()
-    return None if model is None or step is None else _Expansion(iterate, model, step, model.squared_length(step))
+    return None if model is None else _with_step(iterate, model, damping)
+
+
+def _with_step(iterate: Iterate, model: QuadraticModel, damping: float) -> _Expansion | None:
+    step = model.step(damping)
+    return None if step is None else _Expansion(iterate, model, step, model.squared_length(step))
 
 
 def _termination(
