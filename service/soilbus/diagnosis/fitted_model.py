@@ -420,10 +420,9 @@ def _held_at_edges(
     leaves = [f.std > 0.0 and edge != 0.0 for f, edge in zip(free, edges, strict=True)]
     if not any(leaves) or not all(fit.converged for fit in fits):
         return None
-    standardised = gains[problem.n_sensors :].tolist()
     return tuple(
-        replace(f, value=f.at(u), std=0.0) if leaving else f
-        for f, u, leaving in zip(free, standardised, leaves, strict=True)
+        replace(f, value=f.parameter.high if edge > 0.0 else f.parameter.low, std=0.0) if leaving else f
+        for f, edge, leaving in zip(free, edges, leaves, strict=True)
     )
 
 
