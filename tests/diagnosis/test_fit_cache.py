@@ -8,7 +8,7 @@ import pytest
 
 from soilbus.diagnosis import search as search_module
 from soilbus.diagnosis.search import FitCache, PresentModel, Shortlist, full_fits
-from soilbus.estimation.multistart import DescentOptions
+from soilbus.estimation.solver import SolverOptions
 from soilbus.terra.effects.catalogue import CATALOGUE
 
 PAN, LUGS = CATALOGUE["hardpan"], CATALOGUE["lugs"]
@@ -59,7 +59,7 @@ def test_more_effects_cost_no_more_than_fewer(asked):
     fits.fit([LUGS])
     assert fits.fit([PAN, LUGS], ["far off"]).neg2_log_posterior == 49.0
     costs[("hardpan", "lugs"), "given up"] = None
-    assert FitCache([], None).fit([PAN, LUGS], ["given up"], DescentOptions(give_up_above=60.0)) is None
+    assert FitCache([], None).fit([PAN, LUGS], ["given up"], SolverOptions(give_up_above=60.0)) is None
     assert calls[-1] == (("hardpan", "lugs"), "given up")
 
 

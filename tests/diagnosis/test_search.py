@@ -15,9 +15,9 @@ from soilbus.diagnosis.score import further_scores, normal_equations, scores
 from soilbus.diagnosis.search import FitCache
 from soilbus.estimation import multistart
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
-from soilbus.estimation.multistart import DescentOptions, fit_window
+from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.nuisance_parameters import parameters_of
-from soilbus.estimation.solver import descend_jointly
+from soilbus.estimation.solver import SolverOptions, minimise
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -123,7 +123,7 @@ def test_a_model_is_fitted_once_from_one_start(record, base, monkeypatch):
         return fit_model(*args)
 
     monkeypatch.setattr(search_module, "fit_model", counted)
-    fits, give_up_above = FitCache([record], PRIOR), DescentOptions(give_up_above=0.3 * base.neg2_log_posterior)
+    fits, give_up_above = FitCache([record], PRIOR), SolverOptions(give_up_above=0.3 * base.neg2_log_posterior)
     (score,) = scores([record], PRIOR, base, [SLIP_SINKAGE])
     assert (
         fits.fit([SLIP_SINKAGE], [score.starts], give_up_above)
@@ -146,9 +146,9 @@ def test_no_descent_of_a_window_begins_where_another_did(monkeypatch):
 
     def counted(fitting, near, *args, **kwargs):
         began.append((fitting.problem.n, near.soil.tobytes()))
-        return descend_jointly(fitting, near, *args, **kwargs)
+        return minimise(fitting, near, *args, **kwargs)
 
-    monkeypatch.setattr(multistart, "descend_jointly", counted)
+    monkeypatch.setattr(multistart, "minimise", counted)
     assert fit_window(problem, prior) is not None
     assert len(began) == len(set(began))
 
@@ -158,11 +158,11 @@ def test_a_fit_that_will_stay_above_the_limit_is_given_up(record, base):
     found = fit_model([record], PRIOR, [SLIP_SINKAGE], score.starts)
     assert (
         fit_model(
-            [record], PRIOR, [SLIP_SINKAGE], score.starts, DescentOptions(give_up_above=found.neg2_log_posterior - 5.0)
+            [record], PRIOR, [SLIP_SINKAGE], score.starts, SolverOptions(give_up_above=found.neg2_log_posterior - 5.0)
         )
         is None
     )
     kept = fit_model(
-        [record], PRIOR, [SLIP_SINKAGE], score.starts, DescentOptions(give_up_above=found.neg2_log_posterior + 5.0)
+        [record], PRIOR, [SLIP_SINKAGE], score.starts, SolverOptions(give_up_above=found.neg2_log_posterior + 5.0)
     )
     assert kept.neg2_log_posterior == pytest.approx(found.neg2_log_posterior, abs=0.1)

@@ -252,7 +252,7 @@ class _RecordProfile:
             self.gains[column] = f.standardised(fitted.free[k].at(float(self.gains[column])))
         optimum = self.fit.optimum
         objective = Objective(self.problem, prior, joint_prior)
-        iterate = Iterate(optimum.soil, self.gains, optimum.latents, np.inf, 0)
+        iterate = Iterate(optimum.soil, self.gains, optimum.latents)
         quadratic = objective.quadratic_model(iterate)
         if quadratic is None:
             raise np.linalg.LinAlgError("the model is not finite where it was fitted")

@@ -37,8 +37,9 @@ from soilbus.diagnosis.verdict import (
     soil_error_share,
     temperatures,
 )
-from soilbus.estimation.multistart import DEFAULT_OPTIONS, DescentOptions, Start
+from soilbus.estimation.multistart import COMPARED, Start
 from soilbus.estimation.posterior import SoilPrior
+from soilbus.estimation.solver import SolverOptions
 from soilbus.terra.effects.effect import Effect
 
 # A value whose docstring states no source has no evidence recorded.
@@ -67,10 +68,8 @@ FULL_FIT_SHARE = 0.2
 """Share of the required fall, and of the best predicted fall, from which a candidate gets a full fit where the
 predicted falls are small: below it the score is as good."""
 
-MAX_STEPS = 12
-"""Descent steps of the soil, and then of all parameters, of a full fit that is compared with others."""
-TRIAL_OPTIONS = DescentOptions(MAX_STEPS, step_tolerance=0.1, relative_tolerance=5e-3)
-"""Stopping rule of trial fits: looser, as they only choose the candidates for full fits."""
+TRIAL_OPTIONS = replace(COMPARED, step_tolerance=0.1)
+"""Descent of trial fits: looser, as they only choose the candidates for full fits."""
 GIVE_UP_SHARE = 0.3
 """Share of the required fall that the training blocks must show, for a full fit after one that fell short of it."""
 NEGLIGIBLE_FALL = 1.0
@@ -273,7 +272,7 @@ def full_fits(
         if at_hand is not None and present.names | {effect.name} == set(at_hand.names):
             fit: FittedModel | None = at_hand
         else:
-            options = DescentOptions(MAX_STEPS, min(dominated, insufficient))
+            options = replace(COMPARED, give_up_above=min(dominated, insufficient))
             fit = full.fit((*present.effects, effect), [starts], options)
         if fit is None:
             bounds[effect.name] = max(present.neg2_log_posterior - min(dominated, insufficient), 0.0)
@@ -303,7 +302,7 @@ def _comparable(
 
 
 def fitted_to_convergence(full: FitCache, neg2_log_evidence: float, fitted: FittedModel) -> FittedModel:
-    """A model fitted further if its fit stopped at MAX_STEPS; the same where that does not improve it.
+    """A model fitted further if its fit stopped at its evaluations; the same where that does not improve it.
 
     Nor is a model fitted further whose evidence is worse than the given one, or whose gap exceeds MAX_REFINED_GAP.
     """
@@ -387,7 +386,7 @@ def _without_addition(
     without = _fit_without(thinned, present, effect, TRIAL_OPTIONS)
     fall = 0.0 if with_it is None or without is None else predicted_fall(without, with_it, rows)
     if with_it is None or without is None or fall < CLEAR_FALL:
-        fitted = _fit_without(full, present, effect, DescentOptions(MAX_STEPS))
+        fitted = _fit_without(full, present, effect, COMPARED)
         return None if fitted is None else PresentModel.of(fitted, full, thinned)
     explained = base.neg2_log_evidence - present.neg2_log_evidence
     if _has_competitor(thinned, without, addition, candidates, with_it, explained, rows):
@@ -419,7 +418,7 @@ def _has_competitor(
     return False
 
 
-def _fit_without(cache: FitCache, present: FittedModel, effect: Effect, options: DescentOptions) -> FittedModel | None:
+def _fit_without(cache: FitCache, present: FittedModel, effect: Effect, options: SolverOptions) -> FittedModel | None:
     """The present model less one effect, fitted from its optimum but for the latents, which followed that effect."""
     kept = [e for e in present.effects if e.name != effect.name]
     starts = [start._replace(near_optimum=False) for start in present.as_starts(kept)]
@@ -527,7 +526,7 @@ def trial_fit(
     """The best fit of one candidate to the thinned instants, from the starts of its scores (see FitCache.fit)."""
     starts = [s.starts for s in found]
     predicted = [present.neg2_log_evidence + s.neg2_log_evidence for s in found]
-    options = TRIAL_OPTIONS._replace(give_up_above=give_up_above)
+    options = replace(TRIAL_OPTIONS, give_up_above=give_up_above)
     return thinned.fit((*present.effects, found[0].effect), starts, options, predicted)
 
 
@@ -559,7 +558,7 @@ class FitCache:
         self,
         effects: Sequence[Effect],
         starts: Sequence[Sequence[Start]] = (),
-        options: DescentOptions = DEFAULT_OPTIONS,
+        options: SolverOptions = COMPARED,
         predicted: Sequence[float] = (),
     ) -> FittedModel | None:
         """The best fit with these effects.
@@ -610,7 +609,7 @@ class FitCache:
         return self._scored[key][1]
 
     def _from(
-        self, start: Sequence[Start] | None, effects: Sequence[Effect], options: DescentOptions
+        self, start: Sequence[Start] | None, effects: Sequence[Effect], options: SolverOptions
     ) -> FittedModel | None:
         """The fit from one start, from the cache if it is there."""
         key = (frozenset(effect.name for effect in effects), start_key(start), options)

@@ -169,6 +169,7 @@ class WindowEstimator:
             samples=task.window.samples,
             rejected=task.rejected,
             iterations=0 if fit is None else fit.iterations,
+            termination=None if fit is None else str(fit.termination),
             soil_class=self._soil_class(posterior),
             position=task.track.at((tracked.since + task.end) / 2.0),
             failure=self._failure(tracked),
