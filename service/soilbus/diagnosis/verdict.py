@@ -20,31 +20,18 @@ from enum import StrEnum
 from types import MappingProxyType
 
 import numpy as np
-from scipy.special import expit, softmax
+from scipy.special import softmax
 
 from soilbus.diagnosis.evidence import OwnParameters
+from soilbus.terra.effects.catalogue import CATALOGUE
 
-FALL_REQUIRED_ALONE, FALL_REQUIRED_BESIDE = 12.0, 30.0
-"""Least fall of -2 log evidence with which an effect is added: alone, and beside others, as these leave more than
-noise."""
-LEAST_ADDED_SHARE = 0.001
-"""Share of what is explained already that a further effect must explain: less than that formulas are off."""
+COARSENING = 3000.0
+"""Squared residuals of the base model for each unit of temperature (alpha of the coarsened posterior)."""
+TEMPERED_FALL_OF_NONE = 2.0 * math.log(len(CATALOGUE))
+"""Tempered fall from which an effect is more probable than none: a priori the model is as likely to be complete as not,
+and all effects are equally likely."""
 LEAST_GAP_SHARE = 0.25
 """Share of a real gap's excess over noise that an effect must explain to be added."""
-
-TEMPERATURE = 6.0
-"""What differences of -2 log evidence are divided by where little is explained."""
-FORMULA_ERROR, LARGE_FORMULA_ERROR = 0.001, 0.1
-"""Growth of the temperature per unit of -2 log evidence that is explained: usual, and with P_LARGE_FORMULA_ERROR."""
-MAX_LARGE_ERROR_FALL = 1500.0
-"""Explained fall of -2 log evidence beyond which the large formula error grows no more: blind cases with large
-effects could be distinguished."""
-P_LARGE_FORMULA_ERROR = 0.15
-"""Probability of the large formula error."""
-FORMULA_ERROR_OF_EXISTENCE = 0.02
-"""Growth of the temperature with which it is decided whether there is a further effect at all, per explained unit."""
-DOMINATED_TEMPERATURES = 4.0
-"""Large temperatures behind the best candidate beyond which a candidate is dominated: not fitted to all instants."""
 
 NAMED_PROBABILITY = 0.8
 """Probability from which a name stands alone."""
@@ -108,31 +95,45 @@ def gap_limit(rows: int) -> float:
     return max(LEAST_GAP_LIMIT, 1.0 + GAP_LIMIT_SD * math.sqrt(2.0 / max(rows, 1)))
 
 
-def required_fall(explained: float, gap: float, checked_rows: int, rows: int) -> float:
+def temperature(misfit: float) -> float:
+    """T = 1 / zeta where the squared residuals of the present model add up to this misfit."""
+    return 1.0 + misfit / COARSENING
+
+
+def required_fall(divisor: float, gap: float, checked_rows: int, rows: int) -> float:
     """Fall of -2 log evidence from which an effect is added.
 
     Parameters
     ----------
-    explained
-        Fall of -2 log evidence by the effects that the present model has already.
+    divisor
+        The temperature.
     gap, checked_rows
         Reduced chi-square under the present model, and the number of held-out residuals of which it is.
     rows
         Residuals of all blocks.
     """
     excess = (gap - 1.0) * rows if gap > gap_limit(checked_rows) else 0.0
-    return max(least_required_fall(explained), LEAST_GAP_SHARE * excess)
+    return max(least_required_fall(divisor), LEAST_GAP_SHARE * excess)
 
 
-def least_required_fall(explained: float) -> float:
-    """The least required fall at any gap."""
-    return max(FALL_REQUIRED_BESIDE if explained > 0.0 else FALL_REQUIRED_ALONE, LEAST_ADDED_SHARE * explained)
+def least_required_fall(divisor: float) -> float:
+    """The required fall where no gap is seen: an effect is then as probable as none."""
+    return TEMPERED_FALL_OF_NONE * divisor
+
+
+def dominated_deficit(divisor: float) -> float:
+    """-2 log posterior above the best candidate's from which a candidate cannot get into the set of names.
+
+    Twice the deficit of -2 log evidence at which its probability is SET_PROBABILITY: the posterior lacks the penalty
+    for parameters.
+    """
+    return -4.0 * math.log(SET_PROBABILITY) * divisor
 
 
 def probabilities(
     falls: Mapping[str, float],
-    explained: float,
-    further: Mapping[str, Sequence[OwnParameters]] = MappingProxyType({}),
+    divisor: float,
+    own: Mapping[str, Sequence[OwnParameters]] = MappingProxyType({}),
 ) -> dict[str, float]:
     """Probability of each candidate's name, the largest first.
 
@@ -140,9 +141,9 @@ def probabilities(
     ----------
     falls
         Fall of -2 log evidence by name.
-    explained
-        Fall of -2 log evidence by the effects that the present model has already.
-    further
+    divisor
+        The temperature.
+    own
         By name, the parameters that each recording after the first has for itself: that their values agree is a
         coincidence, which no error of a formula makes more likely.
 
@@ -151,51 +152,11 @@ def probabilities(
     dict
         Probabilities; what they lack to one is the probability that nothing more is missing.
     """
-    most = max(falls.values())
-    usual, large = (_tempered_shares(falls, t, further) for t in temperatures(explained + most))
-    something = float(expit(most / (2.0 * temperature(explained, FORMULA_ERROR_OF_EXISTENCE))))
-    chances = {
-        n: something * ((1.0 - P_LARGE_FORMULA_ERROR) * usual[n] + P_LARGE_FORMULA_ERROR * large[n]) for n in falls
-    }
-    return dict(sorted(chances.items(), key=lambda item: -item[1]))
-
-
-def is_dominated(deficit: float, explained: float) -> bool:
-    """Whether a candidate this far (-2 log evidence) behind the best one cannot get into the set of names."""
-    return deficit > dominated_deficit(explained)
-
-
-def dominated_deficit(explained: float) -> float:
-    """Deficit of -2 log evidence, behind the best candidate, beyond which a candidate is dominated."""
-    return DOMINATED_TEMPERATURES * _large_temperature(explained)
-
-
-def temperatures(explained: float) -> tuple[float, float]:
-    """What differences of -2 log evidence between names are divided by: usually, and with P_LARGE_FORMULA_ERROR.
-
-    explained: fall of -2 log evidence by all effects, the candidate included.
-    """
-    return temperature(explained), _large_temperature(explained)
-
-
-def temperature(explained: float, form_error: float = FORMULA_ERROR) -> float:
-    """The usual temperature where this fall of -2 log evidence is explained in all."""
-    return TEMPERATURE + form_error * max(explained, 0.0)
-
-
-def _large_temperature(explained: float) -> float:
-    return temperature(min(explained, MAX_LARGE_ERROR_FALL), LARGE_FORMULA_ERROR)
-
-
-def _tempered_shares(
-    falls: Mapping[str, float], temperature: float, further: Mapping[str, Sequence[OwnParameters]]
-) -> dict[str, float]:
-    """Softmax of the tempered falls, halved."""
     tempered = [
-        fall / temperature - sum(own.surcharge(temperature) for own in further.get(name, ()))
-        for name, fall in falls.items()
+        fall / divisor - sum(one.surcharge(divisor) for one in own.get(name, ())) for name, fall in falls.items()
     ]
-    return dict(zip(falls, softmax(np.array(tempered) / 2.0).tolist(), strict=True))
+    chances = softmax(np.array([*tempered, TEMPERED_FALL_OF_NONE]) / 2.0).tolist()[:-1]
+    return dict(sorted(zip(falls, chances, strict=True), key=lambda item: -item[1]))
 
 
 def soil_error_share(name: str) -> float:
