@@ -32,7 +32,7 @@ class Recordings:
             names=names,
             neg2_log_evidence=value,
             neg2_log_posterior=value,
-            misfit=value,
+            excess=ROWS * (self.gap - 1.0),
             gap=self.gap,
             checked_rows=ROWS // 3,
             rows=ROWS,
@@ -80,7 +80,7 @@ def test_an_effect_that_explains_nothing_beside_another_is_removed():
 
 
 def test_nothing_is_added_that_is_not_more_probable_than_nothing():
-    least = 2.0 * np.log(len(CATALOGUE)) * 2.0  # 3000 squared residuals: the evidence counts half
+    least = 2.0 * np.log(len(CATALOGUE)) * 2.0  # no excess: evidence counts half
     assert found({LUGS: least - 1.0}) == []
     assert found({LUGS: least + 1.0}) == [{LUGS}]
 

@@ -71,7 +71,7 @@ def detectable(
     records: Sequence[Record], prior: SoilPrior, present: FittedModel, candidates: Sequence[Effect]
 ) -> tuple[Detectable, ...]:
     """The detectable size of every candidate beside the present model fitted to these recordings."""
-    required = required_fall(temperature(present.misfit), present.gap, present.checked_rows, present.rows)
+    required = required_fall(temperature(present.excess), present.gap, present.checked_rows, present.rows)
     data_ratio = present.rows / sum(fit.rows for fit in present.fits)
     found: dict[str, Detectable] = {}
     for effects in _with_further_starts(candidates):

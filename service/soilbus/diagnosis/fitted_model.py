@@ -139,9 +139,9 @@ class FittedModel:
         return sum(fit.neg2_log_posterior for fit in self.fits)
 
     @property
-    def misfit(self) -> float:
-        """Sum of the squared residuals of all blocks, in units of their variance."""
-        return self.neg2_log_posterior + self.gap * self.checked_rows
+    def excess(self) -> float:
+        """By how much the squared residuals of all blocks, in units of their variance, exceed their number."""
+        return self.neg2_log_posterior + self.gap * self.checked_rows - self.rows
 
     @property
     def gap(self) -> float:

@@ -146,14 +146,14 @@ def onset_of(records: Sequence[Record], prior: SoilPrior, effect: Effect, beside
     """
     shown: list[OwnParameters | None] = []
     sizes: list[Mapping[str, Estimate] | None] = []
-    misfit = 0.0
+    excess = 0.0
     for record in records:
         fitted = fit_model([record], prior, (*record.training.effects, *beside, effect))
         shown.append(None if fitted is None else fitted.shared_parameters(effect))
         sizes.append(None if fitted is None else fitted.parameters()[effect.name])
-        misfit += 0.0 if fitted is None else fitted.misfit
+        excess += 0.0 if fitted is None else fitted.excess
     falls = [_fall(shown[k:]) for k in range(len(records))]
-    *probabilities, never = onset_probabilities(falls, temperature(misfit))
+    *probabilities, never = onset_probabilities(falls, temperature(excess))
     return Onset(int(np.argmax(probabilities)), tuple(probabilities), never, tuple(sizes))
 
 

@@ -85,7 +85,7 @@ class Search:
     candidates
         Effects that may be missing.
     temperature
-        Of the recordings, by the misfit of the base.
+        Of the recordings, by what the base leaves.
     """
 
     full: FitCache
@@ -96,7 +96,7 @@ class Search:
     _compared: dict[frozenset[str], dict[str, FittedModel]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.temperature = temperature(self.base.misfit)
+        self.temperature = temperature(self.base.excess)
 
     def steps(self) -> Iterator[tuple[list[Addition], FittedModel]]:
         """After each addition and its swaps: the additions in the order of the model's effects, and the model."""
@@ -175,22 +175,21 @@ class Search:
             if trial is not None:
                 trials.append((trial, of_one))
                 limit = min(limit, trial.neg2_log_posterior + margin)
-        best: tuple[FittedModel, list[Score]] | None = None
+        limit = math.inf
         for trial, of_one in sorted(trials, key=lambda one: one[0].neg2_log_posterior):
-            limit = math.inf if best is None else best[0].neg2_log_posterior + margin
             fit = self.full.fit(trial.effects, [trial.as_starts()], DescentOptions(give_up_above=limit))
             if fit is None:
                 continue
-            if best is None or fit.neg2_log_evidence < best[0].neg2_log_evidence:
-                best = fit, of_one
+            promising = [s for s in of_one if model.neg2_log_evidence + s.neg2_log_evidence < fit.neg2_log_evidence]
+            fit = self.full.better(fit, [score.starts for score in promising])
+            limit = min(limit, fit.neg2_log_posterior + margin)
             yield of_one[0].effect.name, fit
-        if best is not None:  # a descent on all instants may end elsewhere
-            fit, of_one = best
-            yield of_one[0].effect.name, self.full.better(fit, [s.starts for s in of_one])
 
     def _by_score(self, model: FittedModel) -> list[list[Score]]:
         """Scores of each candidate that should explain something, one for each start, the best first."""
         possible = [effect for effect in self.candidates if effect.name not in model.names]
+        if not possible:
+            return []
         given = self.full.records, self.full.prior, model, possible
         found: dict[str, list[Score]] = {}
         for score in sorted([*scores(*given), *further_scores(*given)], key=lambda score: score.neg2_log_evidence):
