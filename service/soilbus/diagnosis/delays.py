@@ -47,6 +47,9 @@ MAX_NEWTON_STEPS = 12
 ERROR_OF_PARTS, ERROR_OF_SUM = 0.1, 0.02
 """Further sd of a part and of the sum, as shares of the sum: what moves faster than a channel's interpolating curve is
 not shifted.  Of delays and low passes of 0.04 to 0.2 s of the second generator (tests/support/shaking.py)."""
+SURE_SD = 5.0
+"""Deviations by which a delay exceeds half a sample time, as interpolating leaves errors of its own: with 4 the pitch of a
+simulated drive is late that is not."""
 REFIT_FALL = 2.0
 """Fall of the tempered -2 log posterior along a ridge from which the model is fitted again from there."""
 
@@ -111,7 +114,7 @@ def _starts(fitted: FittedModel, found: Mapping[tuple[str, Late], DelayPosterior
 def exceeds_sampling_delay(
     records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, effect: Effect, divisor: float
 ) -> bool:
-    """Whether an effect of a fitted model delays any channel by more than half its sample time, by two deviations.
+    """Whether an effect of a fitted model delays any channel by more than half its sample time, by SURE_SD.
 
     A stamp says when a frame was on the bus: its value was measured up to a cycle before, half of one on average.
     True where no channel's sample time is known.
@@ -124,7 +127,7 @@ def exceeds_sampling_delay(
         for (name, late), posterior in delay_posteriors(records, prior, fitted, divisor).items()
         if name == effect.name
     ]
-    return any(abs(total.value) - 2.0 * total.std > of_cycle for total, of_cycle in totals)
+    return any(abs(total.value) - SURE_SD * total.std > of_cycle for total, of_cycle in totals)
 
 
 def delay_posteriors(

@@ -136,7 +136,7 @@ def diagnose(
         progress(f"looking for effects beside {' and '.join(addition.effect.name for addition in additions)}")
     if any(effect.late for effect in present.effects):
         progress("separating delays from low passes")
-        present = with_delays(records, prior, present, temperature(base.excess))
+        present = with_delays(records, prior, present, temperature(present.excess))
     additions.sort(key=lambda addition: -addition.falls[addition.effect.name])
     progress("holding out every block in turn")
     before = gap_of(records, prior, base)
