@@ -48,8 +48,8 @@ ERROR_OF_PARTS, ERROR_OF_SUM = 0.1, 0.02
 """Further sd of a part and of the sum, as shares of the sum: what moves faster than a channel's interpolating curve is
 not shifted.  Of delays and low passes of 0.04 to 0.2 s of the second generator (tests/support/shaking.py)."""
 SURE_SD = 5.0
-"""Deviations by which a delay exceeds half a sample time, as interpolating leaves errors of its own: with 4 the pitch of a
-simulated drive is late that is not."""
+"""Deviations by which a delay exceeds half a sample time, as interpolating leaves errors of its own: with 4 the pitch
+of a simulated drive is late that is not."""
 REFIT_FALL = 2.0
 """Fall of the tempered -2 log posterior along a ridge from which the model is fitted again from there."""
 

@@ -25,12 +25,12 @@ from soilbus.diagnosis.evidence import OwnParameters
 from soilbus.terra.effects.catalogue import CATALOGUE
 
 MAX_EXCESS = 10000.0
-"""Excess from which on evidence counts no less: without a bound 4 of 24 blind pairs (seeds 301 to 303) lose the smaller of
-two large effects."""
+"""Excess from which on evidence counts no less: without it 4 of 24 blind pairs (seeds 301 to 303) lose their smaller
+effect."""
 ALPHA, ZETA_0 = 400.0, 0.5
 """Excess of squared residuals at which evidence counts half as much, and how much it counts without excess.
 
-Of 140 blind cases (seeds 211 and 212) names are right as often as their probability says; with 200 to 2000, and 1/3
+Of 140 blind cases (seeds 211 and 212) names are right about as often as their probability says; with 200 to 2000, and 1/3
 to 2/3, as many single effects are named first.  What the probabilities are on other seeds: service/docs/diagnosis.md.
 """
 TEMPERED_FALL_OF_NONE = 2.0 * math.log(len(CATALOGUE))
