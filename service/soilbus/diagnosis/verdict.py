@@ -30,8 +30,8 @@ effect."""
 ALPHA, ZETA_0 = 400.0, 0.5
 """Excess of squared residuals at which evidence counts half as much, and how much it counts without excess.
 
-Of 140 blind cases (seeds 211 and 212) names are right about as often as their probability says; with 200 to 2000, and 1/3
-to 2/3, as many single effects are named first.  What the probabilities are on other seeds: service/docs/diagnosis.md.
+Of 140 blind cases (seeds 211 and 212) names are right about as often as their probability says; with 200 to 2000, and
+1/3 to 2/3, as many single effects are named first.  Other seeds: service/docs/diagnosis.md.
 """
 TEMPERED_FALL_OF_NONE = 2.0 * math.log(len(CATALOGUE))
 """Tempered fall from which an effect is more probable than none."""
