@@ -19,7 +19,6 @@ starts, or turns on a curve needs no case of its own: what the sensors cannot kn
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from soilbus.config.model import Traversability
@@ -114,8 +113,7 @@ class Sample(NamedTuple):
     depth_var: float = math.nan
 
 
-@dataclass(frozen=True, slots=True)
-class StallForecast:
+class StallForecast(NamedTuple):
     """State carried from one sample to the next by `forecast`.
 
     Attributes
@@ -141,10 +139,10 @@ class StallForecast:
     t: float = -math.inf
     heard: float = -math.inf
     since: float = math.inf
-    slip: LocalTrend = LocalTrend()  # noqa: RUF009, immutable
-    speed: LocalTrend = LocalTrend()  # noqa: RUF009, immutable
-    depth: LocalTrend = LocalTrend()  # noqa: RUF009, immutable
-    steady: LocalTrend = LocalTrend()  # noqa: RUF009, immutable
+    slip: LocalTrend = LocalTrend()
+    speed: LocalTrend = LocalTrend()
+    depth: LocalTrend = LocalTrend()
+    steady: LocalTrend = LocalTrend()
     thrust: float = math.nan
     caused: float = -math.inf
     stalls: bool = False

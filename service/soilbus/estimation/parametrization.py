@@ -96,7 +96,10 @@ class Coordinates:
         return self.within(soil)
 
     def log_directions(self, soil: Array) -> Array:
-        """Derivatives (6, F) of the parameters' logarithms by the coordinates."""
+        """Derivatives (6, F) of the parameters' logarithms by the coordinates; kept for the next call with it."""
+        last_soil, directions = self._last_directions
+        if last_soil is soil:
+            return directions
         directions, column = self._own_directions.copy(), self._column
         if _K_PHI in column:
             k_c, k_phi, n = soil[:3].tolist()
@@ -106,6 +109,8 @@ class Coordinates:
                 directions[_K_PHI, column[_K_C]] = -k_c / self.width / k_phi
             if _N in column:
                 directions[_K_PHI, column[_N]] = -K_L / k_phi * n * _LOG_DEPTH
+        directions.flags.writeable = False
+        self._last_directions[:] = soil, directions
         return directions
 
     def curvature(self, gradient: Array) -> Array:
@@ -203,6 +208,11 @@ class Coordinates:
     def _log_bounds(self) -> tuple[Array, Array]:
         low, high = self._bounds
         return np.log(low), np.log(high)
+
+    @cached_property
+    def _last_directions(self) -> list[Array]:
+        """The soil (6,) of the last call of `log_directions`, and its result."""
+        return [np.zeros(0), np.zeros(0)]
 
     @cached_property
     def _own_directions(self) -> Array:

@@ -24,7 +24,7 @@ from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.decision.capability import OverSlip
 from soilbus.decision.immobilisation import BINS_OF_A_MOMENT, Alert, Moment, Watch, moments, watched, with_loss
-from soilbus.decision.traction_loss import NO_LOSS, TractionLoss, motion_of
+from soilbus.decision.traction_loss import NO_LOSS, TractionLoss, motions
 from soilbus.decision.traction_loss import observed as loss_after
 from soilbus.decision.traversability import Status
 from soilbus.estimation.assembly import rig_of
@@ -251,13 +251,11 @@ def _looks_and_curves(
         if able is not None and result.status is Status.VALID:
             curves.append((due, able.over_slip))
     seen = completed(forward(store.window(0.0, end)), rig)
-    losses, loss = [], NO_LOSS
-    for i in range(len(seen.t)):
-        few = seen.rows(np.arange(max(i + 1 - BINS_OF_A_MOMENT, 0), i + 1))
-        motion = motion_of(few, rig, no_limit, config.traversability)
-        loss = loss if motion is None else loss_after(loss, motion, config)
+    losses, loss, bins = [], NO_LOSS, np.arange(len(seen.t))
+    for motion in motions(seen, rig, no_limit, config.traversability, bins, BINS_OF_A_MOMENT):
+        loss = loss_after(loss, motion, config)
         losses.append(loss)
-    return list(moments(seen, rig, 0.0, settings.min_speed)), losses, curves
+    return list(moments(seen, rig, bins, settings.min_speed)), losses, curves
 
 
 def half_of(seed: int) -> str:
