@@ -14,7 +14,7 @@ from soilbus.estimation import multistart
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.nuisance_parameters import parameters_of
-from soilbus.estimation.solver import SolverOptions, descend_jointly
+from soilbus.estimation.solver import SolverOptions, minimise
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -98,9 +98,9 @@ def test_no_descent_of_a_window_begins_where_another_did(monkeypatch):
 
     def counted(fitting, near, *args, **kwargs):
         began.append((fitting.problem.n, near.soil.tobytes()))
-        return descend_jointly(fitting, near, *args, **kwargs)
+        return minimise(fitting, near, *args, **kwargs)
 
-    monkeypatch.setattr(multistart, "descend_jointly", counted)
+    monkeypatch.setattr(multistart, "minimise", counted)
     assert fit_window(problem, prior) is not None
     assert len(began) == len(set(began))
 
