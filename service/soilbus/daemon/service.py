@@ -34,7 +34,7 @@ from soilbus.daemon.totals import totals
 from soilbus.daemon.work_queue import WorkQueue, wait_for
 from soilbus.decision.immobilisation import Alert, Watch, ended, has_cause, watched, with_loss
 from soilbus.decision.judgement import Basis, at_present
-from soilbus.decision.traction_loss import NO_LOSS, observed
+from soilbus.decision.traction_loss import NO_LOSS, observed, slope_felt
 from soilbus.decision.traversability import State, Status, Traversability
 from soilbus.pipeline.intake import Latest
 from soilbus.pipeline.outputs import TICK, WINDOW_MODULUS, demand_frame, forecast_frame, hop_frames, slip_frames
@@ -396,9 +396,10 @@ class Service:
         latest = self.intake.latest(self._time.at(now)) if self.bus.is_open else Latest({}, None)
         if latest.motion is not None:
             self._loss = observed(self._loss, latest.motion, self.config)
+        inertia = latest.inertia - slope_felt(self._loss, self.intake.rig)
         self._watch = watched(
-            self._watch, self._time.at(now), latest.slip.values(), latest.pull, self._present_curve(now), latest.inertia
-        )  # fmt: skip
+            self._watch, self._time.at(now), latest.slip.values(), latest.pull, self._present_curve(now), inertia
+        )
         warning = with_loss(self._watch, self._loss, self._time.at(now))
         self._warned = has_cause(self._watch, self._loss, self.config.warning.hold)
         decision = self.present_decision(now)

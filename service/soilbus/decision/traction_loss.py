@@ -187,6 +187,11 @@ def _others_grip(motion: Motion, spins: Sequence[bool]) -> bool:
     return (0.5 - b) * sum(gripping) / len(gripping) > (0.5 + b) * max(sum(spinning) / len(spinning), 0.0)
 
 
+def slope_felt(loss: TractionLoss, rig: Rig) -> float:
+    """Force [N] of a slope that only a specific force shows, which counts as inertia in `inertia_of`; else 0."""
+    return 0.0 if rig.chassis is None else rig.chassis.mass * loss.ahead.slope
+
+
 def missing_pull(loss: TractionLoss, curve: OverSlip, noise: NoiseOfChannels, deviations: float) -> float:
     """Pull [N] that the estimate predicts at the present slip and the wheels significantly do not give; else 0.
 
@@ -349,6 +354,7 @@ def _last(window: Window, rig: Rig, beside: Array, at_limit: bool) -> Sample:
         at_limit,
         math.nan if deepest is None else float(depth[deepest]),
         math.nan if deepest is None else float(of_depth[deepest]),
+        float(window.acceleration[-1]) if window.kinematic and math.isnan(window.pitch[-1]) else math.nan,
     )
 
 

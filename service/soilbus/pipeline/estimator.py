@@ -33,7 +33,7 @@ from soilbus.decision.immobilisation import (
 )
 from soilbus.decision.judgement import Basis, judge
 from soilbus.decision.torque_ceiling import TorqueCeiling
-from soilbus.decision.traction_loss import NO_LOSS, idle, motion_of, observed
+from soilbus.decision.traction_loss import NO_LOSS, idle, motion_of, observed, slope_felt
 from soilbus.decision.traversability import State, Status, Traversability
 from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.wheels import WheelTable
@@ -261,7 +261,8 @@ class WindowEstimator:
             few = driven.rows(slice(max(i + 1 - BINS_OF_A_MOMENT, 0), i + 1))
             if (motion := motion_of(few, self.rig, window.torque_limit, self.config.traversability)) is not None:
                 self._loss = observed(self._loss, motion, self.config)
-            self._watch = watched(self._watch, moment.t, moment.slip, moment.pull, self._curve, moment.inertia)
+            inertia = moment.inertia - slope_felt(self._loss, self.rig)
+            self._watch = watched(self._watch, moment.t, moment.slip, moment.pull, self._curve, inertia)
             self._warnings = self._warnings.after(moment.t, with_loss(self._watch, self._loss).warning)
 
     def _effects(self, fit: Fit | None) -> list[Active]:

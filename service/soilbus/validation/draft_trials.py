@@ -32,6 +32,7 @@ from soilbus.terra.soils import soil_named
 from soilbus.terra.vehicle import axle_loads
 from soilbus.terra.wheel import Soil, WheelModel, sinkage
 from soilbus.validation.monte_carlo import Each, prior_about
+from soilbus.validation.windows import torque_limits
 
 __all__ = ["SOILS", "DraftFigures", "DraftTrial", "Task", "draft_trials", "figures", "trial", "true_largest_draft"]
 
@@ -128,7 +129,9 @@ def trial(task: Task) -> DraftTrial:
     )
     if fit is None or not fit.converged:
         return DraftTrial(name, np.nan, np.nan, truth)
-    able, _ = assess(fit.reported.posterior, rig, model, None, limit, settings.max_slip, settings.max_sinkage)
+    able, _ = assess(
+        fit.reported.posterior, rig, model, None, torque_limits(config, rig), settings.max_slip, settings.max_sinkage
+    )
     if able is None:
         return DraftTrial(name, np.nan, np.nan, truth)
     return DraftTrial(name, able.max_draft.value, able.max_draft.std, truth)
