@@ -287,9 +287,8 @@ class Service:
         if _first_word(result.reason) == "implausible" and (self.result is None or self.result.reason != result.reason):
             log.warning("%s: contradicts the other sensors, not used in this window", result.reason)
         self.result, self._ended = result, ended
-        able = result.traversability.capability
-        if able is not None and result.status is Status.VALID:
-            self._curve = able.over_slip, result.t
+        if result.curve is not None:
+            self._curve = result.curve, result.t
 
     def _tick(self, now: float) -> None:
         if self.bus.is_open:
@@ -378,7 +377,7 @@ class Service:
         return max(by_stamps, self.result.t + now - self._ended)
 
     def _present_curve(self, now: float) -> OverSlip | None:
-        """Pull over slip of the last valid window, while it is young enough to extrapolate from."""
+        """Pull over slip of the last window that had one, while it is young enough to extrapolate from."""
         known, t = self._curve
         return known if self._time.at(now) - t < MAX_CURVE_AGE else None
 

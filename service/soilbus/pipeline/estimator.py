@@ -110,6 +110,8 @@ class WindowEstimator:
         self._settings = config.estimator
         self._wheels: WheelTable | None = None
         self._gap = GapWatch(config.estimator.window, config.estimator.hop)
+        shared = [f"load.{wheels[0].name}" for wheels in config.same_signal("load") if len(wheels) > 1]
+        self._mismatch = " ".join(["model_mismatch", *shared])
         self._held = Held()
         self._valid_at: float | None = None
         self._watch, self._warnings = Watch(), Warnings()
@@ -192,9 +194,7 @@ class WindowEstimator:
         """The result with traversability and watch; windows in their order, here or in another process."""
         result = self._decided(window)
         self._update_watch(window)
-        capability = result.traversability.capability
-        if capability is not None and result.status is Status.VALID:
-            self._curve = capability.over_slip
+        self._curve = result.curve or self._curve
         watch = with_loss(self._watch, self._loss)
         warned = has_cause(watch, self._loss, self.config.warning.hold)
         now = as_of(result, self._loss, result.t, self.config, warned)
@@ -346,13 +346,13 @@ class WindowEstimator:
         failure = self._failure(tracked)
         if fit is None or failure is not None:
             status = Status.DEGRADED if fit is not None and fit.converged else Status.INVALID
-            return status, "model_mismatch" if failure == "model_mismatch" else "no_convergence"
+            return status, self._mismatch if failure == "model_mismatch" else "no_convergence"
         if task.poor:
             return Status.DEGRADED, "input_stale " + " ".join(task.poor)
         if self._too_little_of_new_soil(tracked, task.end):
             return Status.NOT_EXCITED, "not_excited new_soil"
         if fit.off_scale:
-            return Status.DEGRADED, "model_mismatch"
+            return Status.DEGRADED, self._mismatch
         if self._ambiguous(fit):
             return Status.NOT_EXCITED, "ambiguous"
         posterior = fit.reported.posterior

@@ -19,6 +19,7 @@ from soilbus.pipeline.excitation import Excitation
 from soilbus.pipeline.positions import Position
 
 if TYPE_CHECKING:
+    from soilbus.decision.capability import OverSlip
     from soilbus.estimation.posterior import Estimate, Posterior
 
 
@@ -91,6 +92,16 @@ class WindowResult:
     log: str | None = None
     excitation: Excitation = Excitation()  # noqa: RUF009, immutable
     basis: Basis = Basis()  # noqa: RUF009, immutable
+
+    @property
+    def curve(self) -> OverSlip | None:
+        """Pull over slip, along which the warning extrapolates; None where the model does not fit the window.
+
+        It may say little of the soil: only what the pull still gains beyond the present slip is taken from it, and the
+        pull itself is measured.
+        """
+        able = self.traversability.capability
+        return able.over_slip if able is not None and self.status in (Status.VALID, Status.NOT_EXCITED) else None
 
 
 def as_of(result: WindowResult, loss: TractionLoss, now: float, config: Config, warned: bool = False) -> WindowResult:

@@ -26,7 +26,6 @@ from soilbus.decision.capability import OverSlip
 from soilbus.decision.immobilisation import BINS_OF_A_MOMENT, Alert, Moment, Watch, moments, watched, with_loss
 from soilbus.decision.traction_loss import NO_LOSS, TractionLoss, motion_of, slope_felt
 from soilbus.decision.traction_loss import observed as loss_after
-from soilbus.decision.traversability import Status
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.window import forward
@@ -238,7 +237,7 @@ def watch(observation: Observation) -> tuple[Array, NDArray[np.bool_]]:
 def _looks_and_curves(
     recording: Recording, config: Config, end: float
 ) -> tuple[list[Moment], list[TractionLoss], list[tuple[float, OverSlip]]]:
-    """What is seen until the end [s], and from their times on the curves of windows that the service calls valid."""
+    """What is seen until the end [s], and from their times on the curves of windows."""
     rig, settings = rig_of(config), config.estimator
     estimator, limit = WindowEstimator(config), torque_limits(config, rig)
     store = Bins(rig, LOOK_PERIOD, 0.0)
@@ -247,9 +246,8 @@ def _looks_and_curves(
     for due in np.arange(settings.window, end, settings.hop).tolist():
         window = completed(forward(store.window(due - settings.window, due)), rig)
         result = estimator.solve_unwatched(task_of(window, due, config, limit, fresh=due == settings.window))
-        able = result.traversability.capability
-        if able is not None and result.status is Status.VALID:
-            curves.append((due, able.over_slip))
+        if result.curve is not None:
+            curves.append((due, result.curve))
     seen = completed(forward(store.window(0.0, end)), rig)
     losses, loss = [], NO_LOSS
     for i in range(len(seen.t)):
