@@ -17,6 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, Future
 from dataclasses import replace
+from itertools import compress
 from typing import TYPE_CHECKING, Any
 
 from soilbus import __version__
@@ -395,10 +396,12 @@ class Service:
         latest = self.intake.latest(self._time.at(now)) if self.bus.is_open else Latest({}, None)
         if latest.motion is not None:
             self._loss = observed(self._loss, latest.motion, self.config)
-        inertia = latest.inertia - slope_felt(self._loss, self.intake.rig)
+        rig = self.intake.rig
+        inertia = latest.inertia - slope_felt(self._loss, rig)
+        slips = compress(latest.slip.values(), rig.drives)
         self._watch = watched(
-            self._watch, self._time.at(now), latest.slip.values(), latest.pull, self._present_curve(now), inertia
-        )
+            self._watch, self._time.at(now), slips, latest.pull, self._present_curve(now), inertia
+        )  # fmt: skip
         warning = with_loss(self._watch, self._loss, self._time.at(now))
         self._warned = has_cause(self._watch, self._loss, self.config.warning.hold)
         decision = self.present_decision(now)
