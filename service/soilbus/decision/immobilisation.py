@@ -169,8 +169,8 @@ class Capacity(NamedTuple):
             )
         )
 
-    def joined(self, step: float, value: float | None, reserve: float, earlier: float | None) -> Capacity:
-        """A step [s] later, with one more value [N] or None, its reserve [N], and the value SCATTER_LAG before [N]."""
+    def joined(self, step: float, value: float | None, earlier: float | None, reserve: float = 0.0) -> Capacity:
+        """A step [s] later, with one more value [N] or None, the value SCATTER_LAG before, and its reserve [N]."""
         change = None if value is None or earlier is None else (value - earlier) ** 2
         part = None if value is None else reserve
         return Capacity(
@@ -350,7 +350,7 @@ def watched(
     trend = before.capacity if curve is before.curve else _capacity_along(curve, kept)
     earlier, once, twice = (_look_from(kept, t - lag) for lag in (SCATTER_LAG, SWING_TIME, 2.0 * SWING_TIME))
     capacity = trend.joined(
-        step, _capacity_at(curve, look, reserve), reserve, None if earlier is None else _capacity_at(curve, earlier)
+        step, _capacity_at(curve, look, reserve), None if earlier is None else _capacity_at(curve, earlier), reserve
     )
     demand = before.demand.joined(step, look.asked, *(None if a is None else a.asked for a in (once, twice)))
     peaks, asked = before.peaks.joined(t, pull, PEAK_MEMORY), before.asked.joined(t, look.asked, PEAK_MEMORY)

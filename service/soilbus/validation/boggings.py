@@ -79,11 +79,13 @@ def bogging(config: Config, kind: str, rng: np.random.Generator) -> BoggingDrive
     """
     firm = str(rng.choice(SLIPPING_SOILS if kind in ("draft", "grade", "uneven_draft") else FIRM_SOILS))
     side = side_shift(config, firm, SIDE_SHIFT)
-    made = _bogging(config, kind, firm, largest_draft(config, firm, side), side, rng)
+    made = _bogging(config, kind, firm, side, rng)
     return made._replace(scenario=replace(made.scenario, side_shift=Swing(-side, side)))
 
 
-def _bogging(config: Config, kind: str, firm: str, most: float, side: float, rng: np.random.Generator) -> BoggingDrive:
+def _bogging(config: Config, kind: str, firm: str, side: float, rng: np.random.Generator) -> BoggingDrive:
+    """From a draft that the machine holds on every side slope of the drive to one that it holds on none."""
+    most, level = (largest_draft(config, firm, shift) for shift in (side, 0.0))
     start = rng.uniform(22.0, 32.0)
     if kind in ("softening", "patch", "uneven_softening"):
         length = rng.uniform(*((2.0, 8.0) if kind == "patch" else (15.0, 40.0)))
@@ -93,12 +95,12 @@ def _bogging(config: Config, kind: str, firm: str, most: float, side: float, rng
             draft = Swing(0.2 * most, 0.6 * most, *FAST_SWING_BAND)
         return BoggingDrive(Scenario(DRIVE_TIME, soils, draft=draft, lift_slip=LIFT_SLIP, transition=length))
     if kind in ("draft", "uneven_draft"):
-        draft_of = _growing(rng, most, 0.0 if kind == "draft" else 0.15)
+        draft_of = _growing(rng, most, level, 0.0 if kind == "draft" else 0.15)
         return BoggingDrive(Scenario(DRIVE_TIME, (Patch(0.0, firm),), draft=draft_of, lift_slip=LIFT_SLIP))
     if kind == "grade":
         share, length = rng.uniform(0.35, 0.55), rng.uniform(15.0, 40.0)
         weight = GRAVITY * config.vehicle.mass if config.vehicle else np.inf
-        steepest = float(np.arcsin(min((rng.uniform(1.1, 1.3) - share) * most / weight, 0.5)))
+        steepest = float(np.arcsin(min((rng.uniform(1.1, 1.3) * level - share * most) / weight, 0.5)))
         slope = ((0.0, 0.0), (start, 0.0), (start + length, steepest))
         easy = Scenario(DRIVE_TIME, (Patch(0.0, firm),), draft=_about(share, most), lift_slip=LIFT_SLIP, slope=slope)
         return BoggingDrive(easy)
@@ -133,10 +135,10 @@ def side_shift(config: Config, soil: str, most: float) -> float:
     return next((side for side in shifts.tolist() if largest_draft(config, soil, side) >= KEPT_SHARE * level), 0.0)
 
 
-def _growing(rng: np.random.Generator, most: float, swing: float) -> Profile:
-    """A draft that grows beyond the largest one, most [N]; swing is the share of that by which it swings about."""
+def _growing(rng: np.random.Generator, most: float, level: float, swing: float) -> Profile:
+    """A draft that grows beyond the largest one on the level [N]; swing: share of the largest one, by which it swings."""
     begin = rng.uniform(12.0, 20.0)
-    shares = rng.uniform((0.3, 1.1), (0.5, 1.3))
+    shares = rng.uniform((0.3, 1.1), (0.5, 1.3)) * (1.0, level / most)
     grown = begin + rng.uniform(20.0, 40.0)
     if not swing:
         return Profile((begin, grown), (shares * most).tolist())
