@@ -136,7 +136,7 @@ def side_shift(config: Config, soil: str, most: float) -> float:
 
 
 def _growing(rng: np.random.Generator, most: float, level: float, swing: float) -> Profile:
-    """A draft that grows beyond the largest one on the level [N]; swing: share of the largest one, by which it swings."""
+    """A draft that grows beyond the largest one on the level [N]; swing: share of `most` by which it swings."""
     begin = rng.uniform(12.0, 20.0)
     shares = rng.uniform((0.3, 1.1), (0.5, 1.3)) * (1.0, level / most)
     grown = begin + rng.uniform(20.0, 40.0)
