@@ -362,7 +362,7 @@ def test_a_curve_counts_from_the_end_of_its_window_on():
         assert t[np.argmax(warned)] == pytest.approx(known + SETTLED, abs=0.051)
 
 
-def test_a_window_that_says_little_of_the_soil_gives_a_curve_and_one_that_does_not_fit_gives_none(monkeypatch):
+def test_a_window_gives_a_curve_where_it_shows_the_strength_of_the_soil_however_little_of_its_pressure(monkeypatch):
     monkeypatch.setattr(boggings, "DRIVE_TIME", 16.0)
 
     def curves(**settings):
@@ -370,6 +370,7 @@ def test_a_window_that_says_little_of_the_soil_gives_a_curve_and_one_that_does_n
         return len(observed(Task(CONFIG.model_copy(update={"estimator": estimator}), "draft", 11)).curves)
 
     assert curves(max_bearing_std=1e-6) == 6
+    assert curves(max_tan_phi_std=1e-6) == 0
     assert curves(max_chi2=1e-3) == 0
 
 

@@ -95,13 +95,17 @@ class WindowResult:
 
     @property
     def curve(self) -> OverSlip | None:
-        """Pull over slip, along which the warning extrapolates; None where the model does not fit the window.
+        """Pull over slip, along which the warning extrapolates; None where the window does not determine it.
 
-        It may say little of the soil: only what the pull still gains beyond the present slip is taken from it, and the
-        pull itself is measured.
+        That takes a model that fits and slips that show the soil's strength.  How deep the soil bears, which a window
+        without load cells seldom tells, matters little: only what the pull still gains beyond the present slip is taken
+        from the curve, and the pull itself is measured.
         """
         able = self.traversability.capability
-        return able.over_slip if able is not None and self.status in (Status.VALID, Status.NOT_EXCITED) else None
+        shows_strength = self.status is Status.VALID or (
+            self.status is Status.NOT_EXCITED and "slip_range" not in self.reason.split()
+        )
+        return able.over_slip if able is not None and shows_strength else None
 
 
 def as_of(result: WindowResult, loss: TractionLoss, now: float, config: Config, warned: bool = False) -> WindowResult:
