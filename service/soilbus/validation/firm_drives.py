@@ -81,9 +81,12 @@ def _headland(config: Config, soil: str, most: float, rng: np.random.Generator) 
 
 
 def _stop_and_go(config: Config, soil: str, most: float, rng: np.random.Generator) -> Scenario:
-    """Speed between a crawl and 2 m/s, at up to 1 m/s^2."""
+    """Speed between a crawl and 2 m/s, at up to 1 m/s^2; at less where the machine pulls little of its weight."""
     t = _times()
-    going = _steps(t, rng, (5.0, 15.0), (3.0, 8.0), (2.0, 4.0), (2.0, 4.0))
+    weight = GRAVITY * config.vehicle.mass if config.vehicle else 0.0
+    slower = max(0.27 * weight / most, 1.0)
+    ramp = (2.0 * slower, 4.0 * slower)
+    going = _steps(t, rng, (5.0, 15.0), (3.0, 8.0), ramp, ramp)
     return _scenario(soil, Swing(0.2 * most, 0.5 * most), _profile(t, 0.25 + rng.uniform(1.2, 1.75) * going))
 
 
