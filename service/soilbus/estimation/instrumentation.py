@@ -41,9 +41,11 @@ LOCKED_STD = 1e-3
 """Relative sd of speeds that a shaft makes equal: backlash and twist."""
 LEAST_TORQUE = 0.05
 """Torque over load and radius that a differential's friction counts at least, and that of a coasting vehicle."""
+SIDE_SLOPE_SHARE = 0.06
+"""Sd of an axle's loads left less right over their sum on side slopes, where no roll is measured: 3 degrees."""
 UNKNOWN_SIDE_SHARE = 0.4
-"""Sd of the difference of an axle's loads over that axle's load where no roll is measured: a side slope of 3 degrees
-(sd) shifts 6 %, and lasts for seconds, so that a window holds few independent ones; 0.06 sqrt(2 x 2 s / 0.1 s bin)."""
+"""The same for one instant of many: a side slope lasts for seconds, so that a window holds few independent ones;
+0.06 sqrt(2 x 2 s / 0.1 s bin)."""
 LEAST_WEIGHT = 1e-12
 """Weight below which an entry of an inverse is rounding: its rows hold ones, halves and gear ratios' shares."""
 
