@@ -38,7 +38,11 @@ from soilbus.validation.fakes import Bench, ScriptedBus, feed_message
 
 CONFIG = reference_configuration()
 IN = load_databases(CONFIG)
-MACHINES = {name: reference_configuration(path=path) for name, path in REFERENCES.items()}
+NOT_STRICT = ["estimator.max_bearing_std=1.0"]
+"""Short drives of machines without load cells say little of the pressure, and a go is to end here, which must begin."""
+MACHINES = {
+    name: reference_configuration([] if name == "tractor" else NOT_STRICT, path) for name, path in REFERENCES.items()
+}
 SEEDS = int(os.environ.get("SOILBUS_SEEDS", "1"))
 OTHERS = ["tractor-2wd", "tractor-axles"]
 

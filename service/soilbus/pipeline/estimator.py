@@ -180,6 +180,7 @@ class WindowEstimator:
             basis=basis,
             z_driven=None if fit is None or posterior is None else sinkage_range(fit, self.rig),
             search_ended=tracked.search_ended,
+            shows_strength=fit is not None and self._shows_strength(fit),
         )
         effects = self._effects(fit)
         model = self._present_model(task.window, tracked, effects)
@@ -349,6 +350,11 @@ class WindowEstimator:
         if lacks := lacking(fit, self.rig, self._settings):
             return Status.NOT_EXCITED, " ".join(["not_excited", *lacks])
         return Status.VALID, "none"
+
+    def _shows_strength(self, fit: Fit) -> bool:
+        """Whether the window determines tan phi."""
+        tan_phi = fit.reported.posterior.tan_phi()
+        return tan_phi.std <= self._settings.max_tan_phi_std * tan_phi.value
 
     def _too_little_of_new_soil(self, tracked: TrackerOutput, end: float) -> bool:
         """Whether too little of the window is on the new soil."""

@@ -65,6 +65,8 @@ class WindowResult:
         How much draft and slip varied.
     basis
         The data that the decision rests on.
+    shows_strength
+        Whether tan phi is known to `estimator.max_tan_phi_std`.
     """
 
     t: float
@@ -92,6 +94,7 @@ class WindowResult:
     log: str | None = None
     excitation: Excitation = Excitation()  # noqa: RUF009, immutable
     basis: Basis = Basis()  # noqa: RUF009, immutable
+    shows_strength: bool = False
 
     @property
     def curve(self) -> OverSlip | None:
@@ -102,10 +105,8 @@ class WindowResult:
         from the curve, and the pull itself is measured.
         """
         able = self.traversability.capability
-        shows_strength = self.status is Status.VALID or (
-            self.status is Status.NOT_EXCITED and "slip_range" not in self.reason.split()
-        )
-        return able.over_slip if able is not None and shows_strength else None
+        fits = self.status is Status.VALID or (self.status is Status.NOT_EXCITED and self.shows_strength)
+        return able.over_slip if able is not None and fits else None
 
 
 def as_of(result: WindowResult, loss: TractionLoss, now: float, config: Config, warned: bool = False) -> WindowResult:
