@@ -243,7 +243,7 @@ def judged(slip: float, pull: float = math.nan):
     forecast = Forecast(Estimate(0.035, 0.003), {}, known, known, known)
     capability = Capability(known, None, None, None, known, known, "slip", {}, forecast, CURVE)
     go = Traversability(State.GO, 0.999, capability=capability, spare=known)
-    loss = replace(TractionLoss(), t=10.0, slip=slip, pull=pull)
+    loss = TractionLoss(t=10.0, slip=slip, pull=pull)
     config = reference_configuration()
     return at_present(go, Basis(np.linspace(0.0, 10.0, 101), 0.1), loss, 10.0, config)
 

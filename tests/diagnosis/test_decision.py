@@ -71,7 +71,7 @@ def test_the_pull_is_that_of_a_simulated_drive(effect):
 
 @pytest.mark.parametrize("effect", ["tyre_deflection=8e-6", "rolling_radius.front=0.05"])
 def test_the_sinkage_limit_is_that_of_the_wheel_with_its_effects(effect):
-    model, axles = completed(effect), Axles.of(rig_of(CONFIG))
+    model, axles = completed(effect), Axles.of(rig_of(CONFIG), np.ones(4, bool))
     wheel = axles.wheel(np.array([4000.0, 6000.0]))
     angle = model.angle_of_sinkage(0.12, wheel)
     assert model.sinkage(angle, wheel) == pytest.approx([0.12, 0.12], abs=1e-6)

@@ -47,10 +47,10 @@ def test_likelihood_factor_times_prior_is_the_posterior(simulated):
     factor = mode.likelihood_factor(prior)
     assert factor.covariance[K_C, K_C] > mode.covariance[K_C, K_C]
     objective = Objective(problem, prior, factor)
-    quadratic = objective.prior_at(Iterate(mode.soil, mode.gains, None, np.inf, 0))
+    quadratic = objective.prior_at(Iterate(mode.soil, mode.gains, None))
     scale = np.sqrt(np.diag(quadratic.information))
     assert quadratic.gradient / scale == pytest.approx(0.0, abs=1e-6)
-    directions = objective.directions(Iterate(mode.soil, mode.gains, None, np.inf, 0))[1:]
+    directions = objective.directions(Iterate(mode.soil, mode.gains, None))[1:]
     directions[: len(mode.soil)] /= mode.soil[:, None]  # of logarithms
     covariance = directions @ np.linalg.inv(quadratic.information) @ directions.T
     assert covariance == pytest.approx(mode.covariance, rel=1e-6, abs=1e-12)
@@ -76,7 +76,7 @@ def test_the_prior_factor_is_the_product_of_likelihood_and_prior(name, simulated
             of_k_phi = (mode.soil[1] - soil[1]) / mode.soil[1]
         else:
             of_k_phi = 0.0
-        values.append(objective.prior_at(Iterate(soil, factor.gains, None, np.inf, 0)).neg2_log_prior)
+        values.append(objective.prior_at(Iterate(soil, factor.gains, None)).neg2_log_prior)
         of_data = (ratio + 1.0) ** 2 / variance[i, i] + of_k_phi**2 / variance[1, 1]
         expected.append(of_data + (np.log(soil[i] / prior.median[i]) / prior.log_std[i]) ** 2)
     assert np.array(values) - values[-1] == pytest.approx(np.array(expected) - expected[-1], rel=1e-6, abs=1e-6)

@@ -44,7 +44,7 @@ def test_a_window_without_variation_is_no_more_certain_than_the_bound():
         fit = fit_window(problem, prior)
         calm = DenoisedObservationModel(problem, fit.optimum)
         before = Gaussian.of(prior, problem.gain_std)
-        iterate = Iterate(fit.optimum.soil, fit.optimum.gains, calm.latents, np.inf, 1)
+        iterate = Iterate(fit.optimum.soil, fit.optimum.gains, calm.latents)
         top = refine(Objective(calm, prior, before), iterate)
         bound = cramer_rao(calm, prior, soil).log_covariance[2, 2]
         ratio.append([one.mode.covariance[2, 2] / bound for one in (fit, top)])

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soilbus.estimation.parametrization import Coordinates, moments_along_share
+from soilbus.estimation.moments import moments_along_share
+from soilbus.estimation.parametrization import Coordinates
 from soilbus.terra.soils import SOILS
 
 BOUND_SD = 4.0

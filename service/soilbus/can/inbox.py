@@ -117,12 +117,12 @@ def popped(inbox: Inbox, until: float) -> list[Frame]:
 
 
 def checksum_right(inbox: Inbox, batch: Batch) -> Mask | None:
-    """False where the payload does not give the Checksum; None where none is asked for."""
+    """False where the payload does not give the Checksum; None where it does throughout, or none is asked for."""
     if inbox.checksum_byte is None:
         return None
     due = column_checksums(batch.ids, batch.payload, inbox.checksum_byte)
     right: Mask = batch.payload[:, inbox.checksum_byte] == due
-    return right
+    return None if np.count_nonzero(right) == len(right) else right
 
 
 def time_forward(inbox: Inbox, batch: Batch) -> Mask | None:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from soilbus.allocator import loading
 from soilbus.cli.common import (
     WorkError,
     check_folders,
@@ -30,12 +31,13 @@ if TYPE_CHECKING:
 
 def replay(args: argparse.Namespace) -> None:
     """`soilbus replay`: the daemon's pipeline over recorded logs, or over tables of a test rig."""
-    from soilbus.can.dbc_files import load_databases
-    from soilbus.config.model import ConfigError
-    from soilbus.offline.replay import LogError, estimator_beside, other_channel, replay
-    from soilbus.pipeline.pipeline import Pipeline
-    from soilbus.report.progress import progress
-    from soilbus.report.windows import summary
+    with loading():
+        from soilbus.can.dbc_files import load_databases
+        from soilbus.config.model import ConfigError
+        from soilbus.offline.replay import LogError, estimator_beside, other_channel, replay
+        from soilbus.pipeline.pipeline import Pipeline
+        from soilbus.report.progress import progress
+        from soilbus.report.windows import summary
 
     config = configured(args)
     _check_outputs(args, config)
@@ -81,9 +83,7 @@ def _what_to_drive(args: argparse.Namespace, config: Config, results: Sequence[W
     """
     import json
 
-    from soilbus.offline.manoeuvre import what_excites
     from soilbus.report.advice import of_use
-    from soilbus.report.next_drive import excitation_lines
 
     useful = of_use(results)
     weak = sum(result.reason.startswith(("not_excited", "ambiguous")) for result in useful)
@@ -91,6 +91,9 @@ def _what_to_drive(args: argparse.Namespace, config: Config, results: Sequence[W
         return ""
     now = useful[-1].posterior
     assert now is not None  # of_use sees to it
+    from soilbus.offline.manoeuvre import what_excites  # the diagnosis and scipy, which few replays need
+    from soilbus.report.next_drive import excitation_lines
+
     found = what_excites(config, now.soil)
     if found is None:
         return ""

@@ -287,6 +287,9 @@ class Service:
             )  # fmt: skip
         if _first_word(result.reason) == "implausible" and (self.result is None or self.result.reason != result.reason):
             log.warning("%s: contradicts the other sensors, not used in this window", result.reason)
+        last_failure = None if self.result is None else self.result.failure
+        if result.termination is not None and result.failure not in (None, last_failure):
+            log.warning("%s: solver ended by %s (%d)", result.failure, result.termination, result.iterations)
         self.result, self._ended = result, ended
         if result.curve is not None:
             self._curve = result.curve, result.t

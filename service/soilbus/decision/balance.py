@@ -74,10 +74,11 @@ class Columns(NamedTuple):
     torque: slice
     angle: slice
 
-    @classmethod
-    def of(cls, kinds: int) -> Columns:
+    @staticmethod
+    @cache
+    def of(kinds: int) -> Columns:
         """The columns for this number of kinds of wheels."""
-        return cls(0, *(slice(1 + i * kinds, 1 + (i + 1) * kinds) for i in range(3)))
+        return Columns(0, *(slice(1 + i * kinds, 1 + (i + 1) * kinds) for i in range(3)))
 
 
 @dataclass(frozen=True, slots=True)

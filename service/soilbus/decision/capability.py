@@ -160,6 +160,12 @@ def slip_grid(max_slip: float) -> Array:
     return np.asarray(np.linspace(np.sqrt(least), np.sqrt(max_slip), GRID_SLIPS) ** 2)
 
 
+@cache
+def skid_grid(max_slip: float) -> Array:
+    """Slips (SKID_GRID_SLIPS,) of wheels that are pushed, up to the least one of `slip_grid`."""
+    return np.linspace(-MAX_SKID, slip_grid(max_slip)[0], SKID_GRID_SLIPS)
+
+
 def assess(
     posterior: Posterior,
     rig: Rig,
@@ -206,8 +212,7 @@ def assess(
     driven = ~(torque_limit <= 0.0)
     completed = uncertain.of_rows(len(points.soils))
     table = wheel_table(points.soils, rig, uncertain, slip_grid(max_slip), last, NEWTON_TOLERANCE, driven)
-    skids = np.linspace(-MAX_SKID, table.slip[0], SKID_GRID_SLIPS)
-    skid = cache(lambda: wheel_table(points.soils, rig, uncertain, skids, driven=driven))
+    skid = cache(lambda: wheel_table(points.soils, rig, uncertain, skid_grid(max_slip), driven=driven))
     of_points = balance(table)
     level = of_points.drawn(points)
     limits = Limits.of(table.axles, torque_limit, max_sinkage, completed)

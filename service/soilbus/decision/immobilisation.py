@@ -20,12 +20,12 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.decision.traction_loss import TractionLoss
@@ -260,8 +260,7 @@ class Look(NamedTuple):
     asked: float
 
 
-@dataclass(frozen=True, slots=True)
-class Watch:
+class Watch(NamedTuple):
     """State of the recursion: what is carried from one moment to the next; `watched` makes the next one.
 
     Attributes
@@ -284,12 +283,12 @@ class Watch:
     since: float = math.inf
     recent: tuple[Look, ...] = ()
     curve: OverSlip | None = None
-    capacity: Capacity = Capacity()  # noqa: RUF009, immutable
-    demand: Demand = Demand()  # noqa: RUF009, immutable
-    slip: Trend = Trend()  # noqa: RUF009, immutable
-    given: Trend = Trend()  # noqa: RUF009, immutable
-    peaks: Peaks = Peaks()  # noqa: RUF009, immutable
-    asked: Peaks = Peaks()  # noqa: RUF009, immutable
+    capacity: Capacity = Capacity()
+    demand: Demand = Demand()
+    slip: Trend = Trend()
+    given: Trend = Trend()
+    peaks: Peaks = Peaks()
+    asked: Peaks = Peaks()
     caused: float = -math.inf
     warning: Alert = Alert.UNKNOWN
     time_left: float | None = None
@@ -343,7 +342,7 @@ def watched(
         return before if 0.0 <= t - before.t <= LONGEST_GAP else _restarted(before, t)
     step = t - before.t
     if not 0.0 <= step <= LONGEST_GAP:
-        before, step = replace(_restarted(before, t), since=t), 0.0
+        before, step = _restarted(before, t)._replace(since=t), 0.0
     look = Look(t, sum(slips) / len(slips), pull, pull - inertia)
     reserve = _reserve(curve, look.slip)
     kept = before.recent[bool(before.recent and t - before.recent[0].t > LOOKS_KEPT) :]
@@ -380,9 +379,9 @@ def with_loss(watch: Watch, loss: TractionLoss, now: float = -math.inf) -> Watch
     if not loss.warns:
         slip_known = max(now, loss.t) - loss.ahead.heard <= LONGEST_GAP
         none = watch.warning is Alert.UNKNOWN and slip_known
-        return replace(watch, warning=Alert.NONE) if none else watch
+        return watch._replace(warning=Alert.NONE) if none else watch
     left = [time for time in (watch.time_left, loss.ahead.time_left) if time is not None]
-    return replace(watch, warning=Alert.IMMOBILISATION, time_left=0.0 if loss.stuck else min(left, default=None))
+    return watch._replace(warning=Alert.IMMOBILISATION, time_left=0.0 if loss.stuck else min(left, default=None))
 
 
 def has_cause(watch: Watch, loss: TractionLoss, hold: float) -> bool:
@@ -392,7 +391,7 @@ def has_cause(watch: Watch, loss: TractionLoss, hold: float) -> bool:
 
 def ended(watch: Watch) -> Watch:
     """The watch after a decision is go: a warning that only lasts is over, and begins anew with a new cause only."""
-    return replace(watch, caused=-math.inf, warning=Alert.NONE)
+    return watch._replace(caused=-math.inf, warning=Alert.NONE)
 
 
 class Warnings(NamedTuple):
@@ -408,8 +407,8 @@ class Warnings(NamedTuple):
         return self if self.since is not None else Warnings(t, (*self.begun, t))
 
 
-def moments(window: Window, rig: Rig, since: float, min_speed: float) -> Iterator[Moment]:
-    """Means of slip and pull over BINS_OF_A_MOMENT bins, one for each bin after `since`.
+def moments(window: Window, rig: Rig, chosen: NDArray[np.intp], min_speed: float) -> Iterator[Moment]:
+    """Means of slip and pull over BINS_OF_A_MOMENT bins, one at each of some bins.
 
     Parameters
     ----------
@@ -417,8 +416,8 @@ def moments(window: Window, rig: Rig, since: float, min_speed: float) -> Iterato
         A forward window.
     rig
         With a chassis, else there are no moments.
-    since
-        [s], the end of the last moment already used.
+    chosen
+        (M,), the bins at which each mean ends.
     min_speed
         [m/s], ground speed up to which slip is nan.
     """
@@ -427,7 +426,6 @@ def moments(window: Window, rig: Rig, since: float, min_speed: float) -> Iterato
     ground = window.ground_speed[:, None]
     slip = np.where(ground > min_speed, slip_ratio(rig.radius, window.speed, ground), np.nan)
     of_bins = np.column_stack([slip[:, rig.drives], pull_given(window, rig.chassis), inertia_of(window, rig.chassis)])
-    chosen = np.flatnonzero(window.t > since)
     place = chosen[:, None] + np.arange(1 - BINS_OF_A_MOMENT, 1)
     there = place >= 0
     total = np.where(there[:, :, None], of_bins[np.maximum(place, 0)], 0.0).sum(axis=1)
@@ -443,7 +441,7 @@ def _restarted(before: Watch, t: float) -> Watch:
 
 def _look_from(recent: Sequence[Look], t: float) -> Look | None:
     """The first look from the time t [s] on; None where it came SCATTER_LAG later or more."""
-    place = bisect_left(recent, t, key=lambda look: look.t)
+    place = bisect_left(recent, (t,))  # a look begins with its time
     return recent[place] if place < len(recent) and recent[place].t - t < SCATTER_LAG else None
 
 

@@ -20,7 +20,6 @@ starts, or turns on a curve needs no case of its own: what the sensors cannot kn
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from soilbus.config.model import Traversability
@@ -120,8 +119,7 @@ class Sample(NamedTuple):
     felt: float = math.nan
 
 
-@dataclass(frozen=True, slots=True)
-class StallForecast:
+class StallForecast(NamedTuple):
     """State carried from one sample to the next by `forecast`.
 
     Attributes
@@ -149,12 +147,12 @@ class StallForecast:
     t: float = -math.inf
     heard: float = -math.inf
     since: float = math.inf
-    slip: LocalTrend = LocalTrend()  # noqa: RUF009, immutable
-    speed: LocalTrend = LocalTrend()  # noqa: RUF009, immutable
-    depth: LocalTrend = LocalTrend()  # noqa: RUF009, immutable
-    steady: LocalTrend = LocalTrend()  # noqa: RUF009, immutable
+    slip: LocalTrend = LocalTrend()
+    speed: LocalTrend = LocalTrend()
+    depth: LocalTrend = LocalTrend()
+    steady: LocalTrend = LocalTrend()
     felt: float = 0.0
-    climb: LocalTrend = LocalTrend()  # noqa: RUF009, immutable
+    climb: LocalTrend = LocalTrend()
     thrust: float = math.nan
     caused: float = -math.inf
     stalls: bool = False

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -76,8 +75,7 @@ class Motion(NamedTuple):
     reserve: Sequence[bool] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class TractionLoss:
+class TractionLoss(NamedTuple):
     """State carried from one moment to the next by `observed`.  All times in s.
 
     Attributes
@@ -108,7 +106,7 @@ class TractionLoss:
     last: float = -math.inf
     slip: float = math.nan
     pull: float = math.nan
-    ahead: StallForecast = StallForecast()  # noqa: RUF009, immutable
+    ahead: StallForecast = StallForecast()
 
     @property
     def warns(self) -> bool:
@@ -140,16 +138,16 @@ def observed(before: TractionLoss, motion: Motion, config: Config) -> TractionLo
     settings, min_speed, ahead = config.traversability, config.estimator.min_speed, before.ahead
     if motion.last is not None:
         ahead = forecast(ahead, motion.last, min_speed, config.warning, settings)
-    before = replace(before, ahead=ahead)
     if not 0.0 <= motion.t - before.t <= LONGEST_GAP:
-        fresh = before if motion.t > before.t else TractionLoss(ahead=ahead)
-        before = replace(fresh, spins=math.inf, sticks=math.inf, moves=math.inf)
+        fresh = before if motion.t > before.t else TractionLoss()
+        before = fresh._replace(spins=math.inf, sticks=math.inf, moves=math.inf)
     beside = motion.beside or [0.0] * len(motion.rim)
     known = [rim for rim in motion.rim if math.isfinite(rim)]
     if not known or not math.isfinite(motion.ground):
-        return replace(before, t=motion.t, slip=math.nan, pull=math.nan)
+        return before._replace(t=motion.t, slip=math.nan, pull=math.nan, ahead=ahead)
+    ground, max_slip = motion.ground, settings.max_slip
     spin_now = [
-        rim - (motion.ground + more) > max(min_speed, settings.max_slip * rim)
+        rim - (ground + more) > max(min_speed, max_slip * rim)
         for rim, more in zip(motion.rim, beside, strict=True)  # nor nan
     ]
     spinning, stands = sum(spin_now), motion.ground < min_speed
@@ -293,69 +291,102 @@ def idle(window: Window, rig: Rig, since: float, before: NDArray[np.bool_]) -> N
 
 
 def motion_of(window: Window, rig: Rig, torque_limit: NDArray[np.float64], settings: Settings) -> Motion | None:
-    """The mean motion over a short forward window.
+    """The mean motion over a short forward window; None without a bin or a chassis.  Parameters as of `motions`."""
+    bins = len(window.t)
+    found = motions(window, rig, torque_limit, settings, np.arange(bins)[-1:], bins)
+    return found[0] if found else None
+
+
+def motions(
+    window: Window,
+    rig: Rig,
+    torque_limit: NDArray[np.float64],
+    settings: Settings,
+    chosen: NDArray[np.intp],
+    bins: int,
+) -> list[Motion]:
+    """The mean motions over the last bins at each of some bins of a forward window.
 
     Parameters
     ----------
     window
-        A few bins; None is returned without any.
+        A forward window.
     rig
-        With a chassis, else None is returned.
+        With a chassis, else there are no motions.
     torque_limit
         (W,) [N m], nan where not known.
     settings
         `full_torque`, share of the limit from which a motor is at its limit.
+    chosen
+        (M,), the bins at which each mean ends.
+    bins
+        Over how many each mean goes, fewer at the window's begin.
     """
-    if not len(window.t) or rig.chassis is None:
-        return None
-    drives, radius = rig.drives, rig.radius
+    if not len(chosen) or rig.chassis is None:
+        return []
+    drives, radius, weight = rig.drives, rig.radius, rig.chassis.mass * GRAVITY
     columns = np.column_stack(
         [window.ground_speed, pull_given(window, rig.chassis), radius * window.speed, window.torque, window.yaw_rate]
     )
+    place = chosen[:, None] + np.arange(1 - bins, 1)
+    there, place = place >= 0, np.maximum(place, 0)
     known = np.isfinite(columns)
-    with np.errstate(invalid="ignore"):
-        ground, asked, *wheels, yaw_rate = np.where(known, columns, 0.0).sum(axis=0) / known.sum(axis=0)
-    rim, torque = np.split(np.array(wheels), 2)
-    beside = _side(rig) * (yaw_rate if math.isfinite(yaw_rate) else 0.0)
-    limited = np.isfinite(torque_limit) & (torque_limit > 0.0)
-    full = torque >= settings.full_torque * torque_limit
-    at_limit = bool(limited.any() and full[limited].all())
-    weight = rig.chassis.mass * GRAVITY
-    resistance = ((torque / radius).sum() - asked) / weight
-    weights = np.where((torque > 0.0) & (rim > 0.0) & drives, torque, 0.0)
+    values, counts = np.where(known, columns, 0.0)[place], known[place]
+    accelerates = (np.isfinite(window.acceleration)[place] & there).any(axis=1)
+    if not there.all():
+        values[~there], counts[~there] = 0.0, False
     with np.errstate(invalid="ignore", divide="ignore"):
-        slip = np.where(weights > 0.0, weights * (1.0 - (ground + beside) / rim), 0.0).sum() / weights.sum()
-    pull = asked if np.isfinite(window.acceleration).any() else math.nan
-    return Motion(
-        float(window.t[-1]), float(ground), rim[drives].tolist(), float(resistance), at_limit, float(slip),
-        float(pull), _last(window, rig, beside, at_limit), beside[drives].tolist(), torque[drives].tolist(),
-        (limited & ~full)[drives].tolist(),
-    )  # fmt: skip
+        means = values.sum(axis=1) / counts.sum(axis=1)
+        ground, asked, yaw_rate = means[:, 0], means[:, 1], means[:, -1]
+        rim, torque = means[:, 2 : 2 + len(radius)], means[:, 2 + len(radius) : -1]
+        beside = _side(rig) * np.where(np.isfinite(yaw_rate), yaw_rate, 0.0)[:, None]
+        limited = np.isfinite(torque_limit) & (torque_limit > 0.0)
+        full = torque >= settings.full_torque * torque_limit
+        at_limit = limited.any() & (full | ~limited).all(axis=1)
+        resistance = ((torque / radius).sum(axis=1) - asked) / weight
+        weights = np.where((torque > 0.0) & (rim > 0.0) & drives, torque, 0.0)
+        slips = np.where(weights > 0.0, weights * (1.0 - (ground[:, None] + beside) / rim), 0.0)
+        slip = slips.sum(axis=1) / weights.sum(axis=1)
+    pull = np.where(accelerates, asked, np.nan)
+    of_wheels = (values[:, drives].tolist() for values in (rim, beside, torque, limited & ~full))
+    scalars = (values.tolist() for values in (window.t[chosen], ground, resistance, at_limit, slip, pull))
+    lasts = _samples(window.rows(chosen), rig, beside, at_limit)
+    return [
+        Motion(t, ground, rim, resistance, at_limit, slip, pull, last, beside, torque, reserve)
+        for t, ground, resistance, at_limit, slip, pull, rim, beside, torque, reserve, last in zip(
+            *scalars, *of_wheels, lasts, strict=True
+        )
+    ]
 
 
-def _last(window: Window, rig: Rig, beside: Array, at_limit: bool) -> Sample:
-    """The last bin of a window of a rig with a chassis, for the forecast of a stall."""
-    rim, of_rim = rig.radius * window.speed[-1], rig.radius**2 * window.variance["speed"][-1]
+def _samples(window: Window, rig: Rig, beside: Array, at_limit: NDArray[np.bool_]) -> list[Sample]:
+    """Each bin of a window of a rig with a chassis, for the forecast of a stall; beside (N, W), at_limit (N,)."""
+    assert rig.chassis is not None  # `motions` sees to it
+    rim, of_rim = rig.radius * window.speed, rig.radius**2 * window.variance["speed"]
     known = np.isfinite(rim) & np.isfinite(of_rim) & rig.drives
-    count, force = max(int(known.sum()), 1), window.torque[-1] / rig.radius
-    assert rig.chassis is not None  # `motion_of` sees to it
-    thrust = force[np.isfinite(force)].sum() if np.isfinite(force).any() else math.nan
-    depth, of_depth = window.sinkage[-1], window.variance["sinkage"][-1]
-    sunk = np.flatnonzero(np.isfinite(depth) & np.isfinite(of_depth))
-    deepest = sunk[np.argmax(depth[sunk])] if len(sunk) else None
-    return Sample(
-        float(window.t[-1]),
-        float(window.ground_speed[-1]),
-        float(window.variance["ground_speed"][-1]),
-        float(rim[known].mean()) if known.any() else math.nan,
-        float(of_rim[known].sum()) / count**2,
-        float(thrust) / (rig.chassis.mass * GRAVITY),
-        float(beside[known].mean()) if known.any() else 0.0,
+    count, force = known.sum(axis=1), window.torque / rig.radius
+    pushes = np.isfinite(force)
+    thrust = np.where(pushes.any(axis=1), np.where(pushes, force, 0.0).sum(axis=1), np.nan)
+    depth, of_depth = window.sinkage, window.variance["sinkage"]
+    sunk = np.isfinite(depth) & np.isfinite(of_depth)
+    bin_, deepest = np.arange(len(depth)), np.where(sunk, depth, -np.inf).argmax(axis=1)
+    depth, of_depth = (np.where(sunk, values, np.nan)[bin_, deepest] for values in (depth, of_depth))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean, mean_beside = (np.where(known, values, 0.0).sum(axis=1) / count for values in (rim, beside))
+    columns = (
+        window.t,
+        window.ground_speed,
+        window.variance["ground_speed"],
+        mean,
+        np.where(known, of_rim, 0.0).sum(axis=1) / np.maximum(count, 1) ** 2,
+        thrust / (rig.chassis.mass * GRAVITY),
+        np.where(count > 0, mean_beside, 0.0),
         at_limit,
-        math.nan if deepest is None else float(depth[deepest]),
-        math.nan if deepest is None else float(of_depth[deepest]),
-        float(window.acceleration[-1]) if window.kinematic and math.isnan(window.pitch[-1]) else math.nan,
+        depth,
+        of_depth,
+        np.where(np.isnan(window.pitch) & window.kinematic, window.acceleration, np.nan),
     )
+    return list(map(Sample, *(column.tolist() for column in columns)))
 
 
 def _side(rig: Rig) -> Array:

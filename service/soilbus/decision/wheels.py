@@ -80,16 +80,21 @@ class Axles:
     shared_motors: tuple[Group, ...] = ()
     length: Array | float = 0.0
 
+    @property
+    def drives(self) -> NDArray[np.bool_]:
+        """(W,), which wheels are driven."""
+        return np.asarray(self.driven[self.of_wheel, 0])
+
     @classmethod
-    def of(cls, rig: Rig, driven: NDArray[np.bool_] | None = None) -> Axles:
+    def of(cls, rig: Rig, drives: NDArray[np.bool_]) -> Axles:
         """The kinds of a rig's wheels.
 
         Parameters
         ----------
         rig
             The vehicle's wheels and chassis.
-        driven
-            (W,), which wheels are driven; None for all.
+        drives
+            (W,), which wheels are driven.
 
         Raises
         ------
@@ -98,10 +103,9 @@ class Axles:
         """
         if rig.chassis is None:
             raise ValueError("a capability needs the vehicle's mass and geometry")
-        drives = [True] * len(rig.wheels) if driven is None else driven.tolist()
         lengths = np.zeros(len(drives)) if rig.lengths is None else rig.lengths
         columns = (rig.radius, rig.width, rig.front, lengths)
-        kinds = list(zip(*(column.tolist() for column in columns), drives, strict=True))
+        kinds = list(zip(*(column.tolist() for column in (*columns, drives)), strict=True))
         unlike = list(dict.fromkeys(kinds))
         radius, width, front, long, drive = (np.array(column)[:, None] for column in zip(*unlike, strict=True))
         count = np.array([[float(kinds.count(kind))] for kind in unlike])
@@ -217,13 +221,14 @@ def wheel_table(
     """
     n_soils, n_slips = len(soils), len(slip)
     completed = UncertainModel.over(model).of_rows(n_soils)
-    axles = Axles.of(rig, driven)
+    drives = np.ones(len(rig.wheels), bool) if driven is None else driven
     if start is not None and not (
         start.pull.shape == (n_soils, n_slips)
         and np.array_equal(start.slip, slip)
-        and np.array_equal(start.axles.driven, axles.driven)
+        and np.array_equal(start.axles.drives, drives)
     ):
         start = None
+    axles = Axles.of(rig, drives) if start is None else start.axles
     rolling = np.where(np.asarray(axles.length) > 0.0, 0.0, ROLLING_SLIP)  # a track without thrust does not slip
     slips = np.where(axles.driven, np.broadcast_to(slip, (n_soils, len(axles.count), n_slips)), rolling)
     if start is not None:

@@ -18,16 +18,15 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.diagnosis.damped_descent import descend_damped
 from soilbus.diagnosis.evidence import OwnParameters, mixture_correction, own_parameters
 from soilbus.diagnosis.records import Record
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.multistart import DEFAULT_OPTIONS, DescentOptions, Fit, Start, fit_from, fit_window
+from soilbus.estimation.multistart import COMPARED, Fit, Start, fit_from, fit_window
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.observation_model import RESIDUAL, Latents, Linearisation, ObservationModelWithEffects
 from soilbus.estimation.parametrization import at_bounds
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
-from soilbus.estimation.solver import Iterate, Objective
+from soilbus.estimation.solver import Iterate, Objective, SolverOptions
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.wheel import Soil
 
@@ -138,10 +137,10 @@ class FittedModel:
         """-2 log posterior of the training blocks at the optimum, up to a constant."""
         return sum(fit.neg2_log_posterior for fit in self.fits)
 
-    def predicted_neg2_log_evidence(self, rows: int) -> float:
-        """-2 log evidence expected from this number of residuals like these: the misfit grows in proportion."""
-        misfit = self.neg2_log_posterior + self.gap * self.checked_rows
-        return self.neg2_log_evidence + (rows / self.rows - 1.0) * misfit
+    @property
+    def excess(self) -> float:
+        """By how much the squared residuals of all blocks, in units of their variance, exceed their number."""
+        return self.neg2_log_posterior + self.gap * self.checked_rows - self.rows
 
     @property
     def gap(self) -> float:
@@ -219,8 +218,8 @@ class FittedModel:
             for name, of in parts.items()
         ]
 
-    def own_parameters(self, effect: Effect, data_ratio: float = 1.0) -> tuple[OwnParameters, ...]:
-        """Likelihood of each later recording's own values of an effect of the record, as of data_ratio times its data.
+    def own_parameters(self, effect: Effect) -> tuple[OwnParameters, ...]:
+        """Likelihood of each later recording's own values of an effect of the record.
 
         Empty for other effects, even where they have a zero that wanders in each recording: without the wander they
         are the same effect.
@@ -229,7 +228,7 @@ class FittedModel:
         if not own or not effect.of_record:
             return ()
         n_sensors, free = self.checks[0].problem.n_sensors, [self.free[i] for i in own]
-        return tuple(own_parameters(*_moments(fit, n_sensors, own), free, data_ratio) for fit in self.fits[1:])
+        return tuple(own_parameters(*_moments(fit, n_sensors, own), free) for fit in self.fits[1:])
 
     def shared_parameters(self, effect: Effect) -> OwnParameters:
         """Likelihood, by the first recording, of an effect's parameters that are the vehicle's; without held ones."""
@@ -264,7 +263,7 @@ def fit_model(
     prior: SoilPrior,
     effects: Sequence[Effect],
     starts: Sequence[Start] | None = None,
-    options: DescentOptions = DEFAULT_OPTIONS,
+    options: SolverOptions = COMPARED,
 ) -> FittedModel | None:
     """A model with these effects fitted to all recordings.
 
@@ -332,7 +331,7 @@ def check(
         for _ in range(rounds - 1):
             latents = problem.updated(at, latents, np.zeros(_SOIL), np.zeros(len(gains)))
             at = problem.linearise(soil, gains, latents)
-        quadratic = objective.with_prior(Iterate(fit.mode.soil, gains, latents, np.inf, 0), at)
+        quadratic = objective.with_prior(Iterate(fit.mode.soil, gains, latents), at)
         step = None if quadratic is None else quadratic.step()
     if quadratic is None or step is None:
         return HeldOutCheck(problem, latents, at, np.inf, np.inf)
@@ -348,7 +347,7 @@ def _fits(
     effects: Sequence[Effect],
     free: tuple[Free, ...],
     starts: Sequence[Start] | None,
-    options: DescentOptions,
+    options: SolverOptions,
 ) -> tuple[list[Gaussian], list[Fit]] | None:
     """The joint prior of each recording, and its fit; None where one fails."""
     joint_priors: list[Gaussian] = []
@@ -401,19 +400,15 @@ def _fitted(
     prior: SoilPrior,
     joint_prior: Gaussian,
     start: Start | None,
-    options: DescentOptions,
+    options: SolverOptions,
 ) -> Fit | None:
-    """Fit from the start, or from several if None; one that has not converged goes on by the damped descent."""
+    """Fit from the start; if None from several, and from the best of these where that one has not converged."""
     if start is None:
         fit = fit_window(problem, prior, joint_prior)
         if fit is None or fit.converged:
             return fit
         start = Start(fit.mode.soil, fit.mode.gains)
-    fit = fit_from(problem, prior, joint_prior, start, problem.n_sensors, options)
-    if fit is None or fit.converged:
-        return fit
-    damped = descend_damped(Objective(problem, prior, joint_prior), fit, options)
-    return None if (damped or fit).neg2_log_posterior > options.give_up_above else damped or fit
+    return fit_from(problem, prior, joint_prior, start, options)
 
 
 def _held_at_edges(
@@ -425,10 +420,9 @@ def _held_at_edges(
     leaves = [f.std > 0.0 and edge != 0.0 for f, edge in zip(free, edges, strict=True)]
     if not any(leaves) or not all(fit.converged for fit in fits):
         return None
-    standardised = gains[problem.n_sensors :].tolist()
     return tuple(
-        replace(f, value=f.at(u), std=0.0) if leaving else f
-        for f, u, leaving in zip(free, standardised, leaves, strict=True)
+        replace(f, value=f.parameter.high if edge > 0.0 else f.parameter.low, std=0.0) if leaving else f
+        for f, edge, leaving in zip(free, edges, leaves, strict=True)
     )
 
 

@@ -255,7 +255,7 @@ def _reduced(
     covariance[:-P, :-P], covariance[-P:, -P:] = joint_prior.covariance, np.eye(P)
     extended = Gaussian(joint_prior.soil, np.concatenate([joint_prior.gains, np.zeros(P)]), covariance)
     gains = np.concatenate([fit.optimum.gains, np.zeros(P)])
-    iterate = Iterate(fit.optimum.soil, gains, fit.optimum.latents, np.inf, 0)
+    iterate = Iterate(fit.optimum.soil, gains, fit.optimum.latents)
     objective = Objective(problem, prior, extended)
     with np.errstate(all="ignore"):
         quadratic = objective.quadratic_model(iterate)

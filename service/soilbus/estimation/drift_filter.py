@@ -25,7 +25,7 @@ from soilbus.arrays import Array
 from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
 from soilbus.estimation.multistart import Fit
 from soilbus.estimation.path_curvature import by_curvature
-from soilbus.estimation.solver import GaussianApproximation, Iterate, Objective
+from soilbus.estimation.solver import GaussianApproximation, Objective
 
 PIECES = 5
 """Pieces of a window, each with its own soil; no evidence recorded."""
@@ -73,19 +73,14 @@ def at_window_end(objective: Objective, fit: Fit, window: float, drift: float) -
     optimum, constant = fit.optimum, objective.approximation_at(fit.optimum)
     if constant is None:
         return fit
-    iterate, free = (
-        Iterate(optimum.soil, optimum.gains, optimum.latents, fit.neg2_log_posterior, 0),
-        len(objective.free),
-    )
+    free = len(objective.free)
     models = _drift_models(_joint(objective, fit, constant, window, drift), len(constant.step), free, drift)
     if not models:
         return fit
     step, covariance = _model_average(models)
     covariance[:free, :free] += np.eye(free) * drift**2 / (3.0 * PIECES)  # the end of the last piece is not its mean
-    at_optimum, drift_covariance = (
-        objective.gaussian_with(iterate, constant.covariance),
-        covariance - constant.covariance,
-    )
+    at_optimum = objective.gaussian(optimum.soil, optimum.gains, constant.covariance)
+    drift_covariance = covariance - constant.covariance
 
     def shifted(gaussian: Gaussian) -> Gaussian:
         if gaussian is fit.mode and fit.marginalised is None:

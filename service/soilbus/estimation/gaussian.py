@@ -41,8 +41,6 @@ _SOIL = len(PARAMETERS)
 _K_C, _K_PHI, _N, _PHI, _C = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "phi", "c"))
 LINEAR = np.array([_K_C, _N, _PHI, _C])
 """Parameters in which forces, of n the logarithm of pressure, are linear, of phi in its tangent."""
-_TAN = 2
-"""Place of phi among LINEAR."""
 MIN_VARIANCE_REDUCTION = 1e-3
 """Least share [1] of the prior variance of a linear parameter's logarithm that data are taken to remove.
 
@@ -62,20 +60,19 @@ def deviations(soil: Array, base: Array, width: float) -> tuple[Array, Array]:
     -------
     (6,), (6, 6)
     """
-    free = base > 0.0  # a parameter that is held may be zero
-    soil, base = np.where(free, soil, 1.0), np.where(free, base, 1.0)
-    change, slopes = np.log(soil / base), np.eye(len(soil))
-    value, start, by_log, unit = soil[LINEAR], base[LINEAR], soil[LINEAR], base[LINEAR]
-    tan, tan_at_base = math.tan(soil[_PHI]), math.tan(base[_PHI])
-    value[_TAN], start[_TAN] = tan, tan_at_base
-    by_log[_TAN] *= 1.0 + tan**2
-    unit[_TAN] *= 1.0 + tan_at_base**2
-    change[LINEAR], slopes[LINEAR, LINEAR] = (value - start) / unit, by_log / unit
-    K_L, K_L_at_base = (s[_K_PHI] + s[_K_C] / width for s in (soil, base))
-    k_phi, ratio = base[_K_PHI], K_L_at_base / K_L
-    change[_K_PHI] = (-math.log(ratio) * K_L_at_base - (soil[_K_C] - base[_K_C]) / width) / k_phi
-    slopes[_K_PHI, _K_PHI] = ratio * soil[_K_PHI] / k_phi
-    slopes[_K_PHI, _K_C] = (ratio - 1.0) * soil[_K_C] / width / k_phi
+    pairs = list(zip(soil.tolist(), base.tolist(), strict=True))
+    new, old = zip(*(pair if pair[1] > 0.0 else (1.0, 1.0) for pair in pairs), strict=True)  # a held one may be zero
+    change, slopes = np.log(np.divide(new, old)), np.eye(len(soil))
+    for i in (_K_C, _N, _C):
+        change[i], slopes[i, i] = (new[i] - old[i]) / old[i], new[i] / old[i]
+    tan, tan_at_base = math.tan(new[_PHI]), math.tan(old[_PHI])
+    unit = old[_PHI] * (1.0 + tan_at_base**2)
+    change[_PHI], slopes[_PHI, _PHI] = (tan - tan_at_base) / unit, new[_PHI] * (1.0 + tan**2) / unit
+    K_L, K_L_at_base = (s[_K_PHI] + s[_K_C] / width for s in (new, old))
+    k_phi, ratio = old[_K_PHI], K_L_at_base / K_L
+    change[_K_PHI] = (-math.log(ratio) * K_L_at_base - (new[_K_C] - old[_K_C]) / width) / k_phi
+    slopes[_K_PHI, _K_PHI] = ratio * new[_K_PHI] / k_phi
+    slopes[_K_PHI, _K_C] = (ratio - 1.0) * new[_K_C] / width / k_phi
     return change, slopes
 
 
@@ -278,6 +275,7 @@ class PriorFactor:
         self.least_value = 0.0
         self._offset = np.zeros(_SOIL) if gaussian_prior.offset is None else gaussian_prior.offset
         self._is_likelihood_factor = gaussian_prior.offset is not None
+        self._last_deviations: tuple[Array, tuple[Array, Array]] | None = None
         if self._is_likelihood_factor:
             self._linear = LINEAR[np.isin(LINEAR, self._free)]
             self._place = np.searchsorted(self._free, self._linear)
@@ -312,7 +310,7 @@ class PriorFactor:
         off = np.concatenate([np.log(soil[self._free]), gains[self._active]]) - self._mean
         if not self._is_likelihood_factor:
             return np.asarray(off)
-        changes, _ = deviations(soil, self._gaussian_prior.soil, self._width)
+        changes, _ = self._deviations(soil)
         off[: len(self._free)] = (changes - self._offset)[self._free]
         return np.append(off, np.log(soil[self._linear] / self._prior.median[self._linear]))
 
@@ -333,8 +331,15 @@ class PriorFactor:
         free, changes = len(self._free), by_logs[: len(self._free)].copy()
         for parameter, row in (by_values or {}).items():
             changes[np.searchsorted(self._free, parameter)] = row
-        slopes = deviations(soil, self._gaussian_prior.soil, self._width)[1][np.ix_(self._free, self._free)]
+        slopes = self._deviations(soil)[1][self._free[:, None], self._free]
         return np.vstack([slopes @ changes, by_logs[free:], by_logs[self._place]])
+
+    def _deviations(self, soil: Array) -> tuple[Array, Array]:
+        """`deviations` from the mean to a soil (6,), kept for the next call with the same one."""
+        last = self._last_deviations
+        if last is None or last[0] is not soil:
+            last = self._last_deviations = soil, deviations(soil, self._gaussian_prior.soil, self._width)
+        return last[1]
 
     def jacobian_by_mean(self, soil: Array, gains: Array, shift: Array) -> tuple[Array, Array, Array]:
         """Derivatives (R, M) of the residuals by M shifts (6 + G, M) of the mean, with precision and residuals."""

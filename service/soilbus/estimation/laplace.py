@@ -52,8 +52,6 @@ NODE_STEP_GROWTH = 1.4
 """Ratio [1] of each step of log n to the one before.  No evidence recorded."""
 MAX_NODES = 12
 """Nodes on either side of the mode.  No evidence recorded."""
-MAX_RESTARTS = 3
-"""Descents in a row for one node.  No evidence recorded."""
 NEGLIGIBLE = 9.0
 """-2 log density over its least value where the ridge has ended: 3 sd of a normal distribution."""
 GRID_POINTS = 400
@@ -167,9 +165,9 @@ def profile_over_n(
     """Fits of the denoised window through its optimum near `found`, with nodes along n; None without an optimum."""
     optimum = found.optimum
     denoised = DenoisedObservationModel(problem, optimum)
-    start = Iterate(optimum.soil, optimum.gains, denoised.latents, np.inf, 1)
-    top = _converged(Objective(denoised, prior, joint_prior), start)
-    if top is None:
+    start = Iterate(optimum.soil, optimum.gains, denoised.latents)
+    top = refine(Objective(denoised, prior, joint_prior), start)
+    if top is None or not top.converged:
         return None
     if not has_nodes or not prior.log_std[[_K_C, _K_PHI, _N]].all() or np.ptp(problem.rig.width) == 0.0:
         return ProfileOverN(denoised, top, [])
@@ -196,7 +194,7 @@ def attainable_variance(along: ProfileOverN, prior: SoilPrior, joint_prior: Gaus
     variance = []
     for node in along.nodes:
         optimum = node.fit.optimum
-        iterate = Iterate(optimum.soil, optimum.gains, optimum.latents, np.inf, 1)
+        iterate = Iterate(optimum.soil, optimum.gains, optimum.latents)
         model = objective.with_prior(iterate, optimum.at)
         inverse = None if model is None else solve_with_inverse(model.information, model.gradient)
         if inverse is None:
@@ -313,20 +311,10 @@ def _node(
     median[_N], log_std[_N] = n, 0.0
     objective = Objective(problem, SoilPrior(median, log_std), joint_prior.conditioned_on(_N, u))
     latents = problem.with_entry_angles(near.optimum.latents, Soil(*soil.tolist()), gains)
-    fit = _converged(objective, Iterate(soil, gains, latents, np.inf, 1))
-    if fit is None:
+    fit = refine(objective, Iterate(soil, gains, latents))
+    if fit is None or not fit.converged:
         return None
     return Node(u, fit, joint_prior.neg2_log_marginal(_N, u, prior) + objective.prior_factor.least_value)
-
-
-def _converged(objective: Objective, start: Iterate) -> Fit | None:
-    """The fit from near its optimum, by up to MAX_RESTARTS descents; None where none converges."""
-    for _ in range(MAX_RESTARTS):
-        fit = refine(objective, start)
-        if fit is None or fit.converged:
-            return fit
-        start = Iterate(fit.optimum.soil, fit.optimum.gains, fit.optimum.latents, np.inf, 1)
-    return None
 
 
 def _logs_and_gains(fit: Fit) -> Array:

@@ -100,14 +100,16 @@ class FormPosterior:
 def with_form_step(model: WheelModel, step: Array) -> WheelModel:
     """The model with form parameters that differ from its own by a step (4,)."""
     peak, by_slip, leave, other = step.tolist()
+    share = model.exponential_share
     if model.shear_law == "exponential":  # the same, with a share that can be taken away
-        model, other = replace(model, shear_law="rational", exponential_share=1.0), -other
+        share, other = 1.0, -other
     return replace(
         model,
+        shear_law="rational",
         peak_c1=model.peak_c1 + peak,
         peak_c2=model.peak_c2 + by_slip,
         exit_ratio=model.exit_ratio - leave,
-        exponential_share=model.exponential_share + other,
+        exponential_share=share + other,
         one_off=True,
     )
 

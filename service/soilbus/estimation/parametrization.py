@@ -1,20 +1,12 @@
-"""Coordinates of the soil in which a window's objective is closest to quadratic, and moments along k_c's share.
+"""Coordinates of the soil in which a window's objective is closest to quadratic, and their bounds.
 
 Equations.  With b the mean tyre width, z the typical depth, and K_L = k_c / b + k_phi,
 
     coordinates    log k_c, log (K_L z^n), log n, log phi, log c, log K        (free parameters only)
     bounds         |log parameter - log prior median| <= BOUND_SD prior sd,   phi <= MAX_PHI
-    k_c's share    s = (k_c / b) / K_L
 
 A window determines the bearing pressure K_L z^n well and k_c, k_phi and n apart badly.  In plain logarithms
 the optimum would lie in a long curved valley; with log pressure in the place of log k_phi it does not.
-
-Tyres of different width measure s, and the model is nearly linear in s.  The prior is Gaussian in log k_c and
-log k_phi, and so in log s and log (1 - s) given K_L.  Where the data determine s, the posterior is one
-Gaussian.  Where they do not, the posterior of log s falls off fast towards large s and as slowly as the prior
-towards small s, and the curvature at the mode does not describe its spread.  Given s the other coordinates are
-Gaussian, so that an integral over s alone gives mean and covariance (cf. Rue, Martino & Chopin 2009, J. R. Stat.
-Soc. B 71:319).
 """
 
 from __future__ import annotations
@@ -22,7 +14,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,12 +37,6 @@ MAX_PHI = 1.2
 """Largest free friction angle [rad], beyond any soil's: the model ends at a right angle."""
 MIN_K_PHI_SHARE = 0.01
 """Least share of k_phi in K_L [1] that coordinates are converted to: k_phi is positive."""
-SHARE_NODES = 81
-"""Nodes of the integral over k_c's share.  No evidence recorded."""
-SHARE_HALF_WIDTH_SD = 6.0
-"""Half width of that integral in prior sd of log s.  No evidence recorded."""
-MAX_SHARE = 0.99
-"""Upper end of that integral: share of k_c in K_L [1]."""
 
 _LOG_DEPTH = math.log(TYPICAL_DEPTH)
 _K_C, _K_PHI, _N, _PHI, _C = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n", "phi", "c"))
@@ -96,7 +81,10 @@ class Coordinates:
         return self.within(soil)
 
     def log_directions(self, soil: Array) -> Array:
-        """Derivatives (6, F) of the parameters' logarithms by the coordinates."""
+        """Derivatives (6, F) of the parameters' logarithms by the coordinates; kept for the next call with it."""
+        last_soil, directions = self._last_directions
+        if last_soil is soil:
+            return directions
         directions, column = self._own_directions.copy(), self._column
         if _K_PHI in column:
             k_c, k_phi, n = soil[:3].tolist()
@@ -106,6 +94,8 @@ class Coordinates:
                 directions[_K_PHI, column[_K_C]] = -k_c / self.width / k_phi
             if _N in column:
                 directions[_K_PHI, column[_N]] = -K_L / k_phi * n * _LOG_DEPTH
+        directions.flags.writeable = False
+        self._last_directions[:] = soil, directions
         return directions
 
     def curvature(self, gradient: Array) -> Array:
@@ -205,6 +195,11 @@ class Coordinates:
         return np.log(low), np.log(high)
 
     @cached_property
+    def _last_directions(self) -> list[Array]:
+        """The soil (6,) of the last call of `log_directions`, and its result."""
+        return [np.zeros(0), np.zeros(0)]
+
+    @cached_property
     def _own_directions(self) -> Array:
         """As `log_directions` (6, F), for coordinates that each are their parameter's logarithm."""
         return np.eye(len(PARAMETERS))[:, self.free]
@@ -226,71 +221,3 @@ def step_fraction_within(room: Array, step: Array) -> float:
     if not crosses.any():
         return 1.0
     return max(float((room[crosses] / step[crosses]).min(initial=1.0)), 0.0)
-
-
-class Moments(NamedTuple):
-    """Mean (P,) of deviations from the mode and covariance (P, P) about the mean: log s, then the others."""
-
-    mean: Array
-    covariance: Array
-
-
-def moments_along_share(quadratic: Array, gradient: Array, share: float) -> Moments | None:
-    """Moments of a posterior along k_c's share.
-
-    Parameters
-    ----------
-    quadratic : (P + 2, P + 2)
-        Of z: (change of s) / s, changes of log s and of log (1 - s), and those o (P - 1,) of the other unknowns.
-    gradient : (P + 2,)
-        Half the gradient at the mode: -2 log posterior is z' quadratic z + 2 gradient' z, up to a constant.
-    share
-        s at the mode.
-
-    Returns
-    -------
-    Moments or None
-        None where the other unknowns are not determined.
-    """
-    own = np.diag(quadratic)[3:]
-    if not np.all(own > 0.0):
-        return None
-    scale = 1.0 / np.sqrt(own)
-    scaled = quadratic[3:, 3:] * np.outer(scale, scale)
-    try:
-        np.linalg.cholesky(scaled)  # by rounding it may not be positive definite
-        inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
-    except np.linalg.LinAlgError:
-        return None
-    along = -inverse @ quadratic[3:, :3]
-    of_share = quadratic[:3, :3] + quadratic[:3, 3:] @ along
-    first, second = _over_share(of_share, gradient[:3] + along.T @ gradient[3:], share)
-    spread = np.vstack([[0.0, 1.0, 0.0], along])
-    mean, covariance = spread @ first, spread @ second @ spread.T
-    mean[1:] -= inverse @ gradient[3:]
-    covariance[1:, 1:] += inverse
-    return Moments(mean, covariance) if np.isfinite(covariance).all() else None
-
-
-def _over_share(quadratic: Array, gradient: Array, share: float) -> tuple[Array, Array]:
-    """Mean (3,) of the changes of s, log s and log (1 - s), and covariance (3, 3) about it.
-
-    The mean is over log k_c and log k_phi, as in the prior.  The covariance has Jeffreys' measure, the root of
-    the information at each s: intervals then have their nominal coverage also where the data determine s and the
-    prior does not (Welch & Peers 1963, J. R. Stat. Soc. B 25:318).
-    """
-    at_mode = np.array([1.0, 1.0, -share / (1.0 - share)])
-    scale = 1.0 / np.sqrt(at_mode @ quadratic @ at_mode)
-    half_width = np.arcsinh(SHARE_HALF_WIDTH_SD / np.sqrt(quadratic[1, 1]) / scale)
-    nodes = np.linspace(-half_width, half_width, SHARE_NODES)
-    d = np.minimum(scale * np.sinh(nodes), np.log(MAX_SHARE / share))
-    rest = 1.0 - share * np.exp(d)
-    changes = np.stack([np.expm1(d), d, np.log(rest / (1.0 - share))])
-    slopes = np.stack([np.exp(d), np.ones(SHARE_NODES), 1.0 - 1.0 / rest])
-    neg2_log = (changes * (quadratic @ changes)).sum(0) + 2.0 * gradient @ changes
-    density = np.cosh(nodes) * (scale * np.sinh(nodes) <= d) * np.exp(-0.5 * (neg2_log - neg2_log.min()))
-    by_prior = density / rest
-    mean = changes @ by_prior / by_prior.sum()
-    density *= np.sqrt((slopes * (quadratic @ slopes)).sum(0))
-    off = changes - mean[:, None]
-    return mean, (off * density / density.sum()) @ off.T

@@ -44,6 +44,8 @@ _COLUMNS: tuple[tuple[str, Column], ...] = (
     ("warning.state", _TEXT),
     ("traversability.limit", _TEXT),
     ("traversability.contradicted", _TEXT),
+    ("solver.termination", _TEXT),
+    ("solver.evaluations", _COUNT),
     ("search_ended", _TRUTH),
     ("bearing_pressure.extrapolates", _TRUTH),
     ("soil.k_c.*", Column("number", "N/m^(n+1)")),

@@ -33,7 +33,7 @@ from soilbus.decision.immobilisation import (
 )
 from soilbus.decision.judgement import Basis, judge
 from soilbus.decision.torque_ceiling import TorqueCeiling
-from soilbus.decision.traction_loss import NO_LOSS, idle, motion_of, observed, slope_felt
+from soilbus.decision.traction_loss import NO_LOSS, idle, motions, observed, slope_felt
 from soilbus.decision.traversability import State, Status, Traversability
 from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.wheels import WheelTable
@@ -171,6 +171,7 @@ class WindowEstimator:
             samples=task.window.samples,
             rejected=task.rejected,
             iterations=0 if fit is None else fit.iterations,
+            termination=None if fit is None else str(fit.termination),
             soil_class=self._soil_class(posterior),
             position=task.track.at((tracked.since + task.end) / 2.0),
             failure=self._failure(tracked),
@@ -257,11 +258,13 @@ class WindowEstimator:
         self._warnings = self._warnings._replace(begun=())
         since = -math.inf if window.fresh else window.result.t - self._settings.hop
         driven = window.driven
-        looks = list(moments(driven, self.rig, since, self._settings.min_speed))
-        for i, moment in zip(np.flatnonzero(driven.t > since).tolist(), looks, strict=bool(looks)):
-            few = driven.rows(slice(max(i + 1 - BINS_OF_A_MOMENT, 0), i + 1))
-            if (motion := motion_of(few, self.rig, window.torque_limit, self.config.traversability)) is not None:
-                self._loss = observed(self._loss, motion, self.config)
+        settings, chosen = self._settings, np.flatnonzero(driven.t > since)
+        looks = moments(driven, self.rig, chosen, settings.min_speed)
+        lately = motions(
+            driven, self.rig, window.torque_limit, self.config.traversability, chosen, BINS_OF_A_MOMENT
+        )  # fmt: skip
+        for moment, motion in zip(looks, lately, strict=True):
+            self._loss = observed(self._loss, motion, self.config)
             inertia = moment.inertia - slope_felt(self._loss, self.rig)
             self._watch = watched(self._watch, moment.t, moment.slip, moment.pull, self._curve, inertia)
             self._warnings = self._warnings.after(moment.t, with_loss(self._watch, self._loss).warning)

@@ -13,6 +13,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from statistics import median
 from typing import NamedTuple
 
 import numpy as np
@@ -166,7 +167,7 @@ class ReportedLimits:
         """Add samples [N m] (N,) of the motor of a wheel or axle at the times t [s]."""
         if name in self._names:
             old_t, old = self._reported.get(name, (t[:0], value[:0]))
-            self._reported[name] = np.append(old_t, t), np.append(old, value)
+            self._reported[name] = np.concatenate([old_t, t]), np.concatenate([old, value])
 
     def at(self, t: float) -> Array:
         """The limits (W,) in force at the time t [s]."""
@@ -180,7 +181,7 @@ class ReportedLimits:
     def _of(self, motor: Motor, now: float) -> float:
         t, value = self._reported.get(motor.name, (np.empty(0), np.empty(0)))
         last = value[t <= now][-LIMIT_SAMPLES:]
-        return float(np.median(last)) if len(last) else motor.max_torque
+        return median(last.tolist()) if len(last) else motor.max_torque
 
     def drop_before(self, end: float) -> None:
         """Forget samples that are no longer among the last ones at the time `end` [s]."""

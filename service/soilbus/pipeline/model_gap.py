@@ -36,7 +36,7 @@ class Square(NamedTuple):
 
 
 def squares(at: Linearisation, n_wheels: int) -> dict[str, Square]:
-    """Squares of torque, draft and, where measured, sinkage in one fitted window.
+    """Squares of torque, draft and, where measured, sinkage in one fitted window, as far as they are finite.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def squares(at: Linearisation, n_wheels: int) -> dict[str, Square]:
     known = at.weighed.any(axis=1).reshape(-1, per_instant)
     parts = {"torque": slice(n_wheels), "draft": slice(n_wheels, n_wheels + 1), "sinkage": slice(n_wheels + 1, None)}
     found = {name: Square(float(square[:, part].sum()), int(np.sum(known[:, part]))) for name, part in parts.items()}
-    return {name: of_channel for name, of_channel in found.items() if of_channel.rows}
+    return {name: of for name, of in found.items() if of.rows and math.isfinite(of.total)}
 
 
 class GapWatch:
@@ -59,16 +59,25 @@ class GapWatch:
     def __init__(self, window: float, hop: float) -> None:
         self._overlap = window / hop
         self._seen: deque[tuple[float, Mapping[str, Square]]] = deque()
+        self._sums: dict[str, Square] = {}
 
     def forget(self) -> None:
         """Begin afresh."""
         self._seen.clear()
+        self._sums = {}
 
     def take(self, end: float, found: Mapping[str, Square]) -> None:
         """Add one window that ended at `end` [s]."""
         self._seen.append((end, found))
+        self._add(found, 1)
         while self._seen[0][0] < end - SPAN:
-            self._seen.popleft()
+            self._add(self._seen.popleft()[1], -1)
+
+    def _add(self, found: Mapping[str, Square], sign: int) -> None:
+        """Add the squares of one window to the sums, or take them out again (sign -1)."""
+        for channel, square in found.items():
+            known = self._sums.get(channel, Square(0.0, 0))
+            self._sums[channel] = Square(known.total + sign * square.total, known.rows + sign * square.rows)
 
     def gaps(self) -> dict[str, float]:
         """Reduced chi-square of the channels that have not fitted for minutes, the worst first."""
@@ -76,22 +85,12 @@ class GapWatch:
             return {}
         out = {
             channel: known.total / known.rows
-            for channel, known in self._sums().items()
-            if known.total / known.rows > max(LIMIT, 1.0 + DEVIATIONS * math.sqrt(2.0 * self._overlap / known.rows))
+            for channel, known in self._sums.items()
+            if known.rows
+            and known.total / known.rows > max(LIMIT, 1.0 + DEVIATIONS * math.sqrt(2.0 * self._overlap / known.rows))
         }
         return dict(sorted(out.items(), key=lambda item: -item[1]))
 
     def chi2(self) -> dict[str, float]:
         """Reduced chi-square of every channel, whether it fits or not."""
-        return {channel: known.total / known.rows for channel, known in self._sums().items()}
-
-    def _sums(self) -> dict[str, Square]:
-        """Of each channel over the windows kept."""
-        of_channel: dict[str, list[Square]] = {}
-        for _, found in self._seen:
-            for channel, square in found.items():
-                of_channel.setdefault(channel, []).append(square)
-        return {
-            channel: Square(sum(part.total for part in parts), sum(part.rows for part in parts))
-            for channel, parts in of_channel.items()
-        }
+        return {channel: known.total / known.rows for channel, known in self._sums.items() if known.rows}

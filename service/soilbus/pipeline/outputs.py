@@ -148,6 +148,7 @@ def window_record(result: WindowResult, config: Config) -> dict[str, Any]:
         },
         "capability": None if decision.capability is None else _capability(decision.capability),
         "chi2": result.chi2,
+        "solver": {"termination": result.termination, "evaluations": result.iterations},
         "search_ended": result.search_ended,
         "samples": result.samples,
         "rejected": result.rejected,

@@ -57,7 +57,7 @@ class PositionTrack:
             t, value = samples[name]
             fixed = np.abs(value) > NO_FIX
             old_t, old_value = self._fixes[name]
-            self._fixes[name] = np.append(old_t, t[fixed]), np.append(old_value, value[fixed])
+            self._fixes[name] = np.concatenate([old_t, t[fixed]]), np.concatenate([old_value, value[fixed]])
 
     def at(self, t: float) -> Position | None:
         """The position at t [s]; None where the fixes before and after it are further apart than the timeout."""

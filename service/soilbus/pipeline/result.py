@@ -39,8 +39,10 @@ class WindowResult:
         Means over the window by wheel, sinkage in m; None where not known.
     traversability
         The decision.
-    chi2, samples, rejected, iterations
-        Reduced chi-square, number of samples, refused samples by reason, solver iterations.
+    chi2, samples, rejected
+        Reduced chi-square, number of samples, refused samples by reason.
+    iterations, termination
+        Evaluations of the model by the solver, and why it ended (`solver.Termination`); None without a fit.
     soil_class
         Probability of each known soil and of `unknown`, the largest first.
     position
@@ -82,6 +84,7 @@ class WindowResult:
     samples: int
     rejected: dict[str, int]
     iterations: int = 0
+    termination: str | None = None
     soil_class: dict[str, float] | None = None
     position: Position | None = None
     failure: str | None = None

@@ -67,6 +67,10 @@ def findings_record(findings: Findings) -> dict[str, Any]:
             "residuals": diagnosis.gap_after.rows,
             "open": is_open(diagnosis),
         },
+        "solver": {
+            "before": [str(fit.termination) for fit in diagnosis.base.fits],
+            "after": [str(fit.termination) for fit in diagnosis.completed.fits],
+        },
         **_shown(findings),
         "soil_before": soils[0]["before"],
         "soil_after": soils[0]["after"],

@@ -158,6 +158,7 @@ def _windows(results: Sequence[WindowResult]) -> Table:
             "-" if r.bearing is None else f"{r.bearing.value / 1e3:.2f} ± {r.bearing.std / 1e3:.2f}",
             "-" if r.traversability.max_draft is None else f"{r.traversability.max_draft.value / 1e3:.2f}",
             "-" if r.chi2 is None else f"{r.chi2:.2f}",
+            "-" if r.termination is None else f"{r.termination} ({r.iterations})",
             str(r.traversability.state),
             ", ".join(f"{k} {v}" for k, v in r.rejected.items()) or "-",
         )
@@ -170,6 +171,7 @@ def _windows(results: Sequence[WindowResult]) -> Table:
         "bearing pressure, kPa",
         "largest draft, kN",
         "chi²",
+        "solver ended by (evaluations)",
         "may go on",
         "refused samples",
     )

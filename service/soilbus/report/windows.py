@@ -62,6 +62,7 @@ def summary_of(results: Sequence[WindowResult], heard: str, used: int | None, re
     states = Counter(str(r.traversability.state) for r in results)
     lines.append("traversability " + (", ".join(f"{s} {n}" for s, n in states.most_common()) or "unknown"))
     lines.append("failed solves " + counted(Counter(r.failure for r in results if r.failure)))
+    lines.append("solver ended by " + counted(Counter(r.termination for r in results if r.termination)))
     if ended := sum(r.search_ended for r in results):
         lines.append(f"search for another soil ended by its budget in {ended} windows (estimator.search_rate)")
     if used is not None:

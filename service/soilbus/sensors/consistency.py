@@ -311,6 +311,8 @@ def standing_wheels(data: ConsistencyInput) -> Iterator[str]:
     ground = window.ground_speed[:, None]
     with np.errstate(invalid="ignore"):
         still = data.driving[:, None] & (rig.radius * window.speed < STILL_SHARE * ground)
+        if not still.any():
+            return
         braked = data.traction < -BRAKED
         idle = np.abs(data.traction) < NO_TRACTION
     if lasts(np.logical_and.reduce(still & idle, axis=1), data.sustained):
@@ -327,6 +329,8 @@ def gear_ratio(data: ConsistencyInput) -> Iterator[str]:
     Both, where this is so of most wheels: the gear ratio may be wrong, and the torques with it.
     """
     window, rig, motor = data.window, data.rig, data.motor_speed
+    if not np.isfinite(motor).any():
+        return
     with np.errstate(invalid="ignore"):
         noise = np.sqrt(2.0 * window.variance["speed"])
         apart = np.abs(motor - window.speed) > GEAR_SLACK * np.abs(window.speed) + DEVIATIONS * noise + LEAST_TURN
@@ -399,6 +403,8 @@ def slip_without_traction(data: ConsistencyInput) -> Iterator[str]:
     with np.errstate(invalid="ignore"):
         idle = (slip > FALSE_SLIP) & (grip < NO_TRACTION)
         dragged = (slip < -FALSE_SLIP) & (grip > TRACTION)
+    if not (idle.any() or dragged.any()):
+        return
     idles = [i for i in range(len(rig.wheels)) if lasts(idle[:, i], data.sustained)]
     drags = [i for i in range(len(rig.wheels)) if lasts(dragged[:, i], data.sustained)]
     if 2 * len(drags) > len(rig.wheels):

@@ -121,7 +121,10 @@ def entering(at: Stress, state: WheelState, tau: Array, mobilising: Array) -> tu
 def unit_of(state: WheelState) -> Array:
     """What turns an integral over shares of the entry angle into W, DP and T (3, N)."""
     area = state.radius * state.width * state.entry_angle
-    return np.asarray(np.stack([area, area, state.radius * area]))
+    unit = np.empty((3, *area.shape))
+    unit[:2] = area
+    np.multiply(state.radius, area, out=unit[2])
+    return unit
 
 
 def dot(field: Array, rows: Array) -> Array:

@@ -24,7 +24,7 @@ from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.decision.capability import OverSlip
 from soilbus.decision.immobilisation import BINS_OF_A_MOMENT, Alert, Moment, Watch, moments, watched, with_loss
-from soilbus.decision.traction_loss import NO_LOSS, TractionLoss, motion_of, slope_felt
+from soilbus.decision.traction_loss import NO_LOSS, TractionLoss, motions, slope_felt
 from soilbus.decision.traction_loss import observed as loss_after
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.instrumentation import completed
@@ -249,15 +249,13 @@ def _looks_and_curves(
         if result.curve is not None:
             curves.append((due, result.curve))
     seen = completed(forward(store.window(0.0, end)), rig)
-    losses, loss = [], NO_LOSS
-    for i in range(len(seen.t)):
-        few = seen.rows(np.arange(max(i + 1 - BINS_OF_A_MOMENT, 0), i + 1))
-        motion = motion_of(few, rig, limit, config.traversability)
-        loss = loss if motion is None else loss_after(loss, motion, config)
+    losses, loss, bins = [], NO_LOSS, np.arange(len(seen.t))
+    for motion in motions(seen, rig, limit, config.traversability, bins, BINS_OF_A_MOMENT):
+        loss = loss_after(loss, motion, config)
         losses.append(loss)
     looks = [
         moment._replace(inertia=moment.inertia - slope_felt(loss, rig))
-        for moment, loss in zip(moments(seen, rig, 0.0, settings.min_speed), losses, strict=True)
+        for moment, loss in zip(moments(seen, rig, bins, settings.min_speed), losses, strict=True)
     ]
     return looks, losses, curves
 

@@ -102,7 +102,7 @@ def sample_posterior(
                 jacobian = np.linalg.slogdet(coordinates.log_directions(soil)[coordinates.free])[1]
                 log_share[i] = jacobian - 0.5 * _neg2_log_density(objective, quadratic) - draws.log_density[i]
                 covariance = np.asarray(np.linalg.inv(quadratic.information))
-                bound[i] = objective.gaussian_with(iterate, covariance).posterior.log_covariance
+                bound[i] = objective.gaussian(iterate.soil, iterate.gains, covariance).posterior.log_covariance
     share = softmax(np.where(np.isfinite(log_share), log_share, -np.inf))
     kept = share > 0.0
     return PosteriorSamples(logs[kept], share[kept], bound[kept])
@@ -170,7 +170,7 @@ def _quadratic_at(objective: Objective, soil: Array, near: Node) -> tuple[Iterat
     """The quadratic model at a soil (6,), with the likeliest latents there."""
     problem, optimum = objective.problem, near.fit.optimum
     latents = problem.with_entry_angles(optimum.latents, Soil(*soil.tolist()), optimum.gains)
-    iterate = Iterate(soil, optimum.gains, latents, np.inf, 1)
+    iterate = Iterate(soil, optimum.gains, latents)
     at = problem.linearise(iterate.as_soil(), iterate.gains, latents)
     latents = problem.updated(at, latents, np.zeros(len(PARAMETERS)), np.zeros(len(iterate.gains)))
     iterate = replace(iterate, latents=latents)

@@ -1,6 +1,9 @@
 """Bench of replay: a recorded log through the daemon's pipeline, beside python-can reading it without any pipeline.
 
 real-time factor = length of the recording / time of its replay
+
+The time is what passes with reading and estimating in two processes; for one core it is the processor time of one
+process, as each worker of `soilbus batch` is one.  Neither has the start in it.
 """
 
 from __future__ import annotations
@@ -11,7 +14,7 @@ from soilbus.can.dbc_files import load_databases
 from soilbus.offline.replay import estimator_beside, read_log, replay
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.simulator.reference import reference_configuration
-from soilbus.validation.bench.figure import Figure, wall_time
+from soilbus.validation.bench.figure import Figure, in_turn, wall_time
 
 
 def replay_realtime_factor(log: Path, seconds: float) -> Figure:
@@ -31,4 +34,23 @@ def replay_realtime_factor(log: Path, seconds: float) -> Figure:
     return Figure(
         seconds / ours, 150.0, f"reading alone {peer:.2f} s, whole replay {ours:.2f} s",
         f"{seconds:.0f} s, four wheels, 1 s hop",
+    )  # fmt: skip
+
+
+def replay_one_core_factor(log: Path, seconds: float) -> Figure:
+    """As `replay_realtime_factor`, by processor time of one process."""
+    config = reference_configuration()
+
+    def whole() -> None:
+        for _ in replay(Pipeline(config, load_databases(config)), [log]):
+            pass
+
+    def only_read() -> None:
+        for _ in read_log(log):
+            pass
+
+    ours, peer = in_turn((whole, only_read), 3)
+    return Figure(
+        seconds / ours, 300.0, f"processor time: reading alone {peer:.2f} s, whole replay {ours:.2f} s",
+        f"{seconds:.0f} s, four wheels, 1 s hop, one process",
     )  # fmt: skip

@@ -1,0 +1,85 @@
+"""Fits from starts: where -2 log posterior is underestimated, at the edge of a range, with other effects."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from soilbus.diagnosis.fitted_model import fit_model
+from soilbus.diagnosis.records import record_of
+from soilbus.diagnosis.score import scores
+from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.multistart import fit_at
+from soilbus.estimation.solver import Objective, SolverOptions, minimise
+from soilbus.sensors.bins import Bins
+from soilbus.simulator.recording import simulate
+from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.scenario import excited
+from soilbus.terra.effects.catalogue import CATALOGUE
+from soilbus.terra.effects.effect import Active
+
+CONFIG = reference_configuration()
+PRIOR = prior_of(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def record():
+    return recorded()
+
+
+def recorded(soil="loam", hidden=()):
+    rig = rig_of(CONFIG)
+    store = Bins(rig, 0.1, 0.0)
+    channels = simulate(CONFIG, excited(soil, 60.0), 5, hidden).channels
+    store.add({name: (c.t, c.value) for name, c in channels.items() if name in rig.channels})
+    return record_of("x", store.window(0.0, 60.0), rig, model_of(CONFIG), 0.2, 0.15)
+
+
+def test_a_fit_from_the_optimum_with_the_latents_as_measured_ends_with_them_at_their_optimum():
+    """With latents as measured -2 log posterior seems too low."""
+    record = recorded("wet_clay")
+    known = fit_model([record], PRIOR, ())
+    problem, optimum = record.training, known.fits[0].mode
+    objective = Objective(problem, PRIOR, Gaussian.of(PRIOR, problem.gain_std))
+    start = objective.start(optimum.soil, gains=optimum.gains)
+    assert objective.quadratic_model(start).neg2_log_posterior < known.neg2_log_posterior - 5.0
+    end = minimise(objective, start, SolverOptions(step_tolerance=0.02))
+    fit = fit_at(objective, end)
+    here = end.iterate
+    for _ in range(3):
+        here = objective.stepped(here, objective.quadratic_model(here), np.zeros(len(end.model.gradient)))
+    assert fit.converged
+    assert fit.neg2_log_posterior == pytest.approx(objective.quadratic_model(here).neg2_log_posterior, abs=0.3)
+    assert fit.neg2_log_posterior == pytest.approx(known.neg2_log_posterior, abs=0.6)
+
+
+def test_fits_go_on_from_where_a_parameter_was_held_at_the_edge_of_its_range():
+    """Slip-sinkage greater than it may be."""
+    effect = CATALOGUE["slip_sinkage"]
+    highest = {"softening": 1.0, "exponent": 0.05, "dug": 0.1}
+    narrow = replace(effect, parameters=tuple(replace(p, high=highest[p.name]) for p in effect.parameters))
+    record = recorded(hidden=(Active(effect, {"exponent": 0.3, "softening": 0.0, "dug": 0.0}),))
+    held = fit_model([record], PRIOR, [narrow])
+    i = [f.parameter.name for f in held.free].index("exponent")
+    assert (held.free[i].std, held.free[i].value) == (0.0, 0.05)
+    (start,) = held.as_starts()
+    assert held.free_unheld[i].std > 0.0
+    assert held.free_unheld[i].at(start.gains[record.training.n_sensors + i]) == pytest.approx(0.05)
+    again = fit_model([record], PRIOR, [narrow], [start])
+    assert again.fits[0].iterations == 1
+    assert again.neg2_log_evidence == pytest.approx(held.neg2_log_evidence, abs=0.1)
+    (score,) = scores([record], PRIOR, held, [CATALOGUE["lugs"]])
+    assert held.free_unheld[i].at(score.starts[0].gains[record.training.n_sensors + i]) == pytest.approx(0.05, abs=1e-3)
+
+
+def test_a_start_with_other_effects_has_those_that_are_new_absent(record):
+    slip, lugs = CATALOGUE["slip_sinkage"], CATALOGUE["lugs"]
+    one = fit_model([record], PRIOR, [slip])
+    (own,), (both,), (none,) = one.as_starts(), one.as_starts([lugs, slip]), one.as_starts([])
+    n_sensors, n_lugs = record.training.n_sensors, len(lugs.parameters)
+    assert both.gains[n_sensors : n_sensors + n_lugs].tolist() == [0.0] * n_lugs
+    assert both.gains[n_sensors + n_lugs :].tolist() == own.gains[n_sensors:].tolist()
+    assert none.gains.tolist() == own.gains[:n_sensors].tolist()
