@@ -75,6 +75,12 @@ def configuration_warnings(config: Config) -> list[str]:
                 lines.append(
                     f"{getattr(wheels[0], role).signal} is the {role} of {names}: one measurement of their mean, with"
                     " one noise; what differs between them stays open"
+                    + (
+                        "; if it is the cell of one wheel, map it for that one alone: the loads of the others are then"
+                        " computed"
+                        if role == "load"
+                        else ""
+                    )
                 )
     c = config.soil.c
     if 0.0 < c.value < MIN_COHESION and c.std > 0.0:
