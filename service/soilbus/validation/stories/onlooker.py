@@ -139,7 +139,8 @@ def fit_of(tracked: TrackerOutput) -> Fit:
 
 def good_tracked(config: Config = CONFIG, seed: int = 3) -> TrackerOutput:
     """What the tracker says of a window of a good drive."""
-    config = config.model_copy(update={"estimator": reference_configuration().estimator})
+    limits = {"max_bearing_std": config.estimator.max_bearing_std}
+    config = config.model_copy(update={"estimator": reference_configuration().estimator.model_copy(update=limits)})
     found: list[TrackerOutput] = []
     pipeline = MadePipeline(config, lambda: WindowEstimator(config, partial(NotingTracker, found)))
     messages = drive_messages(config, 20.0, seed)
