@@ -108,7 +108,7 @@ class WorkQueue:
             self._waiting(self._pending[0].future, longest)
 
     def results(self, now: float) -> Iterator[tuple[WindowResult, Pending]]:
-        """The windows that are solved, in their order; after every TIDIED the worker then gives back free memory."""
+        """The windows that are solved, in their order; now and then the worker gives back free memory after one."""
         while self.has_result:
             pending = self._pending.popleft()
             self._busy_since = now
