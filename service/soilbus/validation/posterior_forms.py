@@ -126,18 +126,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = parser.parse_args(arguments)
     reference = reference_configuration(ROUGHLY_KNOWN)
     head = ("window", "sinkage", "soil", "form", *QUANTITIES, "windows")
-    for window, sinkage in product(chosen.window or DRIVES, (True, False)):
-        (duration, varied), lines, of_all = DRIVES[window], [], []
+    for window, has_sinkage in product(chosen.window or DRIVES, (True, False)):
+        duration, varied = DRIVES[window]
+        sinkage = "measured" if has_sinkage else "none"
+        lines: list[list[str]] = []
+        of_all: list[Figures] = []
         for soil in SOILS:
             tasks = tasks_of(reference, soil, duration, chosen.drives, chosen.seed)
-            each = [figures_of(task.config, soil, varied, sinkage, task.seed) for task in tasks]
+            each = [figures_of(task.config, soil, varied, has_sinkage, task.seed) for task in tasks]
             found = [one for one in each if one is not None]
             of_all += found
-            lines += rows((window, "measured" if sinkage else "none", soil), found) if found else []
-        lines += rows((window, "measured" if sinkage else "none", "all"), of_all) if of_all else []
-        print(table(head, lines), flush=True)
-        milliseconds = [1e3 * np.mean([getattr(f, of) for f in of_all]) for of in ("seconds", "laplace_seconds")]
-        print("processor time of fit, and of denoising and average: {:.0f} ms, {:.0f} ms\n".format(*milliseconds))
+            lines += rows((window, sinkage, soil), found) if found else []
+        if of_all:
+            print(table(head, [*lines, *rows((window, sinkage, "all"), of_all)]), flush=True)
+            fit, laplace = (1e3 * float(np.mean(of)) for of in zip(*(one[2:] for one in of_all), strict=True))
+            print(f"processor time of fit, and of denoising and average: {fit:.0f} ms, {laplace:.0f} ms\n")
     return 0
 
 
