@@ -9,9 +9,10 @@ import pytest
 
 from soilbus.decision.demand import present_demand
 from soilbus.estimation.assembly import rig_of
+from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.posterior import Estimate
 from soilbus.sensors.bins import Bins
-from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.reference import REFERENCES, reference_configuration
 from soilbus.terra.vehicle import GRAVITY
 
 RIG = rig_of(reference_configuration())
@@ -69,3 +70,19 @@ def test_an_unknown_slope_counts_as_level_and_an_unknown_draft_as_no_demand():
     gone = dataclasses.replace(window, draft=np.where(window.t > 8.9, np.nan, window.draft))
     assert present_demand(gone, RIG.chassis, 1.0) is None
     assert present_demand(window, None, 1.0) is None
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.2, -0.2])
+def test_a_specific_force_shows_the_slope_whether_the_vehicle_speeds_up_or_not(rate):
+    rig = rig_of(reference_configuration(path=REFERENCES["tractor-axles"]))
+    rng, slope = np.random.default_rng(6), GRAVITY * np.sin(0.08)
+    store = Bins(rig, 0.1, 0.0)
+    store.add({
+        "draft": (T, np.full(len(T), 2000.0)),
+        "acceleration": (T, rate + slope + 0.02 * rng.standard_normal(len(T))),
+        "ground_speed": (T, 3.0 + rate * T + 0.01 * rng.standard_normal(len(T))),
+    })  # fmt: skip
+    demand = present_demand(completed(store.window(0.0, 10.0), rig), rig.chassis, 1.0)
+    assert demand.sine == pytest.approx(np.sin(0.08), abs=0.003)
+    assert demand.pull == pytest.approx(2000.0 + rig.chassis.mass * slope, abs=4.0 * demand.std)
+    assert demand.std < 0.005 * rig.chassis.mass * GRAVITY

@@ -147,3 +147,17 @@ def test_wheels_that_sink_to_their_limit_are_warned_of_while_the_vehicle_loses_l
         return
     passes = 5.0 + (limit - 0.05) / rate
     assert passes - 3.0 < begun[0] < passes
+
+
+def test_a_specific_force_shows_the_slope_within_two_seconds_and_no_acceleration_in_its_place():
+    rng, state, V, found = np.random.default_rng(5), StallForecast(), 1.0, []
+    for i in range(400):
+        t = LOOK * i
+        slope = 0.0 if t < 20.0 else 1.0
+        rate = 0.4 * math.sin(0.8 * t)
+        V += rate * LOOK
+        sample = Sample(t, V + 0.01 * rng.standard_normal(), 1e-4, V, 1e-4, 0.2, felt=rate + slope)
+        state = forecast(state, sample, 0.2, Warning(), Traversability())
+        found.append(state.slope)
+    assert max(abs(s) for s in found[20:200]) < 0.15
+    assert max(abs(s - 1.0) for s in found[220:]) < 0.15

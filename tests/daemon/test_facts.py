@@ -32,15 +32,28 @@ from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import Recording
-from soilbus.simulator.reference import reference_configuration
+from soilbus.simulator.reference import REFERENCES, reference_configuration
 from soilbus.simulator.sensors import measure
 from soilbus.validation.fakes import Bench, ScriptedBus, feed_message
 
 CONFIG = reference_configuration()
 IN = load_databases(CONFIG)
+NOT_STRICT = ["estimator.max_bearing_std=1.0"]
+"""Short drives of machines without load cells say little of the pressure, and a go is to end here, which must begin."""
+MACHINES = {
+    name: reference_configuration([] if name == "tractor" else NOT_STRICT, path) for name, path in REFERENCES.items()
+}
+SEEDS = int(os.environ.get("SOILBUS_SEEDS", "1"))
+OTHERS = ["tractor-2wd", "tractor-axles"]
 
 
-def replayed(messages: Iterable[can.Message], config=CONFIG, database=IN) -> list[WindowResult]:
+def others(daily: str) -> list[str]:
+    """Machines beside the tractor: one in the daily run, all with SOILBUS_SEEDS."""
+    return [daily] if SEEDS == 1 else OTHERS
+
+
+def replayed(messages: Iterable[can.Message], config=CONFIG, database=None) -> list[WindowResult]:
+    database = load_databases(config) if database is None else database
     pipeline, results, due, last = Pipeline(config, database), [], 0.0, 0.0
     for message in messages:
         last = message.timestamp
@@ -51,9 +64,9 @@ def replayed(messages: Iterable[can.Message], config=CONFIG, database=IN) -> lis
     return results + pipeline.finish(last)
 
 
-def live(messages: list[can.Message]) -> list[tuple[float, str, dict]]:
+def live(messages: list[can.Message], config=CONFIG) -> list[tuple[float, str, dict]]:
     """(time of the drive [s], name, signals) of what the service sends."""
-    bench, start = Bench(config=CONFIG, pipeline=Pipeline(CONFIG, IN)), messages[0].timestamp
+    bench, start = Bench(config=config, pipeline=Pipeline(config, load_databases(config))), messages[0].timestamp
     bench.wire = ScriptedBus(bench.clock, messages, start)
     began = bench.run(messages[-1].timestamp - start)
     sent = [
@@ -84,17 +97,26 @@ def judge(story: Story, sent) -> None:
     assert "valid" not in {str(v["Status"]) for v in promised}
 
 
-@pytest.mark.parametrize("seed", range(int(os.environ.get("SOILBUS_SEEDS", "1"))))
-@pytest.mark.parametrize("attempt", TRIES)
-def test_a_start_in_vain_ends_go_on_the_bus(attempt, seed):
-    story = stop_and_try(CONFIG, TRIES[attempt], seed=100 * seed + list(TRIES).index(attempt))
-    judge(story, live(story.messages))
+@pytest.mark.parametrize("seed", range(SEEDS))
+@pytest.mark.parametrize(
+    ("machine", "attempt"),
+    [("tractor", attempt) for attempt in TRIES]
+    + [(machine, "one wheel spins") for machine in OTHERS]
+    + [(machine, attempt) for machine in OTHERS if SEEDS > 1 for attempt in TRIES if attempt != "one wheel spins"],
+)
+def test_a_start_in_vain_ends_go_on_the_bus(machine, attempt, seed):
+    config = MACHINES[machine]
+    story = stop_and_try(config, TRIES[attempt], seed=100 * seed + list(TRIES).index(attempt))
+    judge(story, live(story.messages, config))
 
 
-@pytest.mark.parametrize("seed", [11, 12])
-def test_a_soft_patch_under_one_side_ends_go_on_the_bus(seed):
-    story = halted_by_a_patch(CONFIG, seed)
-    sent = live(story.messages)
+@pytest.mark.parametrize(
+    ("machine", "seed"), [("tractor", 11), ("tractor", 12), *((m, 11) for m in others("tractor-axles"))]
+)
+def test_a_soft_patch_under_one_side_ends_go_on_the_bus(machine, seed):
+    config = MACHINES[machine]
+    story = halted_by_a_patch(config, seed)
+    sent = live(story.messages, config)
     assert "go" in {state for at, state in states(sent) if at < story.begins - 2.0}
     for at, state in states(sent):
         if at > story.begins + 1.0:
@@ -102,10 +124,18 @@ def test_a_soft_patch_under_one_side_ends_go_on_the_bus(seed):
     assert {w for at, w in states(sent, "DemandForecast", "Warning") if at > story.begins + 1.0} == {"immobilisation"}
 
 
-@pytest.mark.parametrize("attempt", ["left wheels spin", "motors at their limit"])
-def test_a_replay_says_what_the_service_says(attempt):
-    story = stop_and_try(CONFIG, TRIES[attempt], seed=21)
-    results = replayed(story.messages)
+@pytest.mark.parametrize(
+    ("machine", "attempt"),
+    [
+        ("tractor", "left wheels spin"),
+        ("tractor", "motors at their limit"),
+        *((m, "rear wheels spin") for m in others("tractor-2wd")),
+    ],
+)
+def test_a_replay_says_what_the_service_says(machine, attempt):
+    config = MACHINES[machine]
+    story = stop_and_try(config, TRIES[attempt], seed=21)
+    results = replayed(story.messages, config)
     assert State.GO in {r.traversability.state for r in results if r.t < story.begins}
     after = [r for r in results if r.t > story.begins + 1.0]
     assert all(r.traversability.state is not State.GO and r.watch.warning == "immobilisation" for r in after)
@@ -118,10 +148,11 @@ def test_a_replay_says_what_the_service_says(attempt):
         assert r.status is not Status.VALID
 
 
-def test_a_vehicle_that_merely_stands_is_unknown_after_the_age_of_its_data():
-    story = stop_and_try(CONFIG, STANDS, seed=31)
+@pytest.mark.parametrize("machine", ["tractor", *others("tractor-axles")])
+def test_a_vehicle_that_merely_stands_is_unknown_after_the_age_of_its_data(machine):
+    story = stop_and_try(MACHINES[machine], STANDS, seed=31)
     stood = story.begins - 1.5
-    sent = live(story.messages)
+    sent = live(story.messages, MACHINES[machine])
     by_speed = 0.2 / 0.5  # below min_speed no slip is judged
     last = max(at for at, state in states(sent) if state == "go")
     max_age = CONFIG.traversability.max_age
@@ -210,7 +241,7 @@ def test_motors_that_give_nothing_are_not_counted_on(dead):
 WEAK = {"all": ("FL", "FR", "RL", "RR"), "rear": ("RL", "RR"), "one": ("RL",)}
 
 
-@pytest.mark.parametrize("seed", range(91, 91 + int(os.environ.get("SOILBUS_SEEDS", "1"))))
+@pytest.mark.parametrize("seed", range(91, 91 + SEEDS))
 @pytest.mark.parametrize(
     ("weak", "soil"), [("all", "loam"), ("rear", "sandy_loam_23_michigan"), ("one", "sandy_loam_15")]
 )
@@ -250,11 +281,20 @@ def test_a_side_that_gives_way_takes_go_and_its_promises_away():
     assert not [draft for draft in promised if isinstance(draft, float) and draft > 1.2 * most]
 
 
-@pytest.mark.parametrize(("rate", "top"), [(0.1, 0.15), (0.15, 1.2), (0.5, 1.2)])
-def test_a_start_that_succeeds_is_no_try_in_vain(rate, top):
+@pytest.mark.parametrize(
+    ("machine", "rate", "top"),
+    [
+        ("tractor", 0.1, 0.15),
+        ("tractor", 0.15, 1.2),
+        ("tractor", 0.5, 1.2),
+        *((m, 0.15, 1.2) for m in others("tractor-axles")),
+    ],
+)
+def test_a_start_that_succeeds_is_no_try_in_vain(machine, rate, top):
     # However slowly it gets away, and however slowly it then creeps, on loam that resists a fifth of the weight.
-    story = start_after_stop(CONFIG, rate, top, seed=81)
-    sent = live(story.messages)
+    config = MACHINES[machine]
+    story = start_after_stop(config, rate, top, seed=81)
+    sent = live(story.messages, config)
     after = [state for at, state in states(sent) if at > story.begins]
     assert "no_go" not in after
     warned = {w for at, w in states(sent, "DemandForecast", "Warning") if at > story.begins}

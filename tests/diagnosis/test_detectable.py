@@ -117,8 +117,8 @@ def test_an_effect_that_no_datum_depends_on_has_no_evidence_either_way():
 
 def test_of_a_great_gap_an_effect_must_explain_a_good_part():
     """An excess of 5000 on 10 000 residuals, of which one effect explains a hundredth: that is no answer."""
-    assert 500.0 < required_fall(0.0, 1.5, 3000, 10000) < 2500.0
-    assert required_fall(0.0, 1.5, 3000, 10000) == pytest.approx(2.0 * required_fall(0.0, 1.25, 3000, 10000))
+    assert 500.0 < required_fall(4.0, 1.5, 3000, 10000) < 2500.0
+    assert required_fall(4.0, 1.5, 3000, 10000) == pytest.approx(2.0 * required_fall(4.0, 1.25, 3000, 10000))
 
 
 def test_three_faults_that_have_nothing_in_common_are_not_doubted():

@@ -34,7 +34,7 @@ from soilbus.terra.effects.catalogue import CATALOGUE
 CONFIG = reference_configuration()
 OFFSET = Addition(CATALOGUE["draft_offset"], 0.6, {"grade": 0.3, "bulldozing": 0.1}, {
     "draft_offset": 52.0, "grade": 48.0, "bulldozing": 41.0, "lugs": 2.0,
-})  # fmt: skip
+}, temperature=2.0)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -157,8 +157,8 @@ def test_page_text_and_json_say_the_same_of_what_could_be_seen(findings, page):
     asked = json.loads(findings_json(findings))
     assert asked["could_show"] is asked["could_not_show"] is asked["unseen"] is None
     assert "from a fall of 12 on" in page
-    beside = dataclasses.replace(OFFSET, beside=frozenset({"lugs"}))
-    assert "from a fall of 30 on" in page_of(with_verdict(findings, Verdict.AMBIGUOUS, additions=(beside,)))
+    doubted = dataclasses.replace(OFFSET, temperature=5.0)
+    assert "from a fall of 30 on" in page_of(with_verdict(findings, Verdict.AMBIGUOUS, additions=(doubted,)))
 
 
 def test_json_says_whether_a_gap_is_left_and_why_names_are_near_each_other(findings):

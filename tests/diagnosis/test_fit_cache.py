@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from soilbus.diagnosis import search as search_module
-from soilbus.diagnosis.search import FitCache, PresentModel, Shortlist, full_fits
+from soilbus.diagnosis.search import FitCache
 from soilbus.estimation.solver import SolverOptions
 from soilbus.terra.effects.catalogue import CATALOGUE
 
@@ -26,17 +26,22 @@ def asked(monkeypatch):
     """Costs of the fits to come, by where they begin; what was asked for."""
     costs, calls = {}, []
 
-    def fit_model(records, prior, effects, starts, effort):
+    def fit_model(records, prior, effects, starts, options=None):
         calls.append((tuple(e.name for e in effects), starts))
         cost = costs[calls[-1]]
         return (
             None
             if cost is None
-            else Fitted(neg2_log_posterior=cost, neg2_log_evidence=cost + 10.0, converged=True, effects=tuple(effects))
+            else Fitted(
+                neg2_log_posterior=cost,
+                neg2_log_evidence=cost + 10.0,
+                converged=True,
+                effects=tuple(effects),
+                names=tuple(e.name for e in effects),
+            )
         )
 
     monkeypatch.setattr(search_module, "fit_model", fit_model)
-    monkeypatch.setattr(search_module, "start_key", lambda starts: starts)
     return costs, calls
 
 
@@ -61,41 +66,3 @@ def test_more_effects_cost_no_more_than_fewer(asked):
     costs[("hardpan", "lugs"), "given up"] = None
     assert FitCache([], None).fit([PAN, LUGS], ["given up"], SolverOptions(give_up_above=60.0)) is None
     assert calls[-1] == (("hardpan", "lugs"), "given up")
-
-
-def test_scores_are_worked_out_once(monkeypatch):
-    calls = []
-    monkeypatch.setattr(search_module, "scores", lambda *args: calls.append(args) or [len(calls)])
-    fits, model = FitCache([], None), object()
-    assert fits.scores(model, [PAN]) == [1] == fits.scores(model, [PAN])
-    assert fits.scores(model, [PAN, LUGS]) == [2]
-    assert fits.scores(object(), [PAN]) == [3]
-
-
-def test_thinned_instants_predict_a_model_of_all():
-    trial = SimpleNamespace(
-        rows=100,
-        checked_rows=30,
-        neg2_log_posterior=70.0,
-        gap=1.5,
-        predicted_neg2_log_evidence=lambda rows: 2.5 * rows,
-        names=("lugs",),
-    )
-    present = PresentModel.predicted(trial, FitCache([], None), 400)
-    assert (present.neg2_log_posterior, present.neg2_log_evidence, present.gap) == (280.0, 1000.0, 1.5)
-    assert (present.checked_rows, present.rows) == (120, 400)
-    assert present.fitted is present.trial
-    assert present.names == {"lugs"}
-
-
-def test_the_model_at_hand_is_not_fitted_again():
-    beside = SimpleNamespace(
-        names=frozenset({"hardpan"}), effects=(PAN,), neg2_log_evidence=100.0, neg2_log_posterior=90.0
-    )
-    at_hand = SimpleNamespace(names=("lugs", "hardpan"), neg2_log_evidence=50.0, neg2_log_posterior=40.0)
-    chosen = Shortlist([(LUGS, ())], {}, {}, {})
-    no_cache = None
-    fitted, _ = full_fits(no_cache, beside, chosen, explained=0.0, required=30.0, at_hand=at_hand)
-    assert fitted == {"lugs": (LUGS, at_hand)}
-    with pytest.raises(AttributeError):
-        full_fits(no_cache, beside, chosen, explained=0.0, required=30.0, at_hand=None)

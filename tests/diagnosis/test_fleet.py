@@ -38,11 +38,11 @@ def test_no_name_is_given_where_none_is_sure():
 
 
 def test_the_onset_is_where_the_evidence_begins():
-    chances = onset_probabilities([90.0, 130.0, 150.0, 65.0])
+    chances = onset_probabilities([90.0, 130.0, 150.0, 65.0], 6.0)
     assert np.argmax(chances) == 2
     assert sum(chances) == pytest.approx(1.0)
-    assert onset_probabilities([-30.0, -30.0, -30.0])[-1] > 0.7  # none has it
-    assert onset_probabilities([0.0, 0.0]) == pytest.approx([1 / 3, 1 / 3, 1 / 3])  # logs that show nothing
+    assert onset_probabilities([-30.0, -30.0, -30.0], 6.0)[-1] > 0.7  # none has it
+    assert onset_probabilities([0.0, 0.0], 6.0) == pytest.approx([1 / 3, 1 / 3, 1 / 3])  # logs that show nothing
 
 
 def record(seed: int, soil: str, *effects: str) -> Record:

@@ -12,6 +12,7 @@ from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.gap import gap_of
 from soilbus.diagnosis.records import record_of
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
+from soilbus.estimation.solver import Termination
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -64,7 +65,7 @@ def test_where_no_others_can_be_held_out_the_gap_is_of_those_that_are(record):
     found = fit_model([record], PRIOR, ())
     alone = (found.gap, found.checked_rows)
     assert gap_of([replace(record, whole=None, fold=None)], PRIOR, found) == alone
-    creeping = replace(found, fits=tuple(replace(fit, converged=False) for fit in found.fits))
+    creeping = replace(found, fits=tuple(replace(fit, termination=Termination.LIMIT) for fit in found.fits))
     assert gap_of([record], PRIOR, creeping) == alone
     clear = replace(found, checks=tuple(replace(check, chi2=3.0 * check.rows) for check in found.checks))
     assert gap_of([record], PRIOR, clear) == (clear.gap, clear.checked_rows)

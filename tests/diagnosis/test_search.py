@@ -1,18 +1,15 @@
-"""The stepwise search: predictions from thinned instants and scores, and fits that are not repeated or given up."""
+"""The stepwise search: predictions by scores, swaps, and fits that are not repeated or given up."""
 
 from __future__ import annotations
 
-import math
 from itertools import islice, product
 
 import numpy as np
 import pytest
 
-from soilbus.diagnosis import search as search_module
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import record_of
 from soilbus.diagnosis.score import further_scores, normal_equations, scores
-from soilbus.diagnosis.search import FitCache
 from soilbus.estimation import multistart
 from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.multistart import fit_window
@@ -30,7 +27,6 @@ from soilbus.validation.blind.trial import record_of_case
 CONFIG = reference_configuration()
 PRIOR = prior_of(CONFIG)
 DURATION = 60.0
-THINNING = 4
 SLIP_SINKAGE = CATALOGUE["slip_sinkage"]
 
 
@@ -47,27 +43,6 @@ def record():
 @pytest.fixture(scope="module")
 def base(record):
     return fit_model([record], PRIOR, ())
-
-
-def fall_of(effect, record, rows=None):
-    """Fall of -2 log evidence by an effect; predicted for `rows` residuals where these are given."""
-    before = fit_model([record], PRIOR, ())
-    (score,) = scores([record], PRIOR, before, [effect])
-    after = fit_model([record], PRIOR, [effect], score.starts)
-    rows = rows or before.rows
-    return before.predicted_neg2_log_evidence(rows) - after.predicted_neg2_log_evidence(rows)
-
-
-def test_thinned_instants_predict_what_an_effect_explains_of_all(record):
-    true = fall_of(SLIP_SINKAGE, record)
-    rows = fit_model([record], PRIOR, ()).rows
-    predicted = fall_of(SLIP_SINKAGE, record.thinned(THINNING), rows)
-    assert true > 100.0
-    assert predicted == pytest.approx(true, abs=3.0 * 2.0 * math.sqrt(THINNING * true))
-
-
-def test_the_evidence_predicted_for_its_own_rows_is_the_evidence(base):
-    assert base.predicted_neg2_log_evidence(base.rows) == pytest.approx(base.neg2_log_evidence)
 
 
 def fall_on_any_face(information, gradient, low, high):
@@ -113,29 +88,6 @@ def test_scores_from_further_starts_are_the_same_together_as_alone(record, base)
         assert score.effect is CATALOGUE[name]
         assert score.neg2_log_evidence == pytest.approx(alone.neg2_log_evidence, rel=1e-6, abs=1e-6)
         assert score.starts[0].gains == pytest.approx(alone.starts[0].gains, rel=1e-6, abs=1e-9)
-
-
-def test_a_model_is_fitted_once_from_one_start(record, base, monkeypatch):
-    calls = []
-
-    def counted(*args):
-        calls.append(args)
-        return fit_model(*args)
-
-    monkeypatch.setattr(search_module, "fit_model", counted)
-    fits, give_up_above = FitCache([record], PRIOR), SolverOptions(give_up_above=0.3 * base.neg2_log_posterior)
-    (score,) = scores([record], PRIOR, base, [SLIP_SINKAGE])
-    assert (
-        fits.fit([SLIP_SINKAGE], [score.starts], give_up_above)
-        is None
-        is fits.fit([SLIP_SINKAGE], [score.starts], give_up_above)
-    )
-    assert len(calls) == 1
-    settled = fits.fit([SLIP_SINKAGE], [score.starts])
-    assert settled.converged
-    assert len(calls) == 2
-    assert fits.fit([SLIP_SINKAGE], [score.starts], give_up_above) is settled is fits.fit([SLIP_SINKAGE])
-    assert len(calls) == 2
 
 
 def test_no_descent_of_a_window_begins_where_another_did(monkeypatch):

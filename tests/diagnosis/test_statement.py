@@ -15,7 +15,7 @@ from soilbus.diagnosis.detectable import Detectable
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.gap import Gap
 from soilbus.diagnosis.search import Addition
-from soilbus.diagnosis.verdict import Verdict, gap_limit, probabilities, temperatures, verdict_of
+from soilbus.diagnosis.verdict import Verdict, gap_limit, probabilities, verdict_of
 from soilbus.diagnosis.where import Disagreement
 from soilbus.estimation.posterior import Posterior
 from soilbus.report.findings import place_lines
@@ -119,19 +119,10 @@ def test_effects_that_are_more_together_than_apart_are_doubted_with_what_rules_t
 def test_probabilities_beside_falls_that_differ_little_are_explained():
     """Falls of 885, 882 and 870 would be 0.82, 0.18 and 0.0005 if formulas were right."""
     falls = {"a": 885.0, "b": 882.0, "c": 870.0}
-    chances = probabilities(falls, 0.0)
-    one = Addition(CATALOGUE["lugs"], chances["a"], {"b": chances["b"]}, falls, temperatures=temperatures(885.0))
-    usual, great = temperatures(885.0)
-    reported = why_probabilities(one) or ""
-    assert f"divided by {usual:.0f} (with a chance of 15 % by {great:.0f})" in reported
-    expected = {
-        n: sum(
-            share * np.exp(falls[n] / (2.0 * t)) / sum(np.exp(f / (2.0 * t)) for f in falls.values())
-            for share, t in ((0.85, usual), (0.15, great))
-        )
-        for n in falls
-    }
-    assert chances == pytest.approx(expected, rel=1e-6)
+    chances = probabilities(falls, 7.0)
+    one = Addition(CATALOGUE["lugs"], chances["a"], {"b": chances["b"]}, falls, temperature=7.0)
+    assert "differences are divided by 7 before half of each is taken" in (why_probabilities(one) or "")
+    assert chances["b"] / chances["a"] == pytest.approx(np.exp(-3.0 / 14.0), rel=1e-9)
     assert why_probabilities(addition("lugs", 1.0)) is None
 
 

@@ -33,7 +33,7 @@ def active(name: str, **values: float) -> Active:
 
 
 LOSS, MORE_LOSS, PUSH = (
-    active("drivetrain_loss", share=0.03),
+    active("drivetrain_loss", share=0.022),
     active("drivetrain_loss", share=0.05),
     active("draft_offset", offset=300.0),
 )

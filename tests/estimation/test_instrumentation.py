@@ -177,7 +177,6 @@ def test_noise_of_draft_and_inertia_draws_neither_gain_away_from_the_truth(tmp_p
     problem = ObservationModel(window_of(config, rig), rig, model_of(config), 0.2)
     soil, gains = soil_named("loam"), np.zeros(problem.n_sensors)
     latents, clean = problem.start(soil), {name: getattr(problem, name).copy() for name in ("draft", "inertia")}
-    problem.demand_var = problem.draft_var + problem.inertia_var
     columns = [7 + problem.gain_names.index(name) for name in ("draft", "load.weight")]
     rng, scores = np.random.default_rng(1), []
     silent = problem.linearise(soil, gains, latents)
@@ -185,7 +184,6 @@ def test_noise_of_draft_and_inertia_draws_neither_gain_away_from_the_truth(tmp_p
     for _ in range(300):
         for name, variance in (("draft", problem.draft_var), ("inertia", problem.inertia_var)):
             setattr(problem, name, clean[name] + rng.standard_normal(problem.n) * np.sqrt(variance))
-        problem.demand = problem.draft + problem.inertia
         at = problem.linearise(soil, gains, latents)
         scores.append(at.rows[:, columns].T @ at.weighed[:, 0] - at_truth)
     error = np.std(scores, axis=0) / np.sqrt(len(scores))

@@ -15,6 +15,7 @@ from soilbus.offline.replay import replay
 from soilbus.pipeline.excitation import Excitation
 from soilbus.pipeline.pipeline import Pipeline
 from soilbus.pipeline.result import WindowResult
+from soilbus.report.configuration import configuration_warnings
 from soilbus.report.windows import summary_of, why_of_no_use
 from soilbus.simulator.frames import START_TIME, frames
 from soilbus.simulator.recording import simulate
@@ -96,3 +97,17 @@ def test_a_draft_about_zero_has_no_share():
     windows = [window("ambiguous", Status.NOT_EXCITED, excitation=Excitation(3.0, 160.0, 0.02, 0.01))]
     text = summary_of(windows, "a log", None, Counter())
     assert "vary the load more: the draft was 3 ± 160 N, slip was 2.0 ± 1.0 %" in text
+
+
+def test_one_cell_for_two_wheels_is_named_where_the_model_does_not_fit(tmp_path):
+    recording = simulate(reference_configuration(), excited("loam", 14.0), seed=2)
+    write_log(frames(recording, reference_configuration()), log := tmp_path / "drive.log")
+    shared, alone = reference_configuration(["wheel.FR.load=WheelLoads.FL"]), reference_configuration()
+    alone = alone.model_copy(
+        update={"wheel": [w.model_copy(update={"load": None}) if w.name == "FR" else w for w in alone.wheel]}
+    )
+    of_shared, of_alone = (list(replay(Pipeline(config, load_databases(config)), [log])) for config in (shared, alone))
+    assert {w.reason for w in of_shared} == {"model_mismatch load.FL"}
+    assert "load.FL is mapped for several wheels" in summary_of(of_shared, "a drive", None, Counter())
+    assert {w.reason for w in of_alone} == {"none"}
+    assert any("WheelLoads.FL" in line and "for that one alone" in line for line in configuration_warnings(shared))

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from soilbus.config.model import Config
-from soilbus.estimation.assembly import chassis_of
+from soilbus.estimation.assembly import chassis_of, rig_of
 from soilbus.simulator.drive import Drive, drive
 from soilbus.simulator.frames import frames
 from soilbus.simulator.recording import Recording
@@ -24,7 +24,9 @@ from soilbus.simulator.sensors import measure
 from soilbus.terra.soils import SOILS
 from soilbus.terra.vehicle import GRAVITY, axle_loads
 from soilbus.terra.wheel import Soil
+from soilbus.validation.boggings import largest_draft
 from soilbus.validation.statics import WEIGHT, brute_with_rolling, wheel
+from soilbus.validation.windows import torque_limits
 
 CRAWL = 0.02
 """Ground speed [m/s] at which the simulated drive ends and the vehicle stands."""
@@ -33,10 +35,20 @@ SPIN_UP = 0.3
 
 
 class Try(NamedTuple):
-    """What the wheels do while the vehicle stands: rim speeds [m/s] and torques [N m] of FL, FR, RL, RR."""
+    """What the wheels do while the vehicle stands: rim speeds [m/s] and torques [N m] of FL, FR, RL, RR.
+
+    Of motors with a limit of 2400 N m at each wheel; those of another machine give the same share of theirs.
+    """
 
     rim: tuple[float, float, float, float]
     torque: tuple[float, float, float, float]
+
+    def of(self, config: Config) -> Try:
+        """The same of this machine's driven wheels; the others roll free."""
+        rig = rig_of(config)
+        share = torque_limits(config, rig) / 2400.0
+        rims = np.where(rig.drives, self.rim, 0.0)
+        return Try(tuple(rims.tolist()), tuple((share * self.torque).tolist()))
 
 
 TRIES = {
@@ -62,7 +74,7 @@ class Story:
 
 def stop_and_try(config: Config, attempt: Try, seed: int, drives: float = 13.0, lasts: float = 8.0) -> Story:
     """A drive on loam of so many seconds, a stop at 0.5 m/s^2, a wait of 1.5 s and a try in vain."""
-    waits = 1.5
+    waits, attempt = 1.5, attempt.of(config)
     done = driven(config, seed, drives, 0.5)
 
     def standing(t: np.ndarray) -> dict[str, np.ndarray]:
@@ -78,15 +90,18 @@ def start_after_stop(config: Config, rate: float, top: float, seed: int, lasts: 
     """A drive on loam, a stop, a wait of 1.5 s and a start at so many m/s^2 to the speed `top` [m/s]."""
     waits = 1.5
     done = driven(config, seed, 13.0, 0.5)
-    resists = 0.2 * WEIGHT  # what loam holds back rolling wheels by, as by brute force
+    mass, drives = weight_of(config) / GRAVITY, rig_of(config).drives
+    resists = 0.2 * mass * GRAVITY  # what loam holds back rolling wheels by, as by brute force
 
     def starting(t: np.ndarray) -> dict[str, np.ndarray]:
         ground = np.clip(rate * (t - waits - SPIN_UP), 0.0, top)
         speeds_up = np.where((ground > 0.0) & (ground < top), rate, 0.0)
         on = np.clip((t - waits) / SPIN_UP, 0.0, 1.0)
-        torque = on * (resists + WEIGHT / GRAVITY * speeds_up) * 0.56 / 4.0
-        rims = [ground / (1.0 - 0.04 - 0.04 * speeds_up) for _ in config.wheel]  # slips that loam needs for so little
-        return {"ground_speed": ground, "acceleration": speeds_up} | _wheels(config, rims, [torque] * len(rims))
+        force = on * (resists + mass * speeds_up) / drives.sum()
+        slips = 0.04 + 0.04 * speeds_up  # that loam needs for so little
+        rims = [ground / np.where(drive, 1.0 - slips, 1.0) for drive in drives]
+        torques = [force * w.radius * drive for w, drive in zip(config.wheel, drives, strict=True)]
+        return {"ground_speed": ground, "acceleration": speeds_up} | _wheels(config, rims, torques)
 
     return told(continued(done, config, waits + lasts, starting), config, seed, float(done.columns["t"][-1]) + waits)
 
@@ -99,8 +114,9 @@ def halted_by_a_patch(config: Config, seed: int, deceleration: float = 1.0, last
     def halting(t: np.ndarray) -> dict[str, np.ndarray]:
         ground = np.maximum(speed - deceleration * t, 0.0)
         spin = speed + (2.0 - speed) * np.clip(t / 0.5, 0.0, 1.0)
-        rims = [spin if wheel.name.endswith("L") else ground for wheel in config.wheel]
-        torques = [np.full_like(t, 300.0 if wheel.axle == "front" else 400.0) for wheel in config.wheel]
+        left = Try((1.0, 0.0) * 2, (300.0, 300.0, 400.0, 400.0)).of(config)
+        rims = [spin if spins else ground for spins in left.rim]
+        torques = [np.full_like(t, torque) for torque in left.torque]
         rate = np.where(ground > 0.0, -deceleration, 0.0)
         return {"ground_speed": ground, "acceleration": rate} | _wheels(config, rims, torques)
 
@@ -117,10 +133,16 @@ def driven(config: Config, seed: int, seconds: float, deceleration: float | None
     ends = [seconds + stop] if deceleration is not None else []
     speed = Profile([*t.tolist(), *ends], [*v.tolist(), *[CRAWL for _ in ends]])
     at = np.arange(0.0, seconds, 1.0)
-    mean, phase = rng.uniform(600.0, 1500.0), rng.uniform(0.0, 6.0)
+    mean, phase = rng.uniform(0.094, 0.235) * largest_draft(config, soil), rng.uniform(0.0, 6.0)
     draft = mean * (1.0 + 0.6 * np.sin(0.9 * at + phase))
     load = Profile([*at.tolist(), *ends], [*draft.tolist(), *[0.0 for _ in ends]])
     return drive(config, Scenario(seconds + stop, [Patch(0.0, soil)], speed, draft=load), seed)
+
+
+def weight_of(config: Config) -> float:
+    """Of the vehicle [N]."""
+    assert config.vehicle is not None
+    return config.vehicle.mass * GRAVITY
 
 
 def continued(

@@ -84,6 +84,17 @@ def test_a_service_without_a_check_is_found_out(mutation, monkeypatch):
     assert any(played(drive := cheap(), drawn(seed, drive.needed)).faults for seed in range(60))
 
 
+def test_a_go_beside_a_warning_or_beside_slip_that_was_not_forecast_is_found_out(monkeypatch):
+    drive = played(cheap(), [])
+    assert str(drive.last["State"]) == "go"
+    assert "immobilisation is warned of" in set(
+        drive.objections(drive.clock.now, drive.last | {"Warning": "immobilisation"})
+    )
+    monkeypatch.setattr(drive, "excess_slip", lambda: 0.3)
+    drive.run(2.0)
+    assert any("slipped more than forecast" in fault for fault in drive.faults)
+
+
 def test_a_window_that_is_solved_when_it_is_too_old_is_no_go():
     drive = played(cheap(), [])
     drive.worker.takes = 2.6  # longer than a posterior counts

@@ -17,6 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, Future
 from dataclasses import replace
+from itertools import compress
 from typing import TYPE_CHECKING, Any
 
 from soilbus import __version__
@@ -34,7 +35,7 @@ from soilbus.daemon.totals import totals
 from soilbus.daemon.work_queue import WorkQueue, wait_for
 from soilbus.decision.immobilisation import Alert, Watch, ended, has_cause, watched, with_loss
 from soilbus.decision.judgement import Basis, at_present
-from soilbus.decision.traction_loss import NO_LOSS, observed
+from soilbus.decision.traction_loss import NO_LOSS, observed, slope_felt
 from soilbus.decision.traversability import State, Status, Traversability
 from soilbus.pipeline.intake import Latest
 from soilbus.pipeline.outputs import TICK, WINDOW_MODULUS, demand_frame, forecast_frame, hop_frames, slip_frames
@@ -290,9 +291,8 @@ class Service:
         if result.termination is not None and result.failure not in (None, last_failure):
             log.warning("%s: solver ended by %s (%d)", result.failure, result.termination, result.iterations)
         self.result, self._ended = result, ended
-        able = result.traversability.capability
-        if able is not None and result.status is Status.VALID:
-            self._curve = able.over_slip, result.t
+        if result.curve is not None:
+            self._curve = result.curve, result.t
 
     def _tick(self, now: float) -> None:
         if self.bus.is_open:
@@ -381,7 +381,7 @@ class Service:
         return max(by_stamps, self.result.t + now - self._ended)
 
     def _present_curve(self, now: float) -> OverSlip | None:
-        """Pull over slip of the last valid window, while it is young enough to extrapolate from."""
+        """Pull over slip of the last window that had one, while it is young enough to extrapolate from."""
         known, t = self._curve
         return known if self._time.at(now) - t < MAX_CURVE_AGE else None
 
@@ -399,8 +399,11 @@ class Service:
         latest = self.intake.latest(self._time.at(now)) if self.bus.is_open else Latest({}, None)
         if latest.motion is not None:
             self._loss = observed(self._loss, latest.motion, self.config)
+        rig = self.intake.rig
+        inertia = latest.inertia - slope_felt(self._loss, rig)
+        slips = compress(latest.slip.values(), rig.drives)
         self._watch = watched(
-            self._watch, self._time.at(now), latest.slip.values(), latest.pull, self._present_curve(now), latest.inertia
+            self._watch, self._time.at(now), slips, latest.pull, self._present_curve(now), inertia
         )  # fmt: skip
         warning = with_loss(self._watch, self._loss, self._time.at(now))
         self._warned = has_cause(self._watch, self._loss, self.config.warning.hold)

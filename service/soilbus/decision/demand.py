@@ -2,7 +2,8 @@
 
     pull = mean(draft) / (1 + gain) + mean(weight * sine(pitch))          over the last hop or the whole window
 
-The larger of the two means counts: a driver who has just lifted the implement still wants it down.
+The larger of the two means counts: a driver who has just lifted the implement still wants it down.  Where no pitch is
+measured but a specific force, m g sine(pitch) = m (specific force - dV/dt).
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from soilbus.estimation.posterior import Estimate
 from soilbus.estimation.window import Window, pull_asked
 from soilbus.terra.vehicle import GRAVITY, Chassis
 
+LEAST_BINS = 3
+"""Bins from which a line through speeds has a slope whose error is that of its noise."""
 NO_GAIN_ERROR = Estimate(0.0, 0.0)
 
 
@@ -43,16 +46,41 @@ def present_demand(
     """
     if chassis is None or not len(window.t):
         return None
-    pull = pull_asked(window, chassis)
-    known = np.isfinite(pull)
+    known = np.isfinite(window.draft)
     recent = known & (window.t > window.t[-1] - hop)
     if not recent.any():
         return None
-    part = recent if pull[recent].mean() >= pull[known].mean() else known
-    weight = chassis.mass * GRAVITY
+    return max((_over(window.rows(np.flatnonzero(part)), chassis, gain) for part in (recent, known)), key=_pull)
+
+
+def _pull(demand: Demand) -> float:
+    return demand.pull
+
+
+def _over(window: Window, chassis: Chassis, gain: Estimate) -> Demand:
+    """Mean demand over a window without gaps in the draft."""
+    weight, n = chassis.mass * GRAVITY, len(window.t)
     of_slope = np.where(np.isfinite(window.pitch), window.variance["pitch"], 0.0)
-    variance = window.variance["draft"] + weight**2 * of_slope
-    std = math.sqrt(float(variance[part].sum())) / np.count_nonzero(part)
-    slope = float((pull - window.draft)[part].mean())
-    draft = float(window.draft[part].mean()) / (1.0 + gain.value)
-    return Demand(draft + slope, math.hypot(std, draft * gain.std), slope / weight)
+    variance = float((window.variance["draft"] + weight**2 * of_slope).sum()) / n**2
+    slope = float((pull_asked(window, chassis) - window.draft).mean())
+    if window.kinematic and not np.isfinite(window.pitch).any():
+        along, of_along = _gravity_felt(window)
+        slope, variance = chassis.mass * along, variance + chassis.mass**2 * of_along
+    draft = float(window.draft.mean()) / (1.0 + gain.value)
+    return Demand(draft + slope, math.hypot(math.sqrt(variance), draft * gain.std), slope / weight)
+
+
+def _gravity_felt(window: Window) -> tuple[float, float]:
+    """Mean g sin(pitch) [m/s^2] that a specific force f shows, and its variance; 0 and 0 where it shows none.
+
+    d/dt (V - integral of f) = -g sin(pitch): minus the slope of a line, whose weights on f add up to one as well.
+    """
+    known = np.isfinite(window.acceleration) & np.isfinite(window.ground_speed)
+    if np.count_nonzero(known) < LEAST_BINS:
+        return 0.0, 0.0
+    t, f, V = window.t[known], window.acceleration[known], window.ground_speed[known]
+    gained = np.concatenate([[0.0], np.cumsum((f[1:] + f[:-1]) / 2.0 * np.diff(t))])
+    weights = (t - t.mean()) / ((t - t.mean()) ** 2).sum()
+    of_speed = float(weights**2 @ window.variance["ground_speed"][known])
+    of_force = float(window.variance["acceleration"][known].mean()) / len(t)
+    return float(weights @ (gained - V)), of_speed + of_force

@@ -141,17 +141,21 @@ class Trend(NamedTuple):
 class Capacity(NamedTuple):
     """Trends of the capacity [N] with the long and the short memory, and what they are worth.
 
-    known: 1 for a moment whose capacity is known, else 0; scatter: square of its change within SCATTER_LAG [N^2].
+    reserve, short_reserve: trends of the part of it [N] that is not given but predicted by the curve, with both
+    memories; known: 1 for a moment whose capacity is known, else 0; scatter: square of its change within SCATTER_LAG
+    [N^2].
     """
 
     long: Trend = Trend()
     short: Trend = Trend()
+    reserve: Trend = Trend()
+    short_reserve: Trend = Trend()
     known: Trend = Trend()
     scatter: Trend = Trend()
 
     @classmethod
-    def through(cls, t: Array, values: Array) -> Capacity:
-        """The trends through values [N] at times t [s], both (N,); nan where not known."""
+    def through(cls, t: Array, values: Array, reserves: Array) -> Capacity:
+        """The trends through values and reserves [N] at times t [s], each (N,); nan where not known."""
         if not len(t):
             return cls()
         x = t - t[-1]
@@ -160,17 +164,20 @@ class Capacity(NamedTuple):
         return cls(
             *_trends(
                 x,
-                [values, values, np.isfinite(values), change],
-                [LONG_MEMORY, SHORT_MEMORY, SHORT_MEMORY, SCATTER_MEMORY],
+                [values, values, reserves, reserves, np.isfinite(values), change],
+                [LONG_MEMORY, SHORT_MEMORY, LONG_MEMORY, SHORT_MEMORY, SHORT_MEMORY, SCATTER_MEMORY],
             )
         )
 
-    def joined(self, step: float, value: float | None, earlier: float | None) -> Capacity:
-        """A step [s] later, with one more value [N] or None; earlier [N] is the value SCATTER_LAG before."""
+    def joined(self, step: float, value: float | None, earlier: float | None, reserve: float = 0.0) -> Capacity:
+        """A step [s] later, with one more value [N] or None, the value SCATTER_LAG before, and its reserve [N]."""
         change = None if value is None or earlier is None else (value - earlier) ** 2
+        part = None if value is None else reserve
         return Capacity(
             self.long.joined(step, value, LONG_MEMORY),
             self.short.joined(step, value, SHORT_MEMORY),
+            self.reserve.joined(step, part, LONG_MEMORY),
+            self.short_reserve.joined(step, part, SHORT_MEMORY),
             self.known.joined(step, float(value is not None), SHORT_MEMORY),
             self.scatter.joined(step, change, SCATTER_MEMORY),
         )
@@ -288,7 +295,7 @@ class Watch(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """Input of the recursion: time [s], slip of each wheel, pull [N] and the inertia [N] in it; nan where not known."""
+    """Input of the recursion: time [s], slip of each driven wheel, pull and the inertia in it [N]; nan: not known."""
 
     t: float
     slip: list[float]
@@ -313,7 +320,7 @@ def watched(
     t
         [s], time of the moment.
     slip
-        Slip of each wheel, None or nan where not known.
+        Slip of each wheel that a motor can drive, as of the curve; None or nan where not known.
     pull
         [N], of draft, slope and inertia.
     curve
@@ -342,7 +349,7 @@ def watched(
     trend = before.capacity if curve is before.curve else _capacity_along(curve, kept)
     earlier, once, twice = (_look_from(kept, t - lag) for lag in (SCATTER_LAG, SWING_TIME, 2.0 * SWING_TIME))
     capacity = trend.joined(
-        step, _capacity_at(curve, look, reserve), None if earlier is None else _capacity_at(curve, earlier)
+        step, _capacity_at(curve, look, reserve), None if earlier is None else _capacity_at(curve, earlier), reserve
     )
     demand = before.demand.joined(step, look.asked, *(None if a is None else a.asked for a in (once, twice)))
     peaks, asked = before.peaks.joined(t, pull, PEAK_MEMORY), before.asked.joined(t, look.asked, PEAK_MEMORY)
@@ -355,7 +362,7 @@ def watched(
         if reserve > 0.0:
             to_limit = _time_of_creep(creep, float(curve.slip[-1]), given.line().slope / total)
             outgrown = _time_to_outgrow(capacity, look.asked, demand, asked.greatest)
-            time_left = min(_time_to_weaken(capacity, peaks.greatest), outgrown, to_limit)
+            time_left = min(_time_to_weaken(capacity, peaks.greatest, _relative_std(curve)), outgrown, to_limit)
     warns = before.warning is Alert.IMMOBILISATION
     enough = share > STAYING_SHARE if warns else share > RISING_SHARE and rise > STEADY_RISE and time_left is not None
     caused = t if enough or (time_left is not None and time_left < WARNING_TIME) else before.caused
@@ -418,7 +425,7 @@ def moments(window: Window, rig: Rig, chosen: NDArray[np.intp], min_speed: float
         return
     ground = window.ground_speed[:, None]
     slip = np.where(ground > min_speed, slip_ratio(rig.radius, window.speed, ground), np.nan)
-    of_bins = np.column_stack([slip, pull_given(window, rig.chassis), inertia_of(window, rig.chassis)])
+    of_bins = np.column_stack([slip[:, rig.drives], pull_given(window, rig.chassis), inertia_of(window, rig.chassis)])
     place = chosen[:, None] + np.arange(1 - BINS_OF_A_MOMENT, 1)
     there = place >= 0
     total = np.where(there[:, :, None], of_bins[np.maximum(place, 0)], 0.0).sum(axis=1)
@@ -454,8 +461,9 @@ def _capacity_along(curve: OverSlip, recent: Sequence[Look]) -> Capacity:
     known = np.isfinite(curve.pull)
     slips, pulls = curve.slip[known], curve.pull[known]
     ahead = np.append(np.maximum.accumulate(pulls[::-1])[::-1], pulls[-1:])[np.searchsorted(slips, slip, "right")]
-    capacity = pull + np.where(slip >= slips[-1], 0.0, ahead - np.interp(slip, slips, pulls))
-    return Capacity.through(t, np.where(slip >= curve.slip[0], capacity, np.nan))
+    reserve = np.where(slip >= slips[-1], 0.0, ahead - np.interp(slip, slips, pulls))
+    reserve = np.where(slip >= curve.slip[0], reserve, np.nan)
+    return Capacity.through(t, pull + reserve, reserve)
 
 
 def _reserve(curve: OverSlip, slip: float) -> float:
@@ -476,6 +484,13 @@ def _known_pulls(curve: OverSlip) -> tuple[list[float], list[float], list[float]
     return curve.slip[known].tolist(), pull.tolist(), np.maximum.accumulate(pull[::-1])[::-1].tolist()
 
 
+@lru_cache(maxsize=2)
+def _relative_std(curve: OverSlip) -> float:
+    """Relative sd of the curve's largest pull."""
+    most = int(np.nanargmax(curve.pull))
+    return float(curve.pull_std[most] / curve.pull[most]) if curve.pull[most] > 0.0 else math.inf
+
+
 def _time_to_outgrow(capacity: Capacity, asked: float, demand: Demand, peak: float) -> float:
     """Time [s] until draft and slope reach the capacity, both extrapolated; inf without a significant rise."""
     if not capacity.is_known or asked < peak:
@@ -486,13 +501,17 @@ def _time_to_outgrow(capacity: Capacity, asked: float, demand: Demand, peak: flo
     return max(limit.value - asked, 0.0) / (line.slope - limit.slope) if outgrows else math.inf
 
 
-def _time_to_weaken(capacity: Capacity, peak: float) -> float:
-    """Time [s] until the capacity, extrapolated, falls to the peak of the pull [N]."""
+def _time_to_weaken(capacity: Capacity, peak: float, relative: float) -> float:
+    """Time [s] until the capacity, extrapolated, falls to the peak of the pull [N]; relative: sd of the curve."""
     if not capacity.is_known:
         return math.inf
     slow, fast = capacity.long.line(), capacity.short.line()
     long = _time_of_weakening(capacity, slow, LONG_WEAKENING, peak)
     short = _time_of_weakening(capacity, fast, SHORT_WEAKENING, peak)
+    if _due_to_the_curve(slow, capacity.reserve.line(), relative):
+        long = math.inf
+    if _due_to_the_curve(fast, capacity.short_reserve.line(), relative):
+        short = math.inf
     if fast.slope < STEEPENING * min(slow.slope, 0.0):
         short /= STEEPENING
     return max(min(long, short), 0.0)
@@ -502,6 +521,20 @@ def _time_of_weakening(capacity: Capacity, line: Line, least: float, peak: float
     """Time [s] until a line of the capacity falls to the peak [N]; inf where it does not fall significantly."""
     falls = -line.slope > max(least * abs(line.value), SIGNIFICANT_SD * capacity.slope_std(line))
     return (line.value - peak) / -line.slope if falls else math.inf
+
+
+def _due_to_the_curve(line: Line, reserve: Line, relative: float) -> bool:
+    """Whether a capacity falls only as its curve may be too high or too low by a factor.
+
+    C' = P' - a P_hat',  ln a ~ N(0, relative^2): where slip and pull rise or fall together, the sign of C' is that of
+    their ratio less a; where the pull does not rise with slip, it is negative for every a.
+    """
+    predicted = -reserve.slope
+    given = line.slope + predicted
+    if predicted * given <= 0.0:
+        return predicted < 0.0
+    ratio = predicted / given if predicted > 0.0 else given / predicted
+    return math.log(ratio) < SIGNIFICANT_SD * relative
 
 
 def _time_of_creep(slip: Trend, limit: float, rise: float) -> float:

@@ -8,6 +8,7 @@
                                              or all motors are at their limit; by a trend that follows each change
                                              of its acceleration, or over a longer time by a steadier one
     P(z + h_s dz/dt > z_max) > p             or the deepest wheel passes the sinkage limit, where sinkage is measured
+    d/dt (V - integral of f) = -g sin(pitch) the slope, where the specific force f is measured and the pitch is not
 
 Each counts only while a vehicle that has moved for some seconds loses speed under thrust: a start is no stall, and one
 in vain is seen by `traction_loss`.  A stall shows in both: wheels that a motor holds at their speed, with
@@ -30,6 +31,8 @@ LONGEST_GAP = 1.0
 """Silence [s] after which the trends start afresh."""
 FIRST_RATE_STD = 1.0
 """Sd of a rate [1/s, m/s^2] before any sample: no vehicle brakes harder than it slides."""
+SLOPE_WANDER = 0.03
+"""How fast g sin(pitch) changes [m/s^2 per sqrt(s)]: by 1 % in 10 m, at 1 m/s."""
 
 
 class LocalTrend(NamedTuple):
@@ -99,6 +102,8 @@ class Sample(NamedTuple):
         Every motor whose limit is known is at its limit, and at least one limit is known.
     depth, depth_var
         [m], sinkage of the deepest wheel, and its variance.
+    felt
+        [m/s^2], dv/dt + g sin(pitch), where a specific force is measured and the pitch is not.
     """
 
     t: float
@@ -111,6 +116,7 @@ class Sample(NamedTuple):
     at_limit: bool = False
     depth: float = math.nan
     depth_var: float = math.nan
+    felt: float = math.nan
 
 
 class StallForecast(NamedTuple):
@@ -124,6 +130,8 @@ class StallForecast(NamedTuple):
         Trends of the log speed ratio [1], of the ground speed [m/s] and of the sinkage [m].
     steady
         Trend of the ground speed [m/s] whose acceleration changes slowly: what a bump takes, it gives back.
+    felt, climb
+        [m/s], integral of the specific force, and trend of the ground speed less that.
     thrust
         As a share of the weight, low-pass filtered.
     caused
@@ -143,6 +151,8 @@ class StallForecast(NamedTuple):
     speed: LocalTrend = LocalTrend()
     depth: LocalTrend = LocalTrend()
     steady: LocalTrend = LocalTrend()
+    felt: float = 0.0
+    climb: LocalTrend = LocalTrend()
     thrust: float = math.nan
     caused: float = -math.inf
     stalls: bool = False
@@ -154,6 +164,11 @@ class StallForecast(NamedTuple):
         """Whether the ground speed rises, at a standstill by more than its rate's sd."""
         least = 0.0 if self.settled else math.sqrt(self.speed.rate_var)
         return self.speed.rate > least
+
+    @property
+    def slope(self) -> float:
+        """g sin(pitch) [m/s^2] where only a specific force shows it, else 0."""
+        return -self.climb.rate
 
 
 def forecast(
@@ -187,6 +202,10 @@ def forecast(
     speed = before.speed.after(step, sample.ground, sample.ground_var, settings.speed_wander)
     steady = before.steady.after(step, sample.ground, sample.ground_var, settings.steady_wander)
     depth = before.depth.after(step, sample.depth, sample.depth_var, settings.depth_wander)
+    felt, climb = 0.0, LocalTrend()
+    if math.isfinite(sample.felt):
+        felt = before.felt + step * sample.felt
+        climb = before.climb.after(step, sample.ground - felt, sample.ground_var, SLOPE_WANDER)
     thrust = sample.thrust
     mean = before.thrust
     if math.isfinite(thrust):
@@ -215,6 +234,8 @@ def forecast(
         speed,
         depth,
         steady,
+        felt,
+        climb,
         mean,
         caused,
         stalls,

@@ -185,6 +185,11 @@ def _others_grip(motion: Motion, spins: Sequence[bool]) -> bool:
     return (0.5 - b) * sum(gripping) / len(gripping) > (0.5 + b) * max(sum(spinning) / len(spinning), 0.0)
 
 
+def slope_felt(loss: TractionLoss, rig: Rig) -> float:
+    """Force [N] of a slope that only a specific force shows, which counts as inertia in `inertia_of`; else 0."""
+    return 0.0 if rig.chassis is None else rig.chassis.mass * loss.ahead.slope
+
+
 def missing_pull(loss: TractionLoss, curve: OverSlip, noise: NoiseOfChannels, deviations: float) -> float:
     """Pull [N] that the estimate predicts at the present slip and the wheels significantly do not give; else 0.
 
@@ -379,6 +384,7 @@ def _samples(window: Window, rig: Rig, beside: Array, at_limit: NDArray[np.bool_
         at_limit,
         depth,
         of_depth,
+        np.where(np.isnan(window.pitch) & window.kinematic, window.acceleration, np.nan),
     )
     return list(map(Sample, *(column.tolist() for column in columns)))
 

@@ -23,7 +23,6 @@ from scipy.special import softmax
 from soilbus.arrays import Array
 from soilbus.diagnosis.fitted_model import FittedModel, fit_model
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.verdict import temperature
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.multistart import Fit, Start
 from soilbus.estimation.nuisance_parameters import Free
@@ -48,6 +47,9 @@ MAX_NEWTON_STEPS = 12
 ERROR_OF_PARTS, ERROR_OF_SUM = 0.1, 0.02
 """Further sd of a part and of the sum, as shares of the sum: what moves faster than a channel's interpolating curve is
 not shifted.  Of delays and low passes of 0.04 to 0.2 s of the second generator (tests/support/shaking.py)."""
+SURE_SD = 5.0
+"""Deviations by which a delay exceeds half a sample time, as interpolating leaves errors of its own: with 4 the pitch
+of a simulated drive is late that is not."""
 REFIT_FALL = 2.0
 """Fall of the tempered -2 log posterior along a ridge from which the model is fitted again from there."""
 
@@ -65,7 +67,7 @@ class DelayPosterior(NamedTuple):
     fall: float
 
 
-def with_delays(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, explained: float) -> FittedModel:
+def with_delays(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, divisor: float) -> FittedModel:
     """A fitted model that reports delays by their joint posteriors.
 
     Fitted again from the best delays where these lower -2 log posterior by more than REFIT_FALL.
@@ -76,14 +78,14 @@ def with_delays(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel
         Those of the fit.
     fitted
         The model.
-    explained
-        Fall of -2 log evidence by its effects.
+    divisor
+        The temperature.
     """
-    found = delay_posteriors(records, prior, fitted, explained)
-    if any(posterior.fall > REFIT_FALL * temperature(explained) for posterior in found.values()):
+    found = delay_posteriors(records, prior, fitted, divisor)
+    if any(posterior.fall > REFIT_FALL * divisor for posterior in found.values()):
         better = fit_model(records, prior, fitted.effects, _starts(fitted, found))
         if better is not None and better.neg2_log_evidence < fitted.neg2_log_evidence:
-            fitted, found = better, delay_posteriors(records, prior, better, explained)
+            fitted, found = better, delay_posteriors(records, prior, better, divisor)
     reported: dict[tuple[str, str], Estimate] = {}
     for (name, late), posterior in found.items():
         reported |= {
@@ -110,9 +112,9 @@ def _starts(fitted: FittedModel, found: Mapping[tuple[str, Late], DelayPosterior
 
 
 def exceeds_sampling_delay(
-    records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, effect: Effect, explained: float
+    records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, effect: Effect, divisor: float
 ) -> bool:
-    """Whether an effect of a fitted model delays any channel by more than half its sample time, by two deviations.
+    """Whether an effect of a fitted model delays any channel by more than half its sample time, by SURE_SD.
 
     A stamp says when a frame was on the bus: its value was measured up to a cycle before, half of one on average.
     True where no channel's sample time is known.
@@ -122,21 +124,20 @@ def exceeds_sampling_delay(
         return True
     totals = [
         (posterior.total, half[late])
-        for (name, late), posterior in delay_posteriors(records, prior, fitted, explained).items()
+        for (name, late), posterior in delay_posteriors(records, prior, fitted, divisor).items()
         if name == effect.name
     ]
-    return any(abs(total.value) - 2.0 * total.std > of_cycle for total, of_cycle in totals)
+    return any(abs(total.value) - SURE_SD * total.std > of_cycle for total, of_cycle in totals)
 
 
 def delay_posteriors(
-    records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, explained: float
+    records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, divisor: float
 ) -> dict[tuple[str, Late], DelayPosterior]:
     """The posterior of each channel that a fitted model lets be late, by effect and names of its parameters.
 
     Parameters as of with_delays().
     """
     found: dict[tuple[str, Late], DelayPosterior] = {}
-    divisor = temperature(explained)
     for effect in fitted.effects:
         for late in effect.late.values():
             names = [(f.effect, f.parameter.name) for f in fitted.free_unheld]

@@ -31,7 +31,7 @@ from soilbus.diagnosis.score import (
     normal_equations,
     shifted_effects,
 )
-from soilbus.diagnosis.verdict import required_fall
+from soilbus.diagnosis.verdict import required_fall, temperature
 from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.terra.effects.effect import Effect, Parameter
@@ -71,7 +71,7 @@ def detectable(
     records: Sequence[Record], prior: SoilPrior, present: FittedModel, candidates: Sequence[Effect]
 ) -> tuple[Detectable, ...]:
     """The detectable size of every candidate beside the present model fitted to these recordings."""
-    required = required_fall(0.0, present.gap, present.checked_rows, present.rows)
+    required = required_fall(temperature(present.excess), present.gap, present.checked_rows, present.rows)
     data_ratio = present.rows / sum(fit.rows for fit in present.fits)
     found: dict[str, Detectable] = {}
     for effects in _with_further_starts(candidates):

@@ -21,17 +21,8 @@ from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.gap import Gap, gap_of
 from soilbus.diagnosis.records import Record
 from soilbus.diagnosis.residual_terms import ResidualTerms, residual_terms
-from soilbus.diagnosis.search import (
-    MAX_REFINED_GAP,
-    THINNING,
-    Addition,
-    FitCache,
-    PresentModel,
-    best_addition,
-    fitted_to_convergence,
-    with_swaps,
-)
-from soilbus.diagnosis.verdict import Verdict, verdict_of
+from soilbus.diagnosis.search import MAX_EFFECTS, THINNING, Addition, FitCache, Search
+from soilbus.diagnosis.verdict import Verdict, temperature, verdict_of
 from soilbus.diagnosis.where import Disagreement, disagreements
 from soilbus.estimation.posterior import Posterior, SoilPrior
 from soilbus.terra.effects.effect import Effect
@@ -39,8 +30,6 @@ from soilbus.terra.effects.vehicle import GRADE, GRADE_BESIDE_PITCH
 
 __all__ = ["Diagnosis", "NotFitted", "diagnose"]
 
-MAX_EFFECTS = 3
-"""Effects that are added at most."""
 MAX_RIVALS = 2
 """Alternatives that are fitted beside the effect that was added, to find what would tell them apart."""
 MAX_OVERLAP = 0.25
@@ -147,24 +136,15 @@ def diagnose(
     thinned = FitCache([record.thinned(THINNING) for record in records], prior)
     law = records[0].training.model.shear_law
     candidates = [of_vehicle(effect, records) for effect in catalogue if effect.base_law in (None, law)]
-    where = disagreements(base)
-    present = base
+    where, present = disagreements(base), base
     additions: list[Addition] = []
-    while len(additions) < MAX_EFFECTS:
-        progress(f"looking for effect {len(additions) + 1}")
-        possible = [effect for effect in candidates if effect.name not in present.names]
-        explained = base.neg2_log_evidence - present.neg2_log_evidence
-        found = best_addition(full, thinned, PresentModel.of(present, full, thinned), possible, explained)
-        if found is None:
-            break
-        addition, present = found
-        additions.append(addition)
-        if len(additions) > 1 and present.gap < MAX_REFINED_GAP:
-            additions, present = with_swaps(full, thinned, base, present, additions, candidates)
-    present = fitted_to_convergence(full, base.neg2_log_evidence, present)
+    progress("looking for effects")
+    for step in Search(full, thinned, base, candidates).steps():
+        additions, present = step
+        progress(f"looking for effects beside {' and '.join(addition.effect.name for addition in additions)}")
     if any(effect.late for effect in present.effects):
         progress("separating delays from low passes")
-        present = with_delays(records, prior, present, base.neg2_log_evidence - present.neg2_log_evidence)
+        present = with_delays(records, prior, present, temperature(present.excess))
     additions.sort(key=lambda addition: -addition.falls[addition.effect.name])
     progress("holding out every block in turn")
     before = gap_of(records, prior, base)

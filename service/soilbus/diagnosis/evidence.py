@@ -85,12 +85,9 @@ class OwnParameters(NamedTuple):
         return coarse - mixture_neg2_log_evidence(self.information, self.information_vector, self.free) / temperature
 
 
-def own_parameters(
-    standardised: Array, covariance: Array, free: Sequence[Free], data_ratio: float = 1.0
-) -> OwnParameters:
-    """OwnParameters from posterior mean (P,) and covariance (P, P) of a fit, as of data_ratio times its data."""
-    information, information_vector = _likelihood(standardised, covariance)
-    return OwnParameters(data_ratio * information, data_ratio * information_vector, tuple(free))
+def own_parameters(standardised: Array, covariance: Array, free: Sequence[Free]) -> OwnParameters:
+    """OwnParameters from posterior mean (P,) and covariance (P, P) of a fit."""
+    return OwnParameters(*_likelihood(standardised, covariance), tuple(free))
 
 
 def _likelihood(standardised: Array, covariance: Array) -> tuple[Array, Array]:

@@ -137,10 +137,10 @@ class FittedModel:
         """-2 log posterior of the training blocks at the optimum, up to a constant."""
         return sum(fit.neg2_log_posterior for fit in self.fits)
 
-    def predicted_neg2_log_evidence(self, rows: int) -> float:
-        """-2 log evidence expected from this number of residuals like these: the misfit grows in proportion."""
-        misfit = self.neg2_log_posterior + self.gap * self.checked_rows
-        return self.neg2_log_evidence + (rows / self.rows - 1.0) * misfit
+    @property
+    def excess(self) -> float:
+        """By how much the squared residuals of all blocks, in units of their variance, exceed their number."""
+        return self.neg2_log_posterior + self.gap * self.checked_rows - self.rows
 
     @property
     def gap(self) -> float:
@@ -218,8 +218,8 @@ class FittedModel:
             for name, of in parts.items()
         ]
 
-    def own_parameters(self, effect: Effect, data_ratio: float = 1.0) -> tuple[OwnParameters, ...]:
-        """Likelihood of each later recording's own values of an effect of the record, as of data_ratio times its data.
+    def own_parameters(self, effect: Effect) -> tuple[OwnParameters, ...]:
+        """Likelihood of each later recording's own values of an effect of the record.
 
         Empty for other effects, even where they have a zero that wanders in each recording: without the wander they
         are the same effect.
@@ -228,7 +228,7 @@ class FittedModel:
         if not own or not effect.of_record:
             return ()
         n_sensors, free = self.checks[0].problem.n_sensors, [self.free[i] for i in own]
-        return tuple(own_parameters(*_moments(fit, n_sensors, own), free, data_ratio) for fit in self.fits[1:])
+        return tuple(own_parameters(*_moments(fit, n_sensors, own), free) for fit in self.fits[1:])
 
     def shared_parameters(self, effect: Effect) -> OwnParameters:
         """Likelihood, by the first recording, of an effect's parameters that are the vehicle's; without held ones."""

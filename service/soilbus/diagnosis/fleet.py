@@ -23,7 +23,7 @@ from soilbus.diagnosis.diagnose import Diagnosis, diagnose
 from soilbus.diagnosis.evidence import OwnParameters, mixture_neg2_log_evidence
 from soilbus.diagnosis.fitted_model import fit_model
 from soilbus.diagnosis.records import Record
-from soilbus.diagnosis.verdict import TEMPERATURE, Verdict
+from soilbus.diagnosis.verdict import Verdict, temperature
 from soilbus.estimation.posterior import Estimate, SoilPrior
 from soilbus.terra.effects.effect import Effect
 
@@ -146,11 +146,14 @@ def onset_of(records: Sequence[Record], prior: SoilPrior, effect: Effect, beside
     """
     shown: list[OwnParameters | None] = []
     sizes: list[Mapping[str, Estimate] | None] = []
+    excess = 0.0
     for record in records:
         fitted = fit_model([record], prior, (*record.training.effects, *beside, effect))
         shown.append(None if fitted is None else fitted.shared_parameters(effect))
         sizes.append(None if fitted is None else fitted.parameters()[effect.name])
-    *probabilities, never = onset_probabilities([_fall(shown[k:]) for k in range(len(records))])
+        excess += 0.0 if fitted is None else fitted.excess
+    falls = [_fall(shown[k:]) for k in range(len(records))]
+    *probabilities, never = onset_probabilities(falls, temperature(excess))
     return Onset(int(np.argmax(probabilities)), tuple(probabilities), never, tuple(sizes))
 
 
@@ -169,19 +172,21 @@ def _fall(shown: Sequence[OwnParameters | None]) -> float:
     return -mixture_neg2_log_evidence(information, vector, [known[0].free[i] for i in kept[0]])
 
 
-def onset_probabilities(falls: Sequence[float]) -> list[float]:
+def onset_probabilities(falls: Sequence[float], divisor: float) -> list[float]:
     """Probability of each log to be the first with an effect, and, last, that none has it.
 
     Parameters
     ----------
     falls
         Fall of -2 log evidence by an effect that all logs from this one on have.
+    divisor
+        The temperature (see `verdict`).
 
     Returns
     -------
-    Probabilities; beforehand each case is as likely as any other, and evidences are tempered as in `verdict`.
+    Probabilities; beforehand each case is as likely as any other.
     """
-    return [float(p) for p in softmax(np.array([*falls, 0.0]) / (2.0 * TEMPERATURE))]
+    return [float(p) for p in softmax(np.array([*falls, 0.0]) / (2.0 * divisor))]
 
 
 def named(probabilities: Sequence[float], rate: float = FALSE_DISCOVERY_RATE) -> list[bool]:

@@ -113,7 +113,7 @@ def expected_posterior(drive: ObservationModelWithEffects, prior: SoilPrior, soi
     return Posterior(soil, shrunk[: len(soil), : len(soil)])
 
 
-def expected_probability(addition: Addition, true: str, gained: dict[str, float], explained: float) -> float:
+def expected_probability(addition: Addition, true: str, gained: dict[str, float]) -> float:
     """Probability of the true name once the drive has been driven and diagnosed with the recordings.
 
     Parameters
@@ -124,10 +124,9 @@ def expected_probability(addition: Addition, true: str, gained: dict[str, float]
         Name that is true.
     gained
         S by name of the rivals.
-    explained
-        Fall of -2 log evidence by the other effects.
     """
     names = {addition.effect.name, *addition.alternatives}
     least = min(gain for name, gain in gained.items() if name != true)
     falls = {name: addition.falls[name] - gained.get(name, least) for name in names}
-    return probabilities({name: fall + max(gained.values()) for name, fall in falls.items()}, explained)[true]
+    with_all = {name: fall + max(gained.values()) for name, fall in falls.items()}
+    return probabilities(with_all, addition.temperature)[true]

@@ -52,7 +52,7 @@ GAIN_QUANTITIES = ("torque", "load", "speed", "ground_speed", "draft")
 
 _BY_INSTANT = (
     "t", "usable", "torque", "torque_var", "has_torque", "sinkage", "sinkage_var", "has_sinkage", "load", "load_var",
-    "speed", "speed_var", "ground_speed", "ground_speed_var", "slip", "draft", "draft_var", "demand", "demand_var",
+    "speed", "speed_var", "ground_speed", "ground_speed_var", "slip", "draft", "draft_var", "demand_var",
     "inertia", "inertia_var", "has_balance", "pitch", "since", "distance", "wheel_angle", "acceleration",
     "acceleration_var",
     "by_inertia", "by_draft", "_measured", "_measured_var", "_latents_measured", "_row_var", "_known",
@@ -214,7 +214,7 @@ class Measurements:
         self._length = 0.0 if self.rig.lengths is None else np.tile(self.rig.lengths, self.n)
 
     def _balance(self, take: Callable[[str], Masked], usable: NDArray[np.bool_]) -> None:
-        """Set the demand: pull [N] for draft, slope and inertia, and its variance."""
+        """Set draft and inertia (with slope) [N], whose sum is the demand, and their variances."""
         self.draft, draft_var, known = take("draft")
         self.with_pitch = False
         inertia, inertia_var = np.zeros_like(self.draft), np.zeros_like(self.draft)
@@ -237,9 +237,14 @@ class Measurements:
             inertia_var = mass**2 * ((GRAVITY * np.cos(pitch)) ** 2 * pitch_var + acceleration_var)
             self.pitch = pitch
         self.acceleration, self.acceleration_var = acceleration, acceleration_var
-        self.inertia, self.demand, self.demand_var = inertia, self.draft + inertia, draft_var + inertia_var
+        self.inertia, self.demand_var = inertia, draft_var + inertia_var
         self.has_balance = known & usable.all(axis=1)
         self.draft_var, self.inertia_var = np.where(self.has_balance, [draft_var, inertia_var], 0.0)
+
+    @property
+    def demand(self) -> Array:
+        """Pull [N] (N,) for draft, slope and inertia."""
+        return self.draft + self.inertia
 
     @property
     def computes_loads(self) -> bool:

@@ -1015,7 +1015,7 @@ class ObservationModelWithEffects(ObservationModel):
             return sum(parts, np.zeros(self.n))
 
         draft = true_draft(active, self.draft, surroundings)
-        off = self.demand - self.draft + draft + resistance(surroundings) - pull
+        off = self.inertia + draft + resistance(surroundings) - pull
         by_draft, by_acceleration = self._noise_shares
         estimated = surroundings._replace(acceleration=surroundings.acceleration - (by_acceleration * off)[:, None])
         errors = [(effect.draft, values) for effect, values in active if effect.draft is not None]

@@ -152,14 +152,13 @@ def what_to_drive(diagnosis: Diagnosis, config: Config) -> Plan | None:
     true = truths(diagnosis.rivals)
     names = tuple(one.name for one in true)
     least = min(diagnosis.additions, key=lambda a: a.probability if a.alternatives else np.inf)
-    explained = diagnosis.base.neg2_log_evidence - diagnosis.completed.neg2_log_evidence - max(least.falls.values())
     chances = {least.effect.name: least.probability, **least.alternatives}
     weight = np.array([chances[name] for name in names])
 
     def chance(found: Sequence[Sequence[float]], times: int = 1) -> float:
         """Expected probability of the right name after this number of drives."""
         after = [
-            expected_probability(least, name, {n: times * s for n, s in zip(names, row, strict=True)}, explained)
+            expected_probability(least, name, {n: times * s for n, s in zip(names, row, strict=True)})
             for name, row in zip(names, found, strict=True)
         ]
         return float(weight @ after / weight.sum()) if after else 0.0

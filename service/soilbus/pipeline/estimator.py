@@ -33,7 +33,7 @@ from soilbus.decision.immobilisation import (
 )
 from soilbus.decision.judgement import Basis, judge
 from soilbus.decision.torque_ceiling import TorqueCeiling
-from soilbus.decision.traction_loss import NO_LOSS, idle, motions, observed
+from soilbus.decision.traction_loss import NO_LOSS, idle, motions, observed, slope_felt
 from soilbus.decision.traversability import State, Status, Traversability
 from soilbus.decision.uncertain_model import UncertainModel
 from soilbus.decision.wheels import WheelTable
@@ -110,6 +110,8 @@ class WindowEstimator:
         self._settings = config.estimator
         self._wheels: WheelTable | None = None
         self._gap = GapWatch(config.estimator.window, config.estimator.hop)
+        shared = [f"load.{wheels[0].name}" for wheels in config.same_signal("load") if len(wheels) > 1]
+        self._mismatch = " ".join(["model_mismatch", *shared])
         self._held = Held()
         self._valid_at: float | None = None
         self._watch, self._warnings = Watch(), Warnings()
@@ -179,6 +181,7 @@ class WindowEstimator:
             basis=basis,
             z_driven=None if fit is None or posterior is None else sinkage_range(fit, self.rig),
             search_ended=tracked.search_ended,
+            shows_strength=fit is not None and self._shows_strength(fit),
         )
         effects = self._effects(fit)
         model = self._present_model(task.window, tracked, effects)
@@ -193,9 +196,7 @@ class WindowEstimator:
         """The result with traversability and watch; windows in their order, here or in another process."""
         result = self._decided(window)
         self._update_watch(window)
-        capability = result.traversability.capability
-        if capability is not None and result.status is Status.VALID:
-            self._curve = capability.over_slip
+        self._curve = result.curve or self._curve
         watch = with_loss(self._watch, self._loss)
         warned = has_cause(watch, self._loss, self.config.warning.hold)
         now = as_of(result, self._loss, result.t, self.config, warned)
@@ -264,7 +265,8 @@ class WindowEstimator:
         )  # fmt: skip
         for moment, motion in zip(looks, lately, strict=True):
             self._loss = observed(self._loss, motion, self.config)
-            self._watch = watched(self._watch, moment.t, moment.slip, moment.pull, self._curve, moment.inertia)
+            inertia = moment.inertia - slope_felt(self._loss, self.rig)
+            self._watch = watched(self._watch, moment.t, moment.slip, moment.pull, self._curve, inertia)
             self._warnings = self._warnings.after(moment.t, with_loss(self._watch, self._loss).warning)
 
     def _effects(self, fit: Fit | None) -> list[Active]:
@@ -339,18 +341,23 @@ class WindowEstimator:
         failure = self._failure(tracked)
         if fit is None or failure is not None:
             status = Status.DEGRADED if fit is not None and fit.converged else Status.INVALID
-            return status, "model_mismatch" if failure == "model_mismatch" else "no_convergence"
+            return status, self._mismatch if failure == "model_mismatch" else "no_convergence"
         if task.poor:
             return Status.DEGRADED, "input_stale " + " ".join(task.poor)
         if self._too_little_of_new_soil(tracked, task.end):
             return Status.NOT_EXCITED, "not_excited new_soil"
         if fit.off_scale:
-            return Status.DEGRADED, "model_mismatch"
+            return Status.DEGRADED, self._mismatch
         if self._ambiguous(fit):
             return Status.NOT_EXCITED, "ambiguous"
         if lacks := lacking(fit, self.rig, self._settings):
             return Status.NOT_EXCITED, " ".join(["not_excited", *lacks])
         return Status.VALID, "none"
+
+    def _shows_strength(self, fit: Fit) -> bool:
+        """Whether the window determines tan phi."""
+        tan_phi = fit.reported.posterior.tan_phi()
+        return tan_phi.std <= self._settings.max_tan_phi_std * tan_phi.value
 
     def _too_little_of_new_soil(self, tracked: TrackerOutput, end: float) -> bool:
         """Whether too little of the window is on the new soil."""

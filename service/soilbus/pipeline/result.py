@@ -19,6 +19,7 @@ from soilbus.pipeline.excitation import Excitation
 from soilbus.pipeline.positions import Position
 
 if TYPE_CHECKING:
+    from soilbus.decision.capability import OverSlip
     from soilbus.estimation.posterior import Estimate, Posterior
 
 
@@ -66,6 +67,8 @@ class WindowResult:
         How much draft and slip varied.
     basis
         The data that the decision rests on.
+    shows_strength
+        Whether tan phi is known to `estimator.max_tan_phi_std`.
     """
 
     t: float
@@ -94,6 +97,19 @@ class WindowResult:
     log: str | None = None
     excitation: Excitation = Excitation()  # noqa: RUF009, immutable
     basis: Basis = Basis()  # noqa: RUF009, immutable
+    shows_strength: bool = False
+
+    @property
+    def curve(self) -> OverSlip | None:
+        """Pull over slip, along which the warning extrapolates; None where the window does not determine it.
+
+        That takes a model that fits and slips that show the soil's strength.  How deep the soil bears, which a window
+        without load cells seldom tells, matters little: only what the pull still gains beyond the present slip is taken
+        from the curve, and the pull itself is measured.
+        """
+        able = self.traversability.capability
+        fits = self.status is Status.VALID or (self.status is Status.NOT_EXCITED and self.shows_strength)
+        return able.over_slip if able is not None and fits else None
 
 
 def as_of(result: WindowResult, loss: TractionLoss, now: float, config: Config, warned: bool = False) -> WindowResult:

@@ -75,6 +75,12 @@ def configuration_warnings(config: Config) -> list[str]:
                 lines.append(
                     f"{getattr(wheels[0], role).signal} is the {role} of {names}: one measurement of their mean, with"
                     " one noise; what differs between them stays open"
+                    + (
+                        "; if it is the cell of one wheel, map it for that one alone: the loads of the others are then"
+                        " computed"
+                        if role == "load"
+                        else ""
+                    )
                 )
     c = config.soil.c
     if 0.0 < c.value < MIN_COHESION and c.std > 0.0:
@@ -166,11 +172,17 @@ def load_lines(config: Config) -> list[str]:
     )
     if own is None or with_cells is None:
         return [line]
+    limit = config.estimator.max_bearing_std
+    too_wide = [
+        f"Windows that know it to no better than {limit:.0%} (estimator.max_bearing_std) count as not excited, and"
+        " there is no GO; without load cells set it to 0.2."
+    ]
     return [
         line,
         f"After {config.estimator.window:g} s of varied draft on the soil assumed below, bearing pressure is known to"
         f" {own[0]:.1%} (with load cells to {with_cells[0]:.1%}), tan phi to {own[1]:.1%} ({with_cells[1]:.1%}), as far"
         " as the sensors go; what the form of the contact leaves open comes on top.",
+        *(too_wide if own[0] > limit else []),
     ]
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from soilbus.diagnosis.verdict import FALL_REQUIRED_ALONE, FALL_REQUIRED_BESIDE, Verdict
+from soilbus.diagnosis.verdict import Verdict, least_required_fall
 from soilbus.offline.diagnose import Findings
 from soilbus.report.diagnosis_pictures import (
     BINS,
@@ -169,8 +169,8 @@ def _candidates(findings: Findings) -> Iterator[tuple[int, Table, str]]:
             for name, fall in sorted(addition.falls.items(), key=lambda item: -item[1])
         ]
         why = why_probabilities(addition)
-        least = FALL_REQUIRED_BESIDE if addition.beside else FALL_REQUIRED_ALONE
-        words = f"An effect is added from a fall of {least:g} on." + (f" {why}." if why else "")
+        least = least_required_fall(addition.temperature)
+        words = f"An effect is added from a fall of {least:.0f} on." + (f" {why}." if why else "")
         yield number, Table(("effect", "fall of -2 log evidence", "probability"), rows, frozenset({1, 2})), words
 
 

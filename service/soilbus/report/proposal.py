@@ -307,7 +307,10 @@ def _put_signals(draft: _Draft) -> None:
 
 
 def _put_rest(draft: _Draft) -> None:
-    """Noise, and candidates that no line names."""
+    """Limits without load cells, noise, and candidates that no line names."""
+    if not all(draft.matched("load", wheel) for wheel in WHEELS):
+        draft.section("[estimator]")
+        draft.put("max_bearing_std", "0.2", "a window without load cells knows the bearing pressure to 10 to 20 %")
     draft.lines += [
         "",
         "# [noise]: sd of each sensor, from data sheets or a drive on the road; else the defaults hold",

@@ -117,7 +117,7 @@ def next_steps(results: Sequence[WindowResult], source: Source) -> Iterator[tupl
         if what is not None:
             why = reason.removeprefix(f"{status} ").replace("_", " ")
             yield f"{len(group)} of {len(results)} windows were {str(status).replace('_', ' ')} ({why}): {what}.", ""
-    if any(r.reason in ("model_mismatch", "no_convergence") for r in results):
+    if any(r.reason.split()[0] in ("model_mismatch", "no_convergence") for r in results):
         yield "Find what the model misses:", f"{source.command('diagnose')} --report diagnosis.html"
     if config.table is not None:
         return

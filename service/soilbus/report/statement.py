@@ -17,7 +17,7 @@ from soilbus.diagnosis.detectable import Detectable
 from soilbus.diagnosis.diagnose import Diagnosis
 from soilbus.diagnosis.fitted_model import FittedModel
 from soilbus.diagnosis.search import Addition
-from soilbus.diagnosis.verdict import NAMED_PROBABILITY, P_LARGE_FORMULA_ERROR, Verdict, gap_limit
+from soilbus.diagnosis.verdict import NAMED_PROBABILITY, Verdict, gap_limit
 from soilbus.estimation.posterior import Posterior, bearing_pressure
 from soilbus.terra.effects.catalogue import CATALOGUE
 from soilbus.terra.effects.vehicle import GRADE_BESIDE_PITCH
@@ -148,12 +148,10 @@ def why_probabilities(addition: Addition) -> str | None:
     """How probabilities follow from the falls of -2 log evidence; None where there is one name only."""
     if len(addition.falls) < 2:
         return None
-    usual, large = addition.temperatures
-    chance = 100 * P_LARGE_FORMULA_ERROR
     return (
         "probabilities: no formula of an effect is the field's, and of falls this great such an error may tip the "
-        f"balance; so their differences are divided by {usual:.0f} (with a chance of {chance:.0f} % by "
-        f"{large:.0f}) before half of each is taken as a logarithm of odds"
+        f"balance; so their differences are divided by {addition.temperature:.0f} before half of each is taken as a "
+        "logarithm of odds"
     )
 
 

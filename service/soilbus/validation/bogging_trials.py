@@ -24,9 +24,8 @@ from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.decision.capability import OverSlip
 from soilbus.decision.immobilisation import BINS_OF_A_MOMENT, Alert, Moment, Watch, moments, watched, with_loss
-from soilbus.decision.traction_loss import NO_LOSS, TractionLoss, motions
+from soilbus.decision.traction_loss import NO_LOSS, TractionLoss, motions, slope_felt
 from soilbus.decision.traction_loss import observed as loss_after
-from soilbus.decision.traversability import Status
 from soilbus.estimation.assembly import rig_of
 from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.window import forward
@@ -38,7 +37,7 @@ from soilbus.simulator.scenario import Swing
 from soilbus.validation.boggings import KINDS, BoggingDrive, bogging
 from soilbus.validation.firm_drives import DRIVE_TIME, EASY, FIRM_KINDS, HARD, firm_ground
 from soilbus.validation.monte_carlo import Each
-from soilbus.validation.windows import task_of
+from soilbus.validation.windows import task_of, torque_limits
 
 HALVES = ("report", "tune")
 """Drives by the parity of their seeds: even ones are reported, odd ones serve to set thresholds."""
@@ -238,24 +237,27 @@ def watch(observation: Observation) -> tuple[Array, NDArray[np.bool_]]:
 def _looks_and_curves(
     recording: Recording, config: Config, end: float
 ) -> tuple[list[Moment], list[TractionLoss], list[tuple[float, OverSlip]]]:
-    """What is seen until the end [s], and from their times on the curves of windows that the service calls valid."""
+    """What is seen until the end [s], and from their times on the curves of windows."""
     rig, settings = rig_of(config), config.estimator
-    estimator, no_limit = WindowEstimator(config), np.full(len(rig.radius), np.nan)
+    estimator, limit = WindowEstimator(config), torque_limits(config, rig)
     store = Bins(rig, LOOK_PERIOD, 0.0)
     store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
     curves = []
     for due in np.arange(settings.window, end, settings.hop).tolist():
-        window = store.window(due - settings.window, due)
-        result = estimator.solve_unwatched(task_of(window, due, config, no_limit, fresh=due == settings.window))
-        able = result.traversability.capability
-        if able is not None and result.status is Status.VALID:
-            curves.append((due, able.over_slip))
+        window = completed(forward(store.window(due - settings.window, due)), rig)
+        result = estimator.solve_unwatched(task_of(window, due, config, limit, fresh=due == settings.window))
+        if result.curve is not None:
+            curves.append((due, result.curve))
     seen = completed(forward(store.window(0.0, end)), rig)
     losses, loss, bins = [], NO_LOSS, np.arange(len(seen.t))
-    for motion in motions(seen, rig, no_limit, config.traversability, bins, BINS_OF_A_MOMENT):
+    for motion in motions(seen, rig, limit, config.traversability, bins, BINS_OF_A_MOMENT):
         loss = loss_after(loss, motion, config)
         losses.append(loss)
-    return list(moments(seen, rig, bins, settings.min_speed)), losses, curves
+    looks = [
+        moment._replace(inertia=moment.inertia - slope_felt(loss, rig))
+        for moment, loss in zip(moments(seen, rig, bins, settings.min_speed), losses, strict=True)
+    ]
+    return looks, losses, curves
 
 
 def half_of(seed: int) -> str:

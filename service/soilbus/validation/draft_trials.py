@@ -22,7 +22,7 @@ from soilbus.estimation.assembly import model_of, prior_of, rig_of
 from soilbus.estimation.laplace import cold_fit
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import NORMAL_95
-from soilbus.estimation.window import Rig
+from soilbus.estimation.window import Rig, pairs
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.drivetrain import Drivetrain, drivetrain_of, own_motors
 from soilbus.simulator.equilibrium import Mechanics, Situation, solve
@@ -32,6 +32,7 @@ from soilbus.terra.soils import soil_named
 from soilbus.terra.vehicle import axle_loads
 from soilbus.terra.wheel import Soil, WheelModel, sinkage
 from soilbus.validation.monte_carlo import Each, prior_about
+from soilbus.validation.windows import torque_limits
 
 __all__ = ["SOILS", "DraftFigures", "DraftTrial", "Task", "draft_trials", "figures", "trial", "true_largest_draft"]
 
@@ -128,7 +129,9 @@ def trial(task: Task) -> DraftTrial:
     )
     if fit is None or not fit.converged:
         return DraftTrial(name, np.nan, np.nan, truth)
-    able, _ = assess(fit.reported.posterior, rig, model, None, limit, settings.max_slip, settings.max_sinkage)
+    able, _ = assess(
+        fit.reported.posterior, rig, model, None, torque_limits(config, rig), settings.max_slip, settings.max_sinkage
+    )
     if able is None:
         return DraftTrial(name, np.nan, np.nan, truth)
     return DraftTrial(name, able.max_draft.value, able.max_draft.std, truth)
@@ -142,6 +145,7 @@ def true_largest_draft(
     model: WheelModel,
     max_sinkage: float = np.inf,
     drivetrain: Drivetrain | None = None,
+    side_shift: float = 0.0,
 ) -> float:
     """Largest draft [N] held steadily on level ground; nan where there is none.
 
@@ -159,6 +163,8 @@ def true_largest_draft(
         Greatest sinkage of a wheel [m].
     drivetrain
         What turns the wheels, with the limits of axles; by default a motor for each wheel.
+    side_shift
+        Share of each axle's load that a side slope moves to its left wheel.
 
     Raises
     ------
@@ -170,6 +176,8 @@ def true_largest_draft(
     slips = max_slip * SLIP_SHARES
     shape = (len(rig.radius), len(slips))
     share = 1.0 / np.where(rig.front, rig.front.sum(), (~rig.front).sum())
+    left, right = pairs(rig)
+    share[left], share[right] = share[left] * (1.0 + side_shift), share[right] * (1.0 - side_shift)
     free, drawn = (np.where(rig.front, *axle_loads(rig.chassis, draft, 0.0, 0.0)) * share for draft in (0.0, 1.0))
     none = np.zeros(len(slips))
     limit = np.where(np.isfinite(torque_limit), torque_limit, np.inf)

@@ -7,6 +7,7 @@ an implement lifted at headlands, stop and go, short hills, clods, and soil that
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,7 +15,15 @@ from soilbus.arrays import Array
 from soilbus.config.model import Config
 from soilbus.simulator.scenario import Patch, Profile, Scenario, Swing, realise
 from soilbus.terra.vehicle import GRAVITY
-from soilbus.validation.boggings import FAST_SWING_BAND, FIRM_SOILS, LIFT_SLIP, SOFT_SOILS, largest_draft
+from soilbus.validation.boggings import (
+    FAST_SWING_BAND,
+    FIRM_SOILS,
+    LIFT_SLIP,
+    SIDE_SHIFT,
+    SOFT_SOILS,
+    largest_draft,
+    side_shift,
+)
 
 DRIVE_TIME = 300.0
 """Length of a drive [s]."""
@@ -25,14 +34,26 @@ hills; stones and clods in the implement's way; a light draft on soil that is so
 FIRM_KINDS = (EASY, *HARD)
 GROUND_SPEED = Swing(1.0, 1.8)
 """Ground speed [m/s], where a kind of drive does not set its own."""
+HARSH_SIDE_SHIFT = 0.4
+"""Share of an axle's load that harsh ground shifts, where the machine bears it (`boggings.side_shift`)."""
+LEAST_PULL = 0.02
+"""Share of the weight that a machine can pull where it is driven."""
 _KNOT_PERIOD = 0.1
 """Time [s] between the knots of a draft."""
 
 
 def firm_ground(config: Config, kind: str, rng: np.random.Generator) -> Scenario:
-    """A drive of one of FIRM_KINDS, with a draft that the ground holds all along."""
-    soil = str(rng.choice(SOFT_SOILS if kind == "soft" else FIRM_SOILS))
-    return _DRIVES[kind](config, soil, largest_draft(config, soil), rng)
+    """A drive of one of FIRM_KINDS, with a draft that the machine holds on the ground all along."""
+    soil = str(rng.choice(_soft_soils(config) if kind == "soft" else FIRM_SOILS))
+    side = side_shift(config, soil, HARSH_SIDE_SHIFT if kind == "harsh" else SIDE_SHIFT)
+    return replace(_DRIVES[kind](config, soil, largest_draft(config, soil, side), rng), side_shift=Swing(-side, side))
+
+
+def _soft_soils(config: Config) -> tuple[str, ...]:
+    """Soft soils on which the machine can pull at all, else firm ones."""
+    least = LEAST_PULL * GRAVITY * (config.vehicle.mass if config.vehicle else 0.0)
+    held = {soil: largest_draft(config, soil, side_shift(config, soil, SIDE_SHIFT)) for soil in SOFT_SOILS}
+    return tuple(soil for soil, most in held.items() if most > least) or FIRM_SOILS
 
 
 def _easy(config: Config, soil: str, most: float, rng: np.random.Generator) -> Scenario:
@@ -41,10 +62,12 @@ def _easy(config: Config, soil: str, most: float, rng: np.random.Generator) -> S
 
 def _harsh(config: Config, soil: str, most: float, rng: np.random.Generator) -> Scenario:
     knots = np.arange(0.0, 3.0 * DRIVE_TIME, 25.0)
-    slope = tuple(zip(knots.tolist(), rng.uniform(-0.04, 0.04, len(knots)).tolist(), strict=True))
+    weight = GRAVITY * config.vehicle.mass if config.vehicle else np.inf
+    pitch = rng.uniform(-0.13, 0.13, len(knots)) * most / weight
+    slope = tuple(zip(knots.tolist(), pitch.tolist(), strict=True))
     return Scenario(
         DRIVE_TIME, (Patch(0.0, soil),), speed=Swing(0.8, 2.5), draft=Swing(0.1 * most, 0.65 * most, *FAST_SWING_BAND),
-        lift_slip=LIFT_SLIP, side_shift=Swing(-0.4, 0.4), slip_spread=0.03, slope=slope,
+        lift_slip=LIFT_SLIP, slip_spread=0.03, slope=slope,
     )  # fmt: skip
 
 
@@ -58,9 +81,12 @@ def _headland(config: Config, soil: str, most: float, rng: np.random.Generator) 
 
 
 def _stop_and_go(config: Config, soil: str, most: float, rng: np.random.Generator) -> Scenario:
-    """Speed between a crawl and 2 m/s, at up to 1 m/s^2."""
+    """Speed between a crawl and 2 m/s, at up to 1 m/s^2; at less where the machine pulls little of its weight."""
     t = _times()
-    going = _steps(t, rng, (5.0, 15.0), (3.0, 8.0), (2.0, 4.0), (2.0, 4.0))
+    weight = GRAVITY * config.vehicle.mass if config.vehicle else 0.0
+    slower = max(0.27 * weight / most, 1.0)
+    ramp = (2.0 * slower, 4.0 * slower)
+    going = _steps(t, rng, (5.0, 15.0), (3.0, 8.0), ramp, ramp)
     return _scenario(soil, Swing(0.2 * most, 0.5 * most), _profile(t, 0.25 + rng.uniform(1.2, 1.75) * going))
 
 

@@ -31,12 +31,14 @@ from soilbus.decision.demand import present_demand
 from soilbus.decision.judgement import judge
 from soilbus.decision.traversability import State, Traversability
 from soilbus.estimation.assembly import prior_of, rig_of
+from soilbus.estimation.instrumentation import completed
 from soilbus.estimation.parametrization import MAX_PHI
 from soilbus.estimation.posterior import PARAMETERS, SoilPrior
-from soilbus.estimation.window import VEHICLE_QUANTITIES, Rig, Window
+from soilbus.estimation.window import VEHICLE_QUANTITIES, Rig, Window, forward
 from soilbus.pipeline.estimator import WindowEstimator
 from soilbus.sensors.bins import Bins
 from soilbus.simulator.drive import SimulationError
+from soilbus.simulator.drivetrain import drivetrain_of
 from soilbus.simulator.recording import Recording, simulate
 from soilbus.simulator.scenario import Patch, Scenario, Swing
 from soilbus.terra.soils import KINDS, soil_named
@@ -44,7 +46,7 @@ from soilbus.terra.vehicle import GRAVITY
 from soilbus.terra.wheel import Soil, WheelModel
 from soilbus.validation.draft_trials import true_largest_draft
 from soilbus.validation.monte_carlo import Each, prior_about
-from soilbus.validation.windows import task_of
+from soilbus.validation.windows import task_of, torque_limits
 
 SOIL_LOG_SD = 0.2
 """Standard deviation of the logarithms of a drive's soil parameters about the table's soil."""
@@ -160,7 +162,8 @@ def trial(task: Task) -> Call:
     settings = config.traversability.model_copy(update={"max_sinkage": ground.max_sinkage})
     measured, exact = (_window(recording, config, rig, of_truth) for of_truth in (False, True))
     with_prior = _with_prior(config, prior_about(prior_of(config), ground.soil, np.random.default_rng([seed, 1])))
-    task_of_window = task_of(measured, config.estimator.window, with_prior, ground.torque_limit, fresh=True)
+    limit = np.fmin(ground.torque_limit, torque_limits(config, rig))
+    task_of_window = task_of(measured, config.estimator.window, with_prior, limit, fresh=True)
     estimate = WindowEstimator(with_prior).estimate(task_of_window)
     posterior, status, demand = estimate.result.posterior, estimate.result.status, estimate.demand
     asked = present_demand(exact, rig.chassis, config.estimator.hop)
@@ -168,7 +171,7 @@ def trial(task: Task) -> Call:
         return Call(ground.name, math.nan, State.UNKNOWN, None, False)
 
     def judged(by: Settings) -> Traversability:
-        return judge(posterior, status, demand, rig, estimate.model, ground.torque_limit, by)[0]
+        return judge(posterior, status, demand, rig, estimate.model, limit, by)[0]
 
     decision = judged(settings)
     if rng.random() < NEAR_LIMIT_SHARE and (margin := _margin(decision, demand, rng)) is not None:
@@ -198,8 +201,9 @@ def _can(config: Config, ground: Ground, settings: Settings, asked: float) -> bo
     """Whether the soil truly holds the pull asked for [N] and its margin within all limits."""
     model = WheelModel(shear_law=config.model.shear_law)
     most = true_largest_draft(
-        ground.soil, rig_of(config), ground.torque_limit, settings.max_slip, model, ground.max_sinkage
-    )
+        ground.soil, rig_of(config), ground.torque_limit, settings.max_slip, model, ground.max_sinkage,
+        drivetrain_of(config),
+    )  # fmt: skip
     return most >= asked + settings.margin * max(asked, 0.0)
 
 
@@ -247,7 +251,7 @@ def _window(recording: Recording, config: Config, rig: Rig, of_truth: bool) -> W
         }
     store = Bins(rig, config.estimator.bin, 0.0)
     store.add({n: (c.t, c.value) for n, c in columns.items()})
-    return store.window(0.0, config.estimator.window)
+    return completed(forward(store.window(0.0, config.estimator.window)), rig)
 
 
 def reliability(calls: Sequence[Call]) -> Reliability:

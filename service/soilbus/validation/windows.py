@@ -6,9 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soilbus.config.model import Config
-from soilbus.estimation.window import Window
-from soilbus.pipeline.intake import WindowTask
+from soilbus.estimation.assembly import motors_of
+from soilbus.estimation.window import Rig, Window
+from soilbus.pipeline.intake import ReportedLimits, WindowTask
 from soilbus.pipeline.positions import PositionTrack
+
+
+def torque_limits(config: Config, rig: Rig) -> NDArray[np.float64]:
+    """Limits (W,) [N m] as the service has them where none is reported: each wheel's share of its motor's."""
+    return ReportedLimits(motors_of(config, rig)).at(0.0)
 
 
 def task_of(window: Window, end: float, config: Config, torque_limit: NDArray[np.float64], fresh: bool) -> WindowTask:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -10,13 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2, norm
 
+from soilbus.validation.blind.calibration import curve
 from soilbus.validation.blind.trial import Trial
 
 HALVES = ("tune", "mixed", "report")
 VISIBLE, BARELY = 100.0, 20.0
 CLEAR_GAP = 1.1
 FAR = "of which the catalogue leaves over 10 %"
-BINS = (0.0, 0.2, 0.5, 0.8, 0.95, 1.001)
 UNNAMED = 0.005
 """Probability that a name outside the set is taken to be given."""
 
@@ -145,12 +144,9 @@ def calibration(trials: Sequence[Trial]) -> Iterator[str]:
     chosen = [t for t in trials if t.kind == "single" and t.visible >= BARELY]
     reported = [(p, name == t.hidden[0]) for t in chosen if t.sets for name, p in t.sets[0].items()]
     error = 0.0
-    for low, high in itertools.pairwise(BINS):
-        members = [(p, right) for p, right in reported if low <= p < high]
-        if members:
-            mean, share = (float(np.mean(column)) for column in zip(*members, strict=True))
-            error += abs(mean - share) * len(members) / len(reported)
-            yield f"  {mean:.2f}  {len(members):4}  {share:.2f}"
+    for one in curve(reported):
+        error += abs(one.stated - one.right / one.names) * one.names / len(reported)
+        yield f"  {one.stated:.2f}  {one.names:4}  {one.right / one.names:.2f}"
     if chosen:
         score = float(np.mean([-np.log(t.sets[0].get(t.hidden[0], UNNAMED) if t.sets else UNNAMED) for t in chosen]))
         yield f"  expected calibration error {error:.3f}, logarithmic score {score:.3f} of {len(chosen)} cases"

@@ -68,7 +68,13 @@ __all__ = [
 CONFIG = reference_configuration(["estimator.window=4.0", "traversability.max_age=2.0"])
 OUT = output_database(CONFIG)
 OWN = [(message.frame_id, message.is_extended_frame) for message in OUT.messages]
-VERDICT = OUT.get_message_by_name("Traversability").frame_id
+VERDICT, DEMAND, SLIP = (
+    OUT.get_message_by_name(name).frame_id for name in ("Traversability", "DemandForecast", "WheelSlip")
+)
+SLIPPING = 0.15
+"""Mean slip of the driven wheels beyond the forecast one with which no go may last."""
+REACTION = 1.0
+"""Time [s] for which it may: slips are means over some moments."""
 NEEDED = ("torque", "speed", "load", "ground_speed", "draft", "pitch", "acceleration")
 """Quantities without which there is no go, where they are mapped."""
 CYCLE, TICK = 0.1, 0.1
@@ -133,7 +139,8 @@ def fit_of(tracked: TrackerOutput) -> Fit:
 
 def good_tracked(config: Config = CONFIG, seed: int = 3) -> TrackerOutput:
     """What the tracker says of a window of a good drive."""
-    config = config.model_copy(update={"estimator": reference_configuration().estimator})
+    limits = {"max_bearing_std": config.estimator.max_bearing_std}
+    config = config.model_copy(update={"estimator": reference_configuration().estimator.model_copy(update=limits)})
     found: list[TrackerOutput] = []
     pipeline = MadePipeline(config, lambda: WindowEstimator(config, partial(NotingTracker, found)))
     messages = drive_messages(config, 20.0, seed)
@@ -214,6 +221,8 @@ class Wire:
     heard: list[Known] = field(default_factory=list)
     """What was so at each delivery since the clock was set back last."""
     forged_at: float = -math.inf
+    said: dict[int, dict[str, Any]] = field(default_factory=dict)
+    """What the service has sent last of forecast and slips."""
     verdicts: list[tuple[float, dict[str, Any]]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -317,10 +326,13 @@ class Wire:
         )
 
     def send(self, message: can.Message, timeout: float | None = None) -> None:
+        if message.arbitration_id not in (VERDICT, DEMAND, SLIP):
+            return
+        values = OUT.decode_message(message.arbitration_id, bytes(message.data))
+        assert isinstance(values, dict)
+        self.said[message.arbitration_id] = values
         if message.arbitration_id == VERDICT:
-            verdict = OUT.decode_message(VERDICT, bytes(message.data))
-            assert isinstance(verdict, dict)
-            self.verdicts.append((self.clock.now, verdict))
+            self.verdicts.append((self.clock.now, values | {"Warning": self.said[DEMAND]["Warning"]}))
 
     def shutdown(self) -> None:
         pass
@@ -423,6 +435,7 @@ class Drive:
         self.go = 0
         self.last: dict[str, Any] = {}
         self.interrupted = self.halted_until = -math.inf
+        self.slips_since = math.inf
         self.recalled: tuple[Gaussian, float] | None = None
         """What the service took over from the one before, and its age [s]."""
         self.start()
@@ -505,9 +518,20 @@ class Drive:
                 self.faults += [f"{said} {why}" for why in self.objections(at, verdict)]
             self.wire.verdicts.clear()
 
+    def excess_slip(self) -> float:
+        """Mean slip of the driven wheels beyond the forecast one; nan where either is not known."""
+        slips, demand = self.wire.said.get(SLIP, {}), self.wire.said.get(DEMAND, {})
+        driven = [slips.get(f"SlipWheel{i + 1}") for i, wheel in enumerate(self.config.wheel) if wheel.driven]
+        known = [slip for slip in driven if isinstance(slip, float)]
+        forecast = demand.get("Slip")
+        return sum(known) / len(known) - forecast if known and isinstance(forecast, float) else math.nan
+
     def look(self) -> None:
         """Note what makes all earlier windows void."""
         now = self.clock.now
+        if not self.excess_slip() > SLIPPING:  # nor nan
+            self.slips_since = math.inf
+        self.slips_since = min(self.slips_since, now)
         if self.wire.halted:
             self.halted_until = now + SLACK
         patience = self.max_age if now < self.halted_until else TIMEOUT  # stamps that stand cannot say what is late
@@ -528,6 +552,10 @@ class Drive:
         if self.result is None:
             yield "there is no window since the start or the step of the clock"
             return
+        if str(verdict["Warning"]) == "immobilisation":
+            yield "immobilisation is warned of"
+        if at - self.slips_since > REACTION:
+            yield f"the driven wheels have slipped more than forecast for {at - self.slips_since:.1f} s"
         age, known = at - self.window.ended, self.window.known
         if self.window.ended <= self.interrupted:
             yield "the last window is of before an interruption"
