@@ -58,6 +58,7 @@ __all__ = [
     "driven",
     "monte_carlo",
     "prior_about",
+    "problem_of",
     "processes",
     "summary",
     "tasks_of",
@@ -294,7 +295,7 @@ def prior_about(prior: SoilPrior, soil: Soil, rng: np.random.Generator) -> SoilP
 def _trial(recording: Recording, task: Task, prior: SoilPrior, soil: Soil, sinkage: bool) -> Trial:
     config, _, duration, seed, drawn, _ = task
     names = [n for n in rig_of(config).channels if n in recording.channels and (sinkage or not n.startswith("sinkage"))]
-    noisy, noiseless = (_problem(recording, config, duration, names, of_truth) for of_truth in (False, True))
+    noisy, noiseless = (problem_of(recording, config, duration, names, of_truth) for of_truth in (False, True))
     bound = cramer_rao(noiseless, prior, soil)
     begin = time.thread_time()
     found, joint_prior = fit_window(noisy, prior), Gaussian.of(prior, noisy.gain_std)
@@ -316,7 +317,7 @@ def _trial(recording: Recording, task: Task, prior: SoilPrior, soil: Soil, sinka
     return replace(trial, bayes_risk=bayes_risk(value, posterior.share, bound_of_each, truth))
 
 
-def _problem(
+def problem_of(
     recording: Recording, config: Config, duration: float, names: Iterable[str], of_truth: bool
 ) -> ObservationModel:
     """The window of these channels as measured, or as it truly was at the times of the samples."""
