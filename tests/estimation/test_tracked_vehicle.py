@@ -342,7 +342,7 @@ def test_strength_and_shear_modulus_from_sprocket_torque_speed_and_ground_speed(
         posterior, K = fit.posterior, fit.posterior.parameters()["K"]
         strength = posterior.soil.c + pressure * posterior.tan_phi().value
         assert strength == pytest.approx(soil.c + pressure * np.tan(soil.phi), rel=0.05)
-        assert K.std < 0.2 * K.value
+        assert K.std < 0.22 * K.value  # an instant's load is left to the torques
         found.append([(K.value - soil.K) / K.std, *errors(posterior, soil)])
     assert np.abs(found).max() < 2.8
 
