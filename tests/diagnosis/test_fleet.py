@@ -10,7 +10,7 @@ import pytest
 from soilbus.diagnosis.fleet import diagnose_vehicle, named, onset_probabilities
 from soilbus.diagnosis.records import Record
 from soilbus.estimation.assembly import prior_of, rig_of, with_effects
-from soilbus.offline.fleet import judged, no_findings
+from soilbus.offline.fleet import judged
 from soilbus.offline.manoeuvre import record_of_recording
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
@@ -76,15 +76,17 @@ def test_a_load_cell_that_drifted_is_found_from_the_log_on_and_a_sound_vehicle_i
 def test_the_fleet_names_what_is_sure_and_says_how_common_it_is():
     def vehicle(name: str, **chances: float) -> dict:
         effects = [{"name": effect, "probability": p, "parameters": {}, "onset": None} for effect, p in chances.items()]
-        return no_findings(name, "") | {"fault": None, "verdict": "named", "effects": effects}
+        return {"vehicle": name, "verdict": "named" if chances else None, "effects": effects}
 
-    fleet = judged([
+    of_type = {"effects": [{"name": "tyre_deflection", "probability": 0.96}]}
+    fleet = judged([of_type], [
         vehicle("a", draft_offset=0.99, slip_sinkage=0.98), vehicle("b", slip_sinkage=0.97),
-        vehicle("c", slip_sinkage=0.5), no_findings("d", "no log of it can be diagnosed"),
+        vehicle("c", slip_sinkage=0.5), vehicle("d"),
     ])  # fmt: skip
     assert [[e["name"] for e in v["effects"] if e["named"]] for v in fleet["vehicles"]] == [
         ["draft_offset", "slip_sinkage"], ["slip_sinkage"], [], [],
     ]  # fmt: skip
+    assert fleet["types"][0]["effects"][0]["named"]
     shares = {effect["name"]: (effect["vehicles_named"], effect["expected_share"]) for effect in fleet["effects"]}
     assert shares["slip_sinkage"] == (2, pytest.approx(2.45 / 3))
     assert fleet["vehicles_diagnosed"] == 3
