@@ -140,7 +140,11 @@ def diagnose_vehicle(records: Sequence[Record], prior: SoilPrior, catalogue: Seq
         # one value of the effect for all logs was wrong: it belongs to those from its onset on
         first, found = begin, diagnose(records[begin:], prior, catalogue)
         onsets = onsets_of(records, prior, found)
-    return VehicleDiagnosis(found, onsets, factors_of(records[first:], prior, found, catalogue))
+    try:
+        factors = factors_of(records[first:], prior, found, catalogue)
+    except np.linalg.LinAlgError:  # the vehicle then says nothing of its type
+        factors = {}
+    return VehicleDiagnosis(found, onsets, factors)
 
 
 def diagnose_type(

@@ -125,19 +125,19 @@ def factors_of(
     }
     factors: dict[str, Factor] = {}
     for addition in found.additions:
-        for name in sorted(possible.keys() & addition.falls.keys() - factors.keys()):
+        falls = {name: fall for name, fall in addition.falls.items() if np.isfinite(fall)}
+        others = [e for e in completed.effects if e is not addition.effect]
+        for name in sorted(possible.keys() & falls.keys() - factors.keys()):
             if name == addition.effect.name:
                 fitted: FittedModel | None = completed
             elif name in completed.names:
                 continue
             else:
-                others = [e for e in completed.effects if e is not addition.effect]
-                fitted = fit_model(
-                    records, prior, (*others, possible[name]), completed.as_starts((*others, possible[name]))
-                )
+                beside = [*others, possible[name]]
+                fitted = fit_model(records, prior, beside, completed.as_starts(beside))
             own = None if fitted is None else _by_fit(records, prior, fitted, possible[name])
             if own is not None:
-                factors[name] = Factor(addition.falls, addition.temperatures[0], own)
+                factors[name] = Factor(falls, addition.temperatures[0], own)
     rest = [e for e in possible.values() if e.name not in factors and e.name not in completed.names]
     return factors | _by_score(records, prior, completed, rest)
 
@@ -283,21 +283,23 @@ def shared_effect(
 
 def _most_probable(vehicles: Sequence[Mapping[str, Factor]]) -> tuple[str, Pool, list[int], float] | None:
     """Name, factors, vehicles that agree, and probability."""
-    found: dict[str, tuple[Pool, list[int]]] = {}
+    pools: dict[str, Pool] = {}
+    agreeing: dict[str, list[int]] = {}
     gains: dict[str, float] = {}
     for name in sorted(set.intersection(*(set(factors) for factors in vehicles))):
-        of_name = [factors[name] for factors in vehicles]
-        pool, own = _pool(name, of_name), _own_log_evidence(name, vehicles)
-        chosen = _agreeing(pool, own) if pool.parts[0].free else None
+        pool = _pool(name, [factors[name] for factors in vehicles])
+        if not pool.parts[0].free:
+            continue
+        pools[name], own = pool, _own_log_evidence(name, vehicles)
+        chosen = _agreeing(pool, own)
         if chosen is not None:
-            found[name] = pool, chosen
+            agreeing[name] = chosen
             gains[name] = pool.log_evidence(chosen) - float(own[chosen].sum())
-    if not found:
+    if not gains:
         return None
     best = max(gains, key=lambda name: gains[name])
-    pool, chosen = found[best]
-    p = _name_probability(best, {name: pool for name, (pool, _) in found.items()}, chosen) * float(expit(gains[best]))
-    return (best, pool, chosen, p) if p >= LEAST_PROBABILITY else None
+    p = _name_probability(best, pools, agreeing[best]) * float(expit(gains[best]))
+    return (best, pools[best], agreeing[best], p) if p >= LEAST_PROBABILITY else None
 
 
 def _name_probability(best: str, pools: Mapping[str, Pool], chosen: Sequence[int]) -> float:
