@@ -86,10 +86,10 @@ def test_a_fleet_of_the_blind_generator():
 def test_a_batch_writes_the_effects_of_types_and_vehicles(client, tmp_path):
     config = reference_configuration(["estimator.window=10", "estimator.hop=10"])
     pd = pytest.importorskip("pandas")
-    truth = with_effects(config, ["drivetrain_loss.drag=70"])
-    for v in range(3):
+    truth = with_effects(config, ["drivetrain_loss.drag=110"])
+    for v, soil in enumerate(("loam", "dry_sand", "wet_clay")):
         (tmp_path / f"logs/T{v}").mkdir(parents=True)
-        drive = replace(excited("loam", 24.0), vehicle_seed=v)
+        drive = replace(excited(soil, 40.0), vehicle_seed=v)
         write_log(frames(simulate(truth, drive, seed=40 + v), config), tmp_path / f"logs/T{v}/a.log")
 
     def run(folder: str, say: Callable[[str], None] = lambda _: None) -> Path:
@@ -102,7 +102,7 @@ def test_a_batch_writes_the_effects_of_types_and_vehicles(client, tmp_path):
     (drag,) = rows[(rows.effect == "drivetrain_loss") & (rows.parameter == "drag")].to_dict("records")
     assert (drag["scope"], drag["named"]) == ("type", True)
     assert pd.isna(drag["vehicle"])
-    assert abs(drag["value"] - 70.0) < 4.0 * drag["std"] < 40.0
+    assert abs(drag["value"] - 110.0) < 4.0 * drag["std"] < 60.0
     assert not rows[rows.scope == "vehicle"].named.any()
     fleet_of_file = json.loads((out / "diagnosis.json").read_text())
     assert fleet_of_file["types"][0]["vehicles"] == ["T0", "T1", "T2"]

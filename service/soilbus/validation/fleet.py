@@ -30,7 +30,7 @@ from soilbus.terra.soils import soil_named
 from soilbus.validation.blind.cases import FORMS, SOILS, plain_sinkage
 from soilbus.validation.blind.form import Setting, together
 
-VEHICLES, LOGS, SECONDS = 8, 3, 40.0
+VEHICLES, LOGS, SECONDS = 8, 2, 40.0
 """Of a fleet: vehicles, logs of each, and seconds of a log."""
 
 
@@ -50,7 +50,7 @@ class Fault(NamedTuple):
 FAULTS = (
     Fault("wheel_load_offset:one", 500.0, 1),
     Fault("draft_gain:gain", 0.12, 1),
-    Fault("rolling_radius:one_axle", 0.06, 2),
+    Fault("rolling_radius:one_axle", 0.06, 1),
     Fault("draft_offset:constant", 600.0, 1),
 )
 """Faults of vehicles, between barely visible and as great as they get."""
