@@ -56,6 +56,19 @@ def test_parameters_have_the_std_of_a_log_normal():
     assert estimates["c"].std == 0.0
 
 
+def test_strength_may_be_known_where_cohesion_and_friction_are_not():
+    """On a line of one strength a change of c is made up for by tan phi."""
+    pressure, tan = 4e4, np.tan(LOAM.phi)
+    by_log_c = np.zeros(6)
+    by_log_c[PARAMETERS.index("c")] = 1.0
+    by_log_c[PARAMETERS.index("phi")] = -LOAM.c / pressure / (LOAM.phi * (1.0 + tan**2))
+    posterior = Posterior(LOAM, 0.5**2 * np.outer(by_log_c, by_log_c))
+    assert posterior.tan_phi().std == pytest.approx(0.5 * LOAM.c / pressure)
+    assert posterior.shear_strength(pressure).value == pytest.approx(LOAM.c + pressure * tan)
+    assert posterior.shear_strength(pressure).std < 1e-6 * LOAM.c  # the root of a variance of rounding
+    assert posterior.shear_strength(2.0 * pressure).std == pytest.approx(0.5 * LOAM.c)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_bearing_pressure_and_tan_phi_against_monte_carlo(seed):
     soil = list(SOILS.values())[seed * 5]

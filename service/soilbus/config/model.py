@@ -570,10 +570,13 @@ class NoiseOfChannels(_Section):
     """[rad]."""
     steering_angle: Noise = Noise(absolute=0.02)
     """[rad]."""
-    computed_load: Noise = Noise(relative=0.12, gain=0.02)
+    computed_load: Noise = Noise(relative=0.5, gain=0.02)
     """Of a load that no cell measures, beside what mass, centre of gravity, pitch, acceleration and draft leave open:
     what bouncing, pitching and rolling on uneven ground add in a bin, and the fixed error of the share left and right.
-    Dynamic wheel loads of tractors vary by 5 to 15 % of the static load on fields (rms); the field vehicle's: 12 %."""
+    Dynamic wheel loads of tractors vary by 5 to 15 % of the static load on fields (rms; the field vehicle's: 12 %), and
+    a wheel that is lighter for a moment slips more in it: with 0.12, which takes loads for independent of slip, bearing
+    pressure is off by a standard deviation; with 0.5 an instant's load is left to the torques, and only what holds on
+    average counts (`python -m soilbus.validation.computed_loads`)."""
     slip: Noise = Noise(absolute=0.005)
     """Of a table that holds slip itself; its gain is the relative error of 1 - slip."""
 
@@ -672,9 +675,11 @@ class Estimator(_Section):
     b_ref: PositiveFloat = 0.3
     """Plate width of the reported bearing pressure [m]."""
     max_bearing_std: PositiveFloat = 0.10
-    """Relative std of the bearing pressure up to which a window counts as excited."""
+    """Relative std of the bearing pressure up to which a window counts as excited; at z_ref, or at the nearest depth
+    that carries load."""
     max_tan_phi_std: PositiveFloat = 0.15
-    """Relative std of tan phi up to which a window counts as excited."""
+    """Relative std of tan phi, or of the strength c + p tan phi at the pressure p of the contact, up to which a window
+    counts as excited."""
     max_chi2: PositiveFloat = 1.1
     """Reduced chi-square, beyond its own scatter, above which the model does not describe the data."""
     search_rate: NonNegativeFloat = 4.0

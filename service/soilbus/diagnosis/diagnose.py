@@ -133,10 +133,18 @@ def diagnose(
         Where already the present model cannot be fitted.
     """
     progress("fitting the present model")
-    full, thinned = FitCache(records, prior), FitCache([record.thinned(THINNING) for record in records], prior)
+    full = FitCache(records, prior)
     base = full.fit(records[0].training.effects)
+    if base is not None and any(record.training.computes_loads for record in records):
+        records = [
+            record.with_weights_at(fit.optimum.at, check.at)
+            for record, fit, check in zip(records, base.fits, base.checks, strict=True)
+        ]
+        full = FitCache(records, prior)
+        base = full.fit(base.effects, [base.as_starts()])
     if base is None:
         raise NotFitted("the present model does not converge on these recordings")
+    thinned = FitCache([record.thinned(THINNING) for record in records], prior)
     law = records[0].training.model.shear_law
     candidates = [of_vehicle(effect, records) for effect in catalogue if effect.base_law in (None, law)]
     where = disagreements(base)

@@ -9,6 +9,7 @@ steady states has no time: each third row in the order of slip is held out.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.nuisance_parameters import Free
-from soilbus.estimation.observation_model import ObservationModelWithEffects
+from soilbus.estimation.observation_model import Linearisation, ObservationModelWithEffects
 from soilbus.estimation.window import Rig, Window
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.wheel import WheelModel
@@ -77,6 +78,17 @@ class Record:
             return None
         training, held_out = (self.whole.part(np.flatnonzero(part)) for part in (self.fold != fold, self.fold == fold))
         return replace(self, training=training, held_out=held_out)
+
+    def with_weights_at(self, training: Linearisation, held_out: Linearisation) -> Record:
+        """The same with the weights of a model in which the parts were linearised; see `ObservationModel`."""
+        parts = [part.with_weights_at(at) for part, at in ((self.training, training), (self.held_out, held_out))]
+        if self.whole is None or self.fold is None or parts[0].held_covariance is None:
+            return replace(self, training=parts[0], held_out=parts[1])
+        whole, covariance = copy(self.whole), np.empty((self.whole.n, *parts[0].held_covariance.shape[1:]))
+        for part, of_part in zip(parts, (self.fold != HELD_OUT_FOLD, self.fold == HELD_OUT_FOLD), strict=True):
+            covariance[of_part] = part.held_covariance
+        whole.held_covariance = covariance
+        return replace(self, training=parts[0], held_out=parts[1], whole=whole)
 
     def thinned(self, every: int) -> Record:
         """The same with each `every`-th instant; a table of few rows keeps all of them."""

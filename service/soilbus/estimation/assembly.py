@@ -20,7 +20,16 @@ from numpy.typing import NDArray
 from soilbus.arrays import Array
 from soilbus.config.model import Config, ConfigError, Vehicle
 from soilbus.config.model import Effect as EffectSetting
-from soilbus.estimation.instrumentation import Coupling, Group, Instrumentation, Row, contrast, rows_of, unit
+from soilbus.estimation.instrumentation import (
+    SIDE_SLOPE_SHARE,
+    Coupling,
+    Group,
+    Instrumentation,
+    Row,
+    contrast,
+    rows_of,
+    unit,
+)
 from soilbus.estimation.nuisance_parameters import Free
 from soilbus.estimation.posterior import SoilPrior
 from soilbus.estimation.window import Rig, SensorNoise
@@ -185,12 +194,13 @@ def _with_instrumentation(rig: Rig, config: Config, computed: SensorNoise) -> Ri
         if a.load is not None:
             groups["load"].append(Group(of_axle[a.name], (1.0,) * len(of_axle[a.name]), a.name))
     couplings = tuple(_couplings(config, of_axle, rig.drives, groups))
+    side = math.hypot(computed.gain, SIDE_SLOPE_SHARE if config.signals.roll is None else 0.0)
     torque, speed, load = (
         rows_of(n, groups[quantity], rig.noise[quantity].gain, rows)
         for quantity, rows in (
             ("torque", _torque_rows(rig, couplings, ratio)),
             ("speed", _speed_rows(rig, couplings, ratio, groups["speed"])),
-            ("load", _load_rows(rig, vehicle, computed)),
+            ("load", _load_rows(rig, vehicle, side)),
         )
     )
     plain = np.eye(n)
@@ -248,8 +258,8 @@ def _speed_rows(rig: Rig, couplings: Sequence[Coupling], ratio: Array, groups: S
     return [*same, *of_couplings, *(Row(unit(n, i), "free", i, rig.wheels[i]) for i in range(n))]
 
 
-def _load_rows(rig: Rig, vehicle: Vehicle, computed: SensorNoise) -> list[Row]:
-    """Weight, its share on the front axle, and the differences left to right on each axle."""
+def _load_rows(rig: Rig, vehicle: Vehicle, side: float) -> list[Row]:
+    """Weight, its share on the front axle, and the differences left to right, a share of each axle's load; side: sd."""
     n, chassis = len(rig.wheels), rig.chassis
     assert chassis is not None
     mass_std = UNKNOWN_SHARE if vehicle.mass_std is None else vehicle.mass_std / vehicle.mass
@@ -263,7 +273,7 @@ def _load_rows(rig: Rig, vehicle: Vehicle, computed: SensorNoise) -> list[Row]:
     for axle in (rig.front, ~rig.front):
         for one, other in pairwise(np.flatnonzero(axle).tolist()):
             name = f"{rig.wheels[one]}-{rig.wheels[other]}"
-            rows.append(Row(contrast(n, [one], [other], np.ones(n)), "side", one, name, computed.gain))
+            rows.append(Row(contrast(n, [one], [other], np.ones(n)), "side", one, name, side))
     return rows
 
 

@@ -41,9 +41,11 @@ LOCKED_STD = 1e-3
 """Relative sd of speeds that a shaft makes equal: backlash and twist."""
 LEAST_TORQUE = 0.05
 """Torque over load and radius that a differential's friction counts at least, and that of a coasting vehicle."""
+SIDE_SLOPE_SHARE = 0.06
+"""Sd of an axle's loads left less right over their sum on side slopes, where no roll is measured: 3 degrees."""
 UNKNOWN_SIDE_SHARE = 0.4
-"""Sd of the difference of an axle's loads over that axle's load where no roll is measured: a side slope of 3 degrees
-(sd) shifts 6 %, and lasts for seconds, so that a window holds few independent ones; 0.06 sqrt(2 x 2 s / 0.1 s bin)."""
+"""The same for one instant of many: a side slope lasts for seconds, so that a window holds few independent ones;
+0.06 sqrt(2 x 2 s / 0.1 s bin)."""
 LEAST_WEIGHT = 1e-12
 """Weight below which an entry of an inverse is rounding: its rows hold ones, halves and gear ratios' shares."""
 
@@ -86,13 +88,16 @@ class Row(NamedTuple):
 class Observations(NamedTuple):
     """Observations of N instants, in the order of the rows: torque, torque_var (N, W); nan where unknown.
 
-    value, variance (N, 2 W + 1): of loads, speeds and ground speed.  weight (N,) [N] is what the loads carry.
+    value, variance (N, 2 W + 1): of loads, speeds and ground speed.  by_inertia, by_draft (N, 2 W + 1) [1]: how the
+    computed loads among them follow m (G sin(pitch) + dv/dt) and the draft as measured, whose noise is not in variance.
     """
 
     torque: Array
     torque_var: Array
     value: Array
     variance: Array
+    by_inertia: Array
+    by_draft: Array
 
     def rows(self, keep: NDArray[np.intp] | slice) -> Observations:
         """Those of the given instants."""
@@ -213,7 +218,7 @@ def completed(window: Window, rig: Rig) -> Window:
     given = rig.instrumentation
     if given is None or window.observations is not None or not len(window.t):
         return window
-    load, load_of, load_var = _loads(window, rig, given)
+    load, load_of, load_var, by_inertia, by_draft = _loads(window, rig, given)
     speed, speed_of, speed_var = _speeds(window, rig, given)
     torque, torque_of, torque_var = _torques(window, rig, given, load)
     observations = Observations(
@@ -221,6 +226,7 @@ def completed(window: Window, rig: Rig) -> Window:
         torque_var,
         np.column_stack([load_of, speed_of, window.ground_speed]),
         np.column_stack([load_var, speed_var, window.variance["ground_speed"]]),
+        *(np.pad(by, ((0, 0), (0, by.shape[1] + 1))) for by in (by_inertia, by_draft)),
     )
     variance = dict(window.variance)
     for quantity, rows, of_rows in (
@@ -275,10 +281,10 @@ def _combined(values: Array, weight: Array) -> Array:
     return np.asarray(sums)
 
 
-def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Array, Array]:
-    """Loads of the wheels, observations of them and their variances, each (N, W)."""
+def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Array, Array, Array, Array]:
+    """Loads of the wheels; observations of them, their variances, and what they follow as in `Observations` (N, W)."""
     n, W = len(window.t), len(given.load)
-    load, scale, variance = (np.zeros((n, W)) for _ in range(3))
+    load, scale, variance, by_inertia, by_draft = (np.zeros((n, W)) for _ in range(5))
     chassis = rig.chassis
     for i, row in enumerate(given.load):
         if row.kind == "channel":
@@ -300,12 +306,14 @@ def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Arr
             share = static / weight
             load[:, i] = (1.0 - share) * front - share * rear
             scale[:, i] = static
-            of_pitch, of_acceleration = _known_var(window, "pitch"), _known_var(window, "acceleration")
-            of_along = of_acceleration if rig.specific_force else GRAVITY**2 * of_pitch + of_acceleration
+            by_inertia[:, i] = -direction * chassis.cg_height / chassis.wheelbase
+            by_inertia[~_knows_inertia(window, rig), i] = 0.0
+            by_draft[:, i] = -direction * np.isfinite(window.draft) * chassis.hitch_height / chassis.wheelbase
+            of_pitch = np.where(by_inertia[:, i] == 0.0, GRAVITY**2 * _known_var(window, "pitch"), 0.0)
             variance[:, i] = (
                 (given.load_noise / 2.0 * min(static, weight - static)) ** 2
-                + (chassis.mass * chassis.cg_height / chassis.wheelbase) ** 2 * of_along
-                + (chassis.hitch_height / chassis.wheelbase) ** 2 * draft_var
+                + (chassis.mass * chassis.cg_height / chassis.wheelbase) ** 2 * of_pitch
+                + np.where(by_draft[:, i] == 0.0, (chassis.hitch_height / chassis.wheelbase) ** 2 * draft_var, 0.0)
             )
         else:  # left less right
             axle = static if rig.front[row.at] else weight - static
@@ -318,7 +326,13 @@ def _loads(window: Window, rig: Rig, given: Instrumentation) -> tuple[Array, Arr
                 (UNKNOWN_SIDE_SHARE * axle) ** 2,
             )
             variance[:, i] = (given.load_noise * axle) ** 2 / 2.0 + of_slope
-    return _solved(given.load, load), scale, variance
+    return _solved(given.load, load), scale, variance, by_inertia, by_draft
+
+
+def _knows_inertia(window: Window, rig: Rig) -> NDArray[np.bool_]:
+    """At which instants (N,) acceleration, and pitch where it counts beside it, are measured."""
+    known = np.isfinite(window.acceleration)
+    return known if rig.specific_force else known & np.isfinite(window.pitch)
 
 
 def _draft_on_hitch(window: Window, rig: Rig) -> tuple[Array, Array]:

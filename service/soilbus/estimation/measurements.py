@@ -53,8 +53,9 @@ GAIN_QUANTITIES = ("torque", "load", "speed", "ground_speed", "draft")
 _BY_INSTANT = (
     "t", "usable", "torque", "torque_var", "has_torque", "sinkage", "sinkage_var", "has_sinkage", "load", "load_var",
     "speed", "speed_var", "ground_speed", "ground_speed_var", "slip", "draft", "draft_var", "demand", "demand_var",
-    "has_balance", "pitch", "since", "distance", "wheel_angle", "acceleration", "acceleration_var",
-    "_measured", "_measured_var", "_latents_measured", "_row_var", "_known",
+    "inertia", "inertia_var", "has_balance", "pitch", "since", "distance", "wheel_angle", "acceleration",
+    "acceleration_var",
+    "by_inertia", "by_draft", "_measured", "_measured_var", "_latents_measured", "_row_var", "_known",
 )  # fmt: skip
 """Attributes of `Measurements` with a row for each instant."""
 
@@ -155,6 +156,7 @@ class Measurements:
         self.n_sensors = len(self.gain_names)
         self.slip = np.where(self.rolls, ROLLING_SLIP, slip[kept])
         self._latents_measured = np.concatenate([self.load, self.speed, self.ground_speed[:, None]], axis=1)
+        self.by_inertia = self.by_draft = np.zeros_like(self._latents_measured)
         if window.observations is None:
             self._measured = self._latents_measured
             self._measured_var = np.concatenate([self.load_var, self.speed_var, self.ground_speed_var[:, None]], axis=1)
@@ -162,12 +164,15 @@ class Measurements:
             value, variance = window.observations.value[kept], window.observations.variance[kept]
             known = np.isfinite(value) & np.isfinite(variance)
             self._measured, self._measured_var = np.where(known, value, 1.0), np.where(known, variance, 0.0)
+            self.by_inertia = window.observations.by_inertia[kept] * self.has_balance[:, None]
+            self.by_draft = window.observations.by_draft[kept] * self.has_balance[:, None]
         known_rows = [self.has_torque, self.has_balance[:, None], self.has_sinkage]
         row_var = [self.torque_var, self.demand_var[:, None], self.sinkage_var]
         n_kinds = 3 if self.with_sinkage else 2
         known = np.concatenate(known_rows[:n_kinds], axis=1)
         self._row_var = np.where(known, np.concatenate(row_var[:n_kinds], axis=1), 1.0)
         self._known = known
+        self.held_covariance: Array | None = None
         self._count()
 
     def _observe(self) -> None:
@@ -212,9 +217,9 @@ class Measurements:
         """Set the demand: pull [N] for draft, slope and inertia, and its variance."""
         self.draft, draft_var, known = take("draft")
         self.with_pitch = False
-        demand, variance = self.draft.copy(), draft_var.copy()
-        acceleration, acceleration_var = np.zeros_like(demand), np.zeros_like(demand)
-        self.pitch = np.zeros_like(demand)
+        inertia, inertia_var = np.zeros_like(self.draft), np.zeros_like(self.draft)
+        acceleration, acceleration_var = np.zeros_like(inertia), np.zeros_like(inertia)
+        self.pitch = np.zeros_like(inertia)
         if self.rig.chassis is not None:
             mass = self.rig.chassis.mass
             pitch, pitch_var, has_pitch = take("pitch")
@@ -228,13 +233,18 @@ class Measurements:
                 known = known & has_acceleration
             else:
                 acceleration, acceleration_var = differentiated_speed(self.t, self.ground_speed, self.ground_speed_var)
-            demand += mass * (GRAVITY * np.sin(pitch) + acceleration)
-            variance += mass**2 * ((GRAVITY * np.cos(pitch)) ** 2 * pitch_var + acceleration_var)
+            inertia = mass * (GRAVITY * np.sin(pitch) + acceleration)
+            inertia_var = mass**2 * ((GRAVITY * np.cos(pitch)) ** 2 * pitch_var + acceleration_var)
             self.pitch = pitch
         self.acceleration, self.acceleration_var = acceleration, acceleration_var
-        self.demand, self.demand_var = demand, variance
-        self.draft_var = np.where(known & usable.all(axis=1), draft_var, 0.0)
+        self.inertia, self.demand, self.demand_var = inertia, self.draft + inertia, draft_var + inertia_var
         self.has_balance = known & usable.all(axis=1)
+        self.draft_var, self.inertia_var = np.where(self.has_balance, [draft_var, inertia_var], 0.0)
+
+    @property
+    def computes_loads(self) -> bool:
+        """Whether a load is not measured."""
+        return bool(self._prior_only.any())
 
     @property
     def row_channels(self) -> list[tuple[str, str]]:
@@ -271,6 +281,7 @@ class Measurements:
         part = copy(self)
         for name in _BY_INSTANT:
             setattr(part, name, getattr(self, name)[instants])
+        part.held_covariance = None if self.held_covariance is None else self.held_covariance[instants]
         part._count()
         return part
 

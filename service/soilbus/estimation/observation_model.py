@@ -404,17 +404,14 @@ class ObservationModel(Measurements):
         A = self._by_observed(self._by_latents(at))
         torque = self.torque_rows(at.value[1])
 
-        of_torque, of_latents, of_draft, corrected, variance, row_var = self._corrected(gains)
+        of_torque, of_latents, of_draft, of_mass, corrected, variance, row_var = self._corrected(gains)
         delay = self.delay_terms(gains, latents, at.value[1])
-        draft, draft_var = self.draft * of_draft, self.draft_var * of_draft**2
-        inertia = self.demand - self.draft
+        draft, inertia = self.draft * of_draft, self.inertia * of_mass
 
         rows = np.zeros((*A.shape[:2], FIRST_GAIN + layout.n_sensors + len(gains) - self.n_sensors))
         residual, by_soil, by_effects = rows[:, :, RESIDUAL], rows[:, :, SOIL], rows[:, :, layout.effect_columns]
         residual[:, torques] = self.torque * of_torque - torque
         residual[:, balance] = inertia + draft + at.extra_pull - at.value[0].sum(1)
-        if self._mass_gain is not None:
-            residual[:, balance] += inertia * (of_latents[self._mass_gain] - 1.0)
         by_soil[:, torques] = self._by_torque_row(-at.by_soil[1])
         by_soil[:, balance] = -at.by_soil[0].sum(2).T
         by_effects[:, torques] = self._by_torque_row(-at.by_effects[1])
@@ -429,12 +426,6 @@ class ObservationModel(Measurements):
             by_gain = rows[:, :, layout.sensor_columns]
             diagonals(by_gain[:, torques, layout.torque_gains])[:] = -of_torque * torque
             np.multiply(A, -latent_by_gain[:, None, :], out=by_gain[:, :, layout.latent_gains])
-            if self._mass_gain is not None:
-                by_mass = by_gain[:, balance, layout.latent_gains][:, self._mass_gain]
-                by_mass -= inertia * of_latents[self._mass_gain] ** 2
-            by_gain[:, balance, layout.draft_gain] = -of_draft * (
-                draft - residual[:, balance] * draft_var / row_var[:, balance]
-            )
         by_delay = np.zeros((0, *now.shape))
         if delay is not None:
             residual += self.delay_residuals(delay, A, gains)
@@ -448,7 +439,16 @@ class ObservationModel(Measurements):
         if self._missing is not None:
             A[self._missing] = 0.0
             rows[self._missing] = 0.0
-        weighed = inverse_covariance(A, variance, row_var) @ rows
+        inverse = self.inverse_covariance(A, variance, row_var)
+        if by_sensors:
+            # draft and inertia without their noise, which S^-1 r says: a gain times noise would fit better when smaller
+            noise = (inverse[:, balance] * residual).sum(1)
+            true_draft = self.has_balance * (draft - self.draft_var * of_draft**2 * noise)
+            by_gain[:, balance, layout.draft_gain] = -of_draft * true_draft
+            if self._mass_gain is not None:
+                true_inertia = self.has_balance * (inertia - self.inertia_var * of_mass**2 * noise)
+                by_gain[:, balance, layout.latent_gains][:, self._mass_gain] -= of_mass * true_inertia
+        weighed = inverse @ rows
         flat, weighed = rows.reshape(-1, rows.shape[2]), weighed.reshape(-1, rows.shape[2])
         return Linearisation(
             rows=flat,
@@ -466,6 +466,53 @@ class ObservationModel(Measurements):
             load_by_effects=at.load_by_effects,
             rolling_slip=rolling_slip,
         )
+
+    def inverse_covariance(self, A: Array, variance: Array, row_var: Array) -> Array:
+        """S^-1 (N, m, m) of every instant: `inverse_covariance`, and what computed loads bring.
+
+        Parameters
+        ----------
+        A : Array
+            Derivatives of the residuals by the observations (N, m, 2 W + 1).
+        variance, row_var : Array
+            From `variances`.
+        """
+        if not self.computes_loads:
+            return inverse_covariance(A, variance, row_var)
+        balance, held = self.layout.balance, self.held_covariance
+        further = self._by_load_noise(A, variance) if held is None else held.copy()
+        for by, share in zip((self.by_inertia, self.by_draft), self._demand_shares, strict=True):
+            of_loads, noise = (A @ by[:, :, None])[:, :, 0], (share * row_var[:, balance])[:, None]
+            further += of_loads[:, :, None] * (noise * of_loads)[:, None]
+            further[:, balance] += noise * of_loads
+            further[:, :, balance] += noise * of_loads
+        return inverse_covariance(A, np.where(self._prior_only, 0.0, variance), row_var, further)
+
+    def _by_load_noise(self, A: Array, variance: Array) -> Array:
+        """Covariance (N, m, m) of the residuals by what is left open of computed loads."""
+        of_loads = A[:, :, self._prior_only]
+        return np.asarray((of_loads * variance[:, None, self._prior_only]) @ of_loads.swapaxes(1, 2))
+
+    @property
+    def _demand_shares(self) -> tuple[Array, Array]:
+        """Shares of inertia and draft (N,) in the variance of the demand."""
+        known = self.has_balance & (self.demand_var > 0.0)
+        shares = (
+            np.divide(v, self.demand_var, out=np.zeros(self.n), where=known) for v in (self.inertia_var, self.draft_var)
+        )
+        return next(shares), next(shares)
+
+    def with_weights_at(self, at: Linearisation) -> Self:
+        """The same measurements with the covariance that computed loads bring held as at a linearisation.
+
+        A computed load has no noise of its own that tells it from what it should be: A V A' of it is a weight.  Where
+        that followed the model, one of larger A would seem to fit better (generalised least squares: Carroll & Ruppert
+        1988, Transformation and Weighting in Regression, sect. 2.1).  The same where all loads are measured.
+        """
+        held = copy(self)
+        if self.computes_loads:
+            held.held_covariance = self._by_load_noise(at.by_latents, at.variance)
+        return held
 
     def _rolling_slip(self, at: Response, latents: Latents) -> Array:
         """Slips (N, F) of the F free wheels after one Newton step to T = 0."""
@@ -551,8 +598,8 @@ class ObservationModel(Measurements):
         """Derivatives of the torque rows (N, W, P) from those of the wheels' torques (P, N, W)."""
         return self.torque_rows(of_wheels).transpose(1, 2, 0)
 
-    def _corrected(self, gains: Array) -> tuple[Array, Array, float, Array, Array, Array]:
-        """Factors 1 / (1 + gain) of torques, latents and draft; corrected latents; their variances; variances of rows.
+    def _corrected(self, gains: Array) -> tuple[Array, Array, float, float, Array, Array, Array]:
+        """Factors 1 / (1 + gain) of torques, latents, draft, mass; corrected latents; their variances; those of rows.
 
         A sensor reads (1 + gain) times the truth, plus noise.  Measurements are divided by
         1 + gain and their noise too; else a gain that makes everything smaller would seem to
@@ -564,8 +611,10 @@ class ObservationModel(Measurements):
         of_draft = float(gain_factors[layout.draft_gain])
         row_var = self._row_var.copy()
         row_var[:, layout.torques] *= of_torque**2
-        row_var[:, layout.balance] += self.draft_var * (of_draft**2 - 1.0)
-        return of_torque, of_latents, of_draft, self._measured * of_latents, self._measured_var * of_latents**2, row_var
+        of_mass = 1.0 if self._mass_gain is None else float(of_latents[self._mass_gain])
+        row_var[:, layout.balance] += self.draft_var * (of_draft**2 - 1.0) + self.inertia_var * (of_mass**2 - 1.0)
+        corrected, variance = self._measured * of_latents, self._measured_var * of_latents**2
+        return of_torque, of_latents, of_draft, of_mass, corrected, variance, row_var
 
     def delay_terms(self, gains: Array, latents: Latents, torque: Array) -> DelayTerms | None:
         """Corrections for delays at gains (G,) and latents; torque (N, W) [N m] is the model's.  None without."""
@@ -648,7 +697,7 @@ class ObservationModel(Measurements):
 
     def variances(self, gains: Array) -> tuple[Array, Array]:
         """Variances of latents (N, 2 W + 1) and rows (N, m) at gains (G,)."""
-        return self._corrected(gains)[4:]
+        return self._corrected(gains)[5:]
 
     def torques(self, soil: Array, gains: Array, latents: Latents) -> Array:
         """Torques (N, W) [N m] of the model at a soil (6,) in SI."""
@@ -675,7 +724,7 @@ class ObservationModel(Measurements):
             (N, m, 6 + G).
         """
         variance, row_var = self.variances(gains)
-        inverse = inverse_covariance(at.by_latents, variance, row_var)
+        inverse = self.inverse_covariance(at.by_latents, variance, row_var)
         root = np.sqrt(diagonals(inverse))
         weighed = at.weighed.reshape(*root.shape, -1) / root[:, :, None]
         weighed[~self._known] = np.nan
@@ -696,8 +745,8 @@ class ObservationModel(Measurements):
         if self.with_sinkage:
             rows[:, layout.sinkages] = -depth.transpose(1, 2, 0)
         rows[~self._known] = 0.0
-        variance, row_var = self._corrected(gains)[4:]
-        weighed = inverse_covariance(at.by_latents, variance, row_var) @ rows
+        variance, row_var = self._corrected(gains)[5:]
+        weighed = self.inverse_covariance(at.by_latents, variance, row_var) @ rows
         return rows.reshape(n * m, -1), weighed.reshape(n * m, -1)
 
     def _contact_by_form(self, soil: Soil, gains: Array, latents: Latents) -> Array:
@@ -1218,7 +1267,7 @@ class DenoisedObservationModel(ObservationModel):
         )
         self._by_latents_at_optimum = problem.linearise(soil, optimum.gains, self.latents).by_latents
         *_, variance, row_var = self._corrected(optimum.gains)
-        self._inverse = inverse_covariance(self._by_latents_at_optimum, variance, row_var)
+        self._inverse = self.inverse_covariance(self._by_latents_at_optimum, variance, row_var)
 
     def allowed(self, gains: Array) -> Array:
         """Gains (G,) clipped to their ranges."""
@@ -1290,7 +1339,7 @@ SINGULAR_RIDGE = 1e-10
 """Added to the squares of rows in their sd where these are linearly dependent within rounding (eps m = 1e-15)."""
 
 
-def inverse_covariance(A: Array, variance: Array, row_var: Array) -> Array:
+def inverse_covariance(A: Array, variance: Array, row_var: Array, further: Array | None = None) -> Array:
     """Inverse covariance (A V A' + R)^-1 (N, m, m) of the residuals of every instant.
 
     Parameters
@@ -1299,6 +1348,8 @@ def inverse_covariance(A: Array, variance: Array, row_var: Array) -> Array:
         Derivatives of the residuals by the observations (N, m, 2 W + 1).
     variance, row_var : Array
         Diagonals of V (N, 2 W + 1) and R (N, m): variances of observations and rows.
+    further : Array, optional
+        Covariance (N, m, m) besides.
 
     Notes
     -----
@@ -1307,6 +1358,8 @@ def inverse_covariance(A: Array, variance: Array, row_var: Array) -> Array:
     """
     S = (A * variance[:, None, :]) @ A.swapaxes(1, 2)
     diagonals(S)[:] += row_var
+    if further is not None:
+        S += further
     scale = 1.0 / np.sqrt(diagonals(S))
     S *= scale[:, :, None] * scale[:, None, :]
     try:

@@ -32,6 +32,7 @@ __all__ = [
     "Scalar",
     "SoilPrior",
     "bearing_pressure",
+    "shear_strength",
     "tan_phi",
     "tyre_modulus",
 ]
@@ -148,6 +149,10 @@ class Posterior:
         """Tangent of the internal friction angle."""
         return self._estimate(tan_phi(self.soil))
 
+    def shear_strength(self, pressure: float) -> Estimate:
+        """Strength c + p tan phi [Pa] below a pressure p [Pa]."""
+        return self._estimate(shear_strength(self.soil, pressure))
+
     def widened(self, factor: float, prior: SoilPrior) -> Posterior:
         """The posterior if the data's noise variance is `factor` times what was assumed.
 
@@ -246,6 +251,14 @@ def tan_phi(soil: Soil) -> Scalar:
     """Tangent of the internal friction angle."""
     tan = float(np.tan(soil.phi))
     return Scalar(tan, np.array([0.0, 0.0, 0.0, 1.0 + tan**2, 0.0, 0.0]))
+
+
+def shear_strength(soil: Soil, pressure: float) -> Scalar:
+    """Shear strength c + p tan phi [Pa] of the soil below a pressure p [Pa] (Mohr-Coulomb)."""
+    tangent = tan_phi(soil)
+    return Scalar(
+        soil.c + pressure * tangent.value, pressure * tangent.gradient + np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+    )
 
 
 def tyre_modulus(soil: Soil, width: float) -> Scalar:

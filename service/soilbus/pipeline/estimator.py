@@ -45,13 +45,13 @@ from soilbus.estimation.posterior import Estimate, Posterior, SoilPrior
 from soilbus.estimation.soil_classes import SoilClasses, guessed
 from soilbus.estimation.tracker import MIN_ROWS, Settings, Tracker, TrackerOutput, TrackerState
 from soilbus.estimation.window import Rig, Window
+from soilbus.pipeline.determination import lacking, sinkage_range
 from soilbus.pipeline.excitation import excitation_of
 from soilbus.pipeline.intake import WindowTask
 from soilbus.pipeline.model_gap import GapWatch, squares
 from soilbus.pipeline.result import WindowResult, as_of
 from soilbus.terra.effects.effect import Active, Surroundings, true_draft
 from soilbus.terra.effects.steady import CompletedModel
-from soilbus.terra.wheel import sinkage
 
 AMBIGUITY_SD = 2.0
 """Difference of bearing pressure or tan phi at a second mode, in standard deviations, from which a window is
@@ -176,7 +176,7 @@ class WindowEstimator:
             channel_chi2=self._gap.chi2(),
             excitation=excitation_of(task.window, self.rig, self._settings.min_speed),
             basis=basis,
-            z_driven=None if fit is None or posterior is None else self._sinkage_range(fit),
+            z_driven=None if fit is None or posterior is None else sinkage_range(fit, self.rig),
             search_ended=tracked.search_ended,
         )
         effects = self._effects(fit)
@@ -293,15 +293,6 @@ class WindowEstimator:
     def _bearing(self, posterior: Posterior) -> Estimate:
         return posterior.bearing_pressure(self._settings.z_ref, self._settings.b_ref)
 
-    def _sinkage_range(self, fit: Fit) -> tuple[float, float] | None:
-        """The 5 % and 95 % quantiles of the sinkage [m] over wheels and instants."""
-        depth = sinkage(fit.optimum.latents.entry_angle, self.rig.radius)
-        known = depth[np.isfinite(depth)]
-        if not len(known):
-            return None
-        low, high = np.percentile(known, (5.0, 95.0)).tolist()
-        return low, high
-
     def _soil_class(self, posterior: Posterior | None) -> dict[str, float] | None:
         if posterior is None or self._classes is None:
             return None
@@ -354,16 +345,8 @@ class WindowEstimator:
             return Status.DEGRADED, "model_mismatch"
         if self._ambiguous(fit):
             return Status.NOT_EXCITED, "ambiguous"
-        posterior = fit.reported.posterior
-        bearing, tan_phi = self._bearing(posterior), posterior.tan_phi()
-        lacking = {
-            "load_range": bearing.std > self._settings.max_bearing_std * bearing.value,
-            "slip_range": tan_phi.std > self._settings.max_tan_phi_std * tan_phi.value,
-        }
-        if any(lacking.values()):
-            return Status.NOT_EXCITED, " ".join(
-                ["not_excited", *(name for name, is_lacking in lacking.items() if is_lacking)]
-            )
+        if lacks := lacking(fit, self.rig, self._settings):
+            return Status.NOT_EXCITED, " ".join(["not_excited", *lacks])
         return Status.VALID, "none"
 
     def _too_little_of_new_soil(self, tracked: TrackerOutput, end: float) -> bool:

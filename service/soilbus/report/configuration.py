@@ -162,7 +162,7 @@ def load_lines(config: Config) -> list[str]:
     without = [rig.wheels[i] for i in np.flatnonzero(given.computes("load"))]
     line = (
         f"No load cell at {', '.join(without)}: the load follows from mass, centre of gravity, pitch, acceleration and"
-        f" draft; uneven ground changes it by {given.load_noise:.0%} (noise.computed_load)."
+        f" draft, and in a single instant is hardly known (noise.computed_load)."
     )
     if own is None or with_cells is None:
         return [line]

@@ -34,7 +34,7 @@ CELLS = ("cells", "axle cells", "none")
 """Load cells of the wheels, of the axles, of neither."""
 SOILS = ("loam", "clayey_soil_38")
 BOUNCES = (0.03, 0.12)
-"""Rms of a wheel's load about its steady one, over it: a smooth field, and the assumed one (noise.computed_load)."""
+"""Rms of a wheel's load about its steady one, over it: a smooth field, and one like the field vehicle's."""
 QUANTITIES = ("pressure", "tan phi", "n")
 
 

@@ -1,0 +1,67 @@
+"""Determination: whether a window determines the soil as far as the machine presses and shears it.
+
+    load_range   lacks where  std p(z) > max_bearing_std p(z),   z: z_ref, within the depths that carry load
+    slip_range   lacks where  std tan phi > max_tan_phi_std tan phi  and  std tau > max_tan_phi_std tau,
+                 tau = c + p tan phi at the contact's own pressure p = W / (b l)
+
+Below a wheel pressure rises from 0 at the edge of the contact to its sinkage: all depths from 0 to there carry load.
+A track presses evenly, so only the depth of its rut does, and at any other one the soil is not asked.  A machine that
+presses with one pressure shows tau alone, which is all that its thrust needs, and not c and tan phi apart.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from soilbus.config.model import Estimator
+from soilbus.estimation.multistart import Fit
+from soilbus.estimation.posterior import Estimate
+from soilbus.estimation.window import Rig
+from soilbus.terra.wheel import sinkage
+
+__all__ = ["contact_pressure", "lacking", "loaded_depths", "sinkage_range"]
+
+
+def lacking(fit: Fit, rig: Rig, settings: Estimator) -> list[str]:
+    """What varied too little in a window: load_range, slip_range or both, as far as its posterior says so."""
+    posterior = fit.reported.posterior
+    low, high = loaded_depths(fit, rig)
+    bearing = posterior.bearing_pressure(min(max(settings.z_ref, low), high), settings.b_ref)
+    sheared = posterior.tan_phi(), posterior.shear_strength(contact_pressure(fit, rig))
+    lacks = {
+        "load_range": _is_wide(bearing, settings.max_bearing_std),
+        "slip_range": all(_is_wide(estimate, settings.max_tan_phi_std) for estimate in sheared),
+    }
+    return [name for name, is_lacking in lacks.items() if is_lacking]
+
+
+def loaded_depths(fit: Fit, rig: Rig) -> tuple[float, float]:
+    """Least and greatest depth [m] at which the machine presses on the soil; 0 and infinity where not known."""
+    depths = sinkage_range(fit, rig)
+    if depths is None:
+        return 0.0, np.inf
+    low, high = depths
+    return low if rig.lengths is not None and (rig.lengths > 0.0).all() else 0.0, high
+
+
+def sinkage_range(fit: Fit, rig: Rig) -> tuple[float, float] | None:
+    """The 5 % and 95 % quantiles of the sinkage [m] over wheels and instants; None where not known."""
+    depth = sinkage(fit.optimum.latents.entry_angle, rig.radius)
+    known = depth[np.isfinite(depth)]
+    if not len(known):
+        return None
+    low, high = np.percentile(known, (5.0, 95.0)).tolist()
+    return low, high
+
+
+def contact_pressure(fit: Fit, rig: Rig) -> float:
+    """Median over wheels and instants of load over contact area [Pa]; a wheel's contact is r sin(entry angle) long."""
+    latents = fit.optimum.latents
+    length = rig.radius * np.sin(latents.entry_angle)
+    if rig.lengths is not None:
+        length = np.where(rig.lengths > 0.0, rig.lengths, length)
+    return float(np.nanmedian(latents.load / (rig.width * length)))
+
+
+def _is_wide(estimate: Estimate, most: float) -> bool:
+    return estimate.std > most * estimate.value
