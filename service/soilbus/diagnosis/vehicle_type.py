@@ -286,41 +286,58 @@ def _most_probable(vehicles: Sequence[Mapping[str, Factor]]) -> tuple[str, Pool,
     pools: dict[str, Pool] = {}
     agreeing: dict[str, list[int]] = {}
     gains: dict[str, float] = {}
-    for name in sorted(set.intersection(*(set(factors) for factors in vehicles))):
-        pool = _pool(name, [factors[name] for factors in vehicles])
+    for name in sorted(set.union(*(set(factors) for factors in vehicles))):
+        shown = [v for v, factors in enumerate(vehicles) if name in factors]
+        pool, own = _pool(name, vehicles), np.zeros(len(vehicles))
         if not pool.parts[0].free:
             continue
-        pools[name], own = pool, _own_log_evidence(name, vehicles)
-        chosen = _agreeing(pool, own)
+        own[shown] = _own_log_evidence(name, [vehicles[v] for v in shown])
+        chosen = _agreeing(pool, own, shown)
         if chosen is not None:
-            agreeing[name] = chosen
+            pools[name], agreeing[name] = pool, chosen
             gains[name] = pool.log_evidence(chosen) - float(own[chosen].sum())
     if not gains:
         return None
     best = max(gains, key=lambda name: gains[name])
-    p = _name_probability(best, pools, agreeing[best]) * float(expit(gains[best]))
+    p = _name_probability(best, [vehicles[v] for v in agreeing[best]]) * float(expit(gains[best]))
     return (best, pools[best], agreeing[best], p) if p >= LEAST_PROBABILITY else None
 
 
-def _name_probability(best: str, pools: Mapping[str, Pool], chosen: Sequence[int]) -> float:
-    """Probability of a name among those that the chosen vehicles may share, by the two temperatures of `verdict`.
+def _name_probability(best: str, vehicles: Sequence[Mapping[str, Factor]]) -> float:
+    """Probability of a name among those in its place in the vehicles that agree, by the temperatures of `verdict`.
 
     They are those of all that the vehicles explain, as a formula that is off is off in all of them.
     """
-    most = max(float(pool.falls[list(chosen)].sum()) for pool in pools.values())
+    places = [factors[best] for factors in vehicles]
+    pools: dict[str, Pool] = {}
+    for name in sorted({rival for place in places for rival in place.falls}):
+        here = [
+            {name: replace(factors[name], falls=place.falls)} if name in factors and name in place.falls else {}
+            for factors, place in zip(vehicles, places, strict=True)
+        ]
+        if any(here):
+            pool = _pool(name, here)
+            pools |= {name: pool} if pool.parts[0].free else {}
+    most = max(float(pool.falls.sum()) for pool in pools.values())
+    chosen = range(len(vehicles))
     usual, large = (
-        softmax([pool._replace(divisors=np.full(len(pool.parts), t)).log_evidence(chosen) for pool in pools.values()])
+        softmax([pool._replace(divisors=np.full(len(vehicles), t)).log_evidence(chosen) for pool in pools.values()])
         for t in temperatures(most)
     )
     at = list(pools).index(best)
     return float((1.0 - P_LARGE_FORMULA_ERROR) * usual[at] + P_LARGE_FORMULA_ERROR * large[at])
 
 
-def _pool(name: str, factors: Sequence[Factor]) -> Pool:
-    """The factors in the parameters that all of them have; others are marginalised."""
-    common = set.intersection(*({f.name for f in factor.own.free} for factor in factors))
-    falls, divisors = [factor.falls[name] for factor in factors], [factor.divisor for factor in factors]
-    return Pool(tuple(_marginal(factor.own, common) for factor in factors), np.array(falls), np.array(divisors))
+def _pool(name: str, vehicles: Sequence[Mapping[str, Factor]]) -> Pool:
+    """The factors in the parameters that all have, others are marginalised; a vehicle without a factor is neutral."""
+    factors = [of_vehicle.get(name) for of_vehicle in vehicles]
+    common = set.intersection(*({f.name for f in factor.own.free} for factor in factors if factor is not None))
+    known = {v: _marginal(factor.own, common) for v, factor in enumerate(factors) if factor is not None}
+    P, free = len(common), next(iter(known.values())).free
+    nothing = OwnParameters(np.zeros((P, P)), np.zeros(P), free)
+    falls = [0.0 if factor is None else factor.falls[name] for factor in factors]
+    divisors = [1.0 if factor is None else factor.divisor for factor in factors]
+    return Pool(tuple(known.get(v, nothing) for v in range(len(factors))), np.array(falls), np.array(divisors))
 
 
 def _marginal(own: OwnParameters, names: set[str]) -> OwnParameters:
@@ -331,10 +348,13 @@ def _marginal(own: OwnParameters, names: set[str]) -> OwnParameters:
     return OwnParameters(precision - np.eye(len(kept)), vector, tuple(own.free[i] for i in kept))
 
 
-def _agreeing(pool: Pool, own: Array) -> list[int] | None:
-    """The vehicles that one value explains better than effects of their own; None where these are not most of them."""
+def _agreeing(pool: Pool, own: Array, shown: Sequence[int]) -> list[int] | None:
+    """The vehicles that one value explains better than effects of their own; None where these are not most of all.
+
+    shown are those whose logs say something of the effect.
+    """
     V = len(pool.parts)
-    chosen = list(range(V))
+    chosen = list(shown)
     while _are_most(chosen, V):
         whole = pool.log_evidence(chosen)
         gains = np.array([whole - pool.log_evidence([j for j in chosen if j != i]) for i in chosen])
@@ -346,7 +366,7 @@ def _agreeing(pool: Pool, own: Array) -> list[int] | None:
     else:
         return None
     whole = pool.log_evidence(chosen)  # a vehicle may have left on account of another that left after it
-    back = [i for i in range(V) if i not in chosen and pool.log_evidence([*chosen, i]) - whole >= own[i]]
+    back = [i for i in shown if i not in chosen and pool.log_evidence([*chosen, i]) - whole >= own[i]]
     return sorted([*chosen, *back])
 
 
