@@ -60,6 +60,10 @@ def test_a_vehicle_that_differs_is_left_out_and_does_not_move_the_value():
     assert abs(found.parameters["gain"].value - 0.1) < 0.01
 
 
+def test_one_vehicles_fault_is_not_the_types_where_the_others_say_nothing():
+    assert shared(factor(0.1, 0.004), *(factor(0.0, 0.5) for _ in range(7))) is None
+
+
 def test_two_vehicles_are_no_type():
     assert shared(factor(0.1, 0.004), factor(0.1, 0.004)) is None
 

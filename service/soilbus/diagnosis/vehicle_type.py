@@ -13,6 +13,7 @@ may contradict the type's value, so vehicles that their own effects explain bett
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -283,6 +284,7 @@ def shared_effect(
 
 def _most_probable(vehicles: Sequence[Mapping[str, Factor]]) -> tuple[str, Pool, list[int], float] | None:
     """Name, factors, vehicles that agree, and probability."""
+    names = len(set.union(*(set(factors) for factors in vehicles)))
     pools: dict[str, Pool] = {}
     agreeing: dict[str, list[int]] = {}
     gains: dict[str, float] = {}
@@ -295,7 +297,8 @@ def _most_probable(vehicles: Sequence[Mapping[str, Factor]]) -> tuple[str, Pool,
         chosen = _agreeing(pool, own, shown)
         if chosen is not None:
             pools[name], agreeing[name] = pool, chosen
-            gains[name] = pool.log_evidence(chosen) - float(own[chosen].sum())
+            # any effect of the catalogue may be the type's, each as likely beforehand as another
+            gains[name] = pool.log_evidence(chosen) - float(own[chosen].sum()) - math.log(names)
     if not gains:
         return None
     best = max(gains, key=lambda name: gains[name])
@@ -351,7 +354,8 @@ def _marginal(own: OwnParameters, names: set[str]) -> OwnParameters:
 def _agreeing(pool: Pool, own: Array, shown: Sequence[int]) -> list[int] | None:
     """The vehicles that one value explains better than effects of their own; None where these are not most of all.
 
-    shown are those whose logs say something of the effect.
+    Most must show the effect too: with the value of the others it explains something in them.  shown are those whose
+    logs say something of the effect.
     """
     V = len(pool.parts)
     chosen = list(shown)
@@ -367,7 +371,10 @@ def _agreeing(pool: Pool, own: Array, shown: Sequence[int]) -> list[int] | None:
         return None
     whole = pool.log_evidence(chosen)  # a vehicle may have left on account of another that left after it
     back = [i for i in shown if i not in chosen and pool.log_evidence([*chosen, i]) - whole >= own[i]]
-    return sorted([*chosen, *back])
+    chosen = sorted([*chosen, *back])
+    whole = pool.log_evidence(chosen)
+    showing = [i for i in chosen if whole > pool.log_evidence([j for j in chosen if j != i])]
+    return chosen if _are_most(showing, V) else None
 
 
 def _are_most(chosen: Sequence[int], vehicles: int) -> bool:
