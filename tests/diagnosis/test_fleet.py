@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from soilbus.diagnosis.fleet import diagnose_vehicle, named, onset_probabilities
-from soilbus.diagnosis.records import Record, record_of
-from soilbus.estimation.assembly import model_of, prior_of, rig_of, with_effects
-from soilbus.offline.fleet import judged, no_findings
-from soilbus.sensors.bins import Bins
+from soilbus.diagnosis.records import Record
+from soilbus.estimation.assembly import prior_of, rig_of, with_effects
+from soilbus.offline.fleet import judged
+from soilbus.offline.manoeuvre import record_of_recording
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import reference_configuration
 from soilbus.simulator.scenario import excited
@@ -45,21 +47,16 @@ def test_the_onset_is_where_the_evidence_begins():
     assert onset_probabilities([0.0, 0.0], 6.0) == pytest.approx([1 / 3, 1 / 3, 1 / 3])  # logs that show nothing
 
 
-def record(seed: int, soil: str, *effects: str) -> Record:
-    recording = simulate(with_effects(CONFIG, list(effects)), excited(soil, 40.0), seed=seed)
-    rig, settings = rig_of(CONFIG), CONFIG.estimator
-    store = Bins(rig, settings.bin, 0.0)
-    columns = {name: (c.t, c.value) for name, c in recording.channels.items() if name in rig.channels}
-    store.add(columns)
-    end = max(float(t[-1]) for t, _ in columns.values())
-    window = store.window(0.0, end)
-    return record_of(str(seed), window, rig, model_of(CONFIG), settings.min_speed, settings.max_turn)
+def record(seed: int, vehicle: int, soil: str, *effects: str) -> Record:
+    drive = replace(excited(soil, 40.0), vehicle_seed=vehicle)
+    recording = simulate(with_effects(CONFIG, list(effects)), drive, seed=seed)
+    return record_of_recording(str(seed), recording, CONFIG)
 
 
 def test_a_load_cell_that_drifted_is_found_from_the_log_on_and_a_sound_vehicle_is_left_alone():
     offset = "wheel_load_offset.offset=800"
-    drifted = [record(1, "loam"), record(2, "dry_sand", offset), record(3, "loam", offset)]
-    sound = [record(4, "loam"), record(5, "dry_sand")]
+    drifted = [record(1, 7, "loam"), record(2, 7, "dry_sand", offset), record(3, 7, "loam", offset)]
+    sound = [record(4, 8, "loam"), record(5, 8, "dry_sand")]
     catalogue = [CATALOGUE[name] for name in ("wheel_load_offset", "draft_offset", "slip_sinkage", "rolling_radius")]
     faulty, healthy = (diagnose_vehicle(records, prior_of(CONFIG), catalogue) for records in (drifted, sound))
     assert not any(named(list(healthy.probabilities.values())))
@@ -79,15 +76,17 @@ def test_a_load_cell_that_drifted_is_found_from_the_log_on_and_a_sound_vehicle_i
 def test_the_fleet_names_what_is_sure_and_says_how_common_it_is():
     def vehicle(name: str, **chances: float) -> dict:
         effects = [{"name": effect, "probability": p, "parameters": {}, "onset": None} for effect, p in chances.items()]
-        return no_findings(name, "") | {"fault": None, "verdict": "named", "effects": effects}
+        return {"vehicle": name, "verdict": "named" if chances else None, "effects": effects}
 
-    fleet = judged([
+    of_type = {"effects": [{"name": "tyre_deflection", "probability": 0.96}]}
+    fleet = judged([of_type], [
         vehicle("a", draft_offset=0.99, slip_sinkage=0.98), vehicle("b", slip_sinkage=0.97),
-        vehicle("c", slip_sinkage=0.5), no_findings("d", "no log of it can be diagnosed"),
+        vehicle("c", slip_sinkage=0.5), vehicle("d"),
     ])  # fmt: skip
     assert [[e["name"] for e in v["effects"] if e["named"]] for v in fleet["vehicles"]] == [
         ["draft_offset", "slip_sinkage"], ["slip_sinkage"], [], [],
     ]  # fmt: skip
+    assert fleet["types"][0]["effects"][0]["named"]
     shares = {effect["name"]: (effect["vehicles_named"], effect["expected_share"]) for effect in fleet["effects"]}
     assert shares["slip_sinkage"] == (2, pytest.approx(2.45 / 3))
     assert fleet["vehicles_diagnosed"] == 3

@@ -4,9 +4,11 @@
 
 Sensor gain errors and parameters of effects belong to the vehicle and are the same in all recordings.  The soil
 belongs to a recording, and so do the parameters of an effect of the record (see terra.effects.effect).  So recordings
-are fitted one after the other, each with the posterior of the previous ones as its prior, and the evidences of the
-parts add up to that of all data.  FittedModel.gap, the reduced chi-square of the held-out blocks, says how well the
-model predicts data that it was not fitted to.
+are fitted one after the other, each with the posterior of the previous ones as its prior, and then in turn again, each
+with the likelihood factors of all others in its prior, until all are at the same shared values: the optimum of all
+recordings together, whatever their order (expectation propagation by Laplace's method: Minka 2001, Proc. UAI 17:362).
+FittedModel.gap, the reduced chi-square of the held-out blocks, says how well the model predicts data that it was not
+fitted to.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soilbus.arrays import Array
 from soilbus.diagnosis.evidence import OwnParameters, mixture_correction, own_parameters
@@ -26,7 +29,7 @@ from soilbus.estimation.nuisance_parameters import Free, parameters_of
 from soilbus.estimation.observation_model import RESIDUAL, Latents, Linearisation, ObservationModelWithEffects
 from soilbus.estimation.parametrization import at_bounds
 from soilbus.estimation.posterior import PARAMETERS, Estimate, SoilPrior
-from soilbus.estimation.solver import Iterate, Objective, SolverOptions
+from soilbus.estimation.solver import Iterate, Objective, SolverOptions, Termination
 from soilbus.terra.effects.effect import Effect
 from soilbus.terra.wheel import Soil
 
@@ -35,6 +38,10 @@ _SOIL = len(PARAMETERS)
 CHECK_ROUNDS, CHECK_ROUNDS_NEAR = 3, 2
 """Linearisations that bring the latents of held-out blocks to their optimum: from the measurements, and from latents
 under a model much like it."""
+MAX_SWEEPS = 6
+"""Rounds in which each of several recordings is fitted again beside all others.  No evidence recorded."""
+SWEEP_TOLERANCE = 0.1
+"""Change of the shared values, in posterior standard deviations, from which a further round follows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,8 +103,10 @@ class FittedModel:
         Parameters of the effects; one that is held at the edge of its range has std 0.
     free_unheld
         The same before any was held.
+    first_prior
+        Of soil, gains and parameters before any recording.
     joint_prior
-        Of each recording, the prior of soil, gains and parameters: the posterior of the recordings before it.
+        The same for each recording, with what the other recordings say of the shared ones.
     fits, checks
         Of each recording.
     mixture_correction
@@ -109,6 +118,7 @@ class FittedModel:
     effects: tuple[Effect, ...]
     free: tuple[Free, ...]
     free_unheld: tuple[Free, ...]
+    first_prior: Gaussian
     joint_prior: tuple[Gaussian, ...]
     fits: tuple[Fit, ...]
     checks: tuple[HeldOutCheck, ...]
@@ -231,12 +241,12 @@ class FittedModel:
         return tuple(own_parameters(*_moments(fit, n_sensors, own), free) for fit in self.fits[1:])
 
     def shared_parameters(self, effect: Effect) -> OwnParameters:
-        """Likelihood, by the first recording, of an effect's parameters that are the vehicle's; without held ones."""
+        """Likelihood, by all recordings, of an effect's parameters that are the vehicle's; without held ones."""
         shared = [i for i in _not_held(effect, self.free) if not effect.own_in_each_record(self.free[i].parameter)]
         if not shared:
             return OwnParameters(np.zeros((0, 0)), np.zeros(0), ())
         n_sensors, free = self.checks[0].problem.n_sensors, [self.free[i] for i in shared]
-        return own_parameters(*_moments(self.fits[0], n_sensors, shared), free)
+        return own_parameters(*_moments(self.fits[-1], n_sensors, shared), free)
 
 
 def _series(held_out: HeldOutCheck, fit: Fit) -> list[Series]:
@@ -295,22 +305,24 @@ def fit_model(
     fitted = _fits(records, prior, effects, free, starts, options)
     for _ in range(len(free)):
         held = (
-            None if fitted is None else _held_at_edges(records[0].training.with_effects(effects, free), fitted[1], free)
+            None if fitted is None else _held_at_edges(records[0].training.with_effects(effects, free), fitted[2], free)
         )
         if fitted is None or held is None:
             break
-        free, starts = held, [_start(fit) for fit in fitted[1]]
+        free, starts = held, [_start(fit) for fit in fitted[2]]
         fitted = _fits(records, prior, effects, free, starts, options)
     if fitted is None:
         return None
-    joint_priors, fits = fitted
+    first_prior, joint_priors, fits = fitted
     checks = [
         check(record.held_out.with_effects(effects, free), prior, fit, None if near is None else near[i])
         for i, (record, fit) in enumerate(zip(records, fits, strict=True))
     ]
     added = [effect for effect in effects if effect not in present.effects]
     correction = sum(_mixture_correction(effect, free, fits, checks) for effect in added)
-    return FittedModel(tuple(effects), free, free_unheld, tuple(joint_priors), tuple(fits), tuple(checks), correction)
+    return FittedModel(
+        tuple(effects), free, free_unheld, first_prior, tuple(joint_priors), tuple(fits), tuple(checks), correction
+    )
 
 
 def check(
@@ -348,21 +360,150 @@ def _fits(
     free: tuple[Free, ...],
     starts: Sequence[Start] | None,
     options: SolverOptions,
-) -> tuple[list[Gaussian], list[Fit]] | None:
-    """The joint prior of each recording, and its fit; None where one fails."""
+) -> tuple[Gaussian, list[Gaussian], list[Fit]] | None:
+    """The prior before any recording, the joint prior of each, and its fit; None where one fails."""
     joint_priors: list[Gaussian] = []
     fits: list[Fit] = []
-    for i, record in enumerate(records):
-        problem = record.training.with_effects(effects, free)
-        joint_prior = (
-            _prior_of_next(fits[-1].mode, prior, problem, effects) if fits else _prior_of_first(record, prior, problem)
-        )
+    problems = [record.training.with_effects(effects, free) for record in records]
+    own = _own(problems[0], effects)
+    for i, problem in enumerate(problems):
+        if fits:
+            joint_prior = _prior_of_next(fits[-1].mode, prior, problem, own)
+        else:
+            joint_prior = _prior_of_first(records[0], prior, problem)
         fit = _fitted(problem, prior, joint_prior, None if starts is None else starts[i], options)
         if fit is None:
             return None
         joint_priors.append(joint_prior)
         fits.append(fit)
-    return joint_priors, fits
+    first = joint_priors[0]
+    if len(records) > 1 and records[0].joint_prior is None:
+        joint_priors, fits = _swept(problems, prior, first, own, joint_priors, fits, options)
+    return first, joint_priors, fits
+
+
+def _own(problem: ObservationModelWithEffects, effects: Sequence[Effect]) -> list[int]:
+    """Indices of the gains that each recording has for itself."""
+    by_name = {effect.name: effect for effect in effects}
+    return [
+        problem.n_sensors + i
+        for i, free in enumerate(problem.free)
+        if by_name[free.effect].own_in_each_record(free.parameter)
+    ]
+
+
+class _Natural(NamedTuple):
+    """A Gaussian factor of the shared gains (S,): exp(vector' x - x' information x / 2)."""
+
+    information: Array
+    vector: Array
+
+    def __add__(self, other: object) -> _Natural:
+        assert isinstance(other, _Natural)
+        return _Natural(self.information + other.information, self.vector + other.vector)
+
+    def without(self, other: _Natural) -> _Natural:
+        """The factor divided by another."""
+        return _Natural(self.information - other.information, self.vector - other.vector)
+
+    @property
+    def log_determinant(self) -> float:
+        """Of the information."""
+        return float(np.linalg.slogdet(self.information)[1])
+
+    @property
+    def mean(self) -> Array:
+        """Where the factor is greatest."""
+        return np.asarray(np.linalg.solve(self.information, self.vector))
+
+    def squared_distance(self, x: Array) -> float:
+        """-2 log of the factor at x, relative to its maximum."""
+        away = x - self.mean
+        return float(away @ self.information @ away)
+
+
+def _swept(
+    problems: Sequence[ObservationModelWithEffects],
+    prior: SoilPrior,
+    first: Gaussian,
+    own: Sequence[int],
+    joint_priors: list[Gaussian],
+    fits: list[Fit],
+    options: SolverOptions,
+) -> tuple[list[Gaussian], list[Fit]]:
+    """Joint priors and fits at the optimum of all recordings together.
+
+    The fits' -2 log evidence and posterior are such that they add up to those of all recordings.  A recording whose
+    fit fails keeps the one that it has.
+    """
+    shared = np.setdiff1d(np.flatnonzero(np.diag(first.covariance)[_SOIL:] > 0.0), own)
+    if not len(shared):
+        return joint_priors, fits
+    options = replace(options, give_up_above=np.inf)
+    priors, fits = list(joint_priors), list(fits)
+    factors = [_natural(f.mode, shared).without(_natural(p, shared)) for f, p in zip(fits, priors, strict=True)]
+    before = _natural(first, shared)
+    for _ in range(MAX_SWEEPS):
+        moved = 0.0
+        for i, problem in enumerate(problems):
+            others = before
+            for j, factor in enumerate(factors):
+                others = others if j == i else others + factor
+            cavity = _with_shared(Gaussian.of(prior, problem.gain_std), shared, others)
+            fit = _fitted(problem, prior, cavity, _start(fits[i]), options)
+            if fit is None:
+                continue
+            sd = np.sqrt(np.diag(fit.mode.covariance)[_SOIL + shared])
+            moved = max(moved, float(np.max(np.abs(fit.mode.gains - fits[i].mode.gains)[shared] / sd)))
+            priors[i], fits[i] = cavity, fit
+            factors[i] = _natural(fit.mode, shared).without(others)
+        if moved < SWEEP_TOLERANCE:
+            break
+    else:
+        fits = [replace(fit, termination=Termination.LIMIT) for fit in fits]
+    return priors, _adding_up(before, factors, [_natural(p, shared) for p in priors], fits, shared)
+
+
+def _adding_up(
+    first: _Natural,
+    factors: Sequence[_Natural],
+    priors: Sequence[_Natural],
+    fits: Sequence[Fit],
+    shared: NDArray[np.intp],
+) -> list[Fit]:
+    """The fits with the prior of the shared gains counted once, with the first one, all at the same shared gains.
+
+    A recording's objective is least at its own shared gains, those of all recordings are a small step away.
+    """
+    together = first
+    for factor in factors:
+        together = together + factor
+    at, out = together.mean, []
+    for i, (fit, joint_prior) in enumerate(zip(fits, priors, strict=True)):
+        alone = _natural(fit.mode, shared)
+        change = alone.squared_distance(at) - joint_prior.squared_distance(at)
+        penalty = joint_prior.log_determinant - alone.log_determinant
+        if i == 0:
+            change += first.squared_distance(at)
+            penalty += together.log_determinant - first.log_determinant
+        evidence, posterior = fit.neg2_log_evidence + change + penalty, fit.neg2_log_posterior + change
+        out.append(replace(fit, neg2_log_evidence=evidence, neg2_log_posterior=posterior))
+    return out
+
+
+def _natural(gaussian: Gaussian, shared: NDArray[np.intp]) -> _Natural:
+    at = _SOIL + shared
+    information = np.asarray(np.linalg.inv(gaussian.covariance[np.ix_(at, at)]))
+    return _Natural(information, information @ gaussian.gains[shared])
+
+
+def _with_shared(gaussian: Gaussian, shared: NDArray[np.intp], factor: _Natural) -> Gaussian:
+    """The Gaussian with another distribution of the shared gains, which are independent of the rest in it."""
+    gains, covariance = gaussian.gains.copy(), gaussian.covariance.copy()
+    at = _SOIL + shared
+    covariance[np.ix_(at, at)] = np.linalg.inv(factor.information)
+    gains[shared] = np.linalg.solve(factor.information, factor.vector)
+    return replace(gaussian, gains=gains, covariance=covariance)
 
 
 def _prior_of_first(record: Record, prior: SoilPrior, problem: ObservationModelWithEffects) -> Gaussian:
@@ -377,16 +518,10 @@ def _prior_of_first(record: Record, prior: SoilPrior, problem: ObservationModelW
 
 
 def _prior_of_next(
-    posterior: Gaussian, prior: SoilPrior, problem: ObservationModelWithEffects, effects: Sequence[Effect]
+    posterior: Gaussian, prior: SoilPrior, problem: ObservationModelWithEffects, own: Sequence[int]
 ) -> Gaussian:
     """Joint prior of the next recording: the posterior, with the prior of what is each recording's own."""
     after = posterior.with_prior_soil(prior)
-    by_name = {effect.name: effect for effect in effects}
-    own = [
-        problem.n_sensors + i
-        for i, free in enumerate(problem.free)
-        if by_name[free.effect].own_in_each_record(free.parameter)
-    ]
     gains, covariance = after.gains.copy(), after.covariance.copy()
     for i in own:
         covariance[_SOIL + i] = covariance[:, _SOIL + i] = 0.0

@@ -178,17 +178,22 @@ class JointEquations:
 def joint_equations(equations: Sequence[NormalEquations]) -> JointEquations:
     """The normal equations of all recordings together, in which the gains that they share are the same.
 
-    Each is taken about its own optimum; the first one has the prior of the gains, the others data alone.
+    Each is taken about its own optimum, without what its prior holds of the others; the gains' prior is added once.
     """
-    parts = [_without_own(one, with_prior=i == 0) for i, one in enumerate(equations)]
+    parts = [_without_own(one) for one in equations]
     at, shared = equations[-1].iterate.gains, equations[0].shared_gains
     information, gradient = np.zeros_like(parts[0].information), np.zeros(len(parts[0].gradient))
+    gains = slice(None, len(shared))
+    first = equations[0].fitted.first_prior
+    precision = _precision(first, shared)
+    information[gains, gains] = precision
+    gradient[gains] = precision @ (at[shared] - first.gains[shared])
     moved = []
     for one, part in zip(equations, parts, strict=True):
         moved.append((at - one.iterate.gains)[shared])
         information += part.information
         gradient += part.gradient + part.information[:, : len(shared)] @ moved[-1]
-    gains, u = slice(None, len(shared)), slice(len(shared), None)
+    u = slice(len(shared), None)
     solved = np.linalg.solve(information[gains, gains], np.column_stack([gradient[gains], information[gains, u]]))
     follow = []
     for one, part, change in zip(equations, parts, moved, strict=True):
@@ -216,19 +221,17 @@ class _WithoutOwn(NamedTuple):
     own_by_gains: Array
 
 
-def _without_own(equations: NormalEquations, with_prior: bool) -> _WithoutOwn:
-    """The equations of one recording's data, with the prior of its own coordinates; of the gains only `with_prior`."""
+def _without_own(equations: NormalEquations) -> _WithoutOwn:
+    """The equations of one recording's data, with the prior of its own coordinates but not of the gains."""
     P, shared = len(equations.gradient), equations.shared_gains
     H, g = equations.quadratic.information.copy(), equations.quadratic.gradient.copy()
     own = np.concatenate([equations.is_own, np.zeros(P, bool)])
     gains = np.concatenate([~equations.is_own, np.zeros(P, bool)])
     H[-P:, -P:] -= np.eye(P)
-    if not with_prior:
-        prior = equations.objective.joint_prior
-        at = len(PARAMETERS) + shared
-        precision = np.linalg.inv(prior.covariance[np.ix_(at, at)])
-        H[np.ix_(gains, gains)] -= precision
-        g[gains] -= precision @ (equations.iterate.gains - prior.gains)[shared]
+    prior = equations.objective.joint_prior
+    precision = _precision(prior, shared)
+    H[np.ix_(gains, gains)] -= precision
+    g[gains] -= precision @ (equations.iterate.gains - prior.gains)[shared]
     rest = ~own
     K = np.linalg.solve(H[np.ix_(own, own)], np.column_stack([g[own], H[np.ix_(own, rest)]]))
     cross, S = H[np.ix_(rest, own)], len(shared)
@@ -238,6 +241,12 @@ def _without_own(equations: NormalEquations, with_prior: bool) -> _WithoutOwn:
         np.column_stack([K[:, 0], K[:, 1 + S :]]),
         K[:, 1 : 1 + S],
     )
+
+
+def _precision(prior: Gaussian, gains: NDArray[np.intp]) -> Array:
+    """Inverse of the covariance of some gains in a prior."""
+    at = len(PARAMETERS) + gains
+    return np.asarray(np.linalg.inv(prior.covariance[np.ix_(at, at)]))
 
 
 def _reduced(

@@ -103,6 +103,11 @@ def temperature(excess: float) -> float:
     return (1.0 + min(max(excess, 0.0), MAX_EXCESS) / ALPHA) / ZETA_0
 
 
+def temperature_of_all(temperatures: Sequence[float]) -> float:
+    """T of recordings together, from that of each: their excesses add up."""
+    return sum(temperatures) - (len(temperatures) - 1) / ZETA_0
+
+
 def required_fall(divisor: float, gap: float, checked_rows: int, rows: int) -> float:
     """Fall of -2 log evidence from which an effect is added.
 

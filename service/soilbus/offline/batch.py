@@ -30,7 +30,15 @@ from typing import Any
 from soilbus import __version__
 from soilbus.config.model import Config, ConfigError
 from soilbus.offline import dataset
-from soilbus.offline.fleet import chosen, findings_of, judged, no_findings
+from soilbus.offline.fleet import (
+    Given,
+    chosen,
+    effect_rows,
+    findings_of,
+    findings_of_type,
+    judged,
+    no_findings,
+)
 from soilbus.offline.parts import Job, OtherVersion, Outcome, Setup, part_of, setup_of, summary_of_part
 from soilbus.pipeline.outputs import known
 from soilbus.words import one_line
@@ -501,28 +509,51 @@ def _diagnose_all(
     out: Path,
     progress: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Findings of every vehicle, kept one by one, and the fleet's diagnosis of them."""
+    """Findings of every vehicle, kept one by one, those of each type together, and the fleet's diagnosis of them."""
     groups: dict[tuple[str, str], list[Job]] = {}
     for job in sorted(jobs, key=lambda job: (summaries.get(job.digest, {}).get("begin") or 0, job.log)):
         if job.digest in summaries:
-            groups.setdefault((job.vehicle, job.setup.digest), []).append(job)
-    together = {_digest_of(group): chosen(group) for _, group in sorted(groups.items())}
-    kept = {digest: out / "parts" / f"{digest}.json" for digest in together}
-    left = {digest: group for digest, group in together.items() if not kept[digest].exists()}
-    unseen = _unseen_folders(client, (job for group in left.values() for job in group))
-    tasks = ((digest, ([_carrying(job, unseen) for job in group], __version__)) for digest, group in left.items())
-    for n, (digest, found) in enumerate(done_in_turn(client, findings_of, tasks), 1):
-        if isinstance(found, OtherVersion):
-            raise BatchError(str(found))
-        if isinstance(found, BaseException):
-            fault = f"{one_line(Exception(str(found)), 200)} ({type(found).__name__})"
-            found = no_findings(together[digest][0].vehicle, fault)
-        dataset.put(kept[digest], json.dumps(known(found), indent=1, allow_nan=False).encode())
-        progress(f"{n} of {len(left)} vehicles diagnosed")
-    fleet = judged([json.loads(path.read_bytes()) for path in kept.values()])
-    dataset.put(out / "diagnosis.json", (json.dumps(fleet, indent=1, allow_nan=False) + "\n").encode())
+            groups.setdefault((job.setup.digest, job.vehicle), []).append(job)
+    types: dict[str, list[list[Job]]] = {}
+    for (setup, _), group in sorted(groups.items()):
+        types.setdefault(setup, []).append(chosen(group))
+    found = [
+        findings_of_type(
+            vehicles[0][0].setup,
+            len(vehicles),
+            lambda given, vehicles=vehicles: _diagnosed(client, vehicles, given, out, progress),  # type: ignore[misc]
+        )
+        for vehicles in types.values()
+    ]
+    fleet = judged([of_type for of_type, _ in found], [each for _, findings in found for each in findings])
+    dataset.put(out / "diagnosis.json", (json.dumps(known(fleet), indent=1, allow_nan=False) + "\n").encode())
+    dataset.write_rows(out / "effects.parquet", effect_rows(fleet), dataset.EFFECT_COLUMNS)
     return fleet
 
 
-def _digest_of(jobs: Sequence[Job]) -> str:
-    return hashlib.sha256(" ".join(job.digest for job in jobs).encode()).hexdigest()[:24]
+def _diagnosed(
+    client: Any, vehicles: Sequence[Sequence[Job]], given: Sequence[Given], out: Path, progress: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    """Findings of each vehicle beside the effects given for it; those that are kept are not made again."""
+    digests = [_digest_of(jobs, each) for jobs, each in zip(vehicles, given, strict=True)]
+    kept = [out / "parts" / f"{digest}.json" for digest in digests]
+    left = {digest: v for v, digest in enumerate(digests) if not kept[v].exists()}
+    unseen = _unseen_folders(client, (job for v in left.values() for job in vehicles[v]))
+    tasks = (
+        (digest, ([_carrying(job, unseen) for job in vehicles[v]], __version__, given[v])) for digest, v in left.items()
+    )
+    for n, (digest, findings) in enumerate(done_in_turn(client, findings_of, tasks), 1):
+        if isinstance(findings, OtherVersion):
+            raise BatchError(str(findings))
+        if isinstance(findings, BaseException):
+            fault = f"{one_line(Exception(str(findings)), 200)} ({type(findings).__name__})"
+            findings = no_findings(vehicles[left[digest]][0].vehicle, fault)
+        dataset.put(kept[left[digest]], json.dumps(known(findings), indent=1, allow_nan=False).encode())
+        beside = f" beside {', '.join(given[0])}" if given[0] else ""
+        progress(f"{n} of {len(left)} vehicles diagnosed{beside}")
+    return [json.loads(path.read_bytes()) for path in kept]
+
+
+def _digest_of(jobs: Sequence[Job], given: Given) -> str:
+    content = " ".join(job.digest for job in jobs) + (json.dumps(given, sort_keys=True) if given else "")
+    return hashlib.sha256(content.encode()).hexdigest()[:24]

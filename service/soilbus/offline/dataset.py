@@ -37,6 +37,9 @@ MAP_COLUMNS = (
 )  # fmt: skip
 """Columns of the windows that the map repeats."""
 ERROR_COLUMNS = ("vehicle", "log", "windows", "fault")
+EFFECT_COLUMNS = (
+    "configuration", "vehicle", "effect", "scope", "parameter", "value", "std", "probability", "named", "since",
+)  # fmt: skip
 GEO = {
     "version": "1.1.0",
     "primary_column": "geometry",

@@ -43,17 +43,27 @@ def fleet_text(fleet: Mapping[str, Any]) -> str:
         f"{fleet['vehicles_diagnosed']} of {len(fleet['vehicles'])} vehicles diagnosed; of the names given, "
         f"{fleet['false_discovery_rate']:.0%} are expected to be false"
     ]
+    for of_type in fleet["types"]:
+        for effect in of_type["effects"]:
+            if effect["named"]:
+                lines.append(
+                    f"  all of {of_type['configuration']}: {effect['name']} ({_sizes(effect)}), "
+                    f"as {len(effect['agreeing'])} of {len(of_type['vehicles'])} vehicles show"
+                )
     for vehicle in fleet["vehicles"]:
         for effect in vehicle["effects"]:
             if effect["named"]:
                 since, onset = "", effect["onset"]
                 if onset and onset["log"] != vehicle["logs"][0]:
                     since = f", since {onset['log']} (probability {onset['probability']:.2f})"
-                sizes = ", ".join(f"{n} {e['value']:.4g} ± {e['std']:.2g}" for n, e in effect["parameters"].items())
-                lines.append(f"  {vehicle['vehicle']}: {effect['name']} ({sizes}){since}")
+                lines.append(f"  {vehicle['vehicle']}: {effect['name']} ({_sizes(effect)}){since}")
         if vehicle["fault"]:
             lines.append(f"  {vehicle['vehicle']}: not diagnosed: {vehicle['fault']}")
     return "\n".join(lines) + "\n"
+
+
+def _sizes(effect: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} {each['value']:.4g} ± {each['std']:.2g}" for name, each in effect["parameters"].items())
 
 
 def _row(row: Mapping[str, Any]) -> tuple[str, ...]:

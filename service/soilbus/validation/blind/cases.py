@@ -148,7 +148,7 @@ def _case(kind: str, seed: int, number: int, forms: tuple[Form, ...], size: str,
     soil, with_sinkage = soil_named(name), bool(rng.integers(2)) or any(form.by_sinkage for form in forms)
     with_sinkage &= all(wheel.sinkage is not None for wheel in _configuration(machine).wheel)
     config = _configured(kind, _configuration(machine), soil, with_sinkage, rng)
-    setting = Setting(soil, _plain_sinkage(soil, machine), rng)
+    setting = Setting(soil, plain_sinkage(soil, machine), rng)
     parts = tuple(form.hide(form.size(size, with_sinkage), setting) for form in forms)
     sensors, other = "sinkage" if with_sinkage else "bare", machine if machine != TRACTOR.stem else ""
     return Case(
@@ -212,7 +212,7 @@ def _configuration(machine: str) -> Config:
 
 
 @cache
-def _plain_sinkage(soil: Soil, machine: str) -> float:
+def plain_sinkage(soil: Soil, machine: str = TRACTOR.stem) -> float:
     """Sinkage [m] of a rear wheel under a quarter of the tractor at a slip of 0.2."""
     config = _configuration(machine)
     assert config.vehicle is not None

@@ -1,0 +1,463 @@
+"""Effects that all vehicles of a type share, apart from those of single vehicles.
+
+    log p(type has e)      = sum over v of log L_v  with  integral of prod over v of L_v(u) dp(u)      one value u
+    log p(vehicles' own)   = sum over v of log [pi_0 + sum over e of pi_e integral of L_v,e(u) dp(u)]  a value each
+
+L_v,e(u) is the likelihood of effect e's size by the logs of vehicle v alone (Gaussian around its fit), soils and
+sensor gains eliminated.  Equal values in several vehicles are a coincidence unless the type has the effect.  pi is the
+share of vehicles that have an effect of their own, and which, as the other vehicles of the type show it (empirical
+Bayes: Efron 2010, Large-Scale Inference, ch. 5; with a rule of succession, so that few vehicles teach little).
+Evidences are tempered as in `verdict`: a formula that is off is off in all vehicles.  A vehicle with a fault of its own
+may contradict the type's value, so vehicles that their own effects explain better are left out, while most remain.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit, logsumexp, softmax
+
+from soilbus.arrays import Array
+from soilbus.diagnosis.diagnose import Diagnosis
+from soilbus.diagnosis.evidence import OwnParameters, mixture_neg2_log_evidence
+from soilbus.diagnosis.fitted_model import FittedModel, fit_model
+from soilbus.diagnosis.records import Record
+from soilbus.diagnosis.score import joint_equations, normal_equations, scores
+from soilbus.diagnosis.verdict import temperature, temperature_of_all
+from soilbus.estimation.nuisance_parameters import Free, parameters_of
+from soilbus.estimation.posterior import Estimate, SoilPrior
+from soilbus.terra.effects.effect import Effect
+
+__all__ = [
+    "Factor",
+    "SharedEffect",
+    "factors_of",
+    "own_probabilities",
+    "records_with",
+    "shared_effect",
+    "shared_effects",
+]
+
+MIN_VEHICLES = 3
+"""Vehicles from which on a type is judged: with two, the one that differs cannot be told from the one that does not."""
+MAX_SHARED = 2
+"""Effects of a type at most; each costs a diagnosis of every vehicle."""
+LEAST_PROBABILITY = 0.5
+"""Probability from which the vehicles are diagnosed again with an effect of the type."""
+MAX_LEAVING = 32
+"""One vehicle in this many leaves at a time; bounds the time of a large type."""
+LEAST_SHARE = 1e-6
+"""Probability below which a name, or nothing, is not taken to be: it is the rounding of a sum."""
+ROUNDS = 20
+"""Rounds of the shares of vehicles with each effect, which settle in a few."""
+
+
+@dataclass(frozen=True, slots=True)
+class Factor:
+    """What the logs of one vehicle say of one effect's size.
+
+    Attributes
+    ----------
+    falls
+        Fall of -2 log evidence by the effect, and by each that may be there in its place, by name.
+    divisor
+        What these are divided by (see `verdict`).
+    own
+        Likelihood of the effect's parameters, those of the whole vehicle, about their neutral values in units of the
+        catalogue's prior std.
+    """
+
+    falls: Mapping[str, float]
+    divisor: float
+    own: OwnParameters
+
+
+@dataclass(frozen=True, slots=True)
+class SharedEffect:
+    """An effect that a type of vehicles has.
+
+    Attributes
+    ----------
+    effect, probability
+        The effect, and that the type has it.
+    vehicles
+        Indices of the vehicles that agree in its value.
+    parameters
+        Value and std by name; a wheel's own with the wheel's number behind a dot.
+    given
+        For each vehicle, the effect's parameters with a prior from the other vehicles.
+    """
+
+    effect: Effect
+    probability: float
+    vehicles: tuple[int, ...]
+    parameters: Mapping[str, Estimate]
+    given: tuple[tuple[Free, ...], ...]
+
+
+# --- one vehicle
+
+
+def factors_of(
+    records: Sequence[Record], prior: SoilPrior, found: Diagnosis, catalogue: Sequence[Effect]
+) -> dict[str, Factor]:
+    """The factor of each effect that several vehicles may share; those of the ground of one log are none.
+
+    Parameters
+    ----------
+    records
+        Of one vehicle.
+    prior
+        Of the soil.
+    found
+        Their diagnosis: an effect found, and each that may be in its place, is judged beside the others found; one
+        that is neither, beside all of them.
+    catalogue
+        Effects that may be missing.
+    """
+    completed, law = found.completed, records[0].training.model.shear_law
+    possible = {
+        e.name: e for e in catalogue if not e.of_record and e.name not in found.base.names and e.base_law in (None, law)
+    }
+    factors: dict[str, Factor] = {}
+    for addition in found.additions:
+        falls = {name: fall for name, fall in addition.falls.items() if np.isfinite(fall)}
+        others = [e for e in completed.effects if e is not addition.effect]
+        for name in sorted(possible.keys() & falls.keys() - factors.keys()):
+            if name == addition.effect.name:
+                fitted: FittedModel | None = completed
+            elif name in completed.names:
+                continue
+            else:
+                beside = [*others, possible[name]]
+                fitted = fit_model(records, prior, beside, completed.as_starts(beside))
+            own = None if fitted is None else _by_fit(records, prior, fitted, possible[name])
+            if own is not None:
+                factors[name] = Factor(falls, addition.temperature, own)
+    rest = [e for e in possible.values() if e.name not in factors and e.name not in completed.names]
+    return factors | _by_score(records, prior, completed, rest)
+
+
+def _by_fit(records: Sequence[Record], prior: SoilPrior, fitted: FittedModel, effect: Effect) -> OwnParameters | None:
+    """Likelihood by a fit with the effect; None where the model without it cannot be fitted.
+
+    A fit that holds a parameter at an edge has no information on it: then it is that of the score without the effect,
+    with its optimum where the fit ended.
+    """
+    if all(f.std > 0.0 for f in fitted.free if f.effect == effect.name):
+        return fitted.shared_parameters(effect)
+    others = [e for e in fitted.effects if e is not effect]
+    without = fit_model(records, prior, others, fitted.as_starts(others))
+    if without is None:
+        return None
+    own = _by_score(records, prior, without, [effect])[effect.name].own
+    at = {f.name: first.standardised(f.at(u)) for f, first, u in _effect_values(fitted)}
+    return own._replace(information_vector=own.information @ [at[f.name] for f in own.free])
+
+
+def _effect_values(fitted: FittedModel) -> Iterator[tuple[Free, Free, float]]:
+    """Each parameter of the effects as fitted, before any was held, and its standardised value."""
+    n_sensors = fitted.checks[0].problem.n_sensors
+    return zip(fitted.free, fitted.free_unheld, fitted.fits[-1].mode.gains[n_sensors:].tolist(), strict=True)
+
+
+def _by_score(
+    records: Sequence[Record], prior: SoilPrior, present: FittedModel, effects: Sequence[Effect]
+) -> dict[str, Factor]:
+    """By one linearisation where the effects are absent, which knows no range of the parameters."""
+    if not effects:
+        return {}
+    free = [f for effect in effects for f in parameters_of(effect, records[0].training.n_wheels)]
+    joint = joint_equations(normal_equations(records, prior, present, effects, free))
+    factors = {}
+    for score in scores(records, prior, present, effects):
+        effect = score.effect
+        shared = [
+            i for i, f in enumerate(free) if f.effect == effect.name and not effect.own_in_each_record(f.parameter)
+        ]
+        information, vector = joint.information[np.ix_(shared, shared)], -joint.gradient[shared]
+        own = OwnParameters(information, vector, tuple(free[i] for i in shared))
+        fall = -score.neg2_log_evidence
+        factors[effect.name] = Factor({effect.name: fall}, temperature(present.excess), own)
+    return factors
+
+
+def records_with(records: Sequence[Record], effect: Effect, free: Sequence[Free]) -> list[Record]:
+    """The same recordings under a present model that has an effect of the type."""
+    return [
+        record.with_effects((*record.training.effects, effect), (*record.training.free, *free)) for record in records
+    ]
+
+
+# --- the vehicles of a type
+
+
+class Pool(NamedTuple):
+    """Likelihood of one value in several vehicles, each divided by a temperature; all in the same `free`.
+
+    falls (V,) are those of -2 log evidence by a value each.
+    """
+
+    parts: tuple[OwnParameters, ...]
+    falls: Array
+    divisors: Array
+
+    def sum(self, chosen: Sequence[int]) -> OwnParameters:
+        """Of the chosen vehicles together."""
+        information = np.sum([self.parts[i].information / self.divisors[i] for i in chosen], axis=0)
+        vector = np.sum([self.parts[i].information_vector / self.divisors[i] for i in chosen], axis=0)
+        return OwnParameters(information, vector, self.parts[0].free)
+
+    def log_evidence(self, chosen: Sequence[int]) -> float:
+        """Of one value in the chosen vehicles, relative to the effect's absence."""
+        each = np.array([self.falls[i] + _neg2_log_evidence(self.parts[i]) for i in chosen])
+        return float(np.sum(each / self.divisors[list(chosen)]) - _neg2_log_evidence(self.sum(chosen))) / 2.0
+
+
+def _neg2_log_evidence(own: OwnParameters) -> float:
+    return mixture_neg2_log_evidence(own.information, own.information_vector, own.free)
+
+
+def shared_effects(
+    effects: Mapping[str, Effect],
+    n_wheels: int,
+    factors_beside: Callable[[tuple[SharedEffect, ...]], Sequence[Mapping[str, Factor]]],
+) -> tuple[SharedEffect, ...]:
+    """The effects that a type has, one after the other.
+
+    Parameters
+    ----------
+    effects, n_wheels
+        As of shared_effect().
+    factors_beside
+        Diagnoses every vehicle beside effects of the type; gives their factors.
+    """
+    found: tuple[SharedEffect, ...] = ()
+    vehicles = factors_beside(found)
+    while len(found) < MAX_SHARED and (one := shared_effect(effects, vehicles, n_wheels)) is not None:
+        found = (*found, one)
+        vehicles = factors_beside(found)
+    return found
+
+
+def shared_effect(
+    effects: Mapping[str, Effect], vehicles: Sequence[Mapping[str, Factor]], n_wheels: int
+) -> SharedEffect | None:
+    """The effect that the vehicles of a type share, the most probable one.
+
+    Parameters
+    ----------
+    effects
+        Of the catalogue, by name.
+    vehicles
+        Of each vehicle of the type, the factors by name; {} of one that says nothing.
+    n_wheels
+        Of a vehicle.
+
+    Returns
+    -------
+    SharedEffect or None
+        None where the vehicles' own effects, or none, explain as much.
+    """
+    usable = [v for v, factors in enumerate(vehicles) if factors]
+    if len(usable) < MIN_VEHICLES:
+        return None
+    found = _most_probable([vehicles[v] for v in usable])
+    if found is None:
+        return None
+    name, pool, chosen, p = found
+    free, members = parameters_of(effects[name], n_wheels), [usable[i] for i in chosen]
+    given = []
+    for v in range(len(vehicles)):
+        others = [i for i in chosen if usable[i] != v]
+        given.append(_given(free, pool.sum(others)))
+    common = {f.name for f in pool.parts[0].free}
+    values = [f for f in _given(free, pool.sum(chosen)) if f.name in common]
+    parameters = {f.name.removeprefix(f"{name}."): Estimate(f.value, f.std) for f in values}
+    return SharedEffect(effects[name], p, tuple(members), parameters, tuple(given))
+
+
+def _most_probable(vehicles: Sequence[Mapping[str, Factor]]) -> tuple[str, Pool, list[int], float] | None:
+    """Name, factors, vehicles that agree, and probability."""
+    names = len(set.union(*(set(factors) for factors in vehicles)))
+    pools: dict[str, Pool] = {}
+    agreeing: dict[str, list[int]] = {}
+    gains: dict[str, float] = {}
+    for name in sorted(set.union(*(set(factors) for factors in vehicles))):
+        shown = [v for v, factors in enumerate(vehicles) if name in factors]
+        pool, own = _pool(name, vehicles), np.zeros(len(vehicles))
+        if not pool.parts[0].free:
+            continue
+        own[shown] = _own_log_evidence(name, [vehicles[v] for v in shown])
+        chosen = _agreeing(pool, own, shown)
+        if chosen is not None:
+            pools[name], agreeing[name] = pool, chosen
+            # any effect of the catalogue may be the type's, each as likely beforehand as another
+            gains[name] = pool.log_evidence(chosen) - float(own[chosen].sum()) - math.log(names)
+    if not gains:
+        return None
+    best = max(gains, key=lambda name: gains[name])
+    p = _name_probability(best, [vehicles[v] for v in agreeing[best]]) * float(expit(gains[best]))
+    return (best, pools[best], agreeing[best], p) if p >= LEAST_PROBABILITY else None
+
+
+def _name_probability(best: str, vehicles: Sequence[Mapping[str, Factor]]) -> float:
+    """Probability of a name among those in its place in the vehicles that agree.
+
+    At the temperature of all their recordings together, as a formula that is off is off in all of them.
+    """
+    places = [factors[best] for factors in vehicles]
+    pools: dict[str, Pool] = {}
+    for name in sorted({rival for place in places for rival in place.falls}):
+        here = [
+            {name: replace(factors[name], falls=place.falls)} if name in factors and name in place.falls else {}
+            for factors, place in zip(vehicles, places, strict=True)
+        ]
+        if any(here):
+            pool = _pool(name, here)
+            pools |= {name: pool} if pool.parts[0].free else {}
+    divisors = np.full(len(vehicles), temperature_of_all([place.divisor for place in places]))
+    chances = softmax([pool._replace(divisors=divisors).log_evidence(range(len(vehicles))) for pool in pools.values()])
+    return float(chances[list(pools).index(best)])
+
+
+def _pool(name: str, vehicles: Sequence[Mapping[str, Factor]]) -> Pool:
+    """The factors in the parameters that all have, others are marginalised; a vehicle without a factor is neutral."""
+    factors = [of_vehicle.get(name) for of_vehicle in vehicles]
+    common = set.intersection(*({f.name for f in factor.own.free} for factor in factors if factor is not None))
+    known = {v: _marginal(factor.own, common) for v, factor in enumerate(factors) if factor is not None}
+    P, free = len(common), next(iter(known.values())).free
+    nothing = OwnParameters(np.zeros((P, P)), np.zeros(P), free)
+    falls = [0.0 if factor is None else factor.falls[name] for factor in factors]
+    divisors = [1.0 if factor is None else factor.divisor for factor in factors]
+    return Pool(tuple(known.get(v, nothing) for v in range(len(factors))), np.array(falls), np.array(divisors))
+
+
+def _marginal(own: OwnParameters, names: set[str]) -> OwnParameters:
+    kept = [i for i, f in enumerate(own.free) if f.name in names]
+    posterior = np.linalg.inv(own.information + np.eye(len(own.free)))
+    precision = np.linalg.inv(posterior[np.ix_(kept, kept)])
+    vector = precision @ (posterior @ own.information_vector)[kept]
+    return OwnParameters(precision - np.eye(len(kept)), vector, tuple(own.free[i] for i in kept))
+
+
+def _agreeing(pool: Pool, own: Array, shown: Sequence[int]) -> list[int] | None:
+    """The vehicles that one value explains better than effects of their own; None where these are not most of all.
+
+    Most must show the effect too: with the value of the others it explains something in them.  shown are those whose
+    logs say something of the effect.
+    """
+    V = len(pool.parts)
+    chosen = list(shown)
+    while _are_most(chosen, V):
+        whole = pool.log_evidence(chosen)
+        gains = np.array([whole - pool.log_evidence([j for j in chosen if j != i]) for i in chosen])
+        worse = gains - own[chosen]
+        if worse.min() >= 0.0:
+            break
+        leaving = {chosen[k] for k in np.argsort(worse)[: 1 + V // MAX_LEAVING] if worse[k] < 0.0}
+        chosen = [i for i in chosen if i not in leaving]
+    else:
+        return None
+    whole = pool.log_evidence(chosen)  # a vehicle may have left on account of another that left after it
+    back = [i for i in shown if i not in chosen and pool.log_evidence([*chosen, i]) - whole >= own[i]]
+    chosen = sorted([*chosen, *back])
+    whole = pool.log_evidence(chosen)
+    showing = [i for i in chosen if whole > pool.log_evidence([j for j in chosen if j != i])]
+    return chosen if _are_most(showing, V) else None
+
+
+def _are_most(chosen: Sequence[int], vehicles: int) -> bool:
+    return 2 * len(chosen) > vehicles and len(chosen) >= MIN_VEHICLES
+
+
+def _own_log_evidence(name: str, vehicles: Sequence[Mapping[str, Factor]]) -> Array:
+    """Tempered log evidence (V,) of an effect of each vehicle's own in the place of this one, relative to none.
+
+    A value of its own is paid in full in each vehicle: data divided by a temperature tell it less well (see
+    OwnParameters.surcharge).
+    """
+    names = sorted({rival for factors in vehicles for rival in factors[name].falls})
+    log_odds = np.full((len(vehicles), len(names)), -np.inf)
+    for v, factors in enumerate(vehicles):
+        here = factors[name]
+        for rival, fall in here.falls.items():
+            own = factors.get(rival, here).own
+            log_odds[v, names.index(rival)] = (fall / here.divisor - own.surcharge(here.divisor)) / 2.0
+    nothing, each = _shares(log_odds, np.arange(len(vehicles)))
+    return np.asarray(logsumexp(np.column_stack([np.log(nothing), log_odds + np.log(each)]), axis=1))
+
+
+def _shares(log_odds: Array, vehicle: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Probability of nothing (R,) and of each effect (R, K), in each place, as those of other vehicles show them.
+
+    Parameters
+    ----------
+    log_odds : (R, K)
+        Log evidence of each effect relative to nothing, in each place for an effect.
+    vehicle : (R,)
+        Of each place.
+    """
+    R, K = log_odds.shape
+    elsewhere = (vehicle[:, None] != vehicle).astype(float)
+    nothing, each = np.full(R, 0.5), np.full((R, K), 0.5 / K)
+    for _ in range(ROUNDS):
+        log_joint = np.column_stack([np.log(nothing), log_odds + np.log(each)])
+        posterior = np.exp(log_joint - logsumexp(log_joint, axis=1, keepdims=True))
+        others = elsewhere @ posterior
+        with_one = others[:, 1:].sum(1)
+        something = (with_one + 1.0) / (others.sum(1) + 2.0)
+        nothing = 1.0 - something
+        each = something[:, None] * (others[:, 1:] + 1.0) / (with_one + K)[:, None]
+    return nothing, each
+
+
+def own_probabilities(found: Sequence[Sequence[Mapping[str, float]]], names: int) -> list[list[dict[str, float]]]:
+    """Probabilities of vehicles' own effects, by how common these are in the other vehicles of the type.
+
+    Parameters
+    ----------
+    found
+        Of each vehicle, for each effect that it shows, the probabilities of its names: each name as likely beforehand
+        as another, and all together as nothing.
+    names
+        Effects that can be named.
+
+    Returns
+    -------
+    list of list of dict
+        The same names.
+    """
+    # a vehicle that shows nothing counts as one place with nothing in it
+    places = [(v, place) for v, of_vehicle in enumerate(found) for place in (of_vehicle or [{}])]
+    columns = sorted({name for _, place in places for name in place})
+    K = max(names, len(columns))
+    log_odds = np.full((len(places), K), -np.inf)
+    for r, (_, place) in enumerate(places):
+        nothing = max(1.0 - sum(place.values()), LEAST_SHARE)
+        for name, p in place.items():
+            log_odds[r, columns.index(name)] = np.log(max(p, LEAST_SHARE) / nothing * K)
+    none, share = _shares(log_odds, np.array([v for v, _ in places]))
+    log_joint = np.column_stack([np.log(none), log_odds + np.log(share)])
+    posterior = np.exp(log_joint - logsumexp(log_joint, axis=1, keepdims=True))[:, 1:]
+    out: list[list[dict[str, float]]] = [[] for _ in found]
+    for r, (v, place) in enumerate(places):
+        if place:
+            out[v].append({name: float(posterior[r, columns.index(name)]) for name in place})
+    return out
+
+
+def _given(parameters: Sequence[Free], likelihood: OwnParameters) -> tuple[Free, ...]:
+    """An effect's parameters with the posterior by a likelihood as prior."""
+    covariance = np.linalg.inv(likelihood.information + np.eye(len(likelihood.free)))
+    mean, sd = covariance @ likelihood.information_vector, np.sqrt(np.diag(covariance))
+    at = {f.name: i for i, f in enumerate(likelihood.free)}
+    return tuple(
+        replace(f, value=f.at(float(mean[at[f.name]])), std=f.std * float(sd[at[f.name]])) if f.name in at else f
+        for f in parameters
+    )
