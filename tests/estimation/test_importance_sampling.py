@@ -9,7 +9,7 @@ import pytest
 
 from soilbus.estimation.assembly import prior_of
 from soilbus.estimation.gaussian import Gaussian
-from soilbus.estimation.laplace import profile_over_n, with_nested_laplace
+from soilbus.estimation.laplace import attainable_variance, error_weights, profile_over_n, with_nested_laplace
 from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.parametrization import Coordinates
 from soilbus.estimation.posterior import SoilPrior
@@ -40,10 +40,17 @@ def test_the_average_along_n_has_the_moments_of_the_sampled_posterior(uncertain)
     assert found.share.sum() == pytest.approx(1.0)
     assert found.effective > 60.0
     reported = with_nested_laplace(problem, prior, joint_prior, fit).reported
+    along = profile_over_n(problem, prior, joint_prior, fit)
+    of_nodes = attainable_variance(along, prior, joint_prior)
+    u = [node.u for node in along.nodes]
+    attainable = np.array([np.interp(found.logs[:, 2], u, column) for column in of_nodes.T]).T
+    assert attainable[:, 0].max() > 2.0 * attainable[:, 0].min()  # the weights of errors matter
     # In coordinates, where k_phi is replaced by the bearing pressure.
     coordinates = Coordinates(prior, float(problem.rig.width.mean()))
     position = np.array([coordinates.position(soil) for soil in np.exp(found.logs)])
-    mean = found.share @ position
+    of_all, of_k_c = error_weights(found.share, attainable)
+    mean = of_all @ position
+    mean[0] = of_k_c @ position[:, 0]
     std = np.sqrt(found.share @ (position - mean) ** 2)
     chance = 3.5 / np.sqrt(found.effective)
     assert np.abs((coordinates.position(reported.soil) - mean) / std).max() < 0.1 + chance

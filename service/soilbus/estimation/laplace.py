@@ -5,11 +5,10 @@ L(u) = -2 log posterior of that fit and q(u) = -2 log prior of u,
 
     density       p(u) ~ exp(-(E(u) + q(u)) / 2)
     confidence    r(u) = sign(u - u_min) sqrt(L(u) + q(u) - min) ~ N(0, 1)
-    mean          sum over u of ((1 - d) p(u) + d c(u)) mean(u)
+    mean          sum over u of weight(u) mean(u)
     covariance    sum over u of c(u) (covariance(u) + a (mean(u) - mean)(mean(u) - mean)')
 
-with c the confidence distribution, d = 1 - posterior over prior variance of log k_c at the mode, and a >= 1 for the
-skewness of c (`longer_side`).
+with c the confidence distribution and a >= 1 for its skewness (`longer_side`).
 
 At constant loads tyres of two widths measure two points of the pressure-sinkage curve, and k_c, k_phi and n
 are three unknowns.  The soils that fit lie along a curved ridge on which k_c rises and falls again while n only
@@ -18,11 +17,11 @@ fits are averaged (Rue, Martino & Chopin 2009, J. R. Stat. Soc. B 71:319, sect. 
 
 The density counts the volume of what the data leave open.  Where k_c may be close to zero that volume is large
 on the logarithm's scale, and soils with much k_c get less probability than their fit deserves.  That gives the
-best mean where small k_c is among the likely soils.  Where the data determine k_c it is only a bias by the choice
-of the logarithm: the better k_c is determined, the more the mean goes by the confidence distribution, in which the
-signed root of the profile likelihood is standard normal (Barndorff-Nielsen & Cox 1994, Inference and Asymptotics,
-sect. 3.4).  The covariance always goes by the confidence distribution: intervals by the density exclude soils with
-much k_c too often when they are true.
+best mean where small k_c is among the likely soils.  Where the data determine k_c one sd above the mean,
+it is only a bias by the choice of the logarithm: the better k_c is determined there, the more the mean goes by
+the confidence distribution, in which the signed root of the profile likelihood is standard normal
+(Barndorff-Nielsen & Cox 1994, Inference and Asymptotics, sect. 3.4).  The covariance always goes by the confidence
+distribution: intervals by the density exclude soils with much k_c too often when they are true.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.arrays import Array, Indices
-from soilbus.estimation.gaussian import Gaussian
+from soilbus.estimation.gaussian import Gaussian, solve_with_inverse
 from soilbus.estimation.multistart import Fit, fit_window, refine
 from soilbus.estimation.observation_model import DenoisedObservationModel, ObservationModel
 from soilbus.estimation.parametrization import BOUND_SD, Coordinates
@@ -57,8 +56,15 @@ NEGLIGIBLE = 9.0
 """-2 log density over its least value where the ridge has ended: 3 sd of a normal distribution."""
 GRID_POINTS = 400
 """Values of n between the first and the last node that are averaged.  No evidence recorded."""
+ERROR_POWER, ERROR_POWER_OF_K_C = 1.0, 2.0
+"""Powers [1] of the attainable sd of a soil by which an error counts less there.
+
+With 2 the mean square error is least in units of what is attainable on each soil, with 0 that of the logarithm.
+"""
 _SOIL = len(PARAMETERS)
 _K_C, _K_PHI, _N = (PARAMETERS.index(name) for name in ("k_c", "k_phi", "n"))
+_OF_K_C, _OF_N = 0, 1
+"""Columns of attainable variances."""
 
 
 class Node(NamedTuple):
@@ -128,7 +134,10 @@ def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, joint_prior
         if along is None:
             return found
         coordinates = Coordinates(prior, float(problem.rig.width.mean()))
-        averaged = _averaged(along, coordinates, joint_prior) if len(along.nodes) > 2 else along.top.gaussian
+        attainable = attainable_variance(along, prior, joint_prior) if len(along.nodes) > 2 else None
+        averaged = (
+            along.top.gaussian if attainable is None else _averaged(along.nodes, attainable, coordinates, joint_prior)
+        )
     is_finite = np.isfinite(averaged.soil).all() and np.isfinite(averaged.covariance).all()
     if not is_finite or found.second_mode is not None:  # beside a second mode the first stays as it was found
         return replace(found, marginalised=averaged) if is_finite else found
@@ -170,6 +179,49 @@ def profile_over_n(
     slope = covariance[:, _N] / covariance[_N, _N]
     down, up = (_one_side(denoised, prior, joint_prior, first, slope, sign * step) for sign in (-1.0, 1.0))
     return ProfileOverN(denoised, top, [*reversed(down), first, *up])
+
+
+def attainable_variance(along: ProfileOverN, prior: SoilPrior, joint_prior: Gaussian) -> Array | None:
+    """Variance that a window on each node's soil could attain.
+
+    Returns
+    -------
+    (nodes, 2) or None
+        Of log k_c and log n.  None where the information of a node is singular.
+    """
+    objective = Objective(along.problem, prior, joint_prior)
+    columns = np.searchsorted(objective.free, [_K_C, _N])
+    variance = []
+    for node in along.nodes:
+        optimum = node.fit.optimum
+        iterate = Iterate(optimum.soil, optimum.gains, optimum.latents)
+        model = objective.with_prior(iterate, optimum.at)
+        inverse = None if model is None else solve_with_inverse(model.information, model.gradient)
+        if inverse is None:
+            return None
+        variance.append(inverse[1].diagonal()[columns])
+    return np.array(variance)
+
+
+def error_weights(probability: Array, attainable: Array) -> tuple[Array, Array]:
+    """Weights of M soils such that the weighted mean has the least error, by ERROR_POWER and ERROR_POWER_OF_K_C.
+
+    Parameters
+    ----------
+    probability : (M,)
+        Of the soils.
+    attainable : (M, 2)
+        Variance of log k_c and log n that is attainable there.
+
+    Returns
+    -------
+    (M,), (M,)
+        For all coordinates, by the variance of log n: combinations with n that the data determine stay so.
+        For log k_c, by its own variance.
+    """
+    of_all = probability * attainable[:, _OF_N] ** (-0.5 * ERROR_POWER)
+    of_k_c = probability * attainable[:, _OF_K_C] ** (-0.5 * ERROR_POWER_OF_K_C)
+    return of_all / of_all.sum(), of_k_c / of_k_c.sum()
 
 
 def density(u: Array, neg2_log: Array, fine: Array) -> Array:
@@ -270,9 +322,12 @@ def _logs_and_gains(fit: Fit) -> Array:
     return np.concatenate([np.log(fit.optimum.soil), fit.optimum.gains])
 
 
-def _averaged(along: ProfileOverN, coordinates: Coordinates, joint_prior: Gaussian) -> Gaussian:
-    """Mean and covariance along n, from the nodes and linear interpolation between them."""
-    nodes = along.nodes
+def _averaged(nodes: list[Node], attainable: Array, coordinates: Coordinates, joint_prior: Gaussian) -> Gaussian:
+    """Mean and covariance along n, from the nodes and linear interpolation between them.
+
+    On the soils of one ridge a window's attainable sd, attainable (nodes, 2) as variance, differs by up to a
+    factor of ten: each soil counts by `error_weights`, so that the mean square error is least.
+    """
     free = coordinates.free
     active = _SOIL + np.flatnonzero(np.diag(joint_prior.covariance)[_SOIL:] > 0.0)
     gaussians = [node.fit.gaussian for node in nodes]
@@ -281,16 +336,18 @@ def _averaged(along: ProfileOverN, coordinates: Coordinates, joint_prior: Gaussi
     by_density = density(u, np.array([node.neg2_log_density for node in nodes]), fine)
     by_confidence = confidence(u, np.array([node.neg2_log_profile for node in nodes]), fine)
     interpolation = np.array([np.interp(fine, u, one) for one in np.eye(len(u))])
-    variance_of_k_c = along.top.mode.covariance[_K_C, _K_C]
-    determined = max(0.0, 1.0 - variance_of_k_c / joint_prior.variance_of_k_c(coordinates.prior))
+    variance_above = _one_sd_above(fine, by_density, attainable[:, _OF_K_C] @ interpolation)
+    determined = 1.0 - variance_above / joint_prior.variance_of_k_c(coordinates.prior)
     position = np.array([[*coordinates.position(b.soil), *b.gains[active - _SOIL]] for b in gaussians])
     unbiased = np.array([_unbiased_k_c(node, joint_prior, coordinates.prior) for node in nodes])
     position[:, _K_C] += determined * (unbiased - position[:, _K_C])
-    means = position.T @ interpolation
+    along = position.T @ interpolation
     own = np.array([_in_coordinates(b.covariance, coordinates.log_directions(b.soil), free, active) for b in gaussians])
     probability = determined * by_confidence + (1.0 - determined) * by_density
-    mean = means @ probability
-    off = means - mean[:, None]
+    of_all, of_k_c = error_weights(probability, interpolation.T @ attainable)
+    mean = along @ of_all
+    mean[_K_C] = along[_K_C] @ of_k_c
+    off = along - mean[:, None]
     inflation = longer_side(fine - fine @ by_density, by_confidence)  # grows as the two distributions differ, too
     spread = inflation * (off * by_confidence) @ off.T
     covariance = np.tensordot(interpolation @ by_confidence, own, axes=1) + spread
@@ -308,6 +365,12 @@ def _in_coordinates(covariance: Array, directions: Array, free: Indices, active:
     back = np.eye(len(unknowns))
     back[: len(free), : len(free)] = np.linalg.inv(directions[free])
     return np.asarray(back @ covariance[np.ix_(unknowns, unknowns)] @ back.T)
+
+
+def _one_sd_above(fine: Array, probability: Array, value: Array) -> float:
+    """A value (M,) on a grid (M,), interpolated one sd above the mean of these probabilities (M,)."""
+    mean = float(fine @ probability)
+    return float(np.interp(mean + math.sqrt((fine - mean) ** 2 @ probability), fine, value))
 
 
 def _unbiased_k_c(node: Node, joint_prior: Gaussian, prior: SoilPrior) -> float:
