@@ -49,6 +49,8 @@ MAX_SHARED = 2
 """Effects of a type at most; each costs a diagnosis of every vehicle."""
 LEAST_PROBABILITY = 0.5
 """Probability from which the vehicles are diagnosed again with an effect of the type."""
+LEAST_LOG_EVIDENCE = 1.0
+"""Tempered log evidence [nat], odds of e, from which a vehicle shows an effect: sound vehicles scatter about zero."""
 MAX_LEAVING = 32
 """One vehicle in this many leaves at a time; bounds the time of a large type."""
 LEAST_SHARE = 1e-6
@@ -368,7 +370,8 @@ def _agreeing(pool: Pool, own: Array, shown: Sequence[int]) -> list[int] | None:
     back = [i for i in shown if i not in chosen and pool.log_evidence([*chosen, i]) - whole >= own[i]]
     chosen = sorted([*chosen, *back])
     whole = pool.log_evidence(chosen)
-    showing = [i for i in chosen if whole > pool.log_evidence([j for j in chosen if j != i])]
+    others = [pool.log_evidence([j for j in chosen if j != i]) for i in chosen]
+    showing = [i for i, without in zip(chosen, others, strict=True) if whole - without > LEAST_LOG_EVIDENCE]
     return chosen if _are_most(showing, V) else None
 
 
