@@ -24,6 +24,7 @@ from soilbus.estimation.multistart import fit_window
 from soilbus.estimation.observation_model import ObservationModel
 from soilbus.estimation.posterior import NORMAL_95
 from soilbus.sensors.bins import Bins
+from soilbus.simulator.drive import SimulationError
 from soilbus.simulator.recording import simulate
 from soilbus.simulator.reference import REFERENCES, TRACTOR, reference_configuration
 from soilbus.simulator.scenario import Patch, Scenario
@@ -63,13 +64,16 @@ def configured(machine: str, cells: str) -> Config | None:
 
 
 def errors(task: Task) -> Array | None:
-    """Errors of QUANTITIES in reported standard deviations; None where the window is not solved."""
+    """Errors of QUANTITIES in reported standard deviations; None where it cannot be driven or is not solved."""
     config = configured(task.machine, task.cells)
     assert config is not None
     soil, window = soil_named(task.soil), config.estimator.window
     config = config.model_copy(update={"wheel": [wheel.model_copy(update={"sinkage": None}) for wheel in config.wheel]})
     scenario = Scenario(window, (Patch(0.0, task.soil),), slip=SLIP_RANGE, bounce=task.bounce, drawn_mass=True)
-    recording, rig = simulate(config, scenario, task.seed), rig_of(config)
+    try:
+        recording, rig = simulate(config, scenario, task.seed), rig_of(config)
+    except SimulationError:
+        return None
     store = Bins(rig, config.estimator.bin, 0.0)
     store.add({n: (c.t, c.value) for n in rig.channels if (c := recording.channels.get(n)) is not None})
     settings = config.estimator
