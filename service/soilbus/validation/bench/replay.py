@@ -51,6 +51,6 @@ def replay_one_core_factor(log: Path, seconds: float) -> Figure:
 
     ours, peer = in_turn((whole, only_read), 3)
     return Figure(
-        seconds / ours, 300.0, f"processor time: reading alone {peer:.2f} s, whole replay {ours:.2f} s",
+        float(seconds / ours), 300.0, f"processor time: reading alone {peer:.2f} s, whole replay {ours:.2f} s",
         f"{seconds:.0f} s, four wheels, 1 s hop, one process",
     )  # fmt: skip
