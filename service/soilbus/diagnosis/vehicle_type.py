@@ -44,7 +44,7 @@ __all__ = [
 ]
 
 MIN_VEHICLES = 3
-"""Vehicles from which on a type is judged: with two, the one that differs cannot be told from the one that does not."""
+"""Vehicles from which on a type is judged: with two, nothing says which one differs."""
 MAX_SHARED = 2
 """Effects of a type at most; each costs a diagnosis of every vehicle."""
 LEAST_PROBABILITY = 0.5
