@@ -15,6 +15,9 @@ Computer Vision, 2016, sect. 4.8): with A = dr/dx and R the diagonal covariance 
 
     r <- r + A (x_measured / (1 + g_x) - x),    covariance  S = A V A' + R,    chi-square = sum r' S^-1 r.
 
+A load that is computed, not measured, stays at its prior; what it leaves open, A V A', is a weight that models share
+(`with_weights_at`), and its noise by draft and inertia is that of the balance.
+
 `ObservationModel.linearise` returns r, its derivatives by soil and g, and S^-1 times both (`Linearisation`,
 columns and rows as in `Layout`).  `ObservationModelWithEffects` adds effects to the wheel-soil model; effects
 may also be delays of channels.  `DenoisedObservationModel` takes the derivatives at latents of which the noise
