@@ -143,6 +143,12 @@ class Instrumentation:
         M[:W, :W], M[W : 2 * W, W : 2 * W] = ([row.weight for row in rows] for rows in (self.load, self.speed))
         return M
 
+    @property
+    def loads_by_torques(self) -> NDArray[np.bool_]:
+        """Which rows of loads (W,) are differences of two wheels whose torques, each measured, say more of them."""
+        computed = self.computes("torque")
+        return np.array([row.kind == "side" and not computed[np.nonzero(row.weight)].any() for row in self.load])
+
     def computes(self, quantity: str) -> NDArray[np.bool_]:
         """Which wheels (W,) have a torque, speed or load that is not wholly measured."""
         rows = getattr(self, quantity)
