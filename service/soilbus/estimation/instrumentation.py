@@ -147,7 +147,7 @@ class Instrumentation:
     def loads_by_torques(self) -> NDArray[np.bool_]:
         """Which rows of loads (W,) are differences of two wheels whose torques, each measured, say more of them."""
         computed = self.computes("torque")
-        return np.array([row.kind == "side" and not computed[np.nonzero(row.weight)].any() for row in self.load])
+        return np.array([row.kind == "side" and not computed[np.array(row.weight) != 0.0].any() for row in self.load])
 
     def computes(self, quantity: str) -> NDArray[np.bool_]:
         """Which wheels (W,) have a torque, speed or load that is not wholly measured."""

@@ -520,7 +520,7 @@ class ObservationModel(Measurements):
         return held
 
     def noise_of_fitted(self, optimum: Optimum) -> Array:
-        """Variance (N, 2 W + 1) of the noise in fitted latents: that measured, V - V A' S^-1 A V where torques say more."""
+        """Variance (N, 2 W + 1) of the noise in latents: V as measured; V - V A' S^-1 A V where torques say more."""
         A, noise, fitted = optimum.at.by_latents, optimum.at.variance, self._by_torques
         if not fitted.any():
             return noise
