@@ -145,9 +145,13 @@ class Instrumentation:
 
     @property
     def loads_by_torques(self) -> NDArray[np.bool_]:
-        """Which rows of loads (W,) are differences of two wheels whose torques, each measured, say more of them."""
-        computed = self.computes("torque")
-        return np.array([row.kind == "side" and not computed[np.array(row.weight) != 0.0].any() for row in self.load])
+        """Which rows of loads (W,) are differences of two wheels with a measured sum, and a measured torque each."""
+        computed, wheels = self.computes("torque"), np.array([row.weight for row in self.load]) != 0.0
+        sums = [on for on, row in zip(wheels, self.load, strict=True) if row.kind == "channel"]
+        return np.array([
+            row.kind == "side" and not computed[on].any() and any(np.array_equal(on, of_sum) for of_sum in sums)
+            for on, row in zip(wheels, self.load, strict=True)
+        ])  # fmt: skip
 
     def computes(self, quantity: str) -> NDArray[np.bool_]:
         """Which wheels (W,) have a torque, speed or load that is not wholly measured."""
