@@ -217,10 +217,11 @@ def _remote_files(url: str, suffixes: Sequence[str]) -> list[str]:
         files, name = url_to_fs(url)
         if glob.has_magic(name):
             return sorted(str(files.unstrip_protocol(each)) for each in files.glob(name))
-        if files.isdir(name):
+        # over HTTP a file that is asked whether it is a folder is read as a page of links
+        if not _is_log(name, suffixes) and files.isdir(name):
             found = [each for each in files.find(name) if _is_log(each, suffixes)]
             return sorted(str(files.unstrip_protocol(each)) for each in found)
-    except (ImportError, OSError, ValueError) as error:
+    except Exception as error:  # each protocol has its own
         raise BatchError(f"{url}: {one_line(error, 150)}") from None
     return [url]
 

@@ -29,9 +29,9 @@ from typing import IO, Any
 from cantools.database.can import Database
 
 from soilbus import __version__
-from soilbus.can.dbc_files import load_databases
+from soilbus.can.dbc_files import checked_messages, load_databases
 from soilbus.config.file import located
-from soilbus.config.model import Config
+from soilbus.config.model import Config, ConfigError
 from soilbus.decision.traversability import State, Status
 from soilbus.export.columns import SCHEMA_VERSION
 from soilbus.offline.replay import LogError, OtherBus, replay
@@ -145,15 +145,51 @@ def setup_of(config: Config, name: str) -> Setup:
     ConfigError
         A DBC file is missing or does not fit the configuration.
     """
-    database, texts = None, []
-    if config.table is None:
-        database = load_databases(config)
-        Pipeline(config, database)
-        texts = [located(config.folder, dbc).read_bytes() for dbc in config.dbc.input]
     digest = hashlib.sha256(config.model_dump_json().encode())
-    for text in texts:
-        digest.update(hashlib.sha256(text).digest())
+    database = None
+    if config.table is None:
+        with TemporaryDirectory(prefix="soilbus-") as folder:
+            here = _with_dbcs_here(config, Path(folder))
+            database = load_databases(here)
+            for dbc in here.dbc.input:
+                digest.update(hashlib.sha256(located(here.folder, dbc).read_bytes()).digest())
+            # a worker has none of these files: what it needs of them is the database, and the names of what is checked
+            config = _with_dbc(config, input=[], checked=sorted(checked_messages(here, database)))
+        Pipeline(config, database)
     return Setup(name, pickle.dumps((config, database)), digest.hexdigest())
+
+
+def _with_dbc(config: Config, **settings: list[str]) -> Config:
+    return config.model_copy(update={"dbc": config.dbc.model_copy(update=settings)})
+
+
+def _with_dbcs_here(config: Config, folder: Path) -> Config:
+    """The configuration with copies, in the folder, of the DBC files that it names by URL."""
+    paths = []
+    for n, name in enumerate(config.dbc.input):
+        paths.append(name)
+        if "://" in name:
+            try:
+                paths[-1] = str(_fetched(name, folder / str(n)))
+            except LogError as error:
+                raise ConfigError([f"dbc.input: {error}"]) from None
+    return _with_dbc(config, input=paths)
+
+
+def _fetched(url: str, folder: Path) -> Path:
+    """Copy of the file at a URL, in a folder that is made; LogError where there is none."""
+    from fsspec.core import url_to_fs
+
+    path = folder / url.rpartition("/")[2]
+    folder.mkdir(exist_ok=True)
+    try:
+        files, name = url_to_fs(url)
+        files.get_file(name, str(path))
+    except FileNotFoundError:
+        raise LogError(f"{url}: {MISSING}") from None
+    except Exception as error:  # each protocol has its own
+        raise LogError(f"{url}: cannot be fetched ({one_line(error, 150)})") from None
+    return path
 
 
 @lru_cache(maxsize=16)
@@ -210,19 +246,11 @@ def local_log(job: Job) -> Iterator[Path]:
         yield Path(job.log)
         return
     with TemporaryDirectory(prefix="soilbus-") as folder:
+        if job.content is None:
+            yield _fetched(job.log, Path(folder))
+            return
         path = Path(folder, job.log.rpartition("/")[2])
-        if job.content is not None:
-            path.write_bytes(job.content)
-        else:
-            from fsspec.core import url_to_fs
-
-            try:
-                files, name = url_to_fs(job.log)
-                files.get_file(name, str(path))
-            except FileNotFoundError:
-                raise LogError(f"{job.log}: {MISSING}") from None
-            except Exception as error:  # each protocol has its own
-                raise LogError(f"{job.log}: cannot be fetched ({one_line(error, 150)})") from None
+        path.write_bytes(job.content)
         yield path
 
 
