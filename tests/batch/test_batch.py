@@ -295,6 +295,19 @@ def test_workers_of_another_version_are_one_line(client, tractor, logs, tmp_path
     assert f"workers have soilbus 0.0.9, this is {soilbus.__version__}" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("missing", "line"), [("soilbus", "no soilbus"), ("soilbus.offline", "another soilbus")])
+def test_workers_without_this_soilbus_are_one_line(missing, line, client, tractor, logs, tmp_path, capsys, monkeypatch):
+    def run(*_: object) -> dict[str, str]:
+        raise RuntimeError(f"ModuleNotFoundError(\"No module named '{missing}'\")")  # as Dask says it
+
+    monkeypatch.setattr("distributed.Client.run", run)
+    arguments = ["--out", str(tmp_path / "o"), "--scheduler", client.scheduler.address]
+    assert main(["batch", "--config", tractor, str(logs), *arguments]) == 1
+    (said,) = capsys.readouterr().err.splitlines()
+    assert f"its workers have {line}" in said
+    assert "install" in said
+
+
 def test_results_are_not_overwritten_by_accident(client, done, tractor, logs, capsys):
     out, address = str(done[1]), client.scheduler.address
     assert main(["batch", "--config", tractor, str(logs), "--out", out, "--scheduler", address]) == 2

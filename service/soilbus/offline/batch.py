@@ -296,12 +296,11 @@ def worker_version() -> str:
 def _check_workers(client: Any, address: str) -> None:
     try:
         versions = set(client.run(worker_version).values())
-    except ModuleNotFoundError:
-        raise BatchError(f"{address}: its workers have no soilbus: install soilbus {__version__} there") from None
-    except Exception as error:  # of an older soilbus, in which this function is missing
-        raise BatchError(
-            f"{address}: its workers have another soilbus than {__version__} ({one_line(error, 100)})"
-        ) from None
+    except Exception as error:  # of Dask, which cannot find this function there
+        if "No module named 'soilbus'" in str(error):
+            raise BatchError(f"{address}: its workers have no soilbus: install soilbus {__version__} there") from None
+        what = f"its workers have another soilbus than {__version__}: install the same everywhere"
+        raise BatchError(f"{address}: {what} ({one_line(error, 100)})") from None
     if not versions:
         raise BatchError(f"{address}: the scheduler has no workers")
     if others := sorted(versions - {__version__}):
