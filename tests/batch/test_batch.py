@@ -295,6 +295,17 @@ def test_workers_of_another_version_are_one_line(client, tractor, logs, tmp_path
     assert f"workers have soilbus 0.0.9, this is {soilbus.__version__}" in capsys.readouterr().err
 
 
+def test_other_versions_of_dask_are_one_line(client, tractor, logs, tmp_path, capsys, monkeypatch):
+    versions = client.get_versions()
+    versions["scheduler"]["packages"] = versions["client"]["packages"] | {"dask": "1.0"}
+    monkeypatch.setattr("distributed.Client.get_versions", lambda *_: versions)
+    arguments = ["--out", str(tmp_path / "o"), "--scheduler", client.scheduler.address, "--set", SHORT]
+    assert main(["batch", "--config", tractor, str(logs / "blue/garbage.log"), *arguments]) == 1
+    said = [line for line in capsys.readouterr().err.splitlines() if "other versions" in line]
+    assert len(said) == 1
+    assert "of dask there than here" in said[0]
+
+
 @pytest.mark.parametrize(("missing", "line"), [("soilbus", "no soilbus"), ("soilbus.offline", "another soilbus")])
 def test_workers_without_this_soilbus_are_one_line(missing, line, client, tractor, logs, tmp_path, capsys, monkeypatch):
     def run(*_: object) -> dict[str, str]:

@@ -17,6 +17,7 @@ import json
 import logging
 import math
 import shutil
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
@@ -56,6 +57,8 @@ TASKS_PER_THREAD = 3
 WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": 1}
 """Of the processes started here.  Dask's own has MALLOC_TRIM_THRESHOLD_ = 64 KiB too: glibc then gives memory back to
 the kernel all the time and has it zeroed again."""
+COMPARED = ("python", "dask", "distributed", "numpy")
+"""Packages of which other versions may fail, or compute other last digits."""
 MAX_SENT_BYTES = 256 * 2**20
 """Bytes of a log that is sent along; it is in memory on its way."""
 
@@ -273,11 +276,14 @@ def cluster(address: str | None, say: Callable[[str], None], processes: int | No
                 yield client
             return
         try:
-            client = distributed.Client(address, timeout=CONNECT_TIMEOUT)
+            with warnings.catch_warnings(category=distributed.versions.VersionMismatchWarning, action="ignore"):
+                client = distributed.Client(address, timeout=CONNECT_TIMEOUT)
         except (OSError, TimeoutError, ValueError) as error:
             raise BatchError(f"{address}: no Dask scheduler there ({one_line(error, 100)})") from None
         with client:
             _check_workers(client, address)
+            if others := _other_versions(client):
+                say(f"{address}: other versions of {', '.join(others)} there than here: install the same everywhere")
             _announce(client, say)
             yield client
 
@@ -307,6 +313,13 @@ def _check_workers(client: Any, address: str) -> None:
         raise BatchError(
             f"{address}: workers have soilbus {', '.join(others)}, this is {__version__}: install the same everywhere"
         )
+
+
+def _other_versions(client: Any) -> list[str]:
+    """Packages whose version differs between this process, the scheduler and its workers."""
+    found = client.get_versions()
+    here, there = found["client"]["packages"], [found["scheduler"], *found["workers"].values()]
+    return [name for name in COMPARED if any(each["packages"].get(name) != here.get(name) for each in there)]
 
 
 def done_in_turn(
