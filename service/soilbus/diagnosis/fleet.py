@@ -37,6 +37,7 @@ __all__ = [
     "named",
     "onset_of",
     "onset_probabilities",
+    "onsets_of",
 ]
 
 FALSE_DISCOVERY_RATE = 0.05
