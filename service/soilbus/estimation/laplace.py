@@ -107,10 +107,10 @@ class ProfileOverN(NamedTuple):
 def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, found: Fit) -> Fit:
     """The fit with mean and covariance of the whole posterior where its mode does not describe it.
 
-    That is where the sd of log n exceeds DETERMINED_N_SD or there is a second mode.  There, and where loads hardly
-    vary, the noise of loads and speeds may have added false information on n or c, so the denoised window is fitted
-    (`DenoisedObservationModel`).  Where k_c, k_phi and n are free and tyres differ in width, its posterior is
-    averaged along n, unless n is determined.
+    That is where the sd of log n (`_sd_of_n`) exceeds DETERMINED_N_SD or there is a second mode.  There, and where
+    loads hardly vary, the noise of loads and speeds may have added false information on n or c, so the denoised window
+    is fitted (`DenoisedObservationModel`).  Where k_c, k_phi and n are free and tyres differ in width, its posterior
+    is averaged along n, unless n is determined.
 
     Parameters
     ----------
@@ -125,8 +125,7 @@ def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, joint_prior
         With `marginalised`, and with the denoised window's Gaussians unless there is a second mode; `found` itself
         where there is nothing to average.
     """
-    spread = math.sqrt(found.mode.covariance[_N, _N])
-    is_determined = spread < DETERMINED_N_SD and found.second_mode is None
+    is_determined = _sd_of_n(problem, prior, joint_prior, found.mode) < DETERMINED_N_SD and found.second_mode is None
     if is_determined and load_signal(problem, found) > MIN_LOAD_SIGNAL:
         return found
     with np.errstate(all="ignore"):
@@ -142,6 +141,21 @@ def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, joint_prior
     if not is_finite or found.second_mode is not None:  # beside a second mode the first stays as it was found
         return replace(found, marginalised=averaged) if is_finite else found
     return replace(found, mode=along.top.mode, marginalised=averaged)
+
+
+def _sd_of_n(problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian, mode: Gaussian) -> float:
+    """Sd of log n where k_c's share s in K_L has the sd that the data and its prior leave it, at most 1.
+
+    The model is linear in s, not in log k_c: where a small s may as well be large, n is as open as it is there.
+    Relative variance: of the data 1 / (1 / var(log k_c) - 1 / var_0), of the prior exp(var_0) - 1, at most 1 / s^2.
+    """
+    of_k_c, of_n, both = mode.covariance[_K_C, _K_C], mode.covariance[_N, _N], mode.covariance[_K_C, _N]
+    if of_k_c <= 0.0:
+        return math.sqrt(of_n)
+    of_prior = joint_prior.variance_of_k_c(prior)
+    share = mode.soil[_K_C] / (mode.soil[_K_C] + mode.soil[_K_PHI] * problem.rig.width.mean())
+    of_share = 1.0 / (max(1.0 / of_k_c - 1.0 / of_prior, 0.0) + max(share**2, 1.0 / math.expm1(of_prior)))
+    return math.sqrt(of_n + (both / of_k_c) ** 2 * max(of_share - of_k_c, 0.0))
 
 
 def cold_fit(problem: ObservationModel, prior: SoilPrior) -> Fit | None:
