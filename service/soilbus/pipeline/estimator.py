@@ -43,7 +43,7 @@ from soilbus.estimation.multistart import Fit
 from soilbus.estimation.nuisance_parameters import active_at
 from soilbus.estimation.posterior import Estimate, Posterior, SoilPrior
 from soilbus.estimation.soil_classes import SoilClasses, guessed
-from soilbus.estimation.tracker import MIN_ROWS, Settings, Tracker, TrackerOutput, TrackerState
+from soilbus.estimation.tracker import Settings, Tracker, TrackerOutput, TrackerState
 from soilbus.estimation.window import Rig, Window
 from soilbus.pipeline.determination import lacking, sinkage_range
 from soilbus.pipeline.excitation import excitation_of
@@ -122,15 +122,13 @@ class WindowEstimator:
         self._classes = SoilClasses.of_table(float(self.rig.width.mean())) if self.rig.wheels else None
         self._class_prior = guessed(self.prior, prior_of(Config()))
         settings = config.estimator
-        least = MIN_ROWS if config.table is None else 1  # a table's rows are chosen with care, and few
-        self._tracker = tracker_of(
-            self.rig, self.prior, self.model,
-            Settings(
-                settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift, least,
-                form_of(config), settings.search_rate, settings.search_burst,
-            ),
-            *self._effects_and_parameters,
+        of_tracker = Settings(
+            settings.window, settings.min_speed, settings.max_turn, settings.max_chi2, settings.soil_drift,
+            form=form_of(config), search_rate=settings.search_rate, search_burst=settings.search_burst,
         )  # fmt: skip
+        if config.table is not None:
+            of_tracker = replace(of_tracker, min_rows=1)  # a table's rows are chosen with care, and few
+        self._tracker = tracker_of(self.rig, self.prior, self.model, of_tracker, *self._effects_and_parameters)
 
     @property
     def tracker(self) -> Tracker:
