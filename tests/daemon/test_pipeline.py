@@ -170,7 +170,10 @@ def test_stubble_is_known_to_be_misunderstood(whole):
 
 
 KEYS = {"t", "status", "soil", "bearing_pressure", "slip", "sinkage", "traversability", "chi2", "samples", "rejected"}
-MORE = {"solver", "search_ended", "window", "log", "reason", "state", "soil_class", "capability", "gaps", "warning"}
+MORE = {"solver", "search_ended", "window", "log", "reason", "state", "soil_class", "capability", "gaps"} | {
+    "warning",
+    "soil_change",
+}
 CAPABILITY = {"max_draft_here", "max_grade_with_draft", "set_points", "forecast", "over_slip"}
 DECISION = {
     "contradicted",

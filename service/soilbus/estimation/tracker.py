@@ -33,7 +33,7 @@ from typing import NamedTuple
 import numpy as np
 
 from soilbus.arrays import Array
-from soilbus.estimation.change_detection import Transition, change_statistic, without_transition
+from soilbus.estimation.change_detection import ChangeStatistic, Transition, change_statistic, without_transition
 from soilbus.estimation.drift_filter import at_window_end
 from soilbus.estimation.gaussian import Gaussian
 from soilbus.estimation.laplace import with_nested_laplace
@@ -84,8 +84,8 @@ class TrackerOptions:
 
     Attributes
     ----------
-    suspect_log_likelihood_ratio
-        Log likelihood ratio of the change detector above which another soil is fitted.  No evidence recorded.
+    false_alarms_per_hour
+        Windows an hour in which noise alone makes the change detector search for another soil (change_detection).
     mismatch_sd
         Sd of reduced chi-square by which a window may exceed `Settings.max_chi2`; 0 after a mismatch.
         No evidence recorded.
@@ -124,7 +124,7 @@ class TrackerOptions:
         Time [s] in which the autocorrelation of a gain error falls to 1/e: amplifiers drift, tyres wear.
     """
 
-    suspect_log_likelihood_ratio: float = 12.0
+    false_alarms_per_hour: float = 1.0
     mismatch_sd: float = 3.5
     settled_sd: float = 1.5
     min_evidence_gain: float = 20.0
@@ -204,6 +204,8 @@ class Settings:
         How far each of `model_form.FORM` may be from the configured model; () holds the form.
     search_rate, search_burst : float
         Evaluations of the model that searches may take, see `SearchBudget`.
+    hop : float
+        Time [s] from one window to the next.
     """
 
     window: float
@@ -215,14 +217,15 @@ class Settings:
     form: tuple[float, ...] = ()
     search_rate: float = 4.0
     search_burst: float = 100.0
+    hop: float = 1.0
 
 
 class ChangePoint(NamedTuple):
-    """Time t [s] from which the data disagree with the present soil, ground speed [m/s] then, and the GLR."""
+    """Time t [s] from which the data disagree with the present soil, ground speed [m/s] then, and why."""
 
     t: float
     speed: float
-    statistic: float
+    statistic: ChangeStatistic
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,8 +332,8 @@ class TrackerOutput:
         Whether the budget of evaluations ended the search for a soil that describes the data.
     reason : Reason
         Why the state is so.
-    statistic : float or None
-        Log likelihood ratio of the present change point; None without one.
+    change : ChangePoint or None
+        The present change point.
     """
 
     fit: Fit | None
@@ -341,7 +344,7 @@ class TrackerOutput:
     turning: int = 0
     search_ended: bool = False
     reason: Reason = Reason.ONE_SOIL
-    statistic: float | None = None
+    change: ChangePoint | None = None
 
 
 class _Present(NamedTuple):
@@ -466,7 +469,7 @@ class Tracker:
         state = next_state(self._state, shown, end, self.settings.window, self.options)
         tracked = TrackerOutput(
             self._reported(explanation.objective, fit), shown.mismatch, state.name, explanation.since, *left_out,
-            reason=state.reason, statistic=None if state.change is None else state.change.statistic,
+            reason=state.reason, change=state.change,
         )  # fmt: skip
         self._store(tracked, state, end, present.problem)
         return tracked
@@ -533,13 +536,13 @@ class Tracker:
         centred = replace(last.reported, soil=last.optimum.soil, gains=last.optimum.gains)
         half_window = 0.5  # the last estimate is of its window's middle
         predicted = centred.drifted(self._drift(centred, half_window), np.zeros(len(centred.gains)))
-        threshold = options.suspect_log_likelihood_ratio
-        found = change_statistic(warm.objective, predicted, warm.iterate, warm.linearisation, first, threshold)
-        if found.ratio <= threshold and fit is not None and fit.chi2 <= self.chi2_limit(fit):
+        false_alarms = options.false_alarms_per_hour * self.settings.hop / 3600.0
+        found = change_statistic(warm.objective, predicted, warm.iterate, warm.linearisation, first, false_alarms)
+        if not found.is_alarm and fit is not None and fit.chi2 <= self.chi2_limit(fit):
             return None
         begin, window = float(t[found.instant]), present.window
         near = window.ground_speed[(window.t >= begin - 1.0) & (window.t <= begin)]
-        return ChangePoint(begin, max(float(np.nanmean(near)), self.settings.min_speed), found.ratio)
+        return ChangePoint(begin, max(float(np.nanmean(near)), self.settings.min_speed), found)
 
     def _explained(self, present: _Present, one: _Explanation, change: ChangePoint | None) -> _Explanation:
         """The window as two soils from the change point on, as another soil, or as one that begins later."""
@@ -586,8 +589,7 @@ class Tracker:
             return _Explanation(objective, new, transition.end, None, Reason.TWO_SOILS, transition)
         if warm is None or old is None or not waits:
             return None
-        is_detected = change.statistic > self.options.suspect_log_likelihood_ratio
-        reason = Reason.CHANGE_STATISTIC if is_detected else Reason.MISMATCH
+        reason = Reason.CHANGE_STATISTIC if change.statistic.is_alarm else Reason.MISMATCH
         return _Explanation(warm.objective, old, float(window.t[0]), warm, reason, self._state.transition)
 
     def _candidate_transitions(self, change: ChangePoint, start: float) -> list[Transition]:
