@@ -25,7 +25,7 @@ limited by `SearchBudget`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
@@ -92,30 +92,27 @@ class TrackerOptions:
     settled_sd
         The same just after a border: its remains in the window bias the soil long before they are a mismatch.
     min_evidence_gain
-        Fall of -2 log evidence by two soils instead of one from which the change is accepted.  No evidence recorded.
-    min_extension_gain
-        Fall of -2 log posterior, beyond the number of residuals left out, from which these are part of the transition.
+        Fall of -2 log evidence by two soils instead of one from which the change is accepted, and of -2 log posterior,
+        beyond the number of residuals left out, from which these are part of the transition.
     max_scale_statistic
         Score statistic, chi-square with one degree of freedom, above which sinkages are on a wrong scale: 5 sd.
     min_rows_per_soil
         Residuals that each of two soils needs before they are compared.  No evidence recorded.
-    look_back
-        Windows before the end of the last fit's data from which on changes are looked for.
     min_to_detect
-        Windows that a new soil must fill before the next change is looked for.
+        Windows that a soil must fill before a change from it is looked for, that lie before the end of the last fit's
+        data and are looked at again, and after a change point during which data that no soil explains may be of a
+        border.
     min_to_learn
         Windows that the data must fill for the posterior to be a later prior: with less it is not Gaussian.
     max_unexplained
         Windows after a change point during which a change may explain a mismatch.
-    unexplained
-        Windows after a change point during which data that no soil explains are not yet a mismatch.
     settling_ratio
         Time that a new soil must last, over that of its gradual border, until the transition is over; at most
         `min_to_learn`.  No evidence recorded.
-    transition_lengths
-        Lengths of a transition that are tried, in wheelbases: borders are sharp or gradual.
     extension_shares
         Shares of a new soil's data that are tried as part of its transition.
+    transition_lengths
+        Lengths of a transition that are tried, in wheelbases: borders are sharp or gradual.
     default_wheelbase
         Length [m] that stands for the wheelbase of a rig that has none.
     gain_memory
@@ -128,17 +125,14 @@ class TrackerOptions:
     mismatch_sd: float = 3.5
     settled_sd: float = 1.5
     min_evidence_gain: float = 20.0
-    min_extension_gain: float = 25.0
     max_scale_statistic: float = 25.0
     min_rows_per_soil: int = 30
-    look_back: float = 0.2
     min_to_detect: float = 0.3
     min_to_learn: float = 0.5
     max_unexplained: float = 2.0
-    unexplained: float = 0.3
     settling_ratio: float = 2.0
-    transition_lengths: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.5, 10.5)
     extension_shares: tuple[float, ...] = (0.1, 0.25, 0.45, 0.7)
+    transition_lengths: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.5, 10.5)
     default_wheelbase: float = 2.0
     gain_memory: float = 60.0
     gain_correlation_time: float = 86400.0
@@ -532,7 +526,7 @@ class Tracker:
         if fit is not None and fit.curved_path and self._is_settled(fit):
             return None  # path curvature explains the disagreement
         t = warm.objective.problem.t
-        first = int(np.searchsorted(t, float(last.optimum.t[-1]) - options.look_back * length))
+        first = int(np.searchsorted(t, float(last.optimum.t[-1]) - options.min_to_detect * length))
         centred = replace(last.reported, soil=last.optimum.soil, gains=last.optimum.gains)
         half_window = 0.5  # the last estimate is of its window's middle
         predicted = centred.drifted(self._drift(centred, half_window), np.zeros(len(centred.gains)))
@@ -570,27 +564,37 @@ class Tracker:
         old = None if self.mismatch(old) else old
         if old is None and not self.mismatch(one.fit):
             return None
-        waits = True
-        for transition in self._candidate_transitions(change, float(window.t[0])):
-            separated = without_transition(window, transition, self.rig.front)
-            second = self._problem(separated.rows(np.flatnonzero(separated.t >= transition.end)))
-            arrived = transition.end + transition.lag if self._state.mismatch else transition.end
-            if second.n_rows < self.options.min_rows_per_soil or window.t[-1] < arrived:
-                break  # after a mismatch both axles and the draft must agree on the new soil
-            waits = self.mismatch(one.fit) and end < change.t + self.options.unexplained * self.settings.window
-            joint_prior = self._prior_at(change.t, second).with_prior_soil(self._new_soil_prior)
-            new = self._search(second, self._new_soil_prior, joint_prior)
-            if new is None or self.mismatch(new):
-                continue
+        joint_prior = self._prior_at(change.t, present.problem).with_prior_soil(self._new_soil_prior)
+        candidates = self._candidate_transitions(change, float(window.t[0]))
+        new = self._after_transition(window, candidates, self._new_soil_prior, joint_prior)
+        if new is not None and new.transition is not None:
+            separated = without_transition(window, new.transition, self.rig.front)
             whole = present._replace(window=separated, problem=self._problem(separated))
-            if old is not None and not self._are_likelier(old, new, self._searched(whole).fit):
+            if old is not None and not self._are_likelier(old, new.fit, self._searched(whole).fit):
                 return None
-            objective = Objective(second, self._new_soil_prior, joint_prior)
-            return _Explanation(objective, new, transition.end, None, Reason.TWO_SOILS, transition)
-        if warm is None or old is None or not waits:
+            return new._replace(found=Reason.TWO_SOILS)
+        if warm is None or old is None or end >= change.t + self.options.min_to_detect * self.settings.window:
             return None
         reason = Reason.CHANGE_STATISTIC if change.statistic.is_alarm else Reason.MISMATCH
         return _Explanation(warm.objective, old, float(window.t[0]), warm, reason, self._state.transition)
+
+    def _after_transition(
+        self, window: Window, transitions: Iterable[Transition], prior: SoilPrior, joint_prior: Gaussian
+    ) -> _Explanation | None:
+        """The data after the first of some transitions, of growing length, that leaves one soil.
+
+        None where none does, or too few data are left.
+        """
+        for transition in transitions:
+            separated = without_transition(window, transition, self.rig.front)
+            problem = self._problem(separated.rows(np.flatnonzero(separated.t >= transition.end)))
+            arrived = transition.end + transition.lag if self._state.mismatch else transition.end
+            if problem.n_rows < self.options.min_rows_per_soil or window.t[-1] < arrived:
+                return None  # after a mismatch both axles and the draft must agree on the new soil
+            fit = self._search(problem, prior, joint_prior)
+            if fit is not None and not self.mismatch(fit):
+                return _Explanation(Objective(problem, prior, joint_prior), fit, transition.end, None, None, transition)
+        return None
 
     def _candidate_transitions(self, change: ChangePoint, start: float) -> list[Transition]:
         """Transitions of growing length from the change point on; of those over before `start` [s] only the last."""
@@ -598,13 +602,12 @@ class Tracker:
         lag = (self.options.default_wheelbase if chassis is None else chassis.wheelbase) / change.speed
         ends = [change.t + length * lag for length in self.options.transition_lengths]
         n_over = sum(end <= start for end in ends)
-        rear_lag = 0.0 if chassis is None else lag
-        return [Transition(change.t - TIME_TOLERANCE, end, rear_lag) for end in ends[max(n_over - 1, 0) :]]
+        return [Transition(change.t - TIME_TOLERANCE, end, lag) for end in ends[max(n_over - 1, 0) :]]
 
-    def _are_likelier(self, old: Fit, new: Fit, one: Fit | None) -> bool:
+    def _are_likelier(self, old: Fit, new: Fit | None, one: Fit | None) -> bool:
         """Whether two soils have much more evidence than one, of the same data."""
-        if one is None or not one.converged:
-            return True
+        if one is None or new is None or not one.converged:
+            return new is not None
         gain = one.neg2_log_evidence - old.neg2_log_evidence - new.neg2_log_evidence
         return gain >= self.options.min_evidence_gain
 
@@ -622,25 +625,17 @@ class Tracker:
 
     def _after_longer_transition(self, present: _Present, one: _Explanation) -> _Explanation:
         """The new soil after a longer transition, if the data that it leaves out are why the others do not agree."""
-        fit, window, transition = one.fit, present.window, one.transition
-        if fit is None or self._is_settled(fit) or transition is None:
+        if one.fit is None or self._is_settled(one.fit) or one.transition is None:
             return one
-        begin, last = max(transition.end, float(window.t[0])), float(window.t[-1])
-        for end in (begin + share * (last - begin) for share in self.options.extension_shares):
-            extended = transition._replace(end=end)
-            separated = without_transition(window, extended, self.rig.front)
-            problem = self._problem(separated.rows(np.flatnonzero(separated.t >= extended.end)))
-            if problem.n_rows < 2 * self.options.min_rows_per_soil:
-                break
-            joint_prior, prior = one.objective.joint_prior, one.objective.coordinates.prior
-            shorter = self._search(problem, prior, joint_prior)
-            if shorter is None or not self._is_settled(shorter):
-                continue
-            fall, noise = fit.neg2_log_posterior - shorter.neg2_log_posterior, fit.rows - shorter.rows
-            if fall > noise + self.options.min_extension_gain:
-                found = one.found or Reason.SPANS_BORDER
-                return _Explanation(Objective(problem, prior, joint_prior), shorter, end, None, found, extended)
-        return one
+        prior, joint_prior = one.objective.coordinates.prior, one.objective.joint_prior
+        begin, last = max(one.transition.end, float(present.window.t[0])), float(present.window.t[-1])
+        ends = (begin + share * (last - begin) for share in self.options.extension_shares)
+        longer = (one.transition._replace(end=end) for end in ends)
+        after = self._after_transition(present.window, longer, prior, joint_prior)
+        if after is None or after.fit is None:
+            return one
+        fall = one.fit.neg2_log_posterior - after.fit.neg2_log_posterior - (one.fit.rows - after.fit.rows)
+        return after._replace(found=one.found or Reason.SPANS_BORDER) if fall > self.options.min_evidence_gain else one
 
     def _search(self, problem: ObservationModel, prior: SoilPrior, joint_prior: Gaussian) -> Fit | None:
         """A fit from many starts; None also where the budget allows no search."""
