@@ -125,7 +125,7 @@ def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, joint_prior
         With `marginalised`, and with the denoised window's Gaussians unless there is a second mode; `found` itself
         where there is nothing to average.
     """
-    spread = math.sqrt(max(found.mode.covariance[_N, _N], found.gaussian.covariance[_N, _N]))
+    spread = math.sqrt(found.mode.covariance[_N, _N])
     is_determined = spread < DETERMINED_N_SD and found.second_mode is None
     if is_determined and load_signal(problem, found) > MIN_LOAD_SIGNAL:
         return found
@@ -136,12 +136,12 @@ def with_nested_laplace(problem: ObservationModel, prior: SoilPrior, joint_prior
         coordinates = Coordinates(prior, float(problem.rig.width.mean()))
         attainable = attainable_variance(along, prior, joint_prior) if len(along.nodes) > 2 else None
         averaged = (
-            along.top.gaussian if attainable is None else _averaged(along.nodes, attainable, coordinates, joint_prior)
+            along.top.mode if attainable is None else _averaged(along.nodes, attainable, coordinates, joint_prior)
         )
     is_finite = np.isfinite(averaged.soil).all() and np.isfinite(averaged.covariance).all()
     if not is_finite or found.second_mode is not None:  # beside a second mode the first stays as it was found
         return replace(found, marginalised=averaged) if is_finite else found
-    return replace(found, gaussian=along.top.gaussian, mode=along.top.mode, marginalised=averaged)
+    return replace(found, mode=along.top.mode, marginalised=averaged)
 
 
 def cold_fit(problem: ObservationModel, prior: SoilPrior) -> Fit | None:
@@ -330,7 +330,7 @@ def _averaged(nodes: list[Node], attainable: Array, coordinates: Coordinates, jo
     """
     free = coordinates.free
     active = _SOIL + np.flatnonzero(np.diag(joint_prior.covariance)[_SOIL:] > 0.0)
-    gaussians = [node.fit.gaussian for node in nodes]
+    gaussians = [node.fit.mode for node in nodes]
     u = np.array([node.u for node in nodes])
     fine = np.linspace(u[0], u[-1], GRID_POINTS)
     by_density = density(u, np.array([node.neg2_log_density for node in nodes]), fine)
